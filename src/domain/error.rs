@@ -1,0 +1,170 @@
+//! What can go wrong, in one place and without a transport.
+//!
+//! A [`Refusal`] is the caller's to mend and is written for them; a [`Fault`] is ours, is logged
+//! once at the boundary and never shown.
+
+use std::error::Error as StdError;
+use std::fmt;
+
+/// `std::result::Result` with this crate's error.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// Every kind of error a caller can meet. `status.rs` gives each its HTTP status, gRPC code and
+/// problem type.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum ErrorKind {
+    /// A field has a value that cannot be used.
+    InvalidArgument,
+    /// The body is not of the announced format.
+    MalformedBody,
+    /// The content type is none that the operation reads.
+    UnsupportedMediaType,
+    /// None of the accepted content types can be written.
+    NotAcceptable,
+    /// Body, batch or message beyond its limit.
+    TooLarge,
+    /// No such path.
+    RouteNotFound,
+    /// The path exists, the method does not.
+    MethodNotAllowed,
+    /// No such camera.
+    CameraNotFound,
+    /// No such training run.
+    RunNotFound,
+    /// No such model version.
+    ModelNotFound,
+    /// No such evaluation.
+    EvaluationNotFound,
+    /// No such track.
+    TrackNotFound,
+    /// A camera of that id exists already.
+    CameraExists,
+    /// `If-Match` names another revision than the stored one.
+    RevisionMismatch,
+    /// The change needs an `If-Match`.
+    RevisionRequired,
+    /// The camera has no active model yet.
+    NoModel,
+    /// The camera has a training run that has not ended.
+    RunLive,
+    /// The training run has ended already.
+    RunEnded,
+    /// The stored samples cannot support a fit.
+    UnusableSamples,
+    /// The caller went away or cancelled.
+    Cancelled,
+    /// More requests are in flight than the server takes.
+    Overloaded,
+    /// The request took longer than it may.
+    Timeout,
+    /// The server is ending.
+    ShuttingDown,
+    /// A fault of the server.
+    Internal,
+}
+
+/// One field at fault: where, and what would be right.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Violation {
+    /// Path of the field, dotted, with indexes in brackets: `observations[3].bounding_box.width_px`.
+    pub field: String,
+    /// What is wrong and what would be right.
+    pub message: String,
+}
+
+/// An error that the caller can mend; all of it may be shown.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refusal {
+    /// The kind, which decides status and type.
+    pub kind: ErrorKind,
+    /// A sentence for a person.
+    pub message: String,
+    /// The fields at fault, if any.
+    pub violations: Vec<Violation>,
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.violations.first() {
+            Some(first) if self.message != first.message => {
+                write!(out, "{}: {}: {}", self.message, first.field, first.message)
+            }
+            Some(first) => write!(out, "{}: {}", first.field, first.message),
+            None => out.write_str(&self.message),
+        }
+    }
+}
+
+/// An error of the server; for the log alone.
+#[derive(Debug)]
+pub struct Fault(Box<dyn StdError + Send + Sync>);
+
+impl fmt::Display for Fault {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "{}", self.0)?;
+        let mut source = self.0.source();
+        while let Some(cause) = source {
+            write!(out, ": {cause}")?;
+            source = cause.source();
+        }
+        Ok(())
+    }
+}
+
+/// Refused or failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The caller can mend it.
+    #[error("{0}")]
+    Refused(Refusal),
+    /// The server is at fault.
+    #[error("{0}")]
+    Fault(Fault),
+}
+
+impl Error {
+    /// A refusal without a field.
+    pub fn refused(kind: ErrorKind, message: impl Into<String>) -> Self {
+        Self::Refused(Refusal { kind, message: message.into(), violations: Vec::new() })
+    }
+
+    /// A field whose value cannot be used.
+    pub fn invalid(field: impl Into<String>, message: impl Into<String>) -> Self {
+        Self::field(ErrorKind::InvalidArgument, field, message)
+    }
+
+    /// A refusal that names one field.
+    pub fn field(kind: ErrorKind, field: impl Into<String>, message: impl Into<String>) -> Self {
+        let violation = Violation { field: field.into(), message: message.into() };
+        Self::Refused(Refusal { kind, message: violation.message.clone(), violations: vec![violation] })
+    }
+
+    /// A fault, from what caused it.
+    pub fn fault(cause: impl Into<Box<dyn StdError + Send + Sync>>) -> Self {
+        Self::Fault(Fault(cause.into()))
+    }
+
+    /// The kind that `status.rs` maps.
+    #[must_use]
+    pub const fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Refused(refusal) => refusal.kind,
+            Self::Fault(_) => ErrorKind::Internal,
+        }
+    }
+
+    /// The same error with the field paths below a parent: `width_px` under `bounding_box`.
+    #[must_use]
+    pub fn under(mut self, parent: &str) -> Self {
+        if let Self::Refused(refusal) = &mut self {
+            for violation in &mut refusal.violations {
+                violation.field = match violation.field.as_str() {
+                    "" => parent.to_owned(),
+                    field if field.starts_with('[') => format!("{parent}{field}"),
+                    field => format!("{parent}.{field}"),
+                };
+            }
+        }
+        self
+    }
+}

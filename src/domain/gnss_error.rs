@@ -1,0 +1,41 @@
+//! How far a receiver's fixes lie from the truth.
+
+use super::error::{Error, Result};
+
+/// A standard deviation per horizontal axis in metres, from 1 mm to 10 km.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct SigmaM(f64);
+
+impl SigmaM {
+    /// # Errors
+    /// Refuses what is not a finite number from 0.001 to 10,000 m; the field is named `sigma_m`.
+    pub fn new(sigma_m: f64) -> Result<Self> {
+        if (0.001..=10_000.0).contains(&sigma_m) {
+            Ok(Self(sigma_m))
+        } else {
+            Err(Error::invalid("sigma_m", "must be a standard deviation from 0.001 to 10000 metres per axis"))
+        }
+    }
+
+    /// Metres.
+    #[must_use]
+    pub const fn metres(self) -> f64 {
+        self.0
+    }
+
+    /// Variance per axis in m2.
+    #[must_use]
+    pub fn variance_m2(self) -> f64 {
+        self.0 * self.0
+    }
+}
+
+/// What the operator knows of a camera's receiver.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum GnssError {
+    /// Standard deviation per axis, from the data sheet or from many fixes at a fixed point.
+    Known(SigmaM),
+    /// To be estimated from the training samples.
+    #[default]
+    Unknown,
+}

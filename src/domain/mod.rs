@@ -1,0 +1,30 @@
+//! The values sightfix speaks of, valid by construction.
+//!
+//! Every check on a number lives in a constructor here or in [`crate::geo`]; the floors above take
+//! these values as they are and check nothing again. What never happens here: I/O, clocks,
+//! randomness, wire formats, status codes.
+
+mod bounding_box;
+mod camera;
+mod error;
+mod gnss_error;
+mod names;
+mod observation;
+mod recipe;
+mod sample;
+mod time;
+mod training;
+
+pub use bounding_box::{BoundingBox, ImageSize};
+pub use camera::{Camera, CameraChange, NewCamera, Revision};
+pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
+pub use gnss_error::{GnssError, SigmaM};
+pub use names::{CameraId, TargetClass, TargetId, check_labels, check_text};
+pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, Observation};
+pub use recipe::Recipe;
+pub use sample::{Sample, Score};
+pub use time::{TimeBounds, parse_time};
+pub use training::{
+    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, ModelMetadata, ModelVersion,
+    OriginDeg, RunId, RunProgress, RunState, TrainingOptions, TrainingRun,
+};

@@ -1,0 +1,130 @@
+//! Names that operators and detectors choose.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
+
+use super::error::{Error, Result};
+
+/// Longest id of a target and longest class name, in bytes.
+const LONGEST_NAME: usize = 128;
+
+/// Id of a camera: a slug of 1 to 63 of `a-z0-9-`, beginning and ending with a letter or digit.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct CameraId(Arc<str>);
+
+impl CameraId {
+    /// # Errors
+    /// Refuses what is not such a slug; the field is named `id`.
+    pub fn new(id: &str) -> Result<Self> {
+        let inner = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
+        let well_formed = (1..=63).contains(&id.len())
+            && id.bytes().all(inner)
+            && !id.starts_with('-')
+            && !id.ends_with('-');
+        if well_formed {
+            Ok(Self(id.into()))
+        } else {
+            Err(Error::invalid("id", "must be 1 to 63 of a-z, 0-9 and -, not beginning or ending with -"))
+        }
+    }
+
+    /// The slug.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+/// A camera id can be looked up by its text in a map.
+impl std::borrow::Borrow<str> for CameraId {
+    fn borrow(&self) -> &str {
+        &self.0
+    }
+}
+
+/// Text that names something: printable, trimmed, of 1 to 128 bytes.
+macro_rules! name {
+    ($(#[$doc:meta])* $name:ident, $field:literal) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+        pub struct $name(Arc<str>);
+
+        impl $name {
+            /// # Errors
+            /// Refuses text that is empty, longer than 128 bytes, padded, or holds control characters.
+            pub fn new(text: &str) -> Result<Self> {
+                check_text($field, text, LONGEST_NAME)?;
+                Ok(Self(text.into()))
+            }
+
+            /// The text.
+            #[must_use]
+            pub fn as_str(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+                out.write_str(&self.0)
+            }
+        }
+    };
+}
+
+name!(
+    /// Id of a target, chosen by the detector or the receiver.
+    TargetId,
+    "target_id"
+);
+name!(
+    /// Class of a target: `person`, `car`, `aircraft`.
+    TargetClass,
+    "class"
+);
+
+impl fmt::Display for CameraId {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(&self.0)
+    }
+}
+
+/// Checks free text for a field.
+///
+/// # Errors
+/// Names the field if the text is empty, longer than `longest` bytes, padded with white space, or
+/// holds control characters.
+pub fn check_text(field: &str, text: &str, longest: usize) -> Result<()> {
+    let fits = !text.is_empty() && text.len() <= longest;
+    if fits && text.trim() == text && !text.chars().any(char::is_control) {
+        Ok(())
+    } else {
+        Err(Error::invalid(
+            field,
+            format!(
+                "must be text of 1 to {longest} bytes without control characters or white space around it"
+            ),
+        ))
+    }
+}
+
+/// Checks free-form labels: at most 64, keys to 63 bytes, values to 255.
+///
+/// # Errors
+/// Names the label at fault under `labels`.
+pub fn check_labels(labels: &BTreeMap<String, String>) -> Result<()> {
+    if labels.len() > 64 {
+        return Err(Error::invalid("labels", "must be at most 64"));
+    }
+    for (key, value) in labels {
+        check_text(&format!("labels.{key}"), key, 63)?;
+        if value.len() > 255 || value.chars().any(char::is_control) {
+            return Err(Error::invalid(
+                format!("labels.{key}"),
+                "must be at most 255 bytes without control characters",
+            ));
+        }
+    }
+    Ok(())
+}

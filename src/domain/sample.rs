@@ -1,0 +1,50 @@
+//! An observation kept for training.
+
+use jiff::Timestamp;
+
+use super::bounding_box::BoundingBox;
+use super::error::{Error, Result};
+use super::names::{TargetClass, TargetId};
+use super::observation::Fix;
+use crate::geo::Position;
+
+/// A detector's score, 0 to 1.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct Score(f64);
+
+impl Score {
+    /// # Errors
+    /// Refuses what is not within 0..=1; the field is named `score`.
+    pub fn new(score: f64) -> Result<Self> {
+        if (0.0..=1.0).contains(&score) {
+            Ok(Self(score))
+        } else {
+            Err(Error::invalid("score", "must be from 0 to 1"))
+        }
+    }
+
+    /// The score.
+    #[must_use]
+    pub const fn value(self) -> f64 {
+        self.0
+    }
+}
+
+/// A box and a fix of one target at one instant. Unique by camera, target and time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample {
+    /// When, to the microsecond.
+    pub time: Timestamp,
+    /// Who.
+    pub target_id: TargetId,
+    /// What the camera saw.
+    pub bounding_box: BoundingBox,
+    /// What the receiver said.
+    pub fix: Fix,
+    /// What the detector takes the target for.
+    pub class: Option<TargetClass>,
+    /// How sure the detector is.
+    pub score: Option<Score>,
+    /// Where the target truly was, for evaluation alone; never used in training.
+    pub truth: Option<Position>,
+}

@@ -1,0 +1,1 @@
+//! Sample, observation and fix files: CSV, NDJSON, JSON, NMEA and GeoJSON.

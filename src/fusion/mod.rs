@@ -1,0 +1,1 @@
+//! Confidences, two-step fusion, pairing and tracks: pure functions and values.

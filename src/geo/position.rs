@@ -1,0 +1,92 @@
+//! A place on the WGS 84 ellipsoid.
+
+use std::sync::LazyLock;
+
+use geographiclib_rs::{Geodesic, InverseGeodesic};
+
+/// A place on the WGS 84 ellipsoid at height zero, valid by construction.
+///
+/// Longitude lies in -180..=180 and latitude in -90..=90, both in degrees and finite.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Position {
+    longitude_deg: f64,
+    latitude_deg: f64,
+}
+
+/// Why two numbers are not a [`Position`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum PositionError {
+    /// The longitude is not a finite number of degrees within -180..=180.
+    #[error("longitude must be a finite number of degrees from -180 to 180")]
+    Longitude,
+    /// The latitude is not a finite number of degrees within -90..=90.
+    #[error("latitude must be a finite number of degrees from -90 to 90")]
+    Latitude,
+}
+
+impl Position {
+    /// A position from degrees.
+    ///
+    /// # Errors
+    /// [`PositionError`] names the coordinate that is not finite or out of range. Longitude 181 and
+    /// latitude 91, common "no position" codes, are refused here.
+    pub fn new(longitude_deg: f64, latitude_deg: f64) -> Result<Self, PositionError> {
+        if !(-180.0..=180.0).contains(&longitude_deg) {
+            return Err(PositionError::Longitude);
+        }
+        if !(-90.0..=90.0).contains(&latitude_deg) {
+            return Err(PositionError::Latitude);
+        }
+        Ok(Self { longitude_deg, latitude_deg })
+    }
+
+    /// A computed position: longitude wrapped into -180..=180, latitude clamped to the poles.
+    pub(super) fn wrapped(longitude_deg: f64, latitude_deg: f64) -> Self {
+        Self { longitude_deg: wrap_degrees(longitude_deg), latitude_deg: latitude_deg.clamp(-90.0, 90.0) }
+    }
+
+    /// Degrees east of Greenwich, -180 to 180.
+    #[must_use]
+    pub const fn longitude_deg(self) -> f64 {
+        self.longitude_deg
+    }
+
+    /// Degrees north of the equator, -90 to 90.
+    #[must_use]
+    pub const fn latitude_deg(self) -> f64 {
+        self.latitude_deg
+    }
+}
+
+/// Degrees brought into -180..=180, so that differences are right across the antimeridian.
+pub(super) fn wrap_degrees(degrees: f64) -> f64 {
+    if (-180.0..=180.0).contains(&degrees) { degrees } else { (degrees + 180.0).rem_euclid(360.0) - 180.0 }
+}
+
+/// Length in metres of the geodesic between two positions on WGS 84 (Karney 2013).
+#[must_use]
+pub fn distance_m(from: Position, to: Position) -> f64 {
+    static WGS84: LazyLock<Geodesic> = LazyLock::new(Geodesic::wgs84);
+    WGS84.inverse(from.latitude_deg, from.longitude_deg, to.latitude_deg, to.longitude_deg)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_for_no_position_are_refused() {
+        assert_eq!(Position::new(181.0, 0.0), Err(PositionError::Longitude));
+        assert_eq!(Position::new(0.0, 91.0), Err(PositionError::Latitude));
+        assert_eq!(Position::new(f64::NAN, 0.0), Err(PositionError::Longitude));
+        assert_eq!(Position::new(0.0, f64::INFINITY), Err(PositionError::Latitude));
+    }
+
+    #[test]
+    fn distance_crosses_the_antimeridian_the_short_way() {
+        let west = Position::new(-179.9995, 10.0).expect("valid");
+        let east = Position::new(179.9995, 10.0).expect("valid");
+        let metres = distance_m(west, east);
+        assert!((metres - 109.64).abs() < 0.05, "{metres}");
+    }
+}

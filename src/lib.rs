@@ -1,0 +1,12 @@
+//! sightfix tells where a target is on the earth from what a fixed camera that nobody calibrated
+//! sees and what a GNSS receiver says. `docs/architecture.md` is the map of this crate.
+
+pub mod domain;
+pub mod evaluation;
+pub mod exchange;
+pub mod filters;
+pub mod fusion;
+pub mod geo;
+pub mod model;
+pub mod simulation;
+pub mod store;

@@ -1,0 +1,1 @@
+//! Synthetic cameras, targets and receivers.

@@ -1,0 +1,1 @@
+//! Everything that lasts, behind one type; the only floor that knows SQL.

@@ -7,6 +7,7 @@ pub mod exchange;
 pub mod filters;
 pub mod fusion;
 pub mod geo;
+pub mod grpc;
 pub mod model;
 pub mod simulation;
 pub mod store;

@@ -55,7 +55,9 @@ pub const fn of(kind: ErrorKind) -> Status {
         }
         ErrorKind::CameraNotFound => (404, code::NOT_FOUND, "camera-not-found", "There is no such camera"),
         ErrorKind::RunNotFound => (404, code::NOT_FOUND, "run-not-found", "There is no such training run"),
-        ErrorKind::ModelNotFound => (404, code::NOT_FOUND, "model-not-found", "There is no such model version"),
+        ErrorKind::ModelNotFound => {
+            (404, code::NOT_FOUND, "model-not-found", "There is no such model version")
+        }
         ErrorKind::EvaluationNotFound => {
             (404, code::NOT_FOUND, "evaluation-not-found", "There is no such evaluation")
         }
@@ -66,9 +68,12 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::RevisionMismatch => {
             (412, code::ABORTED, "revision-mismatch", "The camera was changed in the meantime")
         }
-        ErrorKind::RevisionRequired => {
-            (428, code::FAILED_PRECONDITION, "revision-required", "The change needs the revision it is based on")
-        }
+        ErrorKind::RevisionRequired => (
+            428,
+            code::FAILED_PRECONDITION,
+            "revision-required",
+            "The change needs the revision it is based on",
+        ),
         ErrorKind::NoModel => (409, code::FAILED_PRECONDITION, "no-model", "The camera has no active model"),
         ErrorKind::RunLive => {
             (409, code::FAILED_PRECONDITION, "run-live", "The camera has a training run that has not ended")

@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use hyper::http::{HeaderName, HeaderValue};
-use metrics::{Counter, Gauge, Histogram, Key, KeyName, Label, Level, Metadata, Recorder, SharedString, Unit};
+use metrics::{
+    Counter, Gauge, Histogram, Key, KeyName, Label, Level, Metadata, Recorder, SharedString, Unit,
+};
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
 
 use crate::config::{Config, LogFormat};
@@ -68,9 +70,8 @@ impl Metrics {
         };
         let plain = |name, help| counter(name, help, Vec::new());
         let labelled = |name, help, label, value| counter(name, help, vec![Label::new(label, value)]);
-        let samples = |outcome| {
-            labelled("sightfix_samples_total", "Rows of imports, by outcome", "outcome", outcome)
-        };
+        let samples =
+            |outcome| labelled("sightfix_samples_total", "Rows of imports, by outcome", "outcome", outcome);
         let runs = |state: RunState| {
             labelled("sightfix_training_runs_total", "Training runs that ended", "state", state.as_str())
         };

@@ -141,9 +141,10 @@ impl App {
     /// # Errors
     /// `CameraNotFound`; `NoModel`.
     pub async fn active_model(&self, id: &CameraId) -> Result<ModelVersion> {
-        let number = self.store.camera(id).await?.active_model.ok_or_else(|| {
-            Error::refused(ErrorKind::NoModel, format!("camera {id} has no active model"))
-        })?;
+        let number =
+            self.store.camera(id).await?.active_model.ok_or_else(|| {
+                Error::refused(ErrorKind::NoModel, format!("camera {id} has no active model"))
+            })?;
         self.store.model(id, number).await
     }
 }
@@ -159,9 +160,8 @@ mod tests {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(1);
         let plane = LocalPlane::new(Position::new(103.9, 30.6).expect("valid"));
         // A sum of twelve uniforms has variance 1.
-        let mut normal = || {
-            (0..12).map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX)).sum::<f64>() - 6.0
-        };
+        let mut normal =
+            || (0..12).map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX)).sum::<f64>() - 6.0;
         let fixes: Vec<_> = (0..4_000)
             .map(|_| {
                 let point = EastNorth { east_m: 2.0 * normal(), north_m: 3.0 * normal() };
@@ -177,7 +177,12 @@ mod tests {
     #[test]
     fn few_or_equal_fixes_are_refused() {
         let fix = Fix { position: Position::new(1.0, 2.0).expect("valid"), sigma_m: None };
-        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(Ok(fix), 9).map(|fix: Result<_>| fix)).is_err());
-        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(Ok(fix), 50).map(|fix: Result<_>| fix)).is_err());
+        assert!(
+            GnssErrorEstimate::from_fixes(std::iter::repeat_n(Ok(fix), 9).map(|fix: Result<_>| fix)).is_err()
+        );
+        assert!(
+            GnssErrorEstimate::from_fixes(std::iter::repeat_n(Ok(fix), 50).map(|fix: Result<_>| fix))
+                .is_err()
+        );
     }
 }

@@ -185,9 +185,7 @@ fn read_batches(
             }
         }
         if batch.len() == BATCH_ROWS
-            && batches
-                .blocking_send(std::mem::replace(&mut batch, Vec::with_capacity(BATCH_ROWS)))
-                .is_err()
+            && batches.blocking_send(std::mem::replace(&mut batch, Vec::with_capacity(BATCH_ROWS))).is_err()
         {
             return Ok(());
         }

@@ -100,8 +100,7 @@ const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 /// The answer for an observation without a box: its fix.
 fn pass_through(observation: &Observation, has_model: bool, e_gnss_m2: Option<f64>) -> Option<FusedFix> {
     let fix = observation.fix?;
-    let e_gnss_m2 =
-        fix.sigma_m.map(|sigma| sigma.variance_m2()).or(e_gnss_m2).unwrap_or(UNKNOWN_RECEIVER_M2);
+    let e_gnss_m2 = fix.sigma_m.map(|sigma| sigma.variance_m2()).or(e_gnss_m2).unwrap_or(UNKNOWN_RECEIVER_M2);
     let mut flags = vec![Flag::BoxMissing];
     if !has_model {
         flags.push(Flag::NoModel);

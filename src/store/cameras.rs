@@ -75,6 +75,24 @@ impl Store {
         rows.iter().map(read_camera).collect()
     }
 
+    /// Id, revision and active model of every camera: enough to see what has changed.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn camera_heads(&self) -> Result<Vec<(CameraId, Revision, Option<u32>)>> {
+        let rows = sqlx::query("SELECT id, revision, active_model FROM cameras")
+            .fetch_all(self.readers())
+            .await
+            .map_err(failed)?;
+        let read = |row| {
+            let mut fields = Fields::of("cameras", row);
+            let id = fields.make(CameraId::new)?;
+            let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
+            Ok((id, revision, fields.some_count()?))
+        };
+        rows.iter().map(read).collect()
+    }
+
     /// Puts a profile in the place of the stored one and counts its revision up, if the stored
     /// revision is the expected one.
     ///

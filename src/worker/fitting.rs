@@ -34,7 +34,11 @@ impl Shared {
             FitEvent::Epoch(report) => update.epochs.push(*report),
             FitEvent::Note(line) => update.notes.push(line.to_owned()),
         }
-        if self.cancelled.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        if self.cancelled.load(Ordering::Relaxed) {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
     }
 
     /// What was said since the last call; the progress stays.

@@ -159,7 +159,9 @@ async fn end(
             let verdict = promotion::judge(app, &run.camera_id, &artifact, samples).await?;
             (verdict.reason, Some(artifact), verdict.activate)
         }
-        Err(FitError::Cancelled) if server_is_ending => ("the server ends; the run waits".to_owned(), None, false),
+        Err(FitError::Cancelled) if server_is_ending => {
+            ("the server ends; the run waits".to_owned(), None, false)
+        }
         Err(FitError::Cancelled) => ("cancelled".to_owned(), None, false),
         Err(FitError::Unusable(error)) => (error.to_string(), None, false),
         Err(FitError::Fault(error)) => return Err(Error::fault(error)),

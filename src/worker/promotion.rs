@@ -47,7 +47,9 @@ pub(super) async fn judge(
 fn keep(number: u32, why: String) -> Verdict {
     Verdict {
         activate: false,
-        reason: format!("version {number} stays active: {why}; activate the new one by hand if you know better"),
+        reason: format!(
+            "version {number} stays active: {why}; activate the new one by hand if you know better"
+        ),
     }
 }
 

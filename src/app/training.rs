@@ -57,7 +57,7 @@ impl App {
             return Err(Error::field(
                 ErrorKind::UnusableSamples,
                 "samples",
-                format!("there is none to learn from: import some (POST /v1/cameras/{id}/samples:import)"),
+                format!("there is none to learn from: import some (POST /v1/cameras/{id}/samples)"),
             ));
         }
         let now = self.clock.now();

@@ -95,7 +95,7 @@ pub fn fuse(
 }
 
 /// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
-const UNKNOWN_RECEIVER_M2: f64 = 25.0;
+pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 
 /// The answer for an observation without a box: its fix.
 fn pass_through(observation: &Observation, has_model: bool, e_gnss_m2: Option<f64>) -> Option<FusedFix> {

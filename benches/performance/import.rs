@@ -35,7 +35,7 @@ pub(crate) fn run() {
         let id = new_camera();
         let request = load::post(&format!("/v1/cameras/{id}/samples"), "text/csv", &csv);
         let began = Instant::now();
-        runtime.block_on(load::one(served.address, &request));
+        drop(runtime.block_on(load::one(served.address, &request)));
         let rate = samples.len() as f64 / began.elapsed().as_secs_f64();
         let stored = runtime.block_on(served.app.count_samples(&id, &Default::default())).expect("a count");
         assert_eq!(stored as usize, samples.len(), "every row is stored");

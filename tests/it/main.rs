@@ -4,4 +4,5 @@ mod bad_input;
 mod connections;
 mod harness;
 mod layering;
+mod openapi;
 mod story;

@@ -11,7 +11,9 @@ use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 /// Fewer samples cannot tell a camera from its noise.
-pub(super) const FEWEST_SAMPLES: usize = 20;
+pub const FEWEST_SAMPLES: usize = 20;
+/// Fixes that vary by less, m, lie all at one spot.
+pub const SMALLEST_SPREAD_M: f64 = 0.1;
 /// A hole in a target's samples beyond this, and beyond ten times their usual step, ends a pass.
 const PASS_HOLE_S: f64 = 3.0;
 
@@ -95,7 +97,7 @@ impl Rows {
             )));
         }
         let on_ground = spread(&|row| row.label.east_m).max(spread(&|row| row.label.north_m));
-        if on_ground < 0.1 {
+        if on_ground < SMALLEST_SPREAD_M {
             return Err(unusable(format!(
                 "all {} fixes are at one spot (they vary by {on_ground:.2} m) though the boxes move; check \
                  that boxes and fixes are paired by time",

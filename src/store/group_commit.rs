@@ -13,7 +13,7 @@ use sqlx::sqlite::SqliteArguments;
 use sqlx::{Arguments, SqliteConnection};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
-use super::connection::{Durability, Writer};
+use super::connection::{Durability, Turn, Writer};
 use super::faults::{closed, failed, no_camera, same};
 use crate::domain::{CameraId, Error, Result, Sample};
 
@@ -84,6 +84,12 @@ impl GroupCommit {
         self.queue.is_closed()
     }
 
+    /// Callers whose samples have not been taken up.
+    #[cfg(test)]
+    pub(super) fn waiting(&self) -> usize {
+        self.queue.max_capacity() - self.queue.capacity()
+    }
+
     /// The task has ended, in order or not.
     fn gone(&self) -> Error {
         if self.rows.is_closed() { closed() } else { Error::fault("the task that stores samples has ended") }
@@ -92,21 +98,13 @@ impl GroupCommit {
 
 async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
     while let Some(first) = requests.recv().await {
-        let mut group = Vec::new();
-        let mut rows = 0;
-        let mut next = Some(first);
-        let end = loop {
-            match next {
-                Some(Request::Insert(batch)) => {
-                    rows += batch.samples.len();
-                    group.push(batch);
-                }
-                Some(Request::End(ended)) => break Some(ended),
-                None => break None,
-            }
-            next = if rows < ROWS_PER_TRANSACTION { requests.try_recv().ok() } else { None };
-        };
-        answer_all(&writer, group).await;
+        // The turn first: whoever hands in samples while another change is written is taken along.
+        let turn = writer.turn(Durability::Relaxed).await;
+        let (group, end) = gather(first, &mut requests);
+        match turn {
+            Ok(mut turn) => answer_all(&mut turn, group).await,
+            Err(error) => refuse_all(group, &error),
+        }
         if let Some(ended) = end {
             // Whoever asked may have gone; nothing is left to tell.
             let _ = ended.send(());
@@ -115,10 +113,31 @@ async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
     }
 }
 
+/// What is in the queue now, up to the rows of one transaction.
+fn gather(
+    first: Request,
+    requests: &mut mpsc::Receiver<Request>,
+) -> (Vec<Batch>, Option<oneshot::Sender<()>>) {
+    let mut group = Vec::new();
+    let mut rows = 0;
+    let mut next = Some(first);
+    while let Some(request) = next {
+        match request {
+            Request::Insert(batch) => {
+                rows += batch.samples.len();
+                group.push(batch);
+            }
+            Request::End(ended) => return (group, Some(ended)),
+        }
+        next = if rows < ROWS_PER_TRANSACTION { requests.try_recv().ok() } else { None };
+    }
+    (group, None)
+}
+
 /// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
 /// alone, so that one bad row fails nobody but its caller.
-async fn answer_all(writer: &Writer, group: Vec<Batch>) {
-    match commit(writer, &group).await {
+async fn answer_all(turn: &mut Turn<'_>, group: Vec<Batch>) {
+    match commit(turn, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
                 // A caller who went away needs no answer.
@@ -127,7 +146,7 @@ async fn answer_all(writer: &Writer, group: Vec<Batch>) {
         }
         Err(Failure::Statement(_)) if group.len() > 1 => {
             for batch in group {
-                let alone = commit(writer, std::slice::from_ref(&batch)).await;
+                let alone = commit(turn, std::slice::from_ref(&batch)).await;
                 let outcome = match alone {
                     Ok(mut outcomes) => outcomes.swap_remove(0),
                     Err(Failure::Statement(error) | Failure::Transaction(error)) => Err(error),
@@ -135,11 +154,13 @@ async fn answer_all(writer: &Writer, group: Vec<Batch>) {
                 let _ = batch.reply.send(outcome);
             }
         }
-        Err(Failure::Statement(error) | Failure::Transaction(error)) => {
-            for batch in group {
-                let _ = batch.reply.send(Err(same(&error)));
-            }
-        }
+        Err(Failure::Statement(error) | Failure::Transaction(error)) => refuse_all(group, &error),
+    }
+}
+
+fn refuse_all(group: Vec<Batch>, error: &Error) {
+    for batch in group {
+        let _ = batch.reply.send(Err(same(error)));
     }
 }
 
@@ -151,8 +172,7 @@ enum Failure {
 }
 
 /// One transaction for all batches, with an outcome for each, in their order.
-async fn commit(writer: &Writer, group: &[Batch]) -> Result<Vec<Result<Inserted>>, Failure> {
-    let mut turn = writer.turn(Durability::Relaxed).await.map_err(Failure::Transaction)?;
+async fn commit(turn: &mut Turn<'_>, group: &[Batch]) -> Result<Vec<Result<Inserted>>, Failure> {
     for counting in [Counting::Together, Counting::Apart] {
         let mut transaction = turn.begin().await.map_err(Failure::Transaction)?;
         let outcomes = store(&mut transaction, group, counting).await.map_err(Failure::Statement)?;

@@ -9,6 +9,8 @@ use super::{App, Page, page_of};
 use crate::domain::{
     CameraId, EpochReport, Error, ErrorKind, Recipe, Result, RunId, TrainingOptions, TrainingRun,
 };
+use crate::geo::{Position, distance_m};
+use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 
 /// How often a watched run is looked at.
 const WATCH_EVERY: Duration = Duration::from_millis(200);
@@ -53,13 +55,8 @@ impl App {
             until: request.until,
         };
         let filter = crate::store::SampleFilter { from: options.from, until: options.until, target_id: None };
-        if self.store.samples(id, &filter, None, 1).await?.is_empty() {
-            return Err(Error::field(
-                ErrorKind::UnusableSamples,
-                "samples",
-                format!("there is none to learn from: import some (POST /v1/cameras/{id}/samples:import)"),
-            ));
-        }
+        let (count, extent) = self.store.sample_extent(id, &filter).await?;
+        check_extent(id, count, extent)?;
         let now = self.clock.now();
         let run = RunId(self.randomness.uuid_v7(now));
         let run = self.store.insert_run(run, id, &options, self.limits.live_runs, now).await?;
@@ -143,4 +140,22 @@ impl App {
         });
         Ok(stream::once(async move { Ok(first) }).chain(later))
     }
+}
+
+/// Refuses at once what no recipe can learn from; the fit looks closer.
+fn check_extent(id: &CameraId, count: u64, extent: Option<[Position; 2]>) -> Result<()> {
+    let refused = |message| Err(Error::field(ErrorKind::UnusableSamples, "samples", message));
+    if count < FEWEST_SAMPLES {
+        return refused(format!(
+            "are {count}, at least {FEWEST_SAMPLES} are needed: import more (POST /v1/cameras/{id}/samples)"
+        ));
+    }
+    let spread_m = extent.map_or(0.0, |[south_west, north_east]| distance_m(south_west, north_east));
+    if spread_m < SMALLEST_SPREAD_M {
+        return refused(format!(
+            "lie within {spread_m:.2} m, all at one spot: let the target move through the view, \
+             at least {SMALLEST_SPREAD_M} m"
+        ));
+    }
+    Ok(())
 }

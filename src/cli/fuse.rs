@@ -52,7 +52,7 @@ impl Fuse {
         let rows = exchange::read_observations(open_file(&self.file)?, from, &rules)?;
         let out = File::create(&self.out).with_context(|| format!("cannot write {}", self.out.display()))?;
         let mut out = BufWriter::new(out);
-        let mut writer = exchange::FusedWriter::new(to, &mut out)?;
+        let mut writer = exchange::FusedWriter::new(&mut out, to);
         let (mut answered, mut rejected) = (0_u64, 0_u64);
         for row in rows {
             let row = match row? {

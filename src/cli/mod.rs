@@ -6,6 +6,7 @@
 mod config;
 mod fuse;
 mod gnss_error;
+mod health;
 mod import;
 mod openapi;
 mod progress;
@@ -49,6 +50,8 @@ enum Command {
     Fuse(fuse::Fuse),
     /// Estimate a receiver's error from many fixes at one fixed point
     GnssError(gnss_error::GnssError),
+    /// Ask a server whether it is alive
+    Health(health::Health),
     /// Print the settings in force
     Config(config::PrintConfig),
     /// Print the OpenAPI description of the REST interface
@@ -68,6 +71,7 @@ impl Cli {
             Command::Train(command) => command.run(file),
             Command::Fuse(command) => command.run(file),
             Command::GnssError(command) => command.run(),
+            Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),
         }

@@ -4,6 +4,7 @@ use crate::domain::*;
 use crate::geo::*;
 use bytes::Bytes;
 use std::ops::ControlFlow;
+mod file;
 #[derive(Debug, Clone)]
 pub struct FitOptions {
     pub recipe: Recipe,
@@ -42,12 +43,6 @@ impl Artifact {
     pub fn load(&self) -> Result<Regressor> {
         Err(Error::invalid("x", "x"))
     }
-    pub fn to_file(&self) -> std::result::Result<Bytes, std::io::Error> {
-        Ok(Bytes::new())
-    }
-    pub fn from_file(_: &[u8]) -> Result<Self> {
-        Err(Error::invalid("x", "x"))
-    }
 }
 pub struct Regressor(LocalPlane);
 impl Regressor {
@@ -74,3 +69,4 @@ pub struct Regression {
     pub outside_training: bool,
     pub r95_scale: f64,
 }
+pub const FEWEST_SAMPLES: u64 = 20; pub const SMALLEST_SPREAD_M: f64 = 1.0;

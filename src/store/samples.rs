@@ -83,6 +83,34 @@ impl Store {
         Fields::of("samples", &row).make(|stored: i64| u64::try_from(stored))
     }
 
+    /// How many samples a filter selects, and the corners of the ground they cover (south-west,
+    /// north-east in degrees; across the antimeridian, of the whole parallel).
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`].
+    pub async fn sample_extent(
+        &self,
+        id: &CameraId,
+        filter: &SampleFilter,
+    ) -> Result<(u64, Option<[Position; 2]>)> {
+        let range = Range::of(camera_key(self.readers(), id).await?, filter, None);
+        let sql = range.sql(
+            "SELECT count(*), min(longitude_deg), min(latitude_deg), max(longitude_deg), max(latitude_deg) \
+             FROM samples",
+            "",
+        );
+        let row = range.bind(&sql).fetch_one(self.readers()).await.map_err(failed)?;
+        let mut fields = Fields::of("samples", &row);
+        let count = fields.make(|stored: i64| u64::try_from(stored))?;
+        if count == 0 {
+            return Ok((0, None));
+        }
+        let (west, south) = (fields.take()?, fields.take()?);
+        let (east, north) = (fields.take()?, fields.take()?);
+        let corner = |longitude_deg, latitude_deg| fields.made(Position::new(longitude_deg, latitude_deg));
+        Ok((count, Some([corner(west, south)?, corner(east, north)?])))
+    }
+
     /// Deletes the samples that a filter selects; returns how many.
     ///
     /// # Errors

@@ -57,8 +57,16 @@ fn fit(set: &Arc<TrainingSet>) -> f64 {
     let weights = LossWeights { reconstruction: 1.0, regression: 1.0 };
     let schedule = Schedule { epochs: 100, batch: 512, learning_rate: 0.005, last_rate_share: 1.0 };
     let began = Instant::now();
-    train(&shape, parameters, set.clone(), weights, schedule, &mut rng, &mut |_, _| ControlFlow::Continue(()))
-        .expect("a training of finite numbers");
+    train(
+        &shape,
+        parameters,
+        set.clone(),
+        weights,
+        schedule,
+        &mut rng,
+        &mut |_, _| ControlFlow::Continue(()),
+    )
+    .expect("a training of finite numbers");
     began.elapsed().as_secs_f64()
 }
 

@@ -11,6 +11,7 @@ pub mod filters;
 pub mod fusion;
 pub mod geo;
 pub mod grpc;
+pub mod http;
 pub mod model;
 pub mod shutdown;
 pub mod simulation;

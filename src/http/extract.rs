@@ -98,11 +98,7 @@ impl Params {
         }
     }
 
-    pub(super) fn take<T>(
-        &mut self,
-        name: &str,
-        parse: impl FnOnce(&str) -> Result<T>,
-    ) -> Result<Option<T>> {
+    pub(super) fn take<T>(&mut self, name: &str, parse: impl FnOnce(&str) -> Result<T>) -> Result<Option<T>> {
         let Some(at) = self.0.iter().position(|(given, _)| given == name) else { return Ok(None) };
         let (_, text) = self.0.swap_remove(at);
         if self.0.iter().any(|(given, _)| given == name) {

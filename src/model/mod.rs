@@ -69,4 +69,5 @@ pub struct Regression {
     pub outside_training: bool,
     pub r95_scale: f64,
 }
-pub const FEWEST_SAMPLES: u64 = 20; pub const SMALLEST_SPREAD_M: f64 = 1.0;
+pub const FEWEST_SAMPLES: u64 = 20;
+pub const SMALLEST_SPREAD_M: f64 = 1.0;

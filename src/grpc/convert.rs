@@ -8,8 +8,8 @@ use crate::domain::{
     self, CameraId, Error, ErrorKind, Observation, Refusal, Result, RunId, Sample, Score, TargetClass,
     TargetId,
 };
-use crate::exchange::RowRules;
 use crate::exchange::wire;
+use crate::exchange::{RowError, RowRules};
 use crate::geo;
 use crate::store::SampleFilter;
 
@@ -185,6 +185,12 @@ impl From<domain::BoundingBox> for proto::BoundingBox {
     fn from(bounding_box: domain::BoundingBox) -> Self {
         let [left_px, top_px, width_px, height_px] = bounding_box.sides_px().map(Some);
         Self { left_px, top_px, width_px, height_px }
+    }
+}
+
+impl From<RowError> for proto::RejectedRow {
+    fn from(RowError { line, field, reason }: RowError) -> Self {
+        Self { line, field, reason }
     }
 }
 

@@ -7,6 +7,7 @@ use super::proto::model_service_server::ModelService;
 use super::statuses::{Reply, answer};
 use crate::app::{App, GnssErrorEstimate};
 use crate::domain::{Error, HeldOutError, ModelVersion, Result, RunId};
+use crate::exchange::{RowError, TimedFix};
 
 pub(super) struct Models {
     app: App,
@@ -105,10 +106,11 @@ impl ModelService for Models {
     ) -> Reply<proto::EstimateGnssErrorResponse> {
         answer(request, |asked| async move {
             self.app.camera(&camera_id(&asked.camera_id)?).await?;
-            let fixes = asked.fixes.into_iter().enumerate().map(|(index, message)| {
-                fix(message).map_err(|error| error.under(&format!("fixes[{index}]")))
+            let rows = (1..).zip(asked.fixes).map(|(line, message)| match fix(message) {
+                Ok(fix) => Ok(Ok(TimedFix { time: None, fix })),
+                Err(error) => RowError::of(line, error).map(Err),
             });
-            Ok(GnssErrorEstimate::from_fixes(fixes)?.into())
+            Ok(GnssErrorEstimate::from_rows(rows, self.app.limits.rejected_rows)?.into())
         })
         .await
     }
@@ -154,6 +156,8 @@ impl From<GnssErrorEstimate> for proto::EstimateGnssErrorResponse {
             e_gnss_m2: estimate.e_gnss_m2,
             sigma_m: estimate.sigma_m,
             mean_distance_m: estimate.mean_distance_m,
+            rejected: estimate.rejected,
+            rejected_rows: estimate.rejected_rows.into_iter().map(Into::into).collect(),
         }
     }
 }

@@ -150,14 +150,11 @@ fn rows(
 
 impl From<ImportReport> for proto::ImportSamplesResponse {
     fn from(report: ImportReport) -> Self {
-        let rejected_rows = report.rejected_rows.into_iter();
         Self {
             accepted: report.accepted,
             duplicate: report.duplicate,
             rejected: report.rejected,
-            rejected_rows: rejected_rows
-                .map(|RejectedRow { line, field, reason }| proto::RejectedRow { line, field, reason })
-                .collect(),
+            rejected_rows: report.rejected_rows.into_iter().map(Into::into).collect(),
         }
     }
 }

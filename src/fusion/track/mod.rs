@@ -198,13 +198,7 @@ impl Track {
             bank.step(&settings, &Measurement { time: first.time, fix: rest, regressed: None });
         }
         let base = Box::new(bank);
-        Some(Self {
-            settings,
-            now: base.clone(),
-            base,
-            entries: VecDeque::new(),
-            first: *first,
-        })
+        Some(Self { settings, now: base.clone(), base, entries: VecDeque::new(), first: *first })
     }
 
     /// When the target was measured first.
@@ -358,7 +352,9 @@ impl Track {
     fn shrink(&mut self) {
         let window_s = self.settings.window_s;
         loop {
-            let Some(index) = self.entries.iter().position(|entry| entry.checkpoint.is_some()) else { return };
+            let Some(index) = self.entries.iter().position(|entry| entry.checkpoint.is_some()) else {
+                return;
+            };
             let age_s = self.now.time.duration_since(self.entries[index].measurement.time).as_secs_f64();
             let crowded = self.entries.len() > self.settings.window_items.max(2 * CHECKPOINT_ITEMS);
             if age_s <= window_s && !crowded {

@@ -3,4 +3,8 @@
 mod cameras;
 mod fusions;
 mod imports;
+<<<<<<< HEAD
+mod models;
+=======
+>>>>>>> main
 mod server;

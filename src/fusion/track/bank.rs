@@ -87,7 +87,12 @@ struct Split {
 
 impl Bank {
     /// A filter that knows one measured position and nothing else.
-    pub(super) fn start(settings: &TrackSettings, time: Timestamp, source: Source, measured: Measured) -> Self {
+    pub(super) fn start(
+        settings: &TrackSettings,
+        time: Timestamp,
+        source: Source,
+        measured: Measured,
+    ) -> Self {
         let split = split(settings, source, measured, 1.0);
         let mut mean = State::zeros();
         mean[POSITION] = split.position.east_m;
@@ -156,7 +161,8 @@ impl Bank {
         measurement: &Measurement,
     ) -> [Option<Judgement>; 2] {
         self.predict(settings, measurement.time);
-        let regressed = measurement.regressed.map(|measured| self.take(settings, Source::Regressed, measured));
+        let regressed =
+            measurement.regressed.map(|measured| self.take(settings, Source::Regressed, measured));
         let fix = measurement.fix.map(|measured| self.take(settings, Source::Fix, measured));
         [regressed, fix]
     }
@@ -221,8 +227,11 @@ impl Bank {
         let mut total = PlaneCovariance::default();
         for ((innovation, moments), weight) in parts.iter().zip(self.weights) {
             let (east, north) = (innovation[0] - mean[0], innovation[1] - mean[1]);
-            let spread =
-                PlaneCovariance { east_m2: east * east, north_m2: north * north, east_north_m2: east * north };
+            let spread = PlaneCovariance {
+                east_m2: east * east,
+                north_m2: north * north,
+                east_north_m2: east * north,
+            };
             total = total.plus(moments.plus(spread).scaled(weight));
         }
         let innovation = EastNorth { east_m: mean[0], north_m: mean[1] };
@@ -445,8 +454,7 @@ impl Hypothesis {
         ];
         for state in 0..STATES {
             let (east, north) = (cross[(state, 0)], cross[(state, 1)]);
-            let gain =
-                [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
+            let gain = [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
             self.mean[state] += gain[0] * innovation[0] + gain[1] * innovation[1];
             for other in 0..=state {
                 let less = gain[0] * cross[(other, 0)] + gain[1] * cross[(other, 1)];

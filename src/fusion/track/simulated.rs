@@ -35,6 +35,8 @@ pub(in crate::fusion) struct World {
     pub(in crate::fusion) speed_m_s: f64,
     /// Seconds between turns of a random angle.
     pub(in crate::fusion) turn_s: u32,
+    /// Sharpest acceleration to the side, m/s2.
+    pub(in crate::fusion) turn_m_s2: f64,
 }
 
 impl World {
@@ -46,13 +48,15 @@ impl World {
             regression: RegressionNoise::default(),
             speed_m_s: 1.3,
             turn_s: 25,
+            turn_m_s2: 3.0,
         }
     }
 
     /// One measurement a second, with the truth.
     pub(in crate::fusion) fn walk(&self, seed: u64, seconds: u32) -> Vec<(EastNorth, Measurement)> {
         let mut random = Normal::seeded(seed);
-        let (mut place, mut heading) = ([0.0; 2], 0.0_f64);
+        let (mut place, mut heading, mut wanted) = ([0.0; 2], 0.0_f64, 0.0_f64);
+        let sharpest = self.turn_m_s2 / self.speed_m_s.max(0.1);
         let (mut gnss_bias, mut camera_bias) = (random.pair(), random.pair());
         let gnss_keep = (-1.0 / self.gnss.time_constant_s).exp();
         let camera_rate = 1.0 / self.regression.time_constant_s + self.speed_m_s / self.regression.length_m;
@@ -60,8 +64,9 @@ impl World {
         (0..seconds)
             .map(|second| {
                 if second % self.turn_s == 0 {
-                    heading = random.0.random::<f64>() * std::f64::consts::TAU;
+                    wanted = random.0.random::<f64>() * std::f64::consts::TAU;
                 }
+                heading += (wanted - heading).clamp(-sharpest, sharpest);
                 place[0] += self.speed_m_s * heading.cos();
                 place[1] += self.speed_m_s * heading.sin();
                 fade(&mut gnss_bias, gnss_keep, &mut random);

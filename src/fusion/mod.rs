@@ -2,5 +2,7 @@
 //!
 //! What never happens here: I/O, clocks, randomness, allocation that an outside client decides.
 
+pub mod clock_offset;
+pub mod pairing;
 pub mod plane_covariance;
 pub mod track;

@@ -323,10 +323,10 @@ impl Bank {
         };
         let before = self.hypotheses.clone();
         let mut weights = [0.0; MODES];
-        for to in 0..MODES {
+        for (to, mixed) in weights.iter_mut().enumerate() {
             let shares: [f64; MODES] = std::array::from_fn(|from| self.weights[from] * chance(from, to));
             let total: f64 = shares.iter().sum();
-            weights[to] = total;
+            *mixed = total;
             if total > 1e-12 {
                 self.hypotheses[to] = blend(&before, shares.map(|share| share / total));
             }

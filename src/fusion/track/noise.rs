@@ -89,8 +89,11 @@ fn interval_s(passes: &[Vec<ResidualAt>]) -> Option<f64> {
     intervals.get(intervals.len() / 2).copied()
 }
 
-/// Variance, and (lag in units, covariance, pairs) where there are pairs enough, per axis.
-fn autocovariance(passes: &[Vec<ResidualAt>], unit_s: f64) -> Option<(f64, Vec<(f64, f64, f64)>)> {
+/// (lag in units, covariance in m2, pairs).
+type Lagged = (f64, f64, f64);
+
+/// Variance per axis, and the autocovariance at the lags with pairs enough.
+fn autocovariance(passes: &[Vec<ResidualAt>], unit_s: f64) -> Option<(f64, Vec<Lagged>)> {
     let all = || passes.iter().flatten();
     let count = all().count() as f64;
     let mean = all().fold([0.0; 2], |sum, it| {
@@ -128,7 +131,7 @@ fn autocovariance(passes: &[Vec<ResidualAt>], unit_s: f64) -> Option<(f64, Vec<(
 }
 
 /// Bias variance and time constant (in units) of the best exponential through the curve.
-fn fit(curve: &[(f64, f64, f64)]) -> (f64, f64) {
+fn fit(curve: &[Lagged]) -> (f64, f64) {
     let mut best = (f64::INFINITY, 0.0, TIME_CONSTANTS[0]);
     for constant in TIME_CONSTANTS {
         let mut moments = [0.0; 2];

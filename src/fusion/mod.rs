@@ -6,3 +6,4 @@ pub mod clock_offset;
 pub mod pairing;
 pub mod plane_covariance;
 pub mod track;
+pub mod watch;

@@ -99,7 +99,18 @@ fn simulate(
 
 #[test]
 fn months_without_a_knock_are_quiet() {
-    let (months, mut alarms) = (8, 0);
+    assert_eq!(false_alarms(2), 0);
+}
+
+#[test]
+#[ignore = "takes minutes; gives the rate of false alarms that the settings cite"]
+fn years_without_a_knock_are_quiet() {
+    assert!(false_alarms(24) <= 2);
+}
+
+/// Alarms in so many months of one receiver, and as many of four.
+fn false_alarms(months: u64) -> u32 {
+    let mut alarms = 0;
     for seed in 0..months {
         for receivers in [1, 4] {
             let mut watch = CameraWatch::new(WatchSettings::default());
@@ -110,7 +121,7 @@ fn months_without_a_knock_are_quiet() {
         }
     }
     println!("{alarms} alarms in {} months", 2 * months);
-    assert!(alarms <= 1, "{alarms}");
+    alarms
 }
 
 #[test]

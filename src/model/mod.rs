@@ -1,1 +1,28 @@
 //! Recipes, training loop, fast forward pass and model artifacts; the only floor that knows candle.
+//!
+//! [`fit`] turns samples into an [`Artifact`]; [`Artifact::load`] turns that into a [`Regressor`],
+//! which answers box by box from flat weights. What never happens here: storage, transport, clocks,
+//! threads of its own.
+
+mod artifact;
+mod coverage;
+mod file;
+mod fit;
+mod hybrid;
+mod kernel;
+pub mod net;
+mod noise;
+mod paper;
+mod regressor;
+mod rows;
+mod tensors;
+pub mod train;
+
+pub use artifact::{Artifact, FORMAT};
+pub use fit::{FitError, FitEvent, FitOptions, fit};
+pub use regressor::{R95_PER_SIGMA, Regression, Regressor};
+pub use rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
+pub use tensors::LARGEST_WEIGHTS_BYTES;
+
+#[cfg(test)]
+mod tests;

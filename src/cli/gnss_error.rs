@@ -1,0 +1,45 @@
+//! `sightfix gnss-error`
+
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use clap::Args;
+
+use super::open_file;
+use crate::app::GnssErrorEstimate;
+use crate::clock::Clock;
+use crate::config::Limits;
+use crate::domain::TimeBounds;
+use crate::exchange::{self, FixFormat};
+
+/// Estimate a receiver's error from many fixes at one fixed point
+#[derive(Args)]
+pub(super) struct GnssError {
+    /// Fixes as CSV (longitude, latitude) or NMEA (GGA), told by the ending
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+}
+
+impl GnssError {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let format =
+            FixFormat::from_path(&self.file).context("the ending must be .csv, .nmea, .nma or .txt")?;
+        let time_bounds = TimeBounds::at(Clock::system().now());
+        let rows = exchange::read_fixes(open_file(&self.file)?, format, time_bounds)?;
+        let estimate = GnssErrorEstimate::from_rows(rows, Limits::default().rejected_rows)?;
+        for row in &estimate.rejected_rows {
+            eprintln!("line {}: {}: {}", row.line, row.field, row.reason);
+        }
+        println!("fixes              {}, rejected {}", estimate.fixes, estimate.rejected);
+        println!(
+            "mean               {:.8} {:.8} (longitude, latitude)",
+            estimate.mean.longitude_deg(),
+            estimate.mean.latitude_deg()
+        );
+        println!("east variance      {:.4} m2", estimate.east_variance_m2);
+        println!("north variance     {:.4} m2", estimate.north_variance_m2);
+        println!("e_gnss             {:.4} m2 per axis", estimate.e_gnss_m2);
+        println!("sigma              {:.4} m per axis, for the camera's gnss_error", estimate.sigma_m);
+        Ok(())
+    }
+}

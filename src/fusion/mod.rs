@@ -2,8 +2,11 @@
 //!
 //! What never happens here: I/O, clocks, randomness, allocation that an outside client decides.
 
+pub mod clock_offset;
+pub mod pairing;
 mod plane_covariance;
 pub mod track;
 pub mod two_step;
+pub mod watch;
 
 pub use plane_covariance::PlaneCovariance;

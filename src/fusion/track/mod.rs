@@ -7,13 +7,19 @@
 //! same items in another order within the window give the same state to the last bit.
 
 mod bank;
+mod noise;
 mod settings;
+#[cfg(test)]
+pub(in crate::fusion) mod simulated;
+#[cfg(test)]
+mod tests;
 
 use std::cmp::Ordering;
 use std::collections::VecDeque;
 
 use jiff::Timestamp;
 
+pub use noise::{GnssNoiseEstimate, ResidualAt, estimate_gnss_noise};
 pub use settings::{GnssNoise, Motion, RegressionNoise, TrackSettings};
 
 use self::bank::{Bank, Judgement};

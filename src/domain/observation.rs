@@ -3,6 +3,7 @@
 use jiff::Timestamp;
 
 use super::bounding_box::BoundingBox;
+use super::error::{Error, Result};
 use super::gnss_error::SigmaM;
 use super::names::{TargetClass, TargetId};
 use super::sample::Score;
@@ -43,6 +44,22 @@ pub struct Observation {
     pub bounding_box: Option<BoundingBox>,
     /// What the receiver said.
     pub fix: Option<Fix>,
+}
+
+impl Observation {
+    /// # Errors
+    /// An observation of neither box nor fix; the field is named `bounding_box`.
+    pub fn new(
+        time: Timestamp,
+        target_id: Option<TargetId>,
+        bounding_box: Option<BoundingBox>,
+        fix: Option<Fix>,
+    ) -> Result<Self> {
+        if bounding_box.is_none() && fix.is_none() {
+            return Err(Error::invalid("bounding_box", "give a bounding_box, a fix, or both"));
+        }
+        Ok(Self { time, target_id, bounding_box, fix })
+    }
 }
 
 /// What a caller should know about a [`FusedFix`].

@@ -6,6 +6,7 @@
 
 mod artifact;
 mod coverage;
+mod file;
 mod fit;
 mod hybrid;
 mod kernel;
@@ -20,6 +21,7 @@ pub mod train;
 pub use artifact::{Artifact, FORMAT};
 pub use fit::{FitError, FitEvent, FitOptions, fit};
 pub use regressor::{R95_PER_SIGMA, Regression, Regressor};
+pub use rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use tensors::LARGEST_WEIGHTS_BYTES;
 
 #[cfg(test)]

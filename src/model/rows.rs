@@ -11,7 +11,9 @@ use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 /// Fewer samples cannot tell a camera from its noise.
-pub(super) const FEWEST_SAMPLES: usize = 20;
+pub const FEWEST_SAMPLES: u64 = 20;
+/// Fixes that reach less far apart are all at one spot, m.
+pub const SMALLEST_SPREAD_M: f64 = 1.0;
 /// A hole in a target's samples beyond this, and beyond ten times their usual step, ends a pass.
 const PASS_HOLE_S: f64 = 3.0;
 
@@ -51,7 +53,7 @@ impl Rows {
         if samples.is_empty() {
             return Err(unusable("there are none; import samples that have a box and a fix first".into()));
         }
-        if samples.len() < FEWEST_SAMPLES {
+        if (samples.len() as u64) < FEWEST_SAMPLES {
             return Err(unusable(format!(
                 "there are {}, a fit needs at least {FEWEST_SAMPLES}; import more, best of several passes \
                  through different parts of the image",
@@ -95,7 +97,7 @@ impl Rows {
             )));
         }
         let on_ground = spread(&|row| row.label.east_m).max(spread(&|row| row.label.north_m));
-        if on_ground < 0.1 {
+        if on_ground < 0.1 * SMALLEST_SPREAD_M {
             return Err(unusable(format!(
                 "all {} fixes are at one spot (they vary by {on_ground:.2} m) though the boxes move; check \
                  that boxes and fixes are paired by time",

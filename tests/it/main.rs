@@ -1,1 +1,7 @@
-fn main() {}
+//! The one integration test binary: everything from the outside, through real ports and files.
+
+mod bad_input;
+mod connections;
+mod harness;
+mod layering;
+mod story;

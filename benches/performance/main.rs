@@ -1,0 +1,31 @@
+//! The tables of docs/performance.md. Every row is a ratio of two things measured in turn in this
+//! one run, since machines differ and are shared.
+//!
+//! `cargo bench` runs all parts; `cargo bench -- fuse http` some of them.
+
+mod beside;
+mod fuse;
+mod import;
+mod load;
+mod ratio;
+mod served;
+mod train;
+mod transports;
+
+fn main() {
+    // cargo passes flags of its own, such as --bench.
+    let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
+    let parts: [(&str, fn()); 6] = [
+        ("fuse", fuse::run),
+        ("http", transports::http),
+        ("grpc", transports::grpc),
+        ("import", import::run),
+        ("train", train::run),
+        ("beside", beside::run),
+    ];
+    for (name, part) in parts {
+        if wanted.is_empty() || wanted.iter().any(|wish| wish == name) {
+            part();
+        }
+    }
+}

@@ -1,0 +1,63 @@
+//! Camera profiles.
+
+use super::{App, Page, page_of};
+use crate::domain::{Camera, CameraChange, CameraId, NewCamera, Result, Revision};
+
+impl App {
+    /// Stores a new camera.
+    ///
+    /// # Errors
+    /// `CameraExists`; `InvalidArgument` naming the field.
+    pub async fn create_camera(&self, profile: NewCamera) -> Result<Camera> {
+        let camera = self.store.insert_camera(&profile.check()?, self.clock.now()).await?;
+        self.registry.refresh_camera(&self.store, camera.id()).await?;
+        Ok(camera)
+    }
+
+    /// One camera.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn camera(&self, id: &CameraId) -> Result<Camera> {
+        self.store.camera(id).await
+    }
+
+    /// Cameras by id, from behind a cursor on.
+    ///
+    /// # Errors
+    /// A fault of the store.
+    pub async fn cameras(&self, after: Option<&CameraId>, limit: u32) -> Result<Page<Camera, CameraId>> {
+        let cameras = self.store.cameras(after, limit + 1).await?;
+        Ok(page_of(cameras, limit, |camera| camera.id().clone()))
+    }
+
+    /// Changes a profile, from the revision that the caller saw (any, if `None`).
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RevisionMismatch`, `InvalidArgument` naming the field.
+    pub async fn change_camera(
+        &self,
+        id: &CameraId,
+        change: CameraChange,
+        expected: Option<Revision>,
+    ) -> Result<Camera> {
+        let camera = self.store.camera(id).await?;
+        // Changing what was read needs the revision that was read, whatever the caller said, so
+        // that two changes at once cannot undo each other.
+        let expected = expected.unwrap_or(camera.revision);
+        let profile = change.apply(camera.profile)?;
+        let camera = self.store.replace_camera(&profile, Some(expected), self.clock.now()).await?;
+        self.registry.refresh_camera(&self.store, id).await?;
+        Ok(camera)
+    }
+
+    /// Deletes a camera with its samples, runs and models.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RevisionMismatch`, `RunLive`.
+    pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
+        self.store.delete_camera(id, expected).await?;
+        self.registry.forget(id);
+        Ok(())
+    }
+}

@@ -1,0 +1,64 @@
+//! Fusion: positions for observations, from the registry alone.
+
+use std::sync::Arc;
+
+use super::App;
+use super::registry::Serving;
+use crate::domain::{CameraId, Error, ErrorKind, FusedFix, Observation, Result};
+use crate::fusion::two_step;
+
+impl App {
+    /// Answers observations of one camera, all by the same model version.
+    ///
+    /// # Errors
+    /// `CameraNotFound`; `NoModel` if there is a box and no active model; `TooLarge` beyond the
+    /// limit of observations.
+    pub async fn fuse(&self, id: &CameraId, observations: &[Observation]) -> Result<Vec<FusedFix>> {
+        self.check_batch(observations.len())?;
+        let serving = self.serving(id).await?;
+        let model = serving.model.as_ref().map(|(regressor, number)| (&**regressor, *number));
+        let fused = observations
+            .iter()
+            .map(|observation| {
+                two_step::fuse(observation, model, serving.image_size, serving.e_gnss_m2)
+                    .ok_or_else(|| no_model(id))
+            })
+            .collect::<Result<Vec<_>>>()?;
+        self.metrics.fused(&fused);
+        Ok(fused)
+    }
+
+    /// Checks the length of a batch, before its items are read.
+    ///
+    /// # Errors
+    /// `TooLarge` naming the field `observations`.
+    pub fn check_batch(&self, observations: usize) -> Result<()> {
+        let most = self.limits.batch_observations;
+        if observations > most {
+            return Err(Error::field(
+                ErrorKind::TooLarge,
+                "observations",
+                format!("are {observations}, at most {most} go into one request; send several"),
+            ));
+        }
+        Ok(())
+    }
+
+    /// What answers for a camera; looks into the store for one that another process has made.
+    pub(super) async fn serving(&self, id: &CameraId) -> Result<Arc<Serving>> {
+        match self.registry.get(id) {
+            Some(serving) => Ok(serving),
+            None => self.registry.refresh_camera(&self.store, id).await,
+        }
+    }
+}
+
+fn no_model(id: &CameraId) -> Error {
+    Error::refused(
+        ErrorKind::NoModel,
+        format!(
+            "camera {id} has no active model: import samples, start a training run \
+             (POST /v1/cameras/{id}/training-runs) and wait until it has succeeded"
+        ),
+    )
+}

@@ -1,0 +1,91 @@
+//! The use cases, without a transport: both REST and gRPC call these and nothing below them.
+//!
+//! What never happens here: SQL, status codes, wire formats, reading the wall clock.
+
+mod cameras;
+mod fusion;
+mod models;
+mod registry;
+mod samples;
+mod training;
+
+use std::sync::Arc;
+
+use tokio::sync::Notify;
+
+use crate::clock::{Clock, Randomness};
+use crate::config::Limits;
+use crate::store::Store;
+use crate::telemetry::Metrics;
+
+pub use models::GnssErrorEstimate;
+pub use registry::Registry;
+pub use samples::{ImportReport, RejectedRow};
+pub use training::RunRequest;
+
+/// The application: everything a request needs, cheap to clone.
+#[derive(Clone)]
+pub struct App(Arc<Parts>);
+
+/// What an [`App`] is made of.
+pub struct Parts {
+    /// Everything that lasts.
+    pub store: Store,
+    /// Profiles and active models, ready to answer.
+    pub registry: Registry,
+    /// What time it is.
+    pub clock: Clock,
+    /// Ids and seeds.
+    pub randomness: Randomness,
+    /// What an outside client may make large.
+    pub limits: Limits,
+    /// Counters and times.
+    pub metrics: Metrics,
+    /// Rung when a run was queued, so that a worker need not wait for its next look.
+    pub run_queued: Notify,
+}
+
+impl App {
+    /// An application over an opened store, its registry filled.
+    ///
+    /// # Errors
+    /// A fault if the store cannot be read.
+    pub async fn new(
+        store: Store,
+        clock: Clock,
+        randomness: Randomness,
+        limits: Limits,
+        metrics: Metrics,
+    ) -> crate::domain::Result<Self> {
+        let registry = Registry::default();
+        registry.refresh(&store).await?;
+        let run_queued = Notify::new();
+        Ok(Self(Arc::new(Parts { store, registry, clock, randomness, limits, metrics, run_queued })))
+    }
+}
+
+impl std::ops::Deref for App {
+    type Target = Parts;
+
+    fn deref(&self) -> &Parts {
+        &self.0
+    }
+}
+
+/// One page of a list, and the cursor behind which the next begins.
+#[derive(Debug, Clone)]
+pub struct Page<T, C> {
+    /// The items, in the list's order.
+    pub items: Vec<T>,
+    /// Where the next page begins; `None` on the last.
+    pub next: Option<C>,
+}
+
+/// Cuts a page from one item more than it holds.
+fn page_of<T, C>(mut items: Vec<T>, limit: u32, cursor: impl Fn(&T) -> C) -> Page<T, C> {
+    let limit = limit as usize;
+    let more = items.len() > limit;
+    items.truncate(limit);
+    let next = if more { items.last().map(cursor) } else { None };
+    Page { items, next }
+}

@@ -1,0 +1,183 @@
+//! Model versions: list, activate, roll back, carry to another server; the receiver's error.
+
+use bytes::Bytes;
+
+use super::{App, Page, page_of};
+use crate::domain::{Camera, CameraId, Error, ErrorKind, Fix, ModelVersion, Result};
+use crate::geo::LocalPlane;
+use crate::model::Artifact;
+
+/// The receiver's error from many fixes at one fixed point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GnssErrorEstimate {
+    /// Fixes that were read.
+    pub fixes: u64,
+    /// Their mean position.
+    pub mean: crate::geo::Position,
+    /// Variance of the east component, m2.
+    pub east_variance_m2: f64,
+    /// Variance of the north component, m2.
+    pub north_variance_m2: f64,
+    /// e_gnss of (6): the mean of the two, m2 per axis.
+    pub e_gnss_m2: f64,
+    /// Its square root, for the camera's profile.
+    pub sigma_m: f64,
+    /// Mean distance from the mean position, m.
+    pub mean_distance_m: f64,
+}
+
+impl GnssErrorEstimate {
+    /// Estimates from fixes taken while the receiver stood still. Memory does not grow with them.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `fixes` if there are fewer than ten, or all are the same.
+    pub fn from_fixes(fixes: impl Iterator<Item = Result<Fix>>) -> Result<Self> {
+        const FEWEST: u64 = 10;
+        let mut plane: Option<LocalPlane> = None;
+        let (mut count, mut mean, mut squares) = (0_u64, [0.0; 2], [0.0; 2]);
+        for fix in fixes {
+            let position = fix?.position;
+            let plane = plane.get_or_insert_with(|| LocalPlane::new(position));
+            let point = plane.to_plane(position);
+            count += 1;
+            // Welford: stable in one pass.
+            for (axis, value) in [point.east_m, point.north_m].into_iter().enumerate() {
+                let before = value - mean[axis];
+                mean[axis] += before / count as f64;
+                squares[axis] += before * (value - mean[axis]);
+            }
+        }
+        let Some(plane) = plane.filter(|_| count >= FEWEST) else {
+            return Err(Error::invalid(
+                "fixes",
+                format!("are {count}, at least {FEWEST} from one fixed point are needed"),
+            ));
+        };
+        let [east_variance_m2, north_variance_m2] = squares.map(|sum| sum / (count - 1) as f64);
+        let e_gnss_m2 = 0.5 * (east_variance_m2 + north_variance_m2);
+        if e_gnss_m2 <= 0.0 {
+            return Err(Error::invalid("fixes", "are all the same, so they tell nothing of the error"));
+        }
+        Ok(Self {
+            fixes: count,
+            mean: plane.to_position(crate::geo::EastNorth { east_m: mean[0], north_m: mean[1] }),
+            east_variance_m2,
+            north_variance_m2,
+            e_gnss_m2,
+            sigma_m: e_gnss_m2.sqrt(),
+            // Rayleigh: the mean length of an isotropic normal vector.
+            mean_distance_m: (std::f64::consts::FRAC_PI_2 * e_gnss_m2).sqrt(),
+        })
+    }
+}
+
+impl App {
+    /// One version, without its weights.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `ModelNotFound`.
+    pub async fn model(&self, id: &CameraId, number: u32) -> Result<ModelVersion> {
+        self.store.model(id, number).await
+    }
+
+    /// A camera's versions, newest first, from behind a cursor on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn models(
+        &self,
+        id: &CameraId,
+        before: Option<u32>,
+        limit: u32,
+    ) -> Result<Page<ModelVersion, u32>> {
+        let models = self.store.models(id, before, limit + 1).await?;
+        Ok(page_of(models, limit, |model| model.number))
+    }
+
+    /// One version as a file: safetensors with the metadata in its header.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `ModelNotFound`.
+    pub async fn download_model(&self, id: &CameraId, number: u32) -> Result<Bytes> {
+        let metadata = self.store.model(id, number).await?.metadata;
+        let weights = self.store.weights(id, number).await?.into();
+        Artifact { metadata, weights }.to_file().map_err(Error::fault)
+    }
+
+    /// Stores a version from a file that [`App::download_model`] gave, here or on another server.
+    /// It does not become active by itself.
+    ///
+    /// # Errors
+    /// `CameraNotFound`; `InvalidArgument` naming what in the file cannot be used.
+    pub async fn import_model(&self, id: &CameraId, file: &[u8]) -> Result<ModelVersion> {
+        self.serving(id).await?;
+        let artifact = Artifact::from_file(file)?;
+        artifact.load()?;
+        self.store.insert_model(id, &artifact.metadata, &artifact.weights, self.clock.now()).await
+    }
+
+    /// Lets a version answer from now on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `ModelNotFound`.
+    pub async fn activate_model(&self, id: &CameraId, number: u32) -> Result<Camera> {
+        let camera = self.store.activate_model(id, number, self.clock.now()).await?;
+        self.registry.refresh_camera(&self.store, id).await?;
+        Ok(camera)
+    }
+
+    /// Lets the version answer that did before the active one.
+    ///
+    /// # Errors
+    /// `CameraNotFound`; `NoModel` if there is none before it.
+    pub async fn roll_back_model(&self, id: &CameraId) -> Result<Camera> {
+        let camera = self.store.roll_back(id, self.clock.now()).await?;
+        self.registry.refresh_camera(&self.store, id).await?;
+        Ok(camera)
+    }
+
+    /// The number of the version that answers.
+    ///
+    /// # Errors
+    /// `CameraNotFound`; `NoModel`.
+    pub async fn active_model(&self, id: &CameraId) -> Result<ModelVersion> {
+        let number =
+            self.store.camera(id).await?.active_model.ok_or_else(|| {
+                Error::refused(ErrorKind::NoModel, format!("camera {id} has no active model"))
+            })?;
+        self.store.model(id, number).await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geo::{EastNorth, Position};
+    use rand::{Rng, SeedableRng};
+
+    #[test]
+    fn the_estimate_finds_the_spread() {
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        let plane = LocalPlane::new(Position::new(103.9, 30.6).expect("valid"));
+        // A sum of twelve uniforms has variance 1.
+        let mut normal =
+            || (0..12).map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX)).sum::<f64>() - 6.0;
+        let fixes: Vec<_> = (0..4_000)
+            .map(|_| {
+                let point = EastNorth { east_m: 2.0 * normal(), north_m: 3.0 * normal() };
+                Ok(Fix { position: plane.to_position(point), sigma_m: None })
+            })
+            .collect();
+        let estimate = GnssErrorEstimate::from_fixes(fixes.into_iter()).expect("enough");
+        // Standard error of a variance from 4,000 is 2.2 %: five of them.
+        assert!((estimate.east_variance_m2 / 4.0 - 1.0).abs() < 0.11, "{estimate:?}");
+        assert!((estimate.north_variance_m2 / 9.0 - 1.0).abs() < 0.11, "{estimate:?}");
+    }
+
+    #[test]
+    fn few_or_equal_fixes_are_refused() {
+        let fix = Fix { position: Position::new(1.0, 2.0).expect("valid"), sigma_m: None };
+        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 9).map(Ok)).is_err());
+        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 50).map(Ok)).is_err());
+    }
+}

@@ -1,0 +1,209 @@
+//! Samples: import, list, count, delete.
+
+use std::io::Read;
+
+use futures_util::{Stream, StreamExt as _};
+use tokio::sync::mpsc;
+
+use super::{App, Page, page_of};
+use crate::domain::{CameraId, Error, ImageSize, Result, Sample, TimeBounds};
+use crate::exchange::{self, Format, RowError, RowRules};
+use crate::store::{SampleFilter, SampleKey};
+
+/// Rows that go to the store at once.
+const BATCH_ROWS: usize = 1_000;
+
+/// What became of an import's rows.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ImportReport {
+    /// Stored now.
+    pub accepted: u64,
+    /// The same camera, target and time were stored before, or stand twice in the import.
+    pub duplicate: u64,
+    /// Not stored for a fault of their own.
+    pub rejected: u64,
+    /// The first of them, with their reasons.
+    pub rejected_rows: Vec<RejectedRow>,
+}
+
+/// A row that was not stored, and why.
+pub type RejectedRow = RowError;
+
+impl ImportReport {
+    fn reject(&mut self, row: RowError, tell_at_most: usize) {
+        self.rejected += 1;
+        if self.rejected_rows.len() < tell_at_most {
+            self.rejected_rows.push(row);
+        }
+    }
+}
+
+impl App {
+    /// Stores the rows of a file. One bad row never loses the others; what is counted as accepted
+    /// is committed.
+    ///
+    /// The file is read on a thread for blocking work, in batches, so memory is bounded whatever
+    /// its size.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, before anything is read; `MalformedBody` for a file that cannot be read as
+    /// its format: batches before the place where it broke are stored, and the message tells how
+    /// many rows.
+    pub async fn import_file(
+        &self,
+        id: &CameraId,
+        file: impl Read + Send + 'static,
+        format: Format,
+    ) -> Result<ImportReport> {
+        let rules = self.row_rules(id).await?;
+        let (sender, mut batches) = mpsc::channel(4);
+        let reading = tokio::task::spawn_blocking(move || read_batches(file, format, &rules, &sender));
+        let mut report = ImportReport::default();
+        while let Some(batch) = batches.recv().await {
+            self.store_batch(id, batch, &mut report).await?;
+        }
+        let read = reading.await.map_err(Error::fault)?;
+        self.metrics.imported(report.accepted, report.duplicate, report.rejected);
+        read.map_err(|error| told_what_is_stored(error, &report))?;
+        Ok(report)
+    }
+
+    /// Stores rows that come one by one over a transport that has parsed them.
+    ///
+    /// # Errors
+    /// `CameraNotFound`; the stream's own error, after the rows before it were stored.
+    pub async fn import_rows(
+        &self,
+        id: &CameraId,
+        rows: impl Stream<Item = Result<Result<Sample, RowError>>> + Send,
+    ) -> Result<ImportReport> {
+        self.serving(id).await?;
+        let mut report = ImportReport::default();
+        let mut batches = std::pin::pin!(rows.ready_chunks(BATCH_ROWS));
+        while let Some(chunk) = batches.next().await {
+            let mut broken = None;
+            let mut batch = Vec::with_capacity(chunk.len());
+            for row in chunk {
+                match row {
+                    Ok(row) => batch.push(row),
+                    Err(error) => {
+                        broken = Some(error);
+                        break;
+                    }
+                }
+            }
+            self.store_batch(id, batch, &mut report).await?;
+            if let Some(error) = broken {
+                return Err(error);
+            }
+        }
+        self.metrics.imported(report.accepted, report.duplicate, report.rejected);
+        Ok(report)
+    }
+
+    /// What the rows of a camera must keep.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn row_rules(&self, id: &CameraId) -> Result<RowRules> {
+        let image_size: Option<ImageSize> = self.serving(id).await?.image_size;
+        Ok(RowRules { time_bounds: TimeBounds::at(self.clock.now()), image_size })
+    }
+
+    /// Samples by time and target, from behind a cursor on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn samples(
+        &self,
+        id: &CameraId,
+        filter: &SampleFilter,
+        after: Option<SampleKey>,
+        limit: u32,
+    ) -> Result<Page<Sample, SampleKey>> {
+        let samples = self.store.samples(id, filter, after, limit + 1).await?;
+        Ok(page_of(samples, limit, |sample| SampleKey {
+            time: sample.time,
+            target_id: sample.target_id.clone(),
+        }))
+    }
+
+    /// How many samples there are.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+        self.store.count_samples(id, filter).await
+    }
+
+    /// Deletes samples and tells how many.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+        self.store.delete_samples(id, filter).await
+    }
+
+    async fn store_batch(
+        &self,
+        id: &CameraId,
+        batch: Vec<Result<Sample, RowError>>,
+        report: &mut ImportReport,
+    ) -> Result<()> {
+        let mut samples = Vec::with_capacity(batch.len());
+        for row in batch {
+            match row {
+                Ok(sample) => samples.push(sample),
+                Err(row) => report.reject(row, self.limits.rejected_rows),
+            }
+        }
+        if !samples.is_empty() {
+            let inserted = self.store.insert_samples(id, samples).await?;
+            report.accepted += inserted.accepted;
+            report.duplicate += inserted.duplicate;
+        }
+        Ok(())
+    }
+}
+
+type Batch = Vec<Result<Sample, RowError>>;
+
+fn read_batches(
+    file: impl Read,
+    format: Format,
+    rules: &RowRules,
+    batches: &mpsc::Sender<Batch>,
+) -> Result<()> {
+    let mut batch = Vec::with_capacity(BATCH_ROWS);
+    for row in exchange::read_samples(file, format, rules)? {
+        match row {
+            Ok(row) => batch.push(row),
+            Err(error) => {
+                // What came before the break is stored; the receiver is gone only with its request.
+                let _ = batches.blocking_send(batch);
+                return Err(error);
+            }
+        }
+        if batch.len() == BATCH_ROWS
+            && batches.blocking_send(std::mem::replace(&mut batch, Vec::with_capacity(BATCH_ROWS))).is_err()
+        {
+            return Ok(());
+        }
+    }
+    let _ = batches.blocking_send(batch);
+    Ok(())
+}
+
+fn told_what_is_stored(error: Error, report: &ImportReport) -> Error {
+    match error {
+        Error::Refused(mut refusal) if report.accepted + report.duplicate > 0 => {
+            refusal.message = format!(
+                "{}; {} rows before it are stored, sending them again does no harm",
+                refusal.message,
+                report.accepted + report.duplicate
+            );
+            Error::Refused(refusal)
+        }
+        error => error,
+    }
+}

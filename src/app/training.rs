@@ -1,0 +1,161 @@
+//! Training runs as an operator sees them; `worker` does the work.
+
+use std::time::Duration;
+
+use futures_util::{Stream, StreamExt as _, stream};
+use jiff::Timestamp;
+
+use super::{App, Page, page_of};
+use crate::domain::{
+    CameraId, EpochReport, Error, ErrorKind, Recipe, Result, RunId, TrainingOptions, TrainingRun,
+};
+use crate::geo::{Position, distance_m};
+use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
+
+/// How often a watched run is looked at.
+const WATCH_EVERY: Duration = Duration::from_millis(200);
+
+/// What an operator asks for; what is left out comes from the profile.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RunRequest {
+    /// The profile's recipe, if `None`.
+    pub recipe: Option<Recipe>,
+    /// 0, if `None`: the same samples then give the same model.
+    pub seed: Option<u64>,
+    /// The recipe's own number, if `None`.
+    pub epochs: Option<u32>,
+    /// Only samples from this instant on.
+    pub from: Option<Timestamp>,
+    /// Only samples before this instant.
+    pub until: Option<Timestamp>,
+}
+
+impl App {
+    /// Queues a training run.
+    ///
+    /// # Errors
+    /// `CameraNotFound`; `InvalidArgument` naming the field; `UnusableSamples` if there is none;
+    /// `RunLive`; `Overloaded` beyond the limit of live runs.
+    pub async fn start_run(&self, id: &CameraId, request: RunRequest) -> Result<TrainingRun> {
+        let camera = self.store.camera(id).await?;
+        let most = self.limits.epochs;
+        if request.epochs.is_some_and(|epochs| !(1..=most).contains(&epochs)) {
+            return Err(Error::invalid("epochs", format!("must be from 1 to {most}")));
+        }
+        if let (Some(from), Some(until)) = (request.from, request.until)
+            && from >= until
+        {
+            return Err(Error::invalid("until", "must be later than from"));
+        }
+        let options = TrainingOptions {
+            recipe: request.recipe.unwrap_or(camera.profile.recipe),
+            seed: request.seed.unwrap_or(0),
+            epochs: request.epochs,
+            from: request.from,
+            until: request.until,
+        };
+        let filter = crate::store::SampleFilter { from: options.from, until: options.until, target_id: None };
+        let (count, extent) = self.store.sample_extent(id, &filter).await?;
+        check_extent(id, count, extent)?;
+        let now = self.clock.now();
+        let run = RunId(self.randomness.uuid_v7(now));
+        let run = self.store.insert_run(run, id, &options, self.limits.live_runs, now).await?;
+        self.run_queued.notify_one();
+        Ok(run)
+    }
+
+    /// One run.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RunNotFound`.
+    pub async fn run(&self, id: &CameraId, run: RunId) -> Result<TrainingRun> {
+        self.store.run(id, run).await
+    }
+
+    /// A camera's runs, newest first, from behind a cursor on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn runs(
+        &self,
+        id: &CameraId,
+        before: Option<RunId>,
+        limit: u32,
+    ) -> Result<Page<TrainingRun, RunId>> {
+        let runs = self.store.runs(id, before, limit + 1).await?;
+        Ok(page_of(runs, limit, |run| run.id))
+    }
+
+    /// Cancels a run: at once if it waits, at its next step if it runs.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RunNotFound`, `RunEnded`.
+    pub async fn cancel_run(&self, id: &CameraId, run: RunId) -> Result<TrainingRun> {
+        self.store.request_cancel(id, run, self.clock.now()).await
+    }
+
+    /// The run's curve: one report per epoch of the final fit.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RunNotFound`.
+    pub async fn run_epochs(&self, id: &CameraId, run: RunId) -> Result<Vec<EpochReport>> {
+        self.store.run(id, run).await?;
+        self.store.epochs(run).await
+    }
+
+    /// The run's log.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RunNotFound`.
+    pub async fn run_log(&self, id: &CameraId, run: RunId) -> Result<Vec<(Timestamp, String)>> {
+        self.store.run(id, run).await?;
+        self.store.log(run).await
+    }
+
+    /// The run now and at each change, until it has ended. Looks into the store, so it also sees
+    /// runs that another process works on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RunNotFound` at once; a fault later ends the stream.
+    pub async fn watch_run(
+        &self,
+        id: &CameraId,
+        run: RunId,
+    ) -> Result<impl Stream<Item = Result<TrainingRun>> + Send + use<>> {
+        let first = self.store.run(id, run).await?;
+        let (app, id) = (self.clone(), id.clone());
+        let later = stream::unfold(Some(first.clone()), move |shown| {
+            let (app, id) = (app.clone(), id.clone());
+            async move {
+                let shown = shown.filter(|run| !run.state.has_ended())?;
+                loop {
+                    tokio::time::sleep(WATCH_EVERY).await;
+                    match app.store.run(&id, run).await {
+                        Ok(seen) if seen == shown => {}
+                        Ok(seen) => return Some((Ok(seen.clone()), Some(seen))),
+                        Err(error) => return Some((Err(error), None)),
+                    }
+                }
+            }
+        });
+        Ok(stream::once(async move { Ok(first) }).chain(later))
+    }
+}
+
+/// Refuses at once what no recipe can learn from; the fit looks closer.
+fn check_extent(id: &CameraId, count: u64, extent: Option<[Position; 2]>) -> Result<()> {
+    let refused = |message| Err(Error::field(ErrorKind::UnusableSamples, "samples", message));
+    if count < FEWEST_SAMPLES {
+        return refused(format!(
+            "are {count}, at least {FEWEST_SAMPLES} are needed: import more (POST /v1/cameras/{id}/samples)"
+        ));
+    }
+    let spread_m = extent.map_or(0.0, |[south_west, north_east]| distance_m(south_west, north_east));
+    if spread_m < SMALLEST_SPREAD_M {
+        return refused(format!(
+            "lie within {spread_m:.2} m, all at one spot: let the target move through the view, \
+             at least {SMALLEST_SPREAD_M} m"
+        ));
+    }
+    Ok(())
+}

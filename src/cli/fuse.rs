@@ -1,0 +1,98 @@
+//! `sightfix fuse`
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::Args;
+
+use super::{DataFolder, camera_id, format_of, open_app, open_file, runtime};
+use crate::clock::Clock;
+use crate::domain::{CameraId, ImageSize, TimeBounds};
+use crate::exchange::{self, RowRules};
+use crate::fusion::two_step;
+use crate::model::{Artifact, Regressor};
+
+/// Answer observations from a file, without a server
+#[derive(Args)]
+pub(super) struct Fuse {
+    /// Observations as CSV, NDJSON or JSON, told by the ending; boxes and fixes may be left empty
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Where the positions go: CSV, NDJSON, JSON or GeoJSON, told by the ending
+    #[arg(long, short, value_name = "FILE")]
+    out: PathBuf,
+    /// The camera whose active model answers
+    #[arg(long, value_name = "ID", value_parser = camera_id, required_unless_present = "model")]
+    camera: Option<CameraId>,
+    /// A downloaded model file that answers instead; needs no data folder
+    #[arg(long, value_name = "FILE", conflicts_with = "camera")]
+    model: Option<PathBuf>,
+    #[command(flatten)]
+    folder: DataFolder,
+}
+
+/// What answers: a model with its number, and what the profile says.
+struct Answering {
+    regressor: std::sync::Arc<Regressor>,
+    number: u32,
+    image_size: Option<ImageSize>,
+    e_gnss_m2: Option<f64>,
+}
+
+impl Fuse {
+    pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
+        let (from, to) = (format_of(&self.file)?, format_of(&self.out)?);
+        let answering = self.answering(file)?;
+        let rules = RowRules {
+            time_bounds: TimeBounds::at(Clock::system().now()),
+            image_size: answering.image_size,
+        };
+        let rows = exchange::read_observations(open_file(&self.file)?, from, &rules)?;
+        let out = File::create(&self.out).with_context(|| format!("cannot write {}", self.out.display()))?;
+        let mut out = BufWriter::new(out);
+        let mut writer = exchange::FusedWriter::new(&mut out, to);
+        let (mut answered, mut rejected) = (0_u64, 0_u64);
+        for row in rows {
+            let row = match row? {
+                Ok(row) => row,
+                Err(row) => {
+                    rejected += 1;
+                    eprintln!("line {}: {}: {}", row.line, row.field, row.reason);
+                    continue;
+                }
+            };
+            let model = Some((&*answering.regressor, answering.number));
+            let fused =
+                two_step::fuse(&row.observation, model, answering.image_size, answering.e_gnss_m2)
+                    .context("a model answers every observation")?;
+            writer.write(&fused)?;
+            answered += 1;
+        }
+        writer.finish()?;
+        out.flush()?;
+        println!("answered {answered}, rejected {rejected}");
+        Ok(())
+    }
+
+    fn answering(&self, file: Option<&Path>) -> anyhow::Result<Answering> {
+        if let Some(path) = &self.model {
+            let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+            let regressor = std::sync::Arc::new(Artifact::from_file(&bytes)?.load()?);
+            return Ok(Answering { regressor, number: 0, image_size: None, e_gnss_m2: None });
+        }
+        let id = self.camera.as_ref().context("give --camera or --model")?;
+        let settings = self.folder.settings(file)?;
+        runtime()?.block_on(async {
+            let app = open_app(&settings).await?;
+            let camera = app.camera(id).await?;
+            let serving = app.registry.get(id).context("the camera was deleted")?;
+            app.store.close().await;
+            let (regressor, number) = serving.model.clone().with_context(|| {
+                format!("camera {} has no active model: train it first (sightfix train)", camera.id())
+            })?;
+            Ok(Answering { regressor, number, image_size: serving.image_size, e_gnss_m2: serving.e_gnss_m2 })
+        })
+    }
+}

@@ -1,0 +1,93 @@
+//! `sightfix import`
+
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+
+use super::progress::Progress;
+use super::{DataFolder, camera_id, format_of, open_app, open_file, runtime};
+use crate::app::ImportReport;
+use crate::domain::{CameraId, Error, ErrorKind, ImageSize, NewCamera};
+
+/// Import samples from a file into a camera
+#[derive(Args)]
+pub(super) struct Import {
+    /// Samples as CSV, NDJSON or JSON, told by the ending
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// The camera's id
+    #[arg(long, value_name = "ID", value_parser = camera_id)]
+    camera: CameraId,
+    /// Make the camera if it is not there yet
+    #[arg(long)]
+    create: bool,
+    /// Size of the camera's image, for --create
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size, requires = "create")]
+    image_size: Option<ImageSize>,
+    #[command(flatten)]
+    folder: DataFolder,
+}
+
+impl Import {
+    pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
+        let settings = self.folder.settings(file)?;
+        let format = format_of(&self.file)?;
+        let source = open_file(&self.file)?;
+        let bytes = source.metadata()?.len();
+        let source = Watched { source, read: 0, bytes, progress: Progress::new("{bar:40} {bytes}/{total_bytes}") };
+        let report = runtime()?.block_on(async {
+            let app = open_app(&settings).await?;
+            if self.create {
+                let profile = NewCamera { image_size: self.image_size, ..NewCamera::named(self.camera.clone()) };
+                match app.create_camera(profile).await {
+                    Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {}
+                    created => drop(created?),
+                }
+            }
+            let report = app.import_file(&self.camera, source, format).await;
+            app.store.close().await;
+            anyhow::Ok(report?)
+        })?;
+        print(&report);
+        anyhow::ensure!(report.accepted + report.duplicate > 0 || report.rejected == 0, "every row was rejected");
+        Ok(())
+    }
+}
+
+fn print(report: &ImportReport) {
+    let ImportReport { accepted, duplicate, rejected, rejected_rows } = report;
+    println!("accepted {accepted}, duplicate {duplicate}, rejected {rejected}");
+    for row in rejected_rows {
+        println!("line {}: {}: {}", row.line, row.field, row.reason);
+    }
+    if *rejected > rejected_rows.len() as u64 {
+        println!("... and {} more", rejected - rejected_rows.len() as u64);
+    }
+}
+
+/// A size as `1920x1080`.
+pub(super) fn image_size(text: &str) -> Result<ImageSize, String> {
+    let sides = text.split_once(['x', 'X']).and_then(|(width, height)| {
+        Some((width.parse().ok()?, height.parse().ok()?))
+    });
+    let (width_px, height_px) = sides.ok_or("must be WIDTHxHEIGHT in pixels, such as 1920x1080")?;
+    ImageSize::new(width_px, height_px).map_err(|error| error.to_string())
+}
+
+/// A source that shows how far it was read.
+struct Watched<R> {
+    source: R,
+    read: u64,
+    bytes: u64,
+    progress: Progress,
+}
+
+impl<R: Read> Read for Watched<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let read = self.source.read(buffer)?;
+        self.read += read as u64;
+        self.progress.set(self.read, self.bytes, "bytes read");
+        Ok(read)
+    }
+}

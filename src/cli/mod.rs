@@ -1,0 +1,122 @@
+//! The command line: a file per subcommand.
+//!
+//! What never happens here: rules of the domain. A subcommand reads its flags, calls `app`,
+//! `worker`, `model` or `fusion`, and prints.
+
+mod config;
+mod fuse;
+mod gnss_error;
+mod health;
+mod import;
+mod openapi;
+mod progress;
+mod serve;
+mod train;
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::{Args, Parser, Subcommand};
+
+use crate::app::App;
+use crate::clock::{Clock, Randomness};
+use crate::config::{Config, Overrides};
+use crate::domain::CameraId;
+use crate::exchange::Format;
+use crate::store::Store;
+use crate::telemetry::Metrics;
+
+/// Positions from what an uncalibrated fixed camera sees and what a GNSS receiver says
+#[derive(Parser)]
+#[command(name = "sightfix", version, arg_required_else_help = true)]
+pub struct Cli {
+    /// Settings file; else `sightfix.toml` in the working folder, if it is there
+    #[arg(long, global = true, value_name = "FILE")]
+    config: Option<PathBuf>,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Answer REST and gRPC on one port
+    Serve(serve::Serve),
+    /// Import samples from a file into a camera
+    Import(import::Import),
+    /// Fit a camera's model from its samples
+    Train(train::Train),
+    /// Answer observations from a file, without a server
+    Fuse(fuse::Fuse),
+    /// Estimate a receiver's error from many fixes at one fixed point
+    GnssError(gnss_error::GnssError),
+    /// Ask a server whether it is alive
+    Health(health::Health),
+    /// Print the settings in force
+    Config(config::PrintConfig),
+    /// Print the OpenAPI description of the REST interface
+    Openapi(openapi::Openapi),
+}
+
+impl Cli {
+    /// Runs the command to its end.
+    ///
+    /// # Errors
+    /// What went wrong, for a person.
+    pub fn run(self) -> anyhow::Result<()> {
+        let file = self.config.as_deref();
+        match self.command {
+            Command::Serve(command) => command.run(file),
+            Command::Import(command) => command.run(file),
+            Command::Train(command) => command.run(file),
+            Command::Fuse(command) => command.run(file),
+            Command::GnssError(command) => command.run(),
+            Command::Health(command) => command.run(file),
+            Command::Config(command) => command.run(file),
+            Command::Openapi(command) => command.run(),
+        }
+    }
+}
+
+/// The data folder that a command works on.
+#[derive(Args)]
+struct DataFolder {
+    /// Folder of the database; made if it is not there
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+}
+
+impl DataFolder {
+    fn settings(&self, file: Option<&Path>) -> anyhow::Result<Config> {
+        Config::load(file, Overrides { data: self.data.clone(), listen: None })
+    }
+}
+
+/// The application over the data folder, without a server. A server may run beside it.
+async fn open_app(settings: &Config) -> anyhow::Result<App> {
+    let store = Store::open(&settings.data)
+        .await
+        .with_context(|| format!("cannot open the data folder {}", settings.data.display()))?;
+    Ok(App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new()).await?)
+}
+
+/// A runtime for one command.
+fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build().context("cannot start the runtime")
+}
+
+fn camera_id(text: &str) -> Result<CameraId, String> {
+    CameraId::new(text).map_err(|error| error.to_string())
+}
+
+/// Opens a file to read, with its name in the error.
+fn open_file(path: &Path) -> anyhow::Result<File> {
+    File::open(path).with_context(|| format!("cannot open {}", path.display()))
+}
+
+/// The format by a file's ending.
+fn format_of(path: &Path) -> anyhow::Result<Format> {
+    Format::from_path(path).with_context(|| {
+        format!("{}: the ending must be .csv, .ndjson, .jsonl, .json or .geojson", path.display())
+    })
+}

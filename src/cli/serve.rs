@@ -1,0 +1,79 @@
+//! `sightfix serve`
+
+mod demo;
+
+use std::net::SocketAddr;
+use std::path::Path;
+
+use anyhow::Context as _;
+use clap::Args;
+
+use super::{DataFolder, runtime};
+use crate::clock::{Clock, Randomness};
+use crate::config::{Config, Overrides};
+use crate::server::Server;
+use crate::shutdown::Shutdown;
+use crate::telemetry;
+
+/// Answer REST and gRPC on one port
+#[derive(Args)]
+pub(super) struct Serve {
+    /// Address of the one port [default: 127.0.0.1:8080]
+    #[arg(long, value_name = "ADDR")]
+    listen: Option<SocketAddr>,
+    /// Fill an empty data folder with a small simulated camera, train it, and print what to try
+    #[arg(long)]
+    demo: bool,
+    #[command(flatten)]
+    folder: DataFolder,
+}
+
+impl Serve {
+    pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
+        let overrides = Overrides { data: self.folder.data, listen: self.listen };
+        let settings = Config::load(file, overrides)?;
+        telemetry::start_log(&settings)?;
+        runtime()?.block_on(async {
+            let server = Server::bind(settings.clone(), Clock::system(), Randomness::system()).await?;
+            let address = server.address().context("cannot tell the address")?;
+            let (app, shutdown) = (server.app().clone(), server.shutdown());
+            tokio::spawn(end_on_signal(shutdown.clone()));
+            tracing::info!(%address, folder = %settings.data.display(), "answering REST and gRPC");
+            let serving = tokio::spawn(server.run());
+            let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
+            if shown.is_err() {
+                shutdown.begin();
+            }
+            serving.await.context("the server ended without a word")??;
+            shown
+        })
+    }
+}
+
+/// Ends the server at the first interrupt or termination; a second one ends the process at once.
+async fn end_on_signal(shutdown: Shutdown) {
+    wait_for_signal().await;
+    shutdown.begin();
+    wait_for_signal().await;
+    std::process::exit(130);
+}
+
+#[cfg(unix)]
+async fn wait_for_signal() {
+    use tokio::signal::unix::{SignalKind, signal};
+    match signal(SignalKind::terminate()) {
+        Ok(mut terminate) => tokio::select! {
+            _ = tokio::signal::ctrl_c() => {}
+            _ = terminate.recv() => {}
+        },
+        Err(error) => {
+            tracing::warn!(%error, "cannot listen for termination, only for interrupts");
+            let _ = tokio::signal::ctrl_c().await;
+        }
+    }
+}
+
+#[cfg(not(unix))]
+async fn wait_for_signal() {
+    let _ = tokio::signal::ctrl_c().await;
+}

@@ -1,0 +1,79 @@
+//! The demonstration: a simulated camera, through the same ways that a real one goes.
+
+use std::net::SocketAddr;
+
+use anyhow::Context as _;
+use futures_util::StreamExt as _;
+
+use crate::app::{App, RunRequest};
+use crate::cli::progress::Progress;
+use crate::domain::{CameraId, GnssError, NewCamera, RunState, SigmaM};
+use crate::simulation::{Options, SimulatedRow, simulate};
+
+const CAMERA: &str = "demo";
+
+/// Fills the data folder if it is empty, waits until the camera answers, prints what to try.
+pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
+    let id = CameraId::new(CAMERA)?;
+    let world = simulate(&Options::demo());
+    if app.cameras(None, 1).await?.items.is_empty() {
+        let sigma_m = SigmaM::new(world.gnss_sigma_m)?;
+        app.create_camera(NewCamera {
+            display_name: "Demonstration: a simulated square".to_owned(),
+            image_size: Some(world.image_size),
+            gnss_error: GnssError::Known(sigma_m),
+            ..NewCamera::named(id.clone())
+        })
+        .await?;
+        app.store.insert_samples(&id, world.training_samples()).await?;
+    }
+    let camera = app.camera(&id).await.context("the data folder holds other cameras; choose an empty one")?;
+    if camera.active_model.is_none() {
+        train(app, &id).await?;
+    }
+    let row = world
+        .rows
+        .iter()
+        .find(|row| row.bounding_box.is_some() && row.fix.is_some())
+        .context("the simulation shows no target")?;
+    println!("{}", things_to_try(address, row));
+    Ok(())
+}
+
+async fn train(app: &App, id: &CameraId) -> anyhow::Result<()> {
+    let run = app.start_run(id, RunRequest::default()).await?;
+    let mut progress = Progress::new("training the demonstration {bar:40} {pos}/{len}");
+    let mut changes = std::pin::pin!(app.watch_run(id, run.id).await?);
+    while let Some(run) = changes.next().await {
+        let run = run?;
+        progress.set(run.progress.epoch.into(), run.progress.epochs.into(), "epochs of the demonstration");
+        anyhow::ensure!(
+            !run.state.has_ended() || run.state == RunState::Succeeded,
+            "the demonstration's training run ended: {}",
+            run.outcome.unwrap_or_default()
+        );
+    }
+    progress.finish();
+    Ok(())
+}
+
+fn things_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
+    let (Some(bounding_box), Some(fix)) = (row.bounding_box, row.fix) else { return String::new() };
+    let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
+    let observation = format!(
+        r#"{{"time":"{}","bounding_box":{{"left_px":{left_px:.1},"top_px":{top_px:.1},"width_px":{width_px:.1},"height_px":{height_px:.1}}},"fix":{{"longitude_deg":{:.7},"latitude_deg":{:.7}}}}}"#,
+        row.time,
+        fix.position.longitude_deg(),
+        fix.position.latitude_deg(),
+    );
+    format!(
+        "The camera `{CAMERA}` answers. Three things to try:\n\n\
+         1. Fuse a box and a fix:\n\n   \
+         curl -s http://{address}/v1/cameras/{CAMERA}/fusions --json '{observation}'\n\n\
+         2. The same over gRPC:\n\n   \
+         grpcurl -plaintext -d '{{\"camera_id\":\"{CAMERA}\",\"observations\":[{observation}]}}' {address} \
+         sightfix.v1.FusionService/Fuse\n\n\
+         3. Read and try the whole interface in a browser:\n\n   \
+         http://{address}/docs\n"
+    )
+}

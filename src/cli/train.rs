@@ -1,0 +1,82 @@
+//! `sightfix train`
+
+use std::path::Path;
+use std::time::Duration;
+
+use clap::Args;
+use futures_util::StreamExt as _;
+
+use super::progress::Progress;
+use super::{DataFolder, camera_id, open_app, runtime};
+use crate::app::{App, RunRequest};
+use crate::config::Config;
+use crate::domain::{CameraId, Recipe, RunProgress, RunState, TrainingRun};
+use crate::shutdown::Shutdown;
+use crate::worker;
+
+/// Fit a camera's model from its samples
+#[derive(Args)]
+pub(super) struct Train {
+    /// The camera's id
+    #[arg(long, value_name = "ID", value_parser = camera_id)]
+    camera: CameraId,
+    /// How to learn it; else as its profile says
+    #[arg(long, value_name = "RECIPE")]
+    recipe: Option<Recipe>,
+    /// Everything random in the run comes from it
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Passes over the samples; else the recipe's own number
+    #[arg(long, value_name = "N")]
+    epochs: Option<u32>,
+    #[command(flatten)]
+    folder: DataFolder,
+}
+
+impl Train {
+    pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
+        let settings = self.folder.settings(file)?;
+        runtime()?.block_on(async {
+            let app = open_app(&settings).await?;
+            let request = RunRequest {
+                recipe: self.recipe,
+                seed: self.seed,
+                epochs: self.epochs,
+                ..RunRequest::default()
+            };
+            let ended = train(&app, &settings, &self.camera, request).await;
+            app.store.close().await;
+            let ended = ended?;
+            let outcome = ended.outcome.as_deref().unwrap_or("no outcome was recorded");
+            anyhow::ensure!(ended.state == RunState::Succeeded, "{}: {outcome}", ended.state.as_str());
+            println!("version {} {outcome}", ended.model_version.unwrap_or_default());
+            Ok(())
+        })
+    }
+}
+
+/// Queues a run, works on it in this process (a server beside it may be faster to take it), and
+/// shows it until it has ended.
+pub(super) async fn train(
+    app: &App,
+    settings: &Config,
+    camera: &CameraId,
+    request: RunRequest,
+) -> anyhow::Result<TrainingRun> {
+    let queued = app.start_run(camera, request).await?;
+    let shutdown = Shutdown::new();
+    shutdown.spawn(worker::work(app.clone(), settings.training.clone(), shutdown.clone()));
+    let mut progress = Progress::new("{bar:40} {pos}/{len} epochs {msg}");
+    let mut seen = queued.clone();
+    let mut changes = std::pin::pin!(app.watch_run(camera, queued.id).await?);
+    while let Some(run) = changes.next().await {
+        seen = run?;
+        let RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. } = &seen.progress;
+        let left = remaining_s.map(|seconds| format!(", {seconds:.0} s left")).unwrap_or_default();
+        progress.set((*epoch).into(), (*epochs).into(), &format!("{phase}, Es {error_scale:.3}{left}"));
+    }
+    progress.finish();
+    shutdown.finish(Duration::from_secs(settings.limits.drain_s)).await;
+    Ok(seen)
+}
+

@@ -1,0 +1,67 @@
+//! What time it is and what is random: handed in as values, so that tests and runs repeat exactly.
+//!
+//! This is the only module that reads the wall clock or the operating system's randomness.
+
+use std::sync::{Arc, Mutex};
+
+use jiff::Timestamp;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use uuid::Uuid;
+
+/// Tells the time.
+#[derive(Clone)]
+pub struct Clock(Arc<dyn Fn() -> Timestamp + Send + Sync>);
+
+impl Clock {
+    /// The operating system's clock.
+    #[must_use]
+    pub fn system() -> Self {
+        #[expect(clippy::disallowed_methods, reason = "the one place that reads the wall clock")]
+        Self(Arc::new(Timestamp::now))
+    }
+
+    /// A clock that the caller drives.
+    pub fn from_fn(tell: impl Fn() -> Timestamp + Send + Sync + 'static) -> Self {
+        Self(Arc::new(tell))
+    }
+
+    /// The time now.
+    #[must_use]
+    pub fn now(&self) -> Timestamp {
+        (self.0)()
+    }
+}
+
+/// Makes ids and seeds.
+#[derive(Clone)]
+pub struct Randomness(Arc<Mutex<ChaCha8Rng>>);
+
+impl Randomness {
+    /// Seeded by the operating system.
+    #[must_use]
+    pub fn system() -> Self {
+        Self::seeded(u64::from_le_bytes(
+            Uuid::new_v4().as_bytes()[..8].try_into().expect("a UUID has sixteen bytes"),
+        ))
+    }
+
+    /// The same sequence for the same seed.
+    #[must_use]
+    pub fn seeded(seed: u64) -> Self {
+        Self(Arc::new(Mutex::new(ChaCha8Rng::seed_from_u64(seed))))
+    }
+
+    /// A UUID of version 7: ordered by time, random behind it.
+    #[must_use]
+    pub fn uuid_v7(&self, now: Timestamp) -> Uuid {
+        let mut random = [0; 10];
+        self.fill(&mut random);
+        let millis = u64::try_from(now.as_millisecond()).unwrap_or(0);
+        uuid::Builder::from_unix_timestamp_millis(millis, &random).into_uuid()
+    }
+
+    fn fill(&self, bytes: &mut [u8]) {
+        self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner).fill_bytes(bytes);
+    }
+}

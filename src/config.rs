@@ -1,0 +1,199 @@
+//! Settings and limits: defaults < file < `SIGHTFIX_*` < flags.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::Context as _;
+use serde::{Deserialize, Serialize};
+
+/// Everything that can be set.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// Folder of the database, made at the first start.
+    pub data: PathBuf,
+    /// Address of the one port for REST and gRPC.
+    pub listen: SocketAddr,
+    /// `text` or `json` lines in the log.
+    pub log_format: LogFormat,
+    /// What is logged, as `tracing`'s env filter reads it.
+    pub log_filter: String,
+    /// Training.
+    pub training: Training,
+    /// What an outside client may make large.
+    pub limits: Limits,
+}
+
+/// Form of the log lines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LogFormat {
+    /// For people.
+    Text,
+    /// For machines.
+    Json,
+}
+
+/// Settings of the training workers.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Training {
+    /// Runs fitted at the same time, each on a thread of its own at the lowest priority.
+    pub workers: usize,
+    /// Seconds after which the run of a silent worker is taken up by another.
+    pub lease_s: u32,
+}
+
+/// Everything that an outside client can make large has its limit here.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Limits {
+    /// Bytes of a request body, other than an import.
+    pub body_bytes: usize,
+    /// Bytes of an import's body.
+    pub import_bytes: usize,
+    /// Bytes of an import held in memory before it goes to a temporary file.
+    pub import_memory_bytes: usize,
+    /// Bytes of one gRPC message.
+    pub message_bytes: usize,
+    /// Observations in one fusion request.
+    pub batch_observations: usize,
+    /// Items on one page of a list.
+    pub page_items: u32,
+    /// Rejected rows of an import that are told one by one.
+    pub rejected_rows: usize,
+    /// Bytes of a request's headers.
+    pub header_bytes: u32,
+    /// Seconds to send a request's headers.
+    pub header_s: u64,
+    /// Seconds between two pieces of a body, or without a ping's answer.
+    pub idle_s: u64,
+    /// Seconds that a request may take, its body included, until its answer begins.
+    pub request_s: u64,
+    /// Open connections.
+    pub connections: usize,
+    /// Streams per HTTP/2 connection.
+    pub streams_per_connection: u32,
+    /// Requests in flight.
+    pub requests: usize,
+    /// Event streams open at a time.
+    pub event_streams: usize,
+    /// Training runs that have not ended, over all cameras.
+    pub live_runs: u32,
+    /// Passes of one training run.
+    pub epochs: u32,
+    /// Samples of one training run; the latest are taken.
+    pub samples_per_run: u32,
+    /// Seconds that open requests get when the server ends.
+    pub drain_s: u64,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            data: PathBuf::from("data"),
+            listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            log_format: LogFormat::Text,
+            log_filter: "info".to_owned(),
+            training: Training::default(),
+            limits: Limits::default(),
+        }
+    }
+}
+
+impl Default for Training {
+    fn default() -> Self {
+        Self { workers: 1, lease_s: 15 }
+    }
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            body_bytes: 1 << 20,
+            import_bytes: 64 << 20,
+            import_memory_bytes: 4 << 20,
+            message_bytes: 4 << 20,
+            batch_observations: 1_000,
+            page_items: 1_000,
+            rejected_rows: 100,
+            header_bytes: 32 << 10,
+            header_s: 10,
+            idle_s: 30,
+            request_s: 300,
+            connections: 10_000,
+            streams_per_connection: 256,
+            requests: 1_024,
+            event_streams: 256,
+            live_runs: 256,
+            epochs: 10_000,
+            samples_per_run: 100_000,
+            drain_s: 10,
+        }
+    }
+}
+
+impl Limits {
+    /// Time to send a request's headers.
+    #[must_use]
+    pub const fn header_time(&self) -> Duration {
+        Duration::from_secs(self.header_s)
+    }
+
+    /// Time between two pieces of a body.
+    #[must_use]
+    pub const fn idle_time(&self) -> Duration {
+        Duration::from_secs(self.idle_s)
+    }
+}
+
+/// Values from the command line, which win over all others.
+#[derive(Debug, Clone, Default)]
+pub struct Overrides {
+    /// `--data`
+    pub data: Option<PathBuf>,
+    /// `--listen`
+    pub listen: Option<SocketAddr>,
+}
+
+impl Config {
+    /// Reads file and environment over the defaults, and lays the flags on top.
+    ///
+    /// Without a path, `sightfix.toml` in the working folder is read if it is there. Nested settings
+    /// are set by two underscores: `SIGHTFIX_LIMITS__BODY_BYTES=65536`.
+    ///
+    /// # Errors
+    /// Names the file or variable with a value that cannot be used, and unknown settings.
+    pub fn load(file: Option<&Path>, overrides: Overrides) -> anyhow::Result<Self> {
+        let source = match file {
+            Some(path) => config::File::from(path).required(true),
+            None => config::File::new("sightfix.toml", config::FileFormat::Toml).required(false),
+        };
+        let environment = config::Environment::with_prefix("SIGHTFIX")
+            .prefix_separator("_")
+            .separator("__")
+            .try_parsing(true);
+        let mut loaded: Self = config::Config::builder()
+            .add_source(source)
+            .add_source(environment)
+            .build()
+            .and_then(config::Config::try_deserialize)
+            .context("cannot read the settings")?;
+        if let Some(data) = overrides.data {
+            loaded.data = data;
+        }
+        if let Some(listen) = overrides.listen {
+            loaded.listen = listen;
+        }
+        loaded.check()?;
+        Ok(loaded)
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        anyhow::ensure!(self.training.workers >= 1, "training.workers must be at least 1");
+        anyhow::ensure!(self.training.lease_s >= 3, "training.lease_s must be at least 3");
+        anyhow::ensure!(self.limits.page_items >= 1, "limits.page_items must be at least 1");
+        Ok(())
+    }
+}

@@ -1,0 +1,272 @@
+//! Rows of a CSV file.
+//!
+//! Read line by line on purpose: no column has reason to hold a line break, and so an unclosed
+//! quote costs its own row and not the rest of the file, and memory stays bounded.
+
+use std::io::Read;
+
+use super::columns::{
+    CLASS, HEIGHT, Header, LATITUDE, LEFT, LONGITUDE, SCORE, SIGMA, TARGET_ID, TIME, TRUTH_LATITUDE,
+    TRUTH_LONGITUDE,
+};
+use super::lines::{Line, Lines};
+use super::rows::{Row, RowError};
+use super::wire::{self, Text};
+use crate::domain::{Error, ErrorKind, Result};
+
+/// Reads a CSV file's rows.
+pub(super) struct CsvRows<R> {
+    lines: Lines<R>,
+    header: Box<Header>,
+    fields: Fields,
+}
+
+impl<R: Read> CsvRows<R> {
+    /// # Errors
+    /// A file without a header, or with columns missing, doubled or unknown.
+    pub(super) fn new(reader: R, required: &[usize]) -> Result<Self> {
+        let mut lines = Lines::new(reader);
+        let mut fields = Fields::default();
+        let header = loop {
+            match lines.next_line().map_err(Error::fault)? {
+                Some((_, Line::Text(text))) if text.trim().is_empty() => {}
+                Some((_, Line::Text(text))) => {
+                    let split = fields.split(text).map_err(|reason| malformed(&reason))?;
+                    break Box::new(Header::read(split, required)?);
+                }
+                Some((_, Line::NotUtf8)) => return Err(malformed("the header is not UTF-8")),
+                Some((_, Line::TooLong)) => return Err(malformed("the header is longer than 64 KiB")),
+                None => return Err(malformed("the file is empty; its first line must name its columns")),
+            }
+        };
+        Ok(Self { lines, header, fields })
+    }
+
+    /// Converts the next row that is not blank.
+    pub(super) fn next_row<T>(
+        &mut self,
+        convert: impl FnOnce(Row<'_>) -> Result<T>,
+    ) -> Option<Result<Result<T, RowError>>> {
+        loop {
+            let (line, text) = match self.lines.next_line() {
+                Err(broken) => return Some(Err(Error::fault(broken))),
+                Ok(None) => return None,
+                Ok(Some((_, Line::Text(text)))) if text.trim().is_empty() => continue,
+                Ok(Some((line, Line::Text(text)))) => (line, text),
+                Ok(Some((line, Line::NotUtf8))) => {
+                    return Some(Ok(Err(RowError::whole(line, "is not UTF-8"))));
+                }
+                Ok(Some((line, Line::TooLong))) => {
+                    return Some(Ok(Err(RowError::whole(line, "is longer than 64 KiB"))));
+                }
+            };
+            let header = &self.header;
+            let row = self.fields.split(text).map_err(Fault::Whole).and_then(|fields| {
+                let cells = Cells::of(header, fields)?;
+                let row = cells.row().map_err(|(index, reason)| Fault::Column(index, reason))?;
+                convert(row).map_err(Fault::Domain)
+            });
+            return Some(match row {
+                Ok(value) => Ok(Ok(value)),
+                Err(Fault::Whole(reason)) => Ok(Err(RowError::whole(line, &reason))),
+                Err(Fault::Column(index, reason)) => {
+                    Ok(Err(RowError { line, field: header.name(index).to_owned(), reason }))
+                }
+                Err(Fault::Domain(error)) => RowError::of(line, error).map(|mut fault| {
+                    fault.field = header.name_of_path(&fault.field).to_owned();
+                    Err(fault)
+                }),
+            });
+        }
+    }
+}
+
+/// Why a row is none.
+enum Fault {
+    Whole(String),
+    Column(usize, String),
+    Domain(Error),
+}
+
+fn malformed(reason: &str) -> Error {
+    Error::refused(ErrorKind::MalformedBody, reason)
+}
+
+/// The cells of one line in the order of the known columns.
+struct Cells<'a> {
+    cells: [&'a str; 13],
+}
+
+type Cell<T> = std::result::Result<T, (usize, String)>;
+
+impl<'a> Cells<'a> {
+    fn of(header: &Header, fields: impl Iterator<Item = &'a str>) -> Result<Self, Fault> {
+        let mut in_file = [""; 13];
+        let mut count = 0;
+        for field in fields {
+            if let Some(cell) = in_file.get_mut(count) {
+                *cell = field.trim();
+            }
+            count += 1;
+        }
+        if count != header.width() {
+            let width = header.width();
+            return Err(Fault::Whole(format!("has {count} fields where the header names {width}")));
+        }
+        let cells = std::array::from_fn(|index| header.place(index).map_or("", |place| in_file[place]));
+        Ok(Self { cells })
+    }
+
+    fn row(&self) -> Cell<Row<'a>> {
+        Ok(Row {
+            time: self.text(TIME),
+            target_id: self.text(TARGET_ID),
+            bounding_box: self.numbers([LEFT, LEFT + 1, LEFT + 2, HEIGHT])?.map(
+                |[left_px, top_px, width_px, height_px]| wire::BoundingBox {
+                    left_px,
+                    top_px,
+                    width_px,
+                    height_px,
+                },
+            ),
+            fix: self.fix()?,
+            class: self.text(CLASS),
+            score: self.number(SCORE)?,
+            truth: self
+                .numbers([TRUTH_LONGITUDE, TRUTH_LATITUDE])?
+                .map(|[longitude_deg, latitude_deg]| wire::Position { longitude_deg, latitude_deg }),
+        })
+    }
+
+    fn fix(&self) -> Cell<Option<wire::Fix>> {
+        let sigma_m = self.number(SIGMA)?;
+        let degrees = self.numbers([LONGITUDE, LATITUDE])?;
+        Ok(degrees.map(|[longitude_deg, latitude_deg]| wire::Fix { longitude_deg, latitude_deg, sigma_m }))
+    }
+
+    fn text(&self, index: usize) -> Option<Text<'a>> {
+        let cell = self.cells[index];
+        (!cell.is_empty()).then(|| Text::from(cell))
+    }
+
+    fn number(&self, index: usize) -> Cell<Option<f64>> {
+        let cell = self.cells[index];
+        if cell.is_empty() {
+            return Ok(None);
+        }
+        cell.parse().map(Some).map_err(|_| {
+            let shown: String = cell.chars().take(40).collect();
+            (index, format!("must be a number, not `{shown}`"))
+        })
+    }
+
+    /// Numbers that belong together: `None` if all cells are empty, an error if some are.
+    fn numbers<const N: usize>(&self, indexes: [usize; N]) -> Cell<Option<[f64; N]>> {
+        let mut numbers = [0.0; N];
+        let mut missing = None;
+        let mut given = 0;
+        for (number, index) in numbers.iter_mut().zip(indexes) {
+            match self.number(index)? {
+                Some(value) => {
+                    *number = value;
+                    given += 1;
+                }
+                None => missing = Some(index),
+            }
+        }
+        match missing {
+            None => Ok(Some(numbers)),
+            Some(_) if given == 0 => Ok(None),
+            Some(index) => Err((index, "is empty where the values it belongs to are given".to_owned())),
+        }
+    }
+}
+
+/// The fields of one line; RFC 4180 but for line breaks within quotes.
+#[derive(Default)]
+struct Fields {
+    /// Fields that had quotes, without them.
+    unquoted: String,
+    /// Begin and end of every field in `unquoted`.
+    spans: Vec<(usize, usize)>,
+}
+
+/// Fields that stand in the line as they are, or those freed of their quotes.
+enum Split<'a> {
+    Plain(std::str::Split<'a, char>),
+    Quoted(&'a str, std::slice::Iter<'a, (usize, usize)>),
+}
+
+impl<'a> Iterator for Split<'a> {
+    type Item = &'a str;
+
+    fn next(&mut self) -> Option<&'a str> {
+        match self {
+            Self::Plain(fields) => fields.next(),
+            Self::Quoted(text, spans) => spans.next().map(|&(begin, end)| &text[begin..end]),
+        }
+    }
+}
+
+impl Fields {
+    fn split<'a>(&'a mut self, line: &'a str) -> Result<Split<'a>, String> {
+        if !line.contains('"') {
+            return Ok(Split::Plain(line.split(',')));
+        }
+        self.unquoted.clear();
+        self.spans.clear();
+        let mut rest = Some(line);
+        while let Some(text) = rest {
+            let begin = self.unquoted.len();
+            rest = self.take_field(text)?;
+            self.spans.push((begin, self.unquoted.len()));
+        }
+        Ok(Split::Quoted(&self.unquoted, self.spans.iter()))
+    }
+
+    /// Appends the first field of the text; what follows its comma is left.
+    fn take_field<'a>(&mut self, text: &'a str) -> Result<Option<&'a str>, String> {
+        let Some(mut quoted) = text.strip_prefix('"') else {
+            let (field, rest) =
+                text.split_once(',').map_or((text, None), |(field, rest)| (field, Some(rest)));
+            self.unquoted.push_str(field);
+            return Ok(rest);
+        };
+        loop {
+            let (part, after) = quoted
+                .split_once('"')
+                .ok_or("has a quote that is not closed; a field cannot go on in the next line")?;
+            self.unquoted.push_str(part);
+            if let Some(after) = after.strip_prefix('"') {
+                self.unquoted.push('"');
+                quoted = after;
+            } else if after.is_empty() {
+                return Ok(None);
+            } else {
+                let rest = after.strip_prefix(',').ok_or("has text after a closing quote")?;
+                return Ok(Some(rest));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn fields_come_back_as_the_csv_crate_wrote_them(
+            fields in prop::collection::vec("[a-z0-9 \",;'é]{0,8}", 2..8)
+        ) {
+            let mut writer = csv::Writer::from_writer(Vec::new());
+            writer.write_record(&fields).expect("memory");
+            let line = String::from_utf8(writer.into_inner().expect("memory")).expect("UTF-8");
+            let mut splitter = Fields::default();
+            let split: Vec<&str> = splitter.split(line.trim_end_matches('\n')).expect("well formed").collect();
+            prop_assert_eq!(split, fields);
+        }
+    }
+}

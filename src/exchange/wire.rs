@@ -1,0 +1,381 @@
+//! The JSON shapes of positions, boxes, samples, observations and fused positions.
+//!
+//! One set for files and for REST. Shapes are types without checks: the conversions into
+//! [`crate::domain`] check, and name the field at fault by its path in the JSON.
+
+use std::borrow::Cow;
+use std::fmt;
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::domain::{self, Error, ErrorKind, Result, SigmaM, TimeBounds, parse_time};
+use crate::geo::{self, PositionError};
+
+/// Text borrowed from the JSON it stands in, wherever it has no escapes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Text<'a>(#[serde(borrow)] Cow<'a, str>);
+
+impl Text<'_> {
+    /// The text.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl<'a> From<&'a str> for Text<'a> {
+    fn from(text: &'a str) -> Self {
+        Self(Cow::Borrowed(text))
+    }
+}
+
+/// A place on WGS 84.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Position {
+    /// Degrees east of Greenwich.
+    #[schema(minimum = -180.0, maximum = 180.0, example = 103.98678)]
+    pub longitude_deg: f64,
+    /// Degrees north of the equator.
+    #[schema(minimum = -90.0, maximum = 90.0, example = 30.6280135)]
+    pub latitude_deg: f64,
+}
+
+impl Position {
+    /// # Errors
+    /// Names the coordinate that is not finite or out of range.
+    pub fn to_domain(self) -> Result<geo::Position> {
+        geo::Position::new(self.longitude_deg, self.latitude_deg).map_err(|error| {
+            let field = match error {
+                PositionError::Longitude => "longitude_deg",
+                PositionError::Latitude => "latitude_deg",
+            };
+            Error::invalid(field, error.to_string())
+        })
+    }
+}
+
+impl From<geo::Position> for Position {
+    fn from(position: geo::Position) -> Self {
+        Self { longitude_deg: position.longitude_deg(), latitude_deg: position.latitude_deg() }
+    }
+}
+
+/// A GNSS position, with the receiver's own word on its error if it gave one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Fix {
+    /// Degrees east of Greenwich, WGS 84.
+    #[schema(minimum = -180.0, maximum = 180.0, example = 103.98678)]
+    pub longitude_deg: f64,
+    /// Degrees north of the equator, WGS 84.
+    #[schema(minimum = -90.0, maximum = 90.0, example = 30.6280135)]
+    pub latitude_deg: f64,
+    /// Standard deviation per horizontal axis in metres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.001, maximum = 10000.0, example = 2.2)]
+    pub sigma_m: Option<f64>,
+}
+
+impl Fix {
+    /// # Errors
+    /// Names the coordinate or `sigma_m` that cannot be used.
+    pub fn to_domain(self) -> Result<domain::Fix> {
+        let Self { longitude_deg, latitude_deg, sigma_m } = self;
+        Ok(domain::Fix {
+            position: Position { longitude_deg, latitude_deg }.to_domain()?,
+            sigma_m: sigma_m.map(SigmaM::new).transpose()?,
+        })
+    }
+}
+
+impl From<domain::Fix> for Fix {
+    fn from(fix: domain::Fix) -> Self {
+        Self {
+            longitude_deg: fix.position.longitude_deg(),
+            latitude_deg: fix.position.latitude_deg(),
+            sigma_m: fix.sigma_m.map(SigmaM::metres),
+        }
+    }
+}
+
+/// A box around a target, in pixels from the image's upper left corner.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct BoundingBox {
+    /// Left edge.
+    #[schema(example = 475.0)]
+    pub left_px: f64,
+    /// Upper edge.
+    #[schema(example = 11.0)]
+    pub top_px: f64,
+    /// Width, above 0.
+    #[schema(exclusive_minimum = 0.0, example = 28.0)]
+    pub width_px: f64,
+    /// Height, above 0.
+    #[schema(exclusive_minimum = 0.0, example = 77.0)]
+    pub height_px: f64,
+}
+
+impl BoundingBox {
+    /// # Errors
+    /// Names the side that cannot be used.
+    pub fn to_domain(self) -> Result<domain::BoundingBox> {
+        domain::BoundingBox::new(self.left_px, self.top_px, self.width_px, self.height_px)
+    }
+}
+
+impl From<domain::BoundingBox> for BoundingBox {
+    fn from(bounding_box: domain::BoundingBox) -> Self {
+        let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
+        Self { left_px, top_px, width_px, height_px }
+    }
+}
+
+/// A box and a fix of one target at one instant, kept for training. Unique by target and time.
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+pub struct Sample<'a> {
+    /// RFC 3339 with an offset; stored to the microsecond.
+    #[schema(value_type = String, format = DateTime, example = "2020-12-14T14:41:48+08:00")]
+    pub time: Timestamp,
+    /// Who.
+    #[schema(value_type = String, min_length = 1, max_length = 128, example = "person-1")]
+    pub target_id: &'a str,
+    /// What the camera saw.
+    pub bounding_box: BoundingBox,
+    /// What the receiver said.
+    pub fix: Fix,
+    /// What the detector takes the target for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, example = "person")]
+    pub class: Option<&'a str>,
+    /// How sure the detector is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.0, maximum = 1.0)]
+    pub score: Option<f64>,
+    /// Where the target truly was; for evaluation alone, never used in training.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub truth: Option<Position>,
+}
+
+impl<'a> From<&'a domain::Sample> for Sample<'a> {
+    fn from(sample: &'a domain::Sample) -> Self {
+        Self {
+            time: sample.time,
+            target_id: sample.target_id.as_str(),
+            bounding_box: sample.bounding_box.into(),
+            fix: sample.fix.into(),
+            class: sample.class.as_ref().map(domain::TargetClass::as_str),
+            score: sample.score.map(domain::Score::value),
+            truth: sample.truth.map(Position::from),
+        }
+    }
+}
+
+/// A box, a fix, or both, of one target at one instant.
+#[derive(Debug, Clone, PartialEq, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Observation<'a> {
+    /// RFC 3339 with an offset.
+    #[serde(borrow)]
+    #[schema(value_type = String, format = DateTime, example = "2020-12-14T14:41:48+08:00")]
+    pub time: Text<'a>,
+    /// Who, if known.
+    #[serde(borrow, default)]
+    #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "person-1")]
+    pub target_id: Option<Text<'a>>,
+    /// What the camera saw.
+    #[serde(default)]
+    pub bounding_box: Option<BoundingBox>,
+    /// What the receiver said.
+    #[serde(default)]
+    pub fix: Option<Fix>,
+}
+
+impl Observation<'_> {
+    /// # Errors
+    /// Names the field that cannot be used, or both if neither box nor fix is given.
+    pub fn to_domain(
+        &self,
+        bounds: &TimeBounds,
+        image_size: Option<domain::ImageSize>,
+    ) -> Result<domain::Observation> {
+        if self.bounding_box.is_none() && self.fix.is_none() {
+            return Err(Error::invalid(
+                "bounding_box",
+                "an observation needs a bounding_box, a fix, or both",
+            ));
+        }
+        Ok(domain::Observation {
+            time: bounds.check(parse_time(self.time.as_str())?)?,
+            target_id: self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?,
+            bounding_box: self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
+            fix: self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
+        })
+    }
+}
+
+/// A box that belongs to an image of that size; errors are named below `bounding_box`.
+pub(super) fn box_within(
+    sides: BoundingBox,
+    image_size: Option<domain::ImageSize>,
+) -> Result<domain::BoundingBox> {
+    let checked = sides.to_domain().and_then(|bounding_box| match image_size {
+        Some(size) => bounding_box.within(size),
+        None => Ok(bounding_box),
+    });
+    checked.map_err(|error| error.under("bounding_box"))
+}
+
+/// The answer for one observation.
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+pub struct FusedFix<'a> {
+    /// The observation's time.
+    #[schema(value_type = String, format = DateTime)]
+    pub time: Timestamp,
+    /// The observation's target.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    pub target_id: Option<&'a str>,
+    /// The best position: the two-step one; from the box alone without a fix; the fix without a box.
+    pub fused: Position,
+    /// The one-step position, from the box.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub regressed: Option<Position>,
+    /// The fix as it came.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gnss: Option<Fix>,
+    /// Weight of the regressed position, 0 to 1; both weights sum to 1.
+    pub confidence_regression: f64,
+    /// Weight of the fix, 0 to 1.
+    pub confidence_gnss: f64,
+    /// Error variance per axis of the regressed position, m2.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub e_regression_m2: Option<f64>,
+    /// Error variance per axis of the fix, m2.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub e_gnss_m2: Option<f64>,
+    /// Radius about `fused` that holds the true position with 95 % probability, m.
+    pub r95_m: f64,
+    /// How badly the auto-encoder rebuilds its input, in the recipe's units.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reconstruction_error: Option<f64>,
+    /// Number of the model version that spoke.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub model_version: Option<u32>,
+    /// What to know about it.
+    #[schema(value_type = Vec<Flag>)]
+    pub flags: Flags<'a>,
+}
+
+impl<'a> From<&'a domain::FusedFix> for FusedFix<'a> {
+    fn from(fused: &'a domain::FusedFix) -> Self {
+        Self {
+            time: fused.time,
+            target_id: fused.target_id.as_ref().map(domain::TargetId::as_str),
+            fused: fused.fused.into(),
+            regressed: fused.regressed.map(Position::from),
+            gnss: fused.gnss.map(Fix::from),
+            confidence_regression: fused.confidences.regression,
+            confidence_gnss: fused.confidences.gnss,
+            e_regression_m2: fused.e_regression_m2,
+            e_gnss_m2: fused.e_gnss_m2,
+            r95_m: fused.r95_m,
+            reconstruction_error: fused.reconstruction_error,
+            model_version: fused.model_version,
+            flags: Flags(&fused.flags),
+        }
+    }
+}
+
+/// What a caller should know about a fused position.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ToSchema)]
+#[schema(rename_all = "snake_case")]
+pub enum Flag {
+    /// No fix: the position comes from the box alone.
+    GnssDenied,
+    /// No box: the fix passes through.
+    BoxMissing,
+    /// The image's border cuts the box.
+    BoxAtBorder,
+    /// The box is unlike those of the training samples.
+    OutsideTraining,
+    /// The camera has no model; only fixes can pass.
+    NoModel,
+}
+
+/// Flags by their names.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Flags<'a>(&'a [domain::Flag]);
+
+impl Serialize for Flags<'_> {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_seq(self.0.iter().map(|flag| flag.as_str()))
+    }
+}
+
+impl fmt::Display for Flags<'_> {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, flag) in self.0.iter().enumerate() {
+            if index > 0 {
+                out.write_str(" ")?;
+            }
+            out.write_str(flag.as_str())?;
+        }
+        Ok(())
+    }
+}
+
+/// A value from JSON text.
+///
+/// # Errors
+/// `MalformedBody` for text that is not JSON, `InvalidArgument` for a value of the wrong shape; both
+/// name the path of the field.
+pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
+    // The path costs time to follow, so it is followed only where there is a fault to tell.
+    match serde_json::from_slice(json) {
+        Ok(value) => Ok(value),
+        Err(_) => parse_with_path(json),
+    }
+}
+
+fn parse_with_path<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
+    let mut source = serde_json::Deserializer::from_slice(json);
+    let value = serde_path_to_error::deserialize(&mut source).map_err(|error| {
+        let path = error.path().to_string();
+        refusal_of(if path == "." { "" } else { &path }, &error.into_inner())
+    })?;
+    source.end().map_err(|error| refusal_of("", &error))?;
+    Ok(value)
+}
+
+fn refusal_of(path: &str, error: &serde_json::Error) -> Error {
+    let message = error.to_string();
+    let (what, place) = message.rfind(" at line ").map_or((message.as_str(), ""), |at| message.split_at(at));
+    if what == "number out of range" {
+        return Error::invalid(path, "the number is too large for a double");
+    }
+    if error.is_data() {
+        let (field, reason) = named_in(path, what);
+        return Error::invalid(field, reason);
+    }
+    Error::field(ErrorKind::MalformedBody, path, format!("not JSON: {what}{place}"))
+}
+
+/// serde tells a missing or an unknown field at its parent; here it gets the field's own path.
+fn named_in(path: &str, what: &str) -> (String, String) {
+    let join = |name: &str| if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
+    let quoted = |begin: &str| what.strip_prefix(begin).and_then(|rest| rest.split_once('`'));
+    if let Some((name, _)) = quoted("missing field `") {
+        return (join(name), "is required".to_owned());
+    }
+    if let Some((name, rest)) = quoted("unknown field `") {
+        let is_named = path == name || path.ends_with(&format!(".{name}"));
+        let field = if is_named { path.to_owned() } else { join(name) };
+        return (field, format!("is not a known field{rest}"));
+    }
+    (path.to_owned(), what.to_owned())
+}

@@ -1,0 +1,282 @@
+//! Writers of samples and fused positions, row by row.
+//!
+//! Degrees are written with 8 decimals (about 1 mm) where the format is text for people (CSV), and
+//! in full elsewhere. GeoJSON is RFC 7946: WGS 84, `[longitude, latitude]`.
+
+use std::borrow::Cow;
+use std::fmt::Display;
+use std::io::{self, Write};
+
+use serde::Serialize;
+
+use super::columns::COLUMNS;
+use super::format::Format;
+use super::wire;
+use crate::domain::{FusedFix, Sample};
+
+/// Writes samples as they come. Between two of them the target can be emptied (`get_mut`), so an
+/// export of any length needs the memory of a page.
+pub struct SampleWriter<W: Write>(Document<W>);
+
+impl<W: Write> SampleWriter<W> {
+    /// A document in that format; nothing is written yet.
+    pub const fn new(out: W, format: Format) -> Self {
+        Self(Document::new(out, format, "samples"))
+    }
+
+    /// Writes one sample.
+    ///
+    /// # Errors
+    /// What the target says.
+    pub fn write(&mut self, sample: &Sample) -> io::Result<()> {
+        let row = wire::Sample::from(sample);
+        match self.0.format {
+            Format::Csv => self.0.csv_row(sample_header, |out| sample_cells(out, &row)),
+            Format::Ndjson | Format::Json => self.0.json_row(&row),
+            Format::GeoJson => {
+                let place = wire::Position::from(sample.fix.position);
+                self.0.json_row(&Feature::new(place, &row))
+            }
+        }
+    }
+
+    /// The target, for taking away what is written so far.
+    pub const fn get_mut(&mut self) -> &mut W {
+        &mut self.0.out
+    }
+
+    /// Ends the document and gives back the target.
+    ///
+    /// # Errors
+    /// What the target says.
+    pub fn finish(self) -> io::Result<W> {
+        self.0.finish(sample_header)
+    }
+}
+
+/// Writes fused positions as they come; as [`SampleWriter`].
+pub struct FusedWriter<W: Write>(Document<W>);
+
+impl<W: Write> FusedWriter<W> {
+    /// A document in that format; nothing is written yet.
+    pub const fn new(out: W, format: Format) -> Self {
+        Self(Document::new(out, format, "fusions"))
+    }
+
+    /// Writes one fused position.
+    ///
+    /// # Errors
+    /// What the target says.
+    pub fn write(&mut self, fused: &FusedFix) -> io::Result<()> {
+        let row = wire::FusedFix::from(fused);
+        match self.0.format {
+            Format::Csv => self.0.csv_row(fused_header, |out| fused_cells(out, &row)),
+            Format::Ndjson | Format::Json => self.0.json_row(&row),
+            Format::GeoJson => self.0.json_row(&Feature::new(row.fused, &row)),
+        }
+    }
+
+    /// The target, for taking away what is written so far.
+    pub const fn get_mut(&mut self) -> &mut W {
+        &mut self.0.out
+    }
+
+    /// Ends the document and gives back the target.
+    ///
+    /// # Errors
+    /// What the target says.
+    pub fn finish(self) -> io::Result<W> {
+        self.0.finish(fused_header)
+    }
+}
+
+/// Writes samples as one document.
+///
+/// # Errors
+/// What the target says.
+pub fn write_samples<'a, W: Write>(
+    out: W,
+    format: Format,
+    samples: impl IntoIterator<Item = &'a Sample>,
+) -> io::Result<W> {
+    let mut writer = SampleWriter::new(out, format);
+    for sample in samples {
+        writer.write(sample)?;
+    }
+    writer.finish()
+}
+
+/// Writes fused positions as one document.
+///
+/// # Errors
+/// What the target says.
+pub fn write_fused<'a, W: Write>(
+    out: W,
+    format: Format,
+    fused: impl IntoIterator<Item = &'a FusedFix>,
+) -> io::Result<W> {
+    let mut writer = FusedWriter::new(out, format);
+    for row in fused {
+        writer.write(row)?;
+    }
+    writer.finish()
+}
+
+/// What all documents have in common: how they begin, part their rows, and end.
+struct Document<W> {
+    out: W,
+    format: Format,
+    /// The rows' name in a JSON document.
+    name: &'static str,
+    begun: bool,
+}
+
+impl<W: Write> Document<W> {
+    const fn new(out: W, format: Format, name: &'static str) -> Self {
+        Self { out, format, name, begun: false }
+    }
+
+    fn csv_row(
+        &mut self,
+        header: fn(&mut W) -> io::Result<()>,
+        cells: impl FnOnce(&mut W) -> io::Result<()>,
+    ) -> io::Result<()> {
+        if !self.begun {
+            self.begun = true;
+            header(&mut self.out)?;
+        }
+        cells(&mut self.out)
+    }
+
+    fn json_row(&mut self, row: &impl Serialize) -> io::Result<()> {
+        match self.format {
+            Format::Json | Format::GeoJson if self.begun => self.out.write_all(b",\n")?,
+            Format::Json | Format::GeoJson => self.begin()?,
+            Format::Csv | Format::Ndjson => {}
+        }
+        self.begun = true;
+        serde_json::to_writer(&mut self.out, row)?;
+        if self.format == Format::Ndjson { self.out.write_all(b"\n") } else { Ok(()) }
+    }
+
+    fn begin(&mut self) -> io::Result<()> {
+        if self.format == Format::GeoJson {
+            self.out.write_all(b"{\"type\":\"FeatureCollection\",\"features\":[\n")
+        } else {
+            writeln!(self.out, "{{\"{}\":[", self.name)
+        }
+    }
+
+    fn finish(mut self, header: fn(&mut W) -> io::Result<()>) -> io::Result<W> {
+        match self.format {
+            Format::Csv if !self.begun => header(&mut self.out)?,
+            Format::Csv | Format::Ndjson => {}
+            Format::Json | Format::GeoJson => {
+                if !self.begun {
+                    self.begin()?;
+                }
+                self.out.write_all(b"\n]}\n")?;
+            }
+        }
+        self.out.flush()?;
+        Ok(self.out)
+    }
+}
+
+fn sample_header<W: Write>(out: &mut W) -> io::Result<()> {
+    for (index, column) in COLUMNS.iter().enumerate() {
+        let end = if index + 1 < COLUMNS.len() { "," } else { "\n" };
+        write!(out, "{}{end}", column.plain)?;
+    }
+    Ok(())
+}
+
+fn sample_cells<W: Write>(out: &mut W, row: &wire::Sample<'_>) -> io::Result<()> {
+    let wire::BoundingBox { left_px, top_px, width_px, height_px } = row.bounding_box;
+    write!(out, "{},{},", row.time, quoted(row.target_id))?;
+    write!(out, "{left_px},{top_px},{width_px},{height_px},")?;
+    write!(out, "{:.8},{:.8},", row.fix.longitude_deg, row.fix.latitude_deg)?;
+    cell(out, row.fix.sigma_m)?;
+    cell(out, row.class.map(quoted))?;
+    cell(out, row.score)?;
+    match row.truth {
+        Some(truth) => writeln!(out, "{:.8},{:.8}", truth.longitude_deg, truth.latitude_deg),
+        None => writeln!(out, ","),
+    }
+}
+
+const FUSED_COLUMNS: &str = "time,target_id,longitude,latitude,r95_m,regressed_longitude,regressed_latitude,\
+                             gnss_longitude,gnss_latitude,gnss_sigma_m,confidence_regression,\
+                             confidence_gnss,e_regression_m2,e_gnss_m2,reconstruction_error,\
+                             model_version,flags";
+
+fn fused_header<W: Write>(out: &mut W) -> io::Result<()> {
+    writeln!(out, "{FUSED_COLUMNS}")
+}
+
+fn fused_cells<W: Write>(out: &mut W, row: &wire::FusedFix<'_>) -> io::Result<()> {
+    write!(out, "{},{},", row.time, row.target_id.map(quoted).unwrap_or_default())?;
+    degrees(out, Some(row.fused))?;
+    write!(out, "{},", row.r95_m)?;
+    degrees(out, row.regressed)?;
+    let fix = row.gnss;
+    degrees(
+        out,
+        fix.map(|wire::Fix { longitude_deg, latitude_deg, .. }| wire::Position {
+            longitude_deg,
+            latitude_deg,
+        }),
+    )?;
+    cell(out, fix.and_then(|fix| fix.sigma_m))?;
+    write!(out, "{},{},", row.confidence_regression, row.confidence_gnss)?;
+    cell(out, row.e_regression_m2)?;
+    cell(out, row.e_gnss_m2)?;
+    cell(out, row.reconstruction_error)?;
+    cell(out, row.model_version)?;
+    writeln!(out, "{}", row.flags)
+}
+
+fn degrees<W: Write>(out: &mut W, position: Option<wire::Position>) -> io::Result<()> {
+    match position {
+        Some(position) => write!(out, "{:.8},{:.8},", position.longitude_deg, position.latitude_deg),
+        None => out.write_all(b",,"),
+    }
+}
+
+/// A value and the comma after it; nothing but the comma if there is none.
+fn cell<W: Write>(out: &mut W, value: Option<impl Display>) -> io::Result<()> {
+    match value {
+        Some(value) => write!(out, "{value},"),
+        None => out.write_all(b","),
+    }
+}
+
+/// Names hold no control characters, so only commas and quotes need quotes around them.
+fn quoted(name: &str) -> Cow<'_, str> {
+    if name.contains([',', '"']) {
+        Cow::Owned(format!("\"{}\"", name.replace('"', "\"\"")))
+    } else {
+        Cow::Borrowed(name)
+    }
+}
+
+/// A GeoJSON feature: a point and what is known of it.
+#[derive(Serialize)]
+struct Feature<P> {
+    r#type: &'static str,
+    geometry: Point,
+    properties: P,
+}
+
+#[derive(Serialize)]
+struct Point {
+    r#type: &'static str,
+    coordinates: [f64; 2],
+}
+
+impl<P> Feature<P> {
+    const fn new(place: wire::Position, properties: P) -> Self {
+        let coordinates = [place.longitude_deg, place.latitude_deg];
+        Self { r#type: "Feature", geometry: Point { r#type: "Point", coordinates }, properties }
+    }
+}

@@ -1,0 +1,115 @@
+//! A full camera: pinhole, radial distortion, height, pan and tilt. No method ever sees it.
+//!
+//! What never happens here: noise.
+
+use crate::domain::ImageSize;
+use crate::geo::EastNorth;
+
+/// A point of the world: metres east, north and up of the foot of the camera's mast.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Point {
+    pub(super) ground: EastNorth,
+    pub(super) up_m: f64,
+}
+
+/// A camera on a mast at the origin of the plane.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Camera {
+    pub(super) image_size: ImageSize,
+    pub(super) height_m: f64,
+    pub(super) focal_px: f64,
+    /// Where the optical axis points: clockwise from north.
+    pub(super) pan_deg: f64,
+    /// Below the horizon.
+    pub(super) tilt_deg: f64,
+    /// Radial displacement at the image's corner as a share of its distance from the centre;
+    /// negative is a barrel.
+    pub(super) lens_distortion: f64,
+}
+
+impl Camera {
+    /// Column and row of a point, px; `None` for what lies behind the camera.
+    pub(super) fn project(&self, point: Point) -> Option<[f64; 2]> {
+        let (sin_pan, cos_pan) = self.pan_deg.to_radians().sin_cos();
+        let (sin_tilt, cos_tilt) = self.tilt_deg.to_radians().sin_cos();
+        let EastNorth { east_m, north_m } = point.ground;
+        let down_m = self.height_m - point.up_m;
+        let ahead_m = sin_pan * east_m + cos_pan * north_m;
+        let right_m = cos_pan * east_m - sin_pan * north_m;
+        let depth_m = cos_tilt * ahead_m + sin_tilt * down_m;
+        if depth_m < 0.1 {
+            return None;
+        }
+        let below_m = cos_tilt * down_m - sin_tilt * ahead_m;
+        let (column, row) = (self.focal_px * right_m / depth_m, self.focal_px * below_m / depth_m);
+        let (width_px, height_px) = self.size_px();
+        let bend = self.distortion(column.hypot(row) / (0.5 * width_px.hypot(height_px)));
+        Some([0.5 * width_px + bend * column, 0.5 * height_px + bend * row])
+    }
+
+    /// Factor on the distance from the centre, at that distance in half diagonals. A strong barrel
+    /// would fold the outermost points back into the image; there the factor stays as it is.
+    fn distortion(&self, radius: f64) -> f64 {
+        let turning =
+            if self.lens_distortion < 0.0 { (-1.0 / (3.0 * self.lens_distortion)).sqrt() } else { 2.0 };
+        let inner = radius.min(turning);
+        1.0 + self.lens_distortion * inner * inner
+    }
+
+    /// Width and height of the image, px.
+    pub(super) fn size_px(&self) -> (f64, f64) {
+        (f64::from(self.image_size.width_px()), f64::from(self.image_size.height_px()))
+    }
+
+    /// (left, top, right, bottom) of the smallest rectangle about some points, px, uncut; `None` if
+    /// any of them lies behind the camera.
+    pub(super) fn extents(&self, body: &[Point]) -> Option<[f64; 4]> {
+        let mut extents = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
+        for &point in body {
+            let [column, row] = self.project(point)?;
+            extents =
+                [extents[0].min(column), extents[1].min(row), extents[2].max(column), extents[3].max(row)];
+        }
+        Some(extents)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera(lens_distortion: f64) -> Camera {
+        Camera {
+            image_size: ImageSize::new(1280, 720).expect("valid"),
+            height_m: 10.0,
+            focal_px: 1000.0,
+            pan_deg: 90.0,
+            tilt_deg: 45.0,
+            lens_distortion,
+        }
+    }
+
+    fn at(east_m: f64, north_m: f64, up_m: f64) -> Point {
+        Point { ground: EastNorth { east_m, north_m }, up_m }
+    }
+
+    #[test]
+    fn the_axis_hits_the_middle_of_the_image_and_up_is_up() {
+        let [column, row] = camera(0.0).project(at(10.0, 0.0, 0.0)).expect("in front");
+        assert!((column - 640.0).abs() < 1e-9 && (row - 360.0).abs() < 1e-9, "{column} {row}");
+        let [_, higher] = camera(0.0).project(at(10.0, 0.0, 1.0)).expect("in front");
+        assert!(higher < row);
+        // Looking east, south is to the right.
+        let [right, _] = camera(0.0).project(at(10.0, -1.0, 0.0)).expect("in front");
+        assert!((right - 640.0 - 1000.0 / (10.0 * 2.0f64.sqrt())).abs() < 1e-9, "{right}");
+        assert!(camera(0.0).project(at(-30.0, 0.0, 0.0)).is_none());
+    }
+
+    #[test]
+    fn a_barrel_draws_points_to_the_middle() {
+        let point = at(10.0, -5.0, 0.0);
+        let [straight, _] = camera(0.0).project(point).expect("in front");
+        let [bent, _] = camera(-0.1).project(point).expect("in front");
+        assert!(bent < straight && bent > 640.0, "{bent} {straight}");
+    }
+}

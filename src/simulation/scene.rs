@@ -1,0 +1,208 @@
+//! The two scenes: what stands where, what moves in them, and how large it is.
+
+use std::f64::consts::TAU;
+use std::fmt;
+use std::str::FromStr;
+
+use rand::{Rng, RngExt};
+
+use super::camera::{Camera, Point};
+use super::noise::ReceiverError;
+use super::path::{Gait, Path, Pose};
+use crate::domain::{Error, ImageSize, Result};
+use crate::geo::{EastNorth, Position};
+
+/// White part of a phone's error per axis, m; the rest is coloured (METHOD.md 2.5, measured).
+const PHONE_WHITE_M: f64 = 0.13;
+
+/// A kind of place with its targets and receiver.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Scene {
+    /// The paper's scenario 1: an aircraft of 35 m taxiing along a straight and a curve, white
+    /// GNSS noise.
+    Airport,
+    /// A walker on a square, with a halt and a corner, and a phone's coloured GNSS error.
+    Square,
+}
+
+impl Scene {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Airport, Self::Square];
+
+    /// The one name used everywhere.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Airport => "airport",
+            Self::Square => "square",
+        }
+    }
+
+    /// Class and stem of the ids of its targets.
+    pub(super) const fn class(self) -> &'static str {
+        match self {
+            Self::Airport => "aircraft",
+            Self::Square => "person",
+        }
+    }
+
+    /// Where the camera's mast stands.
+    pub(super) fn origin(self) -> Position {
+        let (longitude_deg, latitude_deg) = match self {
+            Self::Airport => (11.786_1, 48.353_8),
+            Self::Square => (24.745_3, 59.437_1),
+        };
+        Position::new(longitude_deg, latitude_deg).expect("constants within range")
+    }
+
+    /// The camera of that draw. A longer lens lets the border cut boxes on the square; at the
+    /// airport the aircraft enters and leaves by the border anyway.
+    pub(super) fn camera(self, border_cuts: bool, lens_distortion: f64, random: &mut impl Rng) -> Camera {
+        let (size, height_m, focal_px, tilt_deg) = match self {
+            Self::Airport => ((1920, 1080), 30.0, 1660.0, 4.0),
+            Self::Square => ((1280, 720), 7.0, if border_cuts { 1800.0 } else { 1080.0 }, 13.0),
+        };
+        Camera {
+            image_size: ImageSize::new(size.0, size.1).expect("constants above 0"),
+            height_m: height_m * random.random_range(0.9..1.1),
+            focal_px: focal_px * random.random_range(0.96..1.04),
+            pan_deg: 360.0 * random.random::<f64>(),
+            tilt_deg: tilt_deg + random.random_range(-0.7..0.7),
+            lens_distortion,
+        }
+    }
+
+    /// The lines that targets follow in turn, about the camera's axis.
+    pub(super) fn paths(self, pan_deg: f64) -> Vec<Path> {
+        let at = |right_m: f64, ahead_m: f64| turned(right_m, ahead_m, pan_deg);
+        match self {
+            Self::Airport => {
+                let (from, to) = (at(-250.0, 260.0), at(250.0, 330.0));
+                let straight = Path { points: vec![from, to] };
+                vec![straight, Path::bent(from, at(30.0, 299.0), at(10.0, 620.0), 90.0)]
+            }
+            Self::Square => vec![Path { points: vec![at(-9.0, 19.0), at(11.0, 25.0), at(2.0, 50.0)] }],
+        }
+    }
+
+    /// How far aside the line lies that no training pass has followed, m.
+    pub(super) const fn new_line_aside_m(self) -> f64 {
+        match self {
+            Self::Airport => 20.0,
+            Self::Square => 2.0,
+        }
+    }
+
+    pub(super) const fn gait(self) -> Gait {
+        match self {
+            Self::Airport => {
+                Gait { speed_mps: 9.0, speed_spread_mps: 1.5, wander_m: 1.0, halt_s: 0.0, both_ways: false }
+            }
+            Self::Square => {
+                Gait { speed_mps: 1.25, speed_spread_mps: 0.12, wander_m: 0.3, halt_s: 40.0, both_ways: true }
+            }
+        }
+    }
+
+    /// Seconds between two passes of a target.
+    pub(super) fn pause_s(self, random: &mut impl Rng) -> i64 {
+        match self {
+            Self::Airport => random.random_range(60..180),
+            Self::Square => random.random_range(40..90),
+        }
+    }
+
+    /// A receiver of that standard deviation per axis.
+    pub(super) fn receiver_error(self, sigma_m: f64, random: &mut impl Rng) -> ReceiverError {
+        match self {
+            Self::Airport => ReceiverError { white_m: sigma_m, coloured_m: 0.0, time_constant_s: 1.0 },
+            Self::Square => {
+                let white_m = PHONE_WHITE_M.min(sigma_m);
+                ReceiverError {
+                    white_m,
+                    coloured_m: (sigma_m * sigma_m - white_m * white_m).sqrt(),
+                    time_constant_s: random.random_range(35.0..60.0),
+                }
+            }
+        }
+    }
+
+    /// The corners of a target's body; `scale` 1 is the scene's usual size.
+    pub(super) fn body(self, pose: Pose, scale: f64, random: &mut impl Rng) -> Vec<Point> {
+        let [east, north] = pose.heading;
+        let corner = |ahead_m: f64, left_m: f64, up_m: f64| Point {
+            ground: EastNorth {
+                east_m: pose.place.east_m + scale * (ahead_m * east - left_m * north),
+                north_m: pose.place.north_m + scale * (ahead_m * north + left_m * east),
+            },
+            up_m: scale * up_m,
+        };
+        match self {
+            Self::Airport => aircraft(&corner),
+            Self::Square => walker(&corner, random),
+        }
+    }
+}
+
+/// An airliner of 35 m; its antenna is on the roof, 3 m ahead of the middle.
+fn aircraft(corner: &dyn Fn(f64, f64, f64) -> Point) -> Vec<Point> {
+    let mut body = vec![
+        corner(14.5, 0.0, 3.0),
+        corner(9.5, 0.0, 0.0),
+        corner(-19.0, 0.0, 11.8),
+        corner(-20.5, 0.0, 11.8),
+        corner(-20.5, 0.0, 4.5),
+    ];
+    for side in [-1.0, 1.0] {
+        body.extend([
+            corner(9.0, side * 2.0, 5.5),
+            corner(9.0, side * 2.0, 1.5),
+            corner(-10.0, side * 2.0, 5.8),
+            corner(-4.5, side * 3.8, 0.0),
+            corner(-8.0, side * 17.0, 4.2),
+            corner(-18.5, side * 6.0, 5.5),
+        ]);
+    }
+    body
+}
+
+/// A person of 1.72 m; arms and legs change the box's width with every step.
+fn walker(corner: &dyn Fn(f64, f64, f64) -> Point, random: &mut impl Rng) -> Vec<Point> {
+    let stride_m = 0.28 * (TAU * random.random::<f64>()).sin().abs();
+    let mut body = vec![corner(0.0, 0.0, 1.72)];
+    for side in [-1.0, 1.0] {
+        body.extend([
+            corner(0.0, side * 0.24, 1.4),
+            corner(0.0, side * 0.24, 0.8),
+            corner(side * stride_m, side * 0.08, 0.0),
+            corner(side * 0.8 * stride_m, side * 0.24, 0.9),
+        ]);
+    }
+    body
+}
+
+/// A place given from the camera's foot to the right of and along its axis.
+fn turned(right_m: f64, ahead_m: f64, pan_deg: f64) -> EastNorth {
+    let (sin_pan, cos_pan) = pan_deg.to_radians().sin_cos();
+    EastNorth {
+        east_m: cos_pan * right_m + sin_pan * ahead_m,
+        north_m: cos_pan * ahead_m - sin_pan * right_m,
+    }
+}
+
+impl fmt::Display for Scene {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(self.as_str())
+    }
+}
+
+impl FromStr for Scene {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::ALL
+            .into_iter()
+            .find(|scene| scene.as_str() == name)
+            .ok_or_else(|| Error::invalid("scene", "must be one of airport, square"))
+    }
+}

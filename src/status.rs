@@ -1,0 +1,92 @@
+//! The one table from an error's kind to what each transport says.
+
+use crate::domain::ErrorKind;
+
+/// How an error kind is told to a client.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Status {
+    /// Status of the HTTP answer.
+    pub http: u16,
+    /// Number of the gRPC status code.
+    pub grpc: i32,
+    /// Last part of the problem's `type` and the `reason` of gRPC's `ErrorInfo`; stable.
+    pub slug: &'static str,
+    /// Title of the problem, the same for every occurrence.
+    pub title: &'static str,
+}
+
+/// Where the problem types are described; a slug follows.
+pub const PROBLEM_TYPE_PREFIX: &str = "urn:sightfix:problem:";
+
+mod code {
+    pub(super) const CANCELLED: i32 = 1;
+    pub(super) const INVALID_ARGUMENT: i32 = 3;
+    pub(super) const DEADLINE_EXCEEDED: i32 = 4;
+    pub(super) const NOT_FOUND: i32 = 5;
+    pub(super) const ALREADY_EXISTS: i32 = 6;
+    pub(super) const RESOURCE_EXHAUSTED: i32 = 8;
+    pub(super) const FAILED_PRECONDITION: i32 = 9;
+    pub(super) const ABORTED: i32 = 10;
+    pub(super) const UNIMPLEMENTED: i32 = 12;
+    pub(super) const INTERNAL: i32 = 13;
+    pub(super) const UNAVAILABLE: i32 = 14;
+}
+
+/// The row of the table.
+#[must_use]
+pub const fn of(kind: ErrorKind) -> Status {
+    let (http, grpc, slug, title) = match kind {
+        ErrorKind::InvalidArgument => {
+            (422, code::INVALID_ARGUMENT, "invalid-argument", "A field has a value that cannot be used")
+        }
+        ErrorKind::MalformedBody => {
+            (400, code::INVALID_ARGUMENT, "malformed-body", "The body is not of its format")
+        }
+        ErrorKind::UnsupportedMediaType => {
+            (415, code::INVALID_ARGUMENT, "unsupported-media-type", "The content type is not read here")
+        }
+        ErrorKind::NotAcceptable => {
+            (406, code::INVALID_ARGUMENT, "not-acceptable", "None of the accepted types is written here")
+        }
+        ErrorKind::TooLarge => (413, code::RESOURCE_EXHAUSTED, "too-large", "The request is beyond a limit"),
+        ErrorKind::RouteNotFound => (404, code::UNIMPLEMENTED, "route-not-found", "There is no such path"),
+        ErrorKind::MethodNotAllowed => {
+            (405, code::UNIMPLEMENTED, "method-not-allowed", "The path does not know this method")
+        }
+        ErrorKind::CameraNotFound => (404, code::NOT_FOUND, "camera-not-found", "There is no such camera"),
+        ErrorKind::RunNotFound => (404, code::NOT_FOUND, "run-not-found", "There is no such training run"),
+        ErrorKind::ModelNotFound => {
+            (404, code::NOT_FOUND, "model-not-found", "There is no such model version")
+        }
+        ErrorKind::EvaluationNotFound => {
+            (404, code::NOT_FOUND, "evaluation-not-found", "There is no such evaluation")
+        }
+        ErrorKind::TrackNotFound => (404, code::NOT_FOUND, "track-not-found", "There is no such track"),
+        ErrorKind::CameraExists => {
+            (409, code::ALREADY_EXISTS, "camera-exists", "A camera of that id exists already")
+        }
+        ErrorKind::RevisionMismatch => {
+            (412, code::ABORTED, "revision-mismatch", "The camera was changed in the meantime")
+        }
+        ErrorKind::RevisionRequired => (
+            428,
+            code::FAILED_PRECONDITION,
+            "revision-required",
+            "The change needs the revision it is based on",
+        ),
+        ErrorKind::NoModel => (409, code::FAILED_PRECONDITION, "no-model", "The camera has no active model"),
+        ErrorKind::RunLive => {
+            (409, code::FAILED_PRECONDITION, "run-live", "The camera has a training run that has not ended")
+        }
+        ErrorKind::RunEnded => (409, code::FAILED_PRECONDITION, "run-ended", "The training run has ended"),
+        ErrorKind::UnusableSamples => {
+            (422, code::FAILED_PRECONDITION, "unusable-samples", "The samples cannot support a fit")
+        }
+        ErrorKind::Cancelled => (499, code::CANCELLED, "cancelled", "The request was cancelled"),
+        ErrorKind::Overloaded => (503, code::UNAVAILABLE, "overloaded", "The server has too much to do"),
+        ErrorKind::Timeout => (408, code::DEADLINE_EXCEEDED, "timeout", "The request took too long"),
+        ErrorKind::ShuttingDown => (503, code::UNAVAILABLE, "shutting-down", "The server is ending"),
+        ErrorKind::Internal => (500, code::INTERNAL, "internal", "The server failed"),
+    };
+    Status { http, grpc, slug, title }
+}

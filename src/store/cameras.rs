@@ -1,0 +1,231 @@
+//! Profiles of cameras.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use sqlx::sqlite::{SqliteArguments, SqliteRow};
+use sqlx::{Sqlite, SqliteExecutor};
+
+use super::Store;
+use super::faults::{failed, no_camera};
+use super::fields::Fields;
+use crate::domain::{
+    Camera, CameraId, Error, ErrorKind, GnssError, ImageSize, NewCamera, Result, Revision, SigmaM,
+    TargetClass,
+};
+
+macro_rules! columns {
+    () => {
+        "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, target_classes, \
+         labels, revision, created_at_us, updated_at_us, active_model"
+    };
+}
+
+type Query = sqlx::query::Query<'static, Sqlite, SqliteArguments>;
+
+impl Store {
+    /// Stores a new camera with revision 1.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraExists`].
+    pub async fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera> {
+        let mut turn = self.synced().await?;
+        let mut transaction = turn.begin().await?;
+        let insert = sqlx::query(concat!(
+            "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, \
+             target_classes, labels, updated_at_us, id, created_at_us, revision) \
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
+            columns!()
+        ));
+        let row = bind_profile(insert, profile, now)?
+            .bind(profile.id.as_str().to_owned())
+            .bind(now.as_microsecond())
+            .fetch_optional(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        let Some(row) = row else {
+            let taken = format!("a camera of the id {} exists already", profile.id);
+            return Err(Error::field(ErrorKind::CameraExists, "id", taken));
+        };
+        let camera = read_camera(&row)?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(camera)
+    }
+
+    /// One camera.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    pub async fn camera(&self, id: &CameraId) -> Result<Camera> {
+        find_camera(self.readers(), id).await
+    }
+
+    /// A page of cameras ordered by id, after an id.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn cameras(&self, after: Option<&CameraId>, limit: u32) -> Result<Vec<Camera>> {
+        let page = concat!("SELECT ", columns!(), " FROM cameras WHERE id > ? ORDER BY id LIMIT ?");
+        let rows = sqlx::query(page)
+            .bind(after.map_or("", CameraId::as_str).to_owned())
+            .bind(limit)
+            .fetch_all(self.readers())
+            .await
+            .map_err(failed)?;
+        rows.iter().map(read_camera).collect()
+    }
+
+    /// Id, revision and active model of every camera: enough to see what has changed.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn camera_heads(&self) -> Result<Vec<(CameraId, Revision, Option<u32>)>> {
+        let rows = sqlx::query("SELECT id, revision, active_model FROM cameras")
+            .fetch_all(self.readers())
+            .await
+            .map_err(failed)?;
+        let read = |row| {
+            let mut fields = Fields::of("cameras", row);
+            let id = fields.make(CameraId::new)?;
+            let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
+            Ok((id, revision, fields.some_count()?))
+        };
+        rows.iter().map(read).collect()
+    }
+
+    /// Puts a profile in the place of the stored one and counts its revision up, if the stored
+    /// revision is the expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`].
+    pub async fn replace_camera(
+        &self,
+        profile: &NewCamera,
+        expected: Option<Revision>,
+        now: Timestamp,
+    ) -> Result<Camera> {
+        let mut turn = self.synced().await?;
+        let mut transaction = turn.begin().await?;
+        check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
+        let update = sqlx::query(concat!(
+            "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
+             gnss_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, updated_at_us = ?, \
+             revision = revision + 1 WHERE id = ? RETURNING ",
+            columns!()
+        ));
+        let row = bind_profile(update, profile, now)?
+            .bind(profile.id.as_str().to_owned())
+            .fetch_one(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        let camera = read_camera(&row)?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(camera)
+    }
+
+    /// Deletes a camera with its samples, runs and models, if its revision is the expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::RunLive`] while a
+    /// training run has not ended.
+    pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
+        let mut turn = self.synced().await?;
+        let mut transaction = turn.begin().await?;
+        check_revision(&find_camera(&mut *transaction, id).await?, expected)?;
+        let live: i64 = sqlx::query_scalar(
+            "SELECT count(*) FROM training_runs JOIN cameras ON cameras.key = camera_key \
+             WHERE cameras.id = ? AND state IN ('queued', 'running')",
+        )
+        .bind(id.as_str())
+        .fetch_one(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        if live > 0 {
+            return Err(Error::refused(
+                ErrorKind::RunLive,
+                "the camera has a training run that has not ended; cancel it first",
+            ));
+        }
+        sqlx::query("DELETE FROM cameras WHERE id = ?")
+            .bind(id.as_str())
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        transaction.commit().await.map_err(failed)
+    }
+}
+
+/// One camera, inside or outside of a transaction.
+pub(super) async fn find_camera(executor: impl SqliteExecutor<'_>, id: &CameraId) -> Result<Camera> {
+    let row = sqlx::query(concat!("SELECT ", columns!(), " FROM cameras WHERE id = ?"))
+        .bind(id.as_str())
+        .fetch_optional(executor)
+        .await
+        .map_err(failed)?;
+    read_camera(&row.ok_or_else(|| no_camera(id))?)
+}
+
+/// The number by which the other tables call a camera.
+pub(super) async fn camera_key(executor: impl SqliteExecutor<'_>, id: &CameraId) -> Result<i64> {
+    sqlx::query_scalar("SELECT key FROM cameras WHERE id = ?")
+        .bind(id.as_str())
+        .fetch_optional(executor)
+        .await
+        .map_err(failed)?
+        .ok_or_else(|| no_camera(id))
+}
+
+fn check_revision(camera: &Camera, expected: Option<Revision>) -> Result<()> {
+    match expected {
+        Some(expected) if expected != camera.revision => Err(Error::refused(
+            ErrorKind::RevisionMismatch,
+            format!(
+                "the camera is at revision {}, not {}; read it again and repeat the change",
+                camera.revision.0, expected.0
+            ),
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Binds the changeable columns in the order that INSERT and UPDATE share.
+fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Query> {
+    let sigma_m = match profile.gnss_error {
+        GnssError::Known(sigma_m) => Some(sigma_m.metres()),
+        GnssError::Unknown => None,
+    };
+    let classes: Vec<&str> = profile.target_classes.iter().map(TargetClass::as_str).collect();
+    Ok(query
+        .bind(profile.display_name.clone())
+        .bind(profile.image_size.map(ImageSize::width_px))
+        .bind(profile.image_size.map(ImageSize::height_px))
+        .bind(sigma_m)
+        .bind(profile.recipe.as_str())
+        .bind(serde_json::to_string(&classes).map_err(Error::fault)?)
+        .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
+        .bind(now.as_microsecond()))
+}
+
+fn read_camera(row: &SqliteRow) -> Result<Camera> {
+    let mut fields = Fields::of("cameras", row).skip(1);
+    let id = fields.make(CameraId::new)?;
+    let display_name = fields.take()?;
+    let width_px = fields.some_count()?;
+    let height_px = fields.some_count()?;
+    let image_size = width_px.zip(height_px).map(|(width, height)| ImageSize::new(width, height)).transpose();
+    let image_size = fields.made(image_size)?;
+    let gnss_error = fields.make_some(SigmaM::new)?.map_or(GnssError::Unknown, GnssError::Known);
+    let recipe = fields.make(|name: &str| name.parse())?;
+    let target_classes = fields.make(read_classes)?;
+    let labels = fields.make(serde_json::from_str::<BTreeMap<String, String>>)?;
+    let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
+    let (created_at, updated_at) = (fields.time()?, fields.time()?);
+    let active_model = fields.some_count()?;
+    let profile = NewCamera { id, display_name, image_size, gnss_error, recipe, target_classes, labels };
+    Ok(Camera { profile, revision, created_at, updated_at, active_model })
+}
+
+fn read_classes(json: &str) -> Result<Vec<TargetClass>> {
+    let names: Vec<String> = serde_json::from_str(json).map_err(Error::fault)?;
+    names.iter().map(|name| TargetClass::new(name)).collect()
+}

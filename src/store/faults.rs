@@ -1,0 +1,62 @@
+//! Errors of the database as errors of the domain: the one place where they meet.
+
+use crate::domain::{CameraId, Error, ErrorKind, RunId};
+
+/// A row that does not hold what was written: another program changed it, or the disk did.
+#[derive(Debug, thiserror::Error)]
+#[error("the store is corrupt: table {table}, column {column}, row {row}: {cause}")]
+pub(super) struct Corrupt {
+    pub(super) table: &'static str,
+    pub(super) column: String,
+    pub(super) row: String,
+    pub(super) cause: String,
+}
+
+/// SQLite's primary result code, if the error is SQLite's own.
+pub(super) fn primary_code(error: &sqlx::Error) -> Option<u32> {
+    let extended: u32 = error.as_database_error()?.code()?.parse().ok()?;
+    Some(extended & 0xff)
+}
+
+/// SQLITE_BUSY and SQLITE_LOCKED: another connection holds the file.
+pub(super) fn is_busy(error: &sqlx::Error) -> bool {
+    matches!(primary_code(error), Some(5 | 6))
+}
+
+/// A failed statement: refused where the caller can try again, else a fault.
+pub(super) fn failed(error: sqlx::Error) -> Error {
+    match error {
+        sqlx::Error::PoolClosed => closed(),
+        sqlx::Error::PoolTimedOut => {
+            Error::refused(ErrorKind::Overloaded, "too many reads are waiting for the store; try again")
+        }
+        busy if is_busy(&busy) => {
+            Error::refused(ErrorKind::Overloaded, "another process holds the store; try again")
+        }
+        other => Error::fault(other),
+    }
+}
+
+/// The same error once more, for another caller of the same transaction.
+pub(super) fn same(error: &Error) -> Error {
+    match error {
+        Error::Refused(refusal) => Error::Refused(refusal.clone()),
+        Error::Fault(fault) => Error::fault(fault.to_string()),
+    }
+}
+
+pub(super) fn closed() -> Error {
+    Error::refused(ErrorKind::ShuttingDown, "the server is ending; try again soon")
+}
+
+pub(super) fn no_camera(id: &CameraId) -> Error {
+    Error::refused(ErrorKind::CameraNotFound, format!("no camera has the id {id}"))
+}
+
+pub(super) fn no_run(id: RunId) -> Error {
+    Error::refused(ErrorKind::RunNotFound, format!("no training run has the id {id}"))
+}
+
+pub(super) fn no_model(camera: &CameraId, number: u32) -> Error {
+    Error::refused(ErrorKind::ModelNotFound, format!("camera {camera} has no model version {number}"))
+}

@@ -1,0 +1,313 @@
+//! Storing samples: one task takes what many callers hand in and commits it together.
+//!
+//! A commit costs much more than a row, so whoever waits when a transaction begins is taken along.
+//! Nothing is acknowledged before its commit, and a caller's samples are stored wholly or not at all.
+//! What never happens here: a caller waits for more callers to come, the queue grows without bound, a
+//! caller who went away disturbs the others.
+
+use std::collections::HashMap;
+use std::ops::Range;
+use std::sync::{Arc, LazyLock};
+
+use sqlx::sqlite::SqliteArguments;
+use sqlx::{Arguments, SqliteConnection};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
+
+use super::connection::{Durability, Writer};
+use super::faults::{closed, failed, no_camera, same};
+use crate::domain::{CameraId, Error, Result, Sample};
+
+/// A transaction takes no further caller beyond so many rows.
+const ROWS_PER_TRANSACTION: usize = 4_096;
+
+/// Rows that wait or are being committed; callers beyond wait to hand theirs in.
+const ROWS_IN_FLIGHT: u32 = 65_536;
+
+/// Callers that wait; each hands in at least one row, so more never wait.
+const QUEUE: usize = 16_384;
+
+/// What became of the samples of one call.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Inserted {
+    /// Stored now.
+    pub accepted: u64,
+    /// Stored before, under the same camera, target and time.
+    pub duplicate: u64,
+}
+
+/// The way into the task.
+pub(super) struct GroupCommit {
+    queue: mpsc::Sender<Request>,
+    rows: Arc<Semaphore>,
+}
+
+enum Request {
+    Insert(Batch),
+    /// All before it is committed, then the task ends.
+    End(oneshot::Sender<()>),
+}
+
+struct Batch {
+    camera: CameraId,
+    samples: Vec<Sample>,
+    reply: oneshot::Sender<Result<Inserted>>,
+    /// Makes room for other rows when the batch is done.
+    _room: OwnedSemaphorePermit,
+}
+
+impl GroupCommit {
+    pub(super) fn start(writer: Arc<Writer>) -> Self {
+        let (queue, requests) = mpsc::channel(QUEUE);
+        tokio::spawn(run(writer, requests));
+        Self { queue, rows: Arc::new(Semaphore::new(ROWS_IN_FLIGHT as usize)) }
+    }
+
+    pub(super) async fn insert(&self, camera: CameraId, samples: Vec<Sample>) -> Result<Inserted> {
+        let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
+        let room = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
+        let (reply, answer) = oneshot::channel();
+        let batch = Batch { camera, samples, reply, _room: room };
+        self.queue.send(Request::Insert(batch)).await.map_err(|_| self.gone())?;
+        answer.await.map_err(|_| self.gone())?
+    }
+
+    pub(super) async fn close(&self) {
+        self.rows.close();
+        let (ended, end) = oneshot::channel();
+        if self.queue.send(Request::End(ended)).await.is_ok() {
+            // An error means that the task has ended already, which is what is waited for.
+            let _ = end.await;
+        }
+    }
+
+    pub(super) fn has_ended(&self) -> bool {
+        self.queue.is_closed()
+    }
+
+    /// The task has ended, in order or not.
+    fn gone(&self) -> Error {
+        if self.rows.is_closed() { closed() } else { Error::fault("the task that stores samples has ended") }
+    }
+}
+
+async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
+    while let Some(first) = requests.recv().await {
+        let mut group = Vec::new();
+        let mut rows = 0;
+        let mut next = Some(first);
+        let end = loop {
+            match next {
+                Some(Request::Insert(batch)) => {
+                    rows += batch.samples.len();
+                    group.push(batch);
+                }
+                Some(Request::End(ended)) => break Some(ended),
+                None => break None,
+            }
+            next = if rows < ROWS_PER_TRANSACTION { requests.try_recv().ok() } else { None };
+        };
+        answer_all(&writer, group).await;
+        if let Some(ended) = end {
+            // Whoever asked may have gone; nothing is left to tell.
+            let _ = ended.send(());
+            return;
+        }
+    }
+}
+
+/// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
+/// alone, so that one bad row fails nobody but its caller.
+async fn answer_all(writer: &Writer, group: Vec<Batch>) {
+    match commit(writer, &group).await {
+        Ok(outcomes) => {
+            for (batch, outcome) in group.into_iter().zip(outcomes) {
+                // A caller who went away needs no answer.
+                let _ = batch.reply.send(outcome);
+            }
+        }
+        Err(Failure::Statement(_)) if group.len() > 1 => {
+            for batch in group {
+                let alone = commit(writer, std::slice::from_ref(&batch)).await;
+                let outcome = match alone {
+                    Ok(mut outcomes) => outcomes.swap_remove(0),
+                    Err(Failure::Statement(error) | Failure::Transaction(error)) => Err(error),
+                };
+                let _ = batch.reply.send(outcome);
+            }
+        }
+        Err(Failure::Statement(error) | Failure::Transaction(error)) => {
+            for batch in group {
+                let _ = batch.reply.send(Err(same(&error)));
+            }
+        }
+    }
+}
+
+enum Failure {
+    /// A statement failed; the group's other callers may do better.
+    Statement(Error),
+    /// The transaction could not begin or commit; nobody would do better.
+    Transaction(Error),
+}
+
+/// One transaction for all batches, with an outcome for each, in their order.
+async fn commit(writer: &Writer, group: &[Batch]) -> Result<Vec<Result<Inserted>>, Failure> {
+    let mut turn = writer.turn(Durability::Relaxed).await.map_err(Failure::Transaction)?;
+    for counting in [Counting::Together, Counting::Apart] {
+        let mut transaction = turn.begin().await.map_err(Failure::Transaction)?;
+        let outcomes = store(&mut transaction, group, counting).await.map_err(Failure::Statement)?;
+        if let Some(outcomes) = outcomes {
+            transaction.commit().await.map_err(|error| Failure::Transaction(failed(error)))?;
+            return Ok(outcomes);
+        }
+        transaction.rollback().await.map_err(|error| Failure::Transaction(failed(error)))?;
+    }
+    Err(Failure::Statement(Error::fault("stored samples could not be counted")))
+}
+
+/// How statements and batches go together.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Counting {
+    /// Statements span batches: fast, and countable as long as no row is a duplicate.
+    Together,
+    /// No statement spans batches.
+    Apart,
+}
+
+/// A row with the batch it came from and the key of its camera.
+struct Row<'a> {
+    batch: usize,
+    camera_key: i64,
+    sample: &'a Sample,
+}
+
+/// `None` if a statement over several batches met duplicates, so that nobody can tell whose.
+async fn store(
+    connection: &mut SqliteConnection,
+    group: &[Batch],
+    counting: Counting,
+) -> Result<Option<Vec<Result<Inserted>>>> {
+    let keys = camera_keys(connection, group).await?;
+    let mut outcomes: Vec<Result<Inserted>> = Vec::with_capacity(group.len());
+    let mut rows = Vec::with_capacity(group.iter().map(|batch| batch.samples.len()).sum());
+    let mut borders = Vec::new();
+    for (index, batch) in group.iter().enumerate() {
+        let key = keys.get(batch.camera.as_str());
+        outcomes.push(key.map_or_else(|| Err(no_camera(&batch.camera)), |_| Ok(Inserted::default())));
+        if let Some(&camera_key) = key {
+            rows.extend(batch.samples.iter().map(|sample| Row { batch: index, camera_key, sample }));
+        }
+        if counting == Counting::Apart {
+            borders.push(rows.len());
+        }
+    }
+    borders.push(rows.len());
+    for range in statements(&borders) {
+        let rows = &rows[range];
+        let accepted = insert(connection, rows).await?;
+        if !count(&mut outcomes, rows, accepted) {
+            return Ok(None);
+        }
+    }
+    Ok(Some(outcomes))
+}
+
+/// Adds a statement's count to its batches; false if it cannot be told whose rows were duplicates.
+fn count(outcomes: &mut [Result<Inserted>], rows: &[Row<'_>], accepted: u64) -> bool {
+    let all = rows.len() as u64;
+    let single = rows.first().zip(rows.last()).is_some_and(|(first, last)| first.batch == last.batch);
+    if single {
+        if let Some(Ok(inserted)) = rows.first().and_then(|row| outcomes.get_mut(row.batch)) {
+            inserted.accepted += accepted;
+            inserted.duplicate += all - accepted;
+        }
+        return true;
+    }
+    for row in rows {
+        if let Some(Ok(inserted)) = outcomes.get_mut(row.batch) {
+            inserted.accepted += 1;
+        }
+    }
+    accepted == all
+}
+
+/// The keys of the cameras of a group, read in its own transaction, so that none can vanish before
+/// the commit. One statement for all, since a round trip costs as much as several rows.
+async fn camera_keys(connection: &mut SqliteConnection, group: &[Batch]) -> Result<HashMap<String, i64>> {
+    let mut ids: Vec<&str> = group.iter().map(|batch| batch.camera.as_str()).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    let ids = serde_json::to_string(&ids).map_err(Error::fault)?;
+    let keys: Vec<(String, i64)> =
+        sqlx::query_as("SELECT id, key FROM cameras WHERE id IN (SELECT value FROM json_each(?))")
+            .bind(ids)
+            .fetch_all(connection)
+            .await
+            .map_err(failed)?;
+    Ok(keys.into_iter().collect())
+}
+
+/// Columns bound per row.
+const COLUMNS: usize = 14;
+
+/// Rows per statement, largest first. Few sizes, so that each stays prepared.
+const SIZES: [usize; 6] = [1024, 256, 64, 16, 4, 1];
+
+static INSERTS: LazyLock<[Arc<str>; SIZES.len()]> = LazyLock::new(|| {
+    SIZES.map(|rows| {
+        let row = format!("({})", vec!["?"; COLUMNS].join(","));
+        let sql = format!(
+            "INSERT INTO samples (camera_key, time_us, target_id, left_px, top_px, width_px, height_px, \
+             longitude_deg, latitude_deg, sigma_m, class, score, truth_longitude_deg, truth_latitude_deg) \
+             VALUES {} ON CONFLICT DO NOTHING",
+            vec![row; rows].join(",")
+        );
+        sql.into()
+    })
+});
+
+/// Cuts the stretches between borders into statements of the sizes there are.
+fn statements(borders: &[usize]) -> Vec<Range<usize>> {
+    let mut ranges = Vec::new();
+    let mut start = 0;
+    for &border in borders {
+        for size in SIZES {
+            while border - start >= size {
+                ranges.push(start..start + size);
+                start += size;
+            }
+        }
+    }
+    ranges
+}
+
+/// One statement for as many rows as one of the sizes; returns how many were new.
+async fn insert(connection: &mut SqliteConnection, rows: &[Row<'_>]) -> Result<u64> {
+    let size = SIZES.iter().position(|&size| size == rows.len());
+    let sql = size.map(|size| Arc::clone(&INSERTS[size])).ok_or_else(|| Error::fault("no such statement"))?;
+    let mut arguments = SqliteArguments::default();
+    arguments.reserve(rows.len() * COLUMNS, 0);
+    for row in rows {
+        bind(&mut arguments, row).map_err(Error::fault)?;
+    }
+    let done =
+        sqlx::query_with(sqlx::AssertSqlSafe(sql), arguments).execute(connection).await.map_err(failed)?;
+    Ok(done.rows_affected())
+}
+
+fn bind(arguments: &mut SqliteArguments, row: &Row<'_>) -> Result<(), sqlx::error::BoxDynError> {
+    let sample = row.sample;
+    arguments.add(row.camera_key)?;
+    arguments.add(sample.time.as_microsecond())?;
+    arguments.add(sample.target_id.as_str())?;
+    for side_px in sample.bounding_box.sides_px() {
+        arguments.add(side_px)?;
+    }
+    arguments.add(sample.fix.position.longitude_deg())?;
+    arguments.add(sample.fix.position.latitude_deg())?;
+    arguments.add(sample.fix.sigma_m.map(crate::domain::SigmaM::metres))?;
+    arguments.add(sample.class.as_ref().map(crate::domain::TargetClass::as_str))?;
+    arguments.add(sample.score.map(crate::domain::Score::value))?;
+    arguments.add(sample.truth.map(crate::geo::Position::longitude_deg))?;
+    arguments.add(sample.truth.map(crate::geo::Position::latitude_deg))
+}

@@ -1,0 +1,257 @@
+//! Model versions, and which of them is active.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use sqlx::sqlite::SqliteRow;
+use uuid::Uuid;
+
+use super::Store;
+use super::cameras::{camera_key, find_camera};
+use super::faults::{failed, no_model};
+use super::fields::Fields;
+use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelMetadata, ModelVersion, Result, RunId};
+
+macro_rules! select {
+    ($rest:literal) => {
+        concat!(
+            "SELECT cameras.id, models.number, models.run_id, models.created_at_us, \
+             length(models.weights), models.metadata \
+             FROM models JOIN cameras ON cameras.key = models.camera_key ",
+            $rest
+        )
+    };
+}
+
+impl Store {
+    /// Stores an imported model as the camera's next version; it does not become active.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    pub async fn insert_model(
+        &self,
+        camera: &CameraId,
+        metadata: &ModelMetadata,
+        weights: &[u8],
+        now: Timestamp,
+    ) -> Result<ModelVersion> {
+        let mut turn = self.synced().await?;
+        let mut transaction = turn.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        let number = add_model(&mut transaction, key, None, metadata, weights, now).await?;
+        let version = find_model(&mut transaction, camera, number).await?;
+        transaction.commit().await.map_err(failed)?;
+        version.ok_or_else(|| no_model(camera, number))
+    }
+
+    /// One version, without its weights.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
+    pub async fn model(&self, camera: &CameraId, number: u32) -> Result<ModelVersion> {
+        camera_key(self.readers(), camera).await?;
+        let mut reader = self.readers().acquire().await.map_err(failed)?;
+        find_model(&mut reader, camera, number).await?.ok_or_else(|| no_model(camera, number))
+    }
+
+    /// The weights of one version, as they were handed in.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
+    pub async fn weights(&self, camera: &CameraId, number: u32) -> Result<Vec<u8>> {
+        let key = camera_key(self.readers(), camera).await?;
+        sqlx::query_scalar("SELECT weights FROM models WHERE camera_key = ? AND number = ?")
+            .bind(key)
+            .bind(number)
+            .fetch_optional(self.readers())
+            .await
+            .map_err(failed)?
+            .ok_or_else(|| no_model(camera, number))
+    }
+
+    /// A page of versions, newest first, before a number.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    pub async fn models(
+        &self,
+        camera: &CameraId,
+        before: Option<u32>,
+        limit: u32,
+    ) -> Result<Vec<ModelVersion>> {
+        let key = camera_key(self.readers(), camera).await?;
+        let rows = sqlx::query(select!(
+            "WHERE models.camera_key = ? AND models.number < ? ORDER BY models.number DESC LIMIT ?"
+        ))
+        .bind(key)
+        .bind(before.map_or(i64::MAX, i64::from))
+        .bind(limit)
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        rows.iter().map(read_model).collect()
+    }
+
+    /// Makes a version the one that answers. Naming the active one changes nothing.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
+    pub async fn activate_model(&self, camera: &CameraId, number: u32, now: Timestamp) -> Result<Camera> {
+        let mut turn = self.synced().await?;
+        let mut transaction = turn.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        if find_model(&mut transaction, camera, number).await?.is_none() {
+            return Err(no_model(camera, number));
+        }
+        activate(&mut transaction, key, number, now).await?;
+        let camera = find_camera(&mut *transaction, camera).await?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(camera)
+    }
+
+    /// Goes back to the version that was active before the one that is; again and again, until none
+    /// was.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none was active before.
+    pub async fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera> {
+        let mut turn = self.synced().await?;
+        let mut transaction = turn.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        let latest: Vec<(i64, i64)> = sqlx::query_as(
+            "SELECT position, model_number FROM activations \
+             WHERE camera_key = ? AND rolled_back_at_us IS NULL ORDER BY position DESC LIMIT 2",
+        )
+        .bind(key)
+        .fetch_all(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        let [(position, _), (_, number)] = latest[..] else {
+            return Err(Error::refused(
+                ErrorKind::NoModel,
+                "no other model version was active before; activate one by its number",
+            ));
+        };
+        sqlx::query("UPDATE activations SET rolled_back_at_us = ? WHERE camera_key = ? AND position = ?")
+            .bind(now.as_microsecond())
+            .bind(key)
+            .bind(position)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        point_at(&mut transaction, key, number).await?;
+        let camera = find_camera(&mut *transaction, camera).await?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(camera)
+    }
+
+    /// The cameras that have an active model, with its number.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn active_models(&self) -> Result<Vec<(CameraId, u32)>> {
+        let rows =
+            sqlx::query("SELECT id, active_model FROM cameras WHERE active_model IS NOT NULL ORDER BY id")
+                .fetch_all(self.readers())
+                .await
+                .map_err(failed)?;
+        let read = |row| {
+            let mut fields = Fields::of("cameras", row);
+            Ok((fields.make(CameraId::new)?, fields.count()?))
+        };
+        rows.iter().map(read).collect()
+    }
+}
+
+/// Adds the next version of a camera; returns its number.
+pub(super) async fn add_model(
+    connection: &mut SqliteConnection,
+    camera_key: i64,
+    run: Option<RunId>,
+    metadata: &ModelMetadata,
+    weights: &[u8],
+    now: Timestamp,
+) -> Result<u32> {
+    let metadata = serde_json::to_string(metadata).map_err(Error::fault)?;
+    // JSON has no NaN: it would be written as null and could never be read again.
+    serde_json::from_str::<ModelMetadata>(&metadata)
+        .map_err(|error| Error::fault(format!("the metadata of a model cannot be stored: {error}")))?;
+    let number: i64 = sqlx::query_scalar(
+        "INSERT INTO models (camera_key, number, run_id, created_at_us, metadata, weights) \
+         SELECT ?, coalesce(max(number), 0) + 1, ?, ?, ?, ? FROM models WHERE camera_key = ? RETURNING number",
+    )
+    .bind(camera_key)
+    .bind(run.map(|run| run.to_string()))
+    .bind(now.as_microsecond())
+    .bind(metadata)
+    .bind(weights)
+    .bind(camera_key)
+    .fetch_one(connection)
+    .await
+    .map_err(failed)?;
+    u32::try_from(number).map_err(Error::fault)
+}
+
+/// Moves the pointer to a version that exists, and writes it into the history.
+pub(super) async fn activate(
+    connection: &mut SqliteConnection,
+    camera_key: i64,
+    number: u32,
+    now: Timestamp,
+) -> Result<()> {
+    let active: Option<i64> = sqlx::query_scalar("SELECT active_model FROM cameras WHERE key = ?")
+        .bind(camera_key)
+        .fetch_one(&mut *connection)
+        .await
+        .map_err(failed)?;
+    if active == Some(i64::from(number)) {
+        return Ok(());
+    }
+    sqlx::query(
+        "INSERT INTO activations (camera_key, position, model_number, activated_at_us) \
+         SELECT ?, coalesce(max(position), 0) + 1, ?, ? FROM activations WHERE camera_key = ?",
+    )
+    .bind(camera_key)
+    .bind(number)
+    .bind(now.as_microsecond())
+    .bind(camera_key)
+    .execute(&mut *connection)
+    .await
+    .map_err(failed)?;
+    point_at(connection, camera_key, i64::from(number)).await
+}
+
+async fn point_at(connection: &mut SqliteConnection, camera_key: i64, number: i64) -> Result<()> {
+    sqlx::query("UPDATE cameras SET active_model = ? WHERE key = ?")
+        .bind(number)
+        .bind(camera_key)
+        .execute(connection)
+        .await
+        .map_err(failed)?;
+    Ok(())
+}
+
+async fn find_model(
+    connection: &mut SqliteConnection,
+    camera: &CameraId,
+    number: u32,
+) -> Result<Option<ModelVersion>> {
+    let row = sqlx::query(select!("WHERE cameras.id = ? AND models.number = ?"))
+        .bind(camera.as_str())
+        .bind(number)
+        .fetch_optional(connection)
+        .await
+        .map_err(failed)?;
+    row.as_ref().map(read_model).transpose()
+}
+
+fn read_model(row: &SqliteRow) -> Result<ModelVersion> {
+    let mut fields = Fields::of("models", row);
+    Ok(ModelVersion {
+        camera_id: fields.make(CameraId::new)?,
+        number: fields.count()?,
+        run_id: fields.make_some(Uuid::parse_str)?.map(RunId),
+        created_at: fields.time()?,
+        weights_bytes: fields.make(|stored: i64| u64::try_from(stored))?,
+        metadata: fields.make(serde_json::from_str)?,
+    })
+}

@@ -1,0 +1,149 @@
+//! What a run leaves behind while it fits: its curve and its log.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+
+use super::Store;
+use super::faults::{failed, no_run};
+use super::fields::Fields;
+use crate::domain::{EpochReport, Result, RunId};
+
+/// Lines of a run's log; older ones are dropped.
+const LOG_LINES: i64 = 1_000;
+
+/// Bytes of one line; the rest is cut.
+const LINE_BYTES: usize = 4_000;
+
+impl Store {
+    /// Adds points to the curve of a run. An epoch that is there already is replaced. Does nothing
+    /// once the run was lost to another worker or has ended, which the next heartbeat tells.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()> {
+        let mut turn = self.relaxed().await?;
+        let mut transaction = turn.begin().await?;
+        if !is_mine(&mut transaction, run, fence).await? {
+            return Ok(());
+        }
+        for report in epochs {
+            sqlx::query(
+                "INSERT INTO training_epochs \
+                 (run_id, epoch, loss, reconstruction_error, regression_error, error_scale) \
+                 VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (run_id, epoch) DO UPDATE SET loss = excluded.loss, \
+                 reconstruction_error = excluded.reconstruction_error, \
+                 regression_error = excluded.regression_error, error_scale = excluded.error_scale",
+            )
+            .bind(run.to_string())
+            .bind(report.epoch)
+            .bind(report.loss)
+            .bind(report.reconstruction_error)
+            .bind(report.regression_error)
+            .bind(report.error_scale)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        }
+        transaction.commit().await.map_err(failed)
+    }
+
+    /// Adds a line to the log of a run, which keeps its latest 1,000 lines of 4,000 bytes over all
+    /// attempts. Does nothing once the run was lost.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()> {
+        let mut turn = self.relaxed().await?;
+        let mut transaction = turn.begin().await?;
+        if !is_mine(&mut transaction, run, fence).await? {
+            return Ok(());
+        }
+        let number: i64 = sqlx::query_scalar(
+            "INSERT INTO training_log (run_id, line_number, at_us, line) \
+             SELECT ?, coalesce(max(line_number), 0) + 1, ?, ? FROM training_log WHERE run_id = ? \
+             RETURNING line_number",
+        )
+        .bind(run.to_string())
+        .bind(now.as_microsecond())
+        .bind(&line[..line.floor_char_boundary(LINE_BYTES)])
+        .bind(run.to_string())
+        .fetch_one(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        sqlx::query("DELETE FROM training_log WHERE run_id = ? AND line_number <= ?")
+            .bind(run.to_string())
+            .bind(number - LOG_LINES)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        transaction.commit().await.map_err(failed)
+    }
+
+    /// The curve of a run's latest attempt, by epoch.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::RunNotFound`].
+    pub async fn epochs(&self, run: RunId) -> Result<Vec<EpochReport>> {
+        self.check_run(run).await?;
+        let rows = sqlx::query(
+            "SELECT run_id, epoch, loss, reconstruction_error, regression_error, error_scale \
+             FROM training_epochs WHERE run_id = ? ORDER BY epoch",
+        )
+        .bind(run.to_string())
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        let read = |row| {
+            let mut fields = Fields::of("training_epochs", row).skip(1);
+            Ok(EpochReport {
+                epoch: fields.count()?,
+                loss: fields.number()?,
+                reconstruction_error: fields.number()?,
+                regression_error: fields.number()?,
+                error_scale: fields.number()?,
+            })
+        };
+        rows.iter().map(read).collect()
+    }
+
+    /// The log of a run, oldest line first.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::RunNotFound`].
+    pub async fn log(&self, run: RunId) -> Result<Vec<(Timestamp, String)>> {
+        self.check_run(run).await?;
+        let rows = sqlx::query(
+            "SELECT run_id, line_number, at_us, line FROM training_log WHERE run_id = ? ORDER BY line_number",
+        )
+        .bind(run.to_string())
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        let read = |row| {
+            let mut fields = Fields::of("training_log", row).skip(2);
+            Ok((fields.time()?, fields.take()?))
+        };
+        rows.iter().map(read).collect()
+    }
+
+    async fn check_run(&self, run: RunId) -> Result<()> {
+        let known: Option<i64> = sqlx::query_scalar("SELECT 1 FROM training_runs WHERE id = ?")
+            .bind(run.to_string())
+            .fetch_optional(self.readers())
+            .await
+            .map_err(failed)?;
+        known.map(|_| ()).ok_or_else(|| no_run(run))
+    }
+}
+
+/// Whether the holder of a fence still fits the run.
+async fn is_mine(connection: &mut SqliteConnection, run: RunId, fence: i64) -> Result<bool> {
+    let mine: Option<i64> =
+        sqlx::query_scalar("SELECT 1 FROM training_runs WHERE id = ? AND fence = ? AND state = 'running'")
+            .bind(run.to_string())
+            .bind(fence)
+            .fetch_optional(connection)
+            .await
+            .map_err(failed)?;
+    Ok(mine.is_some())
+}

@@ -1,0 +1,213 @@
+//! Logs and metrics. Metrics are one typed struct: no name is spelled at a call site.
+
+use std::time::Duration;
+
+use hyper::http::{HeaderName, HeaderValue};
+use metrics::{
+    Counter, Gauge, Histogram, Key, KeyName, Label, Level, Metadata, Recorder, SharedString, Unit,
+};
+use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
+
+use crate::config::{Config, LogFormat};
+use crate::domain::{Flag, FusedFix, RunState};
+
+/// Starts the log of the process, on standard error.
+///
+/// # Errors
+/// A filter that cannot be read, or a log that was started before.
+pub fn start_log(config: &Config) -> anyhow::Result<()> {
+    let filter = tracing_subscriber::EnvFilter::try_new(&config.log_filter)?;
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match config.log_format {
+        LogFormat::Text => log.try_init(),
+        LogFormat::Json => log.json().flatten_event(true).try_init(),
+    }
+    .map_err(|error| anyhow::anyhow!("cannot start the log: {error}"))
+}
+
+/// Everything that is counted and timed.
+#[derive(Clone)]
+pub struct Metrics {
+    handle: PrometheusHandle,
+    fusions: Counter,
+    fusions_denied: Counter,
+    fusions_outside_training: Counter,
+    samples_accepted: Counter,
+    samples_duplicate: Counter,
+    samples_rejected: Counter,
+    runs_succeeded: Counter,
+    runs_failed: Counter,
+    runs_cancelled: Counter,
+    run_duration_s: Histogram,
+    connections: Gauge,
+    http_requests: [Counter; 5],
+    http_duration_s: Histogram,
+    requests_refused: Counter,
+}
+
+const METADATA: Metadata<'static> = Metadata::new("sightfix", Level::INFO, None);
+
+impl Default for Metrics {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Metrics {
+    /// Metrics of one server; two in one process do not mix.
+    #[must_use]
+    pub fn new() -> Self {
+        let recorder = PrometheusBuilder::new()
+            .set_buckets_for_metric(
+                Matcher::Suffix("duration_seconds".to_owned()),
+                &[0.000_1, 0.000_3, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0],
+            )
+            .unwrap_or_else(|_| PrometheusBuilder::new())
+            .build_recorder();
+        let counter = |name: &'static str, help: &'static str, labels: Vec<Label>| {
+            describe(&recorder, name, help, Recorder::describe_counter);
+            recorder.register_counter(&Key::from_parts(name, labels), &METADATA)
+        };
+        let plain = |name, help| counter(name, help, Vec::new());
+        let labelled = |name, help, label, value| counter(name, help, vec![Label::new(label, value)]);
+        let samples =
+            |outcome| labelled("sightfix_samples_total", "Rows of imports, by outcome", "outcome", outcome);
+        let runs = |state: RunState| {
+            labelled("sightfix_training_runs_total", "Training runs that ended", "state", state.as_str())
+        };
+        let http = |class| {
+            labelled("sightfix_http_requests_total", "Requests answered, by class of status", "status", class)
+        };
+        let histogram = |name: &'static str, help: &'static str| {
+            describe(&recorder, name, help, Recorder::describe_histogram);
+            recorder.register_histogram(&Key::from_name(name), &METADATA)
+        };
+        describe(&recorder, "sightfix_connections", "Open connections", Recorder::describe_gauge);
+        Self {
+            fusions: plain("sightfix_fusions_total", "Observations answered"),
+            fusions_denied: plain("sightfix_fusions_denied_total", "Observations answered without a fix"),
+            fusions_outside_training: plain(
+                "sightfix_fusions_outside_training_total",
+                "Observations whose box was unlike those trained on",
+            ),
+            samples_accepted: samples("accepted"),
+            samples_duplicate: samples("duplicate"),
+            samples_rejected: samples("rejected"),
+            runs_succeeded: runs(RunState::Succeeded),
+            runs_failed: runs(RunState::Failed),
+            runs_cancelled: runs(RunState::Cancelled),
+            run_duration_s: histogram("sightfix_training_run_duration_seconds", "Time of a run"),
+            connections: recorder.register_gauge(&Key::from_name("sightfix_connections"), &METADATA),
+            http_requests: [http("1xx"), http("2xx"), http("3xx"), http("4xx"), http("5xx")],
+            http_duration_s: histogram("sightfix_http_request_duration_seconds", "Time to an answer's head"),
+            requests_refused: plain(
+                "sightfix_requests_refused_total",
+                "Requests refused because too many were in flight",
+            ),
+            handle: recorder.handle(),
+        }
+    }
+
+    /// The text that `/metrics` gives.
+    #[must_use]
+    pub fn render(&self) -> String {
+        self.handle.run_upkeep();
+        self.handle.render()
+    }
+
+    /// Observations were answered.
+    pub fn fused(&self, fused: &[FusedFix]) {
+        let having = |flag| fused.iter().filter(|fix| fix.flags.contains(&flag)).count() as u64;
+        self.fusions.increment(fused.len() as u64);
+        self.fusions_denied.increment(having(Flag::GnssDenied));
+        self.fusions_outside_training.increment(having(Flag::OutsideTraining));
+    }
+
+    /// An import was read: rows by outcome.
+    pub fn imported(&self, accepted: u64, duplicate: u64, rejected: u64) {
+        self.samples_accepted.increment(accepted);
+        self.samples_duplicate.increment(duplicate);
+        self.samples_rejected.increment(rejected);
+    }
+
+    /// A run has ended.
+    pub fn run_ended(&self, state: RunState, time: Duration) {
+        match state {
+            RunState::Succeeded => self.runs_succeeded.increment(1),
+            RunState::Failed => self.runs_failed.increment(1),
+            RunState::Cancelled => self.runs_cancelled.increment(1),
+            RunState::Queued | RunState::Running => return,
+        }
+        self.run_duration_s.record(time.as_secs_f64());
+    }
+
+    /// A request was answered.
+    pub fn answered(&self, status: u16, time: Duration) {
+        let class = usize::from(status / 100).clamp(1, 5) - 1;
+        self.http_requests[class].increment(1);
+        self.http_duration_s.record(time.as_secs_f64());
+    }
+
+    /// A request was refused for too many in flight.
+    pub fn refused(&self) {
+        self.requests_refused.increment(1);
+    }
+
+    /// A connection was opened; it counts until the value is dropped.
+    #[must_use]
+    pub fn connection(&self) -> OpenConnection {
+        self.connections.increment(1.0);
+        OpenConnection(self.connections.clone())
+    }
+}
+
+fn describe(
+    recorder: &PrometheusRecorder,
+    name: &'static str,
+    help: &'static str,
+    by: fn(&PrometheusRecorder, KeyName, Option<Unit>, SharedString),
+) {
+    by(recorder, KeyName::from(name), None, SharedString::from(help));
+}
+
+/// Counts an open connection while it lives.
+pub struct OpenConnection(Gauge);
+
+impl Drop for OpenConnection {
+    fn drop(&mut self) {
+        self.0.decrement(1.0);
+    }
+}
+
+/// Header that carries the request id, in and out.
+pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+
+/// Names one request in the log, in its answer's header and in its problem.
+#[derive(Debug, Clone)]
+pub struct RequestId(HeaderValue);
+
+impl RequestId {
+    /// From visible ASCII.
+    #[must_use]
+    pub const fn new(id: HeaderValue) -> Self {
+        Self(id)
+    }
+
+    /// As a header's value.
+    #[must_use]
+    pub const fn header(&self) -> &HeaderValue {
+        &self.0
+    }
+
+    /// As text.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        self.0.to_str().unwrap_or_default()
+    }
+}
+
+impl std::fmt::Display for RequestId {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        out.write_str(self.as_str())
+    }
+}

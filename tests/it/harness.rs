@@ -1,0 +1,203 @@
+//! A real server: the binary, a data folder of its own, a port of the system's choice.
+
+use std::io::{BufRead as _, BufReader};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
+
+use http_body_util::{BodyExt as _, Full};
+use hyper::body::{Bytes, Incoming};
+use hyper::{HeaderMap, Request, Response, StatusCode};
+use hyper_util::client::legacy::Client;
+use hyper_util::client::legacy::connect::HttpConnector;
+use hyper_util::rt::TokioExecutor;
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// The binary, ready to be given arguments.
+pub(crate) fn sightfix() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sightfix"));
+    command.env_remove("SIGHTFIX_DATA").env_remove("SIGHTFIX_LISTEN").current_dir(std::env::temp_dir());
+    command
+}
+
+/// Runs the binary to its end; gives standard output.
+pub(crate) fn run(arguments: &[&str]) -> String {
+    let output = sightfix().args(arguments).output().expect("the binary runs");
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{arguments:?}: {errors}");
+    String::from_utf8(output.stdout).expect("UTF-8")
+}
+
+/// A running server; killed when dropped.
+pub(crate) struct TestServer {
+    process: Child,
+    pub(crate) address: SocketAddr,
+    client: Client<HttpConnector, Full<Bytes>>,
+    log: Arc<Mutex<Vec<String>>>,
+}
+
+/// A whole answer.
+pub(crate) struct Answer {
+    pub(crate) status: StatusCode,
+    pub(crate) headers: HeaderMap,
+    pub(crate) body: Bytes,
+}
+
+impl Answer {
+    pub(crate) fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).unwrap_or_else(|error| panic!("{error}: {}", self.text()))
+    }
+
+    pub(crate) fn text(&self) -> String {
+        String::from_utf8_lossy(&self.body).into_owned()
+    }
+
+    pub(crate) fn header(&self, name: &str) -> &str {
+        self.headers.get(name).unwrap_or_else(|| panic!("no header {name}")).to_str().expect("visible ASCII")
+    }
+
+    /// The same answer, if its status is the expected one.
+    #[track_caller]
+    pub(crate) fn expect(self, status: u16) -> Self {
+        assert_eq!(self.status.as_u16(), status, "{}", self.text());
+        self
+    }
+}
+
+impl TestServer {
+    /// Starts over a data folder.
+    pub(crate) fn start(folder: &Path) -> Self {
+        Self::start_with(folder, &[])
+    }
+
+    /// Starts over a data folder with settings from the environment.
+    pub(crate) fn start_with(folder: &Path, settings: &[(&str, &str)]) -> Self {
+        let mut process = sightfix()
+            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+            .arg(folder)
+            .env("SIGHTFIX_LOG_FORMAT", "json")
+            .envs(settings.iter().copied())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("the binary starts");
+        let mut lines = BufReader::new(process.stderr.take().expect("piped")).lines();
+        let log = Arc::new(Mutex::new(Vec::new()));
+        let mut address = None;
+        for line in lines.by_ref() {
+            let line = line.expect("UTF-8");
+            let entry: Value = serde_json::from_str(&line).unwrap_or_else(|_| panic!("the server says: {line}"));
+            if let Some(told) = entry["address"].as_str() {
+                address = Some(told.parse().expect("an address"));
+                break;
+            }
+        }
+        let kept = log.clone();
+        std::thread::spawn(move || {
+            lines.map_while(Result::ok).for_each(|line| kept.lock().expect("not poisoned").push(line));
+        });
+        let client = Client::builder(TokioExecutor::new()).build_http();
+        Self { process, address: address.expect("the server tells its address"), client, log }
+    }
+
+    /// `kill -9`.
+    pub(crate) fn kill(mut self) {
+        self.process.kill().expect("the server can be killed");
+        self.process.wait().expect("the server is gone");
+    }
+
+    /// Asks the server to end and waits; gives whether it ended well.
+    pub(crate) fn terminate(mut self) -> bool {
+        let pid = self.process.id().to_string();
+        assert!(Command::new("kill").args(["-TERM", &pid]).status().expect("kill runs").success());
+        self.process.wait().expect("the server ends").success()
+    }
+
+    /// Lines of the log since the start.
+    pub(crate) fn log(&self) -> Vec<String> {
+        self.log.lock().expect("not poisoned").clone()
+    }
+
+    /// Sends a request; the answer's body is still to come.
+    pub(crate) async fn open(
+        &self,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: impl Into<Bytes>,
+    ) -> Response<Incoming> {
+        let mut request = Request::builder().method(method).uri(format!("http://{}{path}", self.address));
+        for (name, value) in headers {
+            request = request.header(*name, *value);
+        }
+        let request = request.body(Full::new(body.into())).expect("a request");
+        self.client.request(request).await.expect("an answer")
+    }
+
+    /// Sends a request and reads the whole answer.
+    pub(crate) async fn send(
+        &self,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: impl Into<Bytes>,
+    ) -> Answer {
+        let (head, body) = self.open(method, path, headers, body).await.into_parts();
+        let body = body.collect().await.expect("a whole body").to_bytes();
+        Answer { status: head.status, headers: head.headers, body }
+    }
+
+    pub(crate) async fn get(&self, path: &str) -> Answer {
+        self.send("GET", path, &[], Bytes::new()).await
+    }
+
+    pub(crate) async fn post(&self, path: &str, body: &Value) -> Answer {
+        self.send("POST", path, &[("content-type", "application/json")], body.to_string()).await
+    }
+
+    /// Starts a training run and waits until it has ended; gives its last state.
+    pub(crate) async fn train(&self, camera: &str, request: &Value) -> Value {
+        let started = self.post(&format!("/v1/cameras/{camera}/training-runs"), request).await.expect(202);
+        let path = started.header("location").to_owned();
+        loop {
+            let run = self.get(&path).await.expect(200).json();
+            if !matches!(run["state"].as_str(), Some("queued" | "running")) {
+                return run;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+        }
+    }
+}
+
+impl Drop for TestServer {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+pub(crate) fn data_folder() -> TempDir {
+    tempfile::tempdir().expect("a folder")
+}
+
+/// A file of the real square, or `None` with a printed reason.
+pub(crate) fn shared(name: &str) -> Option<PathBuf> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    println!("skipped: {} is not there", path.display());
+    None
+}
+
+/// Samples of a small simulated square, as CSV.
+pub(crate) fn simulated_csv() -> String {
+    use sightfix::exchange::{Format, write_samples};
+    use sightfix::simulation::{Options, simulate};
+    let mut csv = Vec::new();
+    let samples = simulate(&Options::demo()).training_samples();
+    write_samples(&mut csv, Format::Csv, &samples).expect("memory can be written");
+    String::from_utf8(csv).expect("UTF-8")
+}

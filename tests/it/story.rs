@@ -1,0 +1,109 @@
+//! The main job, end to end, through the real binary and its real port.
+
+use serde_json::{Value, json};
+
+use crate::harness::{Answer, TestServer, data_folder, run, shared, simulated_csv};
+
+/// A camera is made, taught and used; the server is killed and started again.
+async fn main_job(image_size: Option<Value>, csv: String, rows: u64, epochs: u32) {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+
+    let mut profile = json!({"id": "square", "display_name": "The square", "recipe": "hybrid"});
+    if let Some(size) = &image_size {
+        profile["image_size"] = size.clone();
+    }
+    let made = server.post("/v1/cameras", &profile).await.expect(201);
+    assert_eq!(made.header("location"), "/v1/cameras/square");
+    let warned = made.json()["warnings"].to_string().contains("image_size");
+    assert_eq!(warned, image_size.is_none(), "{}", made.text());
+
+    let imported = import(&server, &csv).await.json();
+    assert_eq!(imported["accepted"], rows, "{imported}");
+    assert_eq!(imported["rejected"], 0, "{imported}");
+    let again = import(&server, &csv).await.json();
+    assert_eq!((&again["accepted"], &again["duplicate"]), (&json!(0), &json!(rows)), "{again}");
+
+    let observation = observation_of(&csv);
+    let early = server.post("/v1/cameras/square/fusions", &observation).await.expect(409).json();
+    assert!(early["type"].as_str().expect("a type").ends_with("no-model"), "{early}");
+
+    let ended = server.train("square", &json!({"seed": 7, "epochs": epochs})).await;
+    assert_eq!(ended["state"], "succeeded", "{ended}");
+    assert_eq!(ended["model_version"], 1, "{ended}");
+
+    let fused = server.post("/v1/cameras/square/fusions", &observation).await.expect(200).json();
+    let item = &fused["items"][0];
+    let number = |name: &str| item[name].as_f64().unwrap_or_else(|| panic!("{name}: {item}"));
+    assert!((number("confidence_regression") + number("confidence_gnss") - 1.0).abs() < 1e-12);
+    assert!(number("r95_m") > 0.0 && number("e_regression_m2") > 0.0 && number("e_gnss_m2") > 0.0);
+    assert_eq!(item["model_version"], 1);
+
+    server.kill();
+    let server = TestServer::start(folder.path());
+    let count = server.get("/v1/cameras/square/samples/count").await.expect(200).json();
+    assert_eq!(count["count"], rows);
+    let after = server.post("/v1/cameras/square/fusions", &observation).await.expect(200).json();
+    assert_eq!(after, fused, "the same model gives the same answer after a crash");
+    assert!(server.terminate(), "the server ends in order");
+}
+
+async fn import(server: &TestServer, csv: &str) -> Answer {
+    let headers = [("content-type", "text/csv")];
+    server.send("POST", "/v1/cameras/square/samples", &headers, csv.to_owned()).await.expect(200)
+}
+
+/// The middle row of a sample file, as a fusion request.
+fn observation_of(csv: &str) -> Value {
+    let lines: Vec<_> = csv.lines().collect();
+    let column = |name: &str| {
+        lines[0].split(',').position(|column| column.trim_end_matches("_px").trim_end_matches("_deg") == name)
+    };
+    let cells: Vec<_> = lines[lines.len() / 2].split(',').collect();
+    let cell = |name: &str| cells[column(name).unwrap_or_else(|| panic!("no column {name}: {}", lines[0]))];
+    let number = |name: &str| cell(name).parse::<f64>().expect("a number");
+    json!({
+        "time": cell("time"),
+        "bounding_box": {
+            "left_px": number("left"), "top_px": number("top"),
+            "width_px": number("width"), "height_px": number("height"),
+        },
+        "fix": {"longitude_deg": number("longitude"), "latitude_deg": number("latitude")},
+    })
+}
+
+#[tokio::test]
+async fn the_main_job_on_a_simulated_square() {
+    let csv = simulated_csv();
+    let rows = csv.lines().count() as u64 - 1;
+    main_job(Some(json!({"width_px": 1920, "height_px": 1080})), csv, rows, 60).await;
+}
+
+#[tokio::test]
+async fn the_main_job_on_the_real_square() {
+    let Some(path) = shared("training.csv") else { return };
+    let csv = std::fs::read_to_string(path).expect("the file can be read");
+    main_job(None, csv, 10_078, 20).await;
+}
+
+#[tokio::test]
+async fn the_command_line_does_the_same_without_a_server() {
+    let folder = data_folder();
+    let file = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    std::fs::write(file("samples.csv"), simulated_csv()).expect("the folder can be written");
+    let data = file("data");
+    let said = run(&["import", &file("samples.csv"), "--camera", "c", "--create", "--data", &data]);
+    assert!(said.starts_with("accepted "), "{said}");
+    let said = run(&["train", "--camera", "c", "--recipe", "hybrid", "--epochs", "60", "--data", &data]);
+    assert!(said.starts_with("version 1 became active"), "{said}");
+    let (from, to) = (file("samples.csv"), file("fused.geojson"));
+    let said = run(&["fuse", &from, "--out", &to, "--camera", "c", "--data", &data]);
+    assert!(said.contains("rejected 0"), "{said}");
+    let positions: Value =
+        serde_json::from_str(&std::fs::read_to_string(to).expect("was written")).expect("GeoJSON");
+    assert!(positions["features"].as_array().is_some_and(|features| features.len() > 100));
+
+    let server = TestServer::start(&folder.path().join("data"));
+    let camera = server.get("/v1/cameras/c").await.expect(200).json();
+    assert_eq!(camera["active_model"], 1, "{camera}");
+}

@@ -7,7 +7,9 @@ use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
 use super::FitError;
+use super::whitening::FixNoise;
 use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
+use crate::filters::{FixError, smooth_pass, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 /// Fewer samples cannot tell a camera from its noise.
@@ -134,6 +136,28 @@ impl Rows {
     pub(super) fn filtered(&self, keep: impl Fn(usize) -> bool) -> Self {
         let rows = self.rows.iter().enumerate().filter(|(at, _)| keep(*at)).map(|(_, row)| *row).collect();
         Self { rows, ..*self }
+    }
+
+    /// The same rows with labels that a kinematic smoother made of each pass's fixes.
+    pub(super) fn smoothed(&self, noise: &FixNoise) -> Self {
+        let error = FixError {
+            white_m: (noise.variance_m2 * noise.white_share).sqrt().max(0.01),
+            coloured_m: (noise.variance_m2 * (1.0 - noise.white_share)).sqrt(),
+            time_constant_s: noise.time_constant_s,
+        };
+        let passes: Vec<(Vec<f64>, Vec<EastNorth>)> = self
+            .rows
+            .chunk_by(|one, other| one.pass == other.pass)
+            .map(|pass| pass.iter().map(|row| (row.time_s, row.label)).unzip())
+            .collect();
+        let acceleration_mps2 = tune_acceleration(&passes, &error);
+        let labels =
+            passes.iter().flat_map(|(times_s, fixes)| smooth_pass(times_s, fixes, &error, acceleration_mps2));
+        let mut smoothed = self.clone();
+        for (row, label) in smoothed.rows.iter_mut().zip(labels) {
+            row.label = label.position;
+        }
+        smoothed
     }
 
     /// Mean of the variances that the receiver gave itself, where every fix has one.

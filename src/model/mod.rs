@@ -6,17 +6,24 @@
 
 mod artifact;
 mod coverage;
+pub mod dnn;
 mod file;
 mod fit;
+pub mod homography;
 mod hybrid;
 mod kernel;
 pub mod net;
-mod noise;
 mod paper;
+mod projection;
+mod projective;
 mod regressor;
 mod rows;
+mod run;
+mod select;
 mod tensors;
 pub mod train;
+mod uncertainty;
+mod whitening;
 
 pub use artifact::{Artifact, FORMAT};
 pub use fit::{FitError, FitEvent, FitOptions, fit};

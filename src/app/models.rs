@@ -177,12 +177,7 @@ mod tests {
     #[test]
     fn few_or_equal_fixes_are_refused() {
         let fix = Fix { position: Position::new(1.0, 2.0).expect("valid"), sigma_m: None };
-        assert!(
-            GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 9).map(Ok)).is_err()
-        );
-        assert!(
-            GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 50).map(Ok))
-                .is_err()
-        );
+        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 9).map(Ok)).is_err());
+        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 50).map(Ok)).is_err());
     }
 }

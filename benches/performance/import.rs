@@ -35,13 +35,16 @@ pub(crate) fn run() {
         let id = new_camera();
         let request = load::post(&format!("/v1/cameras/{id}/samples"), "text/csv", &csv);
         let began = Instant::now();
-        runtime.block_on(load::one(served.address, &request));
+        drop(runtime.block_on(load::one(served.address, &request)));
         let rate = samples.len() as f64 / began.elapsed().as_secs_f64();
         let stored = runtime.block_on(served.app.count_samples(&id, &Default::default())).expect("a count");
         assert_eq!(stored as usize, samples.len(), "every row is stored");
         rate
     };
-    ratio::row(&format!("{} rows as CSV through REST", samples.len()), &in_turn(by_rest, || peer.insert_all()));
+    ratio::row(
+        &format!("{} rows as CSV through REST", samples.len()),
+        &in_turn(by_rest, || peer.insert_all()),
+    );
     let one_by_one = || {
         let id = new_camera();
         let (app, samples) = (served.app.clone(), Arc::new(samples.clone()));

@@ -43,7 +43,8 @@ pub(crate) async fn send(address: SocketAddr, request: &[u8], each: usize) -> (f
     ((CONNECTIONS * each) as f64 / began.elapsed().as_secs_f64(), times)
 }
 
-async fn read_answer(stream: &mut TcpStream, answer: &mut Vec<u8>) {
+/// Reads one answer; gives where its body begins.
+async fn read_answer(stream: &mut TcpStream, answer: &mut Vec<u8>) -> usize {
     answer.clear();
     loop {
         assert_ne!(stream.read_buf(answer).await.expect("the server answers"), 0, "the server closed");
@@ -52,19 +53,23 @@ async fn read_answer(stream: &mut TcpStream, answer: &mut Vec<u8>) {
         let text = std::str::from_utf8(&answer[..head]).expect("a head of text");
         let length = text
             .lines()
-            .find_map(|line| line.split_once(": ").filter(|(name, _)| name.eq_ignore_ascii_case("content-length")))
+            .find_map(|line| {
+                line.split_once(": ").filter(|(name, _)| name.eq_ignore_ascii_case("content-length"))
+            })
             .map(|(_, length)| length.parse::<usize>().expect("a number"))
             .expect("a content length");
         while answer.len() < head + 4 + length {
             assert_ne!(stream.read_buf(answer).await.expect("the server answers"), 0, "the server closed");
         }
-        return;
+        return head + 4;
     }
 }
 
-/// Sends one request and reads its answer.
-pub(crate) async fn one(address: SocketAddr, request: &[u8]) {
+/// Sends one request and gives the body of its answer.
+pub(crate) async fn one(address: SocketAddr, request: &[u8]) -> Vec<u8> {
     let mut stream = TcpStream::connect(address).await.expect("the server listens");
     stream.write_all(request).await.expect("the server reads");
-    read_answer(&mut stream, &mut Vec::new()).await;
+    let mut answer = Vec::new();
+    let body = read_answer(&mut stream, &mut answer).await;
+    answer.split_off(body)
 }

@@ -7,6 +7,7 @@ mod fusion;
 mod models;
 mod registry;
 mod samples;
+mod tracks;
 mod training;
 
 use std::sync::Arc;
@@ -21,6 +22,7 @@ use crate::telemetry::Metrics;
 pub use models::GnssErrorEstimate;
 pub use registry::Registry;
 pub use samples::{ImportReport, RejectedRow};
+pub use tracks::{TrackPoint, Tracks};
 pub use training::RunRequest;
 
 /// The application: everything a request needs, cheap to clone.
@@ -33,6 +35,8 @@ pub struct Parts {
     pub store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
+    /// Where targets are now.
+    pub tracks: Tracks,
     /// What time it is.
     pub clock: Clock,
     /// Ids and seeds.
@@ -59,8 +63,9 @@ impl App {
     ) -> crate::domain::Result<Self> {
         let registry = Registry::default();
         registry.refresh(&store).await?;
-        let run_queued = Notify::new();
-        Ok(Self(Arc::new(Parts { store, registry, clock, randomness, limits, metrics, run_queued })))
+        let (tracks, run_queued) = (Tracks::default(), Notify::new());
+        let parts = Parts { store, registry, tracks, clock, randomness, limits, metrics, run_queued };
+        Ok(Self(Arc::new(parts)))
     }
 }
 

@@ -3,15 +3,20 @@
 use bytes::Bytes;
 
 use super::{App, Page, page_of};
-use crate::domain::{Camera, CameraId, Error, ErrorKind, Fix, ModelVersion, Result};
+use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelVersion, Result};
+use crate::exchange::{RowError, TimedFix};
 use crate::geo::LocalPlane;
 use crate::model::Artifact;
 
 /// The receiver's error from many fixes at one fixed point.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct GnssErrorEstimate {
     /// Fixes that were read.
     pub fixes: u64,
+    /// Rows that were no fix.
+    pub rejected: u64,
+    /// The first of them, with their reasons.
+    pub rejected_rows: Vec<RowError>,
     /// Their mean position.
     pub mean: crate::geo::Position,
     /// Variance of the east component, m2.
@@ -30,13 +35,27 @@ impl GnssErrorEstimate {
     /// Estimates from fixes taken while the receiver stood still. Memory does not grow with them.
     ///
     /// # Errors
-    /// `InvalidArgument` naming `fixes` if there are fewer than ten, or all are the same.
-    pub fn from_fixes(fixes: impl Iterator<Item = Result<Fix>>) -> Result<Self> {
+    /// `InvalidArgument` naming `fixes` if there are fewer than ten, or all are the same; a file that
+    /// cannot be read.
+    pub fn from_rows(
+        rows: impl Iterator<Item = Result<std::result::Result<TimedFix, RowError>>>,
+        tell_at_most: usize,
+    ) -> Result<Self> {
         const FEWEST: u64 = 10;
         let mut plane: Option<LocalPlane> = None;
         let (mut count, mut mean, mut squares) = (0_u64, [0.0; 2], [0.0; 2]);
-        for fix in fixes {
-            let position = fix?.position;
+        let (mut rejected, mut rejected_rows) = (0, Vec::new());
+        for row in rows {
+            let position = match row? {
+                Ok(row) => row.fix.position,
+                Err(row) => {
+                    rejected += 1;
+                    if rejected_rows.len() < tell_at_most {
+                        rejected_rows.push(row);
+                    }
+                    continue;
+                }
+            };
             let plane = plane.get_or_insert_with(|| LocalPlane::new(position));
             let point = plane.to_plane(position);
             count += 1;
@@ -60,6 +79,8 @@ impl GnssErrorEstimate {
         }
         Ok(Self {
             fixes: count,
+            rejected,
+            rejected_rows,
             mean: plane.to_position(crate::geo::EastNorth { east_m: mean[0], north_m: mean[1] }),
             east_variance_m2,
             north_variance_m2,
@@ -152,6 +173,7 @@ impl App {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::Fix;
     use crate::geo::{EastNorth, Position};
     use rand::{Rng, SeedableRng};
 
@@ -165,19 +187,26 @@ mod tests {
         let fixes: Vec<_> = (0..4_000)
             .map(|_| {
                 let point = EastNorth { east_m: 2.0 * normal(), north_m: 3.0 * normal() };
-                Ok(Fix { position: plane.to_position(point), sigma_m: None })
+                at(plane.to_position(point))
             })
             .collect();
-        let estimate = GnssErrorEstimate::from_fixes(fixes.into_iter()).expect("enough");
+        let estimate =
+            GnssErrorEstimate::from_rows(fixes.into_iter().map(|row| Ok(Ok(row))), 0).expect("enough");
         // Standard error of a variance from 4,000 is 2.2 %: five of them.
         assert!((estimate.east_variance_m2 / 4.0 - 1.0).abs() < 0.11, "{estimate:?}");
         assert!((estimate.north_variance_m2 / 9.0 - 1.0).abs() < 0.11, "{estimate:?}");
     }
 
+    fn at(position: Position) -> TimedFix {
+        TimedFix { time: None, fix: Fix { position, sigma_m: None } }
+    }
+
     #[test]
     fn few_or_equal_fixes_are_refused() {
-        let fix = Fix { position: Position::new(1.0, 2.0).expect("valid"), sigma_m: None };
-        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 9).map(Ok)).is_err());
-        assert!(GnssErrorEstimate::from_fixes(std::iter::repeat_n(fix, 50).map(Ok)).is_err());
+        let fix = at(Position::new(1.0, 2.0).expect("valid"));
+        for count in [9, 50] {
+            let rows = std::iter::repeat_n(fix, count).map(|row| Ok(Ok(row)));
+            assert!(GnssErrorEstimate::from_rows(rows, 0).is_err());
+        }
     }
 }

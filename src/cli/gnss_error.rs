@@ -7,6 +7,9 @@ use clap::Args;
 
 use super::open_file;
 use crate::app::GnssErrorEstimate;
+use crate::clock::Clock;
+use crate::config::Limits;
+use crate::domain::TimeBounds;
 use crate::exchange::{self, FixFormat};
 
 /// Estimate a receiver's error from many fixes at one fixed point
@@ -19,10 +22,15 @@ pub(super) struct GnssError {
 
 impl GnssError {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let format = FixFormat::from_path(&self.file).context("the ending must be .csv, .nmea, .nma or .txt")?;
-        let fixes = exchange::read_fixes(open_file(&self.file)?, format)?;
-        let estimate = GnssErrorEstimate::from_fixes(fixes.map(|row| row.map(|row| row.fix)))?;
-        println!("fixes              {}", estimate.fixes);
+        let format =
+            FixFormat::from_path(&self.file).context("the ending must be .csv, .nmea, .nma or .txt")?;
+        let time_bounds = TimeBounds::at(Clock::system().now());
+        let rows = exchange::read_fixes(open_file(&self.file)?, format, time_bounds)?;
+        let estimate = GnssErrorEstimate::from_rows(rows, Limits::default().rejected_rows)?;
+        for row in &estimate.rejected_rows {
+            eprintln!("line {}: {}: {}", row.line, row.field, row.reason);
+        }
+        println!("fixes              {}, rejected {}", estimate.fixes, estimate.rejected);
         println!(
             "mean               {:.8} {:.8} (longitude, latitude)",
             estimate.mean.longitude_deg(),

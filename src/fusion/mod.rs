@@ -2,4 +2,8 @@
 //!
 //! What never happens here: I/O, clocks, randomness, allocation that an outside client decides.
 
+mod plane_covariance;
+pub mod track;
 pub mod two_step;
+
+pub use plane_covariance::PlaneCovariance;

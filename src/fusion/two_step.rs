@@ -3,11 +3,7 @@
 
 use crate::domain::{Confidences, Flag, FusedFix, ImageSize, Observation};
 use crate::geo::EastNorth;
-use crate::model::{Regression, Regressor};
-
-/// Radius in standard deviations per axis that holds 95 % of an isotropic normal plane:
-/// sqrt(-2 ln 0.05).
-pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
+use crate::model::{R95_PER_SIGMA, Regression, Regressor};
 
 /// The weights (6) and (7): each source by the inverse of its error variance (m2, per axis).
 ///
@@ -95,7 +91,7 @@ pub fn fuse(
 }
 
 /// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
-const UNKNOWN_RECEIVER_M2: f64 = 25.0;
+pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 
 /// The answer for an observation without a box: its fix.
 fn pass_through(observation: &Observation, has_model: bool, e_gnss_m2: Option<f64>) -> Option<FusedFix> {

@@ -1,7 +1,5 @@
 //! `/v1/cameras/{camera}/gnss-error`: a receiver's error from many fixes at one fixed point.
 
-use std::io::Read;
-
 use axum::extract::{Request, State};
 use axum::response::Response;
 use serde::{Deserialize, Serialize};
@@ -15,8 +13,8 @@ use super::samples::RejectedRow;
 use super::wire::json;
 use super::{Rest, body};
 use crate::app::{App, GnssErrorEstimate};
-use crate::domain::{Error, Fix, Result, TimeBounds};
-use crate::exchange::{FixFormat, read_fixes, wire};
+use crate::domain::{Error, Result};
+use crate::exchange::{FixFormat, RowError, TimedFix, read_fixes, wire};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(estimate_gnss_error))
@@ -87,10 +85,12 @@ async fn estimate_gnss_error(
     };
     let tell_at_most = limits.rejected_rows;
     let estimating = tokio::task::spawn_blocking(move || match source {
-        Source::Given(fixes) => from_given(&fixes),
-        Source::File(file, format) => from_file(file, format, time_bounds, tell_at_most),
+        Source::Given(fixes) => from_given(&fixes, tell_at_most),
+        Source::File(file, format) => {
+            GnssErrorEstimate::from_rows(read_fixes(file, format, time_bounds)?, tell_at_most)
+        }
     });
-    Ok(json(&estimating.await.map_err(Error::fault)??)?)
+    Ok(json(&estimate(estimating.await.map_err(Error::fault)??))?)
 }
 
 enum Source {
@@ -98,37 +98,15 @@ enum Source {
     File(body::Spooled, FixFormat),
 }
 
-fn from_given(fixes: &[wire::Fix]) -> Result<Estimate> {
-    let taken = fixes
-        .iter()
-        .enumerate()
-        .map(|(index, fix)| fix.to_domain().map_err(|error| error.under(&format!("fixes[{index}]"))));
-    Ok(estimate(GnssErrorEstimate::from_fixes(taken)?, 0, Vec::new()))
-}
-
-fn from_file(
-    file: impl Read,
-    format: FixFormat,
-    time_bounds: TimeBounds,
-    tell_at_most: usize,
-) -> Result<Estimate> {
-    let (mut rejected, mut rejected_rows) = (0, Vec::new());
-    let fixes = read_fixes(file, format, time_bounds)?.filter_map(|row| match row {
-        Ok(Ok(row)) => Some(Ok::<Fix, Error>(row.fix)),
-        Err(broken) => Some(Err(broken)),
-        Ok(Err(row)) => {
-            rejected += 1;
-            if rejected_rows.len() < tell_at_most {
-                rejected_rows.push(RejectedRow::from(row));
-            }
-            None
-        }
+fn from_given(fixes: &[wire::Fix], tell_at_most: usize) -> Result<GnssErrorEstimate> {
+    let rows = (1..).zip(fixes).map(|(line, given)| match given.to_domain() {
+        Ok(fix) => Ok(Ok(TimedFix { time: None, fix })),
+        Err(error) => RowError::of(line, error).map(Err),
     });
-    let told = GnssErrorEstimate::from_fixes(fixes)?;
-    Ok(estimate(told, rejected, rejected_rows))
+    GnssErrorEstimate::from_rows(rows, tell_at_most)
 }
 
-fn estimate(told: GnssErrorEstimate, rejected: u64, rejected_rows: Vec<RejectedRow>) -> Estimate {
+fn estimate(told: GnssErrorEstimate) -> Estimate {
     Estimate {
         fixes: told.fixes,
         mean: told.mean.into(),
@@ -137,7 +115,7 @@ fn estimate(told: GnssErrorEstimate, rejected: u64, rejected_rows: Vec<RejectedR
         e_gnss_m2: told.e_gnss_m2,
         sigma_m: told.sigma_m,
         mean_distance_m: told.mean_distance_m,
-        rejected,
-        rejected_rows,
+        rejected: told.rejected,
+        rejected_rows: told.rejected_rows.into_iter().map(RejectedRow::from).collect(),
     }
 }

@@ -10,10 +10,10 @@ use std::ops::Range;
 use std::sync::{Arc, LazyLock};
 
 use sqlx::sqlite::SqliteArguments;
-use sqlx::{Arguments, SqliteConnection};
+use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
-use super::connection::{Durability, Writer};
+use super::connection::{Durability, Turn, Writer};
 use super::faults::{closed, failed, no_camera, same};
 use crate::domain::{CameraId, Error, Result, Sample};
 
@@ -84,6 +84,12 @@ impl GroupCommit {
         self.queue.is_closed()
     }
 
+    /// Callers whose samples have not been taken up.
+    #[cfg(test)]
+    pub(super) fn waiting(&self) -> usize {
+        self.queue.max_capacity() - self.queue.capacity()
+    }
+
     /// The task has ended, in order or not.
     fn gone(&self) -> Error {
         if self.rows.is_closed() { closed() } else { Error::fault("the task that stores samples has ended") }
@@ -92,21 +98,13 @@ impl GroupCommit {
 
 async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
     while let Some(first) = requests.recv().await {
-        let mut group = Vec::new();
-        let mut rows = 0;
-        let mut next = Some(first);
-        let end = loop {
-            match next {
-                Some(Request::Insert(batch)) => {
-                    rows += batch.samples.len();
-                    group.push(batch);
-                }
-                Some(Request::End(ended)) => break Some(ended),
-                None => break None,
-            }
-            next = if rows < ROWS_PER_TRANSACTION { requests.try_recv().ok() } else { None };
-        };
-        answer_all(&writer, group).await;
+        // The turn first: whoever hands in samples while another change is written is taken along.
+        let turn = writer.turn(Durability::Relaxed).await;
+        let (group, end) = gather(first, &mut requests);
+        match turn {
+            Ok(mut turn) => answer_all(&mut turn, group).await,
+            Err(error) => refuse_all(group, &error),
+        }
         if let Some(ended) = end {
             // Whoever asked may have gone; nothing is left to tell.
             let _ = ended.send(());
@@ -115,10 +113,31 @@ async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
     }
 }
 
+/// What is in the queue now, up to the rows of one transaction.
+fn gather(
+    first: Request,
+    requests: &mut mpsc::Receiver<Request>,
+) -> (Vec<Batch>, Option<oneshot::Sender<()>>) {
+    let mut group = Vec::new();
+    let mut rows = 0;
+    let mut next = Some(first);
+    while let Some(request) = next {
+        match request {
+            Request::Insert(batch) => {
+                rows += batch.samples.len();
+                group.push(batch);
+            }
+            Request::End(ended) => return (group, Some(ended)),
+        }
+        next = if rows < ROWS_PER_TRANSACTION { requests.try_recv().ok() } else { None };
+    }
+    (group, None)
+}
+
 /// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
 /// alone, so that one bad row fails nobody but its caller.
-async fn answer_all(writer: &Writer, group: Vec<Batch>) {
-    match commit(writer, &group).await {
+async fn answer_all(turn: &mut Turn<'_>, group: Vec<Batch>) {
+    match commit(turn, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
                 // A caller who went away needs no answer.
@@ -127,7 +146,7 @@ async fn answer_all(writer: &Writer, group: Vec<Batch>) {
         }
         Err(Failure::Statement(_)) if group.len() > 1 => {
             for batch in group {
-                let alone = commit(writer, std::slice::from_ref(&batch)).await;
+                let alone = commit(turn, std::slice::from_ref(&batch)).await;
                 let outcome = match alone {
                     Ok(mut outcomes) => outcomes.swap_remove(0),
                     Err(Failure::Statement(error) | Failure::Transaction(error)) => Err(error),
@@ -135,11 +154,13 @@ async fn answer_all(writer: &Writer, group: Vec<Batch>) {
                 let _ = batch.reply.send(outcome);
             }
         }
-        Err(Failure::Statement(error) | Failure::Transaction(error)) => {
-            for batch in group {
-                let _ = batch.reply.send(Err(same(&error)));
-            }
-        }
+        Err(Failure::Statement(error) | Failure::Transaction(error)) => refuse_all(group, &error),
+    }
+}
+
+fn refuse_all(group: Vec<Batch>, error: &Error) {
+    for batch in group {
+        let _ = batch.reply.send(Err(same(error)));
     }
 }
 
@@ -151,8 +172,7 @@ enum Failure {
 }
 
 /// One transaction for all batches, with an outcome for each, in their order.
-async fn commit(writer: &Writer, group: &[Batch]) -> Result<Vec<Result<Inserted>>, Failure> {
-    let mut turn = writer.turn(Durability::Relaxed).await.map_err(Failure::Transaction)?;
+async fn commit(turn: &mut Turn<'_>, group: &[Batch]) -> Result<Vec<Result<Inserted>>, Failure> {
     for counting in [Counting::Together, Counting::Apart] {
         let mut transaction = turn.begin().await.map_err(Failure::Transaction)?;
         let outcomes = store(&mut transaction, group, counting).await.map_err(Failure::Statement)?;
@@ -168,7 +188,7 @@ async fn commit(writer: &Writer, group: &[Batch]) -> Result<Vec<Result<Inserted>
 /// How statements and batches go together.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Counting {
-    /// Statements span batches: fast, and countable as long as no row is a duplicate.
+    /// Statements span batches: fast, and countable as long as all rows of each are new, or none.
     Together,
     /// No statement spans batches.
     Apart,
@@ -202,12 +222,17 @@ async fn store(
         }
     }
     borders.push(rows.len());
-    for range in statements(&borders) {
-        let rows = &rows[range];
-        let accepted = insert(connection, rows).await?;
-        if !count(&mut outcomes, rows, accepted) {
+    let statements = statements(&borders);
+    let mut next = statements.first().map(|range| Insert::of(&rows[range.clone()])).transpose()?;
+    for (index, range) in statements.iter().enumerate() {
+        let Some(insert) = next.take() else { break };
+        // The next statement's values are laid out while the database works on this one.
+        let following = async { statements.get(index + 1).map(|range| Insert::of(&rows[range.clone()])) };
+        let (accepted, following) = tokio::join!(insert.execute(connection), following);
+        if !count(&mut outcomes, &rows[range.clone()], accepted?) {
             return Ok(None);
         }
+        next = following.transpose()?;
     }
     Ok(Some(outcomes))
 }
@@ -215,20 +240,26 @@ async fn store(
 /// Adds a statement's count to its batches; false if it cannot be told whose rows were duplicates.
 fn count(outcomes: &mut [Result<Inserted>], rows: &[Row<'_>], accepted: u64) -> bool {
     let all = rows.len() as u64;
-    let single = rows.first().zip(rows.last()).is_some_and(|(first, last)| first.batch == last.batch);
-    if single {
-        if let Some(Ok(inserted)) = rows.first().and_then(|row| outcomes.get_mut(row.batch)) {
-            inserted.accepted += accepted;
-            inserted.duplicate += all - accepted;
+    if accepted == all || accepted == 0 {
+        for row in rows {
+            add(outcomes, row, u64::from(accepted > 0), u64::from(accepted == 0));
         }
         return true;
     }
-    for row in rows {
-        if let Some(Ok(inserted)) = outcomes.get_mut(row.batch) {
-            inserted.accepted += 1;
+    match (rows.first(), rows.last()) {
+        (Some(first), Some(last)) if first.batch == last.batch => {
+            add(outcomes, first, accepted, all - accepted);
+            true
         }
+        _ => false,
     }
-    accepted == all
+}
+
+fn add(outcomes: &mut [Result<Inserted>], row: &Row<'_>, accepted: u64, duplicate: u64) {
+    if let Some(Ok(inserted)) = outcomes.get_mut(row.batch) {
+        inserted.accepted += accepted;
+        inserted.duplicate += duplicate;
+    }
 }
 
 /// The keys of the cameras of a group, read in its own transaction, so that none can vanish before
@@ -251,7 +282,7 @@ async fn camera_keys(connection: &mut SqliteConnection, group: &[Batch]) -> Resu
 const COLUMNS: usize = 14;
 
 /// Rows per statement, largest first. Few sizes, so that each stays prepared.
-const SIZES: [usize; 6] = [1024, 256, 64, 16, 4, 1];
+const SIZES: [usize; 6] = [1000, 250, 50, 10, 3, 1];
 
 static INSERTS: LazyLock<[Arc<str>; SIZES.len()]> = LazyLock::new(|| {
     SIZES.map(|rows| {
@@ -281,18 +312,29 @@ fn statements(borders: &[usize]) -> Vec<Range<usize>> {
     ranges
 }
 
-/// One statement for as many rows as one of the sizes; returns how many were new.
-async fn insert(connection: &mut SqliteConnection, rows: &[Row<'_>]) -> Result<u64> {
-    let size = SIZES.iter().position(|&size| size == rows.len());
-    let sql = size.map(|size| Arc::clone(&INSERTS[size])).ok_or_else(|| Error::fault("no such statement"))?;
-    let mut arguments = SqliteArguments::default();
-    arguments.reserve(rows.len() * COLUMNS, 0);
-    for row in rows {
-        bind(&mut arguments, row).map_err(Error::fault)?;
+/// One statement for as many rows as one of the sizes, with its values.
+struct Insert {
+    sql: Arc<str>,
+    arguments: SqliteArguments,
+}
+
+impl Insert {
+    fn of(rows: &[Row<'_>]) -> Result<Self> {
+        let size = SIZES.iter().position(|&size| size == rows.len());
+        let size = size.ok_or_else(|| Error::fault("a statement of an unknown size"))?;
+        let mut arguments = SqliteArguments::default();
+        arguments.reserve(rows.len() * COLUMNS, 0);
+        for row in rows {
+            bind(&mut arguments, row).map_err(Error::fault)?;
+        }
+        Ok(Self { sql: Arc::clone(&INSERTS[size]), arguments })
     }
-    let done =
-        sqlx::query_with(sqlx::AssertSqlSafe(sql), arguments).execute(connection).await.map_err(failed)?;
-    Ok(done.rows_affected())
+
+    /// Returns how many rows were new.
+    async fn execute(self, connection: &mut SqliteConnection) -> Result<u64> {
+        let query = sqlx::query_with(AssertSqlSafe(self.sql), self.arguments);
+        Ok(query.execute(connection).await.map_err(failed)?.rows_affected())
+    }
 }
 
 fn bind(arguments: &mut SqliteArguments, row: &Row<'_>) -> Result<(), sqlx::error::BoxDynError> {

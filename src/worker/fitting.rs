@@ -3,6 +3,7 @@
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
@@ -20,8 +21,8 @@ pub(super) struct Update {
     pub(super) notes: Vec<String>,
 }
 
-#[derive(Default)]
 struct Shared {
+    began: Instant,
     cancelled: AtomicBool,
     update: Mutex<Update>,
 }
@@ -30,7 +31,10 @@ impl Shared {
     fn hear(&self, event: FitEvent<'_>) -> ControlFlow<()> {
         let mut update = self.update.lock().unwrap_or_else(PoisonError::into_inner);
         match event {
-            FitEvent::Progress(progress) => update.progress.clone_from(progress),
+            FitEvent::Progress(progress) => {
+                update.progress.clone_from(progress);
+                update.progress.remaining_s = remaining_s(progress, self.began.elapsed());
+            }
             FitEvent::Epoch(report) => update.epochs.push(*report),
             FitEvent::Note(line) => update.notes.push(line.to_owned()),
         }
@@ -59,7 +63,11 @@ pub(super) struct Fitting {
 impl Fitting {
     /// Starts the thread.
     pub(super) fn begin(samples: Arc<Vec<Sample>>, options: FitOptions) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared::default());
+        let shared = Arc::new(Shared {
+            began: Instant::now(),
+            cancelled: AtomicBool::new(false),
+            update: Mutex::default(),
+        });
         let (sender, fitted) = oneshot::channel();
         let heard = shared.clone();
         std::thread::Builder::new().name("fit".to_owned()).spawn(move || {
@@ -103,6 +111,12 @@ impl Drop for Fitting {
     }
 }
 
+/// Seconds left if the epochs to come take as long as those done.
+fn remaining_s(progress: &RunProgress, elapsed: Duration) -> Option<f64> {
+    let left = progress.epochs.checked_sub(progress.epoch)?;
+    (progress.epoch > 0).then(|| elapsed.as_secs_f64() * f64::from(left) / f64::from(progress.epoch))
+}
+
 fn panicked() -> FitError {
-    FitError::Fault("the fit's thread ended without a word".into())
+    FitError::Fault("the fit's thread ended without a word".to_owned())
 }

@@ -2,6 +2,8 @@
 
 mod bad_input;
 mod connections;
+mod grpc;
 mod harness;
 mod layering;
+mod openapi;
 mod story;

@@ -1,0 +1,214 @@
+//! Training samples in the form that every recipe learns from: metres, sorted by target and time,
+//! cut into passes and into blocks of time.
+//!
+//! What never happens here: learning; a look at a sample's truth.
+
+use jiff::Timestamp;
+use sha2::{Digest, Sha256};
+
+use super::FitError;
+use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
+use crate::geo::{EastNorth, LocalPlane, Position};
+
+/// Fewer samples cannot tell a camera from its noise.
+pub const FEWEST_SAMPLES: usize = 20;
+/// Fixes that vary by less, m, lie all at one spot.
+pub const SMALLEST_SPREAD_M: f64 = 0.1;
+/// A hole in a target's samples beyond this, and beyond ten times their usual step, ends a pass.
+const PASS_HOLE_S: f64 = 3.0;
+
+/// One training sample.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Row {
+    /// Seconds since the first sample.
+    pub(super) time_s: f64,
+    /// Counts targets from 0.
+    pub(super) target: u32,
+    /// Counts passes from 0; rows of a pass stand together in the order of time.
+    pub(super) pass: u32,
+    pub(super) bounding_box: BoundingBox,
+    /// The fix.
+    pub(super) position: Position,
+    /// The fix in the plane, or what the smoother made of it.
+    pub(super) label: EastNorth,
+    /// Error variance per axis that the receiver itself gave, m2.
+    pub(super) own_variance_m2: Option<f64>,
+}
+
+/// All samples of a fit.
+#[derive(Debug, Clone)]
+pub(super) struct Rows {
+    pub(super) plane: LocalPlane,
+    pub(super) rows: Vec<Row>,
+    pub(super) targets: u32,
+    pub(super) passes: u32,
+}
+
+impl Rows {
+    /// Sorts, projects and cuts the samples.
+    ///
+    /// # Errors
+    /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], or all at one spot.
+    pub(super) fn new(samples: &[Sample]) -> Result<Self, FitError> {
+        if samples.is_empty() {
+            return Err(unusable("there are none; import samples that have a box and a fix first".into()));
+        }
+        if samples.len() < FEWEST_SAMPLES {
+            return Err(unusable(format!(
+                "there are {}, a fit needs at least {FEWEST_SAMPLES}; import more, best of several passes \
+                 through different parts of the image",
+                samples.len()
+            )));
+        }
+        let mut sorted: Vec<&Sample> = samples.iter().collect();
+        sorted.sort_by(|left, right| (&left.target_id, left.time).cmp(&(&right.target_id, right.time)));
+        let plane = central_plane(&sorted);
+        let first = sorted.iter().map(|sample| sample.time).min().unwrap_or(Timestamp::UNIX_EPOCH);
+        let mut rows = Vec::with_capacity(sorted.len());
+        let mut target = 0;
+        for (at, sample) in sorted.iter().enumerate() {
+            target += u32::from(at > 0 && sorted[at - 1].target_id != sample.target_id);
+            rows.push(Row {
+                time_s: (sample.time.as_microsecond() - first.as_microsecond()) as f64 * 1e-6,
+                target,
+                pass: 0,
+                bounding_box: sample.bounding_box,
+                position: sample.fix.position,
+                label: plane.to_plane(sample.fix.position),
+                own_variance_m2: sample.fix.sigma_m.map(|sigma| sigma.variance_m2()),
+            });
+        }
+        let passes = number_passes(&mut rows);
+        let all = Self { plane, rows, targets: target + 1, passes };
+        all.refuse_one_spot()?;
+        Ok(all)
+    }
+
+    fn refuse_one_spot(&self) -> Result<(), FitError> {
+        let spread = |value: &dyn Fn(&Row) -> f64| spread(self.rows.iter().map(value));
+        let in_image = spread(&|row| row.bounding_box.foot_px()[0])
+            .max(spread(&|row| row.bounding_box.foot_px()[1]))
+            .max(spread(&|row| row.bounding_box.height_px()));
+        if in_image < 1.0 {
+            return Err(unusable(format!(
+                "all {} boxes are at one spot of the image (they vary by {in_image:.1} px); let the target \
+                 walk through the whole picture while samples are taken",
+                self.rows.len()
+            )));
+        }
+        let on_ground = spread(&|row| row.label.east_m).max(spread(&|row| row.label.north_m));
+        if on_ground < SMALLEST_SPREAD_M {
+            return Err(unusable(format!(
+                "all {} fixes are at one spot (they vary by {on_ground:.2} m) though the boxes move; check \
+                 that boxes and fixes are paired by time",
+                self.rows.len()
+            )));
+        }
+        Ok(())
+    }
+
+    /// Block of time of each row, 0 to `count - 1`: cuts at the largest holes near equal shares, so
+    /// that passes stay whole where they can. Rows of all targets at one time share a block.
+    pub(super) fn blocks(&self, count: u32) -> Vec<u32> {
+        let mut times: Vec<f64> = self.rows.iter().map(|row| row.time_s).collect();
+        times.sort_by(f64::total_cmp);
+        let share = times.len() / count as usize;
+        let cuts: Vec<f64> = (1..count as usize)
+            .map(|cut| {
+                let (low, high) = (cut * share - share / 3, cut * share + share / 3);
+                let hole = |at: usize| times[at] - times[at - 1];
+                let at = (low.max(1)..=high.min(times.len() - 1))
+                    .max_by(|left, right| {
+                        hole(*left)
+                            .total_cmp(&hole(*right))
+                            .then_with(|| right.abs_diff(cut * share).cmp(&left.abs_diff(cut * share)))
+                    })
+                    .unwrap_or(cut * share);
+                times[at]
+            })
+            .collect();
+        self.rows.iter().map(|row| cuts.iter().filter(|cut| row.time_s >= **cut).count() as u32).collect()
+    }
+
+    /// Some of the rows, in the same plane.
+    pub(super) fn filtered(&self, keep: impl Fn(usize) -> bool) -> Self {
+        let rows = self.rows.iter().enumerate().filter(|(at, _)| keep(*at)).map(|(_, row)| *row).collect();
+        Self { rows, ..*self }
+    }
+
+    /// Mean of the variances that the receiver gave itself, where every fix has one.
+    pub(super) fn own_variance_m2(&self) -> Option<f64> {
+        let sum = self.rows.iter().try_fold(0.0, |sum, row| Some(sum + row.own_variance_m2?))?;
+        Some(sum / self.rows.len() as f64)
+    }
+}
+
+/// SHA-256 of the samples in their order: time, target, box and fix of each.
+pub(super) fn hash_of(samples: &[Sample]) -> String {
+    let mut hash = Sha256::new();
+    for sample in samples {
+        hash.update(sample.time.as_microsecond().to_le_bytes());
+        hash.update((sample.target_id.as_str().len() as u64).to_le_bytes());
+        hash.update(sample.target_id.as_str());
+        for side in sample.bounding_box.sides_px() {
+            hash.update(side.to_le_bytes());
+        }
+        let fix = sample.fix;
+        hash.update(fix.position.longitude_deg().to_le_bytes());
+        hash.update(fix.position.latitude_deg().to_le_bytes());
+        hash.update(fix.sigma_m.map_or(0.0, |sigma| sigma.metres()).to_le_bytes());
+    }
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+pub(super) fn unusable(message: String) -> FitError {
+    FitError::Unusable(Error::field(ErrorKind::UnusableSamples, "samples", message))
+}
+
+/// Standard deviation.
+pub(super) fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
+    let count = values.clone().count().max(1) as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    (values.map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()
+}
+
+/// Middle value; 0 for none.
+pub(super) fn median(mut values: Vec<f64>) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// The plane about the median fix; medians are taken in a first plane, so that the antimeridian
+/// does no harm.
+fn central_plane(samples: &[&Sample]) -> LocalPlane {
+    let Some(first) = samples.first() else {
+        unreachable!("callers have samples");
+    };
+    let plane = LocalPlane::new(first.fix.position);
+    let points: Vec<EastNorth> = samples.iter().map(|sample| plane.to_plane(sample.fix.position)).collect();
+    let middle = EastNorth {
+        east_m: median(points.iter().map(|point| point.east_m).collect()),
+        north_m: median(points.iter().map(|point| point.north_m).collect()),
+    };
+    LocalPlane::new(plane.to_position(middle))
+}
+
+/// Numbers the passes of rows sorted by target and time; returns how many there are.
+fn number_passes(rows: &mut [Row]) -> u32 {
+    let steps = rows
+        .windows(2)
+        .filter(|pair| pair[0].target == pair[1].target)
+        .map(|pair| pair[1].time_s - pair[0].time_s)
+        .collect();
+    let hole_s = (10.0 * median(steps)).max(PASS_HOLE_S);
+    let mut pass = 0;
+    for at in 1..rows.len() {
+        let same = rows[at].target == rows[at - 1].target && rows[at].time_s - rows[at - 1].time_s <= hole_s;
+        pass += u32::from(!same);
+        rows[at].pass = pass;
+    }
+    pass + 1
+}

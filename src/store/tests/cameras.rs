@@ -1,0 +1,125 @@
+use super::*;
+use crate::domain::{Camera, GnssError, ImageSize, Revision, SigmaM, TargetClass};
+use crate::store::SampleFilter;
+
+/// A profile in which every field says something.
+fn full(name: &str) -> NewCamera {
+    NewCamera {
+        id: id(name),
+        display_name: "North \"gate\" – 2".to_owned(),
+        image_size: Some(ImageSize::new(1920, 1080).expect("a size")),
+        gnss_error: GnssError::Known(SigmaM::new(2.7).expect("a sigma")),
+        recipe: Recipe::Projective,
+        target_classes: vec![
+            TargetClass::new("person").expect("a class"),
+            TargetClass::new("a\"b").expect("a class"),
+        ],
+        labels: [("site".to_owned(), "ö\\\"".to_owned())].into(),
+    }
+}
+
+#[tokio::test]
+async fn a_profile_comes_back_as_it_was_given() {
+    let Fixture { store, folder: _folder, .. } = Fixture::new().await;
+    let made = store.insert_camera(&full("gate"), at(5)).await.expect("new");
+    let expected = Camera {
+        profile: full("gate"),
+        revision: Revision(1),
+        created_at: at(5),
+        updated_at: at(5),
+        active_model: None,
+    };
+    assert_eq!(made, expected);
+    assert_eq!(store.camera(&id("gate")).await.expect("known"), expected);
+    assert_eq!(kind(store.insert_camera(&full("gate"), at(6)).await), ErrorKind::CameraExists);
+    assert_eq!(kind(store.camera(&id("none")).await), ErrorKind::CameraNotFound);
+}
+
+#[tokio::test]
+async fn pages_hold_every_camera_once_in_order() {
+    let Fixture { store, folder: _folder, .. } = Fixture::new().await;
+    for name in ["a", "zz", "m-2", "m"] {
+        store.insert_camera(&full(name), at(1)).await.expect("new");
+    }
+    let mut seen: Vec<CameraId> = Vec::new();
+    loop {
+        let page = store.cameras(seen.last(), 2).await.expect("a page");
+        if page.is_empty() {
+            break;
+        }
+        assert!(page.len() <= 2);
+        seen.extend(page.iter().map(|camera| camera.id().clone()));
+    }
+    assert_eq!(seen, ["a", "m", "m-2", "square", "zz"].map(id));
+}
+
+#[tokio::test]
+async fn a_change_needs_the_revision_it_was_made_from() {
+    let Fixture { store, folder: _folder, .. } = Fixture::new().await;
+    let changed = store.replace_camera(&full("square"), Some(Revision(1)), at(7)).await.expect("current");
+    assert_eq!((changed.revision, changed.created_at, changed.updated_at), (Revision(2), at(0), at(7)));
+    assert_eq!(changed.profile, full("square"));
+    let stale = store.replace_camera(&full("square"), Some(Revision(1)), at(8)).await;
+    assert_eq!(kind(stale), ErrorKind::RevisionMismatch);
+    assert_eq!(
+        kind(store.delete_camera(&id("square"), Some(Revision(1))).await),
+        ErrorKind::RevisionMismatch
+    );
+    let forced = store.replace_camera(&full("square"), None, at(9)).await.expect("unconditional");
+    assert_eq!(forced.revision, Revision(3));
+    assert_eq!(kind(store.replace_camera(&full("none"), None, at(9)).await), ErrorKind::CameraNotFound);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn of_changes_at_once_from_one_revision_one_wins() {
+    let Fixture { store, folder: _folder, .. } = Fixture::new().await;
+    let attempts: Vec<_> = (0..8)
+        .map(|_| {
+            let store = store.clone();
+            tokio::spawn(async move { store.replace_camera(&full("square"), Some(Revision(1)), at(7)).await })
+        })
+        .collect();
+    let mut winners = 0;
+    for attempt in attempts {
+        match attempt.await.expect("no panic") {
+            Ok(_) => winners += 1,
+            Err(error) => assert_eq!(error.kind(), ErrorKind::RevisionMismatch),
+        }
+    }
+    assert_eq!(winners, 1);
+}
+
+#[tokio::test]
+async fn a_deleted_camera_takes_all_along_and_its_name_starts_anew() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    store.insert_samples(&camera, vec![sample(1, "a"), sample(2, "a")]).await.expect("stored");
+    store.insert_model(&camera, &metadata(), b"w", at(1)).await.expect("stored");
+    store.activate_model(&camera, 1, at(2)).await.expect("active");
+    store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
+    assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::RunLive);
+    store.request_cancel(&camera, run_id(1), at(4)).await.expect("cancelled");
+
+    store.delete_camera(&camera, Some(Revision(1))).await.expect("deleted");
+    assert_eq!(kind(store.camera(&camera).await), ErrorKind::CameraNotFound);
+    assert_eq!(kind(store.insert_samples(&camera, vec![sample(1, "a")]).await), ErrorKind::CameraNotFound);
+    assert_eq!(kind(store.log(run_id(1)).await), ErrorKind::RunNotFound);
+    assert_eq!(store.active_models().await.expect("none"), []);
+    assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::CameraNotFound);
+
+    store.insert_camera(&NewCamera::named(camera.clone()), at(5)).await.expect("new again");
+    assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 0);
+    assert_eq!(kind(store.model(&camera, 1).await), ErrorKind::ModelNotFound);
+    assert_eq!(kind(store.roll_back(&camera, at(6)).await), ErrorKind::NoModel);
+}
+
+#[tokio::test]
+async fn a_corrupt_row_is_a_fault_that_names_its_place() {
+    let fixture = Fixture::new().await;
+    fixture.tamper("UPDATE cameras SET recipe = 'magic' WHERE id = 'square'").await;
+    let error = fixture.store.camera(&fixture.camera).await.expect_err("corrupt");
+    assert_eq!(error.kind(), ErrorKind::Internal);
+    let text = error.to_string();
+    for part in ["cameras", "recipe", "id=square", "must be one of"] {
+        assert!(text.contains(part), "{part} is missing in: {text}");
+    }
+}

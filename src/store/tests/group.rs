@@ -1,0 +1,238 @@
+use std::collections::HashSet;
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::store::connection::Turn;
+use crate::store::{Inserted, SampleFilter};
+use tokio::task::JoinHandle;
+
+type Call = JoinHandle<Result<Inserted>>;
+
+fn call(store: &Store, camera: &CameraId, samples: Vec<Sample>) -> Call {
+    let (store, camera) = (store.clone(), camera.clone());
+    tokio::spawn(async move { store.insert_samples(&camera, samples).await })
+}
+
+/// Lets the writer go once all but the first of so many calls wait in the queue: they share the
+/// next transaction with it.
+async fn release(store: &Store, turn: Turn<'_>, calls: usize) {
+    while store.inner.samples.waiting() + 1 < calls {
+        tokio::task::yield_now().await;
+    }
+    drop(turn);
+}
+
+async fn count(store: &Store, camera: &CameraId) -> u64 {
+    store.count_samples(camera, &SampleFilter::default()).await.expect("counted")
+}
+
+#[tokio::test]
+async fn callers_of_one_transaction_are_each_counted_right() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    store.insert_samples(&camera, vec![sample(0, "old")]).await.expect("stored");
+    let turn = store.relaxed().await.expect("a turn");
+    let calls = vec![
+        call(&store, &camera, vec![sample(1, "a")]),
+        call(&store, &camera, vec![sample(1, "a")]),
+        call(&store, &camera, vec![sample(0, "old"), sample(2, "a")]),
+        call(&store, &id("none"), vec![sample(1, "a")]),
+        call(&store, &camera, Vec::new()),
+        call(&store, &camera, (3..1500).map(|second| sample(second, "a")).collect()),
+        call(&store, &camera, vec![sample(1499, "a"), sample(1500, "a"), sample(1500, "a")]),
+    ];
+    release(&store, turn, calls.len()).await;
+    let mut answers = Vec::new();
+    for call in calls {
+        answers.push(call.await.expect("no panic").map_err(|error| error.kind()));
+    }
+    let pair: u64 = answers[..2].iter().map(|it| it.expect("stored").accepted).sum();
+    assert_eq!(pair, 1, "one of two equal samples is new");
+    assert_eq!(answers[2], Ok(Inserted { accepted: 1, duplicate: 1 }));
+    assert_eq!(answers[3], Err(ErrorKind::CameraNotFound));
+    assert_eq!(answers[4], Ok(Inserted::default()));
+    assert_eq!(answers[5], Ok(Inserted { accepted: 1497, duplicate: 0 }));
+    assert_eq!(answers[6], Ok(Inserted { accepted: 1, duplicate: 2 }));
+    assert_eq!(count(&store, &camera).await, 1 + 1 + 1 + 1497 + 1);
+}
+
+#[tokio::test]
+async fn a_row_that_fails_fails_only_its_caller() {
+    let fixture = Fixture::new().await;
+    let (store, camera) = (&fixture.store, &fixture.camera);
+    fixture
+        .tamper(
+            "CREATE TRIGGER poison BEFORE INSERT ON samples WHEN NEW.target_id = 'poison' \
+             BEGIN SELECT RAISE(ABORT, 'poisoned'); END",
+        )
+        .await;
+    let turn = store.relaxed().await.expect("a turn");
+    let calls = vec![
+        call(store, camera, vec![sample(1, "a")]),
+        call(store, camera, vec![sample(2, "a"), sample(2, "poison")]),
+        call(store, camera, vec![sample(3, "a"), sample(4, "a")]),
+    ];
+    release(store, turn, calls.len()).await;
+    let mut accepted = Vec::new();
+    for call in calls {
+        accepted.push(
+            call.await.expect("no panic").map(|inserted| inserted.accepted).map_err(|error| error.kind()),
+        );
+    }
+    assert_eq!(accepted, [Ok(1), Err(ErrorKind::Internal), Ok(2)]);
+    assert_eq!(count(store, camera).await, 3, "the failed caller's good row is not stored either");
+}
+
+#[tokio::test]
+async fn callers_who_go_away_do_not_disturb_the_others() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    let turn = store.relaxed().await.expect("a turn");
+    let gone = call(&store, &camera, vec![sample(1, "a")]);
+    let stays = call(&store, &camera, vec![sample(2, "a")]);
+    while store.inner.samples.waiting() + 1 < 2 {
+        tokio::task::yield_now().await;
+    }
+    gone.abort();
+    drop(turn);
+    assert_eq!(stays.await.expect("no panic").expect("stored").accepted, 1);
+    assert_eq!(store.insert_samples(&camera, vec![sample(3, "a")]).await.expect("stored").accepted, 1);
+}
+
+#[tokio::test]
+async fn a_change_dropped_half_way_leaves_nothing_and_holds_nobody_up() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    {
+        let mut turn = store.synced().await.expect("a turn");
+        let mut transaction = turn.begin().await.expect("begins");
+        sqlx::query("DELETE FROM cameras").execute(&mut *transaction).await.expect("deletes");
+    }
+    assert_eq!(store.insert_samples(&camera, vec![sample(3, "a")]).await.expect("stored").accepted, 1);
+    assert_eq!(store.cameras(None, 9).await.expect("a page").len(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn many_callers_at_once_lose_and_double_nothing() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    // Every key is handed in by two callers; a third of the rows is of a camera that comes and goes.
+    let calls: Vec<Call> = (0..2_000).map(|n| call(&store, &camera, vec![sample(n / 2, "a")])).collect();
+    let fleeting = id("fleeting");
+    for round in 0..20 {
+        store.insert_camera(&NewCamera::named(fleeting.clone()), at(round)).await.expect("new");
+        let insert = call(&store, &fleeting, vec![sample(round, "a")]);
+        store.delete_camera(&fleeting, None).await.expect("deleted");
+        match insert.await.expect("no panic") {
+            Ok(inserted) => assert_eq!(inserted.accepted, 1),
+            Err(error) => assert_eq!(error.kind(), ErrorKind::CameraNotFound),
+        }
+    }
+    let mut sum = Inserted::default();
+    for call in calls {
+        let inserted = call.await.expect("no panic").expect("stored");
+        sum.accepted += inserted.accepted;
+        sum.duplicate += inserted.duplicate;
+    }
+    assert_eq!(sum, Inserted { accepted: 1_000, duplicate: 1_000 });
+    assert_eq!(count(&store, &camera).await, 1_000);
+}
+
+#[tokio::test]
+async fn closing_commits_what_was_handed_in_and_refuses_what_comes_later() {
+    let Fixture { store, camera, folder } = Fixture::new().await;
+    let turn = store.relaxed().await.expect("a turn");
+    let calls: Vec<Call> = (0..50).map(|n| call(&store, &camera, vec![sample(n, "a")])).collect();
+    release(&store, turn, calls.len()).await;
+    store.close().await;
+    store.close().await;
+    for call in calls {
+        assert_eq!(call.await.expect("no panic").expect("stored").accepted, 1);
+    }
+    assert_eq!(kind(store.insert_samples(&camera, vec![sample(99, "a")]).await), ErrorKind::ShuttingDown);
+    assert_eq!(kind(store.camera(&camera).await), ErrorKind::ShuttingDown);
+    assert_eq!(kind(store.roll_back(&camera, at(1)).await), ErrorKind::ShuttingDown);
+    assert_eq!(kind(store.ping().await), ErrorKind::ShuttingDown);
+    assert!(!folder.path().join("sightfix.db-wal").exists(), "the log went back into the file");
+    let again = Store::open(folder.path()).await.expect("opens");
+    assert_eq!(count(&again, &camera).await, 50);
+}
+
+/// After some failures (a full disk, an I/O error) the database ends a transaction by itself, which the
+/// connection must not stumble over.
+#[tokio::test]
+async fn the_writer_survives_a_transaction_that_ended_under_it() {
+    let fixture = Fixture::new().await;
+    let (store, camera) = (&fixture.store, &fixture.camera);
+    fixture
+        .tamper(
+            "CREATE TRIGGER poison BEFORE INSERT ON samples WHEN NEW.target_id = 'poison' \
+             BEGIN SELECT RAISE(ROLLBACK, 'poisoned'); END",
+        )
+        .await;
+    for round in 0..3 {
+        let turn = store.relaxed().await.expect("a turn");
+        let calls = vec![
+            call(store, camera, vec![sample(round, "a")]),
+            call(store, camera, vec![sample(round, "b"), sample(round, "poison")]),
+            call(store, camera, vec![sample(round, "c")]),
+        ];
+        release(store, turn, calls.len()).await;
+        let mut accepted = Vec::new();
+        for call in calls {
+            let outcome = call.await.expect("no panic");
+            accepted.push(outcome.map(|inserted| inserted.accepted).map_err(|error| error.kind()));
+        }
+        assert_eq!(accepted, [Ok(1), Err(ErrorKind::Internal), Ok(1)]);
+    }
+    store
+        .replace_camera(&NewCamera::named(camera.clone()), None, at(1))
+        .await
+        .expect("other changes work too");
+    assert_eq!(count(store, camera).await, 6);
+}
+
+#[tokio::test]
+async fn a_full_disk_is_a_fault_and_leaves_nothing_half_done() {
+    let fixture = Fixture::new().await;
+    let (store, camera) = (&fixture.store, &fixture.camera);
+    store.insert_samples(camera, vec![sample(0, "a")]).await.expect("stored");
+    {
+        // The limit is the connection's own, so it must be the one that stores the samples.
+        let mut turn = store.relaxed().await.expect("a turn");
+        let mut transaction = turn.begin().await.expect("begins");
+        sqlx::raw_sql("PRAGMA max_page_count = 60").execute(&mut *transaction).await.expect("set");
+        transaction.commit().await.expect("commits");
+    }
+    let many: Vec<Sample> = (1..20_000).map(|n| sample(n, "a")).collect();
+    assert_eq!(kind(store.insert_samples(camera, many).await), ErrorKind::Internal);
+    assert_eq!(count(store, camera).await, 1);
+    assert_eq!(store.insert_samples(camera, vec![sample(1, "a")]).await.expect("fits").accepted, 1);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(40))]
+
+    /// Whatever callers share a transaction, each is counted as if they had come one after another.
+    #[test]
+    fn sharing_a_transaction_changes_no_count(
+        before in prop::collection::vec((0_i64..40, "[ab]"), 0..20),
+        calls in prop::collection::vec(prop::collection::vec((0_i64..40, "[ab]"), 0..12), 1..12),
+    ) {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        runtime.block_on(async {
+            let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+            let rows = |keys: &[(i64, String)]| keys.iter().map(|(n, who)| sample(*n, who)).collect::<Vec<_>>();
+            store.insert_samples(&camera, rows(&before)).await.expect("stored");
+            let turn = store.relaxed().await.expect("a turn");
+            let tasks: Vec<Call> = calls.iter().map(|keys| call(&store, &camera, rows(keys))).collect();
+            release(&store, turn, tasks.len()).await;
+            let mut known: HashSet<_> = before.into_iter().collect();
+            for (task, keys) in tasks.into_iter().zip(calls) {
+                let asked = keys.len() as u64;
+                let accepted = keys.into_iter().map(|key| u64::from(known.insert(key))).sum();
+                let inserted = task.await.expect("no panic").expect("stored");
+                prop_assert_eq!(inserted, Inserted { accepted, duplicate: asked - accepted });
+            }
+            prop_assert_eq!(count(&store, &camera).await, known.len() as u64);
+            Ok(())
+        })?;
+    }
+}

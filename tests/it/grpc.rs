@@ -3,8 +3,5 @@
 mod cameras;
 mod fusions;
 mod imports;
-<<<<<<< HEAD
 mod models;
-=======
->>>>>>> main
 mod server;

@@ -243,7 +243,7 @@ async fn a_watched_run_is_followed_to_the_end_of_the_run_or_of_the_server() {
     let request = proto::StartTrainingRunRequest { camera_id: "yard".to_owned(), ..Default::default() };
     let run = training.start_training_run(request).await.expect("queued").into_inner().run.expect("a run");
     assert_eq!(run.state(), proto::TrainingRunState::Queued);
-    assert_eq!(run.recipe(), proto::Recipe::Hybrid);
+    assert_eq!(run.recipe(), proto::Recipe::Auto);
     let watch = proto::WatchTrainingRunRequest { camera_id: "yard".to_owned(), run_id: run.id.clone() };
 
     let mut watched = training.watch_training_run(watch.clone()).await.expect("a stream").into_inner();

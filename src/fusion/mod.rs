@@ -2,7 +2,9 @@
 //!
 //! What never happens here: I/O, clocks, randomness, allocation that an outside client decides.
 
-mod plane_covariance;
+pub mod clock_offset;
+pub mod pairing;
+pub mod plane_covariance;
 pub mod track;
 pub mod two_step;
 

@@ -75,6 +75,8 @@ pub(super) struct Bank {
     weights: [f64; MODES],
     standings: [Standing; 2],
     last_box_at: Option<Timestamp>,
+    /// Square of the speed the target was seen to reach, slowly forgotten, m2/s2.
+    reached_m2_s2: f64,
 }
 
 /// A measurement split into its coloured part (a root that scales the bias) and its white part.
@@ -87,7 +89,12 @@ struct Split {
 
 impl Bank {
     /// A filter that knows one measured position and nothing else.
-    pub(super) fn start(settings: &TrackSettings, time: Timestamp, source: Source, measured: Measured) -> Self {
+    pub(super) fn start(
+        settings: &TrackSettings,
+        time: Timestamp,
+        source: Source,
+        measured: Measured,
+    ) -> Self {
         let split = split(settings, source, measured, 1.0);
         let mut mean = State::zeros();
         mean[POSITION] = split.position.east_m;
@@ -122,6 +129,7 @@ impl Bank {
             weights: stationary_weights(&settings.motion),
             standings,
             last_box_at: (source == Source::Regressed).then_some(time),
+            reached_m2_s2: settings.motion.least_speed_m_s.powi(2),
         }
     }
 
@@ -134,7 +142,14 @@ impl Bank {
         self.time = time;
         self.mix(&settings.motion, step_s);
         let motion = &settings.motion;
-        let densities = [0.0, motion.steady_m2_s3, motion.agile_m2_s3];
+        self.remember_speed(motion, step_s);
+        // An agile target's velocity spreads to the speed it was seen to reach, and no further.
+        let agile_m2_s3 = 2.0 * self.reached_m2_s2 / motion.agile_time_constant_s;
+        let ways = [
+            (0.0, f64::INFINITY),
+            (motion.steady_m2_s3, motion.steady_time_constant_s),
+            (agile_m2_s3, motion.agile_time_constant_s),
+        ];
         for (mode, hypothesis) in self.hypotheses.iter_mut().enumerate() {
             hypothesis.fade_biases(settings, step_s);
             if mode == STILL {
@@ -143,7 +158,22 @@ impl Bank {
                     hypothesis.covariance[(POSITION + axis, POSITION + axis)] += motion.still_m2_s * step_s;
                 }
             } else {
-                hypothesis.go(step_s, densities[mode], motion.velocity_time_constant_s);
+                let (density_m2_s3, time_constant_s) = ways[mode];
+                hypothesis.go(step_s, density_m2_s3, time_constant_s);
+            }
+        }
+    }
+
+    /// Holds the highest speed that is beyond doubt, and lets it fade.
+    fn remember_speed(&mut self, motion: &Motion, step_s: f64) {
+        self.reached_m2_s2 *= (-step_s * std::f64::consts::LN_2 / motion.speed_memory_s).exp();
+        self.reached_m2_s2 = self.reached_m2_s2.max(motion.least_speed_m_s.powi(2));
+        for (hypothesis, weight) in self.hypotheses.iter().zip(self.weights).skip(1) {
+            let speed_m2_s2: f64 = (VELOCITY..GNSS_BIAS)
+                .map(|state| hypothesis.mean[state].powi(2) - hypothesis.covariance[(state, state)])
+                .sum();
+            if weight > 0.3 && speed_m2_s2 > self.reached_m2_s2 {
+                self.reached_m2_s2 = speed_m2_s2;
             }
         }
     }
@@ -156,7 +186,8 @@ impl Bank {
         measurement: &Measurement,
     ) -> [Option<Judgement>; 2] {
         self.predict(settings, measurement.time);
-        let regressed = measurement.regressed.map(|measured| self.take(settings, Source::Regressed, measured));
+        let regressed =
+            measurement.regressed.map(|measured| self.take(settings, Source::Regressed, measured));
         let fix = measurement.fix.map(|measured| self.take(settings, Source::Fix, measured));
         [regressed, fix]
     }
@@ -221,8 +252,11 @@ impl Bank {
         let mut total = PlaneCovariance::default();
         for ((innovation, moments), weight) in parts.iter().zip(self.weights) {
             let (east, north) = (innovation[0] - mean[0], innovation[1] - mean[1]);
-            let spread =
-                PlaneCovariance { east_m2: east * east, north_m2: north * north, east_north_m2: east * north };
+            let spread = PlaneCovariance {
+                east_m2: east * east,
+                north_m2: north * north,
+                east_north_m2: east * north,
+            };
             total = total.plus(moments.plus(spread).scaled(weight));
         }
         let innovation = EastNorth { east_m: mean[0], north_m: mean[1] };
@@ -289,10 +323,10 @@ impl Bank {
         };
         let before = self.hypotheses.clone();
         let mut weights = [0.0; MODES];
-        for to in 0..MODES {
+        for (to, mixed) in weights.iter_mut().enumerate() {
             let shares: [f64; MODES] = std::array::from_fn(|from| self.weights[from] * chance(from, to));
             let total: f64 = shares.iter().sum();
-            weights[to] = total;
+            *mixed = total;
             if total > 1e-12 {
                 self.hypotheses[to] = blend(&before, shares.map(|share| share / total));
             }
@@ -445,8 +479,7 @@ impl Hypothesis {
         ];
         for state in 0..STATES {
             let (east, north) = (cross[(state, 0)], cross[(state, 1)]);
-            let gain =
-                [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
+            let gain = [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
             self.mean[state] += gain[0] * innovation[0] + gain[1] * innovation[1];
             for other in 0..=state {
                 let less = gain[0] * cross[(other, 0)] + gain[1] * cross[(other, 1)];

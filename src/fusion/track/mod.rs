@@ -7,13 +7,19 @@
 //! same items in another order within the window give the same state to the last bit.
 
 mod bank;
+mod noise;
 mod settings;
+#[cfg(test)]
+pub(in crate::fusion) mod simulated;
+#[cfg(test)]
+mod tests;
 
 use std::cmp::Ordering;
 use std::collections::VecDeque;
 
 use jiff::Timestamp;
 
+pub use noise::{GnssNoiseEstimate, ResidualAt, estimate_gnss_noise};
 pub use settings::{GnssNoise, Motion, RegressionNoise, TrackSettings};
 
 use self::bank::{Bank, Judgement};
@@ -198,13 +204,7 @@ impl Track {
             bank.step(&settings, &Measurement { time: first.time, fix: rest, regressed: None });
         }
         let base = Box::new(bank);
-        Some(Self {
-            settings,
-            now: base.clone(),
-            base,
-            entries: VecDeque::new(),
-            first: *first,
-        })
+        Some(Self { settings, now: base.clone(), base, entries: VecDeque::new(), first: *first })
     }
 
     /// When the target was measured first.
@@ -358,7 +358,9 @@ impl Track {
     fn shrink(&mut self) {
         let window_s = self.settings.window_s;
         loop {
-            let Some(index) = self.entries.iter().position(|entry| entry.checkpoint.is_some()) else { return };
+            let Some(index) = self.entries.iter().position(|entry| entry.checkpoint.is_some()) else {
+                return;
+            };
             let age_s = self.now.time.duration_since(self.entries[index].measurement.time).as_secs_f64();
             let crowded = self.entries.len() > self.settings.window_items.max(2 * CHECKPOINT_ITEMS);
             if age_s <= window_s && !crowded {

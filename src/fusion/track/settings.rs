@@ -38,17 +38,23 @@ impl Default for RegressionNoise {
 }
 
 /// How targets move. Three ways are followed side by side (interacting multiple models): standing,
-/// going steadily, and turning or starting.
+/// going steadily, and turning or starting. How sharply a target turns is scaled by how fast it was
+/// seen to go, so that the same settings serve walkers and vehicles, and the stated error of a walker
+/// who is out of sight does not grow like a car's.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Motion {
     /// Random walk of a standing target's position, m2/s.
     pub still_m2_s: f64,
     /// Acceleration density of steady going, m2/s3.
     pub steady_m2_s3: f64,
-    /// Acceleration density of turning or starting, m2/s3.
-    pub agile_m2_s3: f64,
-    /// Seconds after which a velocity keeps 1/e of itself when nothing is measured.
-    pub velocity_time_constant_s: f64,
+    /// Seconds after which a steady velocity keeps 1/e of itself when nothing is measured.
+    pub steady_time_constant_s: f64,
+    /// The same for a target that turns or starts; its velocity then spreads to its own speed.
+    pub agile_time_constant_s: f64,
+    /// Every target is believed to be able to go this fast, per axis, m/s.
+    pub least_speed_m_s: f64,
+    /// Seconds after which half of a speed that was reached is forgotten.
+    pub speed_memory_s: f64,
     /// Mean stay in each way of moving, s: still, steady, agile.
     pub stay_s: [f64; 3],
     /// Standard deviation per axis of the unknown first velocity, m/s.
@@ -59,11 +65,13 @@ impl Default for Motion {
     fn default() -> Self {
         Self {
             still_m2_s: 1e-4,
-            steady_m2_s3: 0.03,
-            agile_m2_s3: 1.0,
-            velocity_time_constant_s: 60.0,
+            steady_m2_s3: 0.05,
+            steady_time_constant_s: 60.0,
+            agile_time_constant_s: 5.0,
+            least_speed_m_s: 1.5,
+            speed_memory_s: 120.0,
             stay_s: [30.0, 20.0, 5.0],
-            first_speed_m_s: 2.0,
+            first_speed_m_s: 10.0,
         }
     }
 }

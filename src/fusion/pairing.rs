@@ -1,0 +1,406 @@
+//! Detections and fixes that come apart, brought together by time.
+//!
+//! Each receiver is bound to a target and has a fixed clock offset. Under [`PairingRule::Nearest`] a
+//! fix and a box make a sample when each is the other's nearest within the window, so no fix labels
+//! two boxes; under [`PairingRule::Interpolated`] every box between two neighbouring fixes gets a
+//! fix of its own time. What never happens here: files, clocks, unbounded memory on a live stream.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use jiff::{SignedDuration, Timestamp};
+
+use crate::domain::{Detection, Fix, Sample, TargetId};
+use crate::geo::{EastNorth, LocalPlane};
+
+/// A fix as a receiver sent it, by the receiver's own clock.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReceivedFix {
+    /// When, by the receiver's clock.
+    pub time: Timestamp,
+    /// Which receiver; `None` where the file names none.
+    pub receiver_id: Option<TargetId>,
+    /// Where it says it is.
+    pub fix: Fix,
+}
+
+/// Whose a receiver is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Receiver {
+    /// The target that carries it.
+    pub target_id: TargetId,
+    /// Added to the receiver's time to get the camera's.
+    pub clock_offset: SignedDuration,
+}
+
+/// All receivers of a camera.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Receivers {
+    /// By receiver id; a receiver that is not named here carries its own id as target id.
+    pub bound: BTreeMap<TargetId, Receiver>,
+    /// Whose the fixes without a receiver id are.
+    pub nameless: Option<Receiver>,
+}
+
+impl Receivers {
+    /// Target and camera time of a fix; `None` for a fix without a receiver id that nobody claims.
+    #[must_use]
+    pub fn resolve(&self, received: &ReceivedFix) -> Option<(TargetId, Timestamp)> {
+        let receiver = match &received.receiver_id {
+            Some(id) => match self.bound.get(id) {
+                Some(receiver) => receiver,
+                None => return Some((id.clone(), received.time)),
+            },
+            None => self.nameless.as_ref()?,
+        };
+        let time = received.time.saturating_add(receiver.clock_offset).unwrap_or(received.time);
+        Some((receiver.target_id.clone(), time))
+    }
+}
+
+/// How a box finds its fix.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum PairingRule {
+    /// Box and fix that are each other's nearest within the window.
+    #[default]
+    Nearest,
+    /// The straight line between the fixes before and after the box.
+    Interpolated,
+}
+
+/// How to pair, and how much to keep on a live stream.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PairingSettings {
+    /// How a box finds its fix.
+    pub rule: PairingRule,
+    /// Box and fix are at most this far apart (nearest).
+    pub window: SignedDuration,
+    /// Fixes are joined by a line over at most this long a gap (interpolated).
+    pub longest_gap: SignedDuration,
+    /// On a stream, items may come this late and still find their partner.
+    pub lateness: SignedDuration,
+    /// On a stream, items kept per target and kind.
+    pub items_per_target: usize,
+    /// On a stream, targets kept.
+    pub targets: usize,
+}
+
+impl Default for PairingSettings {
+    /// Half a second: half the interval of the slowest common receivers, so that neighbours in time
+    /// are never mistaken for partners.
+    fn default() -> Self {
+        Self {
+            rule: PairingRule::Nearest,
+            window: SignedDuration::from_millis(500),
+            longest_gap: SignedDuration::from_millis(2_500),
+            lateness: SignedDuration::from_secs(3),
+            items_per_target: 512,
+            targets: 1_024,
+        }
+    }
+}
+
+/// What did not become part of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Unpaired {
+    /// Boxes without a partner.
+    pub detections: u64,
+    /// Fixes without a partner (nearest), or that came too late to be used (interpolated).
+    pub fixes: u64,
+    /// Boxes or fixes of a target and instant that was there already.
+    pub duplicates: u64,
+    /// Fixes of receivers that are bound to nobody.
+    pub unbound: u64,
+    /// Items lost to the limits of a stream.
+    pub dropped: u64,
+}
+
+/// Two recorded lists as training samples.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Paired {
+    /// In order of time, then target.
+    pub samples: Vec<Sample>,
+    /// The rest, counted.
+    pub unpaired: Unpaired,
+}
+
+/// Pairs two recorded lists, in any order.
+#[must_use]
+pub fn pair(
+    mut detections: Vec<Detection>,
+    mut fixes: Vec<ReceivedFix>,
+    receivers: &Receivers,
+    settings: &PairingSettings,
+) -> Paired {
+    detections.sort_by_key(|detection| detection.time);
+    fixes.sort_by_key(|fix| fix.time);
+    let settings = PairingSettings { items_per_target: usize::MAX, targets: usize::MAX, ..*settings };
+    let mut pairer = Pairer::new(settings, receivers.clone());
+    for detection in detections {
+        pairer.insert_detection(detection);
+    }
+    for fix in fixes {
+        pairer.insert_fix(fix);
+    }
+    let samples = pairer.finish();
+    Paired { samples, unpaired: pairer.unpaired }
+}
+
+/// Pairs a live stream in bounded memory. A sample comes out once nothing that may still arrive in
+/// time could change it; [`Pairer::finish`] gives what is left.
+#[derive(Debug, Clone)]
+pub struct Pairer {
+    settings: PairingSettings,
+    receivers: Receivers,
+    lanes: BTreeMap<TargetId, Lane>,
+    unpaired: Unpaired,
+}
+
+/// What is kept of one target, in order of time.
+#[derive(Debug, Clone, Default)]
+struct Lane {
+    detections: VecDeque<Kept<Detection>>,
+    fixes: VecDeque<Kept<Fix>>,
+    latest: Option<Timestamp>,
+    /// Everything up to here has been decided.
+    decided: Option<Timestamp>,
+}
+
+#[derive(Debug, Clone)]
+struct Kept<T> {
+    time: Timestamp,
+    item: T,
+    used: bool,
+}
+
+impl Pairer {
+    /// Nothing kept yet.
+    #[must_use]
+    pub fn new(settings: PairingSettings, receivers: Receivers) -> Self {
+        Self { settings, receivers, lanes: BTreeMap::new(), unpaired: Unpaired::default() }
+    }
+
+    /// What has not become part of a sample so far.
+    #[must_use]
+    pub const fn unpaired(&self) -> Unpaired {
+        self.unpaired
+    }
+
+    /// Takes a box; returns the samples that are now certain.
+    pub fn push_detection(&mut self, detection: Detection) -> Vec<Sample> {
+        let target_id = detection.target_id.clone();
+        self.insert_detection(detection);
+        self.decide(&target_id)
+    }
+
+    /// Takes a fix; returns the samples that are now certain.
+    pub fn push_fix(&mut self, received: ReceivedFix) -> Vec<Sample> {
+        match self.insert_fix(received) {
+            Some(target_id) => self.decide(&target_id),
+            None => Vec::new(),
+        }
+    }
+
+    /// Decides everything kept, as if the stream had ended. In order of time, then target.
+    pub fn finish(&mut self) -> Vec<Sample> {
+        let mut samples = Vec::new();
+        for lane in self.lanes.values_mut() {
+            lane.decide(&self.settings, None, &mut samples);
+            lane.forget(None, &mut self.unpaired, self.settings.rule);
+        }
+        self.lanes.clear();
+        samples.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
+        samples
+    }
+
+    fn insert_detection(&mut self, detection: Detection) {
+        let (target_id, time) = (detection.target_id.clone(), detection.time);
+        let limit = self.settings.items_per_target;
+        let Some(lane) = lane_of(&mut self.lanes, &self.settings, target_id, &mut self.unpaired) else {
+            return;
+        };
+        if lane.is_decided(time) {
+            self.unpaired.detections += 1;
+            return;
+        }
+        lane.latest = lane.latest.max(Some(time));
+        keep(&mut lane.detections, time, detection, limit, &mut self.unpaired);
+    }
+
+    fn insert_fix(&mut self, received: ReceivedFix) -> Option<TargetId> {
+        let Some((target_id, time)) = self.receivers.resolve(&received) else {
+            self.unpaired.unbound += 1;
+            return None;
+        };
+        let limit = self.settings.items_per_target;
+        let lane = lane_of(&mut self.lanes, &self.settings, target_id.clone(), &mut self.unpaired)?;
+        if lane.is_decided(time) {
+            self.unpaired.fixes += 1;
+            return None;
+        }
+        lane.latest = lane.latest.max(Some(time));
+        keep(&mut lane.fixes, time, received.fix, limit, &mut self.unpaired);
+        Some(target_id)
+    }
+
+    fn decide(&mut self, target_id: &TargetId) -> Vec<Sample> {
+        let mut samples = Vec::new();
+        let settings = &self.settings;
+        let Some(lane) = self.lanes.get_mut(target_id) else { return samples };
+        // A partner's own partner may lie one window further on.
+        let reach = reach(settings);
+        let until = lane.latest.and_then(|latest| latest.checked_sub(reach + settings.lateness).ok());
+        let Some(until) = until.filter(|until| !lane.is_decided(*until)) else { return samples };
+        lane.decide(settings, Some(until), &mut samples);
+        lane.decided = Some(until);
+        let forgotten = until.checked_sub(reach).ok();
+        if forgotten.is_some() {
+            lane.forget(forgotten, &mut self.unpaired, settings.rule);
+        }
+        samples
+    }
+}
+
+/// How far beyond an item its decision looks.
+fn reach(settings: &PairingSettings) -> SignedDuration {
+    match settings.rule {
+        PairingRule::Nearest => settings.window + settings.window,
+        PairingRule::Interpolated => settings.longest_gap,
+    }
+}
+
+/// The target's lane, made if there is room for it; else the target heard of longest ago gives way.
+fn lane_of<'a>(
+    lanes: &'a mut BTreeMap<TargetId, Lane>,
+    settings: &PairingSettings,
+    target_id: TargetId,
+    unpaired: &mut Unpaired,
+) -> Option<&'a mut Lane> {
+    if !lanes.contains_key(&target_id) && lanes.len() >= settings.targets {
+        let stalest = lanes.iter().min_by_key(|(_, lane)| lane.latest).map(|(id, _)| id.clone())?;
+        let gone = lanes.remove(&stalest)?;
+        let unused = |used: bool| u64::from(!used);
+        unpaired.dropped += gone.detections.iter().map(|kept| unused(kept.used)).sum::<u64>();
+        unpaired.dropped += gone.fixes.iter().map(|kept| unused(kept.used)).sum::<u64>();
+    }
+    Some(lanes.entry(target_id).or_default())
+}
+
+/// Puts an item at its place in time; the oldest gives way when there is no room.
+fn keep<T>(kept: &mut VecDeque<Kept<T>>, time: Timestamp, item: T, limit: usize, unpaired: &mut Unpaired) {
+    let place = kept.partition_point(|other| other.time < time);
+    if kept.get(place).is_some_and(|other| other.time == time) {
+        unpaired.duplicates += 1;
+        return;
+    }
+    kept.insert(place, Kept { time, item, used: false });
+    if kept.len() > limit {
+        unpaired.dropped += u64::from(kept.pop_front().is_some_and(|oldest| !oldest.used));
+    }
+}
+
+/// Index of the item nearest in time, the earlier of two equally near.
+fn nearest<T>(kept: &VecDeque<Kept<T>>, time: Timestamp) -> Option<usize> {
+    let after = kept.partition_point(|other| other.time < time);
+    let apart = |index: &usize| kept[*index].time.duration_since(time).abs();
+    [after.checked_sub(1), (after < kept.len()).then_some(after)].into_iter().flatten().min_by_key(apart)
+}
+
+impl Lane {
+    fn is_decided(&self, time: Timestamp) -> bool {
+        self.decided.is_some_and(|decided| time <= decided)
+    }
+
+    /// Makes the samples of the boxes up to an instant; of all of them for `None`.
+    fn decide(&mut self, settings: &PairingSettings, until: Option<Timestamp>, samples: &mut Vec<Sample>) {
+        let begin =
+            self.decided.map_or(0, |decided| self.detections.partition_point(|kept| kept.time <= decided));
+        for index in begin..self.detections.len() {
+            let time = self.detections[index].time;
+            if until.is_some_and(|until| time > until) {
+                break;
+            }
+            let fix = match settings.rule {
+                PairingRule::Nearest => self.partner(settings, index),
+                PairingRule::Interpolated => self.interpolated(settings, time),
+            };
+            if let Some(fix) = fix {
+                self.detections[index].used = true;
+                samples.push(sample(&self.detections[index].item, fix));
+            }
+        }
+    }
+
+    /// The fix that is nearest to a box and whose nearest box this is.
+    fn partner(&mut self, settings: &PairingSettings, index: usize) -> Option<Fix> {
+        let time = self.detections[index].time;
+        let found = nearest(&self.fixes, time)?;
+        let fix_time = self.fixes[found].time;
+        let near = fix_time.duration_since(time).abs() <= settings.window;
+        if !near || nearest(&self.detections, fix_time)? != index {
+            return None;
+        }
+        self.fixes[found].used = true;
+        Some(self.fixes[found].item)
+    }
+
+    /// The fix of an instant on the straight line between its neighbours.
+    fn interpolated(&mut self, settings: &PairingSettings, time: Timestamp) -> Option<Fix> {
+        let after = self.fixes.partition_point(|kept| kept.time < time);
+        if let Some(exact) = self.fixes.get_mut(after).filter(|kept| kept.time == time) {
+            exact.used = true;
+            return Some(exact.item);
+        }
+        let before = after.checked_sub(1)?;
+        let (first, second) = (self.fixes.get(before)?, self.fixes.get(after)?);
+        let gap = second.time.duration_since(first.time);
+        if gap > settings.longest_gap {
+            return None;
+        }
+        let share = time.duration_since(first.time).as_secs_f64() / gap.as_secs_f64();
+        let fix = between(first.item, second.item, share);
+        self.fixes[before].used = true;
+        self.fixes[after].used = true;
+        Some(fix)
+    }
+
+    /// Lets go of what no decision will look at again, and counts what found no partner.
+    fn forget(&mut self, until: Option<Timestamp>, unpaired: &mut Unpaired, rule: PairingRule) {
+        let old = |time: Timestamp| until.is_none_or(|until| time < until);
+        while self.detections.front().is_some_and(|kept| old(kept.time)) {
+            let unused = self.detections.pop_front().is_some_and(|kept| !kept.used);
+            unpaired.detections += u64::from(unused);
+        }
+        while self.fixes.front().is_some_and(|kept| old(kept.time)) {
+            let unused = self.fixes.pop_front().is_some_and(|kept| !kept.used);
+            unpaired.fixes += u64::from(unused && rule == PairingRule::Nearest);
+        }
+    }
+}
+
+/// The fix a share of the way from one to another; its sigma is the larger of the two.
+fn between(first: Fix, second: Fix, share: f64) -> Fix {
+    // The plane is right across the antimeridian, where degrees are not.
+    let plane = LocalPlane::new(first.position);
+    let far = plane.to_plane(second.position);
+    let point = EastNorth { east_m: share * far.east_m, north_m: share * far.north_m };
+    let sigma_m = match (first.sigma_m, second.sigma_m) {
+        (Some(one), Some(other)) => Some(if one > other { one } else { other }),
+        (one, other) => one.or(other),
+    };
+    Fix { position: plane.to_position(point), sigma_m }
+}
+
+fn sample(detection: &Detection, fix: Fix) -> Sample {
+    Sample {
+        time: detection.time,
+        target_id: detection.target_id.clone(),
+        bounding_box: detection.bounding_box,
+        fix,
+        class: detection.class.clone(),
+        score: detection.score,
+        truth: None,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,253 @@
+//! Lists with known partners, streams against lists, and the square's own files.
+
+use std::path::PathBuf;
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::domain::{BoundingBox, parse_time};
+use crate::fusion::clock_offset::{OffsetSearch, estimate_clock_offset};
+use crate::fusion::track::simulated::{Normal, World, at_s};
+use crate::geo::Position;
+
+fn target(name: &str) -> TargetId {
+    TargetId::new(name).expect("a name")
+}
+
+fn detection(name: &str, seconds: f64) -> Detection {
+    Detection {
+        time: at_s(seconds),
+        target_id: target(name),
+        bounding_box: BoundingBox::new(10.0 + seconds, 20.0, 30.0, 40.0).expect("valid"),
+        class: None,
+        score: None,
+    }
+}
+
+fn received(name: Option<&str>, seconds: f64, longitude_deg: f64) -> ReceivedFix {
+    let position = Position::new(longitude_deg, 10.0).expect("valid");
+    ReceivedFix { time: at_s(seconds), receiver_id: name.map(target), fix: Fix { position, sigma_m: None } }
+}
+
+fn columns(name: &str) -> Option<Vec<Vec<String>>> {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
+    if !path.exists() {
+        println!("skipped: ../shared/data/square/{name} is not there");
+        return None;
+    }
+    let mut reader = csv::Reader::from_path(path).expect("readable");
+    Some(reader.records().map(|row| row.expect("a row").iter().map(str::to_owned).collect()).collect())
+}
+
+fn number(row: &[String], column: usize) -> f64 {
+    row[column].parse().expect("a number")
+}
+
+fn boxed(row: &[String]) -> Detection {
+    Detection {
+        time: parse_time(&row[0]).expect("a time"),
+        target_id: target(&row[1]),
+        bounding_box: BoundingBox::new(number(row, 2), number(row, 3), number(row, 4), number(row, 5))
+            .expect("a box"),
+        class: None,
+        score: None,
+    }
+}
+
+fn fixed(row: &[String], column: usize) -> Fix {
+    let position = Position::new(number(row, column), number(row, column + 1)).expect("a position");
+    Fix { position, sigma_m: None }
+}
+
+/// The square's boxes and fixes, unpaired.
+fn square() -> Option<(Vec<Detection>, Vec<ReceivedFix>)> {
+    let detections = columns("detections.csv")?.iter().map(|row| boxed(row)).collect();
+    let fixes = columns("gnss.csv")?
+        .iter()
+        .map(|row| ReceivedFix {
+            time: parse_time(&row[0]).expect("a time"),
+            receiver_id: None,
+            fix: fixed(row, 1),
+        })
+        .collect();
+    Some((detections, fixes))
+}
+
+fn carried_by(name: &str, clock_offset: SignedDuration) -> Receivers {
+    Receivers { nameless: Some(Receiver { target_id: target(name), clock_offset }), ..Receivers::default() }
+}
+
+#[test]
+fn the_paired_file_of_the_square_comes_back_row_by_row() {
+    let (Some((detections, fixes)), Some(paired)) = (square(), columns("training.csv")) else { return };
+    let expected: Vec<(Detection, Fix)> = paired.iter().map(|row| (boxed(row), fixed(row, 6))).collect();
+    let (boxes, all_fixes) = (detections.len(), fixes.len());
+    let receivers = carried_by("person-1", SignedDuration::ZERO);
+    let found = pair(detections, fixes, &receivers, &PairingSettings::default());
+    assert_eq!(found.samples.len(), expected.len());
+    for (sample, (detection, fix)) in found.samples.iter().zip(&expected) {
+        assert_eq!((sample.time, &sample.target_id), (detection.time, &detection.target_id));
+        assert_eq!((sample.bounding_box, sample.fix), (detection.bounding_box, *fix));
+    }
+    assert_eq!(found.unpaired.detections, (boxes - expected.len()) as u64);
+    assert_eq!(found.unpaired.fixes, (all_fixes - expected.len()) as u64);
+}
+
+#[test]
+fn the_squares_clocks_agree_and_a_shifted_one_is_found() {
+    let Some((detections, fixes)) = square() else { return };
+    let plain: Vec<(Timestamp, Fix)> = fixes.iter().map(|it| (it.time, it.fix)).collect();
+    let own = estimate_clock_offset(&detections, &plain, &OffsetSearch::default()).expect("he walks");
+    println!("{own:?}");
+    assert!(own.clock_offset.abs() < SignedDuration::from_millis(1_500), "{own:?}");
+    for shift_ms in [-3_400, 2_750] {
+        let shift = SignedDuration::from_millis(shift_ms);
+        let shifted: Vec<(Timestamp, Fix)> = plain.iter().map(|(time, fix)| (*time + shift, *fix)).collect();
+        let found = estimate_clock_offset(&detections, &shifted, &OffsetSearch::default()).expect("walks");
+        let off = found.clock_offset - own.clock_offset + shift;
+        assert!(off.abs() < SignedDuration::from_millis(150), "{found:?} after {shift_ms} ms");
+    }
+}
+
+#[test]
+fn a_known_offset_is_found_in_a_simulated_walk() {
+    let plane = LocalPlane::new(Position::new(8.0, 47.0).expect("valid"));
+    for (seed, shift_s) in [(1, 0.0), (2, -1.3), (3, 4.2), (4, 0.4)] {
+        let walk = World { turn_s: 12, ..World::phone() }.walk(seed, 900);
+        let mut random = Normal::seeded(seed);
+        let (mut detections, mut fixes) = (Vec::new(), Vec::new());
+        for (second, (truth, measurement)) in walk.iter().enumerate() {
+            // A camera 12 m above the ground, 150 m south of where the walk begins.
+            let range_m = (truth.north_m + 150.0).max(20.0);
+            let foot = [
+                900.0 + 1_200.0 * truth.east_m / range_m + random.draw(),
+                300.0 + 14_400.0 / range_m + random.draw(),
+            ];
+            let height_px = 2_000.0 / range_m;
+            detections.push(Detection {
+                bounding_box: BoundingBox::new(foot[0] - 5.0, foot[1] - height_px, 10.0, height_px)
+                    .expect("valid"),
+                ..detection("walker", second as f64)
+            });
+            let position = plane.to_position(measurement.fix.expect("always").position);
+            fixes.push((at_s(second as f64 - shift_s), Fix { position, sigma_m: None }));
+        }
+        let found = estimate_clock_offset(&detections, &fixes, &OffsetSearch::default()).expect("walks");
+        let off_s = found.clock_offset.as_secs_f64() - shift_s;
+        println!("{shift_s}: {found:?}");
+        assert!(off_s.abs() < 0.25 && off_s.abs() < 5.0 * found.sigma_s, "{shift_s}: {found:?}");
+        assert!(found.explained >= found.explained_at_zero - 1e-3);
+    }
+}
+
+#[test]
+fn a_target_that_stands_tells_no_offset() {
+    let detections: Vec<Detection> = (0..500).map(|second| detection("a", f64::from(second))).collect();
+    let fixes: Vec<(Timestamp, Fix)> =
+        (0..500).map(|second| (at_s(f64::from(second)), received(None, 0.0, 5.0).fix)).collect();
+    assert!(estimate_clock_offset(&detections, &fixes, &OffsetSearch::default()).is_none());
+    assert!(estimate_clock_offset(&[], &[], &OffsetSearch::default()).is_none());
+}
+
+#[test]
+fn no_fix_labels_two_boxes_and_the_window_holds() {
+    let detections: Vec<Detection> = (0..100).map(|frame| detection("a", f64::from(frame) * 0.04)).collect();
+    let fixes = (0..6).map(|second| received(Some("a"), f64::from(second) + 0.49, 5.0)).collect();
+    let found = pair(detections, fixes, &Receivers::default(), &PairingSettings::default());
+    let times: Vec<Timestamp> = found.samples.iter().map(|sample| sample.time).collect();
+    assert_eq!(times, [0.48, 1.48, 2.48, 3.48].map(at_s), "the fixes at 4.49 and 5.49 see no box");
+    assert_eq!((found.unpaired.detections, found.unpaired.fixes), (96, 2));
+}
+
+#[test]
+fn receivers_are_bound_to_targets_with_their_clocks() {
+    let receivers = Receivers {
+        bound: [(
+            target("phone-7"),
+            Receiver { target_id: target("a"), clock_offset: SignedDuration::from_secs(-18) },
+        )]
+        .into(),
+        nameless: None,
+    };
+    let fixes =
+        vec![received(Some("phone-7"), 28.0, 5.0), received(Some("b"), 10.1, 6.0), received(None, 10.0, 7.0)];
+    let found = pair(
+        vec![detection("a", 10.0), detection("b", 10.0)],
+        fixes,
+        &receivers,
+        &PairingSettings::default(),
+    );
+    let longitudes: Vec<f64> = found.samples.iter().map(|it| it.fix.position.longitude_deg()).collect();
+    assert!((longitudes[0] - 5.0).abs() < 1e-12 && (longitudes[1] - 6.0).abs() < 1e-12, "{longitudes:?}");
+    assert_eq!(found.unpaired.unbound, 1);
+}
+
+#[test]
+fn a_fix_between_two_lies_on_their_line_across_the_antimeridian() {
+    let settings = PairingSettings { rule: PairingRule::Interpolated, ..PairingSettings::default() };
+    let fixes = vec![received(Some("a"), 0.0, 179.9999), received(Some("a"), 2.0, -179.9999)];
+    let detections = vec![detection("a", 0.0), detection("a", 1.5), detection("a", 3.0)];
+    let found = pair(detections, fixes, &Receivers::default(), &settings);
+    assert_eq!(found.samples.len(), 2);
+    let longitude_deg = found.samples[1].fix.position.longitude_deg();
+    assert!((longitude_deg + 179.999_95).abs() < 1e-8, "{longitude_deg}");
+    assert_eq!(found.unpaired.detections, 1);
+}
+
+#[test]
+fn a_stream_without_partners_stays_bounded() {
+    let settings = PairingSettings { items_per_target: 16, targets: 4, ..PairingSettings::default() };
+    let mut pairer = Pairer::new(settings, Receivers::default());
+    for index in 0..10_000 {
+        let name = format!("target-{}", index % 50);
+        pairer.push_detection(detection(&name, 0.001 * f64::from(index)));
+        pairer.push_fix(received(Some("lone"), 0.001 * f64::from(index), 5.0));
+    }
+    assert!(pairer.lanes.len() <= 4);
+    assert!(pairer.lanes.values().all(|lane| lane.detections.len() <= 16 && lane.fixes.len() <= 16));
+    assert!(pairer.unpaired().dropped > 0);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn a_stream_gives_what_the_lists_give(seed in 0..10_000u64, interpolated in any::<bool>()) {
+        let rule = if interpolated { PairingRule::Interpolated } else { PairingRule::Nearest };
+        let settings = PairingSettings { rule, ..PairingSettings::default() };
+        let mut random = Normal::seeded(seed);
+        let (mut detections, mut fixes) = (Vec::new(), Vec::new());
+        for (name, rate_hz) in [("a", 5.0), ("b", 1.0)] {
+            for index in 0..120 {
+                let jitter_s = 0.05 * random.draw().sin();
+                if random.draw() < 1.0 {
+                    detections.push(detection(name, 100.0 + f64::from(index) / rate_hz + jitter_s));
+                }
+                if random.draw() < 1.0 {
+                    fixes.push(received(Some(name), 100.3 + f64::from(index) + jitter_s, 5.0 + 1e-5 * f64::from(index)));
+                }
+            }
+        }
+        let batch = pair(detections.clone(), fixes.clone(), &Receivers::default(), &settings);
+        // Every item arrives up to 2.8 s late.
+        enum Item { Box(Detection), Fix(ReceivedFix) }
+        let late = |random: &mut Normal, time: Timestamp| time + SignedDuration::from_secs_f64(1.4 * (1.0 + random.draw().sin()));
+        let mut items: Vec<(Timestamp, Item)> = Vec::new();
+        for it in detections { items.push((late(&mut random, it.time), Item::Box(it))); }
+        for it in fixes { items.push((late(&mut random, it.time), Item::Fix(it))); }
+        items.sort_by_key(|(arrival, _)| *arrival);
+        let mut pairer = Pairer::new(settings, Receivers::default());
+        let mut samples = Vec::new();
+        for (_, item) in items {
+            samples.extend(match item {
+                Item::Box(it) => pairer.push_detection(it),
+                Item::Fix(it) => pairer.push_fix(it),
+            });
+        }
+        let early = samples.len();
+        samples.extend(pairer.finish());
+        samples.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
+        prop_assert!(early > samples.len() / 2, "{early} of {} came out in time", samples.len());
+        prop_assert_eq!(&samples, &batch.samples);
+        prop_assert_eq!(pairer.unpaired(), batch.unpaired);
+    }
+}

@@ -103,7 +103,10 @@ impl Metrics {
                 "sightfix_track_nis",
                 "Normalised innovation squared of track updates; its mean is 2 per measured position",
             ),
-            track_rejections: plain("sightfix_track_rejections_total", "Measured positions that tracks rejected"),
+            track_rejections: plain(
+                "sightfix_track_rejections_total",
+                "Measured positions that tracks rejected",
+            ),
             runs_succeeded: runs(RunState::Succeeded),
             runs_failed: runs(RunState::Failed),
             runs_cancelled: runs(RunState::Cancelled),

@@ -190,7 +190,8 @@ mod tests {
                 at(plane.to_position(point))
             })
             .collect();
-        let estimate = GnssErrorEstimate::from_rows(fixes.into_iter().map(|row| Ok(Ok(row))), 0).expect("enough");
+        let estimate =
+            GnssErrorEstimate::from_rows(fixes.into_iter().map(|row| Ok(Ok(row))), 0).expect("enough");
         // Standard error of a variance from 4,000 is 2.2 %: five of them.
         assert!((estimate.east_variance_m2 / 4.0 - 1.0).abs() < 0.11, "{estimate:?}");
         assert!((estimate.north_variance_m2 / 9.0 - 1.0).abs() < 0.11, "{estimate:?}");

@@ -14,9 +14,9 @@ use tokio_stream::wrappers::BroadcastStream;
 
 use super::App;
 use crate::domain::{CameraId, Error, ErrorKind, FusedFix, Observation, Result, TargetId};
+use crate::fusion::PlaneCovariance;
 use crate::fusion::track::{Measured, Measurement, Rejection, Track, TrackSettings, TrackState, Velocity};
 use crate::fusion::two_step::UNKNOWN_RECEIVER_M2;
-use crate::fusion::PlaneCovariance;
 use crate::geo::{LocalPlane, Position};
 
 /// Points that a slow reader of events may lag behind before it loses some.
@@ -99,9 +99,8 @@ impl App {
         let Some(target) = &observation.target_id else { return Ok(None) };
         let camera = self.tracks.of(id);
         let plane = camera.plane.get_or_init(|| LocalPlane::new(fused.fused));
-        let measured = |position: Position, variance_m2: f64| {
-            Measured::isotropic(plane.to_plane(position), variance_m2)
-        };
+        let measured =
+            |position: Position, variance_m2: f64| Measured::isotropic(plane.to_plane(position), variance_m2);
         let measurement = Measurement {
             time: observation.time,
             fix: fused.gnss.map(|fix| measured(fix.position, fused.e_gnss_m2.unwrap_or(UNKNOWN_RECEIVER_M2))),

@@ -106,9 +106,9 @@ fn quantile(ascending: &[f64], part: f64) -> f64 {
 }
 
 fn coverage(answers: &[Judged], factor: f64) -> Option<f64> {
-    let inside = answers.iter().map(|answer| {
-        answer.r95_m.map(|r95_m| f64::from(u8::from(answer.error_m <= factor * r95_m)))
-    });
+    let inside = answers
+        .iter()
+        .map(|answer| answer.r95_m.map(|r95_m| f64::from(u8::from(answer.error_m <= factor * r95_m))));
     let sum: Option<f64> = inside.sum();
     sum.filter(|_| !answers.is_empty()).map(|sum| sum / answers.len() as f64)
 }
@@ -155,7 +155,8 @@ mod tests {
 
     #[test]
     fn seeds_are_averaged_and_the_largest_error_kept() {
-        let seeds = [&[1.0, 3.0][..], &[2.0, 6.0][..]].map(|errors| Metrics::of(&judged(errors)).expect("some"));
+        let seeds =
+            [&[1.0, 3.0][..], &[2.0, 6.0][..]].map(|errors| Metrics::of(&judged(errors)).expect("some"));
         let both = Metrics::over_seeds(&seeds).expect("two");
         assert!(near(both.mean_m, 3.0) && near(both.max_m, 6.0));
         assert_eq!(both.n, 2);

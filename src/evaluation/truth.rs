@@ -30,7 +30,9 @@ impl Truth {
         let mut lines = Vec::new();
         match &document {
             GeoJson::Geometry(geometry) => gather(geometry, &mut lines)?,
-            GeoJson::Feature(feature) => feature.geometry.iter().try_for_each(|one| gather(one, &mut lines))?,
+            GeoJson::Feature(feature) => {
+                feature.geometry.iter().try_for_each(|one| gather(one, &mut lines))?
+            }
             GeoJson::FeatureCollection(all) => {
                 let geometries = all.features.iter().filter_map(|feature| feature.geometry.as_ref());
                 geometries.into_iter().try_for_each(|one| gather(one, &mut lines))?;
@@ -124,9 +126,13 @@ mod tests {
 
     #[test]
     fn documents_without_a_line_are_refused() {
-        for text in ["", "{}", r#"{"type": "Point", "coordinates": [8.0, 47.0]}"#,
+        for text in [
+            "",
+            "{}",
+            r#"{"type": "Point", "coordinates": [8.0, 47.0]}"#,
             r#"{"type": "LineString", "coordinates": [[8.0, 47.0]]}"#,
-            r#"{"type": "LineString", "coordinates": [[8.0, 97.0], [8.0, 47.0]]}"#] {
+            r#"{"type": "LineString", "coordinates": [[8.0, 97.0], [8.0, 47.0]]}"#,
+        ] {
             assert!(Truth::from_geojson(text).is_err(), "{text}");
         }
     }

@@ -22,8 +22,8 @@ impl Artifact {
     /// Weights that are not safetensors.
     pub fn to_file(&self) -> std::result::Result<Bytes, SafeTensorError> {
         let tensors = SafeTensors::deserialize(&self.weights)?;
-        let document = serde_json::to_string(&self.metadata)
-            .map_err(SafeTensorError::InvalidHeaderDeserialization)?;
+        let document =
+            serde_json::to_string(&self.metadata).map_err(SafeTensorError::InvalidHeaderDeserialization)?;
         let header = HashMap::from([(KEY.to_owned(), document)]);
         safetensors::serialize(tensors.tensors(), Some(header)).map(Bytes::from)
     }
@@ -39,7 +39,10 @@ impl Artifact {
         let not_safetensors = |error| Error::invalid("file", format!("is not safetensors: {error}"));
         let (_, header) = SafeTensors::read_metadata(file).map_err(not_safetensors)?;
         let document = header.metadata().as_ref().and_then(|entries| entries.get(KEY)).ok_or_else(|| {
-            Error::invalid("file", format!("has no metadata under `{KEY}`; download it from a sightfix server"))
+            Error::invalid(
+                "file",
+                format!("has no metadata under `{KEY}`; download it from a sightfix server"),
+            )
         })?;
         let metadata = serde_json::from_str(document)
             .map_err(|error| Error::invalid("metadata", format!("cannot be read: {error}")))?;

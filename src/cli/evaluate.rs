@@ -118,8 +118,8 @@ impl Evaluate {
             return Ok(Truth::Point(point));
         }
         if let Some(path) = &self.truth_line {
-            let text = std::fs::read_to_string(path)
-                .with_context(|| format!("cannot read {}", path.display()))?;
+            let text =
+                std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
             return Ok(Truth::from_geojson(&text)?);
         }
         anyhow::ensure!(
@@ -231,6 +231,7 @@ fn point(text: &str) -> Result<Position, String> {
     let pair = text.split_once(',').and_then(|(longitude, latitude)| {
         Some((longitude.trim().parse().ok()?, latitude.trim().parse().ok()?))
     });
-    let (longitude_deg, latitude_deg) = pair.ok_or("must be LON,LAT in degrees, such as 103.98678,30.62801")?;
+    let (longitude_deg, latitude_deg) =
+        pair.ok_or("must be LON,LAT in degrees, such as 103.98678,30.62801")?;
     Position::new(longitude_deg, latitude_deg).map_err(|error| error.to_string())
 }

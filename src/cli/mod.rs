@@ -105,7 +105,8 @@ async fn open_app(settings: &Config) -> anyhow::Result<App> {
     let store = Store::open(&settings.data)
         .await
         .with_context(|| format!("cannot open the data folder {}", settings.data.display()))?;
-    Ok(App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new()).await?)
+    Ok(App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new())
+        .await?)
 }
 
 /// A runtime for one command.

@@ -98,7 +98,8 @@ fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {
 
 /// The columns of a sample file, box and fix left empty where there is none.
 fn write_test(world: &World, mut out: impl io::Write) -> io::Result<()> {
-    let columns = "time,target_id,left,top,width,height,longitude,latitude,class,truth_longitude,truth_latitude";
+    let columns =
+        "time,target_id,left,top,width,height,longitude,latitude,class,truth_longitude,truth_latitude";
     writeln!(out, "{columns}")?;
     for row in &world.rows {
         write!(out, "{},{}", row.time, row.target_id)?;

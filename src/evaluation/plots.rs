@@ -13,7 +13,8 @@ const SIZE_PX: [f64; 2] = [900.0, 520.0];
 const FRAME_PX: [f64; 4] = [70.0, 40.0, 690.0, 465.0];
 /// Colours that differ for most eyes (after Okabe and Ito), then darker ones.
 const COLOURS: [&str; 10] = [
-    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b", "#4b0092", "#1a1a1a",
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b", "#4b0092",
+    "#1a1a1a",
 ];
 /// More points than this are thinned out.
 const MOST_POINTS: usize = 3_000;
@@ -29,11 +30,16 @@ pub fn plots(evaluation: &Evaluation, test: &[TestRow], truth: &Truth) -> Vec<(S
     if !evaluation.curves.is_empty() {
         let curve = |curve: &super::runner::Curve| Series {
             name: curve.recipe.to_string(),
-            points: curve.epochs.iter().map(|one| [f64::from(one.epoch), one.error_scale.max(1e-12).log10()]).collect(),
+            points: curve
+                .epochs
+                .iter()
+                .map(|one| [f64::from(one.epoch), one.error_scale.max(1e-12).log10()])
+                .collect(),
             shape: Shape::Line,
         };
         let series: Vec<Series> = evaluation.curves.iter().map(curve).collect();
-        pictures.push(("error_scale.svg".to_owned(), chart("Es per epoch", "epoch", "log10 Es", &series, false)));
+        pictures
+            .push(("error_scale.svg".to_owned(), chart("Es per epoch", "epoch", "log10 Es", &series, false)));
     }
     pictures
 }
@@ -75,7 +81,8 @@ fn cumulative_share(traces: &[Trace]) -> String {
         let mut errors_m: Vec<f64> = trace.points.iter().filter_map(|point| point.error_m).collect();
         errors_m.sort_by(f64::total_cmp);
         let count = errors_m.len().max(1) as f64;
-        let points = errors_m.iter().enumerate().map(|(index, &error_m)| [error_m, (index + 1) as f64 / count]);
+        let points =
+            errors_m.iter().enumerate().map(|(index, &error_m)| [error_m, (index + 1) as f64 / count]);
         Series { name: trace.method.clone(), points: thin(points.collect()), shape: Shape::Line }
     };
     let series: Vec<Series> = traces.iter().map(share).collect();
@@ -108,11 +115,7 @@ fn plane(traces: &[Trace], test: &[TestRow], truth: &Truth) -> String {
     chart("Positions", "east, m", "north, m", &series, true)
 }
 
-fn of_traces(
-    traces: &[Trace],
-    shape: Shape,
-    point: &dyn Fn(&TracePoint) -> Option<[f64; 2]>,
-) -> Vec<Series> {
+fn of_traces(traces: &[Trace], shape: Shape, point: &dyn Fn(&TracePoint) -> Option<[f64; 2]>) -> Vec<Series> {
     let one = |trace: &Trace| Series {
         name: trace.method.clone(),
         points: thin(trace.points.iter().filter_map(point).collect()),
@@ -277,13 +280,18 @@ mod tests {
     fn ticks_are_round_and_within() {
         let axis = Axis::over(vec![0.0, 7.3], 0.0, 100.0);
         let ticks = axis.ticks();
-        assert!(ticks.len() >= 3 && ticks.iter().all(|tick| (axis.low..=axis.high).contains(tick)), "{ticks:?}");
+        assert!(
+            ticks.len() >= 3 && ticks.iter().all(|tick| (axis.low..=axis.high).contains(tick)),
+            "{ticks:?}"
+        );
         assert!(ticks.iter().all(|tick| (tick - tick.round()).abs() < 1e-9), "{ticks:?}");
     }
 
     #[test]
     fn a_chart_of_nothing_and_of_one_point_is_whole() {
-        for series in [vec![], vec![Series { name: "a".to_owned(), points: vec![[1.0, 1.0]], shape: Shape::Dots }]] {
+        for series in
+            [vec![], vec![Series { name: "a".to_owned(), points: vec![[1.0, 1.0]], shape: Shape::Dots }]]
+        {
             let svg = chart("t", "x", "y", &series, true);
             assert!(svg.starts_with("<svg") && svg.ends_with("</svg>\n"));
             assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");

@@ -2,6 +2,7 @@
 //! sees and what a GNSS receiver says. `docs/architecture.md` is the map of this crate.
 
 pub mod app;
+pub mod cli;
 pub mod clock;
 pub mod config;
 pub mod domain;
@@ -11,7 +12,9 @@ pub mod filters;
 pub mod fusion;
 pub mod geo;
 pub mod grpc;
+pub mod http;
 pub mod model;
+pub mod server;
 pub mod shutdown;
 pub mod simulation;
 pub mod status;

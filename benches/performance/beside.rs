@@ -17,7 +17,8 @@ pub(crate) fn run() {
     let cores = std::thread::available_parallelism().map_or(2, usize::from);
     runtime.block_on(async {
         let served = Served::start_with(cores).await;
-        let samples = simulate(&Options { samples: 10_000, ..Options::new(Scene::Square) }).training_samples();
+        let samples =
+            simulate(&Options { samples: 10_000, ..Options::new(Scene::Square) }).training_samples();
         let mut cameras = Vec::new();
         for number in 0..cores {
             let id = CameraId::new(&format!("busy-{number}")).expect("a slug");
@@ -33,7 +34,8 @@ pub(crate) fn run() {
             let (quiet, mut quiet_times) = load::send(served.address, &request, EACH).await;
             let mut runs = Vec::new();
             for id in &cameras {
-                let wish = RunRequest { recipe: Some(Recipe::Paper), epochs: Some(10_000), ..RunRequest::default() };
+                let wish =
+                    RunRequest { recipe: Some(Recipe::Paper), epochs: Some(10_000), ..RunRequest::default() };
                 runs.push((id, served.app.start_run(id, wish).await.expect("a run").id));
             }
             // Until the fits are under way.

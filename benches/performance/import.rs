@@ -41,7 +41,10 @@ pub(crate) fn run() {
         assert_eq!(stored as usize, samples.len(), "every row is stored");
         rate
     };
-    ratio::row(&format!("{} rows as CSV through REST", samples.len()), &in_turn(by_rest, || peer.insert_all()));
+    ratio::row(
+        &format!("{} rows as CSV through REST", samples.len()),
+        &in_turn(by_rest, || peer.insert_all()),
+    );
     let one_by_one = || {
         let id = new_camera();
         let (app, samples) = (served.app.clone(), Arc::new(samples.clone()));

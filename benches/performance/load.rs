@@ -53,7 +53,9 @@ async fn read_answer(stream: &mut TcpStream, answer: &mut Vec<u8>) -> usize {
         let text = std::str::from_utf8(&answer[..head]).expect("a head of text");
         let length = text
             .lines()
-            .find_map(|line| line.split_once(": ").filter(|(name, _)| name.eq_ignore_ascii_case("content-length")))
+            .find_map(|line| {
+                line.split_once(": ").filter(|(name, _)| name.eq_ignore_ascii_case("content-length"))
+            })
             .map(|(_, length)| length.parse::<usize>().expect("a number"))
             .expect("a content length");
         while answer.len() < head + 4 + length {

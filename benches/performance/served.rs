@@ -52,7 +52,9 @@ impl Served {
             .collect();
         app.store.insert_samples(&camera, samples).await.expect("samples are stored");
         let served = Self { app, address, camera, observations, shutdown, _folder: folder };
-        served.train(RunRequest { recipe: Some(Recipe::Hybrid), epochs: Some(100), ..RunRequest::default() }).await;
+        served
+            .train(RunRequest { recipe: Some(Recipe::Hybrid), epochs: Some(100), ..RunRequest::default() })
+            .await;
         served
     }
 

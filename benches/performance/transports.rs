@@ -75,7 +75,8 @@ pub(crate) fn http() {
     ratio::head("REST: POST .../fusions, against a bare axum handler of the same JSON", "items/s");
     for items in [1, 32] {
         let body = request_body(&served.observations[..items]);
-        let request = load::post(&format!("/v1/cameras/{}/fusions", served.camera), "application/json", &body);
+        let request =
+            load::post(&format!("/v1/cameras/{}/fusions", served.camera), "application/json", &body);
         let answer = runtime.block_on(load::one(served.address, &request));
         let answer: Value = serde_json::from_slice(&answer).expect("JSON");
         let bare = runtime.block_on(bare_axum(answer));
@@ -107,8 +108,7 @@ async fn bare_tonic(answer: proto::FuseResponse) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
     let address = listener.local_addr().expect("an address");
     let incoming = tonic::transport::server::TcpIncoming::from(listener).with_nodelay(Some(true));
-    let server =
-        tonic::transport::Server::builder().add_service(FusionServiceServer::new(Bare(answer)));
+    let server = tonic::transport::Server::builder().add_service(FusionServiceServer::new(Bare(answer)));
     tokio::spawn(async move { server.serve_with_incoming(incoming).await });
     address
 }
@@ -142,8 +142,7 @@ fn proto_request(served: &Served, items: usize) -> proto::FuseRequest {
     let observations = served.observations[..items]
         .iter()
         .map(|observation| {
-            let [left_px, top_px, width_px, height_px] =
-                observation.bounding_box.expect("a box").sides_px();
+            let [left_px, top_px, width_px, height_px] = observation.bounding_box.expect("a box").sides_px();
             let fix = observation.fix.expect("a fix").position;
             proto::Observation {
                 time: Some(prost_types::Timestamp {

@@ -31,8 +31,11 @@ impl App {
     /// Checks the length of a batch, before its items are read.
     ///
     /// # Errors
-    /// `TooLarge` naming the field `observations`.
+    /// `TooLarge` and, for none at all, `InvalidArgument`, naming the field `observations`.
     pub fn check_batch(&self, observations: usize) -> Result<()> {
+        if observations == 0 {
+            return Err(Error::invalid("observations", "must be one or more"));
+        }
         let most = self.limits.batch_observations;
         if observations > most {
             return Err(Error::field(

@@ -71,7 +71,8 @@ impl App {
     /// Stores rows that come one by one over a transport that has parsed them.
     ///
     /// # Errors
-    /// `CameraNotFound`; the stream's own error, after the rows before it were stored.
+    /// `CameraNotFound`; the stream's own error, after the rows before it were stored; its message
+    /// tells how many.
     pub async fn import_rows(
         &self,
         id: &CameraId,
@@ -94,7 +95,8 @@ impl App {
             }
             self.store_batch(id, batch, &mut report).await?;
             if let Some(error) = broken {
-                return Err(error);
+                self.metrics.imported(report.accepted, report.duplicate, report.rejected);
+                return Err(told_what_is_stored(error, &report));
             }
         }
         self.metrics.imported(report.accepted, report.duplicate, report.rejected);

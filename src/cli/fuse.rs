@@ -45,10 +45,8 @@ impl Fuse {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let (from, to) = (format_of(&self.file)?, format_of(&self.out)?);
         let answering = self.answering(file)?;
-        let rules = RowRules {
-            time_bounds: TimeBounds::at(Clock::system().now()),
-            image_size: answering.image_size,
-        };
+        let rules =
+            RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: answering.image_size };
         let rows = exchange::read_observations(open_file(&self.file)?, from, &rules)?;
         let out = File::create(&self.out).with_context(|| format!("cannot write {}", self.out.display()))?;
         let mut out = BufWriter::new(out);
@@ -64,9 +62,8 @@ impl Fuse {
                 }
             };
             let model = Some((&*answering.regressor, answering.number));
-            let fused =
-                two_step::fuse(&row.observation, model, answering.image_size, answering.e_gnss_m2)
-                    .context("a model answers every observation")?;
+            let fused = two_step::fuse(&row.observation, model, answering.image_size, answering.e_gnss_m2)
+                .context("a model answers every observation")?;
             writer.write(&fused)?;
             answered += 1;
         }

@@ -22,7 +22,8 @@ pub(super) struct GnssError {
 
 impl GnssError {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let format = FixFormat::from_path(&self.file).context("the ending must be .csv, .nmea, .nma or .txt")?;
+        let format =
+            FixFormat::from_path(&self.file).context("the ending must be .csv, .nmea, .nma or .txt")?;
         let time_bounds = TimeBounds::at(Clock::system().now());
         let rows = exchange::read_fixes(open_file(&self.file)?, format, time_bounds)?;
         let estimate = GnssErrorEstimate::from_rows(rows, Limits::default().rejected_rows)?;

@@ -35,11 +35,13 @@ impl Import {
         let format = format_of(&self.file)?;
         let source = open_file(&self.file)?;
         let bytes = source.metadata()?.len();
-        let source = Watched { source, read: 0, bytes, progress: Progress::new("{bar:40} {bytes}/{total_bytes}") };
+        let source =
+            Watched { source, read: 0, bytes, progress: Progress::new("{bar:40} {bytes}/{total_bytes}") };
         let report = runtime()?.block_on(async {
             let app = open_app(&settings).await?;
             if self.create {
-                let profile = NewCamera { image_size: self.image_size, ..NewCamera::named(self.camera.clone()) };
+                let profile =
+                    NewCamera { image_size: self.image_size, ..NewCamera::named(self.camera.clone()) };
                 match app.create_camera(profile).await {
                     Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {}
                     created => drop(created?),
@@ -50,7 +52,10 @@ impl Import {
             anyhow::Ok(report?)
         })?;
         print(&report);
-        anyhow::ensure!(report.accepted + report.duplicate > 0 || report.rejected == 0, "every row was rejected");
+        anyhow::ensure!(
+            report.accepted + report.duplicate > 0 || report.rejected == 0,
+            "every row was rejected"
+        );
         Ok(())
     }
 }
@@ -68,9 +73,9 @@ fn print(report: &ImportReport) {
 
 /// A size as `1920x1080`.
 pub(super) fn image_size(text: &str) -> Result<ImageSize, String> {
-    let sides = text.split_once(['x', 'X']).and_then(|(width, height)| {
-        Some((width.parse().ok()?, height.parse().ok()?))
-    });
+    let sides = text
+        .split_once(['x', 'X'])
+        .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
     let (width_px, height_px) = sides.ok_or("must be WIDTHxHEIGHT in pixels, such as 1920x1080")?;
     ImageSize::new(width_px, height_px).map_err(|error| error.to_string())
 }

@@ -18,7 +18,8 @@ impl Progress {
     /// Nothing is done yet. The template says how the bar looks.
     pub(super) fn new(template: &str) -> Self {
         if std::io::stderr().is_terminal() {
-            let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+            let style =
+                ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
             Self::Bar(ProgressBar::no_length().with_style(style))
         } else {
             Self::Lines { said: None }

@@ -79,4 +79,3 @@ pub(super) async fn train(
     shutdown.finish(Duration::from_secs(settings.limits.drain_s)).await;
     Ok(seen)
 }
-

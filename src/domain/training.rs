@@ -5,6 +5,7 @@ use std::str::FromStr;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::error::{Error, ErrorKind, Result};
@@ -85,7 +86,7 @@ impl RunState {
 }
 
 /// How far a fit has come.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct RunProgress {
     /// What is being done: `held-out block 2 of 4`, `final fit`.
     pub phase: String,
@@ -104,7 +105,7 @@ pub struct RunProgress {
 }
 
 /// One point of a run's curve: one epoch of the final fit.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct EpochReport {
     /// From 1.
     pub epoch: u32,
@@ -146,7 +147,7 @@ pub struct TrainingRun {
 }
 
 /// How well a fit foretold blocks of time that it had not seen.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct HeldOutError {
     /// Blocks of time that were held out in turn.
     pub blocks: u32,
@@ -163,7 +164,7 @@ pub struct HeldOutError {
 }
 
 /// One input of the network: what is subtracted, then what it is multiplied by.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FeatureScale {
     /// `left_px`, `top_px`, `width_px`, `height_px`, `east_m`, ...
     pub feature: String,
@@ -174,7 +175,7 @@ pub struct FeatureScale {
 }
 
 /// A position in the metadata document.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct OriginDeg {
     /// Degrees east.
     pub longitude_deg: f64,
@@ -183,7 +184,7 @@ pub struct OriginDeg {
 }
 
 /// Where the receiver's error came from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum GnssErrorSource {
     /// The camera's profile, or the fixes themselves.
@@ -193,7 +194,7 @@ pub enum GnssErrorSource {
 }
 
 /// A recipe that was tried, and its held-out error.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CandidateReport {
     /// The recipe or its variant.
     pub candidate: String,
@@ -203,7 +204,7 @@ pub struct CandidateReport {
 
 /// All that a model version says of itself beside its weights. This is a document format: it is
 /// stored, downloaded and imported as JSON.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ModelMetadata {
     /// Version of this document, now 1.

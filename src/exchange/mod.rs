@@ -8,6 +8,7 @@
 
 mod columns;
 mod csv_rows;
+mod cursor;
 mod elements;
 mod fixes;
 mod format;
@@ -18,6 +19,7 @@ mod tests;
 pub mod wire;
 mod write;
 
+pub use cursor::{foreign_cursor, read_cursor, write_cursor};
 pub use fixes::{FixFormat, TimedFix, read_fixes};
 pub use format::Format;
 pub use rows::{ObservedRow, RowError, RowRules, read_observations, read_samples};

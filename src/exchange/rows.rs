@@ -33,7 +33,10 @@ impl RowError {
     }
 
     /// A refusal as the row's fault; a fault of the machine stays an error of the file.
-    pub(super) fn of(line: u64, error: Error) -> Result<Self> {
+    ///
+    /// # Errors
+    /// The fault.
+    pub fn of(line: u64, error: Error) -> Result<Self> {
         match error {
             Error::Refused(refusal) => Ok(match refusal.violations.into_iter().next() {
                 Some(violation) => Self { line, field: violation.field, reason: violation.message },

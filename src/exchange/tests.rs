@@ -346,7 +346,7 @@ fn fused_positions_are_written_in_every_format() {
     assert_eq!(line["flags"], serde_json::json!(["gnss_denied", "box_at_border"]));
     assert_eq!(line.get("gnss"), None);
     let document: serde_json::Value = serde_json::from_str(&written(Format::Json)).expect("JSON");
-    assert_eq!(document["fusions"][0], line);
+    assert_eq!(document["items"][0], line);
     let map: serde_json::Value = serde_json::from_str(&written(Format::GeoJson)).expect("JSON");
     assert_eq!(map["features"][0]["properties"], line);
 }

@@ -60,7 +60,7 @@ pub struct FusedWriter<W: Write>(Document<W>);
 impl<W: Write> FusedWriter<W> {
     /// A document in that format; nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
-        Self(Document::new(out, format, "fusions"))
+        Self(Document::new(out, format, "items"))
     }
 
     /// Writes one fused position.

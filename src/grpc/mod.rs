@@ -1,4 +1,37 @@
-//! The gRPC transport of `sightfix.v1` over [`crate::app`].
+//! The gRPC transport of `sightfix.v1` over [`crate::app`]: convert, call the use case, convert.
+//!
+//! What never happens here: checks on numbers (the constructors of [`crate::domain`] make them), status
+//! codes other than those of [`crate::status`], and streams that outlive the server's end.
+
+mod cameras;
+mod convert;
+mod ending;
+mod fusion;
+mod models;
+mod pages;
+mod samples;
+mod statuses;
+mod training;
+
+use futures_util::FutureExt as _;
+use hyper::Response;
+use tonic::server::NamedService;
+use tonic::service::Routes;
+use tonic_health::ServingStatus;
+use tonic_health::server::{HealthReporter, HealthService};
+
+use crate::app::App;
+use crate::domain::Error;
+use crate::shutdown::Shutdown;
+use crate::telemetry::RequestId;
+use ending::EndsWithServer;
+use proto::camera_service_server::CameraServiceServer;
+use proto::fusion_service_server::FusionServiceServer;
+use proto::model_service_server::ModelServiceServer;
+use proto::sample_service_server::SampleServiceServer;
+use proto::training_service_server::TrainingServiceServer;
+
+pub use statuses::explain;
 
 /// Messages, services and clients generated from `proto/`.
 #[expect(clippy::allow_attributes, reason = "generated code")]
@@ -7,6 +40,70 @@ pub mod proto {
 
     /// The descriptors of all files of `proto/`, for server reflection.
     pub const FILE_DESCRIPTOR_SET: &[u8] = tonic::include_file_descriptor_set!("sightfix_descriptor");
+}
+
+/// All services, health and reflection. Requests carry their [`RequestId`] as an extension; pass
+/// the answers through [`explain`].
+#[must_use]
+pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
+    let most = app.limits.message_bytes;
+    let cameras = CameraServiceServer::new(cameras::Cameras::new(app)).max_decoding_message_size(most);
+    let samples =
+        SampleServiceServer::new(samples::Samples::new(app, shutdown)).max_decoding_message_size(most);
+    let training =
+        TrainingServiceServer::new(training::Training::new(app, shutdown)).max_decoding_message_size(most);
+    let models = ModelServiceServer::new(models::Models::new(app)).max_decoding_message_size(most);
+    let fusion = FusionServiceServer::new(fusion::Fusion::new(app)).max_decoding_message_size(most);
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+        .build_v1()
+        .expect("the build wrote the descriptors");
+    Routes::default()
+        .add_service(health(shutdown))
+        .add_service(EndsWithServer::new(reflection, shutdown))
+        .add_service(cameras)
+        .add_service(samples)
+        .add_service(training)
+        .add_service(models)
+        .add_service(fusion)
+        .prepare()
+}
+
+/// A refusal before any service was asked, as a whole answer.
+#[must_use]
+pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
+    statuses::to_status(error, id).into_http()
+}
+
+/// The names under which health is told; the empty one is the server as a whole.
+const HEALTHY: [&str; 6] = [
+    "",
+    CameraServiceServer::<()>::NAME,
+    SampleServiceServer::<()>::NAME,
+    TrainingServiceServer::<()>::NAME,
+    ModelServiceServer::<()>::NAME,
+    FusionServiceServer::<()>::NAME,
+];
+
+/// Serving until the end begins; then watchers are told, and their streams end.
+fn health(shutdown: &Shutdown) -> tonic_health::pb::health_server::HealthServer<HealthService> {
+    let mut reporter = HealthReporter::new();
+    for name in HEALTHY {
+        // Nobody else holds the reporter's lock yet, so this never waits.
+        let set = reporter.set_service_status(name, ServingStatus::Serving).now_or_never();
+        debug_assert!(set.is_some(), "the reporter is new");
+    }
+    let service = HealthService::from_health_reporter(reporter.clone());
+    let ending = shutdown.clone();
+    shutdown.spawn(async move {
+        ending.begun().await;
+        for name in HEALTHY {
+            reporter.set_service_status(name, ServingStatus::NotServing).await;
+            reporter.clear_service_status(name).await;
+        }
+    });
+    tonic_health::pb::health_server::HealthServer::new(service)
 }
 
 #[cfg(test)]

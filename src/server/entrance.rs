@@ -37,7 +37,7 @@ impl Entrance {
     pub(super) fn new(app: App, shutdown: &Shutdown) -> Self {
         Self {
             http: http::router(app.clone(), shutdown.clone()),
-            grpc: grpc::router(&app, shutdown),
+            grpc: grpc::router(&app, shutdown).into_axum_router(),
             places: Arc::new(Semaphore::new(app.limits.requests)),
             request_time: Duration::from_secs(app.limits.request_s),
             idle_time: app.limits.idle_time(),
@@ -68,6 +68,7 @@ impl Entrance {
                 return refuse(is_grpc, &overloaded(), &id);
             };
             match tokio::time::timeout(self.request_time, self.route(is_grpc, request)).await {
+                Ok(response) if is_grpc => grpc::explain(response, &id),
                 Ok(response) => response,
                 Err(_) => refuse(is_grpc, &too_slow(self.request_time), &id),
             }

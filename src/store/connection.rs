@@ -37,6 +37,7 @@ pub(super) enum Durability {
 
 /// The one connection that writes. Whoever writes takes a turn.
 pub(super) struct Writer {
+    options: SqliteConnectOptions,
     open: Mutex<Option<Open>>,
 }
 
@@ -44,28 +45,55 @@ struct Open {
     connection: SqliteConnection,
     /// `None` while a change of it is under way, so that a caller who goes away leaves no wrong belief.
     durability: Option<Durability>,
+    /// A transaction could not begin, and nobody else held the file.
+    broken: bool,
+}
+
+impl Open {
+    const fn new(connection: SqliteConnection) -> Self {
+        Self { connection, durability: None, broken: false }
+    }
+
+    /// Whether the library believes in a transaction that is not there. That happens when the database
+    /// ends one by itself (a full disk, an I/O error): the library's own end of it then fails.
+    async fn is_stuck(&mut self) -> Result<bool, sqlx::Error> {
+        if self.connection.is_in_transaction() {
+            // Commands are worked off in order, so this waits for a roll back that is under way.
+            self.connection.ping().await?;
+        }
+        Ok(self.connection.is_in_transaction())
+    }
+
+    async fn set(&mut self, durability: Durability) -> Result<(), sqlx::Error> {
+        if self.durability == Some(durability) {
+            return Ok(());
+        }
+        self.durability = None;
+        let pragma = match durability {
+            Durability::Relaxed => "PRAGMA synchronous = NORMAL",
+            Durability::Synced => "PRAGMA synchronous = FULL",
+        };
+        sqlx::query(pragma).execute(&mut self.connection).await?;
+        self.durability = Some(durability);
+        Ok(())
+    }
 }
 
 /// The writer, held.
 pub(super) struct Turn<'w> {
+    options: &'w SqliteConnectOptions,
     open: MutexGuard<'w, Option<Open>>,
+    durability: Durability,
 }
 
 impl Writer {
-    /// Waits for the writer and sets how durable its next transaction is.
+    /// Waits for the writer; `durability` is that of the transactions of this turn.
     pub(super) async fn turn(&self, durability: Durability) -> Result<Turn<'_>> {
-        let mut guard = self.open.lock().await;
-        let open = guard.as_mut().ok_or_else(closed)?;
-        if open.durability != Some(durability) {
-            open.durability = None;
-            let pragma = match durability {
-                Durability::Relaxed => "PRAGMA synchronous = NORMAL",
-                Durability::Synced => "PRAGMA synchronous = FULL",
-            };
-            sqlx::query(pragma).execute(&mut open.connection).await.map_err(failed)?;
-            open.durability = Some(durability);
+        let open = self.open.lock().await;
+        if open.is_none() {
+            return Err(closed());
         }
-        Ok(Turn { open: guard })
+        Ok(Turn { options: &self.options, open, durability })
     }
 
     /// Writes the log back into the file and closes it.
@@ -86,7 +114,21 @@ impl Turn<'_> {
     /// A transaction that holds the file's write lock from its first moment; rolled back if dropped.
     pub(super) async fn begin(&mut self) -> Result<Transaction<'_, Sqlite>> {
         let open = self.open.as_mut().ok_or_else(closed)?;
-        open.connection.begin_with("BEGIN IMMEDIATE").await.map_err(failed)
+        // An error here means a connection that is of no more use.
+        if open.broken || open.is_stuck().await.unwrap_or(true) {
+            *open = Open::new(self.options.connect().await.map_err(failed)?);
+        }
+        if let Err(error) = open.set(self.durability).await {
+            open.broken = true;
+            return Err(failed(error));
+        }
+        match open.connection.begin_with("BEGIN IMMEDIATE").await {
+            Ok(transaction) => Ok(transaction),
+            Err(error) => {
+                open.broken = !is_busy(&error);
+                Err(failed(error))
+            }
+        }
     }
 }
 
@@ -96,17 +138,17 @@ pub(super) async fn open(folder: &Path) -> Result<(Writer, SqlitePool)> {
         .await
         .map_err(|error| Error::fault(format!("cannot make the folder {}: {error}", folder.display())))?;
     let path = folder.join(FILE_NAME);
-    let connection = open_writer(&path).await.map_err(|cause| unusable(&path, &cause))?;
+    let options = options(&path);
+    let writer = writer_options(options.clone());
+    let connection = open_writer(&writer).await.map_err(|cause| unusable(&path, &cause))?;
     let readers = SqlitePoolOptions::new()
         .max_connections(READERS)
         .acquire_timeout(READER_WAIT)
         .test_before_acquire(false)
         .idle_timeout(None)
         .max_lifetime(None)
-        .connect_lazy_with(
-            options(&path).create_if_missing(false).pragma("query_only", "ON").row_buffer_size(512),
-        );
-    Ok((Writer { open: Mutex::new(Some(Open { connection, durability: None })) }, readers))
+        .connect_lazy_with(options.create_if_missing(false).pragma("query_only", "ON").row_buffer_size(512));
+    Ok((Writer { options: writer, open: Mutex::new(Some(Open::new(connection))) }, readers))
 }
 
 fn options(path: &Path) -> SqliteConnectOptions {
@@ -120,15 +162,20 @@ fn options(path: &Path) -> SqliteConnectOptions {
         .disable_statement_logging()
 }
 
-async fn open_writer(path: &Path) -> Result<SqliteConnection, MigrateError> {
-    let options = options(path)
+/// The log is written back every 16 MB, and is cut to that size after a large change.
+fn writer_options(options: SqliteConnectOptions) -> SqliteConnectOptions {
+    options
         .journal_mode(SqliteJournalMode::Wal)
         .pragma("cache_size", "-16000")
         .pragma("wal_autocheckpoint", "4000")
-        .thread_name(|_| "store-writer".to_owned());
+        .pragma("journal_size_limit", "16777216")
+        .thread_name(|_| "store-writer".to_owned())
+}
+
+async fn open_writer(options: &SqliteConnectOptions) -> Result<SqliteConnection, MigrateError> {
     let mut attempt = 1;
     loop {
-        match connect_and_migrate(&options).await {
+        match connect_and_migrate(options).await {
             Err(MigrateError::Execute(error)) if is_busy(&error) && attempt < OPEN_ATTEMPTS => {
                 attempt += 1;
                 tokio::time::sleep(OPEN_PAUSE).await;

@@ -10,7 +10,7 @@ use std::ops::Range;
 use std::sync::{Arc, LazyLock};
 
 use sqlx::sqlite::SqliteArguments;
-use sqlx::{Arguments, SqliteConnection};
+use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::connection::{Durability, Turn, Writer};
@@ -188,7 +188,7 @@ async fn commit(turn: &mut Turn<'_>, group: &[Batch]) -> Result<Vec<Result<Inser
 /// How statements and batches go together.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Counting {
-    /// Statements span batches: fast, and countable as long as no row is a duplicate.
+    /// Statements span batches: fast, and countable as long as all rows of each are new, or none.
     Together,
     /// No statement spans batches.
     Apart,
@@ -222,12 +222,17 @@ async fn store(
         }
     }
     borders.push(rows.len());
-    for range in statements(&borders) {
-        let rows = &rows[range];
-        let accepted = insert(connection, rows).await?;
-        if !count(&mut outcomes, rows, accepted) {
+    let statements = statements(&borders);
+    let mut next = statements.first().map(|range| Insert::of(&rows[range.clone()])).transpose()?;
+    for (index, range) in statements.iter().enumerate() {
+        let Some(insert) = next.take() else { break };
+        // The next statement's values are laid out while the database works on this one.
+        let following = async { statements.get(index + 1).map(|range| Insert::of(&rows[range.clone()])) };
+        let (accepted, following) = tokio::join!(insert.execute(connection), following);
+        if !count(&mut outcomes, &rows[range.clone()], accepted?) {
             return Ok(None);
         }
+        next = following.transpose()?;
     }
     Ok(Some(outcomes))
 }
@@ -235,20 +240,26 @@ async fn store(
 /// Adds a statement's count to its batches; false if it cannot be told whose rows were duplicates.
 fn count(outcomes: &mut [Result<Inserted>], rows: &[Row<'_>], accepted: u64) -> bool {
     let all = rows.len() as u64;
-    let single = rows.first().zip(rows.last()).is_some_and(|(first, last)| first.batch == last.batch);
-    if single {
-        if let Some(Ok(inserted)) = rows.first().and_then(|row| outcomes.get_mut(row.batch)) {
-            inserted.accepted += accepted;
-            inserted.duplicate += all - accepted;
+    if accepted == all || accepted == 0 {
+        for row in rows {
+            add(outcomes, row, u64::from(accepted > 0), u64::from(accepted == 0));
         }
         return true;
     }
-    for row in rows {
-        if let Some(Ok(inserted)) = outcomes.get_mut(row.batch) {
-            inserted.accepted += 1;
+    match (rows.first(), rows.last()) {
+        (Some(first), Some(last)) if first.batch == last.batch => {
+            add(outcomes, first, accepted, all - accepted);
+            true
         }
+        _ => false,
     }
-    accepted == all
+}
+
+fn add(outcomes: &mut [Result<Inserted>], row: &Row<'_>, accepted: u64, duplicate: u64) {
+    if let Some(Ok(inserted)) = outcomes.get_mut(row.batch) {
+        inserted.accepted += accepted;
+        inserted.duplicate += duplicate;
+    }
 }
 
 /// The keys of the cameras of a group, read in its own transaction, so that none can vanish before
@@ -271,7 +282,7 @@ async fn camera_keys(connection: &mut SqliteConnection, group: &[Batch]) -> Resu
 const COLUMNS: usize = 14;
 
 /// Rows per statement, largest first. Few sizes, so that each stays prepared.
-const SIZES: [usize; 6] = [1024, 256, 64, 16, 4, 1];
+const SIZES: [usize; 6] = [1000, 250, 50, 10, 3, 1];
 
 static INSERTS: LazyLock<[Arc<str>; SIZES.len()]> = LazyLock::new(|| {
     SIZES.map(|rows| {
@@ -301,18 +312,29 @@ fn statements(borders: &[usize]) -> Vec<Range<usize>> {
     ranges
 }
 
-/// One statement for as many rows as one of the sizes; returns how many were new.
-async fn insert(connection: &mut SqliteConnection, rows: &[Row<'_>]) -> Result<u64> {
-    let size = SIZES.iter().position(|&size| size == rows.len());
-    let sql = size.map(|size| Arc::clone(&INSERTS[size])).ok_or_else(|| Error::fault("no such statement"))?;
-    let mut arguments = SqliteArguments::default();
-    arguments.reserve(rows.len() * COLUMNS, 0);
-    for row in rows {
-        bind(&mut arguments, row).map_err(Error::fault)?;
+/// One statement for as many rows as one of the sizes, with its values.
+struct Insert {
+    sql: Arc<str>,
+    arguments: SqliteArguments,
+}
+
+impl Insert {
+    fn of(rows: &[Row<'_>]) -> Result<Self> {
+        let size = SIZES.iter().position(|&size| size == rows.len());
+        let size = size.ok_or_else(|| Error::fault("a statement of an unknown size"))?;
+        let mut arguments = SqliteArguments::default();
+        arguments.reserve(rows.len() * COLUMNS, 0);
+        for row in rows {
+            bind(&mut arguments, row).map_err(Error::fault)?;
+        }
+        Ok(Self { sql: Arc::clone(&INSERTS[size]), arguments })
     }
-    let done =
-        sqlx::query_with(sqlx::AssertSqlSafe(sql), arguments).execute(connection).await.map_err(failed)?;
-    Ok(done.rows_affected())
+
+    /// Returns how many rows were new.
+    async fn execute(self, connection: &mut SqliteConnection) -> Result<u64> {
+        let query = sqlx::query_with(AssertSqlSafe(self.sql), self.arguments);
+        Ok(query.execute(connection).await.map_err(failed)?.rows_affected())
+    }
 }
 
 fn bind(arguments: &mut SqliteArguments, row: &Row<'_>) -> Result<(), sqlx::error::BoxDynError> {

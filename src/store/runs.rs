@@ -306,7 +306,7 @@ impl Store {
 /// Room for one more live run, of this camera and of all.
 async fn check_live_runs(connection: &mut SqliteConnection, camera_key: i64, max_live: u32) -> Result<()> {
     let (all, own): (i64, i64) = sqlx::query_as(
-        "SELECT count(*), coalesce(sum(camera_key = ?), 0) FROM training_runs \
+        "SELECT count(*), count(CASE WHEN camera_key = ? THEN 1 END) FROM training_runs \
          WHERE state IN ('queued', 'running')",
     )
     .bind(camera_key)

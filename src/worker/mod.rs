@@ -25,6 +25,8 @@ use fitting::{Fitting, Update};
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// How often progress is written while a run is fitted, if the lease does not ask for more.
 const REPORT_EVERY: Duration = Duration::from_millis(400);
+/// Takes of a run after which it is given up: it has brought down every worker that tried.
+const MOST_ATTEMPTS: u32 = 5;
 /// Samples read at a time.
 const PAGE_SAMPLES: u32 = 10_000;
 
@@ -93,6 +95,10 @@ async fn attempt(
     shutdown: &Shutdown,
 ) -> Result<Option<TrainingRun>> {
     let run = &claim.run;
+    if run.attempt > MOST_ATTEMPTS {
+        let outcome = format!("given up: {MOST_ATTEMPTS} workers took it up and none came to its end");
+        return app.store.finish_run(run.id, claim.fence, RunEnd::Failed { outcome }, app.clock.now()).await;
+    }
     let camera = app.store.camera(&run.camera_id).await?;
     let samples = Arc::new(load_samples(app, run).await?);
     let options = FitOptions {

@@ -34,9 +34,11 @@ async fn refused(server: &TestServer, path: &str, content_type: &str, body: Stri
     assert_eq!(answer.header("content-type"), "application/problem+json", "{said}");
     let problem = answer.json();
     assert!(problem["type"].as_str().is_some_and(|name| name.starts_with("urn:sightfix:problem:")), "{said}");
-    let named = problem["violations"].as_array().into_iter().flatten().any(|violation| {
-        violation["field"].as_str().is_some_and(|named| named.ends_with(field))
-    });
+    let named = problem["violations"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .any(|violation| violation["field"].as_str().is_some_and(|named| named.ends_with(field)));
     assert!(named || field.is_empty(), "the field {field} is not named: {said}");
 }
 
@@ -70,7 +72,8 @@ async fn observations_with_bad_values_name_the_field() {
     refused(&server, FUSIONS, "application/json", neither, "bounding_box").await;
     refused(&server, FUSIONS, "application/json", "{".to_owned(), "").await;
     refused(&server, FUSIONS, "text/html", "{}".to_owned(), "").await;
-    refused(&server, "/v1/cameras/none/fusions", "application/json", changed("/target_id", json!("a")), "").await;
+    refused(&server, "/v1/cameras/none/fusions", "application/json", changed("/target_id", json!("a")), "")
+        .await;
 }
 
 #[tokio::test]
@@ -82,7 +85,8 @@ async fn bodies_beyond_the_limit_are_refused_and_leave_nothing() {
         let answer = server.send("POST", path, &headers, hundred_megabytes.clone()).await.expect(413);
         assert!(answer.json()["type"].as_str().is_some_and(|name| name.ends_with("too-large")));
     }
-    let many = vec![json!({"time": "2026-01-01T00:00:00Z", "fix": {"longitude_deg": 1, "latitude_deg": 2}}); 1_001];
+    let many =
+        vec![json!({"time": "2026-01-01T00:00:00Z", "fix": {"longitude_deg": 1, "latitude_deg": 2}}); 1_001];
     let body = json!({"observations": many}).to_string();
     refused(&server, FUSIONS, "application/json", body, "observations").await;
     let count = server.get("/v1/cameras/c/samples/count").await.expect(200).json();
@@ -108,10 +112,14 @@ async fn one_bad_row_never_loses_the_others() {
         .as_array()
         .expect("rows")
         .iter()
-        .map(|row| (row["line"].as_u64().expect("a line"), row["field"].as_str().expect("a field").to_owned()))
+        .map(|row| {
+            (row["line"].as_u64().expect("a line"), row["field"].as_str().expect("a field").to_owned())
+        })
         .collect();
     assert_eq!(told.len(), 3, "{report}");
-    for ((line, field), (expected_line, part)) in told.iter().zip([(3, "latitude"), (4, "time"), (5, "width")]) {
+    for ((line, field), (expected_line, part)) in
+        told.iter().zip([(3, "latitude"), (4, "time"), (5, "width")])
+    {
         assert_eq!(*line, expected_line, "{report}");
         assert!(field.contains(part), "{report}");
     }

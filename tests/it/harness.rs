@@ -88,7 +88,8 @@ impl TestServer {
         let mut address = None;
         for line in lines.by_ref() {
             let line = line.expect("UTF-8");
-            let entry: Value = serde_json::from_str(&line).unwrap_or_else(|_| panic!("the server says: {line}"));
+            let entry: Value =
+                serde_json::from_str(&line).unwrap_or_else(|_| panic!("the server says: {line}"));
             if let Some(told) = entry["address"].as_str() {
                 address = Some(told.parse().expect("an address"));
                 break;

@@ -1,8 +1,4 @@
 //! The one integration test binary: everything from the outside, through real ports and files.
 
-mod bad_input;
-mod connections;
-mod harness;
+mod grpc;
 mod layering;
-mod openapi;
-mod story;

@@ -22,7 +22,11 @@ async fn the_server_tells_the_same_description_and_shows_it_offline() {
     let told = server.get("/openapi.json").await.expect(200).json();
     let printed: serde_json::Value = serde_json::from_str(&run(&["openapi"])).expect("JSON");
     assert_eq!(told, printed);
-    assert!(told["openapi"].as_str().is_some_and(|version| version.starts_with("3.1")), "{}", told["openapi"]);
+    assert!(
+        told["openapi"].as_str().is_some_and(|version| version.starts_with("3.1")),
+        "{}",
+        told["openapi"]
+    );
 
     let page = server.get("/docs/").await.expect(200).text();
     for (at, _) in page.match_indices("src=\"").chain(page.match_indices("href=\"")) {

@@ -1,3 +1,7 @@
+use std::collections::HashSet;
+
+use proptest::prelude::*;
+
 use super::*;
 use crate::store::connection::Turn;
 use crate::store::{Inserted, SampleFilter};
@@ -149,4 +153,86 @@ async fn closing_commits_what_was_handed_in_and_refuses_what_comes_later() {
     assert!(!folder.path().join("sightfix.db-wal").exists(), "the log went back into the file");
     let again = Store::open(folder.path()).await.expect("opens");
     assert_eq!(count(&again, &camera).await, 50);
+}
+
+/// After some failures (a full disk, an I/O error) the database ends a transaction by itself, which the
+/// connection must not stumble over.
+#[tokio::test]
+async fn the_writer_survives_a_transaction_that_ended_under_it() {
+    let fixture = Fixture::new().await;
+    let (store, camera) = (&fixture.store, &fixture.camera);
+    fixture
+        .tamper(
+            "CREATE TRIGGER poison BEFORE INSERT ON samples WHEN NEW.target_id = 'poison' \
+             BEGIN SELECT RAISE(ROLLBACK, 'poisoned'); END",
+        )
+        .await;
+    for round in 0..3 {
+        let turn = store.relaxed().await.expect("a turn");
+        let calls = vec![
+            call(store, camera, vec![sample(round, "a")]),
+            call(store, camera, vec![sample(round, "b"), sample(round, "poison")]),
+            call(store, camera, vec![sample(round, "c")]),
+        ];
+        release(store, turn, calls.len()).await;
+        let mut accepted = Vec::new();
+        for call in calls {
+            let outcome = call.await.expect("no panic");
+            accepted.push(outcome.map(|inserted| inserted.accepted).map_err(|error| error.kind()));
+        }
+        assert_eq!(accepted, [Ok(1), Err(ErrorKind::Internal), Ok(1)]);
+    }
+    store
+        .replace_camera(&NewCamera::named(camera.clone()), None, at(1))
+        .await
+        .expect("other changes work too");
+    assert_eq!(count(store, camera).await, 6);
+}
+
+#[tokio::test]
+async fn a_full_disk_is_a_fault_and_leaves_nothing_half_done() {
+    let fixture = Fixture::new().await;
+    let (store, camera) = (&fixture.store, &fixture.camera);
+    store.insert_samples(camera, vec![sample(0, "a")]).await.expect("stored");
+    {
+        // The limit is the connection's own, so it must be the one that stores the samples.
+        let mut turn = store.relaxed().await.expect("a turn");
+        let mut transaction = turn.begin().await.expect("begins");
+        sqlx::raw_sql("PRAGMA max_page_count = 60").execute(&mut *transaction).await.expect("set");
+        transaction.commit().await.expect("commits");
+    }
+    let many: Vec<Sample> = (1..20_000).map(|n| sample(n, "a")).collect();
+    assert_eq!(kind(store.insert_samples(camera, many).await), ErrorKind::Internal);
+    assert_eq!(count(store, camera).await, 1);
+    assert_eq!(store.insert_samples(camera, vec![sample(1, "a")]).await.expect("fits").accepted, 1);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(40))]
+
+    /// Whatever callers share a transaction, each is counted as if they had come one after another.
+    #[test]
+    fn sharing_a_transaction_changes_no_count(
+        before in prop::collection::vec((0_i64..40, "[ab]"), 0..20),
+        calls in prop::collection::vec(prop::collection::vec((0_i64..40, "[ab]"), 0..12), 1..12),
+    ) {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        runtime.block_on(async {
+            let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+            let rows = |keys: &[(i64, String)]| keys.iter().map(|(n, who)| sample(*n, who)).collect::<Vec<_>>();
+            store.insert_samples(&camera, rows(&before)).await.expect("stored");
+            let turn = store.relaxed().await.expect("a turn");
+            let tasks: Vec<Call> = calls.iter().map(|keys| call(&store, &camera, rows(keys))).collect();
+            release(&store, turn, tasks.len()).await;
+            let mut known: HashSet<_> = before.into_iter().collect();
+            for (task, keys) in tasks.into_iter().zip(calls) {
+                let asked = keys.len() as u64;
+                let accepted = keys.into_iter().map(|key| u64::from(known.insert(key))).sum();
+                let inserted = task.await.expect("no panic").expect("stored");
+                prop_assert_eq!(inserted, Inserted { accepted, duplicate: asked - accepted });
+            }
+            prop_assert_eq!(count(&store, &camera).await, known.len() as u64);
+            Ok(())
+        })?;
+    }
 }

@@ -109,3 +109,25 @@ fn metadata() -> ModelMetadata {
 fn kind<T: std::fmt::Debug>(outcome: Result<T>) -> ErrorKind {
     outcome.expect_err("is refused").kind()
 }
+
+/// Handlers run on any thread, so every future of the store must be able to move between threads.
+#[tokio::test]
+async fn futures_can_move_between_threads() {
+    fn movable<F: Future + Send>(_: F) {}
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    let (filter, run, lease) = (super::SampleFilter::default(), run_id(1), std::time::Duration::ZERO);
+    movable(Store::open(std::path::Path::new("none")));
+    movable(store.close());
+    movable(store.ping());
+    movable(store.cameras(Some(&camera), 1));
+    movable(store.delete_camera(&camera, None));
+    movable(store.insert_samples(&camera, Vec::new()));
+    movable(store.samples(&camera, &filter, None, 1));
+    movable(store.delete_samples(&camera, &filter));
+    movable(store.insert_run(run, &camera, &options(), 1, at(0)));
+    movable(store.claim_run(lease, at(0)));
+    movable(store.heartbeat(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
+    movable(store.append_epochs(run, 1, &[]));
+    movable(store.finish_run(run, 1, super::RunEnd::Cancelled, at(0)));
+    movable(store.roll_back(&camera, at(0)));
+}

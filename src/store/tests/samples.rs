@@ -53,6 +53,16 @@ async fn many_rows_of_any_number_are_counted_right() {
 }
 
 #[tokio::test]
+async fn a_cursor_from_before_the_filter_does_not_widen_it() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    store.insert_samples(&camera, (0..6).map(|second| sample(second, "a")).collect()).await.expect("stored");
+    let filter = SampleFilter { from: Some(at(3)), ..SampleFilter::default() };
+    let page =
+        store.samples(&camera, &filter, Some(SampleKey::of(&sample(1, "a"))), 2).await.expect("a page");
+    assert_eq!(page, [sample(3, "a"), sample(4, "a")]);
+}
+
+#[tokio::test]
 async fn deleting_takes_what_the_filter_selects() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     let all = (0..10).flat_map(|second| [sample(second, "a"), sample(second, "b")]).collect();

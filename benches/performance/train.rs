@@ -1,0 +1,77 @@
+//! Training the same net on one thread, against PyTorch (benches/peers).
+
+use std::ops::ControlFlow;
+use std::process::Command;
+use std::sync::Arc;
+use std::time::Instant;
+
+use rand::{RngExt as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+use sightfix::model::net::{Activation, NetShape};
+use sightfix::model::train::{LossWeights, Schedule, TrainingSet, train};
+
+use crate::ratio::{self, in_turn, median};
+
+const SAMPLES: usize = 10_000;
+const INPUTS: usize = 4;
+const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/peers/train_torch.py");
+
+pub(crate) fn run() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let set = Arc::new(training_set(&mut rng));
+    let ours = || fit(&set);
+    match std::env::var("PEERS_PYTHON") {
+        Ok(python) => {
+            ratio::head("Training 10,000 samples, 100 epochs, batch 512, net 4-32-2-32-4, one thread", "s");
+            ratio::row("against PyTorch", &in_turn(ours, || by_torch(&python)));
+        }
+        Err(_) => {
+            println!("\n### Training 10,000 samples, 100 epochs, batch 512, net 4-32-2-32-4, one thread\n");
+            let mut rounds: Vec<f64> = (0..7).map(|_| ours()).collect();
+            println!("ours: {:.3} s; set PEERS_PYTHON for the peer (benches/peers)", median(&mut rounds));
+        }
+    }
+}
+
+/// The peer's own figures: boxes of unit variance, fixes that bend with them.
+fn training_set(rng: &mut ChaCha8Rng) -> TrainingSet {
+    // A sum of twelve uniforms has variance 1.
+    let mut normal = || (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0;
+    let inputs: Vec<Vec<f32>> = (0..INPUTS).map(|_| (0..SAMPLES).map(|_| normal()).collect()).collect();
+    let target = |axis: usize| {
+        let (straight, bent) = (&inputs[axis], &inputs[axis + 2]);
+        straight.iter().zip(bent).map(|(straight, bent)| 0.7 * straight + 0.3 * bent * bent).collect()
+    };
+    TrainingSet {
+        rebuilt: inputs.clone(),
+        targets: [target(0), target(1)],
+        inputs,
+        weights: vec![1.0; SAMPLES],
+    }
+}
+
+fn fit(set: &Arc<TrainingSet>) -> f64 {
+    let shape = NetShape::auto_encoder(INPUTS, &[32], Activation::Tanh);
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let parameters = shape.initial_parameters(&mut rng);
+    let weights = LossWeights { reconstruction: 1.0, regression: 1.0 };
+    let schedule = Schedule { epochs: 100, batch: 512, learning_rate: 0.005, last_rate_share: 1.0 };
+    let began = Instant::now();
+    train(
+        &shape,
+        parameters,
+        set.clone(),
+        weights,
+        schedule,
+        &mut rng,
+        &mut |_, _| ControlFlow::Continue(()),
+    )
+    .expect("a training of finite numbers");
+    began.elapsed().as_secs_f64()
+}
+
+fn by_torch(python: &str) -> f64 {
+    let output = Command::new(python).arg(SCRIPT).output().expect("PEERS_PYTHON is a Python with PyTorch");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8_lossy(&output.stdout).trim().parse().expect("the script prints seconds")
+}

@@ -1,0 +1,48 @@
+//! Where the next page of a list begins, as text that a client hands back and need not understand.
+
+use base64::Engine as _;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+
+use crate::domain::{Error, Result};
+
+/// Longest cursor that is read.
+const LONGEST_BYTES: usize = 512;
+
+/// A cursor of a list, from the key of the last item shown.
+#[must_use]
+pub fn write_cursor(list: &str, key: &str) -> String {
+    URL_SAFE_NO_PAD.encode(format!("{list}:{key}"))
+}
+
+/// The key in a cursor of the same list.
+///
+/// # Errors
+/// Names the field `cursor` for text that no page of this list gave.
+pub fn read_cursor(list: &str, cursor: &str) -> Result<String> {
+    let key = (cursor.len() <= LONGEST_BYTES)
+        .then(|| URL_SAFE_NO_PAD.decode(cursor).ok())
+        .flatten()
+        .and_then(|bytes| String::from_utf8(bytes).ok())
+        .and_then(|text| text.strip_prefix(list)?.strip_prefix(':').map(str::to_owned));
+    key.ok_or_else(foreign_cursor)
+}
+
+/// The refusal of a cursor that no page of the list gave.
+#[must_use]
+pub fn foreign_cursor() -> Error {
+    Error::invalid("cursor", "must be what a page of this list gave as its next cursor")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cursor_is_read_by_its_own_list_only() {
+        let cursor = write_cursor("samples", "17:é");
+        assert_eq!(read_cursor("samples", &cursor).expect("own"), "17:é");
+        for foreign in ["", "*", "c2FtcGxlcw", cursor.as_str()] {
+            assert!(read_cursor("cameras", foreign).is_err(), "{foreign}");
+        }
+    }
+}

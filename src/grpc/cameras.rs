@@ -1,0 +1,250 @@
+//! `CameraService`.
+
+use super::convert::{camera_id, of_field, recipe, required, timestamp};
+use super::pages;
+use super::proto;
+use super::proto::camera_service_server::CameraService;
+use super::statuses::{Reply, answer};
+use crate::app::App;
+use crate::domain::{
+    Camera, CameraChange, CameraId, Error, GnssError, ImageSize, NewCamera, Result, Revision, SigmaM,
+    TargetClass,
+};
+
+pub(super) struct Cameras {
+    app: App,
+}
+
+impl Cameras {
+    pub(super) fn new(app: &App) -> Self {
+        Self { app: app.clone() }
+    }
+}
+
+#[tonic::async_trait]
+impl CameraService for Cameras {
+    async fn create_camera(
+        &self,
+        request: tonic::Request<proto::CreateCameraRequest>,
+    ) -> Reply<proto::CreateCameraResponse> {
+        answer(request, |asked| async move {
+            let id = CameraId::new(&asked.id)?;
+            let profile = new_camera(id, asked.profile.unwrap_or_default())
+                .and_then(NewCamera::check)
+                .map_err(|error| error.under("profile"))?;
+            let camera = self.app.create_camera(profile).await?;
+            Ok(proto::CreateCameraResponse { camera: Some(camera.into()) })
+        })
+        .await
+    }
+
+    async fn get_camera(
+        &self,
+        request: tonic::Request<proto::GetCameraRequest>,
+    ) -> Reply<proto::GetCameraResponse> {
+        answer(request, |asked| async move {
+            let camera = self.app.camera(&camera_id(&asked.camera_id)?).await?;
+            Ok(proto::GetCameraResponse { camera: Some(camera.into()) })
+        })
+        .await
+    }
+
+    async fn list_cameras(
+        &self,
+        request: tonic::Request<proto::ListCamerasRequest>,
+    ) -> Reply<proto::ListCamerasResponse> {
+        answer(request, |asked| async move {
+            let size = pages::size(asked.page_size, &self.app.limits)?;
+            let after = pages::cursor::<CameraId>(&asked.page_token)?;
+            let page = self.app.cameras(after.as_ref(), size).await?;
+            Ok(proto::ListCamerasResponse {
+                next_page_token: pages::token(page.next.as_ref()),
+                cameras: page.items.into_iter().map(Into::into).collect(),
+            })
+        })
+        .await
+    }
+
+    async fn update_camera(
+        &self,
+        request: tonic::Request<proto::UpdateCameraRequest>,
+    ) -> Reply<proto::UpdateCameraResponse> {
+        answer(request, |asked| async move {
+            let id = camera_id(&asked.camera_id)?;
+            let expected = asked.expected_revision.map(Revision);
+            let change = camera_change(&id, required(asked.profile, "profile")?, asked.update_mask)?;
+            let changed = self.app.change_camera(&id, change, expected).await;
+            let camera = changed.map_err(|error| of_field(error, "profile"))?;
+            Ok(proto::UpdateCameraResponse { camera: Some(camera.into()) })
+        })
+        .await
+    }
+
+    async fn delete_camera(
+        &self,
+        request: tonic::Request<proto::DeleteCameraRequest>,
+    ) -> Reply<proto::DeleteCameraResponse> {
+        answer(request, |asked| async move {
+            let id = camera_id(&asked.camera_id)?;
+            self.app.delete_camera(&id, asked.expected_revision.map(Revision)).await?;
+            Ok(proto::DeleteCameraResponse {})
+        })
+        .await
+    }
+}
+
+/// A profile of which everything may be left out.
+fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> {
+    let named = NewCamera::named(id);
+    let classes = profile.target_classes.iter().enumerate().map(|(index, class)| {
+        TargetClass::new(class).map_err(|error| renamed(error, format!("target_classes[{index}]")))
+    });
+    Ok(NewCamera {
+        display_name: Some(profile.display_name)
+            .filter(|name| !name.is_empty())
+            .unwrap_or(named.display_name),
+        image_size: profile.image_size.map(image_size).transpose()?,
+        gnss_error: gnss_error(profile.gnss_error)?,
+        recipe: recipe(profile.recipe)?.unwrap_or_default(),
+        target_classes: classes.collect::<Result<_>>()?,
+        labels: profile.labels.into_iter().collect(),
+        id: named.id,
+    })
+}
+
+/// The same refusal of another field.
+fn renamed(mut error: Error, field: String) -> Error {
+    if let Error::Refused(refusal) = &mut error
+        && let Some(first) = refusal.violations.first_mut()
+    {
+        first.field = field;
+    }
+    error
+}
+
+fn image_size(size: proto::ImageSize) -> Result<ImageSize> {
+    ImageSize::new(size.width_px, size.height_px).map_err(|error| error.under("image_size"))
+}
+
+fn gnss_error(error: Option<proto::GnssError>) -> Result<GnssError> {
+    match error.and_then(|error| error.sigma_m) {
+        None => Ok(GnssError::Unknown),
+        Some(sigma_m) => {
+            SigmaM::new(sigma_m).map(GnssError::Known).map_err(|error| error.under("gnss_error"))
+        }
+    }
+}
+
+/// The fields of a profile, as a mask names them.
+const FIELDS: [&str; 6] = ["display_name", "image_size", "gnss_error", "recipe", "target_classes", "labels"];
+
+/// The fields that the mask names, or those that the profile has.
+fn camera_change(
+    id: &CameraId,
+    profile: proto::CameraProfile,
+    mask: Option<prost_types::FieldMask>,
+) -> Result<CameraChange> {
+    let paths = match mask {
+        Some(mask) => mask.paths,
+        None => present(&profile).into_iter().map(str::to_owned).collect(),
+    };
+    let unknown = |path: &String| path != "*" && !FIELDS.contains(&path.as_str());
+    if let Some(index) = paths.iter().position(unknown) {
+        let known = FIELDS.join(", ");
+        return Err(Error::invalid(
+            format!("update_mask.paths[{index}]"),
+            format!("must be one of {known}, or * for all"),
+        ));
+    }
+    let named = |field: &str| paths.iter().any(|path| path == field || path == "*");
+    let profile = new_camera(id.clone(), profile).map_err(|error| error.under("profile"))?;
+    Ok(CameraChange {
+        display_name: named("display_name").then_some(profile.display_name),
+        image_size: named("image_size").then_some(profile.image_size),
+        gnss_error: named("gnss_error").then_some(profile.gnss_error),
+        recipe: named("recipe").then_some(profile.recipe),
+        target_classes: named("target_classes").then_some(profile.target_classes),
+        labels: named("labels").then_some(profile.labels),
+    })
+}
+
+/// Names of the fields that a profile has.
+fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
+    let has = [
+        !profile.display_name.is_empty(),
+        profile.image_size.is_some(),
+        profile.gnss_error.is_some(),
+        profile.recipe != proto::Recipe::Unspecified as i32,
+        !profile.target_classes.is_empty(),
+        !profile.labels.is_empty(),
+    ];
+    FIELDS.into_iter().zip(has).filter_map(|(field, has)| has.then_some(field)).collect()
+}
+
+impl From<Camera> for proto::Camera {
+    fn from(camera: Camera) -> Self {
+        Self {
+            id: camera.id().as_str().to_owned(),
+            warnings: camera.profile.warnings(),
+            profile: Some(camera.profile.into()),
+            revision: camera.revision.0,
+            created_at: Some(timestamp(camera.created_at)),
+            updated_at: Some(timestamp(camera.updated_at)),
+            active_model: camera.active_model,
+        }
+    }
+}
+
+impl From<NewCamera> for proto::CameraProfile {
+    fn from(profile: NewCamera) -> Self {
+        let sigma_m = match profile.gnss_error {
+            GnssError::Known(sigma) => Some(sigma.metres()),
+            GnssError::Unknown => None,
+        };
+        Self {
+            display_name: profile.display_name,
+            image_size: profile
+                .image_size
+                .map(|size| proto::ImageSize { width_px: size.width_px(), height_px: size.height_px() }),
+            gnss_error: Some(proto::GnssError { sigma_m }),
+            recipe: proto::Recipe::from(profile.recipe).into(),
+            target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
+            labels: profile.labels.into_iter().collect(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn change(profile: proto::CameraProfile, paths: Option<&[&str]>) -> Result<CameraChange> {
+        let id = CameraId::new("yard").expect("a slug");
+        let paths = paths.map(|paths| paths.iter().map(|&path| path.to_owned()).collect());
+        camera_change(&id, profile, paths.map(|paths| prost_types::FieldMask { paths }))
+    }
+
+    #[test]
+    fn without_a_mask_what_is_there_is_changed() {
+        let profile = proto::CameraProfile { display_name: "Yard".to_owned(), ..Default::default() };
+        let expected = CameraChange { display_name: Some("Yard".to_owned()), ..Default::default() };
+        assert_eq!(change(profile, None).expect("good"), expected);
+    }
+
+    #[test]
+    fn a_field_that_is_named_and_left_out_is_forgotten() {
+        let profile = proto::CameraProfile { display_name: "Yard".to_owned(), ..Default::default() };
+        let expected = CameraChange {
+            image_size: Some(None),
+            gnss_error: Some(GnssError::Unknown),
+            ..CameraChange::default()
+        };
+        assert_eq!(change(profile, Some(&["image_size", "gnss_error"])).expect("good"), expected);
+    }
+
+    #[test]
+    fn an_unknown_field_is_refused_by_its_place() {
+        let refused = change(proto::CameraProfile::default(), Some(&["labels", "id"]));
+        assert!(refused.expect_err("unknown").to_string().starts_with("update_mask.paths[1]"));
+    }
+}

@@ -1,0 +1,71 @@
+//! `FusionService`.
+
+use super::convert::{camera_id, observation, timestamp};
+use super::proto;
+use super::proto::fusion_service_server::FusionService;
+use super::statuses::{Reply, answer};
+use crate::app::App;
+use crate::domain::{Flag, FusedFix, TargetId};
+
+pub(super) struct Fusion {
+    app: App,
+}
+
+impl Fusion {
+    pub(super) fn new(app: &App) -> Self {
+        Self { app: app.clone() }
+    }
+}
+
+#[tonic::async_trait]
+impl FusionService for Fusion {
+    async fn fuse(&self, request: tonic::Request<proto::FuseRequest>) -> Reply<proto::FuseResponse> {
+        answer(request, |asked| async move {
+            let camera = camera_id(&asked.camera_id)?;
+            self.app.check_batch(asked.observations.len())?;
+            let rules = self.app.row_rules(&camera).await?;
+            let mut observations = Vec::with_capacity(asked.observations.len());
+            for (index, message) in asked.observations.into_iter().enumerate() {
+                observations.push(
+                    observation(message, &rules)
+                        .map_err(|error| error.under(&format!("observations[{index}]")))?,
+                );
+            }
+            let fused = self.app.fuse(&camera, &observations).await?;
+            Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
+        })
+        .await
+    }
+}
+
+impl From<FusedFix> for proto::FusedFix {
+    fn from(fused: FusedFix) -> Self {
+        Self {
+            time: Some(timestamp(fused.time)),
+            target_id: fused.target_id.as_ref().map(TargetId::as_str).map(str::to_owned),
+            fused: Some(fused.fused.into()),
+            regressed: fused.regressed.map(Into::into),
+            gnss: fused.gnss.map(Into::into),
+            confidence_regression: fused.confidences.regression,
+            confidence_gnss: fused.confidences.gnss,
+            e_regression_m2: fused.e_regression_m2,
+            e_gnss_m2: fused.e_gnss_m2,
+            r95_m: fused.r95_m,
+            reconstruction_error: fused.reconstruction_error,
+            model_version: fused.model_version,
+            flags: fused.flags.into_iter().map(|flag| proto::Flag::from(flag).into()).collect(),
+        }
+    }
+}
+
+impl From<Flag> for proto::Flag {
+    fn from(flag: Flag) -> Self {
+        match flag {
+            Flag::GnssDenied => Self::GnssDenied,
+            Flag::BoxMissing => Self::BoxMissing,
+            Flag::BoxAtBorder => Self::BoxAtBorder,
+            Flag::OutsideTraining => Self::OutsideTraining,
+            Flag::NoModel => Self::NoModel,
+        }
+    }
+}

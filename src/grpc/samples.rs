@@ -1,0 +1,160 @@
+//! `SampleService`.
+
+use futures_util::{Stream, StreamExt as _, TryStreamExt as _, stream};
+use tonic::Streaming;
+
+use super::convert::{camera_id, sample, sample_filter};
+use super::pages;
+use super::proto;
+use super::proto::sample_service_server::SampleService;
+use super::statuses::{Reply, answer, broken};
+use crate::app::{App, ImportReport, RejectedRow};
+use crate::domain::{Error, ErrorKind, Result, Sample};
+use crate::exchange::RowRules;
+use crate::shutdown::Shutdown;
+use crate::store::{SampleFilter, SampleKey};
+
+pub(super) struct Samples {
+    app: App,
+    shutdown: Shutdown,
+}
+
+impl Samples {
+    pub(super) fn new(app: &App, shutdown: &Shutdown) -> Self {
+        Self { app: app.clone(), shutdown: shutdown.clone() }
+    }
+}
+
+#[tonic::async_trait]
+impl SampleService for Samples {
+    async fn import_samples(
+        &self,
+        request: tonic::Request<Streaming<proto::ImportSamplesRequest>>,
+    ) -> Reply<proto::ImportSamplesResponse> {
+        answer(request, |messages| async move {
+            let mut batches = Batches { messages, shutdown: self.shutdown.clone(), camera: String::new() };
+            let Some(first) = batches.next().await? else {
+                return Err(Error::invalid("camera_id", "is required in the first message"));
+            };
+            let camera = camera_id(&first.camera_id)?;
+            batches.camera = first.camera_id;
+            let rules = self.app.row_rules(&camera).await?;
+            let rows = rows(first.samples, batches, rules);
+            Ok(self.app.import_rows(&camera, rows).await?.into())
+        })
+        .await
+    }
+
+    async fn list_samples(
+        &self,
+        request: tonic::Request<proto::ListSamplesRequest>,
+    ) -> Reply<proto::ListSamplesResponse> {
+        answer(request, |asked| async move {
+            let camera = camera_id(&asked.camera_id)?;
+            let filter = sample_filter(asked.filter)?;
+            let size = pages::size(asked.page_size, &self.app.limits)?;
+            let after = pages::cursor::<SampleKey>(&asked.page_token)?;
+            let page = self.app.samples(&camera, &filter, after, size).await?;
+            Ok(proto::ListSamplesResponse {
+                next_page_token: pages::token(page.next.as_ref()),
+                samples: page.items.into_iter().map(Into::into).collect(),
+            })
+        })
+        .await
+    }
+
+    async fn count_samples(
+        &self,
+        request: tonic::Request<proto::CountSamplesRequest>,
+    ) -> Reply<proto::CountSamplesResponse> {
+        answer(request, |asked| async move {
+            let filter = sample_filter(asked.filter)?;
+            let count = self.app.count_samples(&camera_id(&asked.camera_id)?, &filter).await?;
+            Ok(proto::CountSamplesResponse { count })
+        })
+        .await
+    }
+
+    async fn delete_samples(
+        &self,
+        request: tonic::Request<proto::DeleteSamplesRequest>,
+    ) -> Reply<proto::DeleteSamplesResponse> {
+        answer(request, |asked| async move {
+            let camera = camera_id(&asked.camera_id)?;
+            let filter = sample_filter(asked.filter)?;
+            if filter == SampleFilter::default() {
+                return Err(Error::invalid(
+                    "filter",
+                    "must have from, until or target_id, so that not all samples go by an oversight",
+                ));
+            }
+            let deleted = self.app.delete_samples(&camera, &filter).await?;
+            Ok(proto::DeleteSamplesResponse { deleted })
+        })
+        .await
+    }
+}
+
+/// The messages of an import, one at a time.
+struct Batches {
+    messages: Streaming<proto::ImportSamplesRequest>,
+    shutdown: Shutdown,
+    /// As the first message names it.
+    camera: String,
+}
+
+impl Batches {
+    async fn next(&mut self) -> Result<Option<proto::ImportSamplesRequest>> {
+        tokio::select! {
+            biased;
+            message = self.messages.message() => message.map_err(|status| broken(&status)),
+            () = self.shutdown.begun() => Err(Error::refused(
+                ErrorKind::ShuttingDown,
+                "the server is ending; send the samples again, those that are stored count as duplicates",
+            )),
+        }
+    }
+
+    /// The samples of the next message.
+    async fn samples(&mut self) -> Result<Option<Vec<proto::Sample>>> {
+        let Some(message) = self.next().await? else { return Ok(None) };
+        if !message.camera_id.is_empty() && message.camera_id != self.camera {
+            return Err(Error::invalid("camera_id", "must be that of the first message, or empty"));
+        }
+        Ok(Some(message.samples))
+    }
+}
+
+/// The samples of a whole stream one by one, each with its ordinal if it is at fault. No more than one
+/// message is held at a time.
+fn rows(
+    first: Vec<proto::Sample>,
+    batches: Batches,
+    rules: RowRules,
+) -> impl Stream<Item = Result<Result<Sample, RejectedRow>>> + Send {
+    let later = stream::try_unfold(batches, |mut batches| async move {
+        Ok(batches.samples().await?.map(|samples| (samples, batches)))
+    });
+    let all = stream::once(async { Ok(first) }).chain(later);
+    let mut line = 0;
+    all.map_ok(|samples| stream::iter(samples.into_iter().map(Ok::<_, Error>))).try_flatten().map(
+        move |message| {
+            line += 1;
+            match sample(message?, &rules) {
+                Ok(sample) => Ok(Ok(sample)),
+                Err(error) => RejectedRow::of(line, error).map(Err),
+            }
+        },
+    )
+}
+
+impl From<ImportReport> for proto::ImportSamplesResponse {
+    fn from(report: ImportReport) -> Self {
+        Self {
+            accepted: report.accepted,
+            duplicate: report.duplicate,
+            rejected: report.rejected,
+            rejected_rows: report.rejected_rows.into_iter().map(Into::into).collect(),
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! Errors as gRPC tells them. The only place of this transport that makes a status.
+
+use std::collections::HashMap;
+
+use hyper::Response;
+use hyper::http::Extensions;
+use hyper::http::HeaderValue;
+use tonic::{Code, Request, Status};
+use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
+
+use crate::domain::{Error, ErrorKind, Refusal, Result, Violation};
+use crate::status;
+use crate::telemetry::RequestId;
+
+/// Who speaks in `ErrorInfo`.
+const DOMAIN: &str = "sightfix";
+/// Clients take no more than some kB of headers, and texts may quote what they sent.
+const LONGEST_TEXT: usize = 400;
+/// Fields at fault that are told.
+const MOST_VIOLATIONS: usize = 8;
+
+/// What a unary method gives.
+pub(super) type Reply<T> = std::result::Result<tonic::Response<T>, Status>;
+
+/// Answers a unary request by a use case.
+pub(super) async fn answer<M, R, F>(request: Request<M>, handle: impl FnOnce(M) -> F) -> Reply<R>
+where
+    F: Future<Output = Result<R>>,
+{
+    let (_, extensions, message) = request.into_parts();
+    match handle(message).await {
+        Ok(reply) => Ok(tonic::Response::new(reply)),
+        Err(error) => Err(to_status(&error, &request_id(&extensions))),
+    }
+}
+
+/// The id that the entrance gave.
+pub(super) fn request_id(extensions: &Extensions) -> RequestId {
+    let unknown = || RequestId::new(HeaderValue::from_static("unknown"));
+    extensions.get().cloned().unwrap_or_else(unknown)
+}
+
+/// An error with its code and details: `ErrorInfo` with the problem's slug as reason, `RequestInfo`,
+/// and `BadRequest` where fields are at fault. A fault is logged here and nothing of it is shown.
+pub(super) fn to_status(error: &Error, id: &RequestId) -> Status {
+    let told = status::of(error.kind());
+    let mut details = ErrorDetails::with_error_info(told.slug, DOMAIN, HashMap::new());
+    details.set_request_info(id.as_str(), "");
+    let message = match error {
+        Error::Refused(refusal) => {
+            if !refusal.violations.is_empty() {
+                details.set_bad_request(violations(refusal));
+            }
+            shortened(&refusal.to_string())
+        }
+        Error::Fault(fault) => {
+            tracing::error!(request.id = %id, error = %fault, "a request failed");
+            told.title.to_owned()
+        }
+    };
+    Status::with_error_details(Code::from(told.grpc), message, details)
+}
+
+fn violations(refusal: &Refusal) -> Vec<FieldViolation> {
+    let told = refusal.violations.iter().take(MOST_VIOLATIONS);
+    told.map(|Violation { field, message }| FieldViolation::new(shortened(field), shortened(message)))
+        .collect()
+}
+
+fn shortened(text: &str) -> String {
+    if text.len() <= LONGEST_TEXT {
+        return text.to_owned();
+    }
+    format!("{}...", &text[..text.floor_char_boundary(LONGEST_TEXT)])
+}
+
+/// An answer that tonic gave by itself (no such method, a message too large or not of its type) with
+/// the code and the details of the same table; any other answer as it is.
+pub fn explain<B>(mut response: Response<B>, id: &RequestId) -> Response<B> {
+    let Some(bare) = Status::from_header_map(response.headers()).filter(|status| status.details().is_empty())
+    else {
+        return response;
+    };
+    let error = match bare.code() {
+        Code::Unimplemented if bare.message().is_empty() => Error::refused(
+            ErrorKind::RouteNotFound,
+            "there is no such service or method; server reflection lists those that there are",
+        ),
+        Code::OutOfRange | Code::Internal => broken(&bare),
+        _ => return response,
+    };
+    // All of it was made here from text, so it fits into headers.
+    let _ = to_status(&error, id).add_header(response.headers_mut());
+    response
+}
+
+/// Why a client's message could not be read, from what tonic says of it.
+pub(super) fn broken(status: &Status) -> Error {
+    let kind = match status.code() {
+        Code::OutOfRange | Code::ResourceExhausted => ErrorKind::TooLarge,
+        Code::Cancelled => ErrorKind::Cancelled,
+        Code::DeadlineExceeded => ErrorKind::Timeout,
+        _ => ErrorKind::MalformedBody,
+    };
+    Error::refused(kind, format!("the message cannot be read: {}", status.message()))
+}

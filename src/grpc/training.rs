@@ -1,0 +1,231 @@
+//! `TrainingService`.
+
+use std::pin::Pin;
+use std::sync::Arc;
+
+use futures_util::{Stream, StreamExt as _, stream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tonic::Status;
+
+use super::convert::{camera_id, instant, recipe, run_id, timestamp};
+use super::pages;
+use super::proto;
+use super::proto::training_service_server::TrainingService;
+use super::statuses::{Reply, answer, request_id, to_status};
+use crate::app::{App, RunRequest};
+use crate::domain::{EpochReport, Error, ErrorKind, Result, RunId, RunProgress, RunState, TrainingRun};
+use crate::shutdown::Shutdown;
+use crate::telemetry::RequestId;
+
+pub(super) struct Training {
+    app: App,
+    shutdown: Shutdown,
+    /// Places of those who watch.
+    places: Arc<Semaphore>,
+}
+
+impl Training {
+    pub(super) fn new(app: &App, shutdown: &Shutdown) -> Self {
+        let places = Arc::new(Semaphore::new(app.limits.event_streams));
+        Self { app: app.clone(), shutdown: shutdown.clone(), places }
+    }
+}
+
+#[tonic::async_trait]
+impl TrainingService for Training {
+    async fn start_training_run(
+        &self,
+        request: tonic::Request<proto::StartTrainingRunRequest>,
+    ) -> Reply<proto::StartTrainingRunResponse> {
+        answer(request, |asked| async move {
+            let options = RunRequest {
+                recipe: recipe(asked.recipe)?,
+                seed: asked.seed,
+                epochs: asked.epochs,
+                from: instant(asked.from, "from")?,
+                until: instant(asked.until, "until")?,
+            };
+            let run = self.app.start_run(&camera_id(&asked.camera_id)?, options).await?;
+            Ok(proto::StartTrainingRunResponse { run: Some(run.into()) })
+        })
+        .await
+    }
+
+    async fn get_training_run(
+        &self,
+        request: tonic::Request<proto::GetTrainingRunRequest>,
+    ) -> Reply<proto::GetTrainingRunResponse> {
+        answer(request, |asked| async move {
+            let run = self.app.run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            Ok(proto::GetTrainingRunResponse { run: Some(run.into()) })
+        })
+        .await
+    }
+
+    async fn list_training_runs(
+        &self,
+        request: tonic::Request<proto::ListTrainingRunsRequest>,
+    ) -> Reply<proto::ListTrainingRunsResponse> {
+        answer(request, |asked| async move {
+            let camera = camera_id(&asked.camera_id)?;
+            let size = pages::size(asked.page_size, &self.app.limits)?;
+            let page = self.app.runs(&camera, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
+            Ok(proto::ListTrainingRunsResponse {
+                next_page_token: pages::token(page.next.as_ref()),
+                runs: page.items.into_iter().map(Into::into).collect(),
+            })
+        })
+        .await
+    }
+
+    async fn cancel_training_run(
+        &self,
+        request: tonic::Request<proto::CancelTrainingRunRequest>,
+    ) -> Reply<proto::CancelTrainingRunResponse> {
+        answer(request, |asked| async move {
+            let run = self.app.cancel_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            Ok(proto::CancelTrainingRunResponse { run: Some(run.into()) })
+        })
+        .await
+    }
+
+    type WatchTrainingRunStream = Changes;
+
+    async fn watch_training_run(
+        &self,
+        request: tonic::Request<proto::WatchTrainingRunRequest>,
+    ) -> Reply<Changes> {
+        let id = request_id(request.extensions());
+        answer(request, |asked| async move {
+            let place = self.places.clone().try_acquire_owned().map_err(|_| all_watched())?;
+            let (camera, run) = (camera_id(&asked.camera_id)?, run_id(&asked.run_id)?);
+            let runs = self.app.watch_run(&camera, run).await?;
+            Ok(changes(runs, place, self.shutdown.clone(), id))
+        })
+        .await
+    }
+
+    async fn get_training_log(
+        &self,
+        request: tonic::Request<proto::GetTrainingLogRequest>,
+    ) -> Reply<proto::GetTrainingLogResponse> {
+        answer(request, |asked| async move {
+            let log = self.app.run_log(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            let line = |(time, text)| proto::TrainingLogLine { time: Some(timestamp(time)), text };
+            Ok(proto::GetTrainingLogResponse { lines: log.into_iter().map(line).collect() })
+        })
+        .await
+    }
+
+    async fn get_training_curve(
+        &self,
+        request: tonic::Request<proto::GetTrainingCurveRequest>,
+    ) -> Reply<proto::GetTrainingCurveResponse> {
+        answer(request, |asked| async move {
+            let epochs = self.app.run_epochs(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            Ok(proto::GetTrainingCurveResponse { epochs: epochs.into_iter().map(Into::into).collect() })
+        })
+        .await
+    }
+}
+
+/// A run after each of its changes.
+pub(super) type Changes =
+    Pin<Box<dyn Stream<Item = std::result::Result<proto::WatchTrainingRunResponse, Status>> + Send>>;
+
+/// Ends with the run, with the first fault, or with the server, which is told as an error so that
+/// nobody takes the run for ended.
+fn changes(
+    runs: impl Stream<Item = Result<TrainingRun>> + Send + 'static,
+    place: OwnedSemaphorePermit,
+    shutdown: Shutdown,
+    id: RequestId,
+) -> Changes {
+    let watched = Some((Box::pin(runs), place));
+    stream::unfold(watched, move |watched| {
+        let (shutdown, id) = (shutdown.clone(), id.clone());
+        async move {
+            let (mut runs, place) = watched?;
+            let next = tokio::select! {
+                biased;
+                next = runs.next() => next?,
+                () = shutdown.begun() => Err(ending()),
+            };
+            Some(match next {
+                Ok(run) => {
+                    (Ok(proto::WatchTrainingRunResponse { run: Some(run.into()) }), Some((runs, place)))
+                }
+                Err(error) => (Err(to_status(&error, &id)), None),
+            })
+        }
+    })
+    .boxed()
+}
+
+fn ending() -> Error {
+    Error::refused(ErrorKind::ShuttingDown, "the server is ending; the run goes on when it is back")
+}
+
+fn all_watched() -> Error {
+    Error::refused(ErrorKind::Overloaded, "too many clients watch runs; ask for the run now and then")
+}
+
+impl From<TrainingRun> for proto::TrainingRun {
+    fn from(run: TrainingRun) -> Self {
+        Self {
+            id: run.id.to_string(),
+            camera_id: run.camera_id.as_str().to_owned(),
+            recipe: proto::Recipe::from(run.options.recipe).into(),
+            seed: run.options.seed,
+            epochs: run.options.epochs,
+            from: run.options.from.map(timestamp),
+            until: run.options.until.map(timestamp),
+            state: proto::TrainingRunState::from(run.state).into(),
+            progress: Some(run.progress.into()),
+            attempt: run.attempt,
+            model_version: run.model_version,
+            outcome: run.outcome,
+            created_at: Some(timestamp(run.created_at)),
+            started_at: run.started_at.map(timestamp),
+            ended_at: run.ended_at.map(timestamp),
+        }
+    }
+}
+
+impl From<RunState> for proto::TrainingRunState {
+    fn from(state: RunState) -> Self {
+        match state {
+            RunState::Queued => Self::Queued,
+            RunState::Running => Self::Running,
+            RunState::Succeeded => Self::Succeeded,
+            RunState::Failed => Self::Failed,
+            RunState::Cancelled => Self::Cancelled,
+        }
+    }
+}
+
+impl From<RunProgress> for proto::TrainingProgress {
+    fn from(progress: RunProgress) -> Self {
+        Self {
+            phase: progress.phase,
+            epoch: progress.epoch,
+            epochs: progress.epochs,
+            reconstruction_error: progress.reconstruction_error,
+            regression_error: progress.regression_error,
+            error_scale: progress.error_scale,
+            remaining_s: progress.remaining_s,
+        }
+    }
+}
+
+impl From<EpochReport> for proto::TrainingEpoch {
+    fn from(epoch: EpochReport) -> Self {
+        Self {
+            epoch: epoch.epoch,
+            loss: epoch.loss,
+            reconstruction_error: epoch.reconstruction_error,
+            regression_error: epoch.regression_error,
+            error_scale: epoch.error_scale,
+        }
+    }
+}

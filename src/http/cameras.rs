@@ -1,0 +1,367 @@
+//! `/v1/cameras`: profiles.
+
+use std::collections::BTreeMap;
+
+use axum::extract::State;
+use hyper::header::IF_MATCH;
+use hyper::{HeaderMap, StatusCode, Uri};
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::extract::{CameraPath, JsonBody, Params};
+use super::problem::{Answer, Problem};
+use super::wire::{Recipe, empty, json, made, nullable, with_etag};
+use crate::app::App;
+use crate::domain::{self, CameraId, Error, ErrorKind, NewCamera, Result, Revision, SigmaM, TargetClass};
+use crate::exchange::{read_cursor, write_cursor};
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new().routes(routes!(create_camera, list_cameras)).routes(routes!(
+        get_camera,
+        change_camera,
+        delete_camera
+    ))
+}
+
+/// Size of a camera's image.
+#[derive(Clone, Copy, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ImageSize {
+    /// Columns.
+    #[schema(minimum = 1, maximum = 131_072, example = 1920)]
+    width_px: u32,
+    /// Rows.
+    #[schema(minimum = 1, maximum = 131_072, example = 1080)]
+    height_px: u32,
+}
+
+impl ImageSize {
+    fn to_domain(self) -> Result<domain::ImageSize> {
+        domain::ImageSize::new(self.width_px, self.height_px).map_err(|error| error.under("image_size"))
+    }
+}
+
+/// A receiver's error: `"unknown"` (then it is estimated from the training samples), or its
+/// standard deviation per horizontal axis in metres.
+#[derive(Clone, Copy, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum GnssError {
+    /// To be estimated.
+    Unknown,
+    /// Metres per axis, 0.001 to 10,000.
+    SigmaM(f64),
+}
+
+impl GnssError {
+    fn to_domain(self) -> Result<domain::GnssError> {
+        match self {
+            Self::Unknown => Ok(domain::GnssError::Unknown),
+            Self::SigmaM(sigma_m) => {
+                SigmaM::new(sigma_m).map(domain::GnssError::Known).map_err(|error| error.under("gnss_error"))
+            }
+        }
+    }
+}
+
+impl From<domain::GnssError> for GnssError {
+    fn from(error: domain::GnssError) -> Self {
+        match error {
+            domain::GnssError::Known(sigma) => Self::SigmaM(sigma.metres()),
+            domain::GnssError::Unknown => Self::Unknown,
+        }
+    }
+}
+
+/// A camera to be stored. Nothing but the id is needed; no calibration is ever asked for.
+#[derive(Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+struct CameraDraft {
+    /// A slug: 1 to 63 of `a-z`, `0-9` and `-`.
+    #[schema(pattern = "^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$", example = "north-gate")]
+    id: String,
+    /// The name for people; the id if left out.
+    #[schema(max_length = 200, example = "North gate")]
+    display_name: Option<String>,
+    /// Without it, boxes cut by the right or lower border cannot be told.
+    image_size: Option<ImageSize>,
+    /// `"unknown"` if left out.
+    gnss_error: Option<GnssError>,
+    /// The server's default if left out.
+    recipe: Option<Recipe>,
+    /// Classes that the camera is used for; none means all.
+    #[serde(default)]
+    #[schema(max_items = 64, example = json!(["person"]))]
+    target_classes: Vec<String>,
+    /// Free-form labels.
+    #[serde(default)]
+    labels: BTreeMap<String, String>,
+}
+
+impl CameraDraft {
+    fn to_domain(self) -> Result<NewCamera> {
+        let blank = NewCamera::named(CameraId::new(&self.id)?);
+        Ok(NewCamera {
+            display_name: self.display_name.unwrap_or(blank.display_name),
+            image_size: self.image_size.map(ImageSize::to_domain).transpose()?,
+            gnss_error: self.gnss_error.map_or(Ok(blank.gnss_error), GnssError::to_domain)?,
+            recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
+            target_classes: classes(&self.target_classes)?,
+            labels: self.labels,
+            id: blank.id,
+        })
+    }
+}
+
+fn classes(names: &[String]) -> Result<Vec<TargetClass>> {
+    let class = |(index, name): (usize, &String)| {
+        TargetClass::new(name).map_err(|error| match error {
+            Error::Refused(refusal) => Error::invalid(format!("target_classes[{index}]"), refusal.message),
+            fault @ Error::Fault(_) => fault,
+        })
+    };
+    names.iter().enumerate().map(class).collect()
+}
+
+/// Changes to a profile (a merge patch, RFC 7396): what is left out stays, null forgets.
+#[derive(Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+struct CameraChange {
+    /// New name.
+    #[schema(max_length = 200)]
+    display_name: Option<String>,
+    /// New size of the image; null forgets it.
+    #[serde(default, deserialize_with = "nullable")]
+    #[schema(value_type = Option<ImageSize>)]
+    image_size: Option<Option<ImageSize>>,
+    /// New error of the receiver; null is `"unknown"`.
+    #[serde(default, deserialize_with = "nullable")]
+    #[schema(value_type = Option<GnssError>)]
+    gnss_error: Option<Option<GnssError>>,
+    /// New recipe, for runs to come.
+    recipe: Option<Recipe>,
+    /// New classes, all of them.
+    target_classes: Option<Vec<String>>,
+    /// New labels, all of them.
+    labels: Option<BTreeMap<String, String>>,
+}
+
+impl CameraChange {
+    fn to_domain(self) -> Result<domain::CameraChange> {
+        Ok(domain::CameraChange {
+            display_name: self.display_name,
+            image_size: self.image_size.map(|size| size.map(ImageSize::to_domain).transpose()).transpose()?,
+            gnss_error: self
+                .gnss_error
+                .map(|error| error.map_or(Ok(domain::GnssError::Unknown), GnssError::to_domain))
+                .transpose()?,
+            recipe: self.recipe.map(domain::Recipe::from),
+            target_classes: self.target_classes.as_deref().map(classes).transpose()?,
+            labels: self.labels,
+        })
+    }
+}
+
+/// A stored camera.
+#[derive(Serialize, ToSchema)]
+pub(super) struct Camera {
+    /// The slug that the operator chose.
+    #[schema(example = "north-gate")]
+    id: String,
+    /// The name for people.
+    display_name: String,
+    /// Size of the image, if it is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    image_size: Option<ImageSize>,
+    /// The receiver's error.
+    gnss_error: GnssError,
+    /// How the camera is learnt.
+    recipe: Recipe,
+    /// Classes that the camera is used for; none means all.
+    target_classes: Vec<String>,
+    /// Free-form labels.
+    labels: BTreeMap<String, String>,
+    /// Counts the changes of the profile, from 1; also in the header `etag`.
+    revision: u64,
+    /// When it was made.
+    #[schema(value_type = String, format = DateTime)]
+    created_at: Timestamp,
+    /// When the profile was changed last.
+    #[schema(value_type = String, format = DateTime)]
+    updated_at: Timestamp,
+    /// Number of the model version that answers, if any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    active_model: Option<u32>,
+    /// What is lost by what was left out.
+    warnings: Vec<String>,
+}
+
+impl From<domain::Camera> for Camera {
+    fn from(camera: domain::Camera) -> Self {
+        let warnings = camera.profile.warnings();
+        let domain::Camera { profile, revision, created_at, updated_at, active_model } = camera;
+        Self {
+            id: profile.id.as_str().to_owned(),
+            display_name: profile.display_name,
+            image_size: profile
+                .image_size
+                .map(|size| ImageSize { width_px: size.width_px(), height_px: size.height_px() }),
+            gnss_error: profile.gnss_error.into(),
+            recipe: profile.recipe.into(),
+            target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
+            labels: profile.labels,
+            revision: revision.0,
+            created_at,
+            updated_at,
+            active_model,
+            warnings,
+        }
+    }
+}
+
+/// A page of cameras, by id.
+#[derive(Serialize, ToSchema)]
+struct CameraPage {
+    /// Cameras.
+    items: Vec<Camera>,
+    /// Asks for the next page; missing on the last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next_cursor: Option<String>,
+}
+
+/// Store a new camera
+#[utoipa::path(
+    post, path = "/v1/cameras", tag = "cameras", request_body = CameraDraft,
+    responses(
+        (status = 201, description = "The stored camera", body = Camera,
+            headers(("location" = String, description = "Its path"), ("etag" = String, description = "Its revision"))),
+        (status = 409, description = "A camera of that id exists", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn create_camera(State(app): State<App>, body: JsonBody) -> Answer {
+    let camera = app.create_camera(body.read::<CameraDraft>()?.to_domain()?).await?;
+    let (location, revision) = (format!("/v1/cameras/{}", camera.id()), camera.revision);
+    Ok(with_etag(made(StatusCode::CREATED, &location, &Camera::from(camera))?, revision)?)
+}
+
+/// List cameras by id
+#[utoipa::path(
+    get, path = "/v1/cameras", tag = "cameras",
+    params(
+        ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
+        ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
+    ),
+    responses((status = 200, description = "A page of cameras", body = CameraPage))
+)]
+async fn list_cameras(State(app): State<App>, uri: Uri) -> Answer {
+    let mut params = Params::of(&uri)?;
+    let limit = params.limit(app.limits.page_items)?;
+    let after = params.take("cursor", |text| CameraId::new(&read_cursor("cameras", text)?))?;
+    params.end()?;
+    let page = app.cameras(after.as_ref(), limit).await?;
+    Ok(json(&CameraPage {
+        items: page.items.into_iter().map(Camera::from).collect(),
+        next_cursor: page.next.map(|id| write_cursor("cameras", id.as_str())),
+    })?)
+}
+
+/// Read a camera
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}", tag = "cameras", params(("camera" = String, Path, description = "The camera's id")),
+    responses((status = 200, description = "The camera", body = Camera, headers(("etag" = String, description = "Its revision"))))
+)]
+async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+    let camera = app.camera(&id).await?;
+    let revision = camera.revision;
+    Ok(with_etag(json(&Camera::from(camera))?, revision)?)
+}
+
+/// Change a camera's profile
+///
+/// The change is based on a revision, named by the header `if-match` with the `etag` that was
+/// read; `if-match: *` changes whatever is there.
+#[utoipa::path(
+    patch, path = "/v1/cameras/{camera}", tag = "cameras",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("if-match" = String, Header, description = "The `etag` that was read, or `*`"),
+    ),
+    request_body(content((CameraChange = "application/merge-patch+json"), (CameraChange = "application/json"))),
+    responses(
+        (status = 200, description = "The changed camera", body = Camera, headers(("etag" = String, description = "Its new revision"))),
+        (status = 412, description = "The camera has another revision", body = Problem, content_type = "application/problem+json"),
+        (status = 428, description = "`if-match` is missing", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn change_camera(
+    State(app): State<App>,
+    CameraPath(id): CameraPath,
+    headers: HeaderMap,
+    body: JsonBody,
+) -> Answer {
+    let expected = if_match(&headers)?.ok_or_else(|| {
+        let message =
+            "the header must name the revision that the change is based on, as `etag` gave it, or be *";
+        Error::field(ErrorKind::RevisionRequired, "if-match", message)
+    })?;
+    let change = body.read::<CameraChange>()?.to_domain()?;
+    let camera = app.change_camera(&id, change, expected.revision()).await?;
+    let revision = camera.revision;
+    Ok(with_etag(json(&Camera::from(camera))?, revision)?)
+}
+
+/// Delete a camera with its samples, runs and models
+#[utoipa::path(
+    delete, path = "/v1/cameras/{camera}", tag = "cameras",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("if-match" = Option<String>, Header, description = "Delete only at this revision"),
+    ),
+    responses(
+        (status = 204, description = "It is gone"),
+        (status = 409, description = "A training run is live", body = Problem, content_type = "application/problem+json"),
+        (status = 412, description = "The camera has another revision", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn delete_camera(State(app): State<App>, CameraPath(id): CameraPath, headers: HeaderMap) -> Answer {
+    let expected = if_match(&headers)?.and_then(IfMatch::revision);
+    app.delete_camera(&id, expected).await?;
+    Ok(empty())
+}
+
+/// What `If-Match` says.
+#[derive(Clone, Copy)]
+enum IfMatch {
+    Any,
+    One(Revision),
+}
+
+impl IfMatch {
+    const fn revision(self) -> Option<Revision> {
+        match self {
+            Self::Any => None,
+            Self::One(revision) => Some(revision),
+        }
+    }
+}
+
+fn if_match(headers: &HeaderMap) -> Result<Option<IfMatch>> {
+    let Some(value) = headers.get(IF_MATCH) else { return Ok(None) };
+    let text = value.to_str().unwrap_or_default().trim();
+    if text == "*" {
+        return Ok(Some(IfMatch::Any));
+    }
+    let quoted = text.strip_prefix('"').and_then(|rest| rest.strip_suffix('"'));
+    match quoted.and_then(|number| number.parse().ok()) {
+        Some(revision) => Ok(Some(IfMatch::One(Revision(revision)))),
+        // No revision of ours ever looked like this, so none can match it.
+        None => Err(Error::field(
+            ErrorKind::RevisionMismatch,
+            "if-match",
+            "must be an `etag` as this server gave it, quotes included, or *",
+        )),
+    }
+}

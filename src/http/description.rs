@@ -1,0 +1,81 @@
+//! What the OpenAPI description says of the interface as a whole, and of every operation alike.
+
+use std::collections::BTreeMap;
+
+use utoipa::openapi::path::{Operation, PathItem};
+use utoipa::openapi::tag::TagBuilder;
+use utoipa::openapi::{
+    ContentBuilder, InfoBuilder, License, OpenApi, OpenApiBuilder, Ref, RefOr, Response, ResponseBuilder,
+};
+
+use super::problem::PROBLEM_JSON;
+use crate::domain::ErrorKind;
+use crate::status;
+
+const TAGS: [(&str, &str); 6] = [
+    ("cameras", "Profiles of cameras that nobody calibrated"),
+    ("samples", "Boxes and fixes that cameras learn from"),
+    ("training", "Background fits of a camera's model"),
+    ("models", "Model versions that runs yield"),
+    ("fusion", "Positions of targets"),
+    ("service", "What watches the server"),
+];
+
+/// Refusals that any operation may meet.
+const ANY: [ErrorKind; 4] =
+    [ErrorKind::Timeout, ErrorKind::Internal, ErrorKind::Overloaded, ErrorKind::InvalidArgument];
+/// Refusals of operations with a body.
+const WITH_BODY: [ErrorKind; 3] =
+    [ErrorKind::MalformedBody, ErrorKind::TooLarge, ErrorKind::UnsupportedMediaType];
+/// Refusals of operations below a camera.
+const BELOW_CAMERA: [ErrorKind; 1] = [ErrorKind::CameraNotFound];
+
+pub(super) fn head() -> OpenApi {
+    let info = InfoBuilder::new()
+        .title("sightfix")
+        .version(env!("CARGO_PKG_VERSION"))
+        .description(Some(
+            "Positions of targets from what an uncalibrated fixed camera sees and what a GNSS receiver says. \
+             Every refusal is a problem (RFC 9457) with a stable `type`, the fields at fault, and the id of \
+             the request. Units end the names: `_m`, `_m2`, `_px`, `_deg`, `_s`.",
+        ))
+        .license(Some(License::new("Apache-2.0")))
+        .build();
+    let tags = TAGS.map(|(name, text)| TagBuilder::new().name(name).description(Some(text)).build());
+    OpenApiBuilder::new().info(info).tags(Some(tags)).build()
+}
+
+/// Gives each operation the problems that it has in common with others.
+pub(super) fn add_problems(openapi: &mut OpenApi) {
+    for (path, item) in &mut openapi.paths.paths {
+        let is_service = !path.starts_with("/v1/");
+        let is_below_camera = path.contains("{camera}");
+        for operation in operations(item).into_iter().flatten() {
+            let mut kinds: Vec<ErrorKind> = Vec::new();
+            if !is_service {
+                kinds.extend(ANY);
+            }
+            if operation.request_body.is_some() {
+                kinds.extend(WITH_BODY);
+            }
+            if is_below_camera {
+                kinds.extend(BELOW_CAMERA);
+            }
+            add(&mut operation.responses.responses, &kinds);
+        }
+    }
+}
+
+fn operations(item: &mut PathItem) -> [Option<&mut Operation>; 5] {
+    [item.get.as_mut(), item.post.as_mut(), item.put.as_mut(), item.patch.as_mut(), item.delete.as_mut()]
+}
+
+fn add(responses: &mut BTreeMap<String, RefOr<Response>>, kinds: &[ErrorKind]) {
+    for kind in kinds {
+        let row = status::of(*kind);
+        responses.entry(row.http.to_string()).or_insert_with(|| {
+            let content = ContentBuilder::new().schema(Some(Ref::from_schema_name("Problem"))).build();
+            ResponseBuilder::new().description(row.title).content(PROBLEM_JSON, content).build().into()
+        });
+    }
+}

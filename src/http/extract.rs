@@ -1,0 +1,258 @@
+//! What handlers take from a request: path, parameters, JSON body, media types.
+
+use axum::extract::{FromRef, FromRequest, FromRequestParts, Path, Query, Request};
+use bytes::Bytes;
+use hyper::header::{ACCEPT, CONTENT_TYPE};
+use hyper::http::request::Parts;
+use hyper::{HeaderMap, Uri};
+use jiff::Timestamp;
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+
+use super::body;
+use super::problem::{Answer, Refused, no_route};
+use crate::app::App;
+use crate::domain::{CameraId, Error, ErrorKind, Result, RunId, parse_time};
+use crate::exchange::wire;
+
+/// Items on a page whose length the client leaves open.
+const PAGE_ITEMS: u32 = 100;
+
+/// A camera of the path. What is no slug names no camera.
+pub(super) struct CameraPath(pub(super) CameraId);
+
+impl<S: Send + Sync> FromRequestParts<S> for CameraPath {
+    type Rejection = Refused;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+        camera_of(&path::<CameraSegment, S>(parts, state).await?.camera).map(Self)
+    }
+}
+
+/// A training run of the path.
+pub(super) struct RunPath(pub(super) CameraId, pub(super) RunId);
+
+impl<S: Send + Sync> FromRequestParts<S> for RunPath {
+    type Rejection = Refused;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+        let RunSegments { camera, run } = path(parts, state).await?;
+        Ok(Self(camera_of(&camera)?, run.parse()?))
+    }
+}
+
+/// A model version of the path.
+pub(super) struct ModelPath(pub(super) CameraId, pub(super) u32);
+
+impl<S: Send + Sync> FromRequestParts<S> for ModelPath {
+    type Rejection = Refused;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+        let ModelSegments { camera, model } = path(parts, state).await?;
+        let number = model.parse();
+        let number =
+            number.map_err(|_| Error::refused(ErrorKind::ModelNotFound, "a model's number is 1, 2, ..."))?;
+        Ok(Self(camera_of(&camera)?, number))
+    }
+}
+
+#[derive(Deserialize)]
+struct CameraSegment {
+    camera: String,
+}
+
+#[derive(Deserialize)]
+struct RunSegments {
+    camera: String,
+    run: String,
+}
+
+#[derive(Deserialize)]
+struct ModelSegments {
+    camera: String,
+    model: String,
+}
+
+async fn path<T: DeserializeOwned + Send, S: Send + Sync>(parts: &mut Parts, state: &S) -> Result<T> {
+    match Path::<T>::from_request_parts(parts, state).await {
+        Ok(Path(segments)) => Ok(segments),
+        Err(_) => Err(no_route()), // not UTF-8
+    }
+}
+
+fn camera_of(id: &str) -> Answer<CameraId> {
+    CameraId::new(id).map_err(|_| {
+        let shown: String = id.chars().take(80).collect();
+        Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera")).into()
+    })
+}
+
+/// Query parameters, each taken at most once; what nobody takes is refused.
+pub(super) struct Params(Vec<(String, String)>);
+
+impl Params {
+    pub(super) fn of(uri: &Uri) -> Result<Self> {
+        match Query::try_from_uri(uri) {
+            Ok(Query(pairs)) => Ok(Self(pairs)),
+            Err(_) => Err(Error::invalid("query", "is not a query string")),
+        }
+    }
+
+    pub(super) fn take<T>(&mut self, name: &str, parse: impl FnOnce(&str) -> Result<T>) -> Result<Option<T>> {
+        let Some(at) = self.0.iter().position(|(given, _)| given == name) else { return Ok(None) };
+        let (_, text) = self.0.swap_remove(at);
+        if self.0.iter().any(|(given, _)| given == name) {
+            return Err(Error::invalid(name, "stands twice"));
+        }
+        parse(&text).map(Some)
+    }
+
+    /// An instant; its refusal names the parameter.
+    pub(super) fn time(&mut self, name: &str) -> Result<Option<Timestamp>> {
+        self.take(name, |text| {
+            // A plus sign that was not escaped arrives as a space.
+            parse_time(&text.replace(' ', "+")).map_err(|error| match error {
+                Error::Refused(refusal) => Error::invalid(name, refusal.message),
+                fault @ Error::Fault(_) => fault,
+            })
+        })
+    }
+
+    /// `limit`: items on a page, from 1 to the server's own limit.
+    pub(super) fn limit(&mut self, most: u32) -> Result<u32> {
+        let limit = self.take("limit", |text| {
+            let limit = text.parse().ok().filter(|limit| (1..=most).contains(limit));
+            limit.ok_or_else(|| Error::invalid("limit", format!("must be from 1 to {most}")))
+        })?;
+        Ok(limit.unwrap_or(PAGE_ITEMS.min(most)))
+    }
+
+    /// Nothing may be left.
+    pub(super) fn end(self) -> Result<()> {
+        match self.0.first() {
+            None => Ok(()),
+            Some((name, _)) => Err(Error::invalid(name.clone(), "is not a parameter of this operation")),
+        }
+    }
+}
+
+/// A body of JSON, not yet read.
+pub(super) struct JsonBody(Bytes);
+
+impl<S> FromRequest<S> for JsonBody
+where
+    S: Send + Sync,
+    App: FromRef<S>,
+{
+    type Rejection = Refused;
+
+    async fn from_request(request: Request, state: &S) -> Answer<Self> {
+        let (parts, content) = request.into_parts();
+        let is_json = media_type(&parts.headers).is_some_and(|essence| {
+            let essence = essence.to_ascii_lowercase();
+            essence == "application/json" || essence.ends_with("+json")
+        });
+        let limit = App::from_ref(state).limits.body_bytes;
+        let content = body::whole(&parts.headers, content, limit).await?;
+        if !is_json && !content.is_empty() {
+            return Err(not_read(&["application/json"]).into());
+        }
+        Ok(Self(content))
+    }
+}
+
+impl JsonBody {
+    /// # Errors
+    /// `MalformedBody` for what is not JSON; `InvalidArgument` naming the path of a field of the
+    /// wrong type, missing or unknown.
+    pub(super) fn read<'a, T: Deserialize<'a>>(&'a self) -> Result<T> {
+        if self.0.is_empty() {
+            return Err(Error::refused(ErrorKind::MalformedBody, "the operation needs a body of JSON"));
+        }
+        wire::parse_json(&self.0)
+    }
+
+    /// The same where all of the body may be left out.
+    pub(super) fn read_or_default<'a, T: Deserialize<'a> + Default>(&'a self) -> Result<T> {
+        if self.0.is_empty() { Ok(T::default()) } else { self.read() }
+    }
+}
+
+/// The announced type of a body, without its parameters.
+pub(super) fn media_type(headers: &HeaderMap) -> Option<&str> {
+    let text = headers.get(CONTENT_TYPE)?.to_str().ok()?;
+    text.split(';').next().map(str::trim)
+}
+
+/// The refusal of a body of another type than these.
+pub(super) fn not_read(readable: &[&str]) -> Error {
+    let readable = readable.join(", ");
+    Error::field(
+        ErrorKind::UnsupportedMediaType,
+        "content-type",
+        format!("the header must be one of {readable}"),
+    )
+}
+
+/// The one of the offers that the client likes best; of equals the first. No word means any.
+pub(super) fn negotiate<T: Copy>(headers: &HeaderMap, offers: &[(&str, T)]) -> Result<T> {
+    let accepted = headers.get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok());
+    let ranges: Vec<(&str, f32)> =
+        accepted.flat_map(|value| value.split(',')).map(range).filter(|(name, _)| !name.is_empty()).collect();
+    let mut best = None;
+    for &(name, offer) in offers {
+        let quality = if ranges.is_empty() { 1.0 } else { quality_of(name, &ranges) };
+        if quality > best.map_or(0.0, |(quality, _)| quality) {
+            best = Some((quality, offer));
+        }
+    }
+    best.map(|(_, offer)| offer).ok_or_else(|| {
+        let names: Vec<&str> = offers.iter().map(|&(name, _)| name).collect();
+        let message = format!("the header must accept one of {}", names.join(", "));
+        Error::field(ErrorKind::NotAcceptable, "accept", message)
+    })
+}
+
+fn range(text: &str) -> (&str, f32) {
+    let mut parts = text.split(';').map(str::trim);
+    let name = parts.next().unwrap_or_default();
+    let quality = parts.find_map(|part| part.strip_prefix("q=")?.parse().ok());
+    (name, quality.unwrap_or(1.0))
+}
+
+/// The quality of the narrowest range that a type falls into.
+fn quality_of(name: &str, ranges: &[(&str, f32)]) -> f32 {
+    let kind = name.split('/').next().unwrap_or_default();
+    let fits = |range: &str| match range.split_once('/') {
+        _ if range.eq_ignore_ascii_case(name) => 3,
+        Some((of, "*")) if of.eq_ignore_ascii_case(kind) => 2,
+        Some(("*", "*")) => 1,
+        _ => 0,
+    };
+    let narrowest = ranges.iter().map(|&(range, quality)| (fits(range), quality)).filter(|(fit, _)| *fit > 0);
+    narrowest.max_by_key(|(fit, _)| *fit).map_or(0.0, |(_, quality)| quality)
+}
+
+#[cfg(test)]
+mod tests {
+    use hyper::http::HeaderValue;
+
+    use super::*;
+
+    fn chosen(accept: &str) -> Option<u8> {
+        let mut headers = HeaderMap::new();
+        headers.insert(ACCEPT, HeaderValue::from_str(accept).expect("a header"));
+        negotiate(&headers, &[("application/json", 1), ("text/csv", 2)]).ok()
+    }
+
+    #[test]
+    fn the_best_liked_offer_is_taken() {
+        assert_eq!(chosen("*/*"), Some(1));
+        assert_eq!(chosen("text/csv"), Some(2));
+        assert_eq!(chosen("text/*;q=0.9, */*;q=0.1"), Some(2));
+        assert_eq!(chosen("application/json;q=0.2, text/csv;q=0.3"), Some(2));
+        assert_eq!(chosen("*/*, application/json;q=0"), Some(2));
+        assert_eq!(chosen("image/png"), None);
+        assert!(negotiate(&HeaderMap::new(), &[("application/json", 1)]).is_ok());
+    }
+}

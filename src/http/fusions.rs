@@ -1,0 +1,133 @@
+//! `/v1/cameras/{camera}/fusions`: positions of targets.
+
+use axum::extract::State;
+use axum::response::Response;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::extract::{CameraPath, JsonBody};
+use super::problem::{Answer, Problem};
+use super::wire::json;
+use crate::app::App;
+use crate::domain::{Error, ErrorKind, Observation, Refusal, Result, Violation};
+use crate::exchange::{RowRules, wire};
+
+/// Most fields at fault that one answer names.
+const VIOLATIONS: usize = 100;
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new().routes(routes!(fuse))
+}
+
+/// One observation as it is, or many as `observations`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Request<'a> {
+    #[serde(borrow)]
+    observations: Option<Vec<wire::Observation<'a>>>,
+    #[serde(borrow)]
+    time: Option<wire::Text<'a>>,
+    #[serde(borrow)]
+    target_id: Option<wire::Text<'a>>,
+    bounding_box: Option<wire::BoundingBox>,
+    fix: Option<wire::Fix>,
+}
+
+/// Observations of one camera.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "the shape of a batch, for the description alone")]
+struct Batch {
+    /// Boxes, fixes, or both.
+    #[schema(min_items = 1)]
+    observations: Vec<wire::Observation<'static>>,
+}
+
+/// One observation, or a batch of them.
+#[derive(ToSchema)]
+#[schema(title = "FusionRequest")]
+#[serde(untagged)]
+#[expect(dead_code, reason = "the shape of a request, for the description alone")]
+enum FusionRequest {
+    One(wire::Observation<'static>),
+    Many(Batch),
+}
+
+/// One answer per observation, in their order.
+#[derive(Serialize, ToSchema)]
+struct Fusions<'a> {
+    /// Positions.
+    items: Vec<wire::FusedFix<'a>>,
+}
+
+/// Fuse observations into positions
+///
+/// The body is one observation, or an object with the array `observations`. Each has a box, a fix,
+/// or both: without a fix the position comes from the box alone, without a box the fix passes
+/// through. All are answered by the same model version.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/fusions", tag = "fusion", params(("camera" = String, Path, description = "The camera's id")),
+    request_body = FusionRequest,
+    responses(
+        (status = 200, description = "Positions", body = Fusions<'static>),
+        (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn fuse(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer<Response> {
+    let rules = app.row_rules(&id).await?;
+    let observations = observations(&app, &body.read()?, &rules)?;
+    let fused = app.fuse(&id, &observations).await?;
+    Ok(json(&Fusions { items: fused.iter().map(wire::FusedFix::from).collect() })?)
+}
+
+fn observations(app: &App, request: &Request<'_>, rules: &RowRules) -> Result<Vec<Observation>> {
+    let RowRules { time_bounds, image_size } = rules;
+    let Some(batch) = &request.observations else {
+        let one = wire::Observation {
+            time: request.time.clone().ok_or_else(|| Error::invalid("time", "is required"))?,
+            target_id: request.target_id.clone(),
+            bounding_box: request.bounding_box,
+            fix: request.fix,
+        };
+        return Ok(vec![one.to_domain(time_bounds, *image_size)?]);
+    };
+    let beside = [
+        ("time", request.time.is_some()),
+        ("target_id", request.target_id.is_some()),
+        ("bounding_box", request.bounding_box.is_some()),
+        ("fix", request.fix.is_some()),
+    ];
+    if let Some((field, _)) = beside.into_iter().find(|(_, given)| *given) {
+        return Err(Error::invalid(field, "belongs into one of the observations"));
+    }
+    if batch.is_empty() {
+        return Err(Error::invalid("observations", "must hold at least one"));
+    }
+    app.check_batch(batch.len())?;
+    let mut taken = Vec::with_capacity(batch.len());
+    let mut violations = Vec::new();
+    for (index, observation) in batch.iter().enumerate() {
+        match observation.to_domain(time_bounds, *image_size) {
+            Ok(observation) => taken.push(observation),
+            Err(error) => violations.extend(told(error.under(&format!("observations[{index}]")))?),
+        }
+        if violations.len() >= VIOLATIONS {
+            break;
+        }
+    }
+    if violations.is_empty() { Ok(taken) } else { Err(refused(violations)) }
+}
+
+fn told(error: Error) -> Result<Vec<Violation>> {
+    match error {
+        Error::Refused(refusal) => Ok(refusal.violations),
+        fault @ Error::Fault(_) => Err(fault),
+    }
+}
+
+fn refused(violations: Vec<Violation>) -> Error {
+    let message = "nothing was fused, for the fields at fault".to_owned();
+    Error::Refused(Refusal { kind: ErrorKind::InvalidArgument, message, violations })
+}

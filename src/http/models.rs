@@ -1,0 +1,194 @@
+//! `/v1/cameras/{camera}/models` and `.../active-model`: what training runs yield.
+
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::response::Response;
+use hyper::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
+use hyper::http::HeaderValue;
+use hyper::{StatusCode, Uri};
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::extract::{CameraPath, JsonBody, ModelPath, Params, media_type, not_read};
+use super::problem::{Answer, Problem};
+use super::wire::{json, made};
+use super::{Rest, body};
+use crate::app::App;
+use crate::domain::{self, Error, ModelMetadata};
+use crate::exchange::{foreign_cursor, read_cursor, write_cursor};
+
+/// Weights with the metadata in their header.
+const SAFETENSORS: &str = "application/vnd.safetensors";
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new()
+        .routes(routes!(list_models, import_model))
+        .routes(routes!(get_model))
+        .routes(routes!(download_model))
+        .routes(routes!(get_active_model, activate_model))
+        .routes(routes!(roll_back_model))
+}
+
+/// An immutable model of one camera.
+#[derive(Serialize, ToSchema)]
+struct ModelVersion {
+    /// Whose.
+    camera_id: String,
+    /// Counts from 1 per camera.
+    number: u32,
+    /// The run that yielded it; missing if it was imported.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(format = "uuid")]
+    run_id: Option<String>,
+    /// When it was stored.
+    #[schema(value_type = String, format = DateTime)]
+    created_at: Timestamp,
+    /// Size of the weights.
+    weights_bytes: u64,
+    /// What it says of itself.
+    metadata: ModelMetadata,
+}
+
+impl From<domain::ModelVersion> for ModelVersion {
+    fn from(model: domain::ModelVersion) -> Self {
+        Self {
+            camera_id: model.camera_id.as_str().to_owned(),
+            number: model.number,
+            run_id: model.run_id.map(|run| run.to_string()),
+            created_at: model.created_at,
+            weights_bytes: model.weights_bytes,
+            metadata: model.metadata,
+        }
+    }
+}
+
+/// A page of model versions, newest first.
+#[derive(Serialize, ToSchema)]
+struct ModelPage {
+    /// Versions.
+    items: Vec<ModelVersion>,
+    /// Asks for the next page; missing on the last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next_cursor: Option<String>,
+}
+
+/// Which version shall answer.
+#[derive(Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+struct Activation {
+    /// Number of the version.
+    #[schema(minimum = 1, example = 1)]
+    number: u32,
+}
+
+/// List model versions, newest first
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/models", tag = "models",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
+        ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
+    ),
+    responses((status = 200, description = "A page of versions", body = ModelPage))
+)]
+async fn list_models(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> Answer {
+    let mut params = Params::of(&uri)?;
+    let limit = params.limit(app.limits.page_items)?;
+    let before =
+        params.take("cursor", |text| read_cursor("models", text)?.parse().map_err(|_| foreign_cursor()))?;
+    params.end()?;
+    let page = app.models(&id, before, limit).await?;
+    Ok(json(&ModelPage {
+        items: page.items.into_iter().map(ModelVersion::from).collect(),
+        next_cursor: page.next.map(|number| write_cursor("models", &number.to_string())),
+    })?)
+}
+
+/// Inspect a model version
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/models/{model}", tag = "models",
+    params(("camera" = String, Path, description = "The camera's id"), ("model" = u32, Path, description = "The version's number")),
+    responses((status = 200, description = "The version", body = ModelVersion))
+)]
+async fn get_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> Answer {
+    Ok(json(&ModelVersion::from(app.model(&id, number).await?))?)
+}
+
+/// Download a model version
+///
+/// A safetensors file: the weights, and the metadata in its header. It can be imported on another
+/// server.
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/models/{model}/file", tag = "models",
+    params(("camera" = String, Path, description = "The camera's id"), ("model" = u32, Path, description = "The version's number")),
+    responses((status = 200, description = "The file", body = Vec<u8>, content_type = "application/vnd.safetensors"))
+)]
+async fn download_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> Answer {
+    let mut response = Response::new(Body::from(app.download_model(&id, number).await?));
+    let name = format!("attachment; filename=\"{id}-{number}.safetensors\"");
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(SAFETENSORS));
+    headers.insert(CONTENT_DISPOSITION, HeaderValue::from_str(&name).map_err(Error::fault)?);
+    Ok(response)
+}
+
+/// Import a model version
+///
+/// From a file that a download gave, here or on another server. It does not become active by
+/// itself.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/models", tag = "models", params(("camera" = String, Path, description = "The camera's id")),
+    request_body(content((Vec<u8> = "application/vnd.safetensors"), (Vec<u8> = "application/octet-stream"))),
+    responses((status = 201, description = "The stored version", body = ModelVersion, headers(("location" = String, description = "Its path"))))
+)]
+async fn import_model(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> Answer {
+    let (parts, content) = request.into_parts();
+    let readable = [SAFETENSORS, "application/octet-stream"];
+    if !media_type(&parts.headers).is_some_and(|given| readable.contains(&given)) {
+        return Err(not_read(&readable).into());
+    }
+    let file = body::whole(&parts.headers, content, app.limits.body_bytes).await?;
+    let model = app.import_model(&id, &file).await?;
+    let location = format!("/v1/cameras/{id}/models/{}", model.number);
+    Ok(made(StatusCode::CREATED, &location, &ModelVersion::from(model))?)
+}
+
+/// Inspect the active model version
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/active-model", tag = "models", params(("camera" = String, Path, description = "The camera's id")),
+    responses(
+        (status = 200, description = "The version that answers", body = ModelVersion),
+        (status = 409, description = "No version is active", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn get_active_model(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+    Ok(json(&ModelVersion::from(app.active_model(&id).await?))?)
+}
+
+/// Activate a model version
+#[utoipa::path(
+    put, path = "/v1/cameras/{camera}/active-model", tag = "models", params(("camera" = String, Path, description = "The camera's id")),
+    request_body = Activation,
+    responses((status = 200, description = "The version that answers now", body = ModelVersion))
+)]
+async fn activate_model(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
+    let Activation { number } = body.read()?;
+    app.activate_model(&id, number).await?;
+    Ok(json(&ModelVersion::from(app.model(&id, number).await?))?)
+}
+
+/// Roll back to the version that answered before
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/active-model/roll-back", tag = "models", params(("camera" = String, Path, description = "The camera's id")),
+    responses(
+        (status = 200, description = "The version that answers now", body = ModelVersion),
+        (status = 409, description = "No version answered before", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn roll_back_model(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+    app.roll_back_model(&id).await?;
+    Ok(json(&ModelVersion::from(app.active_model(&id).await?))?)
+}

@@ -1,0 +1,171 @@
+//! Errors as RFC 9457 problems, by the one table in [`crate::status`].
+//!
+//! A handler's error carries no request; the layer [`tell`] knows the request and writes the
+//! problem, and the log line of a fault, once and here.
+
+use std::any::Any;
+use std::sync::Arc;
+
+use axum::body::Body;
+use axum::extract::Request;
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use hyper::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER};
+use hyper::http::HeaderValue;
+use hyper::{Method, StatusCode};
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use crate::domain::{Error, ErrorKind};
+use crate::status;
+use crate::telemetry::RequestId;
+
+/// Media type of a problem.
+pub(super) const PROBLEM_JSON: &str = "application/problem+json";
+
+/// An error on its way to the layer that tells it.
+#[derive(Clone)]
+pub(super) struct Refused(Arc<Error>);
+
+/// What a handler gives.
+pub(super) type Answer<T = Response> = std::result::Result<T, Refused>;
+
+impl From<Error> for Refused {
+    fn from(error: Error) -> Self {
+        Self(Arc::new(error))
+    }
+}
+
+impl IntoResponse for Refused {
+    fn into_response(self) -> Response {
+        let mut response = status_of(&self.0).into_response();
+        response.extensions_mut().insert(self);
+        response
+    }
+}
+
+/// What is wrong, by RFC 9457.
+#[derive(Serialize, ToSchema)]
+pub(super) struct Problem<'a> {
+    /// Stable name of the kind of problem.
+    #[schema(value_type = String, example = "urn:sightfix:problem:invalid-argument")]
+    r#type: String,
+    /// The kind in words, the same for every occurrence.
+    #[schema(value_type = String)]
+    title: &'a str,
+    /// The status of the answer.
+    #[schema(example = 422)]
+    status: u16,
+    /// This occurrence in words.
+    detail: String,
+    /// The path that was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    instance: Option<&'a str>,
+    /// Id of the request, as in the header `x-request-id` and in the server's log.
+    #[schema(value_type = String)]
+    trace_id: &'a str,
+    /// The fields at fault.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    violations: Vec<Violation<'a>>,
+}
+
+/// One field at fault.
+#[derive(Serialize, ToSchema)]
+struct Violation<'a> {
+    /// Path of the field in the body, or name of the parameter.
+    #[schema(value_type = String, example = "observations[3].bounding_box.width_px")]
+    field: &'a str,
+    /// What is wrong and what would be right.
+    #[schema(value_type = String)]
+    message: &'a str,
+}
+
+fn status_of(error: &Error) -> StatusCode {
+    StatusCode::from_u16(status::of(error.kind()).http).unwrap_or_default()
+}
+
+/// The problem of an error as a response.
+pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) -> Response<Body> {
+    let row = status::of(error.kind());
+    let (detail, violations) = match error {
+        Error::Refused(refusal) => {
+            let violations = refusal.violations.iter();
+            let told = violations.map(|at| Violation { field: &at.field, message: &at.message });
+            (refusal.to_string(), told.collect())
+        }
+        Error::Fault(fault) => {
+            tracing::error!(request.id = %id, error = %fault, "a request failed");
+            ("the server failed; its log tells more under this trace_id".to_owned(), Vec::new())
+        }
+    };
+    let problem = Problem {
+        r#type: format!("{}{}", status::PROBLEM_TYPE_PREFIX, row.slug),
+        title: row.title,
+        status: row.http,
+        detail,
+        instance,
+        trace_id: id.as_str(),
+        violations,
+    };
+    let json = serde_json::to_vec(&problem).unwrap_or_default();
+    let mut response = Response::new(Body::from(json));
+    *response.status_mut() = status_of(error);
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
+    if error.kind() == ErrorKind::Overloaded {
+        headers.insert(RETRY_AFTER, HeaderValue::from_static("1"));
+    }
+    response
+}
+
+/// Writes the problem of a refused request, in whatever part of the router it was refused.
+pub(super) async fn tell(request: Request, next: Next) -> Response {
+    let id = request.extensions().get::<RequestId>().cloned();
+    let uri = request.uri().clone();
+    let is_head = request.method() == Method::HEAD;
+    let answer = next.run(request).await;
+    let error = match answer.extensions().get::<Refused>() {
+        Some(refused) => refused.0.clone(),
+        None => match unsaid(&answer) {
+            Some(error) => Arc::new(error),
+            None => return answer,
+        },
+    };
+    let id = id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
+    let mut told = response(&error, &id, Some(uri.path()));
+    for (name, value) in answer.headers() {
+        if name != CONTENT_TYPE && name != CONTENT_LENGTH {
+            told.headers_mut().insert(name, value.clone());
+        }
+    }
+    if is_head {
+        *told.body_mut() = Body::empty();
+    }
+    told
+}
+
+/// What the router itself refuses, it refuses without a word.
+fn unsaid(answer: &Response) -> Option<Error> {
+    if answer.headers().contains_key(CONTENT_TYPE) {
+        return None;
+    }
+    match answer.status() {
+        StatusCode::NOT_FOUND => Some(no_route()),
+        StatusCode::METHOD_NOT_ALLOWED => {
+            Some(Error::refused(ErrorKind::MethodNotAllowed, "the header `allow` lists the methods"))
+        }
+        _ => None,
+    }
+}
+
+pub(super) fn no_route() -> Error {
+    Error::refused(ErrorKind::RouteNotFound, "there is no such path; /docs lists them")
+}
+
+/// What is answered when a handler panics.
+pub(super) fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
+    let said = panic.downcast_ref::<String>().cloned();
+    let said = said.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()));
+    Refused::from(Error::fault(format!("a handler panicked: {}", said.unwrap_or_default()))).into_response()
+}

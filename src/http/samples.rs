@@ -1,0 +1,312 @@
+//! `/v1/cameras/{camera}/samples`: import, list, export, count, delete.
+
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::response::Response;
+use bytes::Bytes;
+use futures_util::stream;
+use hyper::header::{CONTENT_DISPOSITION, CONTENT_TYPE, VARY};
+use hyper::http::HeaderValue;
+use hyper::{HeaderMap, Uri};
+use jiff::Timestamp;
+use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::extract::{CameraPath, Params, media_type, negotiate, not_read};
+use super::problem::{Answer, Problem};
+use super::wire::json;
+use super::{Rest, body};
+use crate::app::{App, ImportReport};
+use crate::domain::{CameraId, Error, Result, Sample, TargetId};
+use crate::exchange::wire;
+use crate::exchange::{Format, SampleWriter, foreign_cursor, read_cursor, write_cursor};
+use crate::store::{SampleFilter, SampleKey};
+
+/// Samples read from the store at once for an export.
+const EXPORT_PAGE: u32 = 1_000;
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new()
+        .routes(routes!(import_samples, list_samples, delete_samples))
+        .routes(routes!(count_samples))
+}
+
+/// What became of an import's rows.
+#[derive(Serialize, ToSchema)]
+pub(super) struct Imported {
+    /// Stored now.
+    accepted: u64,
+    /// The same camera, target and time were stored before, or stand twice in the import.
+    duplicate: u64,
+    /// Not stored for a fault of their own.
+    rejected: u64,
+    /// The first 100 of these.
+    rejected_rows: Vec<RejectedRow>,
+}
+
+/// A row that was not taken, and why.
+#[derive(Serialize, ToSchema)]
+pub(super) struct RejectedRow {
+    /// Line of the file from 1 (a CSV file's header is line 1), or element of the JSON array from 1.
+    line: u64,
+    /// Column, or path of the field; empty if the row as a whole is at fault.
+    #[schema(example = "latitude")]
+    field: String,
+    /// What is wrong and what would be right.
+    reason: String,
+}
+
+impl From<crate::app::RejectedRow> for RejectedRow {
+    fn from(row: crate::app::RejectedRow) -> Self {
+        Self { line: row.line, field: row.field, reason: row.reason }
+    }
+}
+
+impl From<ImportReport> for Imported {
+    fn from(report: ImportReport) -> Self {
+        let ImportReport { accepted, duplicate, rejected, rejected_rows } = report;
+        let rejected_rows = rejected_rows.into_iter().map(RejectedRow::from).collect();
+        Self { accepted, duplicate, rejected, rejected_rows }
+    }
+}
+
+/// A page of samples, by time and target.
+#[derive(Serialize, ToSchema)]
+struct SamplePage<'a> {
+    /// Samples.
+    items: Vec<wire::Sample<'a>>,
+    /// Asks for the next page; missing on the last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next_cursor: Option<String>,
+}
+
+/// How many samples there are.
+#[derive(Serialize, ToSchema)]
+struct SampleCount {
+    /// Their number.
+    count: u64,
+}
+
+/// How many samples were deleted.
+#[derive(Serialize, ToSchema)]
+struct DeletedSamples {
+    /// Their number.
+    deleted: u64,
+}
+
+/// Import samples
+///
+/// CSV has a header naming the columns `time`, `target_id`, `left`, `top`, `width`, `height`,
+/// `longitude`, `latitude` in any order (also with their units: `left_px`, `longitude_deg`), and
+/// at will `sigma_m`, `class`, `score`, `truth_longitude`, `truth_latitude`. NDJSON has one sample
+/// a line. JSON is an array of samples, or an object with the array `samples`.
+///
+/// One bad row never loses the others. Samples that are stored already are counted, not stored
+/// again, so an import that broke off can be sent again as it is.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/samples", tag = "samples", params(("camera" = String, Path, description = "The camera's id")),
+    request_body(content(
+        (String = "text/csv", example = "time,target_id,left,top,width,height,longitude,latitude\n2020-12-14T14:41:48+08:00,person-1,475,11,28,77,103.98678,30.6280135\n"),
+        (wire::Sample<'static> = "application/x-ndjson"),
+        (Vec<wire::Sample<'static>> = "application/json"),
+    )),
+    responses((status = 200, description = "What became of the rows", body = Imported))
+)]
+async fn import_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> Answer {
+    let (parts, content) = request.into_parts();
+    let format = import_format(&parts.headers)?;
+    app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
+    let limits = &app.limits;
+    let spooled = body::spooled(&parts.headers, content, limits.import_bytes, limits.import_memory_bytes);
+    let report = app.import_file(&id, spooled.await?, format).await?;
+    Ok(json(&Imported::from(report))?)
+}
+
+fn import_format(headers: &HeaderMap) -> Result<Format> {
+    let format = media_type(headers).and_then(Format::from_media_type);
+    format
+        .filter(|format| *format != Format::GeoJson)
+        .ok_or_else(|| not_read(&["text/csv", "application/x-ndjson", "application/json"]))
+}
+
+/// List or export samples by time and target
+///
+/// As JSON, page by page. As CSV, NDJSON or GeoJSON (by the header `accept`), all at once.
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/samples", tag = "samples",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
+        ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
+        ("target_id" = Option<String>, Query, description = "Of this target alone"),
+        ("limit" = Option<u32>, Query, description = "Items on a page of JSON, 100 if left out"),
+        ("cursor" = Option<String>, Query, description = "`next_cursor` of the page of JSON before"),
+    ),
+    responses(
+        (status = 200, description = "A page of samples, or all of them", content(
+            (SamplePage<'static> = "application/json"),
+            (String = "text/csv"), (String = "application/x-ndjson"), (String = "application/geo+json"),
+        )),
+        (status = 406, description = "None of the accepted types can be written", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn list_samples(
+    State(app): State<App>,
+    CameraPath(id): CameraPath,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Answer {
+    let mut params = Params::of(&uri)?;
+    let filter = filter(&mut params)?;
+    let formats = [Format::Json, Format::Csv, Format::Ndjson, Format::GeoJson];
+    let mut response = match negotiate(&headers, &formats.map(|format| (format.media_type(), format)))? {
+        Format::Json => {
+            let limit = params.limit(app.limits.page_items)?;
+            let after = params.take("cursor", sample_key)?;
+            params.end()?;
+            page(&app, &id, &filter, after, limit).await?
+        }
+        format @ (Format::Csv | Format::Ndjson | Format::GeoJson) => {
+            params.end()?;
+            export(app, id, filter, format).await?
+        }
+    };
+    response.headers_mut().insert(VARY, HeaderValue::from_static("accept"));
+    Ok(response)
+}
+
+async fn page(
+    app: &App,
+    id: &CameraId,
+    filter: &SampleFilter,
+    after: Option<SampleKey>,
+    limit: u32,
+) -> Result<Response> {
+    let page = app.samples(id, filter, after, limit).await?;
+    let next_cursor = page
+        .next
+        .map(|key| write_cursor("samples", &format!("{}:{}", key.time.as_microsecond(), key.target_id)));
+    json(&SamplePage { items: page.items.iter().map(wire::Sample::from).collect(), next_cursor })
+}
+
+fn sample_key(cursor: &str) -> Result<SampleKey> {
+    let key = read_cursor("samples", cursor)?;
+    let (time_us, target_id) = key.split_once(':').ok_or_else(foreign_cursor)?;
+    let time = time_us.parse().ok().and_then(|time_us| Timestamp::from_microsecond(time_us).ok());
+    Ok(SampleKey {
+        time: time.ok_or_else(foreign_cursor)?,
+        target_id: TargetId::new(target_id).map_err(|_| foreign_cursor())?,
+    })
+}
+
+/// How far an export has come; each step writes one page.
+struct Export {
+    app: App,
+    id: CameraId,
+    filter: SampleFilter,
+    writer: SampleWriter<Vec<u8>>,
+    page: Vec<Sample>,
+    next: Option<SampleKey>,
+}
+
+impl Export {
+    /// Writes the page at hand and reads the next; gives back the export unless it is done.
+    async fn step(mut self) -> Result<(Bytes, Option<Self>)> {
+        for sample in &self.page {
+            self.writer.write(sample).map_err(Error::fault)?;
+        }
+        let Some(next) = self.next.take() else {
+            let last = self.writer.finish().map_err(Error::fault)?;
+            return Ok((last.into(), None));
+        };
+        let page = self.app.samples(&self.id, &self.filter, Some(next), EXPORT_PAGE).await?;
+        (self.page, self.next) = (page.items, page.next);
+        let written = std::mem::take(self.writer.get_mut());
+        Ok((written.into(), Some(self)))
+    }
+}
+
+/// All samples, page by page as the client reads them.
+async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) -> Result<Response> {
+    // The first page is read before the answer begins, so that an unknown camera is still refused.
+    let first = app.samples(&id, &filter, None, EXPORT_PAGE).await?;
+    let ending = match format {
+        Format::Csv => "csv",
+        Format::Ndjson => "ndjson",
+        Format::Json => "json",
+        Format::GeoJson => "geojson",
+    };
+    let name = format!("attachment; filename=\"{id}.{ending}\"");
+    let writer = SampleWriter::new(Vec::new(), format);
+    let export = Export { app, id, filter, writer, page: first.items, next: first.next };
+    let parts = stream::try_unfold(Some(export), |export| async {
+        match export {
+            None => Ok::<_, Error>(None),
+            Some(export) => export.step().await.map(Some).inspect_err(|error| {
+                tracing::error!(%error, "an export broke off");
+            }),
+        }
+    });
+    let mut response = Response::new(Body::from_stream(parts));
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
+    headers.insert(CONTENT_DISPOSITION, HeaderValue::from_str(&name).map_err(Error::fault)?);
+    Ok(response)
+}
+
+/// Count samples
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/samples/count", tag = "samples",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
+        ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
+        ("target_id" = Option<String>, Query, description = "Of this target alone"),
+    ),
+    responses((status = 200, description = "Their number", body = SampleCount))
+)]
+async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> Answer {
+    let mut params = Params::of(&uri)?;
+    let filter = filter(&mut params)?;
+    params.end()?;
+    Ok(json(&SampleCount { count: app.count_samples(&id, &filter).await? })?)
+}
+
+/// Delete samples
+///
+/// At least one of the parameters must be given, so that not all are deleted by an oversight.
+#[utoipa::path(
+    delete, path = "/v1/cameras/{camera}/samples", tag = "samples",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
+        ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
+        ("target_id" = Option<String>, Query, description = "Of this target alone"),
+    ),
+    responses((status = 200, description = "How many were deleted", body = DeletedSamples))
+)]
+async fn delete_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> Answer {
+    let mut params = Params::of(&uri)?;
+    let filter = filter(&mut params)?;
+    params.end()?;
+    if filter == SampleFilter::default() {
+        return Err(Error::invalid("from", "give from, until or target_id: which samples to delete").into());
+    }
+    Ok(json(&DeletedSamples { deleted: app.delete_samples(&id, &filter).await? })?)
+}
+
+fn filter(params: &mut Params) -> Result<SampleFilter> {
+    let filter = SampleFilter {
+        from: params.time("from")?,
+        until: params.time("until")?,
+        target_id: params.take("target_id", TargetId::new)?,
+    };
+    if let (Some(from), Some(until)) = (filter.from, filter.until)
+        && from >= until
+    {
+        return Err(Error::invalid("until", "must be later than from"));
+    }
+    Ok(filter)
+}

@@ -1,0 +1,50 @@
+//! What watches the server: `/livez`, `/readyz`, `/metrics`.
+
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use hyper::header::CONTENT_TYPE;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::problem::{Answer, Problem};
+use crate::app::App;
+use crate::domain::{Error, ErrorKind};
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz)).routes(routes!(metrics))
+}
+
+/// Whether the process is alive
+#[utoipa::path(
+    get, path = "/livez", tag = "service",
+    responses((status = 200, description = "It is", body = String, content_type = "text/plain"))
+)]
+async fn livez() -> &'static str {
+    "alive\n"
+}
+
+/// Whether the server can take work
+#[utoipa::path(
+    get, path = "/readyz", tag = "service",
+    responses(
+        (status = 200, description = "It can", body = String, content_type = "text/plain"),
+        (status = 503, description = "It is ending, or its store does not answer", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn readyz(State(rest): State<Rest>) -> Answer<&'static str> {
+    if rest.shutdown.has_begun() {
+        return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
+    }
+    rest.app.store.ping().await?;
+    Ok("ready\n")
+}
+
+/// Counters and times, in the text format of Prometheus
+#[utoipa::path(
+    get, path = "/metrics", tag = "service",
+    responses((status = 200, description = "Metrics", body = String, content_type = "text/plain"))
+)]
+async fn metrics(State(app): State<App>) -> Response {
+    ([(CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], app.metrics.render()).into_response()
+}

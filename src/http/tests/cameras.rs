@@ -1,0 +1,139 @@
+use super::*;
+
+#[tokio::test]
+async fn a_camera_is_made_read_changed_and_deleted() {
+    let rest = Rest::new().await;
+    let profile = json!({
+        "id": "north-gate", "display_name": "North gate", "image_size": {"width_px": 1920, "height_px": 1080},
+        "gnss_error": {"sigma_m": 2.5}, "recipe": "paper", "target_classes": ["person"], "labels": {"site": "a"},
+    });
+    let made = rest.post("/v1/cameras", &profile).await.expect(201);
+    assert_eq!(made.header("location"), "/v1/cameras/north-gate");
+    assert_eq!(made.header("etag"), "\"1\"");
+    let camera = made.json();
+    for (name, value) in profile.as_object().expect("fields") {
+        assert_eq!(&camera[name], value, "{name}");
+    }
+    assert_eq!(camera["warnings"], json!([]));
+    let read = rest.get("/v1/cameras/north-gate").await.expect(200);
+    assert_eq!((read.header("etag"), read.json()), ("\"1\"", camera));
+
+    let path = "/v1/cameras/north-gate";
+    let patch = |if_match: &'static str, change: Value| {
+        let headers = [("content-type", "application/merge-patch+json"), ("if-match", if_match)];
+        let rest = &rest;
+        async move { rest.send("PATCH", path, &headers, change.to_string()).await }
+    };
+    let changed = patch("\"1\"", json!({"image_size": null, "gnss_error": "unknown"})).await.expect(200);
+    assert_eq!(changed.header("etag"), "\"2\"");
+    let camera = changed.json();
+    assert_eq!((camera.get("image_size"), &camera["gnss_error"]), (None, &json!("unknown")));
+    assert_eq!(camera["display_name"], "North gate", "what is left out stays");
+    assert_eq!(camera["warnings"].as_array().map(Vec::len), Some(2));
+
+    patch("\"1\"", json!({"recipe": "auto"})).await.problem(412, "revision-mismatch");
+    patch("1", json!({"recipe": "auto"})).await.problem(412, "revision-mismatch");
+    assert_eq!(patch("*", json!({"recipe": "auto"})).await.expect(200).json()["recipe"], "auto");
+    let without = rest.send("PATCH", path, &[("content-type", "application/json")], "{}").await;
+    assert_eq!(without.problem(428, "revision-required"), ["if-match"]);
+
+    let stale = rest.send("DELETE", path, &[("if-match", "\"1\"")], Body::empty()).await;
+    stale.problem(412, "revision-mismatch");
+    assert!(rest.send("DELETE", path, &[], Body::empty()).await.expect(204).body.is_empty());
+    rest.get(path).await.problem(404, "camera-not-found");
+}
+
+#[tokio::test]
+async fn bad_profiles_name_their_fields() {
+    let rest = Rest::with_camera().await;
+    for (profile, status, kind, field) in [
+        (json!({}), 422, "invalid-argument", "id"),
+        (json!({"id": 5}), 422, "invalid-argument", "id"),
+        (json!({"id": "North Gate"}), 422, "invalid-argument", "id"),
+        (json!({"id": "d", "name": "x"}), 422, "invalid-argument", "name"),
+        (
+            json!({"id": "d", "image_size": {"width_px": 0, "height_px": 1}}),
+            422,
+            "invalid-argument",
+            "image_size.width_px",
+        ),
+        (json!({"id": "d", "image_size": {"width_px": 1}}), 422, "invalid-argument", "image_size.height_px"),
+        (
+            json!({"id": "d", "image_size": {"width_px": 1.5, "height_px": 1}}),
+            422,
+            "invalid-argument",
+            "image_size.width_px",
+        ),
+        (json!({"id": "d", "gnss_error": {"sigma_m": -1}}), 422, "invalid-argument", "gnss_error.sigma_m"),
+        (json!({"id": "d", "gnss_error": {"sigma_m": 1e39}}), 422, "invalid-argument", "gnss_error.sigma_m"),
+        (json!({"id": "d", "recipe": "best"}), 422, "invalid-argument", "recipe"),
+        (json!({"id": "d", "target_classes": ["a", ""]}), 422, "invalid-argument", "target_classes[1]"),
+        (json!({"id": "d", "target_classes": ["a", "a"]}), 422, "invalid-argument", "target_classes[1]"),
+        (json!({"id": "d", "labels": {"a": 1}}), 422, "invalid-argument", "labels.a"),
+        (json!({"id": "c"}), 409, "camera-exists", "id"),
+    ] {
+        let fields = rest.post("/v1/cameras", &profile).await.problem(status, kind);
+        assert!(fields.is_empty() && kind == "camera-exists" || fields == [field], "{profile}: {fields:?}");
+    }
+    rest.send("POST", "/v1/cameras", &[("content-type", "application/json")], "{")
+        .await
+        .problem(400, "malformed-body");
+    rest.send("POST", "/v1/cameras", &[("content-type", "application/json")], "")
+        .await
+        .problem(400, "malformed-body");
+    rest.send("POST", "/v1/cameras", &[], "{}").await.problem(415, "unsupported-media-type");
+    rest.get("/v1/cameras/d").await.problem(404, "camera-not-found");
+    rest.get("/v1/cameras/NO%2FSLUG").await.problem(404, "camera-not-found");
+}
+
+#[tokio::test]
+async fn cameras_are_listed_page_by_page() {
+    let rest = Rest::new().await;
+    for id in ["a", "b", "d", "c", "e"] {
+        rest.post("/v1/cameras", &json!({"id": id})).await.expect(201);
+    }
+    let (mut seen, mut path) = (Vec::new(), "/v1/cameras?limit=2".to_owned());
+    loop {
+        let page = rest.get(&path).await.expect(200).json();
+        let items = page["items"].as_array().expect("items");
+        seen.extend(items.iter().map(|camera| camera["id"].as_str().expect("an id").to_owned()));
+        let Some(cursor) = page["next_cursor"].as_str() else { break };
+        assert_eq!(items.len(), 2);
+        path = format!("/v1/cameras?limit=2&cursor={cursor}");
+    }
+    assert_eq!(seen, ["a", "b", "c", "d", "e"]);
+    for (query, field) in [
+        ("limit=0", "limit"),
+        ("limit=1001", "limit"),
+        ("limit=x", "limit"),
+        ("limit=1&limit=2", "limit"),
+        ("cursor=x", "cursor"),
+        ("page=2", "page"),
+    ] {
+        let answer = rest.get(&format!("/v1/cameras?{query}")).await;
+        assert_eq!(answer.problem(422, "invalid-argument"), [field], "{query}");
+    }
+}
+
+#[tokio::test]
+async fn a_receivers_error_is_told_from_fixes_at_one_point() {
+    let rest = Rest::with_camera().await;
+    let path = "/v1/cameras/c/gnss-error";
+    let spread: Vec<f64> = (0..50).map(|n| f64::from(n % 7) * 1e-5).collect();
+    let csv: String = spread.iter().map(|d| format!("{},{}\n", 103.9 + d, 30.6 - d)).collect();
+    let told = rest.csv(path, format!("longitude,latitude\n{csv}181,30\n")).await.expect(200).json();
+    assert_eq!((&told["fixes"], &told["rejected"]), (&json!(50), &json!(1)), "{told}");
+    assert_eq!(told["rejected_rows"][0]["field"], "longitude");
+    let fixes: Vec<Value> =
+        spread.iter().map(|d| json!({"longitude_deg": 103.9 + d, "latitude_deg": 30.6 - d})).collect();
+    let same = rest.post(path, &json!({"fixes": fixes})).await.expect(200).json();
+    let sigma = |told: &Value| told["sigma_m"].as_f64().expect("a number");
+    assert!((sigma(&told) - sigma(&same)).abs() < 1e-6 && sigma(&told) > 0.5, "{told} {same}");
+
+    assert_eq!(rest.post(path, &json!({"fixes": []})).await.problem(422, "invalid-argument"), ["fixes"]);
+    let bad = json!({"fixes": [{"longitude_deg": 1, "latitude_deg": 91}]});
+    assert_eq!(rest.post(path, &bad).await.problem(422, "invalid-argument"), ["fixes[0].latitude_deg"]);
+    rest.csv("/v1/cameras/none/gnss-error", "").await.problem(404, "camera-not-found");
+    let nmea = rest.send("POST", path, &[("content-type", "text/plain")], "$GPGGA,x\n").await;
+    assert_eq!(nmea.problem(422, "invalid-argument"), ["fixes"]);
+}

@@ -1,0 +1,342 @@
+//! `/v1/cameras/{camera}/training-runs`: background fits, and their progress as events.
+
+use std::convert::Infallible;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::{Stream, StreamExt as _};
+use hyper::{HeaderMap, StatusCode, Uri};
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::extract::{CameraPath, JsonBody, Params, RunPath};
+use super::problem::{Answer, Problem};
+use super::wire::{Recipe, empty, json, made};
+use crate::app::{App, RunRequest};
+use crate::domain::{self, EpochReport, Error, ErrorKind, Result, RunProgress, parse_time};
+use crate::exchange::{foreign_cursor, read_cursor, write_cursor};
+
+/// How often a silent event stream says that it is still there.
+const KEEP_ALIVE: Duration = Duration::from_secs(15);
+/// Id of the last event of a run.
+const ENDED: &str = "ended";
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new()
+        .routes(routes!(start_training_run, list_training_runs))
+        .routes(routes!(get_training_run))
+        .routes(routes!(cancel_training_run))
+        .routes(routes!(watch_training_run))
+        .routes(routes!(get_training_log))
+        .routes(routes!(get_training_curve))
+}
+
+/// What to fit; all of it may be left out.
+#[derive(Default, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+struct RunDraft {
+    /// The profile's recipe if left out.
+    recipe: Option<Recipe>,
+    /// Everything random in the run comes from it; 0 if left out.
+    seed: Option<u64>,
+    /// Passes over the samples; the recipe's own number if left out.
+    #[schema(minimum = 1)]
+    epochs: Option<u32>,
+    /// Only samples from this instant on (RFC 3339).
+    #[schema(format = DateTime)]
+    from: Option<String>,
+    /// Only samples before this instant (RFC 3339).
+    #[schema(format = DateTime)]
+    until: Option<String>,
+}
+
+impl RunDraft {
+    fn to_domain(&self) -> Result<RunRequest> {
+        Ok(RunRequest {
+            recipe: self.recipe.map(domain::Recipe::from),
+            seed: self.seed,
+            epochs: self.epochs,
+            from: instant("from", self.from.as_deref())?,
+            until: instant("until", self.until.as_deref())?,
+        })
+    }
+}
+
+fn instant(field: &str, text: Option<&str>) -> Result<Option<Timestamp>> {
+    let Some(text) = text else { return Ok(None) };
+    parse_time(text).map(Some).map_err(|error| match error {
+        Error::Refused(refusal) => Error::invalid(field, refusal.message),
+        fault @ Error::Fault(_) => fault,
+    })
+}
+
+/// Where a run stands. Queued and running runs are live; the others have ended.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum RunState {
+    /// Waits for a worker.
+    Queued,
+    /// A worker fits it.
+    Running,
+    /// Yielded a model version.
+    Succeeded,
+    /// Ended by an error.
+    Failed,
+    /// Ended by the operator.
+    Cancelled,
+}
+
+impl From<domain::RunState> for RunState {
+    fn from(state: domain::RunState) -> Self {
+        match state {
+            domain::RunState::Queued => Self::Queued,
+            domain::RunState::Running => Self::Running,
+            domain::RunState::Succeeded => Self::Succeeded,
+            domain::RunState::Failed => Self::Failed,
+            domain::RunState::Cancelled => Self::Cancelled,
+        }
+    }
+}
+
+/// A training run.
+#[derive(Serialize, ToSchema)]
+struct TrainingRun {
+    /// A UUID of version 7.
+    #[schema(format = "uuid")]
+    id: String,
+    /// Whose model is fitted.
+    camera_id: String,
+    /// How the camera is learnt.
+    recipe: Recipe,
+    /// Everything random in the run comes from it.
+    seed: u64,
+    /// Passes over the samples, if they were asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    epochs: Option<u32>,
+    /// Only samples from this instant on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, format = DateTime)]
+    from: Option<Timestamp>,
+    /// Only samples before this instant.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, format = DateTime)]
+    until: Option<Timestamp>,
+    /// Where it stands.
+    state: RunState,
+    /// How far it has come.
+    progress: RunProgress,
+    /// How often a worker has taken it up.
+    attempt: u32,
+    /// The version it yielded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model_version: Option<u32>,
+    /// Whether that version became active, and why or why not, or why the run failed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    outcome: Option<String>,
+    /// When it was asked for.
+    #[schema(value_type = String, format = DateTime)]
+    created_at: Timestamp,
+    /// When a worker took it up last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, format = DateTime)]
+    started_at: Option<Timestamp>,
+    /// When it ended.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, format = DateTime)]
+    ended_at: Option<Timestamp>,
+}
+
+impl From<domain::TrainingRun> for TrainingRun {
+    fn from(run: domain::TrainingRun) -> Self {
+        Self {
+            id: run.id.to_string(),
+            camera_id: run.camera_id.as_str().to_owned(),
+            recipe: run.options.recipe.into(),
+            seed: run.options.seed,
+            epochs: run.options.epochs,
+            from: run.options.from,
+            until: run.options.until,
+            state: run.state.into(),
+            progress: run.progress,
+            attempt: run.attempt,
+            model_version: run.model_version,
+            outcome: run.outcome,
+            created_at: run.created_at,
+            started_at: run.started_at,
+            ended_at: run.ended_at,
+        }
+    }
+}
+
+/// A page of training runs, newest first.
+#[derive(Serialize, ToSchema)]
+struct RunPage {
+    /// Runs.
+    items: Vec<TrainingRun>,
+    /// Asks for the next page; missing on the last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next_cursor: Option<String>,
+}
+
+/// Start a training run
+///
+/// The run waits in a queue and is fitted in the background; the answer comes at once.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/training-runs", tag = "training", params(("camera" = String, Path, description = "The camera's id")),
+    request_body = Option<RunDraft>,
+    responses(
+        (status = 202, description = "The queued run", body = TrainingRun, headers(("location" = String, description = "Its path"))),
+        (status = 409, description = "The camera has a live run", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn start_training_run(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
+    let run = app.start_run(&id, body.read_or_default::<RunDraft>()?.to_domain()?).await?;
+    let location = format!("/v1/cameras/{id}/training-runs/{}", run.id);
+    Ok(made(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
+}
+
+/// List training runs, newest first
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/training-runs", tag = "training",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
+        ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
+    ),
+    responses((status = 200, description = "A page of runs", body = RunPage))
+)]
+async fn list_training_runs(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> Answer {
+    let mut params = Params::of(&uri)?;
+    let limit = params.limit(app.limits.page_items)?;
+    let before = params
+        .take("cursor", |text| read_cursor("training-runs", text)?.parse().map_err(|_| foreign_cursor()))?;
+    params.end()?;
+    let page = app.runs(&id, before, limit).await?;
+    Ok(json(&RunPage {
+        items: page.items.into_iter().map(TrainingRun::from).collect(),
+        next_cursor: page.next.map(|run| write_cursor("training-runs", &run.to_string())),
+    })?)
+}
+
+/// Read a training run
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/training-runs/{run}", tag = "training",
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
+    responses((status = 200, description = "The run", body = TrainingRun))
+)]
+async fn get_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+    Ok(json(&TrainingRun::from(app.run(&id, run).await?))?)
+}
+
+/// Cancel a training run
+///
+/// At once if it waits, at its next step if it runs.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/training-runs/{run}/cancel", tag = "training",
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
+    responses(
+        (status = 200, description = "The run as it stands now", body = TrainingRun),
+        (status = 409, description = "The run has ended", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn cancel_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+    Ok(json(&TrainingRun::from(app.cancel_run(&id, run).await?))?)
+}
+
+/// Watch a training run
+///
+/// Server-sent events `run`, each with the whole run as JSON: now, at each change, and the last
+/// one, with the id `ended`, when it has ended. A browser that comes back after that gets 204.
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/training-runs/{run}/events", tag = "training",
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
+    responses(
+        (status = 200, description = "Events", body = TrainingRun, content_type = "text/event-stream"),
+        (status = 204, description = "The client has seen the last event"),
+    )
+)]
+async fn watch_training_run(
+    State(rest): State<Rest>,
+    RunPath(id, run): RunPath,
+    headers: HeaderMap,
+) -> Answer {
+    if headers.get("last-event-id").is_some_and(|last| last == ENDED) {
+        return Ok(empty());
+    }
+    let place = rest.event_streams.clone().try_acquire_owned().map_err(|_| {
+        Error::refused(ErrorKind::Overloaded, "too many event streams are open; poll the run instead")
+    })?;
+    let changes = rest.app.watch_run(&id, run).await?;
+    let shutdown = rest.shutdown.clone();
+    let events = changes.take_until(async move { shutdown.begun().await }).map(move |change| {
+        let _held = &place; // until the stream is dropped
+        Ok(event_of(change))
+    });
+    Ok(event_stream(events))
+}
+
+fn event_stream(events: impl Stream<Item = Result<Event, Infallible>> + Send + 'static) -> Response {
+    Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response()
+}
+
+fn event_of(change: Result<domain::TrainingRun>) -> Event {
+    let told = change.and_then(|run| {
+        let event = if run.state.has_ended() { Event::default().id(ENDED) } else { Event::default() };
+        event.event("run").json_data(TrainingRun::from(run)).map_err(Error::fault)
+    });
+    told.unwrap_or_else(|error| {
+        tracing::error!(%error, "a watched run cannot be read");
+        Event::default().event("error").data("the server failed; read the run again")
+    })
+}
+
+/// A line of a run's log.
+#[derive(Serialize, ToSchema)]
+struct LogLine {
+    /// When.
+    #[schema(value_type = String, format = DateTime)]
+    time: Timestamp,
+    /// What happened.
+    text: String,
+}
+
+/// A run's log, oldest line first.
+#[derive(Serialize, ToSchema)]
+struct TrainingLog {
+    /// Lines.
+    items: Vec<LogLine>,
+}
+
+/// Read a training run's log
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/training-runs/{run}/log", tag = "training",
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
+    responses((status = 200, description = "The log", body = TrainingLog))
+)]
+async fn get_training_log(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+    let lines = app.run_log(&id, run).await?;
+    Ok(json(&TrainingLog { items: lines.into_iter().map(|(time, text)| LogLine { time, text }).collect() })?)
+}
+
+/// A run's curve: one point per epoch of the final fit.
+#[derive(Serialize, ToSchema)]
+struct TrainingCurve {
+    /// Epochs in their order.
+    items: Vec<EpochReport>,
+}
+
+/// Read a training run's curve
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/training-runs/{run}/curve", tag = "training",
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
+    responses((status = 200, description = "The curve", body = TrainingCurve))
+)]
+async fn get_training_curve(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+    Ok(json(&TrainingCurve { items: app.run_epochs(&id, run).await? })?)
+}

@@ -1,0 +1,89 @@
+//! Shapes that several resources share.
+
+use axum::body::Body;
+use axum::response::Response;
+use hyper::StatusCode;
+use hyper::header::{CONTENT_TYPE, ETAG, IntoHeaderName, LOCATION};
+use hyper::http::HeaderValue;
+use serde::{Deserialize, Deserializer, Serialize};
+use utoipa::ToSchema;
+
+use crate::domain::{Error, Result, Revision};
+
+/// How a camera is learnt.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Recipe {
+    /// The paper to the letter.
+    Paper,
+    /// The hybrid loss in metres, on scaled inputs.
+    Hybrid,
+    /// A learnt homography with a small residual network.
+    Projective,
+    /// The best of the candidates on held-out blocks of time.
+    Auto,
+}
+
+impl From<Recipe> for crate::domain::Recipe {
+    fn from(recipe: Recipe) -> Self {
+        match recipe {
+            Recipe::Paper => Self::Paper,
+            Recipe::Hybrid => Self::Hybrid,
+            Recipe::Projective => Self::Projective,
+            Recipe::Auto => Self::Auto,
+        }
+    }
+}
+
+impl From<crate::domain::Recipe> for Recipe {
+    fn from(recipe: crate::domain::Recipe) -> Self {
+        match recipe {
+            crate::domain::Recipe::Paper => Self::Paper,
+            crate::domain::Recipe::Hybrid => Self::Hybrid,
+            crate::domain::Recipe::Projective => Self::Projective,
+            crate::domain::Recipe::Auto => Self::Auto,
+        }
+    }
+}
+
+/// A field that may be left out (`None`), or be null (`Some(None)`).
+pub(super) fn nullable<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
+    deserializer: D,
+) -> std::result::Result<Option<Option<T>>, D::Error> {
+    Option::deserialize(deserializer).map(Some)
+}
+
+/// A 200 of JSON.
+pub(super) fn json(value: &impl Serialize) -> Result<Response> {
+    let json = serde_json::to_vec(value).map_err(Error::fault)?;
+    let mut response = Response::new(Body::from(json));
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
+    Ok(response)
+}
+
+/// A 201 or 202 of JSON, with the path of what was made.
+pub(super) fn made(status: StatusCode, location: &str, value: &impl Serialize) -> Result<Response> {
+    let mut response = json(value)?;
+    *response.status_mut() = status;
+    insert(&mut response, LOCATION, location)?;
+    Ok(response)
+}
+
+/// Names the revision of what is shown.
+pub(super) fn with_etag(mut response: Response, revision: Revision) -> Result<Response> {
+    insert(&mut response, ETAG, &format!("\"{}\"", revision.0))?;
+    Ok(response)
+}
+
+fn insert(response: &mut Response, name: impl IntoHeaderName, value: &str) -> Result<()> {
+    let value = HeaderValue::from_str(value).map_err(Error::fault)?;
+    response.headers_mut().insert(name, value);
+    Ok(())
+}
+
+/// An answer without a body.
+pub(super) fn empty() -> Response {
+    let mut response = Response::new(Body::empty());
+    *response.status_mut() = StatusCode::NO_CONTENT;
+    response
+}

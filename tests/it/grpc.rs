@@ -1,0 +1,6 @@
+//! The gRPC transport through a real port, by its own generated clients.
+
+mod cameras;
+mod fusions;
+mod imports;
+mod server;

@@ -14,7 +14,7 @@ use crate::filters::ImmUkf;
 use crate::fusion::track::{Measured, Measurement, Track};
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::{R95_PER_SIGMA, Regression};
+use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, dnn, homography};
 
 /// Standard deviation per axis taken for a receiver of which nothing is known, m.
 const UNKNOWN_RECEIVER_M: f64 = 5.0;
@@ -276,7 +276,7 @@ impl<'a> Run<'a> {
         known.or(learnt_m2).unwrap_or(UNKNOWN_RECEIVER_M * UNKNOWN_RECEIVER_M)
     }
 
-    fn baseline<'b>(&self, method: Method, _seed: u64) -> Result<Answerer<'b>, String>
+    fn baseline<'b>(&self, method: Method, seed: u64) -> Result<Answerer<'b>, String>
     where
         'a: 'b,
     {
@@ -290,11 +290,53 @@ impl<'a> Run<'a> {
                 Some(Told { position: fix.position, r95_m })
             })),
             Method::ImmUkf => Ok(self.imm_ukf(variance_m2)),
-            Method::Dnn | Method::DnnDenied | Method::HomographyDenied => {
-                Err("this build has no such baseline".to_owned())
-            }
+            Method::Dnn | Method::DnnDenied => self.dnn(method == Method::Dnn, seed),
+            Method::HomographyDenied => self.homography(seed),
             Method::Recipe(..) | Method::Track | Method::TrackDenied => Err("needs a model".to_owned()),
         }
+    }
+
+    /// The supervised network; in its 6D form it answers only rows that have a fix.
+    fn dnn<'b>(&self, with_fix: bool, seed: u64) -> Result<Answerer<'b>, String>
+    where
+        'a: 'b,
+    {
+        self.enough()?;
+        let plane = self.plane;
+        let network = dnn::fit(self.train, &plane, with_fix, seed);
+        Ok(self.row_by_row(move |observation| {
+            let drawn = observation.bounding_box.as_ref()?;
+            let fix = observation.fix.filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
+            let point = (fix.is_some() == with_fix).then(|| network.regress(drawn, fix))?;
+            Some(Told { position: plane.to_position(point), r95_m: None })
+        }))
+    }
+
+    fn homography<'b>(&self, seed: u64) -> Result<Answerer<'b>, String>
+    where
+        'a: 'b,
+    {
+        let plane = self.plane;
+        let pairs: Vec<(BoundingBox, EastNorth)> = self
+            .train
+            .iter()
+            .map(|sample| (sample.bounding_box, plane.to_plane(sample.fix.position)))
+            .collect();
+        let homography = homography::fit(&pairs, seed)
+            .ok_or("fewer than 8 training samples, or all of them at one spot")?;
+        Ok(self.row_by_row(move |observation| {
+            let point = homography.project(observation.bounding_box.as_ref()?)?;
+            Some(Told { position: plane.to_position(point), r95_m: None })
+        }))
+    }
+
+    /// The recipes refuse by themselves; the network has no such check.
+    fn enough(&self) -> Result<(), String> {
+        let fewest = FEWEST_SAMPLES;
+        if self.train.len() < fewest {
+            return Err(format!("needs at least {fewest} training samples, has {}", self.train.len()));
+        }
+        Ok(())
     }
 
     fn imm_ukf<'b>(&self, variance_m2: f64) -> Answerer<'b>

@@ -6,17 +6,21 @@
 
 mod artifact;
 mod coverage;
+pub mod dnn;
 mod file;
 mod fit;
+pub mod homography;
 mod hybrid;
 mod kernel;
 pub mod net;
 mod noise;
 mod paper;
+mod projection;
 mod regressor;
 mod rows;
 mod tensors;
 pub mod train;
+mod whitening;
 
 pub use artifact::{Artifact, FORMAT};
 pub use fit::{FitError, FitEvent, FitOptions, fit};

@@ -33,9 +33,6 @@ impl RowError {
     }
 
     /// A refusal as the row's fault; a fault of the machine stays an error of the file.
-    ///
-    /// # Errors
-    /// The fault.
     pub fn of(line: u64, error: Error) -> Result<Self> {
         match error {
             Error::Refused(refusal) => Ok(match refusal.violations.into_iter().next() {

@@ -203,20 +203,26 @@ impl Observation<'_> {
         bounds: &TimeBounds,
         image_size: Option<domain::ImageSize>,
     ) -> Result<domain::Observation> {
-        domain::Observation::new(
-            bounds.check(parse_time(self.time.as_str())?)?,
-            self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?,
-            self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
-            self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
-        )
+        if self.bounding_box.is_none() && self.fix.is_none() {
+            return Err(Error::invalid(
+                "bounding_box",
+                "an observation needs a bounding_box, a fix, or both",
+            ));
+        }
+        Ok(domain::Observation {
+            time: bounds.check(parse_time(self.time.as_str())?)?,
+            target_id: self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?,
+            bounding_box: self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
+            fix: self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
+        })
     }
 }
 
 /// A box that belongs to an image of that size; errors are named below `bounding_box`.
-///
-/// # Errors
-/// Names the side that cannot be used, or that lies outside of the image.
-pub fn box_within(sides: BoundingBox, image_size: Option<domain::ImageSize>) -> Result<domain::BoundingBox> {
+pub fn box_within(
+    sides: BoundingBox,
+    image_size: Option<domain::ImageSize>,
+) -> Result<domain::BoundingBox> {
     let checked = sides.to_domain().and_then(|bounding_box| match image_size {
         Some(size) => bounding_box.within(size),
         None => Ok(bounding_box),

@@ -102,7 +102,7 @@ struct CameraDraft {
 }
 
 impl CameraDraft {
-    fn to_domain(self) -> Result<NewCamera> {
+    fn into_domain(self) -> Result<NewCamera> {
         let blank = NewCamera::named(CameraId::new(&self.id)?);
         Ok(NewCamera {
             display_name: self.display_name.unwrap_or(blank.display_name),
@@ -150,7 +150,7 @@ struct CameraChange {
 }
 
 impl CameraChange {
-    fn to_domain(self) -> Result<domain::CameraChange> {
+    fn into_domain(self) -> Result<domain::CameraChange> {
         Ok(domain::CameraChange {
             display_name: self.display_name,
             image_size: self.image_size.map(|size| size.map(ImageSize::to_domain).transpose()).transpose()?,
@@ -242,7 +242,7 @@ struct CameraPage {
     )
 )]
 async fn create_camera(State(app): State<App>, body: JsonBody) -> Answer {
-    let camera = app.create_camera(body.read::<CameraDraft>()?.to_domain()?).await?;
+    let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
     let (location, revision) = (format!("/v1/cameras/{}", camera.id()), camera.revision);
     Ok(with_etag(made(StatusCode::CREATED, &location, &Camera::from(camera))?, revision)?)
 }
@@ -307,7 +307,7 @@ async fn change_camera(
             "the header must name the revision that the change is based on, as `etag` gave it, or be *";
         Error::field(ErrorKind::RevisionRequired, "if-match", message)
     })?;
-    let change = body.read::<CameraChange>()?.to_domain()?;
+    let change = body.read::<CameraChange>()?.into_domain()?;
     let camera = app.change_camera(&id, change, expected.revision()).await?;
     let revision = camera.revision;
     Ok(with_etag(json(&Camera::from(camera))?, revision)?)

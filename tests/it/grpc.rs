@@ -3,4 +3,5 @@
 mod cameras;
 mod fusions;
 mod imports;
+mod models;
 mod server;

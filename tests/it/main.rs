@@ -1,4 +1,9 @@
 //! The one integration test binary: everything from the outside, through real ports and files.
 
+mod bad_input;
+mod connections;
 mod grpc;
+mod harness;
 mod layering;
+mod openapi;
+mod story;

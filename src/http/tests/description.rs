@@ -30,7 +30,6 @@ fn every_operation_tells_its_problems() {
     ids.sort();
     ids.dedup();
     assert_eq!(ids.len(), count, "operation ids are unique");
-    assert_eq!(count, 25);
 }
 
 #[test]

@@ -7,6 +7,11 @@ const RUNS: &str = "/v1/cameras/c/training-runs";
 /// A camera with samples of a target that walks to and fro.
 async fn taught() -> Rest {
     let rest = Rest::with_camera().await;
+    teach(&rest).await;
+    rest
+}
+
+async fn teach(rest: &Rest) {
     let rows: String = (0..200)
         .map(|n| {
             let step = f64::from(n % 50);
@@ -16,7 +21,6 @@ async fn taught() -> Rest {
         .collect();
     let csv = format!("time,target_id,left,top,width,height,longitude,latitude\n{rows}");
     rest.csv("/v1/cameras/c/samples", csv).await.expect(200);
-    rest
 }
 
 #[tokio::test]
@@ -49,15 +53,24 @@ async fn a_run_is_queued_listed_and_cancelled() {
 }
 
 #[tokio::test]
-async fn watching_ends_with_the_server_and_has_few_places() {
-    let limits = Limits { event_streams: 1, ..Limits::default() };
-    let rest = Rest { router: taught().await.router, ..Rest::with(limits).await };
-    let path = rest.send("POST", RUNS, &[], Body::empty()).await.expect(202).header("location").to_owned();
-    let events = format!("{path}/events");
+async fn watching_has_few_places_and_ends_with_the_server() {
+    let rest = Rest::with(Limits { event_streams: 1, ..Limits::default() }).await;
+    rest.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
+    teach(&rest).await;
+    let run = rest.send("POST", RUNS, &[], Body::empty()).await.expect(202);
+    let events = format!("{}/events", run.header("location"));
+
     let mut first = rest.open("GET", &events, &[], Body::empty()).await;
     let told = first.body_mut().frame().await.expect("an event").expect("whole").into_data().expect("text");
-    assert!(String::from_utf8_lossy(&told).starts_with("event: run\n"), "{told:?}");
+    assert!(String::from_utf8_lossy(&told).contains("\"queued\""), "{told:?}");
+    let second = rest.get(&events).await;
+    assert_eq!(second.header("retry-after"), "1");
+    second.problem(503, "overloaded");
+
+    rest.shutdown.begin();
+    assert!(first.body_mut().frame().await.is_none(), "the stream ends with the server");
     drop(first);
+    rest.get(&events).await.expect(200);
 }
 
 #[tokio::test]

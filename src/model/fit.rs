@@ -60,14 +60,14 @@ pub enum FitError {
     Unusable(Error),
     /// Ours.
     #[error("the fit failed: {0}")]
-    Fault(Box<dyn std::error::Error + Send + Sync>),
+    Fault(String),
 }
 
 impl From<TrainError> for FitError {
     fn from(error: TrainError) -> Self {
         match error {
             TrainError::Cancelled => Self::Cancelled,
-            TrainError::Candle(cause) => Self::Fault(cause.into()),
+            TrainError::Candle(cause) => Self::Fault(cause.to_string()),
         }
     }
 }
@@ -128,7 +128,7 @@ pub fn fit(
     let rng = ChaCha8Rng::seed_from_u64(options.seed);
     let mut phase = Phase { run: &mut run, name: "final fit".to_owned(), rng, is_final: true };
     let parts = fit_rows(&rows, &mut phase)?;
-    let weights = parts.tensors.to_bytes().map_err(|cause| FitError::Fault(cause.into()))?;
+    let weights = parts.tensors.to_bytes().map_err(|cause| FitError::Fault(cause.to_string()))?;
     let origin = parts.plane.origin();
     Ok(Artifact {
         metadata: ModelMetadata {
@@ -179,7 +179,7 @@ fn held_out(
         rng.set_stream(u64::from(block) + 1);
         let name = format!("held-out block {} of {BLOCKS}", block + 1);
         let parts = fit_rows(&train, &mut Phase { run, name, rng, is_final: false })?;
-        let regressor = Regressor::build(parts).map_err(|error| FitError::Fault(error.into()))?;
+        let regressor = Regressor::build(parts).map_err(|error| FitError::Fault(error.to_string()))?;
         let held = rows.rows.iter().zip(&blocks).filter(|(_, of)| **of == block);
         for (row, _) in held {
             let fix = regressor.plane().to_plane(row.position);

@@ -449,3 +449,6 @@ fn step_track(
     };
     Some(Told { position: plane.to_position(state.position), r95_m: Some(state.r95_m) })
 }
+
+#[cfg(test)]
+mod tests;

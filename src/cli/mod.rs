@@ -4,6 +4,7 @@
 //! `worker`, `model` or `fusion`, and prints.
 
 mod config;
+mod evaluate;
 mod fuse;
 mod gnss_error;
 mod health;
@@ -11,6 +12,7 @@ mod import;
 mod openapi;
 mod progress;
 mod serve;
+mod simulate;
 mod train;
 
 use std::fs::File;
@@ -50,6 +52,10 @@ enum Command {
     Fuse(fuse::Fuse),
     /// Estimate a receiver's error from many fixes at one fixed point
     GnssError(gnss_error::GnssError),
+    /// Try methods side by side on a test file, without a server
+    Evaluate(evaluate::Evaluate),
+    /// Write a seeded synthetic world with its truth
+    Simulate(simulate::Simulate),
     /// Ask a server whether it is alive
     Health(health::Health),
     /// Print the settings in force
@@ -77,6 +83,8 @@ impl Cli {
             Command::Train(command) => command.run(file),
             Command::Fuse(command) => command.run(file),
             Command::GnssError(command) => command.run(),
+            Command::Evaluate(command) => command.run(),
+            Command::Simulate(command) => command.run(),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),

@@ -96,6 +96,21 @@ impl Options {
     }
 }
 
+impl Options {
+    /// What to try on a model of this world: the same camera, other passes and other noise, a week
+    /// after the start.
+    #[must_use]
+    pub fn test(&self, samples: usize) -> Self {
+        Self {
+            // Any odd constant: what matters is that no two seeds share their test noise.
+            seed: self.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x5bd1),
+            samples,
+            start: self.start.saturating_add(SignedDuration::from_hours(168)).unwrap_or(self.start),
+            ..self.clone()
+        }
+    }
+}
+
 impl Default for Options {
     fn default() -> Self {
         Self::new(Scene::Airport)
@@ -191,14 +206,7 @@ pub fn simulate(options: &Options) -> World {
 /// week later.
 #[must_use]
 pub fn simulate_split(options: &Options, test_rows: usize) -> (World, World) {
-    let test = Options {
-        // Any odd constant: what matters is that no two seeds share their test noise.
-        seed: options.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x5bd1),
-        samples: test_rows,
-        start: options.start.saturating_add(SignedDuration::from_hours(168)).unwrap_or(options.start),
-        ..options.clone()
-    };
-    (simulate(options), simulate(&test))
+    (simulate(options), simulate(&options.test(test_rows)))
 }
 
 /// One target with its receiver, and what its detector suffers.

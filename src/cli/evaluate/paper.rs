@@ -1,0 +1,165 @@
+//! The paper's experiments, and those this project adds, as one page of figures.
+//!
+//! What never happens here: a choice. Everything is fitted on training rows with the recipes as they
+//! are; the page reports what came out, good or bad.
+
+mod experiments;
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use anyhow::Context as _;
+use experiments::Experiment;
+
+use super::{DEFAULT_RECIPE, cpu_s, evaluate_aloud};
+use crate::evaluation::{EvaluateOptions, Evaluation, Metrics};
+
+/// Epochs whose Es is shown.
+const SHOWN_EPOCHS: [u32; 8] = [1, 2, 5, 10, 20, 50, 100, 200];
+
+/// Runs everything and writes the page.
+pub(super) fn run(shared_data: Option<&Path>, out: &Path, seeds: u64) -> anyhow::Result<()> {
+    let mut page = String::from(HEAD);
+    let data = shared_data.map_or_else(String::new, |_| " --shared-data DIR".to_owned());
+    // Writing to a string cannot fail.
+    let _ =
+        writeln!(page, "Made by `sightfix evaluate --paper --seeds {seeds}{data}`; {seeds} seeds each.\n");
+    let mut experiments = experiments::simulated()?;
+    if let Some(folder) = shared_data {
+        experiments.extend(experiments::real_square(folder)?);
+    }
+    let mut group = "";
+    let mut pooled = Vec::new();
+    for (number, experiment) in experiments.iter().enumerate() {
+        eprintln!("experiment {} of {}: {}", number + 1, experiments.len(), experiment.title);
+        if experiment.group != group {
+            pool(&mut page, &mut pooled);
+            group = experiment.group;
+            let _ = writeln!(page, "## {group}\n");
+        }
+        let evaluation = evaluate_aloud(
+            &experiment.train,
+            &experiment.test,
+            &experiment.truth,
+            &EvaluateOptions {
+                methods: experiment.methods.clone(),
+                default_recipe: DEFAULT_RECIPE,
+                seeds,
+                epochs: None,
+                image_size: experiment.image_size,
+                gnss_sigma: Some(experiment.gnss_sigma),
+                box_shift_px: experiment.box_shift_px,
+                cpu_s,
+            },
+        )?;
+        section(&mut page, experiment, &evaluation);
+        if experiment.pooled {
+            pooled.push(evaluation);
+        }
+    }
+    pool(&mut page, &mut pooled);
+    if let Some(folder) = out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    }
+    std::fs::write(out, &page).with_context(|| format!("cannot write {}", out.display()))?;
+    println!("{page}");
+    Ok(())
+}
+
+const HEAD: &str = "\
+# How accurate it is
+
+Generated; do not edit. Errors are horizontal and geodesic (WGS 84), in metres, means over seeds;
+`spread` is the standard deviation of the seeds' means. `cov50` and `cov95` are the shares of true
+positions inside the stated 50 % and 95 % radius. Nothing was chosen on these test rows. The error to
+a line is the distance to its nearest point, so it is smaller than the error to a known position, and
+coverage of it larger.
+
+";
+
+/// One experiment: what was done, the table, and Es per epoch where it is asked for.
+fn section(page: &mut String, experiment: &Experiment, evaluation: &Evaluation) {
+    let _ = writeln!(page, "### {}\n\n{}\n", experiment.title, experiment.what);
+    let _ = writeln!(
+        page,
+        "{} training rows, {} test rows, receiver sigma {} m per axis.\n",
+        experiment.train.len(),
+        experiment.test.len(),
+        experiment.gnss_sigma.metres()
+    );
+    if let Some(command) = &experiment.command {
+        let _ = writeln!(page, "```sh\n{command}\n```\n");
+    }
+    let _ = writeln!(
+        page,
+        "| method | mean | spread | median | p95 | max | variance | RMSE | in 1 m | in 5 m | cov50 | cov95 | \
+         train s | us | n |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    );
+    for (name, one) in evaluation.report.rows() {
+        let Metrics { mean_m, median_m, p95_m, max_m, variance_m2, rmse_m, n, .. } = one.metrics;
+        let within = |bound: &str| percent(one.metrics.share_within.get(bound).copied());
+        let _ = writeln!(
+            page,
+            "| `{name}` | {mean_m:.3} | {:.3} | {median_m:.3} | {p95_m:.3} | {max_m:.2} | {variance_m2:.3} | \
+             {rmse_m:.3} | {} | {} | {} | {} | {:.2} | {:.2} | {n} |",
+            one.seed_spread_m(),
+            within("1"),
+            within("5"),
+            percent(one.metrics.coverage50),
+            percent(one.metrics.coverage95),
+            one.train_cpu_s,
+            one.fuse_us,
+        );
+    }
+    page.push('\n');
+    for (name, reason) in &evaluation.report.failed {
+        let _ = writeln!(page, "`{name}` was not run: {reason}.\n");
+    }
+    if experiment.show_curves {
+        curves(page, evaluation);
+    }
+}
+
+fn curves(page: &mut String, evaluation: &Evaluation) {
+    let _ = writeln!(page, "Es per epoch of the final fit, first seed:\n");
+    let head: String = SHOWN_EPOCHS.iter().map(|epoch| format!(" {epoch} |")).collect();
+    let _ = writeln!(page, "| recipe |{head} last |\n|---|{}", "---|".repeat(SHOWN_EPOCHS.len() + 1));
+    for curve in &evaluation.curves {
+        let _ = write!(page, "| `{}` |", curve.recipe);
+        let cell =
+            |scale: Option<f64>| scale.map_or_else(|| " |".to_owned(), |scale| format!(" {scale:.4} |"));
+        for wanted in SHOWN_EPOCHS {
+            let found = curve.epochs.iter().find(|one| one.epoch == wanted);
+            page.push_str(&cell(found.map(|one| one.error_scale)));
+        }
+        page.push_str(&cell(curve.epochs.last().map(|one| one.error_scale)));
+        page.push('\n');
+    }
+    page.push('\n');
+}
+
+/// The experiments of a group taken together, each row of equal weight.
+fn pool(page: &mut String, evaluations: &mut Vec<Evaluation>) {
+    let Some(first) = evaluations.first().filter(|_| evaluations.len() > 1) else {
+        evaluations.clear();
+        return;
+    };
+    let _ = writeln!(page, "### All of these together\n\n| method | mean | cov95 | n |\n|---|---|---|---|");
+    for (name, _) in first.report.rows() {
+        let figures: Vec<&Metrics> = evaluations
+            .iter()
+            .filter_map(|evaluation| Some(&evaluation.report.methods.get(name)?.metrics))
+            .collect();
+        let rows: f64 = figures.iter().map(|one| one.n as f64).sum();
+        let mean_m = figures.iter().map(|one| one.mean_m * one.n as f64).sum::<f64>() / rows;
+        let inside = figures.iter().map(|one| Some(one.coverage95? * one.n as f64)).sum::<Option<f64>>();
+        let _ =
+            writeln!(page, "| `{name}` | {mean_m:.3} | {} | {rows} |", percent(inside.map(|sum| sum / rows)));
+    }
+    page.push('\n');
+    evaluations.clear();
+}
+
+fn percent(share: Option<f64>) -> String {
+    share.map_or_else(|| "-".to_owned(), |share| format!("{:.1}%", 100.0 * share))
+}

@@ -1,0 +1,123 @@
+//! The names of the methods that stand side by side.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::domain::{Error, Recipe, Result};
+
+/// How a recipe's model is asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Step {
+    /// The regressed position.
+    OneStep,
+    /// The regressed position and the fix, weighted by (6) to (8).
+    TwoStep,
+    /// The box alone.
+    Denied,
+}
+
+/// A way to tell a position.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Method {
+    /// The fix as it comes.
+    Gnss,
+    /// The IMM-UKF over fixes.
+    ImmUkf,
+    /// The supervised DNN over box and fix.
+    Dnn,
+    /// The supervised DNN over the box.
+    DnnDenied,
+    /// The robust homography of the foot point.
+    HomographyDenied,
+    /// A recipe's model.
+    Recipe(Recipe, Step),
+    /// Sequence fusion over the default recipe.
+    Track,
+    /// The same without any fix.
+    TrackDenied,
+}
+
+impl Method {
+    /// All of them, in the order of the table.
+    #[must_use]
+    pub fn all() -> Vec<Self> {
+        let mut all = vec![Self::Gnss, Self::ImmUkf, Self::Dnn, Self::DnnDenied, Self::HomographyDenied];
+        for recipe in Recipe::ALL {
+            all.extend([Step::OneStep, Step::TwoStep, Step::Denied].map(|step| Self::Recipe(recipe, step)));
+        }
+        all.extend([Self::Track, Self::TrackDenied]);
+        all
+    }
+
+    /// Methods from names with commas between; `all` is all.
+    ///
+    /// # Errors
+    /// Names `methods` for a name that is none.
+    pub fn list(text: &str) -> Result<Vec<Self>> {
+        if text == "all" {
+            return Ok(Self::all());
+        }
+        text.split(',').map(|name| name.trim().parse()).collect()
+    }
+
+    /// The recipe whose model it asks; `default` is that of the tracks.
+    #[must_use]
+    pub const fn recipe(self, default: Recipe) -> Option<Recipe> {
+        match self {
+            Self::Recipe(recipe, _) => Some(recipe),
+            Self::Track | Self::TrackDenied => Some(default),
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for Method {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Gnss => out.pad("gnss"),
+            Self::ImmUkf => out.pad("imm_ukf"),
+            Self::Dnn => out.pad("dnn"),
+            Self::DnnDenied => out.pad("dnn.denied"),
+            Self::HomographyDenied => out.pad("homography.denied"),
+            Self::Track => out.pad("track"),
+            Self::TrackDenied => out.pad("track.denied"),
+            Self::Recipe(recipe, step) => {
+                let step = match step {
+                    Step::OneStep => "one_step",
+                    Step::TwoStep => "two_step",
+                    Step::Denied => "denied",
+                };
+                out.pad(&format!("{recipe}.{step}"))
+            }
+        }
+    }
+}
+
+impl FromStr for Method {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::all().into_iter().find(|method| method.to_string() == name).ok_or_else(|| {
+            let names: Vec<String> = Self::all().iter().map(Self::to_string).collect();
+            Error::invalid("methods", format!("{name:?} is none of all, {}", names.join(", ")))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_name_is_read_back() {
+        let all = Method::all();
+        assert_eq!(all.len(), 19);
+        for method in &all {
+            assert_eq!(method.to_string().parse::<Method>().expect("a name"), *method);
+        }
+        assert_eq!(Method::list("all").expect("all"), all);
+        let two = Method::list("gnss, auto.denied").expect("two");
+        assert_eq!(two, [Method::Gnss, Method::Recipe(Recipe::Auto, Step::Denied)]);
+        assert!(Method::list("gnss,guess").is_err());
+    }
+}

@@ -1,0 +1,164 @@
+//! What is said of a method's errors.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+/// Radii (m) whose share of errors is reported.
+pub const BOUNDS_M: [f64; 8] = [0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0];
+/// Radius that holds half of an isotropic normal plane, in radii that hold 95 %:
+/// sqrt(ln 0.5 / ln 0.05).
+const R50_PER_R95: f64 = 0.481_015_8;
+
+/// One judged answer.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Judged {
+    /// Horizontal error, m.
+    pub error_m: f64,
+    /// The radius that the method states for 95 %, m, if it states one.
+    pub r95_m: Option<f64>,
+}
+
+/// Figures of the horizontal error of one method with one seed, or their means over seeds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Metrics {
+    /// Mean.
+    pub mean_m: f64,
+    /// Median.
+    pub median_m: f64,
+    /// 95 % of errors are below.
+    pub p95_m: f64,
+    /// Largest.
+    pub max_m: f64,
+    /// Variance about the mean.
+    pub variance_m2: f64,
+    /// Root of the mean square.
+    pub rmse_m: f64,
+    /// Share of errors at most as large as each of [`BOUNDS_M`], by the bound's text.
+    pub share_within: BTreeMap<String, f64>,
+    /// Share of true positions inside the stated 50 % radius, if the method states one.
+    pub coverage50: Option<f64>,
+    /// The same of the 95 % radius.
+    pub coverage95: Option<f64>,
+    /// Judged answers.
+    pub n: usize,
+}
+
+impl Metrics {
+    /// Figures of these answers; `None` of none.
+    #[must_use]
+    pub fn of(answers: &[Judged]) -> Option<Self> {
+        let n = answers.len();
+        let mut errors_m: Vec<f64> = answers.iter().map(|answer| answer.error_m).collect();
+        errors_m.sort_by(f64::total_cmp);
+        let max_m = *errors_m.last()?;
+        let count = n as f64;
+        let mean_m = errors_m.iter().sum::<f64>() / count;
+        let square_m2 = errors_m.iter().map(|error| error * error).sum::<f64>() / count;
+        let within = |bound_m: f64| errors_m.partition_point(|&error_m| error_m <= bound_m) as f64 / count;
+        Some(Self {
+            mean_m,
+            median_m: quantile(&errors_m, 0.5),
+            p95_m: quantile(&errors_m, 0.95),
+            max_m,
+            variance_m2: errors_m.iter().map(|error_m| (error_m - mean_m).powi(2)).sum::<f64>() / count,
+            rmse_m: square_m2.sqrt(),
+            share_within: BOUNDS_M.iter().map(|&bound_m| (format!("{bound_m}"), within(bound_m))).collect(),
+            coverage50: coverage(answers, R50_PER_R95),
+            coverage95: coverage(answers, 1.0),
+            n,
+        })
+    }
+
+    /// The mean of each figure over seeds, but the largest error of all; `None` of no seed.
+    #[must_use]
+    pub fn over_seeds(seeds: &[Self]) -> Option<Self> {
+        let first = seeds.first()?;
+        let count = seeds.len() as f64;
+        let mean = |figure: &dyn Fn(&Self) -> f64| seeds.iter().map(figure).sum::<f64>() / count;
+        let optional = |figure: &dyn Fn(&Self) -> Option<f64>| {
+            seeds.iter().map(figure).sum::<Option<f64>>().map(|sum| sum / count)
+        };
+        let shares = first.share_within.keys().map(|bound| {
+            (bound.clone(), mean(&|one| one.share_within.get(bound).copied().unwrap_or_default()))
+        });
+        Some(Self {
+            mean_m: mean(&|one| one.mean_m),
+            median_m: mean(&|one| one.median_m),
+            p95_m: mean(&|one| one.p95_m),
+            max_m: seeds.iter().map(|one| one.max_m).fold(0.0, f64::max),
+            variance_m2: mean(&|one| one.variance_m2),
+            rmse_m: mean(&|one| one.rmse_m),
+            share_within: shares.collect(),
+            coverage50: optional(&|one| one.coverage50),
+            coverage95: optional(&|one| one.coverage95),
+            n: first.n,
+        })
+    }
+}
+
+/// Linear between neighbours, of ascending values, at least one.
+fn quantile(ascending: &[f64], part: f64) -> f64 {
+    let place = part * (ascending.len() - 1) as f64;
+    let low = place.floor() as usize;
+    let high = (low + 1).min(ascending.len() - 1);
+    ascending[low] + (place - place.floor()) * (ascending[high] - ascending[low])
+}
+
+fn coverage(answers: &[Judged], factor: f64) -> Option<f64> {
+    let inside = answers
+        .iter()
+        .map(|answer| answer.r95_m.map(|r95_m| f64::from(u8::from(answer.error_m <= factor * r95_m))));
+    let sum: Option<f64> = inside.sum();
+    sum.filter(|_| !answers.is_empty()).map(|sum| sum / answers.len() as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    fn judged(errors_m: &[f64]) -> Vec<Judged> {
+        errors_m.iter().map(|&error_m| Judged { error_m, r95_m: None }).collect()
+    }
+
+    fn near(one: f64, other: f64) -> bool {
+        (one - other).abs() < 1e-9
+    }
+
+    #[test]
+    fn figures_of_known_errors() {
+        let metrics = Metrics::of(&judged(&[4.0, 1.0, 3.0, 2.0, 10.0])).expect("some");
+        assert!(near(metrics.mean_m, 4.0) && near(metrics.median_m, 3.0) && near(metrics.max_m, 10.0));
+        assert!(near(metrics.variance_m2, 10.0) && near(metrics.rmse_m, 26.0f64.sqrt()));
+        assert!(near(metrics.p95_m, 8.8), "{}", metrics.p95_m);
+        assert!(near(metrics.share_within["3"], 0.6) && near(metrics.share_within["0.5"], 0.0));
+        assert_eq!((metrics.coverage95, metrics.n), (None, 5));
+        assert_eq!(Metrics::of(&[]), None);
+    }
+
+    #[test]
+    fn an_honest_radius_covers_its_share() {
+        let mut random = ChaCha8Rng::seed_from_u64(5);
+        // Rayleigh errors of sigma 1, whose 95 % radius is known.
+        let answers: Vec<Judged> = (0..20_000)
+            .map(|_| Judged {
+                error_m: (-2.0 * (1.0 - random.random::<f64>()).ln()).sqrt(),
+                r95_m: Some(2.447_746_8),
+            })
+            .collect();
+        let metrics = Metrics::of(&answers).expect("some");
+        assert!((metrics.coverage95.expect("stated") - 0.95).abs() < 0.006, "{metrics:?}");
+        assert!((metrics.coverage50.expect("stated") - 0.5).abs() < 0.015, "{metrics:?}");
+    }
+
+    #[test]
+    fn seeds_are_averaged_and_the_largest_error_kept() {
+        let seeds =
+            [&[1.0, 3.0][..], &[2.0, 6.0][..]].map(|errors| Metrics::of(&judged(errors)).expect("some"));
+        let both = Metrics::over_seeds(&seeds).expect("two");
+        assert!(near(both.mean_m, 3.0) && near(both.max_m, 6.0));
+        assert_eq!(both.n, 2);
+    }
+}

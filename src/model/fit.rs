@@ -121,6 +121,10 @@ pub fn fit(
         parts.parameters.insert("image_height_px".to_owned(), f64::from(size.height_px()));
     }
     let mut held_out = reports[kept].held_out.clone();
+    if e_gnss_source == GnssErrorSource::Estimated {
+        // What lasts for a whole block of time cannot be seen within it.
+        parts.e_gnss_m2 += uncertainty::lasting_m2(&residuals[kept], &noise);
+    }
     if candidate.way != Way::Paper {
         held_out.e_regression_m2 = uncertainty::calibrate(&mut parts, &rows, &residuals[kept], &noise)?;
         held_out.coverage95_of_fixes = coverage_of_fixes(&parts, &rows, &residuals[kept])?;
@@ -128,7 +132,7 @@ pub fn fit(
     run.note(&format!(
         "the regressed position's own error is {:.2} m per axis, the receiver's {:.2} m",
         held_out.e_regression_m2.sqrt(),
-        e_gnss_m2.sqrt()
+        parts.e_gnss_m2.sqrt()
     ))?;
     put_noise(&mut parts, &noise, candidate);
     let summary =

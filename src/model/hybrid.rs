@@ -19,7 +19,7 @@ use crate::geo::EastNorth;
 
 const HIDDEN: [usize; 2] = [24, 24];
 /// Passes over the samples unless the run says otherwise.
-pub(super) const EPOCHS: u32 = 120;
+pub(super) const EPOCHS: u32 = 60;
 /// wX : wZ on scaled inputs.
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.5, regression: 1.0 };
 

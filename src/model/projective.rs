@@ -25,7 +25,7 @@ use crate::geo::EastNorth;
 /// Hidden units of the residual network.
 const HIDDEN: usize = 16;
 /// Passes over the samples unless the run says otherwise.
-pub(super) const EPOCHS: u32 = 80;
+pub(super) const EPOCHS: u32 = 50;
 /// Prior standard deviation of a residual column's weight, in units of position.
 const RESIDUAL_SIGMA: f64 = 0.1;
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.2, regression: 1.0 };

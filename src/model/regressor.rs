@@ -15,8 +15,6 @@ use crate::geo::{EastNorth, LocalPlane};
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
 /// Beyond this many radii of the training boxes a box is outside.
 const OUTSIDE_RADII: f64 = 1.5;
-/// Factor on the error variance of boxes that the image's border cuts where few were in training.
-const BORDER_FACTOR: f64 = 4.0;
 
 /// The one-step answer for one box.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -49,6 +47,7 @@ pub struct Regressor {
     /// Es, m2 per unit of reconstruction error beyond the usual.
     error_scale: f64,
     reconstruction_usual: f64,
+    border_factor: f64,
     image_size: Option<ImageSize>,
     coverage: Coverage,
     kind: Kind,
@@ -68,9 +67,12 @@ impl Regressor {
         };
         let image_size = image_size_of(&parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
-        let reconstruction_usual = match kind {
-            Kind::Paper(_) => 0.0,
-            _ => parts.positive_parameter("reconstruction_usual")?,
+        let (reconstruction_usual, border_factor) = match kind {
+            Kind::Paper(_) => (0.0, 1.0),
+            _ => (
+                parts.positive_parameter("reconstruction_usual")?,
+                parts.positive_parameter("border_factor")?,
+            ),
         };
         let Parts { plane, e_gnss_m2, error_scale, tensors, .. } = parts;
         tensors.finish()?;
@@ -78,12 +80,7 @@ impl Regressor {
             plane,
             e_gnss_m2,
             r95_scale,
-            error_scale,
-            reconstruction_usual,
-            image_size,
-            coverage,
-            kind,
-        })
+            error_scale, reconstruction_usual, border_factor, image_size, coverage, kind })
     }
 
     /// The plane in which it answers.
@@ -96,6 +93,11 @@ impl Regressor {
     #[must_use]
     pub const fn e_gnss_m2(&self) -> f64 {
         self.e_gnss_m2
+    }
+
+    /// Size of the image that it was trained on, if known.
+    pub(super) const fn image_size(&self) -> Option<ImageSize> {
+        self.image_size
     }
 
     /// Where the target in a box stands, and how sure that is. The fix only matters to the network
@@ -137,7 +139,7 @@ impl Regressor {
             squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px());
         let excess = (reconstruction_error - self.reconstruction_usual).max(0.0);
         let beyond = (radii - 1.0).max(0.0);
-        let border = if bounding_box.touches_border(self.image_size) { BORDER_FACTOR } else { 1.0 };
+        let border = if bounding_box.touches_border(self.image_size) { self.border_factor } else { 1.0 };
         let e_m2 = (usual_m2 * border + self.error_scale * excess) * (1.0 + beyond * beyond);
         (regressed, reconstruction_error, e_m2)
     }

@@ -39,8 +39,8 @@ pub(super) enum Way {
 const HOMOGRAPHY: Candidate = candidate("projective/foot", Way::Projective(variant(false, false)), false);
 const SIDES: Candidate = candidate("projective/sides", Way::Projective(variant(true, false)), false);
 const RESIDUAL: Candidate = candidate("projective/residual", Way::Projective(variant(true, true)), false);
-const RESIDUAL_SMOOTHED: Candidate =
-    candidate("projective/residual+smoothed", Way::Projective(variant(true, true)), true);
+const SIDES_SMOOTHED: Candidate =
+    candidate("projective/sides+smoothed", Way::Projective(variant(true, false)), true);
 const HYBRID: Candidate = candidate("hybrid", Way::Hybrid, false);
 const HYBRID_SMOOTHED: Candidate = candidate("hybrid+smoothed", Way::Hybrid, true);
 const PAPER: Candidate = candidate("paper", Way::Paper, false);
@@ -58,8 +58,8 @@ pub(super) const fn candidates(recipe: Recipe) -> &'static [Candidate] {
     match recipe {
         Recipe::Paper => &[PAPER],
         Recipe::Hybrid => &[HYBRID, HYBRID_SMOOTHED],
-        Recipe::Projective => &[HOMOGRAPHY, SIDES, RESIDUAL, RESIDUAL_SMOOTHED],
-        Recipe::Auto => &[HOMOGRAPHY, SIDES, RESIDUAL, RESIDUAL_SMOOTHED, HYBRID, HYBRID_SMOOTHED],
+        Recipe::Projective => &[HOMOGRAPHY, SIDES, SIDES_SMOOTHED, RESIDUAL],
+        Recipe::Auto => &[HOMOGRAPHY, SIDES, SIDES_SMOOTHED, RESIDUAL, HYBRID, HYBRID_SMOOTHED],
     }
 }
 

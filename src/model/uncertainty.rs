@@ -11,6 +11,7 @@ use super::artifact::Parts;
 use super::coverage::Coverage;
 use super::regressor::{R95_PER_SIGMA, Regressor};
 use super::rows::{Row, Rows, median};
+use super::select::BLOCKS;
 use super::whitening::FixNoise;
 use crate::domain::BoundingBox;
 use crate::geo::EastNorth;
@@ -21,8 +22,10 @@ const PATCHES: usize = 24;
 const UNKNOWNS_PER_AXIS: f64 = 4.0;
 /// The error varies over the image, so its distribution has longer tails than a normal one.
 const TAIL: f64 = 1.15;
+/// Factor on the error variance of boxes that the image's border cuts, where training had few.
+const RARE_BORDER_FACTOR: f64 = 4.0;
 /// Share of training boxes whose reconstruction error counts as usual.
-const USUAL: f64 = 0.95;
+const USUAL: f64 = 0.995;
 
 /// Sets the error's size and shape in the parts of a model.
 ///
@@ -41,7 +44,7 @@ pub(super) fn calibrate(
     let mut rebuilt: Vec<f64> =
         rows.rows.iter().map(|row| regressor.regress(&row.bounding_box, None).reconstruction_error).collect();
     rebuilt.sort_by(f64::total_cmp);
-    let usual = rebuilt[((rebuilt.len() - 1) as f64 * USUAL) as usize].max(1e-5);
+    let usual = rebuilt[((rebuilt.len() - 1) as f64 * USUAL) as usize].max(1e-4);
 
     let independent = independent_fixes(&rows.rows, noise);
     let floor_m2 = UNKNOWNS_PER_AXIS * noise.variance_m2 / independent;
@@ -49,7 +52,8 @@ pub(super) fn calibrate(
         Some(shared_m2) => shared_m2,
         None => few_passes_error(residuals, noise, independent),
     };
-    let error_m2 = shared_m2.max(floor_m2) + jitter_m2(&rows.rows, &points);
+    let lasting_m2 = lasting_m2(residuals, noise) / f64::from(BLOCKS);
+    let error_m2 = shared_m2.max(floor_m2).max(lasting_m2) + jitter_m2(&rows.rows, &points);
     let error_m2 = error_m2.max(1e-4);
 
     let boxes: Vec<BoundingBox> = coverage.boxes().collect();
@@ -73,6 +77,11 @@ pub(super) fn calibrate(
     parts.error_scale = height_m2.clamp(1e-9, 1e9);
     parts.parameters.insert("reconstruction_usual".to_owned(), usual);
     parts.parameters.insert("r95_scale".to_owned(), TAIL * R95_PER_SIGMA);
+    let image_size = regressor.image_size();
+    let cut = rows.rows.iter().filter(|row| row.bounding_box.touches_border(image_size)).count();
+    // Where training has seen many cut boxes, their error is in the figures already.
+    let rare = (cut as f64) < 0.03 * rows.rows.len() as f64;
+    parts.parameters.insert("border_factor".to_owned(), if rare { RARE_BORDER_FACTOR } else { 1.0 });
     parts.parameters.insert("independent_fixes".to_owned(), independent);
     parts.put_coverage(&coverage);
     Ok(error_m2)
@@ -81,6 +90,7 @@ pub(super) fn calibrate(
 /// Values with which the encoder can be built before it is calibrated.
 pub(super) fn set_plain(parts: &mut Parts, coverage: &Coverage) {
     parts.put_coverage(coverage);
+    parts.parameters.insert("border_factor".to_owned(), 1.0);
     parts.parameters.insert("reconstruction_usual".to_owned(), 1.0);
     parts.parameters.insert("r95_scale".to_owned(), R95_PER_SIGMA);
 }
@@ -95,6 +105,20 @@ pub(super) fn independent_fixes(rows: &[Row], noise: &FixNoise) -> f64 {
         sum += 1.0 / (noise.white_share / pass.len() as f64 + stays / spells);
     }
     sum.max(1.0)
+}
+
+/// Variance per axis of what stays the same for a whole block of time, m2: held-out fixes scatter
+/// more about a map that other blocks have made than a map's own fixes do, by it and by the share
+/// of it that those other blocks left in the map.
+pub(super) fn lasting_m2(residuals: &[[f64; 2]], noise: &FixNoise) -> f64 {
+    let others = f64::from(BLOCKS - 1);
+    (scatter_m2(residuals) - noise.variance_m2).max(0.0) * others / (others + 1.0)
+}
+
+/// Variance per axis of residuals by their median, which a few wild ones do not move, m2.
+fn scatter_m2(residuals: &[[f64; 2]]) -> f64 {
+    let squares = residuals.iter().map(|[east, north]| 0.5 * (east * east + north * north));
+    median(squares.collect()) / std::f64::consts::LN_2
 }
 
 /// Variance per axis that the passes through one patch share, over all patches, m2, with half of
@@ -149,10 +173,8 @@ fn shared_error(rows: &Rows, coverage: &Coverage, residuals: &[[f64; 2]]) -> Opt
 /// Where passes are too few to compare: the plain difference, not trusted below what so few
 /// independent fixes can tell.
 fn few_passes_error(residuals: &[[f64; 2]], noise: &FixNoise, independent: f64) -> f64 {
-    let squares = residuals.iter().map(|[east, north]| 0.5 * (east * east + north * north));
-    let scatter_m2 = median(squares.collect()) / std::f64::consts::LN_2;
     let doubt_m2 = noise.variance_m2 / independent.sqrt();
-    (scatter_m2 - noise.variance_m2).max(doubt_m2)
+    (scatter_m2(residuals) - noise.variance_m2).max(doubt_m2)
 }
 
 /// Variance per axis of the frame-to-frame unrest of regressed positions, m2, from their second

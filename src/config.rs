@@ -79,10 +79,6 @@ pub struct Limits {
     pub requests: usize,
     /// Event streams open at a time.
     pub event_streams: usize,
-    /// Targets that are followed at a time, per camera.
-    pub tracks_per_camera: usize,
-    /// Points that are kept of each track.
-    pub track_points: usize,
     /// Training runs that have not ended, over all cameras.
     pub live_runs: u32,
     /// Passes of one training run.
@@ -130,8 +126,6 @@ impl Default for Limits {
             streams_per_connection: 256,
             requests: 1_024,
             event_streams: 256,
-            tracks_per_camera: 1_000,
-            track_points: 600,
             live_runs: 256,
             epochs: 10_000,
             samples_per_run: 100_000,

@@ -58,10 +58,6 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::ModelNotFound => {
             (404, code::NOT_FOUND, "model-not-found", "There is no such model version")
         }
-        ErrorKind::EvaluationNotFound => {
-            (404, code::NOT_FOUND, "evaluation-not-found", "There is no such evaluation")
-        }
-        ErrorKind::TrackNotFound => (404, code::NOT_FOUND, "track-not-found", "There is no such track"),
         ErrorKind::CameraExists => {
             (409, code::ALREADY_EXISTS, "camera-exists", "A camera of that id exists already")
         }

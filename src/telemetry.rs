@@ -35,8 +35,6 @@ pub struct Metrics {
     samples_accepted: Counter,
     samples_duplicate: Counter,
     samples_rejected: Counter,
-    track_nis: Histogram,
-    track_rejections: Counter,
     runs_succeeded: Counter,
     runs_failed: Counter,
     runs_cancelled: Counter,
@@ -64,10 +62,6 @@ impl Metrics {
                 Matcher::Suffix("duration_seconds".to_owned()),
                 &[0.000_1, 0.000_3, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0],
             )
-            .and_then(|builder| {
-                let nis = Matcher::Full("sightfix_track_nis".to_owned());
-                builder.set_buckets_for_metric(nis, &[0.5, 1.0, 2.0, 4.0, 6.0, 9.0, 14.0, 20.0])
-            })
             .unwrap_or_else(|_| PrometheusBuilder::new())
             .build_recorder();
         let counter = |name: &'static str, help: &'static str, labels: Vec<Label>| {
@@ -99,14 +93,6 @@ impl Metrics {
             samples_accepted: samples("accepted"),
             samples_duplicate: samples("duplicate"),
             samples_rejected: samples("rejected"),
-            track_nis: histogram(
-                "sightfix_track_nis",
-                "Normalised innovation squared of track updates; its mean is 2 per measured position",
-            ),
-            track_rejections: plain(
-                "sightfix_track_rejections_total",
-                "Measured positions that tracks rejected",
-            ),
             runs_succeeded: runs(RunState::Succeeded),
             runs_failed: runs(RunState::Failed),
             runs_cancelled: runs(RunState::Cancelled),
@@ -142,14 +128,6 @@ impl Metrics {
         self.samples_accepted.increment(accepted);
         self.samples_duplicate.increment(duplicate);
         self.samples_rejected.increment(rejected);
-    }
-
-    /// A track was updated: its consistency, and how many measured positions it rejected.
-    pub fn tracked(&self, nis: Option<f64>, rejected: u64) {
-        if let Some(nis) = nis {
-            self.track_nis.record(nis);
-        }
-        self.track_rejections.increment(rejected);
     }
 
     /// A run has ended.

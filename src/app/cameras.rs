@@ -58,7 +58,6 @@ impl App {
     pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
         self.store.delete_camera(id, expected).await?;
         self.registry.forget(id);
-        self.tracks.forget(id);
         Ok(())
     }
 }

@@ -7,7 +7,6 @@ mod fusion;
 mod models;
 mod registry;
 mod samples;
-mod tracks;
 mod training;
 
 use std::sync::Arc;
@@ -22,7 +21,6 @@ use crate::telemetry::Metrics;
 pub use models::GnssErrorEstimate;
 pub use registry::Registry;
 pub use samples::{ImportReport, RejectedRow};
-pub use tracks::{TrackPoint, Tracks};
 pub use training::RunRequest;
 
 /// The application: everything a request needs, cheap to clone.
@@ -35,8 +33,6 @@ pub struct Parts {
     pub store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
-    /// Where targets are now.
-    pub tracks: Tracks,
     /// What time it is.
     pub clock: Clock,
     /// Ids and seeds.
@@ -63,8 +59,8 @@ impl App {
     ) -> crate::domain::Result<Self> {
         let registry = Registry::default();
         registry.refresh(&store).await?;
-        let (tracks, run_queued) = (Tracks::default(), Notify::new());
-        let parts = Parts { store, registry, tracks, clock, randomness, limits, metrics, run_queued };
+        let run_queued = Notify::new();
+        let parts = Parts { store, registry, clock, randomness, limits, metrics, run_queued };
         Ok(Self(Arc::new(parts)))
     }
 }

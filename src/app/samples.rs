@@ -12,6 +12,8 @@ use crate::store::{SampleFilter, SampleKey};
 
 /// Rows that go to the store at once.
 const BATCH_ROWS: usize = 1_000;
+/// Batches that are read ahead of the store.
+const BATCHES_AHEAD: usize = 8;
 
 /// What became of an import's rows.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -56,10 +58,14 @@ impl App {
         format: Format,
     ) -> Result<ImportReport> {
         let rules = self.row_rules(id).await?;
-        let (sender, mut batches) = mpsc::channel(4);
+        let (sender, mut batches) = mpsc::channel(BATCHES_AHEAD);
         let reading = tokio::task::spawn_blocking(move || read_batches(file, format, &rules, &sender));
         let mut report = ImportReport::default();
-        while let Some(batch) = batches.recv().await {
+        while let Some(mut batch) = batches.recv().await {
+            // What was read while the last batch was stored goes into one transaction.
+            while let Ok(more) = batches.try_recv() {
+                batch.extend(more);
+            }
             self.store_batch(id, batch, &mut report).await?;
         }
         let read = reading.await.map_err(Error::fault)?;

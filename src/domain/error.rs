@@ -33,10 +33,6 @@ pub enum ErrorKind {
     RunNotFound,
     /// No such model version.
     ModelNotFound,
-    /// No such evaluation.
-    EvaluationNotFound,
-    /// No such track.
-    TrackNotFound,
     /// A camera of that id exists already.
     CameraExists,
     /// `If-Match` names another revision than the stored one.

@@ -80,7 +80,13 @@ impl Regressor {
             plane,
             e_gnss_m2,
             r95_scale,
-            error_scale, reconstruction_usual, border_factor, image_size, coverage, kind })
+            error_scale,
+            reconstruction_usual,
+            border_factor,
+            image_size,
+            coverage,
+            kind,
+        })
     }
 
     /// The plane in which it answers.

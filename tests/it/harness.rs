@@ -72,15 +72,33 @@ impl TestServer {
 
     /// Starts over a data folder with settings from the environment.
     pub(crate) fn start_with(folder: &Path, settings: &[(&str, &str)]) -> Self {
-        let mut process = sightfix()
-            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
-            .arg(folder)
-            .env("SIGHTFIX_LOG_FORMAT", "json")
-            .envs(settings.iter().copied())
-            .stdout(Stdio::null())
-            .stderr(Stdio::piped())
-            .spawn()
-            .expect("the binary starts");
+        let mut command = sightfix();
+        command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
+        command.envs(settings.iter().copied()).stdout(Stdio::null());
+        Self::run(command)
+    }
+
+    /// Starts the demonstration over an empty folder; gives what it prints once it answers.
+    pub(crate) fn demonstrate(folder: &Path) -> (Self, String) {
+        let mut command = sightfix();
+        command.args(["serve", "--demo", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
+        command.stdout(Stdio::piped());
+        let mut server = Self::run(command);
+        let lines = BufReader::new(server.process.stdout.take().expect("piped")).lines();
+        let mut said = String::new();
+        for line in lines.map_while(Result::ok) {
+            said.push_str(&line);
+            said.push('\n');
+            if line.trim_end().ends_with("/docs") {
+                break;
+            }
+        }
+        (server, said)
+    }
+
+    fn run(mut command: Command) -> Self {
+        let command = command.env("SIGHTFIX_LOG_FORMAT", "json").stderr(Stdio::piped());
+        let mut process = command.spawn().expect("the binary starts");
         let mut lines = BufReader::new(process.stderr.take().expect("piped")).lines();
         let mut address = None;
         for line in lines.by_ref() {

@@ -1,6 +1,8 @@
 //! The main job, end to end, through the real binary and its real port.
 
 use serde_json::{Value, json};
+use sightfix::grpc::proto;
+use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 
 use crate::harness::{Answer, TestServer, data_folder, run, shared, simulated_csv};
 
@@ -39,6 +41,27 @@ async fn main_job(image_size: Option<Value>, csv: String, rows: u64, epochs: u32
     assert!(number("r95_m") > 0.0 && number("e_regression_m2") > 0.0 && number("e_gnss_m2") > 0.0);
     assert_eq!(item["model_version"], 1);
 
+    let by_grpc = fuse_by_grpc(&server, &observation).await;
+    let position =
+        |name: &str| [number_of(&item[name]["longitude_deg"]), number_of(&item[name]["latitude_deg"])];
+    let told = |position: Option<proto::Position>| {
+        position
+            .and_then(|position| Some([position.longitude_deg?, position.latitude_deg?]))
+            .expect("a position")
+    };
+    assert_eq!(told(by_grpc.fused).map(f64::to_bits), position("fused").map(f64::to_bits));
+    assert_eq!(told(by_grpc.regressed).map(f64::to_bits), position("regressed").map(f64::to_bits));
+    for (grpc, rest) in [
+        (by_grpc.confidence_regression, "confidence_regression"),
+        (by_grpc.confidence_gnss, "confidence_gnss"),
+        (by_grpc.e_regression_m2.expect("a box was given"), "e_regression_m2"),
+        (by_grpc.e_gnss_m2.expect("a fix was given"), "e_gnss_m2"),
+        (by_grpc.r95_m, "r95_m"),
+        (by_grpc.reconstruction_error.expect("a box was given"), "reconstruction_error"),
+    ] {
+        assert_eq!(grpc.to_bits(), number(rest).to_bits(), "{rest} differs between the transports");
+    }
+
     server.kill();
     let server = TestServer::start(folder.path());
     let count = server.get("/v1/cameras/square/samples/count").await.expect(200).json();
@@ -46,6 +69,38 @@ async fn main_job(image_size: Option<Value>, csv: String, rows: u64, epochs: u32
     let after = server.post("/v1/cameras/square/fusions", &observation).await.expect(200).json();
     assert_eq!(after, fused, "the same model gives the same answer after a crash");
     assert!(server.terminate(), "the server ends in order");
+}
+
+fn number_of(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+}
+
+/// The same observation by the other transport, on the same port.
+async fn fuse_by_grpc(server: &TestServer, observation: &Value) -> proto::FusedFix {
+    let time: jiff::Timestamp = observation["time"].as_str().expect("text").parse().expect("an instant");
+    let (sides, fix) = (&observation["bounding_box"], &observation["fix"]);
+    let request = proto::FuseRequest {
+        camera_id: "square".to_owned(),
+        observations: vec![proto::Observation {
+            time: Some(prost_types::Timestamp { seconds: time.as_second(), nanos: time.subsec_nanosecond() }),
+            target_id: None,
+            bounding_box: Some(proto::BoundingBox {
+                left_px: sides["left_px"].as_f64(),
+                top_px: sides["top_px"].as_f64(),
+                width_px: sides["width_px"].as_f64(),
+                height_px: sides["height_px"].as_f64(),
+            }),
+            fix: Some(proto::Fix {
+                longitude_deg: fix["longitude_deg"].as_f64(),
+                latitude_deg: fix["latitude_deg"].as_f64(),
+                sigma_m: None,
+            }),
+        }],
+    };
+    let address = format!("http://{}", server.address);
+    let mut client = FusionServiceClient::connect(address).await.expect("gRPC is on the same port");
+    let answer = client.fuse(request).await.expect("an answer").into_inner();
+    answer.fusions.into_iter().next().expect("one answer for one observation")
 }
 
 async fn import(server: &TestServer, csv: &str) -> Answer {
@@ -106,4 +161,15 @@ async fn the_command_line_does_the_same_without_a_server() {
     let server = TestServer::start(&folder.path().join("data"));
     let camera = server.get("/v1/cameras/c").await.expect(200).json();
     assert_eq!(camera["active_model"], 1, "{camera}");
+}
+
+#[tokio::test]
+async fn the_demonstration_prints_what_works() {
+    let folder = data_folder();
+    let (server, said) = TestServer::demonstrate(folder.path());
+    let observation = said.split('\'').nth(1).unwrap_or_else(|| panic!("no body for curl: {said}"));
+    let observation: Value = serde_json::from_str(observation).expect("JSON");
+    let fused = server.post("/v1/cameras/demo/fusions", &observation).await.expect(200).json();
+    assert!(fused["items"][0]["r95_m"].as_f64().is_some_and(|r95_m| r95_m > 0.0), "{fused}");
+    assert!(said.contains("grpcurl -plaintext") && said.contains("/docs"), "{said}");
 }

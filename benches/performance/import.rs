@@ -82,7 +82,7 @@ impl Peer {
         let made = runtime().block_on(async {
             let store = sightfix::store::Store::open(folder).await?;
             store.close().await;
-            sightfix::domain::Result::Ok(())
+            Ok::<(), sightfix::domain::Error>(())
         });
         made.expect("a new database");
         let connection = rusqlite::Connection::open(folder.join("sightfix.db")).expect("the database");

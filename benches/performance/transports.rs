@@ -142,7 +142,8 @@ fn proto_request(served: &Served, items: usize) -> proto::FuseRequest {
     let observations = served.observations[..items]
         .iter()
         .map(|observation| {
-            let [left_px, top_px, width_px, height_px] = observation.bounding_box.expect("a box").sides_px();
+            let [left_px, top_px, width_px, height_px] =
+                observation.bounding_box.expect("a box").sides_px().map(Some);
             let fix = observation.fix.expect("a fix").position;
             proto::Observation {
                 time: Some(prost_types::Timestamp {
@@ -152,8 +153,8 @@ fn proto_request(served: &Served, items: usize) -> proto::FuseRequest {
                 target_id: observation.target_id.as_ref().map(ToString::to_string),
                 bounding_box: Some(proto::BoundingBox { left_px, top_px, width_px, height_px }),
                 fix: Some(proto::Fix {
-                    longitude_deg: fix.longitude_deg(),
-                    latitude_deg: fix.latitude_deg(),
+                    longitude_deg: Some(fix.longitude_deg()),
+                    latitude_deg: Some(fix.latitude_deg()),
                     sigma_m: None,
                 }),
             }

@@ -67,9 +67,12 @@ impl GnssErrorEstimate {
             }
         }
         let Some(plane) = plane.filter(|_| count >= FEWEST) else {
+            let told = rejected_rows.first().map_or_else(String::new, |row: &RowError| {
+                format!("; {rejected} were rejected, first line {}: {}: {}", row.line, row.field, row.reason)
+            });
             return Err(Error::invalid(
                 "fixes",
-                format!("are {count}, at least {FEWEST} from one fixed point are needed"),
+                format!("are {count}, at least {FEWEST} from one fixed point are needed{told}"),
             ));
         };
         let [east_variance_m2, north_variance_m2] = squares.map(|sum| sum / (count - 1) as f64);

@@ -65,6 +65,12 @@ enum Command {
 }
 
 impl Cli {
+    /// The command that the process was started with; ends the process where it is none.
+    #[must_use]
+    pub fn from_arguments() -> Self {
+        Self::parse()
+    }
+
     /// Runs the command to its end.
     ///
     /// # Errors

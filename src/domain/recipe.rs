@@ -11,11 +11,11 @@ pub enum Recipe {
     /// Liang et al. 2022 to the letter: raw pixels, standardised degrees, weights 1 : 2000, Es by (4).
     Paper,
     /// The same hybrid loss in metres and scaled inputs, box-only encoder, robust Es.
-    #[default]
     Hybrid,
     /// A learnt homography of the foot point with a small residual network.
     Projective,
     /// Trains the candidates and keeps the best on held-out blocks of time.
+    #[default]
     Auto,
 }
 

@@ -333,7 +333,7 @@ impl<'a> Run<'a> {
     /// The recipes refuse by themselves; the network has no such check.
     fn enough(&self) -> Result<(), String> {
         let fewest = FEWEST_SAMPLES;
-        if self.train.len() < fewest {
+        if (self.train.len() as u64) < fewest {
             return Err(format!("needs at least {fewest} training samples, has {}", self.train.len()));
         }
         Ok(())

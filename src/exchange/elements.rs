@@ -95,17 +95,14 @@ impl<R: Read> Elements<R> {
         }
         self.element.clear();
         let mut nesting = Nesting::default();
-        let mut byte = first;
-        loop {
-            if nesting.is_outside() && matches!(byte, b',' | b']' | b'}') {
-                break;
+        let byte = match first {
+            b',' | b']' | b'}' => first,
+            _ => {
+                nesting.enter(first);
+                self.element.push(first);
+                self.gather_rest(&mut nesting)?
             }
-            nesting.enter(byte);
-            if self.element.len() <= LONGEST_ROW_BYTES {
-                self.element.push(byte);
-            }
-            byte = self.byte()?.ok_or_else(|| self.broken_off())?;
-        }
+        };
         self.count += 1;
         let is_blank = self.element.iter().all(u8::is_ascii_whitespace);
         match byte {
@@ -117,6 +114,32 @@ impl<R: Read> Elements<R> {
                 Ok(true)
             }
             _ => Ok(true),
+        }
+    }
+
+    /// Gathers an element up to the comma or bracket that ends it, which is taken and given back.
+    fn gather_rest(&mut self, nesting: &mut Nesting) -> Result<u8> {
+        loop {
+            let bytes = fill(&mut self.reader)?;
+            if bytes.is_empty() {
+                return Err(self.broken_off());
+            }
+            let end = bytes.iter().position(|&byte| {
+                let ends = nesting.is_outside() && matches!(byte, b',' | b']' | b'}');
+                if !ends {
+                    nesting.enter(byte);
+                }
+                ends
+            });
+            let part = &bytes[..end.unwrap_or(bytes.len())];
+            // One byte too many is kept, to tell that the element is too long.
+            let room = (LONGEST_ROW_BYTES + 1).saturating_sub(self.element.len());
+            self.element.extend_from_slice(&part[..part.len().min(room)]);
+            let (taken, ending) = (part.len(), end.map(|at| bytes[at]));
+            self.reader.consume(taken + usize::from(ending.is_some()));
+            if let Some(ending) = ending {
+                return Ok(ending);
+            }
         }
     }
 
@@ -145,18 +168,22 @@ impl<R: Read> Elements<R> {
     }
 
     fn byte(&mut self) -> Result<Option<u8>> {
-        loop {
-            match self.reader.fill_buf() {
-                Ok(bytes) => {
-                    let next = bytes.first().copied();
-                    self.reader.consume(usize::from(next.is_some()));
-                    return Ok(next);
-                }
-                Err(error) if error.kind() == ErrorKindOfIo::Interrupted => {}
-                Err(error) => return Err(Error::fault(error)),
-            }
+        let next = fill(&mut self.reader)?.first().copied();
+        self.reader.consume(usize::from(next.is_some()));
+        Ok(next)
+    }
+}
+
+/// Bytes at hand; none at the end of the file.
+fn fill<R: Read>(reader: &mut BufReader<R>) -> Result<&[u8]> {
+    loop {
+        match reader.fill_buf() {
+            Ok(_) => break,
+            Err(error) if error.kind() == ErrorKindOfIo::Interrupted => {}
+            Err(error) => return Err(Error::fault(error)),
         }
     }
+    Ok(reader.buffer())
 }
 
 /// How deep in brackets and quotes a byte stands.

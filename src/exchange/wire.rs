@@ -219,10 +219,7 @@ impl Observation<'_> {
 }
 
 /// A box that belongs to an image of that size; errors are named below `bounding_box`.
-pub fn box_within(
-    sides: BoundingBox,
-    image_size: Option<domain::ImageSize>,
-) -> Result<domain::BoundingBox> {
+pub fn box_within(sides: BoundingBox, image_size: Option<domain::ImageSize>) -> Result<domain::BoundingBox> {
     let checked = sides.to_domain().and_then(|bounding_box| match image_size {
         Some(size) => bounding_box.within(size),
         None => Ok(bounding_box),

@@ -67,7 +67,8 @@ pub fn estimate_clock_offset(
     let boxes: Vec<(f64, SVector<f64, FEATURES>)> =
         detections.iter().map(|it| (seconds(it.time), features(it.bounding_box))).collect();
     let changes = changes(&boxes, search.change_s);
-    let explained = |offset_s: f64| explained(&changes, &path, offset_s);
+    let width_s = width_s(&path);
+    let explained = |offset_s: f64| explained(&changes, &path, width_s, offset_s);
 
     let coarse_s = 0.5;
     let steps = (search.largest_s / coarse_s).floor().max(1.0);
@@ -136,14 +137,19 @@ struct Explained {
 }
 
 /// Least squares of the fixes' changes on the boxes', both axes at once.
-fn explained(changes: &[Change], path: &[(f64, EastNorth)], offset_s: f64) -> Option<Explained> {
+fn explained(
+    changes: &[Change],
+    path: &[(f64, EastNorth)],
+    width_s: f64,
+    offset_s: f64,
+) -> Option<Explained> {
     let mut normal = SMatrix::<f64, FEATURES, FEATURES>::zeros();
     let mut mixed = SMatrix::<f64, FEATURES, 2>::zeros();
     let (mut total, mut rows, mut span_s, mut last_s) = (0.0, 0, 0.0, f64::NEG_INFINITY);
     for change in changes {
         // A fix of receiver time t belongs to camera time t + offset.
         let (Some(first), Some(last)) =
-            (place(path, change.from_s - offset_s), place(path, change.to_s - offset_s))
+            (place(path, width_s, change.from_s - offset_s), place(path, width_s, change.to_s - offset_s))
         else {
             continue;
         };
@@ -163,21 +169,40 @@ fn explained(changes: &[Change], path: &[(f64, EastNorth)], offset_s: f64) -> Op
     Some(Explained { share: (solved.dot(&mixed) / total).clamp(0.0, 1.0), rows, span_s })
 }
 
-/// Where the receiver says it was, between its fixes.
-fn place(path: &[(f64, EastNorth)], at_s: f64) -> Option<EastNorth> {
-    let after = path.partition_point(|(time_s, _)| *time_s < at_s);
-    let (last_s, last) = path.get(after)?;
-    if (last_s - at_s).abs() < 1e-9 {
-        return Some(*last);
-    }
-    let (first_s, first) = path.get(after.checked_sub(1)?)?;
-    let gap_s = last_s - first_s;
-    if gap_s > LONGEST_GAP_S {
+/// Where the receiver says it was, smoothed over its neighbours: a straight line fitted with
+/// Gaussian weights. Plain interpolation halves the noise between fixes and not at them, and so
+/// draws every estimate to half an interval.
+fn place(path: &[(f64, EastNorth)], width_s: f64, at_s: f64) -> Option<EastNorth> {
+    let reach_s = 3.0 * width_s;
+    let begin = path.partition_point(|(time_s, _)| *time_s < at_s - reach_s);
+    let middle = path.partition_point(|(time_s, _)| *time_s < at_s);
+    let end = path.partition_point(|(time_s, _)| *time_s <= at_s + reach_s);
+    // Fixes on both sides, and no hole where the instant lies.
+    let (before, after) = (path.get(middle.checked_sub(1)?)?, path.get(middle)?);
+    if after.0 - before.0 > LONGEST_GAP_S || begin + 1 >= end {
         return None;
     }
-    let share = (at_s - first_s) / gap_s;
-    Some(EastNorth {
-        east_m: first.east_m + share * (last.east_m - first.east_m),
-        north_m: first.north_m + share * (last.north_m - first.north_m),
-    })
+    let mut moments = [0.0; 3];
+    let mut sums = [[0.0; 2]; 2];
+    for (time_s, point) in &path[begin..end] {
+        let away_s = time_s - at_s;
+        let weight = (-0.5 * (away_s / width_s).powi(2)).exp();
+        moments[0] += weight;
+        moments[1] += weight * away_s;
+        moments[2] += weight * away_s * away_s;
+        for (sum, value) in sums.iter_mut().zip([point.east_m, point.north_m]) {
+            sum[0] += weight * value;
+            sum[1] += weight * away_s * value;
+        }
+    }
+    let determinant = moments[0] * moments[2] - moments[1] * moments[1];
+    let level = |sum: [f64; 2]| (moments[2] * sum[0] - moments[1] * sum[1]) / determinant;
+    (determinant > 1e-9).then(|| EastNorth { east_m: level(sums[0]), north_m: level(sums[1]) })
+}
+
+/// Width of the smoothing, s: three quarters of the fixes' usual interval.
+fn width_s(path: &[(f64, EastNorth)]) -> f64 {
+    let mut intervals: Vec<f64> = path.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
+    intervals.sort_by(f64::total_cmp);
+    0.75 * intervals.get(intervals.len() / 2).copied().unwrap_or(1.0).clamp(0.2, LONGEST_GAP_S)
 }

@@ -4,8 +4,9 @@
 
 pub mod clock_offset;
 pub mod pairing;
-pub mod plane_covariance;
+mod plane_covariance;
 pub mod track;
 pub mod two_step;
+pub mod watch;
 
 pub use plane_covariance::PlaneCovariance;

@@ -115,6 +115,7 @@ impl Parts {
     pub(super) fn put_coverage(&mut self, coverage: &Coverage) {
         let centres = coverage.centres.iter().flatten().copied().collect();
         self.tensors.put_f32("coverage.centres", &[coverage.centres.len(), DIMENSIONS], centres);
+        self.tensors.put_f32("coverage.errors_m2", &[coverage.centres.len()], coverage.errors_m2.clone());
         self.tensors.put_f32("coverage.units", &[DIMENSIONS], coverage.units.to_vec());
         self.tensors.put_f32("coverage.radius", &[1], vec![coverage.radius]);
     }
@@ -127,11 +128,15 @@ impl Parts {
         let centres = self.tensors.take_f32("coverage.centres", &[count, DIMENSIONS])?;
         let units = self.tensors.take_f32("coverage.units", &[DIMENSIONS])?;
         let radius = self.tensors.take_f32("coverage.radius", &[1])?[0];
+        let errors_m2 = self.tensors.take_f32("coverage.errors_m2", &[count])?;
+        if errors_m2.iter().any(|error_m2| *error_m2 <= 0.0) {
+            return Err(Error::invalid("weights", "coverage.errors_m2 must be above 0"));
+        }
         if radius <= 0.0 || units.iter().any(|unit| *unit <= 0.0) {
             return Err(Error::invalid("weights", "coverage.radius and coverage.units must be above 0"));
         }
         let units = std::array::from_fn(|axis| units[axis]);
-        Ok(Coverage { units, centres: centres.as_chunks().0.to_vec(), radius })
+        Ok(Coverage { units, centres: centres.as_chunks().0.to_vec(), radius, errors_m2 })
     }
 
     /// Stores a network as candle's `Linear` layers: `{prefix}encoder.0.weight` and so on.

@@ -18,6 +18,8 @@ pub(super) struct Coverage {
     pub(super) centres: Vec<[f32; DIMENSIONS]>,
     /// No training box is farther from its nearest centre, in units.
     pub(super) radius: f32,
+    /// Error variance of the regression at each centre, m2 per axis.
+    pub(super) errors_m2: Vec<f32>,
 }
 
 impl Coverage {
@@ -31,7 +33,7 @@ impl Coverage {
         });
         let points: Vec<[f32; DIMENSIONS]> =
             raw.iter().map(|point| std::array::from_fn(|axis| point[axis] / units[axis])).collect();
-        let mut coverage = Self { units, centres: Vec::new(), radius: 0.0 };
+        let mut coverage = Self { units, centres: Vec::new(), radius: 0.0, errors_m2: Vec::new() };
         let mut nearest = vec![f32::INFINITY; points.len()];
         let mut next = 0;
         while coverage.centres.len() < MOST_CENTRES && next < points.len() {
@@ -49,16 +51,64 @@ impl Coverage {
             next = at;
         }
         coverage.radius = coverage.radius.max(0.25);
+        coverage.errors_m2 = vec![1.0; coverage.centres.len()];
         coverage
     }
 
-    /// Distance to the nearest centre in radii: up to 1 among the training boxes.
+    /// The first centres alone, which cover the same boxes more coarsely.
+    pub(super) fn coarse(&self, centres: usize) -> Self {
+        let mut coarse = self.clone();
+        coarse.centres.truncate(centres);
+        coarse.errors_m2.truncate(centres);
+        coarse
+    }
+
+    /// The boxes at the centres.
+    pub(super) fn boxes(&self) -> impl Iterator<Item = BoundingBox> + '_ {
+        self.centres.iter().filter_map(|centre| {
+            let [foot_x, foot_y, width, height]: [f64; DIMENSIONS] =
+                std::array::from_fn(|axis| f64::from(centre[axis] * self.units[axis]));
+            let (width, height) = (width.exp(), height.exp());
+            BoundingBox::new(foot_x - 0.5 * width, foot_y - height, width, height).ok()
+        })
+    }
+
+    /// Index of the nearest centre.
+    pub(super) fn nearest(&self, bounding_box: &BoundingBox) -> usize {
+        let point = self.point(bounding_box);
+        let distances = self.centres.iter().map(|centre| squared(centre, &point)).enumerate();
+        distances.min_by(|one, other| one.1.total_cmp(&other.1)).map_or(0, |(at, _)| at)
+    }
+
     #[inline]
-    pub(super) fn distance(&self, bounding_box: &BoundingBox) -> f64 {
+    fn point(&self, bounding_box: &BoundingBox) -> [f32; DIMENSIONS] {
         let raw = coordinates(*bounding_box);
-        let point: [f32; DIMENSIONS] = std::array::from_fn(|axis| raw[axis] / self.units[axis]);
-        let least = self.centres.iter().map(|centre| squared(centre, &point)).fold(f32::INFINITY, f32::min);
-        f64::from(least.sqrt() / self.radius)
+        std::array::from_fn(|axis| raw[axis] / self.units[axis])
+    }
+
+    /// Distance to the nearest centre in radii (up to 1 among the training boxes), and the error
+    /// variance there, blended between centres by the inverse fourth power of their distance, m2.
+    #[inline]
+    pub(super) fn look_up(&self, bounding_box: &BoundingBox) -> (f64, f64) {
+        let point = self.point(bounding_box);
+        // A few percent of a radius, squared, so that a box upon a centre has a finite weight.
+        let soft = 1e-3 * self.radius * self.radius;
+        let mut lanes = [[f32::INFINITY, 0.0, 0.0]; 8];
+        for (at, (centre, error_m2)) in self.centres.iter().zip(&self.errors_m2).enumerate() {
+            let distance = squared(centre, &point);
+            let near = 1.0 / (distance + soft);
+            let [least, sum, weights] = &mut lanes[at % 8];
+            *least = least.min(distance);
+            *sum += near * near * error_m2;
+            *weights += near * near;
+        }
+        let least = lanes.iter().map(|lane| lane[0]).fold(f32::INFINITY, f32::min);
+        let sum: f32 = lanes.iter().map(|lane| lane[1]).sum();
+        let weights: f32 = lanes.iter().map(|lane| lane[2]).sum();
+        // Far away all weights vanish in f32; the factor on the distance rules there anyway.
+        let error_m2 =
+            if weights > 0.0 { sum / weights } else { self.errors_m2.iter().fold(0.0, |a, b| b.max(a)) };
+        (f64::from(least.sqrt() / self.radius), f64::from(error_m2))
     }
 }
 

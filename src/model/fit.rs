@@ -4,24 +4,23 @@
 //! and fills in the time that is left by its own clock.
 
 use std::ops::ControlFlow;
-use std::sync::Arc;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::artifact::{Artifact, FORMAT, Parts};
-use super::net::NetShape;
+use super::projection::{self, Form};
 use super::regressor::{R95_PER_SIGMA, Regressor};
 use super::rows::{Rows, hash_of};
-use super::train::{LossSums, LossWeights, Schedule, TrainError, TrainingSet, train};
-use super::{hybrid, noise, paper};
+use super::run::{Phase, Run};
+use super::select::{self, BLOCKS, Candidate, Common, Way};
+use super::train::TrainError;
+use super::uncertainty;
+use super::whitening::FixNoise;
 use crate::domain::{
-    EpochReport, Error, GnssError, GnssErrorSource, HeldOutError, ImageSize, ModelMetadata, OriginDeg,
-    Recipe, RunProgress, Sample,
+    CandidateReport, EpochReport, Error, GnssError, GnssErrorSource, HeldOutError, ImageSize, ModelMetadata,
+    OriginDeg, Recipe, RunProgress, Sample,
 };
-
-/// Blocks of time that are held out in turn.
-const BLOCKS: u32 = 4;
 
 /// What a fit is asked to do.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,14 +59,14 @@ pub enum FitError {
     Unusable(Error),
     /// Ours.
     #[error("the fit failed: {0}")]
-    Fault(String),
+    Fault(Box<dyn std::error::Error + Send + Sync>),
 }
 
 impl From<TrainError> for FitError {
     fn from(error: TrainError) -> Self {
         match error {
             TrainError::Cancelled => Self::Cancelled,
-            TrainError::Candle(cause) => Self::Fault(cause.to_string()),
+            TrainError::Candle(cause) => Self::Fault(cause.into()),
         }
     }
 }
@@ -88,188 +87,187 @@ pub fn fit(
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
     let rows = Rows::new(samples)?;
-    let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error);
-    let recipe = match options.recipe {
-        Recipe::Paper => Recipe::Paper,
-        Recipe::Hybrid | Recipe::Projective | Recipe::Auto => Recipe::Hybrid,
-    };
-    let own_epochs = if recipe == Recipe::Paper { paper::EPOCHS } else { hybrid::EPOCHS };
-    let epochs = options.epochs.unwrap_or(own_epochs).max(1);
-    let nets = if recipe == Recipe::Paper { 2 } else { 1 };
-    let mut run = Run {
-        observer,
-        progress: RunProgress { epochs: epochs * nets * (BLOCKS + 1), ..RunProgress::default() },
-    };
+    let noise = noise_of(&rows, options.seed);
+    let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &noise);
+    let common = Common { e_gnss_m2, noise, epochs: options.epochs, seed: options.seed };
+    let candidates = select::candidates(options.recipe);
+    let most = candidates.iter().map(|candidate| candidate.all_epochs(&common)).max().unwrap_or(1);
+    let held_out = candidates.iter().map(|candidate| BLOCKS * candidate.all_epochs(&common)).sum::<u32>();
+    let mut run =
+        Run { observer, progress: RunProgress { epochs: held_out + most, ..RunProgress::default() } };
+    tell_samples(&rows, &common, &mut run)?;
+
+    let blocks = rows.blocks(BLOCKS);
+    let mut residuals = Vec::with_capacity(candidates.len());
+    let mut reports = Vec::with_capacity(candidates.len());
+    for candidate in candidates {
+        let (misses, claims) = candidate.held_out(&rows, &blocks, &common, &mut run)?;
+        let report = held_out_error(&misses, &claims, e_gnss_m2);
+        run.note(&format!("{}: {:.3} m from the held-out fixes", candidate.name, report.mean_to_fix_m))?;
+        reports.push(CandidateReport { candidate: candidate.name.to_owned(), held_out: report });
+        residuals.push(misses);
+    }
+    let kept = select::choose(&rows, &residuals);
+    tell_choice(&reports, kept, &mut run)?;
+
+    let candidate = candidates[kept];
+    // The final fit may be shorter than the longest candidate's.
+    run.progress.epochs = held_out + candidate.all_epochs(&common);
+    let rng = ChaCha8Rng::seed_from_u64(options.seed);
+    let mut phase = Phase { run: &mut run, name: "final fit".to_owned(), rng, is_final: true };
+    let mut parts = candidate.fit(&rows, &common, &mut phase)?;
+    if let Some(size) = options.image_size {
+        parts.parameters.insert("image_width_px".to_owned(), f64::from(size.width_px()));
+        parts.parameters.insert("image_height_px".to_owned(), f64::from(size.height_px()));
+    }
+    let mut held_out = reports[kept].held_out.clone();
+    if e_gnss_source == GnssErrorSource::Estimated {
+        // What lasts for a whole block of time cannot be seen within it.
+        parts.e_gnss_m2 += uncertainty::lasting_m2(&residuals[kept], &noise);
+    }
+    if candidate.way != Way::Paper {
+        held_out.e_regression_m2 = uncertainty::calibrate(&mut parts, &rows, &residuals[kept], &noise)?;
+        held_out.coverage95_of_fixes = coverage_of_fixes(&parts, &rows, &residuals[kept])?;
+    }
+    run.note(&format!(
+        "the regressed position's own error is {:.2} m per axis, the receiver's {:.2} m",
+        held_out.e_regression_m2.sqrt(),
+        parts.e_gnss_m2.sqrt()
+    ))?;
+    put_noise(&mut parts, &noise, candidate);
+    let summary =
+        Summary { requested: options.recipe, common, epochs: candidate.epochs(&common), e_gnss_source };
+    artifact_of(parts, &rows, samples, &summary, held_out, reports)
+}
+
+/// The error of the fixes about the richest geometry: coloured or white, and how large.
+fn noise_of(rows: &Rows, seed: u64) -> FixNoise {
+    let form = Form { sides: true, extra_sigma: 1.0 };
+    projection::fit(&rows.rows, form, &[], &mut ChaCha8Rng::seed_from_u64(seed)).noise
+}
+
+fn receiver_variance(rows: &Rows, known: GnssError, noise: &FixNoise) -> (f64, GnssErrorSource) {
+    match (known, rows.own_variance_m2()) {
+        (GnssError::Known(sigma), _) => (sigma.variance_m2(), GnssErrorSource::Profile),
+        (GnssError::Unknown, Some(variance_m2)) => (variance_m2, GnssErrorSource::Profile),
+        (GnssError::Unknown, None) => (noise.variance_m2.max(1e-4), GnssErrorSource::Estimated),
+    }
+}
+
+fn tell_samples(rows: &Rows, common: &Common, run: &mut Run<'_>) -> Result<(), FitError> {
+    let FixNoise { white_share, time_constant_s, variance_m2 } = common.noise;
     run.note(&format!(
         "{} samples of {} targets in {} passes; the receiver's sigma is {:.2} m per axis",
         rows.rows.len(),
         rows.targets,
         rows.passes,
-        e_gnss_m2.sqrt()
+        common.e_gnss_m2.sqrt()
     ))?;
-    let fit_rows = |rows: &Rows, phase: &mut Phase<'_, '_>| {
-        let mut parts = match recipe {
-            Recipe::Paper => paper::fit(rows, e_gnss_m2, epochs, phase),
-            _ => hybrid::fit(rows, e_gnss_m2, epochs, phase),
-        }?;
-        if let Some(size) = options.image_size {
-            parts.parameters.insert("image_width_px".to_owned(), f64::from(size.width_px()));
-            parts.parameters.insert("image_height_px".to_owned(), f64::from(size.height_px()));
-        }
-        Ok::<Parts, FitError>(parts)
+    let kind = if white_share < 1.0 {
+        format!("{:.0} % of it stays for about {time_constant_s:.0} s", 100.0 * (1.0 - white_share))
+    } else {
+        "new with each fix".to_owned()
     };
-    let held_out = held_out(&rows, options.seed, e_gnss_m2, &mut run, &fit_rows)?;
-    if let Some(held_out) = &held_out {
-        run.note(&format!(
-            "on {} held-out blocks of time the regressed position is {:.2} m from the fix on average",
-            held_out.blocks, held_out.mean_to_fix_m
-        ))?;
+    run.note(&format!(
+        "about the geometry the fixes scatter by {:.2} m per axis, {kind}; they are worth {:.0} independent ones",
+        variance_m2.sqrt(),
+        uncertainty::independent_fixes(&rows.rows, &common.noise)
+    ))
+}
+
+fn tell_choice(reports: &[CandidateReport], kept: usize, run: &mut Run<'_>) -> Result<(), FitError> {
+    let (first, own) = (&reports[0], &reports[kept]);
+    if reports.len() == 1 {
+        return Ok(());
     }
-    let rng = ChaCha8Rng::seed_from_u64(options.seed);
-    let mut phase = Phase { run: &mut run, name: "final fit".to_owned(), rng, is_final: true };
-    let parts = fit_rows(&rows, &mut phase)?;
-    let weights = parts.tensors.to_bytes().map_err(|cause| FitError::Fault(cause.to_string()))?;
+    let gain = 1.0 - own.held_out.error_to_fix_m2 / first.held_out.error_to_fix_m2;
+    run.note(&format!(
+        "kept {}: its mean square to the held-out fixes is {:.1} % below that of {}",
+        own.candidate,
+        100.0 * gain,
+        first.candidate
+    ))
+}
+
+fn held_out_error(residuals: &[[f64; 2]], claims: &[f64], e_gnss_m2: f64) -> HeldOutError {
+    let count = residuals.len() as f64;
+    let (mut distance_m, mut square_m2, mut inside) = (0.0, 0.0, 0.0);
+    for ([east, north], claim) in residuals.iter().zip(claims) {
+        let miss_m = east.hypot(*north);
+        distance_m += miss_m;
+        square_m2 += 0.5 * miss_m * miss_m;
+        inside += f64::from(u8::from(miss_m <= R95_PER_SIGMA * (claim + e_gnss_m2).sqrt()));
+    }
+    let error_to_fix_m2 = square_m2 / count;
+    HeldOutError {
+        blocks: BLOCKS,
+        samples: residuals.len() as u32,
+        mean_to_fix_m: distance_m / count,
+        error_to_fix_m2,
+        e_regression_m2: (error_to_fix_m2 - e_gnss_m2).max(0.01 * error_to_fix_m2),
+        coverage95_of_fixes: inside / count,
+    }
+}
+
+/// Share of held-out fixes inside the radius that the calibrated error and the receiver foretell.
+fn coverage_of_fixes(parts: &Parts, rows: &Rows, residuals: &[[f64; 2]]) -> Result<f64, FitError> {
+    let regressor = Regressor::build(parts.clone()).map_err(|error| FitError::Fault(error.into()))?;
+    let inside = rows.rows.iter().zip(residuals).filter(|(row, [east, north])| {
+        let answer = regressor.regress(&row.bounding_box, None);
+        let regression_m = answer.r95_scale * answer.e_regression_m2.sqrt();
+        east.hypot(*north) <= regression_m.hypot(R95_PER_SIGMA * regressor.e_gnss_m2().sqrt())
+    });
+    Ok(inside.count() as f64 / residuals.len() as f64)
+}
+
+fn put_noise(parts: &mut Parts, noise: &FixNoise, candidate: Candidate) {
+    for (name, value) in [
+        ("fix_scatter_m2", noise.variance_m2),
+        ("fix_white_share", noise.white_share),
+        ("fix_time_constant_s", noise.time_constant_s),
+        ("labels_smoothed", f64::from(u8::from(candidate.smoothed))),
+    ] {
+        parts.parameters.insert(name.to_owned(), value);
+    }
+}
+
+struct Summary {
+    requested: Recipe,
+    common: Common,
+    epochs: u32,
+    e_gnss_source: GnssErrorSource,
+}
+
+fn artifact_of(
+    parts: Parts,
+    rows: &Rows,
+    samples: &[Sample],
+    summary: &Summary,
+    held_out: HeldOutError,
+    candidates: Vec<CandidateReport>,
+) -> Result<Artifact, FitError> {
+    let weights = parts.tensors.to_bytes().map_err(|cause| FitError::Fault(cause.into()))?;
     let origin = parts.plane.origin();
     Ok(Artifact {
         metadata: ModelMetadata {
             format: FORMAT,
-            requested_recipe: options.recipe.as_str().to_owned(),
+            requested_recipe: summary.requested.as_str().to_owned(),
             recipe: parts.recipe.as_str().to_owned(),
             features: parts.features,
             origin: OriginDeg { longitude_deg: origin.longitude_deg(), latitude_deg: origin.latitude_deg() },
-            seed: options.seed,
-            epochs,
+            seed: summary.common.seed,
+            epochs: summary.epochs,
             training_rows_sha256: hash_of(samples),
             samples: rows.rows.len() as u32,
             targets: rows.targets,
             passes: rows.passes,
             error_scale: parts.error_scale,
-            e_gnss_m2,
-            e_gnss_source,
-            held_out,
-            candidates: Vec::new(),
+            e_gnss_m2: parts.e_gnss_m2,
+            e_gnss_source: summary.e_gnss_source,
+            held_out: Some(held_out),
+            candidates,
             parameters: parts.parameters,
         },
         weights,
     })
-}
-
-fn receiver_variance(rows: &Rows, known: GnssError) -> (f64, GnssErrorSource) {
-    match (known, rows.own_variance_m2()) {
-        (GnssError::Known(sigma), _) => (sigma.variance_m2(), GnssErrorSource::Profile),
-        (GnssError::Unknown, Some(variance_m2)) => (variance_m2, GnssErrorSource::Profile),
-        (GnssError::Unknown, None) => (noise::scatter_m2(rows), GnssErrorSource::Estimated),
-    }
-}
-
-/// Fits without each block of time in turn and compares with its fixes; `None` where too few rows
-/// are left to learn from.
-fn held_out(
-    rows: &Rows,
-    seed: u64,
-    e_gnss_m2: f64,
-    run: &mut Run<'_>,
-    fit_rows: &dyn Fn(&Rows, &mut Phase<'_, '_>) -> Result<Parts, FitError>,
-) -> Result<Option<HeldOutError>, FitError> {
-    let blocks = rows.blocks(BLOCKS);
-    let (mut count, mut distance_m, mut square_m2, mut inside) = (0u32, 0.0, 0.0, 0u32);
-    for block in 0..BLOCKS {
-        let train = rows.filtered(|at| blocks[at] != block);
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(u64::from(block) + 1);
-        let name = format!("held-out block {} of {BLOCKS}", block + 1);
-        let parts = fit_rows(&train, &mut Phase { run, name, rng, is_final: false })?;
-        let regressor = Regressor::build(parts).map_err(|error| FitError::Fault(error.to_string()))?;
-        let held = rows.rows.iter().zip(&blocks).filter(|(_, of)| **of == block);
-        for (row, _) in held {
-            let fix = regressor.plane().to_plane(row.position);
-            // From the box alone: a network that sees the fix would be praised for repeating it.
-            let answer = regressor.regress(&row.bounding_box, None);
-            let miss_m = answer.regressed.distance_m(fix);
-            count += 1;
-            distance_m += miss_m;
-            square_m2 += 0.5 * miss_m * miss_m;
-            inside += u32::from(miss_m <= R95_PER_SIGMA * (answer.e_regression_m2 + e_gnss_m2).sqrt());
-        }
-    }
-    if count == 0 {
-        return Ok(None);
-    }
-    let error_to_fix_m2 = square_m2 / f64::from(count);
-    Ok(Some(HeldOutError {
-        blocks: BLOCKS,
-        samples: count,
-        mean_to_fix_m: distance_m / f64::from(count),
-        error_to_fix_m2,
-        e_regression_m2: (error_to_fix_m2 - e_gnss_m2).max(0.01 * error_to_fix_m2),
-        coverage95_of_fixes: f64::from(inside) / f64::from(count),
-    }))
-}
-
-/// One fit with its observer and progress.
-pub(super) struct Run<'a> {
-    observer: &'a mut Observer<'a>,
-    progress: RunProgress,
-}
-
-impl Run<'_> {
-    pub(super) fn note(&mut self, line: &str) -> Result<(), FitError> {
-        self.tell(|observer, _| observer(FitEvent::Note(line)))
-    }
-
-    fn tell(
-        &mut self,
-        event: impl FnOnce(&mut Observer<'_>, &RunProgress) -> ControlFlow<()>,
-    ) -> Result<(), FitError> {
-        match event(self.observer, &self.progress) {
-            ControlFlow::Continue(()) => Ok(()),
-            ControlFlow::Break(()) => Err(FitError::Cancelled),
-        }
-    }
-}
-
-/// One part of a run: a held-out block, or the final fit.
-pub(super) struct Phase<'r, 'a> {
-    pub(super) run: &'r mut Run<'a>,
-    pub(super) name: String,
-    pub(super) rng: ChaCha8Rng,
-    /// Whether its epochs are those of the run's curve.
-    pub(super) is_final: bool,
-}
-
-impl Phase<'_, '_> {
-    /// Trains a network from fresh parameters; `part` tells networks of one phase apart. Returns
-    /// the parameters and the sums of the last epoch.
-    pub(super) fn train(
-        &mut self,
-        part: &str,
-        shape: &NetShape,
-        set: Arc<TrainingSet>,
-        weights: LossWeights,
-        schedule: Schedule,
-    ) -> Result<(Vec<f32>, LossSums), FitError> {
-        let Self { run, name, rng, is_final } = self;
-        run.progress.phase = format!("{name} {}", part.trim_end_matches('.')).trim().to_owned();
-        // The curve shows the network that answers when there is a fix.
-        let curve = *is_final && part != "denied.";
-        let mut last = LossSums::default();
-        let parameters = shape.initial_parameters(rng);
-        let parameters = train(shape, parameters, set, weights, schedule, rng, &mut |epoch, sums| {
-            last = *sums;
-            let report = EpochReport {
-                epoch,
-                loss: sums.loss / sums.samples,
-                reconstruction_error: sums.reconstruction / sums.samples,
-                regression_error: sums.regression / sums.samples,
-                error_scale: sums.ratio / sums.samples,
-            };
-            run.progress.epoch += 1;
-            run.progress.reconstruction_error = report.reconstruction_error;
-            run.progress.regression_error = report.regression_error;
-            run.progress.error_scale = report.error_scale;
-            (run.observer)(FitEvent::Progress(&run.progress))?;
-            if curve { (run.observer)(FitEvent::Epoch(&report)) } else { ControlFlow::Continue(()) }
-        })?;
-        Ok((parameters, last))
-    }
 }

@@ -7,11 +7,11 @@ use std::sync::Arc;
 
 use super::FitError;
 use super::artifact::{Parts, Scale};
-use super::coverage::Coverage;
-use super::fit::Phase;
 use super::net::{Activation, Net, NetShape};
-use super::regressor::{R95_PER_SIGMA, Raw};
+use super::projection::sides_of;
+use super::projective::FEATURES;
 use super::rows::{Rows, spread};
+use super::run::Phase;
 use super::tensors::Tensors;
 use super::train::{LossWeights, Schedule, TrainingSet};
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
@@ -19,19 +19,12 @@ use crate::geo::EastNorth;
 
 const HIDDEN: [usize; 2] = [24, 24];
 /// Passes over the samples unless the run says otherwise.
-pub(super) const EPOCHS: u32 = 120;
+pub(super) const EPOCHS: u32 = 60;
 /// wX : wZ on scaled inputs.
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.5, regression: 1.0 };
-const FEATURES: [&str; 4] = ["foot_x_px", "foot_y_px", "width_px", "height_px"];
 
 fn shape() -> NetShape {
     NetShape::auto_encoder(FEATURES.len(), &HIDDEN, Activation::Tanh)
-}
-
-#[inline]
-fn features(bounding_box: &BoundingBox) -> [f64; 4] {
-    let [foot_x, foot_y] = bounding_box.foot_px();
-    [foot_x, foot_y, bounding_box.width_px(), bounding_box.height_px()]
 }
 
 /// Samples per step: small sets need small steps to make enough of them.
@@ -46,7 +39,7 @@ pub(super) fn fit(
     epochs: u32,
     phase: &mut Phase<'_, '_>,
 ) -> Result<Parts, FitError> {
-    let boxes: Vec<[f64; 4]> = rows.rows.iter().map(|row| features(&row.bounding_box)).collect();
+    let boxes: Vec<[f64; 4]> = rows.rows.iter().map(|row| sides_of(&row.bounding_box)).collect();
     let scales: [Scale; 4] = std::array::from_fn(|at| {
         let values = boxes.iter().map(|features| features[at]);
         let offset = values.clone().sum::<f64>() / boxes.len() as f64;
@@ -76,10 +69,7 @@ pub(super) fn fit(
     };
     let schedule =
         Schedule { epochs, batch: batch_of(rows.rows.len()), learning_rate: 0.01, last_rate_share: 0.01 };
-    let (parameters, sums) = phase.train("", &shape(), Arc::new(set), WEIGHTS, schedule)?;
-    let reconstruction = (sums.reconstruction / sums.samples).max(1e-9);
-    let scatter_m2 = sums.regression / sums.samples * position_scale_m * position_scale_m;
-    let e_regression_m2 = (scatter_m2 - e_gnss_m2).max(0.05 * e_gnss_m2.min(scatter_m2)).max(1e-4);
+    let (parameters, _) = phase.train("", &shape(), Arc::new(set), WEIGHTS, schedule)?;
     let mut parts = Parts {
         recipe: Recipe::Hybrid,
         plane: rows.plane,
@@ -92,22 +82,18 @@ pub(super) fn fit(
                 factor: scale.factor,
             })
             .collect(),
-        // Half of the error goes with the reconstruction error, half stands.
-        error_scale: 0.5 * e_regression_m2 / reconstruction,
+        error_scale: 1.0,
         e_gnss_m2,
         parameters: [
-            ("r95_scale", R95_PER_SIGMA),
             ("east_offset_m", centre.east_m),
             ("north_offset_m", centre.north_m),
             ("position_scale_m", position_scale_m),
-            ("error_floor_m2", 0.5 * e_regression_m2),
         ]
         .map(|(name, value)| (name.to_owned(), value))
         .into(),
         tensors: Tensors::default(),
     };
     parts.put_net("", &shape(), &parameters);
-    parts.put_coverage(&Coverage::new(rows.rows.iter().map(|row| row.bounding_box)));
     Ok(parts)
 }
 
@@ -118,8 +104,6 @@ pub(super) struct HybridRegressor {
     scales: [Scale; 4],
     centre: EastNorth,
     position_scale_m: f64,
-    error_scale_m2: f64,
-    error_floor_m2: f64,
 }
 
 impl HybridRegressor {
@@ -131,26 +115,24 @@ impl HybridRegressor {
                 north_m: parts.parameter("north_offset_m")?,
             },
             position_scale_m: parts.positive_parameter("position_scale_m")?,
-            error_scale_m2: parts.error_scale,
-            error_floor_m2: parts.positive_parameter("error_floor_m2")?,
             net: parts.take_net("", shape())?,
         })
     }
 
-    pub(super) fn regress(&self, bounding_box: &BoundingBox) -> Raw {
-        let raw = features(bounding_box);
+    /// Position, and the sides (foot x, foot y, width, height, px) that belong to it.
+    #[inline]
+    pub(super) fn regress(&self, bounding_box: &BoundingBox) -> (EastNorth, [f64; 4]) {
+        let raw = sides_of(bounding_box);
         let inputs: [f32; 4] = std::array::from_fn(|at| self.scales[at].apply(raw[at]));
         let middle = self.net.encode(&inputs);
         let rebuilt = self.net.decode(middle);
-        let squares = inputs.iter().zip(&rebuilt).map(|(one, other)| f64::from(one - other).powi(2));
-        let reconstruction_error = squares.sum::<f64>() / 4.0;
-        Raw {
-            regressed: EastNorth {
-                east_m: self.centre.east_m + f64::from(middle[0]) * self.position_scale_m,
-                north_m: self.centre.north_m + f64::from(middle[1]) * self.position_scale_m,
-            },
-            reconstruction_error,
-            e_m2: self.error_floor_m2 + self.error_scale_m2 * reconstruction_error,
-        }
+        let sides = std::array::from_fn(|at| {
+            f64::from(rebuilt[at]) / self.scales[at].factor + self.scales[at].offset
+        });
+        let regressed = EastNorth {
+            east_m: self.centre.east_m + f64::from(middle[0]) * self.position_scale_m,
+            north_m: self.centre.north_m + f64::from(middle[1]) * self.position_scale_m,
+        };
+        (regressed, sides)
     }
 }

@@ -13,13 +13,16 @@ pub mod homography;
 mod hybrid;
 mod kernel;
 pub mod net;
-mod noise;
 mod paper;
 mod projection;
+mod projective;
 mod regressor;
 mod rows;
+mod run;
+mod select;
 mod tensors;
 pub mod train;
+mod uncertainty;
 mod whitening;
 
 pub use artifact::{Artifact, FORMAT};

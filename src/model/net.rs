@@ -208,6 +208,16 @@ impl Net {
         [units[0], units[1]]
     }
 
+    /// Outputs of the first layer, which must have `UNITS`.
+    #[inline]
+    #[must_use]
+    pub fn first_hidden<const UNITS: usize>(&self, inputs: &[f32]) -> [f32; UNITS] {
+        let mut units = [0.0; WIDEST_LAYER];
+        units[..inputs.len()].copy_from_slice(inputs);
+        self.run(0..1, &mut units);
+        std::array::from_fn(|unit| units[unit])
+    }
+
     /// The rebuilt inputs of a regressed position; only the first `inputs` of them are set.
     #[inline]
     #[must_use]

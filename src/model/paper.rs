@@ -8,11 +8,10 @@
 use std::sync::Arc;
 
 use super::artifact::Parts;
-use super::coverage::Coverage;
-use super::fit::Phase;
 use super::net::{Activation, Net, NetShape};
-use super::regressor::{R95_PER_SIGMA, Raw};
+use super::regressor::R95_PER_SIGMA;
 use super::rows::Rows;
+use super::run::Phase;
 use super::train::{LossSums, LossWeights, Schedule, TrainingSet};
 use super::{FitError, tensors::Tensors};
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
@@ -39,7 +38,7 @@ pub(super) fn fit(
 ) -> Result<Parts, FitError> {
     let offset = lowest_corner(rows);
     let units: [Vec<f32>; 2] = std::array::from_fn(|axis| {
-        rows.rows.iter().map(|row| standardised(&rows.plane, offset, row.position)[axis]).collect()
+        rows.rows.iter().map(|row| standardised(offset, row.position)[axis]).collect()
     });
     let mut features: Vec<FeatureScale> = FEATURES
         .iter()
@@ -69,7 +68,6 @@ pub(super) fn fit(
             _ => drop(parts.parameters.insert("denied_error_scale".to_owned(), error_scale)),
         }
     }
-    parts.put_coverage(&Coverage::new(rows.rows.iter().map(|row| row.bounding_box)));
     Ok(parts)
 }
 
@@ -113,7 +111,7 @@ fn turned(degrees: f64) -> f64 {
     (degrees + 180.0).rem_euclid(360.0) - 180.0
 }
 
-fn standardised(_plane: &LocalPlane, offset: Position, position: Position) -> [f32; 2] {
+fn standardised(offset: Position, position: Position) -> [f32; 2] {
     [
         (turned(position.longitude_deg() - offset.longitude_deg()) * UNITS_PER_DEGREE) as f32,
         ((position.latitude_deg() - offset.latitude_deg()) * UNITS_PER_DEGREE) as f32,
@@ -153,12 +151,12 @@ impl PaperRegressor {
         plane: &LocalPlane,
         bounding_box: &BoundingBox,
         fix: Option<EastNorth>,
-    ) -> Raw {
+    ) -> (EastNorth, f64, f64) {
         let [left, top, width, height] = bounding_box.sides_px().map(|side| side as f32);
         let (middle, rebuilt, inputs, error_scale);
         match fix {
             Some(fix) => {
-                let [east, north] = standardised(plane, plane.origin(), plane.to_position(fix));
+                let [east, north] = standardised(plane.origin(), plane.to_position(fix));
                 let all = [left, top, width, height, east, north];
                 middle = self.joint.encode(&all);
                 (rebuilt, inputs, error_scale) = (self.joint.decode(middle), all, self.error_scales[0]);
@@ -172,11 +170,7 @@ impl PaperRegressor {
         let count = if fix.is_some() { 6 } else { 4 };
         let squares = inputs[..count].iter().zip(&rebuilt).map(|(one, other)| f64::from(one - other).powi(2));
         let reconstruction_error = squares.sum::<f64>() / count as f64;
-        Raw {
-            regressed: in_plane(plane, middle),
-            reconstruction_error,
-            e_m2: error_scale * reconstruction_error * self.unit_m2,
-        }
+        (in_plane(plane, middle), reconstruction_error, error_scale * reconstruction_error * self.unit_m2)
     }
 }
 

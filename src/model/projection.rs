@@ -110,7 +110,9 @@ impl Projection {
         self.ratio(&self.terms(bounding_box))[2] > LEAST_DENOMINATOR
     }
 
-    fn target(&self, label: EastNorth) -> [f64; 2] {
+    /// A position in units about the middle.
+    #[inline]
+    pub(super) fn in_units(&self, label: EastNorth) -> [f64; 2] {
         [
             (label.east_m - self.middle.east_m) / self.unit_m,
             (label.north_m - self.middle.north_m) / self.unit_m,
@@ -124,7 +126,7 @@ impl Projection {
         let mut right = DVector::<f64>::zeros(8);
         for at in chosen {
             let terms = self.terms(&rows[*at].bounding_box);
-            for (axis, target) in self.target(rows[*at].label).into_iter().enumerate() {
+            for (axis, target) in self.in_units(rows[*at].label).into_iter().enumerate() {
                 let mut line = [0.0; 8];
                 line[3 * axis..3 * axis + 3].copy_from_slice(&terms[..3]);
                 (line[6], line[7]) = (-target * terms[1], -target * terms[2]);
@@ -149,7 +151,7 @@ impl Projection {
     fn typical_miss(&self, rows: &[Row], chosen: &[usize]) -> f64 {
         let misses = chosen.iter().map(|at| {
             let [east, north, _] = self.ratio(&self.terms(&rows[*at].bounding_box));
-            let target = self.target(rows[*at].label);
+            let target = self.in_units(rows[*at].label);
             (east - target[0]).hypot(north - target[1])
         });
         median(misses.collect())

@@ -6,15 +6,15 @@ use super::artifact::Parts;
 use super::coverage::Coverage;
 use super::hybrid::HybridRegressor;
 use super::paper::PaperRegressor;
-use crate::domain::{BoundingBox, ImageSize, Recipe, Result};
+use super::projection::{SIDES, sides_of};
+use super::projective::ProjectiveRegressor;
+use crate::domain::{BoundingBox, Error, ImageSize, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane};
 
 /// Radius that holds 95 % of a circular normal distribution, in standard deviations per axis.
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
 /// Beyond this many radii of the training boxes a box is outside.
 const OUTSIDE_RADII: f64 = 1.5;
-/// Factor on the error variance of boxes that the image's border cuts where few were in training.
-const BORDER_FACTOR: f64 = 4.0;
 
 /// The one-step answer for one box.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,18 +31,11 @@ pub struct Regression {
     pub r95_scale: f64,
 }
 
-/// What a recipe alone says of a box.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Raw {
-    pub(super) regressed: EastNorth,
-    pub(super) reconstruction_error: f64,
-    pub(super) e_m2: f64,
-}
-
 #[derive(Debug, Clone)]
 enum Kind {
-    Paper(PaperRegressor),
-    Hybrid(HybridRegressor),
+    Paper(Box<PaperRegressor>),
+    Hybrid(Box<HybridRegressor>),
+    Projective(Box<ProjectiveRegressor>),
 }
 
 /// A loaded model: flat weights, shared freely between threads.
@@ -51,6 +44,10 @@ pub struct Regressor {
     plane: LocalPlane,
     e_gnss_m2: f64,
     r95_scale: f64,
+    /// Es, m2 per unit of reconstruction error beyond the usual.
+    error_scale: f64,
+    reconstruction_usual: f64,
+    border_factor: f64,
     image_size: Option<ImageSize>,
     coverage: Coverage,
     kind: Kind,
@@ -60,16 +57,30 @@ impl Regressor {
     pub(super) fn build(mut parts: Parts) -> Result<Self> {
         let coverage = parts.take_coverage()?;
         let kind = match parts.recipe {
-            Recipe::Paper => Kind::Paper(PaperRegressor::build(&mut parts)?),
-            Recipe::Hybrid | Recipe::Projective | Recipe::Auto => {
-                Kind::Hybrid(HybridRegressor::build(&mut parts)?)
+            Recipe::Paper => Kind::Paper(Box::new(PaperRegressor::build(&mut parts)?)),
+            Recipe::Hybrid => Kind::Hybrid(Box::new(HybridRegressor::build(&mut parts)?)),
+            Recipe::Projective => Kind::Projective(Box::new(ProjectiveRegressor::build(&mut parts)?)),
+            Recipe::Auto => {
+                let message = "must be the recipe that auto has chosen: paper, hybrid or projective";
+                return Err(Error::invalid("metadata.recipe", message));
             }
         };
         let image_size = image_size_of(&parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
-        let Parts { plane, e_gnss_m2, tensors, .. } = parts;
+        let (reconstruction_usual, border_factor) = match kind {
+            Kind::Paper(_) => (0.0, 1.0),
+            _ => (
+                parts.positive_parameter("reconstruction_usual")?,
+                parts.positive_parameter("border_factor")?,
+            ),
+        };
+        let Parts { plane, e_gnss_m2, error_scale, tensors, .. } = parts;
         tensors.finish()?;
-        Ok(Self { plane, e_gnss_m2, r95_scale, image_size, coverage, kind })
+        Ok(Self {
+            plane,
+            e_gnss_m2,
+            r95_scale,
+            error_scale, reconstruction_usual, border_factor, image_size, coverage, kind })
     }
 
     /// The plane in which it answers.
@@ -84,33 +95,53 @@ impl Regressor {
         self.e_gnss_m2
     }
 
+    /// Size of the image that it was trained on, if known.
+    pub(super) const fn image_size(&self) -> Option<ImageSize> {
+        self.image_size
+    }
+
     /// Where the target in a box stands, and how sure that is. The fix only matters to the network
     /// of the recipe `paper` that has it among its inputs.
     #[must_use]
     pub fn regress(&self, bounding_box: &BoundingBox, fix: Option<EastNorth>) -> Regression {
-        let raw = match &self.kind {
-            Kind::Paper(paper) => paper.regress(&self.plane, bounding_box, fix),
-            Kind::Hybrid(hybrid) => hybrid.regress(bounding_box),
-        };
-        let radii = self.coverage.distance(bounding_box);
-        let outside_training = radii > OUTSIDE_RADII;
-        let widened = match &self.kind {
+        let (radii, usual_m2) = self.coverage.look_up(bounding_box);
+        let (regressed, reconstruction_error, e_m2) = match &self.kind {
             // To the letter: the error is Es * eX and nothing else.
-            Kind::Paper(_) => 1.0,
-            Kind::Hybrid(_) => {
-                let beyond = (radii - 1.0).max(0.0);
-                let border = if bounding_box.touches_border(self.image_size) { BORDER_FACTOR } else { 1.0 };
-                border * (1.0 + beyond * beyond)
+            Kind::Paper(paper) => paper.regress(&self.plane, bounding_box, fix),
+            Kind::Hybrid(hybrid) => self.judged(bounding_box, radii, usual_m2, hybrid.regress(bounding_box)),
+            Kind::Projective(projective) => {
+                self.judged(bounding_box, radii, usual_m2, projective.regress(bounding_box))
             }
         };
         Regression {
-            regressed: raw.regressed,
-            reconstruction_error: raw.reconstruction_error,
+            regressed,
+            reconstruction_error,
             // The bounds keep every weight and radius finite whatever the net says.
-            e_regression_m2: (raw.e_m2 * widened).clamp(1e-6, 1e12),
-            outside_training,
+            e_regression_m2: e_m2.clamp(1e-6, 1e12),
+            outside_training: radii > OUTSIDE_RADII,
             r95_scale: self.r95_scale,
         }
+    }
+
+    /// Reconstruction error, in squared box heights, and error variance: what is usual at that
+    /// place, what the box's contradiction adds, wider beyond the training boxes and at the border.
+    #[inline]
+    fn judged(
+        &self,
+        bounding_box: &BoundingBox,
+        radii: f64,
+        usual_m2: f64,
+        (regressed, rebuilt): (EastNorth, [f64; SIDES]),
+    ) -> (EastNorth, f64, f64) {
+        let sides = sides_of(bounding_box);
+        let squares = sides.iter().zip(&rebuilt).map(|(one, other)| (one - other) * (one - other));
+        let reconstruction_error =
+            squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px());
+        let excess = (reconstruction_error - self.reconstruction_usual).max(0.0);
+        let beyond = (radii - 1.0).max(0.0);
+        let border = if bounding_box.touches_border(self.image_size) { self.border_factor } else { 1.0 };
+        let e_m2 = (usual_m2 * border + self.error_scale * excess) * (1.0 + beyond * beyond);
+        (regressed, reconstruction_error, e_m2)
     }
 }
 

@@ -7,13 +7,15 @@ use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
 use super::FitError;
+use super::whitening::FixNoise;
 use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
+use crate::filters::{FixError, smooth_pass, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 /// Fewer samples cannot tell a camera from its noise.
-pub const FEWEST_SAMPLES: usize = 20;
-/// Fixes that vary by less, m, lie all at one spot.
-pub const SMALLEST_SPREAD_M: f64 = 0.1;
+pub const FEWEST_SAMPLES: u64 = 20;
+/// Fixes that reach less far apart are all at one spot, m.
+pub const SMALLEST_SPREAD_M: f64 = 1.0;
 /// A hole in a target's samples beyond this, and beyond ten times their usual step, ends a pass.
 const PASS_HOLE_S: f64 = 3.0;
 
@@ -53,7 +55,7 @@ impl Rows {
         if samples.is_empty() {
             return Err(unusable("there are none; import samples that have a box and a fix first".into()));
         }
-        if samples.len() < FEWEST_SAMPLES {
+        if (samples.len() as u64) < FEWEST_SAMPLES {
             return Err(unusable(format!(
                 "there are {}, a fit needs at least {FEWEST_SAMPLES}; import more, best of several passes \
                  through different parts of the image",
@@ -97,7 +99,7 @@ impl Rows {
             )));
         }
         let on_ground = spread(&|row| row.label.east_m).max(spread(&|row| row.label.north_m));
-        if on_ground < SMALLEST_SPREAD_M {
+        if on_ground < 0.1 * SMALLEST_SPREAD_M {
             return Err(unusable(format!(
                 "all {} fixes are at one spot (they vary by {on_ground:.2} m) though the boxes move; check \
                  that boxes and fixes are paired by time",
@@ -134,6 +136,28 @@ impl Rows {
     pub(super) fn filtered(&self, keep: impl Fn(usize) -> bool) -> Self {
         let rows = self.rows.iter().enumerate().filter(|(at, _)| keep(*at)).map(|(_, row)| *row).collect();
         Self { rows, ..*self }
+    }
+
+    /// The same rows with labels that a kinematic smoother made of each pass's fixes.
+    pub(super) fn smoothed(&self, noise: &FixNoise) -> Self {
+        let error = FixError {
+            white_m: (noise.variance_m2 * noise.white_share).sqrt().max(0.01),
+            coloured_m: (noise.variance_m2 * (1.0 - noise.white_share)).sqrt(),
+            time_constant_s: noise.time_constant_s,
+        };
+        let passes: Vec<(Vec<f64>, Vec<EastNorth>)> = self
+            .rows
+            .chunk_by(|one, other| one.pass == other.pass)
+            .map(|pass| pass.iter().map(|row| (row.time_s, row.label)).unzip())
+            .collect();
+        let acceleration_mps2 = tune_acceleration(&passes, &error);
+        let labels =
+            passes.iter().flat_map(|(times_s, fixes)| smooth_pass(times_s, fixes, &error, acceleration_mps2));
+        let mut smoothed = self.clone();
+        for (row, label) in smoothed.rows.iter_mut().zip(labels) {
+            row.label = label.position;
+        }
+        smoothed
     }
 
     /// Mean of the variances that the receiver gave itself, where every fix has one.

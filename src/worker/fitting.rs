@@ -118,5 +118,5 @@ fn remaining_s(progress: &RunProgress, elapsed: Duration) -> Option<f64> {
 }
 
 fn panicked() -> FitError {
-    FitError::Fault("the fit's thread ended without a word".to_owned())
+    FitError::Fault("the fit's thread ended without a word".into())
 }

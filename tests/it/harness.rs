@@ -4,7 +4,6 @@ use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::{Arc, Mutex};
 
 use http_body_util::{BodyExt as _, Full};
 use hyper::body::{Bytes, Incoming};
@@ -35,7 +34,6 @@ pub(crate) struct TestServer {
     process: Child,
     pub(crate) address: SocketAddr,
     client: Client<HttpConnector, Full<Bytes>>,
-    log: Arc<Mutex<Vec<String>>>,
 }
 
 /// A whole answer.
@@ -84,7 +82,6 @@ impl TestServer {
             .spawn()
             .expect("the binary starts");
         let mut lines = BufReader::new(process.stderr.take().expect("piped")).lines();
-        let log = Arc::new(Mutex::new(Vec::new()));
         let mut address = None;
         for line in lines.by_ref() {
             let line = line.expect("UTF-8");
@@ -95,12 +92,10 @@ impl TestServer {
                 break;
             }
         }
-        let kept = log.clone();
-        std::thread::spawn(move || {
-            lines.map_while(Result::ok).for_each(|line| kept.lock().expect("not poisoned").push(line));
-        });
+        // Read on, or the server's log would fill the pipe and halt it.
+        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
         let client = Client::builder(TokioExecutor::new()).build_http();
-        Self { process, address: address.expect("the server tells its address"), client, log }
+        Self { process, address: address.expect("the server tells its address"), client }
     }
 
     /// `kill -9`.
@@ -114,11 +109,6 @@ impl TestServer {
         let pid = self.process.id().to_string();
         assert!(Command::new("kill").args(["-TERM", &pid]).status().expect("kill runs").success());
         self.process.wait().expect("the server ends").success()
-    }
-
-    /// Lines of the log since the start.
-    pub(crate) fn log(&self) -> Vec<String> {
-        self.log.lock().expect("not poisoned").clone()
     }
 
     /// Sends a request; the answer's body is still to come.

@@ -51,11 +51,7 @@ impl Server {
     pub(super) async fn with(limits: Limits) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let store = Store::open(folder.path()).await.expect("a new store");
-<<<<<<< HEAD
         let now = "2027-01-01T00:00:00Z".parse().expect("a time");
-=======
-        let now = "2026-01-01T00:00:00Z".parse().expect("a time");
->>>>>>> main
         let clock = Clock::from_fn(move || now);
         let app =
             App::new(store, clock, Randomness::seeded(1), limits, Metrics::new()).await.expect("an app");
@@ -247,7 +243,7 @@ async fn a_watched_run_is_followed_to_the_end_of_the_run_or_of_the_server() {
     let request = proto::StartTrainingRunRequest { camera_id: "yard".to_owned(), ..Default::default() };
     let run = training.start_training_run(request).await.expect("queued").into_inner().run.expect("a run");
     assert_eq!(run.state(), proto::TrainingRunState::Queued);
-    assert_eq!(run.recipe(), proto::Recipe::Hybrid);
+    assert_eq!(run.recipe(), proto::Recipe::Auto);
     let watch = proto::WatchTrainingRunRequest { camera_id: "yard".to_owned(), run_id: run.id.clone() };
 
     let mut watched = training.watch_training_run(watch.clone()).await.expect("a stream").into_inner();

@@ -86,29 +86,82 @@ impl Coverage {
         std::array::from_fn(|axis| raw[axis] / self.units[axis])
     }
 
+    /// The same, laid out for answers.
+    pub(super) fn table(&self) -> CoverageTable {
+        let groups = self
+            .centres
+            .chunks(LANES)
+            .zip(self.errors_m2.chunks(LANES))
+            .map(|(centres, errors_m2)| {
+                // Lanes without a centre are too far away to weigh anything.
+                let mut group = Group { axes: [[FAR; LANES]; DIMENSIONS], errors_m2: [1.0; LANES] };
+                for (lane, (centre, error_m2)) in centres.iter().zip(errors_m2).enumerate() {
+                    for (axis, coordinate) in group.axes.iter_mut().zip(centre) {
+                        axis[lane] = *coordinate;
+                    }
+                    group.errors_m2[lane] = *error_m2;
+                }
+                group
+            })
+            .collect();
+        let worst_m2 = self.errors_m2.iter().fold(0.0f32, |worst, error_m2| worst.max(*error_m2));
+        CoverageTable { units: self.units, radius: self.radius, groups, worst_m2 }
+    }
+}
+
+const LANES: usize = 8;
+const FAR: f32 = 1e12;
+
+#[derive(Debug, Clone, PartialEq)]
+struct Group {
+    axes: [[f32; LANES]; DIMENSIONS],
+    errors_m2: [f32; LANES],
+}
+
+/// A [`Coverage`] whose centres stand beside each other in lanes, so that one look takes some tens
+/// of nanoseconds.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct CoverageTable {
+    units: [f32; DIMENSIONS],
+    radius: f32,
+    groups: Vec<Group>,
+    worst_m2: f32,
+}
+
+impl CoverageTable {
     /// Distance to the nearest centre in radii (up to 1 among the training boxes), and the error
     /// variance there, blended between centres by the inverse fourth power of their distance, m2.
     #[inline]
     pub(super) fn look_up(&self, bounding_box: &BoundingBox) -> (f64, f64) {
-        let point = self.point(bounding_box);
+        let raw = coordinates(*bounding_box);
         // A few percent of a radius, squared, so that a box upon a centre has a finite weight.
         let soft = 1e-3 * self.radius * self.radius;
-        let mut lanes = [[f32::INFINITY, 0.0, 0.0]; 8];
-        for (at, (centre, error_m2)) in self.centres.iter().zip(&self.errors_m2).enumerate() {
-            let distance = squared(centre, &point);
-            let near = 1.0 / (distance + soft);
-            let [least, sum, weights] = &mut lanes[at % 8];
-            *least = least.min(distance);
-            *sum += near * near * error_m2;
-            *weights += near * near;
+        let (mut least, mut sums, mut weights) = ([f32::INFINITY; LANES], [0.0; LANES], [0.0; LANES]);
+        let point: [f32; DIMENSIONS] = std::array::from_fn(|axis| raw[axis] / self.units[axis]);
+        for group in &self.groups {
+            for lane in 0..LANES {
+                let mut distance = 0.0;
+                for axis in 0..DIMENSIONS {
+                    let miss = group.axes[axis][lane] - point[axis];
+                    distance += miss * miss;
+                }
+                let near = 1.0 / (distance + soft);
+                least[lane] = if distance < least[lane] { distance } else { least[lane] };
+                sums[lane] += near * near * group.errors_m2[lane];
+                weights[lane] += near * near;
+            }
         }
-        let least = lanes.iter().map(|lane| lane[0]).fold(f32::INFINITY, f32::min);
-        let sum: f32 = lanes.iter().map(|lane| lane[1]).sum();
-        let weights: f32 = lanes.iter().map(|lane| lane[2]).sum();
+        let least = least.iter().fold(f32::INFINITY, |least, lane| least.min(*lane));
+        let weight: f32 = weights.iter().sum();
         // Far away all weights vanish in f32; the factor on the distance rules there anyway.
-        let error_m2 =
-            if weights > 0.0 { sum / weights } else { self.errors_m2.iter().fold(0.0, |a, b| b.max(a)) };
+        let error_m2 = if weight > 1e-30 { sums.iter().sum::<f32>() / weight } else { self.worst_m2 };
         (f64::from(least.sqrt() / self.radius), f64::from(error_m2))
+    }
+
+    /// Pixels of the foot point that make one radius.
+    #[inline]
+    pub(super) fn radius_px(&self) -> f64 {
+        f64::from(self.radius * self.units[0].min(self.units[1]))
     }
 }
 

@@ -121,12 +121,12 @@ pub fn fit(
         parts.parameters.insert("image_height_px".to_owned(), f64::from(size.height_px()));
     }
     let mut held_out = reports[kept].held_out.clone();
-    if e_gnss_source == GnssErrorSource::Estimated {
-        // What lasts for a whole block of time cannot be seen within it.
-        parts.e_gnss_m2 += uncertainty::lasting_m2(&residuals[kept], &noise);
-    }
     if candidate.way != Way::Paper {
-        held_out.e_regression_m2 = uncertainty::calibrate(&mut parts, &rows, &residuals[kept], &noise)?;
+        let calibration = uncertainty::calibrate(&mut parts, &rows, &residuals[kept], &noise)?;
+        held_out.e_regression_m2 = calibration.error_m2;
+        if e_gnss_source == GnssErrorSource::Estimated {
+            parts.e_gnss_m2 = calibration.receiver_m2.max(1e-4);
+        }
         held_out.coverage95_of_fixes = coverage_of_fixes(&parts, &rows, &residuals[kept])?;
     }
     run.note(&format!(

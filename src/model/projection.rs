@@ -20,8 +20,12 @@ pub(super) const SIDES: usize = 4;
 pub(super) const COEFFICIENTS: usize = 14;
 /// The denominator is kept above it, so that a box near the horizon stays finite.
 const LEAST_DENOMINATOR: f64 = 0.02;
+/// Widths and heights beyond so many units say no more, lest a wild box land far away.
+const FARTHEST_SIDE: f64 = 3.5;
 const STARTS: usize = 150;
 const STEPS: usize = 25;
+/// Rounds of refinement and re-weighting.
+const ROUNDS: usize = 4;
 
 /// The map itself.
 #[derive(Debug, Clone, PartialEq)]
@@ -83,7 +87,8 @@ impl Projection {
     fn terms(&self, bounding_box: &BoundingBox) -> [f64; 5] {
         let sides = sides_of(bounding_box);
         let scaled = |at: usize| (sides[at] - self.scales[at][0]) / self.scales[at][1];
-        [1.0, scaled(0), scaled(1), scaled(2), scaled(3)]
+        let bounded = |at: usize| scaled(at).clamp(-FARTHEST_SIDE, FARTHEST_SIDE);
+        [1.0, scaled(0), scaled(1), bounded(2), bounded(3)]
     }
 
     /// Position in units about the middle, and the denominator.
@@ -195,11 +200,11 @@ pub(super) fn fit(rows: &[Row], form: Form, columns: &[Vec<f64>], rng: &mut ChaC
         *doubt = doubt.max(0.0) * 8.0;
     }
     fitted.noise = FixNoise::white(usual_m * usual_m / 1.39);
-    for round in 0..4 {
+    for round in 0..ROUNDS {
         fitted.refine(rows, form, columns, &doubts);
         let residuals = fitted.residuals(rows, columns);
         fitted.noise = FixNoise::of_residuals(rows, &residuals, &doubts);
-        if round < 3 {
+        if round + 1 < ROUNDS {
             let whitener = Whitener::new(rows, &fitted.noise, &doubts);
             let whitened = residuals.map(|mut axis| {
                 whitener.apply(&mut axis);

@@ -3,7 +3,7 @@
 //! What never happens here: candle, training, GNSS fusion (that is the floor above).
 
 use super::artifact::Parts;
-use super::coverage::Coverage;
+use super::coverage::CoverageTable;
 use super::hybrid::HybridRegressor;
 use super::paper::PaperRegressor;
 use super::projection::{SIDES, sides_of};
@@ -13,6 +13,8 @@ use crate::geo::{EastNorth, LocalPlane};
 
 /// Radius that holds 95 % of a circular normal distribution, in standard deviations per axis.
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
+/// Up to this many radii of the training boxes the error is that of the nearest of them.
+const TRUSTED_RADII: f64 = 1.25;
 /// Beyond this many radii of the training boxes a box is outside.
 const OUTSIDE_RADII: f64 = 1.5;
 
@@ -49,13 +51,13 @@ pub struct Regressor {
     reconstruction_usual: f64,
     border_factor: f64,
     image_size: Option<ImageSize>,
-    coverage: Coverage,
+    coverage: CoverageTable,
     kind: Kind,
 }
 
 impl Regressor {
     pub(super) fn build(mut parts: Parts) -> Result<Self> {
-        let coverage = parts.take_coverage()?;
+        let coverage = parts.take_coverage()?.table();
         let kind = match parts.recipe {
             Recipe::Paper => Kind::Paper(Box::new(PaperRegressor::build(&mut parts)?)),
             Recipe::Hybrid => Kind::Hybrid(Box::new(HybridRegressor::build(&mut parts)?)),
@@ -144,9 +146,12 @@ impl Regressor {
         let reconstruction_error =
             squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px());
         let excess = (reconstruction_error - self.reconstruction_usual).max(0.0);
-        let beyond = (radii - 1.0).max(0.0);
+        let beyond = (radii - TRUSTED_RADII).max(0.0);
         let border = if bounding_box.touches_border(self.image_size) { self.border_factor } else { 1.0 };
-        let e_m2 = (usual_m2 * border + self.error_scale * excess) * (1.0 + beyond * beyond);
+        // A box beyond those of training may be a wrong box; then its foot is as far from the truth.
+        let astray = beyond * self.coverage.radius_px() / bounding_box.height_px();
+        let e_m2 =
+            usual_m2 * border * (1.0 + beyond * beyond) + self.error_scale * (excess + astray * astray);
         (regressed, reconstruction_error, e_m2)
     }
 }

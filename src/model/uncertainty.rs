@@ -17,15 +17,24 @@ use crate::domain::BoundingBox;
 use crate::geo::EastNorth;
 
 /// Patches of the image.
-const PATCHES: usize = 24;
+const PATCHES: usize = 64;
 /// Unknowns per axis of the simplest map, for the error that the fixes' noise must leave.
 const UNKNOWNS_PER_AXIS: f64 = 4.0;
 /// The error varies over the image, so its distribution has longer tails than a normal one.
-const TAIL: f64 = 1.15;
+const TAIL: f64 = 1.2;
 /// Factor on the error variance of boxes that the image's border cuts, where training had few.
 const RARE_BORDER_FACTOR: f64 = 4.0;
 /// Share of training boxes whose reconstruction error counts as usual.
 const USUAL: f64 = 0.995;
+
+/// What [`calibrate`] found, per axis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Calibration {
+    /// Error variance of the regression, mean over the training boxes, m2.
+    pub(super) error_m2: f64,
+    /// The receiver's variance as the rows show it, with what lasts for a whole block of time, m2.
+    pub(super) receiver_m2: f64,
+}
 
 /// Sets the error's size and shape in the parts of a model.
 ///
@@ -35,7 +44,7 @@ pub(super) fn calibrate(
     rows: &Rows,
     residuals: &[[f64; 2]],
     noise: &FixNoise,
-) -> Result<f64, FitError> {
+) -> Result<Calibration, FitError> {
     let mut coverage = Coverage::new(rows.rows.iter().map(|row| row.bounding_box));
     set_plain(parts, &coverage);
     let regressor = Regressor::build(parts.clone()).map_err(|error| FitError::Fault(error.into()))?;
@@ -52,8 +61,15 @@ pub(super) fn calibrate(
         Some(shared_m2) => shared_m2,
         None => few_passes_error(residuals, noise, independent),
     };
-    let lasting_m2 = lasting_m2(residuals, noise) / f64::from(BLOCKS);
-    let error_m2 = shared_m2.max(floor_m2).max(lasting_m2) + jitter_m2(&rows.rows, &points);
+    let own: Vec<[f64; 2]> = rows
+        .rows
+        .iter()
+        .zip(&points)
+        .map(|(row, point)| [point.east_m - row.label.east_m, point.north_m - row.label.north_m])
+        .collect();
+    let lasting_m2 = lasting_m2(residuals, &own);
+    let error_m2 =
+        shared_m2.max(floor_m2).max(lasting_m2 / f64::from(BLOCKS)) + jitter_m2(&rows.rows, &points);
     let error_m2 = error_m2.max(1e-4);
 
     let boxes: Vec<BoundingBox> = coverage.boxes().collect();
@@ -84,7 +100,7 @@ pub(super) fn calibrate(
     parts.parameters.insert("border_factor".to_owned(), if rare { RARE_BORDER_FACTOR } else { 1.0 });
     parts.parameters.insert("independent_fixes".to_owned(), independent);
     parts.put_coverage(&coverage);
-    Ok(error_m2)
+    Ok(Calibration { error_m2, receiver_m2: scatter_m2(&own) + lasting_m2 })
 }
 
 /// Values with which the encoder can be built before it is calibrated.
@@ -110,9 +126,9 @@ pub(super) fn independent_fixes(rows: &[Row], noise: &FixNoise) -> f64 {
 /// Variance per axis of what stays the same for a whole block of time, m2: held-out fixes scatter
 /// more about a map that other blocks have made than a map's own fixes do, by it and by the share
 /// of it that those other blocks left in the map.
-pub(super) fn lasting_m2(residuals: &[[f64; 2]], noise: &FixNoise) -> f64 {
+fn lasting_m2(held_out: &[[f64; 2]], own: &[[f64; 2]]) -> f64 {
     let others = f64::from(BLOCKS - 1);
-    (scatter_m2(residuals) - noise.variance_m2).max(0.0) * others / (others + 1.0)
+    (scatter_m2(held_out) - scatter_m2(own)).max(0.0) * others / (others + 1.0)
 }
 
 /// Variance per axis of residuals by their median, which a few wild ones do not move, m2.
@@ -121,7 +137,7 @@ fn scatter_m2(residuals: &[[f64; 2]]) -> f64 {
     median(squares.collect()) / std::f64::consts::LN_2
 }
 
-/// Variance per axis that the passes through one patch share, over all patches, m2, with half of
+/// Variance per axis that the passes through one patch share, over all patches, m2, with
 /// its own standard error on top; `None` where too few patches have three passes.
 fn shared_error(rows: &Rows, coverage: &Coverage, residuals: &[[f64; 2]]) -> Option<f64> {
     let patches = coverage.coarse(PATCHES);
@@ -167,7 +183,7 @@ fn shared_error(rows: &Rows, coverage: &Coverage, residuals: &[[f64; 2]]) -> Opt
     let mean = sum / weights;
     let standard =
         (squares / (weights * weights) - mean * mean * weights2 / (weights * weights)).max(0.0).sqrt();
-    Some((mean + 0.5 * standard).max(0.0))
+    Some((mean + standard).max(0.0))
 }
 
 /// Where passes are too few to compare: the plain difference, not trusted below what so few

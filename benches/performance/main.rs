@@ -12,6 +12,10 @@ mod served;
 mod train;
 mod transports;
 
+/// As in the binary itself.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();

@@ -10,13 +10,15 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::extract::{CameraPath, JsonBody};
 use super::problem::{Answer, Problem};
-use super::wire::json;
+use super::wire::json_of_about;
 use crate::app::App;
 use crate::domain::{Error, ErrorKind, Observation, Refusal, Result, Violation};
 use crate::exchange::{RowRules, wire};
 
 /// Most fields at fault that one answer names.
 const VIOLATIONS: usize = 100;
+/// A fused position as JSON is seldom longer.
+const ITEM_BYTES: usize = 640;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(fuse))
@@ -79,7 +81,8 @@ async fn fuse(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody
     let rules = app.row_rules(&id).await?;
     let observations = observations(&app, &body.read()?, &rules)?;
     let fused = app.fuse(&id, &observations).await?;
-    Ok(json(&Fusions { items: fused.iter().map(wire::FusedFix::from).collect() })?)
+    let items = fused.iter().map(wire::FusedFix::from).collect();
+    Ok(json_of_about(&Fusions { items }, 64 + ITEM_BYTES * fused.len())?)
 }
 
 fn observations(app: &App, request: &Request<'_>, rules: &RowRules) -> Result<Vec<Observation>> {

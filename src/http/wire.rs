@@ -55,7 +55,13 @@ pub(super) fn nullable<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
 
 /// A 200 of JSON.
 pub(super) fn json(value: &impl Serialize) -> Result<Response> {
-    let json = serde_json::to_vec(value).map_err(Error::fault)?;
+    json_of_about(value, 128)
+}
+
+/// A 200 of JSON whose length is about known, so that the buffer need not grow step by step.
+pub(super) fn json_of_about(value: &impl Serialize, bytes: usize) -> Result<Response> {
+    let mut json = Vec::with_capacity(bytes);
+    serde_json::to_writer(&mut json, value).map_err(Error::fault)?;
     let mut response = Response::new(Body::from(json));
     response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
     Ok(response)

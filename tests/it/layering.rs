@@ -44,7 +44,7 @@ const WALLS: &[(&str, &[&str])] = &[
     ("geographiclib_rs", &["geo"]),
     ("clap", &["cli"]),
     ("indicatif", &["cli"]),
-    ("metrics", &["telemetry"]),
+    ("metrics_exporter_prometheus", &["telemetry"]),
 ];
 
 struct Source {

@@ -23,7 +23,8 @@ use crate::worker;
 
 use entrance::Entrance;
 
-/// How often the registry looks for what another process on the same file has changed.
+/// How often metrics are gathered, and the registry looks for what another process on the same file
+/// has changed.
 const REFRESH_EVERY: Duration = Duration::from_secs(2);
 
 /// A server that listens but does not answer yet.
@@ -78,7 +79,7 @@ impl Server {
     pub async fn run(self) -> anyhow::Result<()> {
         let Self { config, app, listener, shutdown } = self;
         shutdown.spawn(worker::work(app.clone(), config.training.clone(), shutdown.clone()));
-        shutdown.spawn(refresh(app.clone(), shutdown.clone()));
+        shutdown.spawn(keep_up(app.clone(), shutdown.clone()));
         let entrance = Arc::new(Entrance::new(app.clone(), &shutdown));
         connection::accept(listener, entrance, &config.limits, &shutdown).await;
         tracing::info!("ending");
@@ -90,12 +91,13 @@ impl Server {
     }
 }
 
-async fn refresh(app: App, shutdown: Shutdown) {
+async fn keep_up(app: App, shutdown: Shutdown) {
     loop {
         tokio::select! {
             () = shutdown.begun() => return,
             () = tokio::time::sleep(REFRESH_EVERY) => {}
         }
+        app.metrics.upkeep();
         if let Err(error) = app.registry.refresh(&app.store).await {
             tracing::error!(%error, "cannot look for changed cameras");
         }

@@ -1,13 +1,19 @@
 //! The end of a server, in two steps: first no new work, then no work at all.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 /// Handed to everything that runs for long. Clones speak of the same end.
+///
+/// One pointer: handlers clone it with every request, and each clone of a token takes its lock.
 #[derive(Clone, Default)]
-pub struct Shutdown {
+pub struct Shutdown(Arc<Tokens>);
+
+#[derive(Default)]
+struct Tokens {
     soft: CancellationToken,
     hard: CancellationToken,
     tasks: TaskTracker,
@@ -22,41 +28,41 @@ impl Shutdown {
 
     /// Asks for the end: accept nothing new, end streams and runs in order.
     pub fn begin(&self) {
-        self.soft.cancel();
+        self.0.soft.cancel();
     }
 
     /// Whether the end was asked for.
     #[must_use]
     pub fn has_begun(&self) -> bool {
-        self.soft.is_cancelled()
+        self.0.soft.is_cancelled()
     }
 
     /// Waits until the end is asked for.
     pub async fn begun(&self) {
-        self.soft.cancelled().await;
+        self.0.soft.cancelled().await;
     }
 
     /// Waits until the time to end in order is over.
     pub async fn overdue(&self) {
-        self.hard.cancelled().await;
+        self.0.hard.cancelled().await;
     }
 
     /// Runs a task that the end waits for.
     pub fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) {
-        self.tasks.spawn(task);
+        self.0.tasks.spawn(task);
     }
 
     /// Waits until every task has ended; after `patience` they are told to drop what they do.
     /// Says whether all of them ended in order.
     pub async fn finish(&self, patience: Duration) -> bool {
-        self.soft.cancel();
-        self.tasks.close();
-        if tokio::time::timeout(patience, self.tasks.wait()).await.is_ok() {
+        self.0.soft.cancel();
+        self.0.tasks.close();
+        if tokio::time::timeout(patience, self.0.tasks.wait()).await.is_ok() {
             return true;
         }
-        self.hard.cancel();
+        self.0.hard.cancel();
         // What does not heed even this is left behind: the process ends anyway.
-        let _ = tokio::time::timeout(Duration::from_secs(2), self.tasks.wait()).await;
+        let _ = tokio::time::timeout(Duration::from_secs(2), self.0.tasks.wait()).await;
         false
     }
 }

@@ -1,5 +1,6 @@
 //! Logs and metrics. Metrics are one typed struct: no name is spelled at a call site.
 
+use std::io::IsTerminal as _;
 use std::time::Duration;
 
 use hyper::http::{HeaderName, HeaderValue};
@@ -17,7 +18,10 @@ use crate::domain::{Flag, FusedFix, RunState};
 /// A filter that cannot be read, or a log that was started before.
 pub fn start_log(config: &Config) -> anyhow::Result<()> {
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log_filter)?;
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    let log = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr);
     match config.log_format {
         LogFormat::Text => log.try_init(),
         LogFormat::Json => log.json().flatten_event(true).try_init(),
@@ -111,8 +115,13 @@ impl Metrics {
     /// The text that `/metrics` gives.
     #[must_use]
     pub fn render(&self) -> String {
-        self.handle.run_upkeep();
         self.handle.render()
+    }
+
+    /// Gathers recorded times into their buckets. They pile up until then, so this must run every
+    /// few seconds whether anybody reads the metrics or not.
+    pub fn upkeep(&self) {
+        self.handle.run_upkeep();
     }
 
     /// Observations were answered.

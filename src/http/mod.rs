@@ -66,8 +66,8 @@ pub fn router(app: App, shutdown: Shutdown) -> Router {
     routes
         .merge(page)
         .with_state(rest)
-        .layer(CatchPanicLayer::custom(problem::panicked))
-        .layer(from_fn(problem::tell))
+        // As one layer: axum boxes every request anew for each.
+        .layer((from_fn(problem::tell), CatchPanicLayer::custom(problem::panicked)))
 }
 
 /// The description of the REST interface, by OpenAPI 3.1.

@@ -134,7 +134,12 @@ async fn attempt(
             }
         }
     }
-    let (fitted, update) = fitting.finish().await;
+    let (fitted, mut update) = fitting.finish().await;
+    if fitted.is_ok() {
+        // A recipe may skip what it had counted on: a kept candidate without a network, say.
+        update.progress.epoch = update.progress.epochs;
+        update.progress.remaining_s = Some(0.0);
+    }
     if matches!(record(app, claim, update, lease).await?, Heartbeat::Lost) {
         return Ok(None);
     }

@@ -173,3 +173,34 @@ async fn the_demonstration_prints_what_works() {
     assert!(fused["items"][0]["r95_m"].as_f64().is_some_and(|r95_m| r95_m > 0.0), "{fused}");
     assert!(said.contains("grpcurl -plaintext") && said.contains("/docs"), "{said}");
 }
+
+/// A model file of an earlier version still answers, and better than the receiver alone.
+#[test]
+fn the_reference_model_answers() {
+    use sightfix::geo::distance_m;
+
+    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.safetensors");
+    let file = std::fs::read(model).expect("the reference model");
+    let regressor =
+        sightfix::model::Artifact::from_file(&file).expect("a model file").load().expect("a model");
+    let world = sightfix::simulation::simulate(&sightfix::simulation::Options {
+        seed: 99,
+        ..sightfix::simulation::Options::demo()
+    });
+    let (mut fused_m, mut gnss_m, mut rows) = (0.0, 0.0, 0.0);
+    for row in &world.rows {
+        let (Some(bounding_box), Some(fix)) = (row.bounding_box, row.fix) else { continue };
+        let observation = sightfix::domain::Observation {
+            time: row.time,
+            target_id: None,
+            bounding_box: Some(bounding_box),
+            fix: Some(fix),
+        };
+        let fused = sightfix::fusion::two_step::fuse(&observation, Some((&regressor, 1)), None, None);
+        fused_m += distance_m(fused.expect("a model answers").fused, row.truth);
+        gnss_m += distance_m(fix.position, row.truth);
+        rows += 1.0;
+    }
+    assert!(rows > 100.0, "{rows}");
+    assert!(fused_m < 0.7 * gnss_m, "fused {} m, GNSS {} m", fused_m / rows, gnss_m / rows);
+}

@@ -13,9 +13,8 @@ use crate::geo::{EastNorth, LocalPlane};
 
 /// Radius that holds 95 % of a circular normal distribution, in standard deviations per axis.
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
-/// Up to this many radii of the training boxes the error is that of the nearest of them.
-const TRUSTED_RADII: f64 = 1.25;
-/// Beyond this many radii of the training boxes a box is outside.
+/// Up to this many radii of the training boxes the error is that of the nearest of them; beyond it
+/// a box is outside.
 const OUTSIDE_RADII: f64 = 1.5;
 
 /// The one-step answer for one box.
@@ -146,7 +145,7 @@ impl Regressor {
         let reconstruction_error =
             squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px());
         let excess = (reconstruction_error - self.reconstruction_usual).max(0.0);
-        let beyond = (radii - TRUSTED_RADII).max(0.0);
+        let beyond = (radii - OUTSIDE_RADII).max(0.0);
         let border = if bounding_box.touches_border(self.image_size) { self.border_factor } else { 1.0 };
         // A box beyond those of training may be a wrong box; then its foot is as far from the truth.
         let astray = beyond * self.coverage.radius_px() / bounding_box.height_px();

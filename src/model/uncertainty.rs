@@ -24,8 +24,10 @@ const UNKNOWNS_PER_AXIS: f64 = 4.0;
 const TAIL: f64 = 1.2;
 /// Factor on the error variance of boxes that the image's border cuts, where training had few.
 const RARE_BORDER_FACTOR: f64 = 4.0;
-/// Share of training boxes whose reconstruction error counts as usual.
+/// Share of training boxes whose reconstruction error is usual for certain, and the factor on it up
+/// to which any is.
 const USUAL: f64 = 0.995;
+const USUAL_FACTOR: f64 = 2.0;
 
 /// What [`calibrate`] found, per axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,7 +55,7 @@ pub(super) fn calibrate(
     let mut rebuilt: Vec<f64> =
         rows.rows.iter().map(|row| regressor.regress(&row.bounding_box, None).reconstruction_error).collect();
     rebuilt.sort_by(f64::total_cmp);
-    let usual = rebuilt[((rebuilt.len() - 1) as f64 * USUAL) as usize].max(1e-4);
+    let usual = rebuilt[((rebuilt.len() - 1) as f64 * USUAL) as usize].max(1e-4) * USUAL_FACTOR;
 
     let independent = independent_fixes(&rows.rows, noise);
     let floor_m2 = UNKNOWNS_PER_AXIS * noise.variance_m2 / independent;
@@ -183,7 +185,7 @@ fn shared_error(rows: &Rows, coverage: &Coverage, residuals: &[[f64; 2]]) -> Opt
     let mean = sum / weights;
     let standard =
         (squares / (weights * weights) - mean * mean * weights2 / (weights * weights)).max(0.0).sqrt();
-    Some((mean + standard).max(0.0))
+    Some(mean.max(0.0) + standard)
 }
 
 /// Where passes are too few to compare: the plain difference, not trusted below what so few
@@ -205,7 +207,10 @@ fn jitter_m2(rows: &[Row], points: &[EastNorth]) -> f64 {
             jumps.push(jump(&|point| point.east_m).powi(2) + jump(&|point| point.north_m).powi(2));
         }
     }
-    median(jumps) / (2.0 * std::f64::consts::LN_2) / 6.0
+    jumps.sort_by(f64::total_cmp);
+    // The largest few are halts and turns; a mean of the rest, since far targets jitter more.
+    jumps.truncate((jumps.len() as f64 * 0.97) as usize);
+    jumps.iter().sum::<f64>() / (2.0 * 6.0 * jumps.len().max(1) as f64)
 }
 
 /// Variance per axis in m2 that one pixel of noise in both coordinates of the foot makes.

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use sightfix::app::{App, RunRequest};
 use sightfix::clock::{Clock, Randomness};
 use sightfix::config::Config;
-use sightfix::domain::{CameraId, NewCamera, Observation, Recipe};
+use sightfix::domain::{CameraId, NewCamera, Observation};
 use sightfix::server::Server;
 use sightfix::shutdown::Shutdown;
 use sightfix::simulation::{Options, simulate};
@@ -52,9 +52,8 @@ impl Served {
             .collect();
         app.store.insert_samples(&camera, samples).await.expect("samples are stored");
         let served = Self { app, address, camera, observations, shutdown, _folder: folder };
-        served
-            .train(RunRequest { recipe: Some(Recipe::Hybrid), epochs: Some(100), ..RunRequest::default() })
-            .await;
+        // As an operator who says nothing more gets it.
+        served.train(RunRequest::default()).await;
         served
     }
 

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 use tokio::sync::Mutex;
 
-use crate::domain::{CameraId, Error, ErrorKind, GnssError, ImageSize, Result, Revision};
+use crate::domain::{CameraId, Error, ErrorKind, GnssError, ImageSize, Receivers, Result, Revision};
 use crate::model::{Artifact, Regressor};
 use crate::store::Store;
 
@@ -21,6 +21,8 @@ pub struct Serving {
     pub image_size: Option<ImageSize>,
     /// The receiver's variance per axis in m2, if the profile tells it.
     pub e_gnss_m2: Option<f64>,
+    /// Whose the receivers are, for pairing.
+    pub receivers: Receivers,
     /// The active model and its version number.
     pub model: Option<(Arc<Regressor>, u32)>,
 }
@@ -117,6 +119,7 @@ impl Registry {
                 GnssError::Known(sigma) => Some(sigma.variance_m2()),
                 GnssError::Unknown => None,
             },
+            receivers: camera.profile.receivers,
             model,
         }))
     }

@@ -1,6 +1,6 @@
 //! Detections and fixes that come apart, brought together by time.
 //!
-//! Each receiver is bound to a target and has a fixed clock offset. Under [`PairingRule::Nearest`] a
+//! Each receiver is bound to a target and has a fixed clock offset ([`Receivers`]). Under [`PairingRule::Nearest`] a
 //! fix and a box make a sample when each is the other's nearest within the window, so no fix labels
 //! two boxes; under [`PairingRule::Interpolated`] every box between two neighbouring fixes gets a
 //! fix of its own time. What never happens here: files, clocks, unbounded memory on a live stream.
@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::domain::{Detection, Fix, Sample, TargetId};
+use crate::domain::{Detection, Fix, ReceiverId, Receivers, Sample, TargetId};
 use crate::geo::{EastNorth, LocalPlane};
 
 /// A fix as a receiver sent it, by the receiver's own clock.
@@ -17,44 +17,10 @@ use crate::geo::{EastNorth, LocalPlane};
 pub struct ReceivedFix {
     /// When, by the receiver's clock.
     pub time: Timestamp,
-    /// Which receiver; `None` where the file names none.
-    pub receiver_id: Option<TargetId>,
+    /// Which receiver; a fix that names none belongs to nobody.
+    pub receiver_id: Option<ReceiverId>,
     /// Where it says it is.
     pub fix: Fix,
-}
-
-/// Whose a receiver is.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Receiver {
-    /// The target that carries it.
-    pub target_id: TargetId,
-    /// Added to the receiver's time to get the camera's.
-    pub clock_offset: SignedDuration,
-}
-
-/// All receivers of a camera.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Receivers {
-    /// By receiver id; a receiver that is not named here carries its own id as target id.
-    pub bound: BTreeMap<TargetId, Receiver>,
-    /// Whose the fixes without a receiver id are.
-    pub nameless: Option<Receiver>,
-}
-
-impl Receivers {
-    /// Target and camera time of a fix; `None` for a fix without a receiver id that nobody claims.
-    #[must_use]
-    pub fn resolve(&self, received: &ReceivedFix) -> Option<(TargetId, Timestamp)> {
-        let receiver = match &received.receiver_id {
-            Some(id) => match self.bound.get(id) {
-                Some(receiver) => receiver,
-                None => return Some((id.clone(), received.time)),
-            },
-            None => self.nameless.as_ref()?,
-        };
-        let time = received.time.saturating_add(receiver.clock_offset).unwrap_or(received.time);
-        Some((receiver.target_id.clone(), time))
-    }
 }
 
 /// How a box finds its fix.
@@ -108,7 +74,7 @@ pub struct Unpaired {
     pub fixes: u64,
     /// Boxes or fixes of a target and instant that was there already.
     pub duplicates: u64,
-    /// Fixes of receivers that are bound to nobody.
+    /// Fixes that name no receiver.
     pub unbound: u64,
 }
 
@@ -132,15 +98,17 @@ pub fn pair(
     detections.sort_by_key(|detection| detection.time);
     fixes.sort_by_key(|fix| fix.time);
     let settings = PairingSettings { items_per_target: usize::MAX, targets: usize::MAX, ..*settings };
-    let mut pairer = Pairer::new(settings, receivers.clone());
+    let mut pairer = Pairer::new(settings);
     for detection in detections {
         pairer.insert_detection(detection);
     }
     for received in fixes {
-        match receivers.resolve(&received) {
-            Some((target_id, time)) => pairer.insert_fix(&target_id, time, received.fix),
-            None => pairer.unpaired.unbound += 1,
-        }
+        let Some(receiver_id) = &received.receiver_id else {
+            pairer.unpaired.unbound += 1;
+            continue;
+        };
+        let (target_id, time) = receivers.resolve(receiver_id, received.time);
+        pairer.insert_fix(&target_id, time, received.fix);
     }
     let samples = pairer.finish();
     Paired { samples, unpaired: pairer.unpaired }
@@ -163,7 +131,6 @@ pub struct Decided {
 #[derive(Debug, Clone)]
 pub struct Pairer {
     settings: PairingSettings,
-    receivers: Receivers,
     lanes: BTreeMap<TargetId, Lane>,
     unpaired: Unpaired,
 }
@@ -188,8 +155,8 @@ struct Kept<T> {
 impl Pairer {
     /// Nothing kept yet.
     #[must_use]
-    pub fn new(settings: PairingSettings, receivers: Receivers) -> Self {
-        Self { settings, receivers, lanes: BTreeMap::new(), unpaired: Unpaired::default() }
+    pub fn new(settings: PairingSettings) -> Self {
+        Self { settings, lanes: BTreeMap::new(), unpaired: Unpaired::default() }
     }
 
     /// What has not become part of a sample so far.
@@ -207,15 +174,11 @@ impl Pairer {
         decided
     }
 
-    /// Takes a fix; returns what is now certain.
-    pub fn push_fix(&mut self, received: ReceivedFix) -> Vec<Decided> {
-        let Some((target_id, time)) = self.receivers.resolve(&received) else {
-            self.unpaired.unbound += 1;
-            return Vec::new();
-        };
-        let mut decided = self.make_room(&target_id);
-        self.insert_fix(&target_id, time, received.fix);
-        decided.extend(self.decide(&target_id));
+    /// Takes the fix of a target, at the camera's time; returns what is now certain.
+    pub fn push_fix(&mut self, target_id: &TargetId, time: Timestamp, fix: Fix) -> Vec<Decided> {
+        let mut decided = self.make_room(target_id);
+        self.insert_fix(target_id, time, fix);
+        decided.extend(self.decide(target_id));
         decided
     }
 

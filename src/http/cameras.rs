@@ -14,6 +14,7 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::extract::{CameraPath, JsonBody, Params};
 use super::problem::{Answer, Problem};
+use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, empty, json, made, nullable, with_etag};
 use crate::app::App;
 use crate::domain::{self, CameraId, Error, ErrorKind, NewCamera, Result, Revision, SigmaM, TargetClass};
@@ -99,6 +100,10 @@ struct CameraDraft {
     /// Free-form labels.
     #[serde(default)]
     labels: BTreeMap<String, String>,
+    /// Whose the GNSS receivers are; one that is not named here carries its own id as target id.
+    #[serde(default)]
+    #[schema(max_items = 1_024)]
+    receivers: Vec<Receiver>,
 }
 
 impl CameraDraft {
@@ -111,6 +116,7 @@ impl CameraDraft {
             recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
             target_classes: classes(&self.target_classes)?,
             labels: self.labels,
+            receivers: receivers(&self.receivers)?,
             id: blank.id,
         })
     }
@@ -147,6 +153,9 @@ struct CameraChange {
     target_classes: Option<Vec<String>>,
     /// New labels, all of them.
     labels: Option<BTreeMap<String, String>>,
+    /// New receivers, all of them.
+    #[schema(max_items = 1_024)]
+    receivers: Option<Vec<Receiver>>,
 }
 
 impl CameraChange {
@@ -161,6 +170,7 @@ impl CameraChange {
             recipe: self.recipe.map(domain::Recipe::from),
             target_classes: self.target_classes.as_deref().map(classes).transpose()?,
             labels: self.labels,
+            receivers: self.receivers.as_deref().map(receivers).transpose()?,
         })
     }
 }
@@ -184,6 +194,8 @@ pub(super) struct Camera {
     target_classes: Vec<String>,
     /// Free-form labels.
     labels: BTreeMap<String, String>,
+    /// Whose the GNSS receivers are, and how far their clocks are off, by receiver id.
+    receivers: Vec<Receiver>,
     /// Counts the changes of the profile, from 1; also in the header `etag`.
     revision: u64,
     /// When it was made.
@@ -213,6 +225,7 @@ impl From<domain::Camera> for Camera {
             recipe: profile.recipe.into(),
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels,
+            receivers: shown(&profile.receivers),
             revision: revision.0,
             created_at,
             updated_at,

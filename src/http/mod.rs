@@ -12,6 +12,7 @@ mod fusions;
 mod gnss_error;
 mod models;
 mod problem;
+mod receivers;
 mod samples;
 mod service;
 #[cfg(test)]

@@ -15,7 +15,7 @@ use tokio::time::Instant;
 
 use super::lock;
 use crate::domain::{CameraId, Detection, Error, ErrorKind, Fix, Result, Sample, TargetId};
-use crate::fusion::pairing::{Decided, Pairer, PairingSettings, ReceivedFix, Receivers};
+use crate::fusion::pairing::{Decided, Pairer, PairingSettings};
 use crate::store::Store;
 use crate::telemetry::Metrics;
 
@@ -110,7 +110,7 @@ impl Receipt {
 /// Part of an item that looks for its partner.
 pub(super) enum Half {
     Box(Detection),
-    Fix(ReceivedFix),
+    Fix(TargetId, Timestamp, Fix),
 }
 
 /// What is decided together.
@@ -129,7 +129,6 @@ pub(super) struct Keeping {
 
 struct Waiting {
     pairer: Pairer,
-    receivers: Receivers,
     targets: HashMap<TargetId, Unsettled>,
     items: usize,
 }
@@ -141,16 +140,12 @@ struct Unsettled {
 
 impl Keeping {
     /// Begins to keep samples of a camera, by a task that ends when the last holder is gone.
-    pub(super) fn start(id: CameraId, receivers: Receivers, store: Store, metrics: Metrics) -> Arc<Self> {
-        let settings = PairingSettings { items_per_target: 1_024, targets: 256, ..PairingSettings::default() };
+    pub(super) fn start(id: CameraId, store: Store, metrics: Metrics) -> Arc<Self> {
+        let settings =
+            PairingSettings { items_per_target: 1_024, targets: 256, ..PairingSettings::default() };
         let (commits, queue) = mpsc::channel(QUEUE);
         let keeping = Arc::new(Self {
-            waiting: Mutex::new(Waiting {
-                pairer: Pairer::new(settings, receivers.clone()),
-                receivers,
-                targets: HashMap::new(),
-                items: 0,
-            }),
+            waiting: Mutex::new(Waiting { pairer: Pairer::new(settings), targets: HashMap::new(), items: 0 }),
             commits,
             settings,
         });
@@ -178,9 +173,11 @@ impl Keeping {
     /// # Errors
     /// The samples could not be committed.
     pub(super) async fn half(&self, ledger: &Arc<Ledger>, seq: u64, half: Half) -> Result<()> {
-        // The place in the queue first, so that decisions are queued in the order they are made.
+        // The place in the queue first and the lock held to the end, so that decisions are queued in
+        // the order they are made.
         let room = self.commits.reserve().await.map_err(|_| stopped(ledger))?;
-        let commit = lock(&self.waiting).take(ledger, seq, half);
+        let mut waiting = lock(&self.waiting);
+        let commit = waiting.take(ledger, seq, half);
         if !commit.samples.is_empty() || !commit.receipts.is_empty() {
             room.send(commit);
         }
@@ -193,10 +190,10 @@ impl Keeping {
     /// The samples could not be committed.
     pub(super) async fn end(&self, ledger: &Arc<Ledger>) -> Result<()> {
         let room = self.commits.reserve().await.map_err(|_| stopped(ledger))?;
-        let commit = lock(&self.waiting).end(|unsettled| {
+        let mut waiting = lock(&self.waiting);
+        room.send(waiting.end(|unsettled| {
             unsettled.receipts.iter().any(|(_, receipt)| Arc::ptr_eq(&receipt.ledger, ledger))
-        });
-        room.send(commit);
+        }));
         Ok(())
     }
 }
@@ -210,24 +207,22 @@ fn stopped(ledger: &Ledger) -> Error {
 
 impl Waiting {
     fn take(&mut self, ledger: &Arc<Ledger>, seq: u64, half: Half) -> Commit {
-        let whose = match &half {
-            Half::Box(detection) => Some((detection.target_id.clone(), detection.time)),
-            Half::Fix(received) => self.receivers.resolve(received),
+        let (target_id, time) = match &half {
+            Half::Box(detection) => (&detection.target_id, detection.time),
+            Half::Fix(target_id, time, _) => (target_id, *time),
         };
-        let receipt = ledger.receipt(seq);
-        let Some((target_id, time)) = whose else {
-            return Commit { samples: Vec::new(), receipts: vec![receipt] };
-        };
-        let unsettled = self
-            .targets
-            .entry(target_id)
-            .or_insert_with(|| Unsettled { receipts: Vec::new(), touched: Instant::now() });
-        unsettled.touched = Instant::now();
-        unsettled.receipts.push((time, receipt));
+        let now = Instant::now();
+        if !self.targets.contains_key(target_id) {
+            self.targets.insert(target_id.clone(), Unsettled { receipts: Vec::new(), touched: now });
+        }
+        if let Some(unsettled) = self.targets.get_mut(target_id) {
+            unsettled.touched = now;
+            unsettled.receipts.push((time, ledger.receipt(seq)));
+        }
         self.items += 1;
         let decided = match half {
             Half::Box(detection) => self.pairer.push_detection(detection),
-            Half::Fix(received) => self.pairer.push_fix(received),
+            Half::Fix(target_id, time, fix) => self.pairer.push_fix(&target_id, time, fix),
         };
         let mut commit = self.commit(decided);
         if self.items > MOST_WAITING {
@@ -245,8 +240,11 @@ impl Waiting {
         let decided = targets
             .into_iter()
             .map(|target_id| {
-                let nothing =
-                    || Decided { target_id: target_id.clone(), samples: Vec::new(), settled_before: Timestamp::MAX };
+                let nothing = || Decided {
+                    target_id: target_id.clone(),
+                    samples: Vec::new(),
+                    settled_before: Timestamp::MAX,
+                };
                 self.pairer.end(&target_id).unwrap_or_else(nothing)
             })
             .collect();
@@ -346,9 +344,4 @@ impl Keeping {
     pub(super) fn has_failed(&self) -> bool {
         self.commits.is_closed()
     }
-}
-
-/// A fix and its receiver.
-pub(super) fn received(time: Timestamp, receiver_id: TargetId, fix: Fix) -> Half {
-    Half::Fix(ReceivedFix { time, receiver_id: Some(receiver_id), fix })
 }

@@ -19,13 +19,12 @@ use self::stream::Places;
 use self::tracks::{Seen, Tracks};
 use self::watching::Watching;
 use super::App;
+use super::fusion::fuse_one;
 use super::registry::Serving;
-use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, Observation, Result, TargetId,
-};
+use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, FusedFix, Observation, Result, TargetId};
 use crate::fusion::two_step;
 
-pub use stream::{LiveItem, LiveStream};
+pub use stream::{LiveItem, LiveStream, Moves};
 pub use tracks::TrackPoint;
 
 /// Events that a slow reader may lag behind before it loses some.
@@ -116,10 +115,12 @@ impl App {
         serving: &Serving,
         observation: &Observation,
     ) -> Result<Followed> {
-        let fused = self.fuse_one(serving, observation);
+        let fused = fuse_one(serving, observation);
+        self.metrics.fused(fused.as_slice());
         let Some(target_id) = &observation.target_id else { return Ok(Followed { fused, track: None }) };
         let model = serving.model.as_ref().map(|(regressor, version)| (&**regressor, *version));
-        let e_gnss_m2 = two_step::fix_variance_m2(observation, model.map(|(regressor, _)| regressor), serving.e_gnss_m2);
+        let e_gnss_m2 =
+            two_step::fix_variance_m2(observation, model.map(|(regressor, _)| regressor), serving.e_gnss_m2);
         let seen = Seen {
             target_id,
             observation,

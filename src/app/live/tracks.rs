@@ -91,7 +91,9 @@ impl Tracks {
                 followed.track.update(&measurement)
             }
             Some(followed) => {
-                let Some((track, state)) = start(seen.regressor, &measurement) else { return Ok((None, None)) };
+                let Some((track, state)) = start(seen.regressor, &measurement) else {
+                    return Ok((None, None));
+                };
                 followed.track = track;
                 followed.heard_at = seen.now;
                 followed.meeting = Meeting::default();
@@ -99,7 +101,9 @@ impl Tracks {
             }
             None => {
                 self.make_room(id, seen.now, limits.tracks_per_camera)?;
-                let Some((track, state)) = start(seen.regressor, &measurement) else { return Ok((None, None)) };
+                let Some((track, state)) = start(seen.regressor, &measurement) else {
+                    return Ok((None, None));
+                };
                 let latest = Arc::new(self.point(seen.target_id, state));
                 let followed = Followed {
                     track,
@@ -184,7 +188,9 @@ impl Tracks {
         }
         Err(Error::refused(
             ErrorKind::Overloaded,
-            format!("camera {id} follows {most} targets already; target ids that change with every frame do that"),
+            format!(
+                "camera {id} follows {most} targets already; target ids that change with every frame do that"
+            ),
         ))
     }
 

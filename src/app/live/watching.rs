@@ -91,7 +91,7 @@ impl App {
     /// A fault of the store.
     pub async fn retrain_moved(&self) -> Result<()> {
         for (id, moved) in self.store.moves_to_retrain().await? {
-            let request = super::super::RunRequest { from: Some(moved.began_at), ..Default::default() };
+            let request = crate::app::RunRequest { from: Some(moved.began_at), ..Default::default() };
             match self.start_run(&id, request).await {
                 Ok(run) => {
                     self.store.note_retraining(&id, moved.model_version, run.id).await?;

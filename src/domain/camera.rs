@@ -34,6 +34,8 @@ pub struct NewCamera {
     pub labels: BTreeMap<String, String>,
     /// Whose the GNSS receivers are, and how far their clocks are off.
     pub receivers: Receivers,
+    /// Whether a training run is started by itself once the camera is found to have moved.
+    pub retrain_when_moved: bool,
 }
 
 impl NewCamera {
@@ -49,6 +51,7 @@ impl NewCamera {
             target_classes: Vec::new(),
             labels: BTreeMap::new(),
             receivers: Receivers::default(),
+            retrain_when_moved: false,
         }
     }
 
@@ -111,6 +114,8 @@ pub struct CameraChange {
     pub labels: Option<BTreeMap<String, String>>,
     /// New receivers, all of them.
     pub receivers: Option<Receivers>,
+    /// Whether to train anew by itself.
+    pub retrain_when_moved: Option<bool>,
 }
 
 impl CameraChange {
@@ -128,6 +133,7 @@ impl CameraChange {
             target_classes: self.target_classes.unwrap_or(profile.target_classes),
             labels: self.labels.unwrap_or(profile.labels),
             receivers: self.receivers.unwrap_or(profile.receivers),
+            retrain_when_moved: self.retrain_when_moved.unwrap_or(profile.retrain_when_moved),
         }
         .check()
     }

@@ -33,7 +33,7 @@ impl CameraService for Cameras {
                 .and_then(NewCamera::check)
                 .map_err(|error| error.under("profile"))?;
             let camera = self.app.create_camera(profile).await?;
-            Ok(proto::CreateCameraResponse { camera: Some(camera.into()) })
+            Ok(proto::CreateCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
         })
         .await
     }
@@ -44,7 +44,7 @@ impl CameraService for Cameras {
     ) -> Reply<proto::GetCameraResponse> {
         answer(request, |asked| async move {
             let camera = self.app.camera(&camera_id(&asked.camera_id)?).await?;
-            Ok(proto::GetCameraResponse { camera: Some(camera.into()) })
+            Ok(proto::GetCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
         })
         .await
     }
@@ -59,7 +59,7 @@ impl CameraService for Cameras {
             let page = self.app.cameras(after.as_ref(), size).await?;
             Ok(proto::ListCamerasResponse {
                 next_page_token: pages::token(page.next.as_ref()),
-                cameras: page.items.into_iter().map(Into::into).collect(),
+                cameras: page.items.into_iter().map(|camera| proto::Camera::of(&self.app, camera)).collect(),
             })
         })
         .await
@@ -75,7 +75,7 @@ impl CameraService for Cameras {
             let change = camera_change(&id, required(asked.profile, "profile")?, asked.update_mask)?;
             let changed = self.app.change_camera(&id, change, expected).await;
             let camera = changed.map_err(|error| of_field(error, "profile"))?;
-            Ok(proto::UpdateCameraResponse { camera: Some(camera.into()) })
+            Ok(proto::UpdateCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
         })
         .await
     }
@@ -109,6 +109,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
         target_classes: classes.collect::<Result<_>>()?,
         labels: profile.labels.into_iter().collect(),
         receivers: receivers(&profile.receivers)?,
+        retrain_when_moved: profile.retrain_when_moved.unwrap_or(named.retrain_when_moved),
         id: named.id,
     })
 }
@@ -155,8 +156,16 @@ fn gnss_error(error: Option<proto::GnssError>) -> Result<GnssError> {
 }
 
 /// The fields of a profile, as a mask names them.
-const FIELDS: [&str; 7] =
-    ["display_name", "image_size", "gnss_error", "recipe", "target_classes", "labels", "receivers"];
+const FIELDS: [&str; 8] = [
+    "display_name",
+    "image_size",
+    "gnss_error",
+    "recipe",
+    "target_classes",
+    "labels",
+    "receivers",
+    "retrain_when_moved",
+];
 
 /// The fields that the mask names, or those that the profile has.
 fn camera_change(
@@ -186,6 +195,7 @@ fn camera_change(
         target_classes: named("target_classes").then_some(profile.target_classes),
         labels: named("labels").then_some(profile.labels),
         receivers: named("receivers").then_some(profile.receivers),
+        retrain_when_moved: named("retrain_when_moved").then_some(profile.retrain_when_moved),
     })
 }
 
@@ -199,13 +209,15 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         !profile.target_classes.is_empty(),
         !profile.labels.is_empty(),
         !profile.receivers.is_empty(),
+        profile.retrain_when_moved.is_some(),
     ];
     FIELDS.into_iter().zip(has).filter_map(|(field, has)| has.then_some(field)).collect()
 }
 
-impl From<Camera> for proto::Camera {
-    fn from(camera: Camera) -> Self {
+impl proto::Camera {
+    fn of(app: &App, camera: Camera) -> Self {
         Self {
+            moved: app.camera_moved(camera.id()).map(|moved| (*moved).clone().into()),
             id: camera.id().as_str().to_owned(),
             warnings: camera.profile.warnings(),
             profile: Some(camera.profile.into()),
@@ -233,6 +245,7 @@ impl From<NewCamera> for proto::CameraProfile {
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels.into_iter().collect(),
             receivers: profile.receivers.iter().map(Into::into).collect(),
+            retrain_when_moved: Some(profile.retrain_when_moved),
         }
     }
 }

@@ -17,6 +17,7 @@ mod samples;
 mod service;
 #[cfg(test)]
 mod tests;
+mod tracks;
 mod training_runs;
 mod wire;
 
@@ -90,6 +91,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(training_runs::routes())
         .merge(models::routes())
         .merge(fusions::routes())
+        .merge(tracks::routes())
         .merge(gnss_error::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());

@@ -18,7 +18,7 @@ use crate::domain::{
 macro_rules! columns {
     () => {
         "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, target_classes, \
-         labels, receivers, revision, created_at_us, updated_at_us, active_model"
+         labels, receivers, retrain_when_moved, revision, created_at_us, updated_at_us, active_model"
     };
 }
 
@@ -34,8 +34,8 @@ impl Store {
         let mut transaction = turn.begin().await?;
         let insert = sqlx::query(concat!(
             "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, \
-             target_classes, labels, receivers, updated_at_us, id, created_at_us, revision) \
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
+             target_classes, labels, receivers, retrain_when_moved, updated_at_us, id, created_at_us, revision) \
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
         let row = bind_profile(insert, profile, now)?
@@ -110,7 +110,8 @@ impl Store {
         check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
-             gnss_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, updated_at_us = ?, \
+             gnss_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, retrain_when_moved = ?, \
+             updated_at_us = ?, \
              revision = revision + 1 WHERE id = ? RETURNING ",
             columns!()
         ));
@@ -205,6 +206,7 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
         .bind(serde_json::to_string(&classes).map_err(Error::fault)?)
         .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
         .bind(write_receivers(&profile.receivers)?)
+        .bind(profile.retrain_when_moved)
         .bind(now.as_microsecond()))
 }
 
@@ -221,11 +223,21 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
     let target_classes = fields.make(read_classes)?;
     let labels = fields.make(serde_json::from_str::<BTreeMap<String, String>>)?;
     let receivers = fields.make(read_receivers)?;
+    let retrain_when_moved = fields.take()?;
     let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
     let (created_at, updated_at) = (fields.time()?, fields.time()?);
     let active_model = fields.some_count()?;
-    let profile =
-        NewCamera { id, display_name, image_size, gnss_error, recipe, target_classes, labels, receivers };
+    let profile = NewCamera {
+        id,
+        display_name,
+        image_size,
+        gnss_error,
+        recipe,
+        target_classes,
+        labels,
+        receivers,
+        retrain_when_moved,
+    };
     Ok(Camera { profile, revision, created_at, updated_at, active_model })
 }
 

@@ -7,3 +7,4 @@ mod harness;
 mod layering;
 mod openapi;
 mod story;
+mod stream;

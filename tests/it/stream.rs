@@ -601,6 +601,8 @@ async fn a_camera_that_was_turned_is_told_everywhere_and_trained_anew() {
     let Some(Outcome::Fused(fused)) = client.answer().await.outcome else { panic!("no position") };
     let flags: Vec<_> = fused.flags().collect();
     assert!(flags.contains(&proto::Flag::CameraMoved), "{flags:?}");
+    // It is wrong by metres now, and says so.
+    assert!(fused.e_regression_m2 > fused.e_gnss_m2, "{fused:?}");
     client.finish().await;
     let begun = Instant::now();
     loop {

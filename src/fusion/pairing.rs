@@ -9,19 +9,10 @@ use std::collections::{BTreeMap, VecDeque};
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::domain::{Detection, Fix, ReceiverId, Receivers, Sample, TargetId};
-use crate::geo::{EastNorth, LocalPlane};
+use crate::domain::{Detection, Fix, Receivers, Sample, TargetId};
 
-/// A fix as a receiver sent it, by the receiver's own clock.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ReceivedFix {
-    /// When, by the receiver's clock.
-    pub time: Timestamp,
-    /// Which receiver; a fix that names none belongs to nobody.
-    pub receiver_id: Option<ReceiverId>,
-    /// Where it says it is.
-    pub fix: Fix,
-}
+pub use crate::domain::ReceivedFix;
+use crate::geo::{EastNorth, LocalPlane};
 
 /// How a box finds its fix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -70,10 +61,14 @@ impl Default for PairingSettings {
 pub struct Unpaired {
     /// Boxes without a partner.
     pub detections: u64,
-    /// Fixes without a partner (nearest), or that came too late to be used (interpolated).
+    /// Of these, boxes whose nearest fix is nearer to another box (nearest).
+    pub outbid: u64,
+    /// Fixes without a partner.
     pub fixes: u64,
     /// Boxes or fixes of a target and instant that was there already.
     pub duplicates: u64,
+    /// Of these, fixes.
+    pub duplicate_fixes: u64,
     /// Fixes that name no receiver.
     pub unbound: u64,
     /// Items lost to the limits of a stream.
@@ -87,6 +82,10 @@ pub struct Paired {
     pub samples: Vec<Sample>,
     /// The rest, counted.
     pub unpaired: Unpaired,
+    /// Of the boxes without a partner, those of targets that no fix belongs to.
+    pub detections_without_fixes: u64,
+    /// Of the fixes without a partner, those of targets that no box shows.
+    pub fixes_without_detections: u64,
 }
 
 /// Pairs two recorded lists, in any order.
@@ -107,8 +106,17 @@ pub fn pair(
     for fix in fixes {
         pairer.insert_fix(fix);
     }
+    let lanes = || pairer.lanes.values();
+    let without_fixes = lanes().filter(|lane| lane.fixes.is_empty()).map(|lane| lane.detections.len());
+    let without_detections = lanes().filter(|lane| lane.detections.is_empty()).map(|lane| lane.fixes.len());
+    let (detections, fixes) = (without_fixes.sum::<usize>(), without_detections.sum::<usize>());
     let samples = pairer.finish();
-    Paired { samples, unpaired: pairer.unpaired }
+    Paired {
+        samples,
+        unpaired: pairer.unpaired,
+        detections_without_fixes: detections as u64,
+        fixes_without_detections: fixes as u64,
+    }
 }
 
 /// Pairs a live stream in bounded memory. A sample comes out once nothing that may still arrive in
@@ -136,6 +144,8 @@ struct Kept<T> {
     time: Timestamp,
     item: T,
     used: bool,
+    /// Of a box: its nearest fix is nearer to another.
+    outbid: bool,
 }
 
 impl Pairer {
@@ -171,7 +181,7 @@ impl Pairer {
         let mut samples = Vec::new();
         for lane in self.lanes.values_mut() {
             lane.decide(&self.settings, None, &mut samples);
-            lane.forget(None, &mut self.unpaired, self.settings.rule);
+            lane.forget(None, &mut self.unpaired);
         }
         self.lanes.clear();
         samples.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
@@ -205,7 +215,9 @@ impl Pairer {
             return None;
         }
         lane.latest = lane.latest.max(Some(time));
+        let duplicates = self.unpaired.duplicates;
         keep(&mut lane.fixes, time, received.fix, limit, &mut self.unpaired);
+        self.unpaired.duplicate_fixes += self.unpaired.duplicates - duplicates;
         Some(target_id)
     }
 
@@ -221,7 +233,7 @@ impl Pairer {
         lane.decided = Some(until);
         let forgotten = until.checked_sub(reach).ok();
         if forgotten.is_some() {
-            lane.forget(forgotten, &mut self.unpaired, settings.rule);
+            lane.forget(forgotten, &mut self.unpaired);
         }
         samples
     }
@@ -259,7 +271,7 @@ fn keep<T>(kept: &mut VecDeque<Kept<T>>, time: Timestamp, item: T, limit: usize,
         unpaired.duplicates += 1;
         return;
     }
-    kept.insert(place, Kept { time, item, used: false });
+    kept.insert(place, Kept { time, item, used: false, outbid: false });
     if kept.len() > limit {
         unpaired.dropped += u64::from(kept.pop_front().is_some_and(|oldest| !oldest.used));
     }
@@ -303,7 +315,11 @@ impl Lane {
         let found = nearest(&self.fixes, time)?;
         let fix_time = self.fixes[found].time;
         let near = fix_time.duration_since(time).abs() <= settings.window;
-        if !near || nearest(&self.detections, fix_time)? != index {
+        if !near {
+            return None;
+        }
+        if nearest(&self.detections, fix_time)? != index {
+            self.detections[index].outbid = true;
             return None;
         }
         self.fixes[found].used = true;
@@ -331,15 +347,16 @@ impl Lane {
     }
 
     /// Lets go of what no decision will look at again, and counts what found no partner.
-    fn forget(&mut self, until: Option<Timestamp>, unpaired: &mut Unpaired, rule: PairingRule) {
+    fn forget(&mut self, until: Option<Timestamp>, unpaired: &mut Unpaired) {
         let old = |time: Timestamp| until.is_none_or(|until| time < until);
         while self.detections.front().is_some_and(|kept| old(kept.time)) {
-            let unused = self.detections.pop_front().is_some_and(|kept| !kept.used);
-            unpaired.detections += u64::from(unused);
+            let Some(kept) = self.detections.pop_front().filter(|kept| !kept.used) else { continue };
+            unpaired.detections += 1;
+            unpaired.outbid += u64::from(kept.outbid);
         }
         while self.fixes.front().is_some_and(|kept| old(kept.time)) {
             let unused = self.fixes.pop_front().is_some_and(|kept| !kept.used);
-            unpaired.fixes += u64::from(unused && rule == PairingRule::Nearest);
+            unpaired.fixes += u64::from(unused);
         }
     }
 }

@@ -5,6 +5,7 @@
 mod cameras;
 mod fusion;
 mod models;
+mod pairing;
 mod registry;
 mod samples;
 mod training;
@@ -19,6 +20,7 @@ use crate::store::Store;
 use crate::telemetry::Metrics;
 
 pub use models::GnssErrorEstimate;
+pub use pairing::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::Registry;
 pub use samples::{ImportReport, RejectedRow};
 pub use training::RunRequest;

@@ -5,8 +5,7 @@ use std::io::BufWriter;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use clap::{Args, ValueEnum};
-use jiff::SignedDuration;
+use clap::Args;
 
 use super::{format_of, open_file};
 use crate::app::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
@@ -32,15 +31,16 @@ pub(super) struct Pair {
     /// Where the samples go, as `sightfix import` takes them: CSV, NDJSON or JSON by the ending
     #[arg(long, value_name = "FILE", required_unless_present = "estimate_offset")]
     out: Option<PathBuf>,
-    /// How a box finds its fix
-    #[arg(long, value_enum, default_value_t = Method::Nearest)]
-    method: Method,
-    /// Box and fix are at most this far apart, s (nearest)
-    #[arg(long, value_name = "S", default_value = "0.5", value_parser = seconds)]
-    window_s: SignedDuration,
-    /// Fixes are joined over at most this long a gap, s (interpolate)
-    #[arg(long, value_name = "S", default_value = "2.5", value_parser = seconds)]
-    longest_gap_s: SignedDuration,
+    /// How a box finds its fix: nearest (each is the other's nearest within the window) or
+    /// interpolate (on the line between the fixes before and after the box)
+    #[arg(long, value_name = "METHOD", default_value = "nearest")]
+    method: PairingRule,
+    /// Box and fix are at most this far apart, s (nearest); 0.5 if left out
+    #[arg(long, value_name = "S")]
+    window_s: Option<f64>,
+    /// Fixes are joined over at most this long a gap, s (interpolate); 2.5 if left out
+    #[arg(long, value_name = "S")]
+    longest_gap_s: Option<f64>,
     /// Whose a receiver is; one that is not named carries its own id as target id
     #[arg(long = "receiver", value_name = "RECEIVER=TARGET", value_parser = binding)]
     receivers: Vec<Receiver>,
@@ -61,16 +61,9 @@ pub(super) struct Pair {
     apply_offset: bool,
 }
 
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Method {
-    /// Box and fix that are each other's nearest within the window
-    Nearest,
-    /// The straight line between the fixes before and after the box
-    Interpolate,
-}
-
 impl Pair {
     pub(super) fn run(self) -> anyhow::Result<()> {
+        let settings = PairingSettings::new(self.method, self.window_s, self.longest_gap_s)?;
         let (mut recording, format) = self.read()?;
         tell_rejected(&recording.rejected);
         let mut receivers = self.receivers()?;
@@ -87,7 +80,7 @@ impl Pair {
             }
         }
         let Some(out) = &self.out else { return Ok(()) };
-        let (paired, counts, _) = recording.paired(&receivers, &self.settings());
+        let (paired, counts, _) = recording.paired(&receivers, &settings);
         tell_counts(&counts);
         anyhow::ensure!(counts.paired > 0, "nothing could be paired, so {} is not written", out.display());
         let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
@@ -131,15 +124,6 @@ impl Pair {
             }
         }
         Receivers::new(receivers).context("--receiver")
-    }
-
-    fn settings(&self) -> PairingSettings {
-        let rule = match self.method {
-            Method::Nearest => PairingRule::Nearest,
-            Method::Interpolate => PairingRule::Interpolated,
-        };
-        let (window, longest_gap) = (self.window_s, self.longest_gap_s);
-        PairingSettings { rule, window, longest_gap, ..PairingSettings::default() }
     }
 }
 
@@ -209,15 +193,6 @@ fn tell_counts(counts: &PairingCounts) {
         "unused fixes: no receiver named {}, no box of the target {}, no box to take it {}, duplicate {}",
         counts.fixes_unbound, counts.fixes_without_detections, counts.fixes_unused, counts.fixes_duplicate,
     );
-}
-
-fn seconds(text: &str) -> Result<SignedDuration, String> {
-    let seconds: f64 = text.parse().map_err(|_| "must be a number of seconds")?;
-    if (0.001..=3_600.0).contains(&seconds) {
-        Ok(SignedDuration::from_secs_f64(seconds))
-    } else {
-        Err("must be from 0.001 to 3600 s".to_owned())
-    }
 }
 
 fn receiver_id(text: &str) -> Result<ReceiverId, String> {

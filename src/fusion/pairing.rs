@@ -6,10 +6,11 @@
 //! fix of its own time. What never happens here: files, clocks, unbounded memory on a live stream.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::str::FromStr;
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::domain::{Detection, Fix, Receivers, Sample, TargetId};
+use crate::domain::{Detection, Error, Fix, Receivers, Result, Sample, TargetId};
 
 pub use crate::domain::ReceivedFix;
 use crate::geo::{EastNorth, LocalPlane};
@@ -22,6 +23,31 @@ pub enum PairingRule {
     Nearest,
     /// The straight line between the fixes before and after the box.
     Interpolated,
+}
+
+impl PairingRule {
+    /// Both of them.
+    pub const ALL: [Self; 2] = [Self::Nearest, Self::Interpolated];
+
+    /// The one name used everywhere.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Nearest => "nearest",
+            Self::Interpolated => "interpolate",
+        }
+    }
+}
+
+impl FromStr for PairingRule {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::ALL
+            .into_iter()
+            .find(|rule| rule.as_str() == name)
+            .ok_or_else(|| Error::invalid("method", "must be nearest or interpolate"))
+    }
 }
 
 /// How to pair, and how much to keep on a live stream.
@@ -53,6 +79,29 @@ impl Default for PairingSettings {
             items_per_target: 512,
             targets: 1_024,
         }
+    }
+}
+
+impl PairingSettings {
+    /// The defaults but for what is given.
+    ///
+    /// # Errors
+    /// Names `window_s` or `longest_gap_s` if it is not from 0.001 to 3600 s.
+    pub fn new(rule: PairingRule, window_s: Option<f64>, longest_gap_s: Option<f64>) -> Result<Self> {
+        let default = Self::default();
+        let checked = |field: &str, seconds: Option<f64>, default: SignedDuration| match seconds {
+            None => Ok(default),
+            Some(seconds) if (0.001..=3_600.0).contains(&seconds) => {
+                Ok(SignedDuration::from_secs_f64(seconds))
+            }
+            Some(_) => Err(Error::invalid(field, "must be a number of seconds from 0.001 to 3600")),
+        };
+        Ok(Self {
+            rule,
+            window: checked("window_s", window_s, default.window)?,
+            longest_gap: checked("longest_gap_s", longest_gap_s, default.longest_gap)?,
+            ..default
+        })
     }
 }
 

@@ -61,6 +61,10 @@ pub struct Limits {
     pub batch_observations: usize,
     /// Items on one page of a list.
     pub page_items: u32,
+    /// Detections and fixes of an import in two parts, each; they are paired in memory.
+    pub pairing_rows: usize,
+    /// Imports in two parts that are paired at the same time; more wait.
+    pub pairings: usize,
     /// Rejected rows of an import that are told one by one.
     pub rejected_rows: usize,
     /// Bytes of a request's headers.
@@ -131,6 +135,8 @@ impl Default for Limits {
             message_bytes: 4 << 20,
             batch_observations: 1_000,
             page_items: 1_000,
+            pairing_rows: 500_000,
+            pairings: 2,
             rejected_rows: 100,
             header_bytes: 32 << 10,
             header_s: 10,
@@ -214,6 +220,7 @@ impl Config {
     fn check(&self) -> anyhow::Result<()> {
         anyhow::ensure!(self.training.workers >= 1, "training.workers must be at least 1");
         anyhow::ensure!(self.training.lease_s >= 3, "training.lease_s must be at least 3");
+        anyhow::ensure!(self.limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(self.limits.page_items >= 1, "limits.page_items must be at least 1");
         Ok(())
     }

@@ -6,13 +6,15 @@ mod cameras;
 mod fusion;
 mod live;
 mod models;
+mod pairing;
+mod recording;
 mod registry;
 mod samples;
 mod training;
 
 use std::sync::Arc;
 
-use tokio::sync::Notify;
+use tokio::sync::{Notify, Semaphore};
 
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
@@ -21,6 +23,8 @@ use crate::telemetry::Metrics;
 
 pub use live::{CameraEvent, Followed, LiveItem, LiveStream, Moves, TrackPoint};
 pub use models::GnssErrorEstimate;
+pub use pairing::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
+pub use recording::{PairedImport, PairedReport};
 pub use registry::Registry;
 pub use samples::{ImportReport, RejectedRow};
 pub use training::RunRequest;
@@ -45,6 +49,8 @@ pub struct Parts {
     pub limits: Limits,
     /// Counters and times.
     pub metrics: Metrics,
+    /// Places for recordings that are paired in memory.
+    pub pairings: Semaphore,
     /// Rung when a run was queued, so that a worker need not wait for its next look.
     pub run_queued: Notify,
 }
@@ -63,9 +69,9 @@ impl App {
     ) -> crate::domain::Result<Self> {
         let registry = Registry::default();
         registry.refresh(&store).await?;
-        let run_queued = Notify::new();
+        let (run_queued, pairings) = (Notify::new(), Semaphore::new(limits.pairings));
         let live = live::Live::default();
-        let parts = Parts { store, registry, live, clock, randomness, limits, metrics, run_queued };
+        let parts = Parts { store, registry, live, clock, randomness, limits, metrics, pairings, run_queued };
         Ok(Self(Arc::new(parts)))
     }
 }

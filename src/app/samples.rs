@@ -11,7 +11,7 @@ use crate::exchange::{self, Format, RowError, RowRules};
 use crate::store::{SampleFilter, SampleKey};
 
 /// Rows that go to the store at once.
-const BATCH_ROWS: usize = 1_000;
+pub(super) const BATCH_ROWS: usize = 1_000;
 /// Batches that are read ahead of the store.
 const BATCHES_AHEAD: usize = 8;
 
@@ -152,7 +152,7 @@ impl App {
         self.store.delete_samples(id, filter).await
     }
 
-    async fn store_batch(
+    pub(super) async fn store_batch(
         &self,
         id: &CameraId,
         batch: Vec<Result<Sample, RowError>>,
@@ -202,7 +202,7 @@ fn read_batches(
     Ok(())
 }
 
-fn told_what_is_stored(error: Error, report: &ImportReport) -> Error {
+pub(super) fn told_what_is_stored(error: Error, report: &ImportReport) -> Error {
     match error {
         Error::Refused(mut refusal) if report.accepted + report.duplicate > 0 => {
             refusal.message = format!(

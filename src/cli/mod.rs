@@ -10,6 +10,7 @@ mod gnss_error;
 mod health;
 mod import;
 mod openapi;
+mod pair;
 mod progress;
 mod serve;
 mod simulate;
@@ -46,6 +47,8 @@ enum Command {
     Serve(serve::Serve),
     /// Import samples from a file into a camera
     Import(import::Import),
+    /// Make samples of detections and fixes that were recorded apart
+    Pair(pair::Pair),
     /// Fit a camera's model from its samples
     Train(train::Train),
     /// Answer observations from a file, without a server
@@ -80,6 +83,7 @@ impl Cli {
         match self.command {
             Command::Serve(command) => command.run(file),
             Command::Import(command) => command.run(file),
+            Command::Pair(command) => command.run(),
             Command::Train(command) => command.run(file),
             Command::Fuse(command) => command.run(file),
             Command::GnssError(command) => command.run(),

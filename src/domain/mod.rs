@@ -22,7 +22,7 @@ pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use gnss_error::{GnssError, SigmaM};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, Observation};
-pub use receiver::{ClockOffset, Receiver, Receivers};
+pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use sample::{Sample, Score};
 pub use time::{TimeBounds, parse_time};

@@ -6,6 +6,7 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::error::{Error, Result};
 use super::names::{ReceiverId, TargetId};
+use super::observation::Fix;
 
 /// What has to be added to a receiver's time to get the camera's: at most a day, to the microsecond.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
@@ -58,6 +59,17 @@ impl ClockOffset {
 
 fn refused<T>() -> Result<T> {
     Err(Error::invalid("clock_offset_s", "must be a number of seconds from -86400 to 86400"))
+}
+
+/// A fix as a receiver sent it, by the receiver's own clock.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReceivedFix {
+    /// When, by the receiver's clock.
+    pub time: Timestamp,
+    /// Which receiver; a fix that names none belongs to nobody.
+    pub receiver_id: Option<ReceiverId>,
+    /// Where it says it is.
+    pub fix: Fix,
 }
 
 /// Whose a receiver is.

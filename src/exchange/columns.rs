@@ -27,7 +27,11 @@ pub(super) const CLASS: usize = 9;
 pub(super) const SCORE: usize = 10;
 pub(super) const TRUTH_LONGITUDE: usize = 11;
 pub(super) const TRUTH_LATITUDE: usize = 12;
-const COUNT: usize = 13;
+pub(super) const RECEIVER_ID: usize = 13;
+/// Columns that a file of fixes may have.
+pub(super) const COUNT: usize = 14;
+/// Columns that a file of samples, observations or detections may have, the first of all.
+pub(super) const OF_SAMPLES: usize = 13;
 
 /// All columns, in the order in which they are written.
 pub(super) const COLUMNS: [Column; COUNT] = [
@@ -44,6 +48,7 @@ pub(super) const COLUMNS: [Column; COUNT] = [
     column("score", "score", "score"),
     column("truth_longitude", "truth_longitude_deg", "truth.longitude_deg"),
     column("truth_latitude", "truth_latitude_deg", "truth.latitude_deg"),
+    column("receiver_id", "receiver_id", "receiver_id"),
 ];
 
 /// Columns that belong together: all of them or none.
@@ -58,19 +63,24 @@ pub(super) struct Header {
 }
 
 impl Header {
-    /// Reads the names of a header line.
+    /// Reads the names of a header line, of which the first `known` columns are known.
     ///
     /// # Errors
     /// Names a column that is unknown, stands twice or is missing.
-    pub(super) fn read<'a>(names: impl Iterator<Item = &'a str>, required: &[usize]) -> Result<Self> {
+    pub(super) fn read<'a>(
+        names: impl Iterator<Item = &'a str>,
+        required: &[usize],
+        known: usize,
+    ) -> Result<Self> {
+        let known = COLUMNS.get(..known).unwrap_or(&COLUMNS);
         let mut header =
             Self { place: [None; COUNT], spelled: COLUMNS.each_ref().map(|column| column.plain), width: 0 };
         for name in names {
             let name = name.trim();
-            let index = COLUMNS
+            let index = known
                 .iter()
                 .position(|column| column.plain == name || column.with_unit == name)
-                .ok_or_else(|| unknown(name))?;
+                .ok_or_else(|| unknown(name, known))?;
             if header.place[index].is_some() {
                 return Err(refused(COLUMNS[index].plain, "the column stands twice".to_owned()));
             }
@@ -129,8 +139,8 @@ impl Header {
     }
 }
 
-fn unknown(name: &str) -> Error {
-    let known = COLUMNS.each_ref().map(|column| column.plain).join(", ");
+fn unknown(name: &str, known: &[Column]) -> Error {
+    let known = known.iter().map(|column| column.plain).collect::<Vec<_>>().join(", ");
     let shown: String = name.chars().take(60).collect();
     refused(&shown, format!("unknown column `{shown}`; columns, parted by commas, may be {known}"))
 }

@@ -6,8 +6,8 @@
 use std::io::Read;
 
 use super::columns::{
-    CLASS, HEIGHT, Header, LATITUDE, LEFT, LONGITUDE, SCORE, SIGMA, TARGET_ID, TIME, TRUTH_LATITUDE,
-    TRUTH_LONGITUDE,
+    CLASS, COUNT, HEIGHT, Header, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA,
+    TARGET_ID, TIME, TRUTH_LATITUDE, TRUTH_LONGITUDE,
 };
 use super::lines::{Line, Lines};
 use super::rows::{Row, RowError};
@@ -25,6 +25,18 @@ impl<R: Read> CsvRows<R> {
     /// # Errors
     /// A file without a header, or with columns missing, doubled or unknown.
     pub(super) fn new(reader: R, required: &[usize]) -> Result<Self> {
+        Self::knowing(reader, required, OF_SAMPLES)
+    }
+
+    /// The same for a file of fixes, which may name receivers.
+    ///
+    /// # Errors
+    /// As [`CsvRows::new`].
+    pub(super) fn of_fixes(reader: R, required: &[usize]) -> Result<Self> {
+        Self::knowing(reader, required, COUNT)
+    }
+
+    fn knowing(reader: R, required: &[usize], known: usize) -> Result<Self> {
         let mut lines = Lines::new(reader);
         let mut fields = Fields::default();
         let header = loop {
@@ -32,7 +44,7 @@ impl<R: Read> CsvRows<R> {
                 Some((_, Line::Text(text))) if text.trim().is_empty() => {}
                 Some((_, Line::Text(text))) => {
                     let split = fields.split(text).map_err(|reason| malformed(&reason))?;
-                    break Box::new(Header::read(split, required)?);
+                    break Box::new(Header::read(split, required, known)?);
                 }
                 Some((_, Line::NotUtf8)) => return Err(malformed("the header is not UTF-8")),
                 Some((_, Line::TooLong)) => return Err(malformed("the header is longer than 64 KiB")),
@@ -40,6 +52,11 @@ impl<R: Read> CsvRows<R> {
             }
         };
         Ok(Self { lines, header, fields })
+    }
+
+    /// Number of the line that was read last, from 1.
+    pub(super) const fn line(&self) -> u64 {
+        self.lines.number()
     }
 
     /// Converts the next row that is not blank.
@@ -94,14 +111,14 @@ fn malformed(reason: &str) -> Error {
 
 /// The cells of one line in the order of the known columns.
 struct Cells<'a> {
-    cells: [&'a str; 13],
+    cells: [&'a str; COUNT],
 }
 
 type Cell<T> = std::result::Result<T, (usize, String)>;
 
 impl<'a> Cells<'a> {
     fn of(header: &Header, fields: impl Iterator<Item = &'a str>) -> Result<Self, Fault> {
-        let mut in_file = [""; 13];
+        let mut in_file = [""; COUNT];
         let mut count = 0;
         for field in fields {
             if let Some(cell) = in_file.get_mut(count) {
@@ -135,6 +152,7 @@ impl<'a> Cells<'a> {
             truth: self
                 .numbers([TRUTH_LONGITUDE, TRUTH_LATITUDE])?
                 .map(|[longitude_deg, latitude_deg]| wire::Position { longitude_deg, latitude_deg }),
+            receiver_id: self.text(RECEIVER_ID),
         })
     }
 

@@ -26,6 +26,11 @@ impl<R: Read> Lines<R> {
         Self { reader: BufReader::with_capacity(64 * 1024, reader), line: Vec::with_capacity(256), number: 0 }
     }
 
+    /// Number of the line that was read last; 0 before the first.
+    pub(super) const fn number(&self) -> u64 {
+        self.number
+    }
+
     /// The next line and its number from 1, or `None` at the end of the file.
     pub(super) fn next_line(&mut self) -> io::Result<Option<(u64, Line<'_>)>> {
         self.line.clear();

@@ -1,4 +1,5 @@
-//! Files of samples, observations, fixes and fused positions: CSV, NDJSON, JSON, GeoJSON and NMEA.
+//! Files of samples, observations, fixes and fused positions: CSV, NDJSON, JSON, GeoJSON,
+//! NMEA, GPX and gpsd's log.
 //!
 //! HTTP, the command line and evaluation all read and write through here, so a file means the same
 //! everywhere. Readers and writers stream: memory is bounded by one line or element of at most
@@ -12,7 +13,10 @@ mod cursor;
 mod elements;
 mod fixes;
 mod format;
+mod gpsd;
+mod gpx;
 mod lines;
+mod nmea_fixes;
 mod rows;
 #[cfg(test)]
 mod tests;
@@ -20,9 +24,9 @@ pub mod wire;
 mod write;
 
 pub use cursor::{foreign_cursor, read_cursor, write_cursor};
-pub use fixes::{FixFormat, TimedFix, read_fixes};
+pub use fixes::{FixFormat, TimedFix, read_fixes, read_received_fixes};
 pub use format::Format;
-pub use rows::{ObservedRow, RowError, RowRules, read_observations, read_samples};
+pub use rows::{ObservedRow, RowError, RowRules, read_detections, read_observations, read_samples};
 pub use write::{FusedWriter, SampleWriter, write_fused, write_samples};
 
 /// Longest line of a CSV, NDJSON or NMEA file and longest element of a JSON array, in bytes.

@@ -11,8 +11,8 @@ use super::format::Format;
 use super::lines::{Line, Lines};
 use super::wire::{self, Text, box_within};
 use crate::domain::{
-    Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, TargetClass, TargetId, TimeBounds,
-    parse_time,
+    Detection, Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, TargetClass, TargetId,
+    TimeBounds, parse_time,
 };
 use crate::geo::Position;
 
@@ -103,6 +103,23 @@ pub fn read_observations<R: Read>(
     Ok(std::iter::from_fn(move || rows.next_row(|row| reading.observed(&row))))
 }
 
+/// Detections of a file, one by one: rows as those of [`read_samples`] without a fix. A `target_id`
+/// that is left out is the given one. What else a row holds is passed over.
+///
+/// # Errors
+/// As [`read_samples`].
+pub fn read_detections<R: Read>(
+    reader: R,
+    format: Format,
+    rules: &RowRules,
+    target_id: Option<TargetId>,
+) -> Result<impl Iterator<Item = Result<Result<Detection, RowError>>> + use<R>> {
+    let required = [TIME, LEFT, LEFT + 1, LEFT + 2, HEIGHT];
+    let mut rows = Rows::new(reader, format, &required)?;
+    let mut reading = Reading::new(*rules);
+    Ok(std::iter::from_fn(move || rows.next_row(|row| reading.detection(&row, target_id.as_ref()))))
+}
+
 /// Any row as it stands in a file; what is required of it depends on who reads.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -117,6 +134,9 @@ pub(super) struct Row<'a> {
     pub class: Option<Text<'a>>,
     pub score: Option<f64>,
     pub truth: Option<wire::Position>,
+    /// Only files of fixes have it, and these are not JSON.
+    #[serde(skip)]
+    pub receiver_id: Option<Text<'a>>,
 }
 
 /// Turns rows into values. Neighbouring rows mostly have the same target and class, so these are
@@ -143,6 +163,18 @@ impl Reading {
             class,
             score,
             truth,
+        })
+    }
+
+    fn detection(&mut self, row: &Row<'_>, unnamed: Option<&TargetId>) -> Result<Detection> {
+        let ObservedRow { observation, class, score, .. } = self.observed(row)?;
+        let target_id = observation.target_id.or_else(|| unnamed.cloned());
+        Ok(Detection {
+            time: observation.time,
+            target_id: target_id.ok_or_else(|| missing("target_id"))?,
+            bounding_box: observation.bounding_box.ok_or_else(|| missing("bounding_box"))?,
+            class,
+            score,
         })
     }
 
@@ -175,7 +207,7 @@ fn missing(path: &str) -> Error {
 }
 
 /// The name, taken from the row before if it is the same.
-fn shared<T: Clone>(
+pub(super) fn shared<T: Clone>(
     text: Option<&Text<'_>>,
     before: &mut Option<T>,
     as_str: impl Fn(&T) -> &str,

@@ -1,5 +1,7 @@
 //! What files must and must not do, through the public readers and writers.
 
+mod fixes;
+
 use std::fs::File;
 use std::path::PathBuf;
 

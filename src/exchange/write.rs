@@ -9,7 +9,7 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::columns::COLUMNS;
+use super::columns::{COLUMNS, OF_SAMPLES};
 use super::format::Format;
 use super::wire;
 use crate::domain::{FusedFix, Sample};
@@ -184,8 +184,8 @@ impl<W: Write> Document<W> {
 }
 
 fn sample_header<W: Write>(out: &mut W) -> io::Result<()> {
-    for (index, column) in COLUMNS.iter().enumerate() {
-        let end = if index + 1 < COLUMNS.len() { "," } else { "\n" };
+    for (index, column) in COLUMNS.iter().take(OF_SAMPLES).enumerate() {
+        let end = if index + 1 < OF_SAMPLES { "," } else { "\n" };
         write!(out, "{}{end}", column.plain)?;
     }
     Ok(())

@@ -6,22 +6,14 @@
 //! fix of its own time. What never happens here: files, clocks, unbounded memory on a live stream.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::str::FromStr;
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::domain::{Detection, Fix, ReceiverId, Receivers, Sample, TargetId};
-use crate::geo::{EastNorth, LocalPlane};
+use crate::domain::{Detection, Error, Fix, Receivers, Result, Sample, TargetId};
 
-/// A fix as a receiver sent it, by the receiver's own clock.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ReceivedFix {
-    /// When, by the receiver's clock.
-    pub time: Timestamp,
-    /// Which receiver; a fix that names none belongs to nobody.
-    pub receiver_id: Option<ReceiverId>,
-    /// Where it says it is.
-    pub fix: Fix,
-}
+pub use crate::domain::ReceivedFix;
+use crate::geo::{EastNorth, LocalPlane};
 
 /// How a box finds its fix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -31,6 +23,31 @@ pub enum PairingRule {
     Nearest,
     /// The straight line between the fixes before and after the box.
     Interpolated,
+}
+
+impl PairingRule {
+    /// Both of them.
+    pub const ALL: [Self; 2] = [Self::Nearest, Self::Interpolated];
+
+    /// The one name used everywhere.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Nearest => "nearest",
+            Self::Interpolated => "interpolate",
+        }
+    }
+}
+
+impl FromStr for PairingRule {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::ALL
+            .into_iter()
+            .find(|rule| rule.as_str() == name)
+            .ok_or_else(|| Error::invalid("method", "must be nearest or interpolate"))
+    }
 }
 
 /// How to pair, and how much to keep on a live stream.
@@ -65,15 +82,42 @@ impl Default for PairingSettings {
     }
 }
 
+impl PairingSettings {
+    /// The defaults but for what is given.
+    ///
+    /// # Errors
+    /// Names `window_s` or `longest_gap_s` if it is not from 0.001 to 3600 s.
+    pub fn new(rule: PairingRule, window_s: Option<f64>, longest_gap_s: Option<f64>) -> Result<Self> {
+        let default = Self::default();
+        let checked = |field: &str, seconds: Option<f64>, default: SignedDuration| match seconds {
+            None => Ok(default),
+            Some(seconds) if (0.001..=3_600.0).contains(&seconds) => {
+                Ok(SignedDuration::from_secs_f64(seconds))
+            }
+            Some(_) => Err(Error::invalid(field, "must be a number of seconds from 0.001 to 3600")),
+        };
+        Ok(Self {
+            rule,
+            window: checked("window_s", window_s, default.window)?,
+            longest_gap: checked("longest_gap_s", longest_gap_s, default.longest_gap)?,
+            ..default
+        })
+    }
+}
+
 /// What did not become part of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Unpaired {
     /// Boxes without a partner.
     pub detections: u64,
-    /// Fixes without a partner (nearest), or that came too late to be used (interpolated).
+    /// Of these, boxes whose nearest fix is nearer to another box (nearest).
+    pub outbid: u64,
+    /// Fixes without a partner.
     pub fixes: u64,
     /// Boxes or fixes of a target and instant that was there already.
     pub duplicates: u64,
+    /// Of these, fixes.
+    pub duplicate_fixes: u64,
     /// Fixes that name no receiver.
     pub unbound: u64,
 }
@@ -85,6 +129,10 @@ pub struct Paired {
     pub samples: Vec<Sample>,
     /// The rest, counted.
     pub unpaired: Unpaired,
+    /// Of the boxes without a partner, those of targets that no fix belongs to.
+    pub detections_without_fixes: u64,
+    /// Of the fixes without a partner, those of targets that no box shows.
+    pub fixes_without_detections: u64,
 }
 
 /// Pairs two recorded lists, in any order.
@@ -110,8 +158,17 @@ pub fn pair(
         let (target_id, time) = receivers.resolve(receiver_id, received.time);
         pairer.insert_fix(&target_id, time, received.fix);
     }
+    let lanes = || pairer.lanes.values();
+    let without_fixes = lanes().filter(|lane| lane.fixes.is_empty()).map(|lane| lane.detections.len());
+    let without_detections = lanes().filter(|lane| lane.detections.is_empty()).map(|lane| lane.fixes.len());
+    let (detections, fixes) = (without_fixes.sum::<usize>(), without_detections.sum::<usize>());
     let samples = pairer.finish();
-    Paired { samples, unpaired: pairer.unpaired }
+    Paired {
+        samples,
+        unpaired: pairer.unpaired,
+        detections_without_fixes: detections as u64,
+        fixes_without_detections: fixes as u64,
+    }
 }
 
 /// What has become certain of one target.
@@ -150,6 +207,8 @@ struct Kept<T> {
     time: Timestamp,
     item: T,
     used: bool,
+    /// Of a box: its nearest fix is nearer to another.
+    outbid: bool,
 }
 
 impl Pairer {
@@ -187,7 +246,7 @@ impl Pairer {
         let mut lane = self.lanes.remove(target_id)?;
         let mut samples = Vec::new();
         lane.decide(&self.settings, None, &mut samples);
-        lane.forget(None, &mut self.unpaired, self.settings.rule);
+        lane.forget(None, &mut self.unpaired);
         Some(Decided { target_id: target_id.clone(), samples, settled_before: Timestamp::MAX })
     }
 
@@ -235,7 +294,9 @@ impl Pairer {
             return;
         }
         lane.latest = lane.latest.max(Some(time));
+        let duplicates = self.unpaired.duplicates;
         keep(&mut lane.fixes, time, fix, &mut self.unpaired);
+        self.unpaired.duplicate_fixes += self.unpaired.duplicates - duplicates;
     }
 
     fn decide(&mut self, target_id: &TargetId) -> Option<Decided> {
@@ -251,7 +312,7 @@ impl Pairer {
         lane.decide(settings, Some(until), &mut samples);
         lane.decided = Some(until);
         let settled_before = until.checked_sub(reach).ok()?;
-        lane.forget(Some(settled_before), &mut self.unpaired, settings.rule);
+        lane.forget(Some(settled_before), &mut self.unpaired);
         Some(Decided { target_id: target_id.clone(), samples, settled_before })
     }
 }
@@ -270,7 +331,7 @@ fn keep<T>(kept: &mut VecDeque<Kept<T>>, time: Timestamp, item: T, unpaired: &mu
     if kept.get(place).is_some_and(|other| other.time == time) {
         unpaired.duplicates += 1;
     } else {
-        kept.insert(place, Kept { time, item, used: false });
+        kept.insert(place, Kept { time, item, used: false, outbid: false });
     }
 }
 
@@ -312,7 +373,11 @@ impl Lane {
         let found = nearest(&self.fixes, time)?;
         let fix_time = self.fixes[found].time;
         let near = fix_time.duration_since(time).abs() <= settings.window;
-        if !near || nearest(&self.detections, fix_time)? != index {
+        if !near {
+            return None;
+        }
+        if nearest(&self.detections, fix_time)? != index {
+            self.detections[index].outbid = true;
             return None;
         }
         self.fixes[found].used = true;
@@ -340,15 +405,16 @@ impl Lane {
     }
 
     /// Lets go of what no decision will look at again, and counts what found no partner.
-    fn forget(&mut self, until: Option<Timestamp>, unpaired: &mut Unpaired, rule: PairingRule) {
+    fn forget(&mut self, until: Option<Timestamp>, unpaired: &mut Unpaired) {
         let old = |time: Timestamp| until.is_none_or(|until| time < until);
         while self.detections.front().is_some_and(|kept| old(kept.time)) {
-            let unused = self.detections.pop_front().is_some_and(|kept| !kept.used);
-            unpaired.detections += u64::from(unused);
+            let Some(kept) = self.detections.pop_front().filter(|kept| !kept.used) else { continue };
+            unpaired.detections += 1;
+            unpaired.outbid += u64::from(kept.outbid);
         }
         while self.fixes.front().is_some_and(|kept| old(kept.time)) {
             let unused = self.fixes.pop_front().is_some_and(|kept| !kept.used);
-            unpaired.fixes += u64::from(unused && rule == PairingRule::Nearest);
+            unpaired.fixes += u64::from(unused);
         }
     }
 }

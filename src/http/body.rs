@@ -107,32 +107,58 @@ pub(super) async fn spooled(
     memory_bytes: usize,
 ) -> Result<Spooled> {
     check_announced(headers, &mut body, limit).await?;
-    let (mut parts, mut length) = (VecDeque::new(), 0);
-    let mut file = None;
+    let mut spool = Spool::new(memory_bytes);
     while let Some(part) = next(&mut body).await? {
-        length += part.len();
-        if length > limit {
+        if spool.length + part.len() > limit {
             discard(headers, &mut body).await;
             return Err(too_large(limit));
         }
+        spool.push(part).await?;
+    }
+    spool.finish().await
+}
+
+/// Gathers what comes piece by piece, in memory up to a size and in a temporary file beyond.
+pub(super) struct Spool {
+    memory_bytes: usize,
+    length: usize,
+    parts: VecDeque<Bytes>,
+    file: Option<tokio::fs::File>,
+}
+
+impl Spool {
+    pub(super) const fn new(memory_bytes: usize) -> Self {
+        Self { memory_bytes, length: 0, parts: VecDeque::new(), file: None }
+    }
+
+    /// # Errors
+    /// A fault if the temporary file cannot be written.
+    pub(super) async fn push(&mut self, part: Bytes) -> Result<()> {
+        self.length += part.len();
         if !part.is_empty() {
-            parts.push_back(part);
+            self.parts.push_back(part);
         }
-        if length > memory_bytes {
-            let file = match &mut file {
+        if self.length > self.memory_bytes {
+            let file = match &mut self.file {
                 Some(file) => file,
-                None => file.insert(temporary_file().await?),
+                None => self.file.insert(temporary_file().await?),
             };
-            for part in parts.drain(..) {
+            for part in self.parts.drain(..) {
                 file.write_all(&part).await.map_err(Error::fault)?;
             }
         }
+        Ok(())
     }
-    let Some(mut file) = file else { return Ok(Spooled::Memory(parts)) };
-    file.flush().await.map_err(Error::fault)?;
-    let mut file = file.into_std().await;
-    file.rewind().map_err(Error::fault)?;
-    Ok(Spooled::File(file))
+
+    /// # Errors
+    /// A fault if the temporary file cannot be written.
+    pub(super) async fn finish(self) -> Result<Spooled> {
+        let Some(mut file) = self.file else { return Ok(Spooled::Memory(self.parts)) };
+        file.flush().await.map_err(Error::fault)?;
+        let mut file = file.into_std().await;
+        file.rewind().map_err(Error::fault)?;
+        Ok(Spooled::File(file))
+    }
 }
 
 async fn temporary_file() -> Result<tokio::fs::File> {

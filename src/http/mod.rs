@@ -11,6 +11,8 @@ mod extract;
 mod fusions;
 mod gnss_error;
 mod models;
+mod pairings;
+mod parts;
 mod problem;
 mod receivers;
 mod samples;
@@ -88,6 +90,7 @@ fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
         .merge(samples::routes())
+        .merge(pairings::routes())
         .merge(training_runs::routes())
         .merge(models::routes())
         .merge(fusions::routes())

@@ -43,10 +43,15 @@ pub(super) fn receivers(given: &[Receiver]) -> Result<Receivers> {
 
 /// The list as it is shown, all fields filled, by receiver id.
 pub(super) fn shown(receivers: &Receivers) -> Vec<Receiver> {
-    let shown = receivers.iter().map(|receiver| Receiver {
-        receiver_id: receiver.receiver_id.as_str().to_owned(),
-        target_id: Some(receiver.target_id.as_str().to_owned()),
-        clock_offset_s: receiver.clock_offset.seconds(),
-    });
-    shown.collect()
+    receivers.iter().map(Receiver::from).collect()
+}
+
+impl From<&domain::Receiver> for Receiver {
+    fn from(receiver: &domain::Receiver) -> Self {
+        Self {
+            receiver_id: receiver.receiver_id.as_str().to_owned(),
+            target_id: Some(receiver.target_id.as_str().to_owned()),
+            clock_offset_s: receiver.clock_offset.seconds(),
+        }
+    }
 }

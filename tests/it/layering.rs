@@ -42,6 +42,8 @@ const WALLS: &[(&str, &[&str])] = &[
     ("tonic_reflection", &["grpc"]),
     ("prost", &["grpc"]),
     ("geographiclib_rs", &["geo"]),
+    ("nmea", &["exchange"]),
+    ("quick_xml", &["exchange"]),
     ("clap", &["cli"]),
     ("indicatif", &["cli"]),
     ("metrics_exporter_prometheus", &["telemetry"]),

@@ -6,5 +6,6 @@ mod grpc;
 mod harness;
 mod layering;
 mod openapi;
+mod pairing;
 mod story;
 mod stream;

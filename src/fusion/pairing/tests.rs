@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use proptest::prelude::*;
 
 use super::*;
-use crate::domain::{BoundingBox, ClockOffset, Receiver, parse_time};
+use crate::domain::{BoundingBox, ClockOffset, Receiver, ReceiverId, parse_time};
 use crate::fusion::clock_offset::{OffsetSearch, estimate_clock_offset};
 use crate::fusion::track::simulated::{Normal, World, at_s};
 use crate::geo::Position;
@@ -163,6 +163,8 @@ fn no_fix_labels_two_boxes_and_the_window_holds() {
     let times: Vec<Timestamp> = found.samples.iter().map(|sample| sample.time).collect();
     assert_eq!(times, [0.48, 1.48, 2.48, 3.48].map(at_s), "the fixes at 4.49 and 5.49 see no box");
     assert_eq!((found.unpaired.detections, found.unpaired.fixes), (96, 2));
+    // No box is farther than the window from its nearest fix.
+    assert_eq!((found.unpaired.outbid, found.detections_without_fixes), (96, 0));
 }
 
 #[test]
@@ -179,6 +181,33 @@ fn receivers_are_bound_to_targets_with_their_clocks() {
     let longitudes: Vec<f64> = found.samples.iter().map(|it| it.fix.position.longitude_deg()).collect();
     assert!((longitudes[0] - 5.0).abs() < 1e-12 && (longitudes[1] - 6.0).abs() < 1e-12, "{longitudes:?}");
     assert_eq!(found.unpaired.unbound, 1);
+}
+
+#[test]
+fn what_stays_without_a_partner_is_told_by_its_reason() {
+    for rule in [PairingRule::Nearest, PairingRule::Interpolated] {
+        let settings = PairingSettings { rule, ..PairingSettings::default() };
+        let detections = ["a", "a", "a", "lone", "lone"].map(str::to_owned);
+        let detections =
+            detections.iter().zip([1.0, 1.1, 9.0, 1.0, 1.0]).map(|(name, at)| detection(name, at));
+        let fixes = [("a", 1.05), ("a", 1.05), ("a", 1.2), ("a", 5.0), ("b", 1.0)];
+        let fixes = fixes.iter().map(|(name, at)| received(Some(name), *at, 5.0));
+        let fixes = fixes.chain([received(None, 1.0, 5.0)]);
+        let found = pair(detections.collect(), fixes.collect(), &Receivers::default(), &settings);
+        let nearest = rule == PairingRule::Nearest;
+        // Nearest: 1.0 and 1.05. Interpolated: 1.1 between 1.05 and 1.2.
+        assert_eq!(found.samples.len(), 1);
+        let expected = Unpaired {
+            detections: 3,
+            outbid: u64::from(nearest),
+            fixes: if nearest { 3 } else { 2 },
+            duplicates: 2,
+            duplicate_fixes: 1,
+            unbound: 1,
+        };
+        assert_eq!(found.unpaired, expected, "{rule:?}");
+        assert_eq!((found.detections_without_fixes, found.fixes_without_detections), (1, 1));
+    }
 }
 
 #[test]

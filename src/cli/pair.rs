@@ -1,0 +1,218 @@
+//! `sightfix pair`
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use clap::Args;
+
+use super::{format_of, open_file};
+use crate::app::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
+use crate::clock::Clock;
+use crate::config::Limits;
+use crate::domain::{ClockOffset, Receiver, ReceiverId, Receivers, TargetId, TimeBounds};
+use crate::exchange::{self, FixFormat, RowRules};
+use crate::fusion::clock_offset::OffsetEstimate;
+use crate::fusion::pairing::{PairingRule, PairingSettings};
+
+/// Make samples of detections and fixes that were recorded apart
+#[derive(Args)]
+pub(super) struct Pair {
+    /// Boxes as CSV (time, target_id, left, top, width, height), NDJSON or JSON, told by the ending
+    #[arg(long, value_name = "FILE")]
+    detections: PathBuf,
+    /// Fixes as CSV, NMEA, GPX or gpsd's reports (.json), told by the ending
+    #[arg(long, value_name = "FILE")]
+    fixes: PathBuf,
+    /// Format of the fixes, where the ending does not tell: csv, nmea, gpx or gpsd
+    #[arg(long, value_name = "FORMAT")]
+    fixes_format: Option<FixFormat>,
+    /// Where the samples go, as `sightfix import` takes them: CSV, NDJSON or JSON by the ending
+    #[arg(long, value_name = "FILE", required_unless_present = "estimate_offset")]
+    out: Option<PathBuf>,
+    /// How a box finds its fix: nearest (each is the other's nearest within the window) or
+    /// interpolate (on the line between the fixes before and after the box)
+    #[arg(long, value_name = "METHOD", default_value = "nearest")]
+    method: PairingRule,
+    /// Box and fix are at most this far apart, s (nearest); 0.5 if left out
+    #[arg(long, value_name = "S")]
+    window_s: Option<f64>,
+    /// Fixes are joined over at most this long a gap, s (interpolate); 2.5 if left out
+    #[arg(long, value_name = "S")]
+    longest_gap_s: Option<f64>,
+    /// Whose a receiver is; one that is not named carries its own id as target id
+    #[arg(long = "receiver", value_name = "RECEIVER=TARGET", value_parser = binding)]
+    receivers: Vec<Receiver>,
+    /// What is to be added to a receiver's time to get the camera's, s
+    #[arg(long = "clock-offset", value_name = "RECEIVER=S", value_parser = offset)]
+    offsets: Vec<(ReceiverId, ClockOffset)>,
+    /// The receiver of fixes that name none; else the only --receiver, else the only target's own
+    #[arg(long, value_name = "RECEIVER", value_parser = receiver_id)]
+    receiver_id: Option<ReceiverId>,
+    /// The target of boxes that name none
+    #[arg(long, value_name = "TARGET", value_parser = target_id)]
+    target_id: Option<TargetId>,
+    /// Print each receiver's clock offset as the files tell it
+    #[arg(long)]
+    estimate_offset: bool,
+    /// Pair by the estimated offsets in the place of those given
+    #[arg(long, requires = "estimate_offset")]
+    apply_offset: bool,
+}
+
+impl Pair {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let settings = PairingSettings::new(self.method, self.window_s, self.longest_gap_s)?;
+        let (mut recording, format) = self.read()?;
+        tell_rejected(&recording.rejected);
+        let mut receivers = self.receivers()?;
+        if let Some(receiver) = recording.name_fixes(format, &receivers, self.receiver_id.clone())? {
+            println!("fixes that name no receiver are those of {}", carried(&receiver));
+        }
+        if self.estimate_offset {
+            let estimates = recording.clock_offsets(&receivers);
+            for (receiver, estimate) in &estimates {
+                tell_offset(receiver, estimate.as_ref());
+            }
+            if self.apply_offset {
+                receivers = applied(&receivers, &estimates)?;
+            }
+        }
+        let Some(out) = &self.out else { return Ok(()) };
+        let (paired, counts, _) = recording.paired(&receivers, &settings);
+        tell_counts(&counts);
+        anyhow::ensure!(counts.paired > 0, "nothing could be paired, so {} is not written", out.display());
+        let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
+        exchange::write_samples(BufWriter::new(file), format_of(out)?, &paired.samples)?;
+        Ok(())
+    }
+
+    fn read(&self) -> anyhow::Result<(Recording, FixFormat)> {
+        let format = self.fixes_format.or_else(|| FixFormat::from_path(&self.fixes)).with_context(|| {
+            let name = self.fixes.display();
+            format!("{name}: the ending does not tell the format; give --fixes-format csv, nmea, gpx or gpsd")
+        })?;
+        if let Some(out) = &self.out {
+            format_of(out)?; // before the work, not after
+        }
+        let rules = RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: None };
+        let (detections, fixes) = (open_file(&self.detections)?, open_file(&self.fixes)?);
+        let boxes = exchange::read_detections(
+            detections,
+            format_of(&self.detections)?,
+            &rules,
+            self.target_id.clone(),
+        )
+        .map_err(|error| of_part(Part::Detections, error))?;
+        let fixes = exchange::read_received_fixes(fixes, format, rules.time_bounds)
+            .map_err(|error| of_part(Part::Fixes, error))?;
+        let limits = RecordingLimits { rows: usize::MAX, rejected_rows: Limits::default().rejected_rows };
+        Ok((Recording::read(boxes, fixes, limits)?, format))
+    }
+
+    /// The receivers of both flags.
+    fn receivers(&self) -> anyhow::Result<Receivers> {
+        let mut receivers = self.receivers.clone();
+        for (index, (receiver_id, clock_offset)) in self.offsets.iter().enumerate() {
+            let twice = self.offsets[..index].iter().any(|(other, _)| other == receiver_id);
+            anyhow::ensure!(!twice, "--clock-offset {receiver_id} stands twice");
+            match receivers.iter_mut().find(|receiver| &receiver.receiver_id == receiver_id) {
+                Some(receiver) => receiver.clock_offset = *clock_offset,
+                None => receivers
+                    .push(Receiver { clock_offset: *clock_offset, ..Receiver::named(receiver_id.clone()) }),
+            }
+        }
+        Receivers::new(receivers).context("--receiver")
+    }
+}
+
+/// The receivers with their estimated offsets, where there is an estimate.
+fn applied(
+    receivers: &Receivers,
+    estimates: &[(Receiver, Option<OffsetEstimate>)],
+) -> anyhow::Result<Receivers> {
+    let mut changed: Vec<Receiver> = receivers.iter().cloned().collect();
+    for (receiver, estimate) in estimates {
+        let Some(estimate) = estimate else { continue };
+        let clock_offset = ClockOffset::from_seconds(estimate.clock_offset.as_secs_f64())?;
+        changed.retain(|other| other.receiver_id != receiver.receiver_id);
+        changed.push(Receiver { clock_offset, ..receiver.clone() });
+    }
+    Ok(Receivers::new(changed)?)
+}
+
+fn carried(receiver: &Receiver) -> String {
+    format!("{}, carried by {}", receiver.receiver_id, receiver.target_id)
+}
+
+fn tell_rejected(rejected: &RejectedParts) {
+    for (part, row) in &rejected.rows {
+        eprintln!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason);
+    }
+    let told = rejected.rows.len() as u64;
+    if rejected.count > told {
+        eprintln!("... and {} more", rejected.count - told);
+    }
+    if rejected.count > 0 {
+        println!("rejected rows {}", rejected.count);
+    }
+}
+
+fn tell_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) {
+    let whose = carried(receiver);
+    let given_s = receiver.clock_offset.seconds();
+    match estimate {
+        None => println!(
+            "clock offset of {whose}: not told by these files (too little movement, too little in common, or \
+             more than 10 s); {given_s:+.3} s is given"
+        ),
+        Some(found) => println!(
+            "clock offset of {whose}: {:+.3} s, standard deviation {:.3} s, explains {:.1} % of the movement \
+             ({:.1} % without an offset); {given_s:+.3} s is given",
+            found.clock_offset.as_secs_f64(),
+            found.sigma_s,
+            100.0 * found.explained,
+            100.0 * found.explained_at_zero,
+        ),
+    }
+}
+
+fn tell_counts(counts: &PairingCounts) {
+    let PairingCounts { detections, fixes, paired, .. } = counts;
+    println!("paired {paired} of {detections} detections and {fixes} fixes");
+    println!(
+        "unpaired detections: no fix of the target {}, no fix near in time {}, nearest fix is nearer to \
+         another box {}, duplicate {}",
+        counts.detections_without_fixes,
+        counts.detections_far_from_fixes,
+        counts.detections_outbid,
+        counts.detections_duplicate,
+    );
+    println!(
+        "unused fixes: no receiver named {}, no box of the target {}, no box to take it {}, duplicate {}",
+        counts.fixes_unbound, counts.fixes_without_detections, counts.fixes_unused, counts.fixes_duplicate,
+    );
+}
+
+fn receiver_id(text: &str) -> Result<ReceiverId, String> {
+    ReceiverId::new(text).map_err(|error| error.to_string())
+}
+
+fn target_id(text: &str) -> Result<TargetId, String> {
+    TargetId::new(text).map_err(|error| error.to_string())
+}
+
+/// A receiver as `phone-7=person-1`.
+fn binding(text: &str) -> Result<Receiver, String> {
+    let (receiver, target) = text.split_once('=').ok_or("must be RECEIVER=TARGET")?;
+    Ok(Receiver { target_id: target_id(target)?, ..Receiver::named(receiver_id(receiver)?) })
+}
+
+/// An offset as `phone-7=-0.35`.
+fn offset(text: &str) -> Result<(ReceiverId, ClockOffset), String> {
+    let (receiver, seconds) = text.rsplit_once('=').ok_or("must be RECEIVER=SECONDS")?;
+    let seconds: f64 = seconds.parse().map_err(|_| "must be RECEIVER=SECONDS")?;
+    let offset = ClockOffset::from_seconds(seconds).map_err(|error| error.to_string())?;
+    Ok((receiver_id(receiver)?, offset))
+}

@@ -1,0 +1,262 @@
+//! `/v1/cameras/{camera}/samples/pairings`: an import of detections and fixes that come apart.
+
+use axum::extract::{Request, State};
+use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::extract::{CameraPath, Params};
+use super::parts::parts;
+use super::problem::Answer;
+use super::receivers::Receiver;
+use super::wire::json;
+use crate::app::{App, PairedImport, PairedReport, PairingCounts, Part};
+use crate::domain::{self, Error, ReceiverId, Result, TargetId};
+use crate::exchange::{FixFormat, Format, RowError};
+use crate::fusion::clock_offset::OffsetEstimate;
+use crate::fusion::pairing::{PairingRule, PairingSettings};
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new().routes(routes!(pair_samples))
+}
+
+/// Two files to be paired by time.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "describes the body, which is read part by part")]
+struct PairingParts {
+    /// CSV with the columns `time`, `target_id`, `left`, `top`, `width`, `height`, or NDJSON or JSON
+    /// of the same; told by the part's content type or its file's name.
+    #[schema(value_type = String, format = Binary)]
+    detections: Vec<u8>,
+    /// CSV (`time`, `longitude`, `latitude`, at will `receiver_id` and `sigma_m`), NMEA 0183, GPX or
+    /// gpsd's reports, one a line; told by the part's content type or its file's name.
+    #[schema(value_type = String, format = Binary)]
+    fixes: Vec<u8>,
+}
+
+/// What became of an import in two parts.
+#[derive(Serialize, ToSchema)]
+struct PairedSamples {
+    /// Samples stored now.
+    accepted: u64,
+    /// Samples of which the same camera, target and time were stored before.
+    duplicate: u64,
+    /// Rows of both parts that are none.
+    rejected: u64,
+    /// The first 100 of these in each part.
+    rejected_rows: Vec<RejectedPartRow>,
+    /// What became of the other rows.
+    pairing: Pairing,
+    /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    unnamed_fixes_of: Option<Receiver>,
+    /// What the files tell of the receivers' clocks, if that was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    clock_offsets: Option<Vec<ClockOffsetEstimate>>,
+}
+
+/// A row that was not taken, and why.
+#[derive(Serialize, ToSchema)]
+struct RejectedPartRow {
+    /// `detections` or `fixes`.
+    #[schema(value_type = String, example = "fixes")]
+    part: &'static str,
+    /// Line of the part from 1 (a CSV file's header is line 1), or element of the JSON array from 1.
+    line: u64,
+    /// Column, or path of the field; empty if the row as a whole is at fault.
+    field: String,
+    /// What is wrong and what would be right.
+    reason: String,
+}
+
+/// What became of the rows that could be read.
+#[derive(Serialize, ToSchema)]
+struct Pairing {
+    /// Boxes.
+    detections: u64,
+    /// Fixes.
+    fixes: u64,
+    /// Samples made.
+    paired: u64,
+    /// Boxes that became no sample.
+    unpaired_detections: UnpairedDetections,
+    /// Fixes that no sample holds.
+    unused_fixes: UnusedFixes,
+}
+
+/// Boxes that became no sample, by reason.
+#[derive(Serialize, ToSchema)]
+struct UnpairedDetections {
+    /// No fix belongs to the target.
+    no_fix_of_target: u64,
+    /// The target has fixes, but none near in time.
+    no_fix_near: u64,
+    /// The nearest fix is nearer to another box.
+    fix_nearer_to_another: u64,
+    /// A box of that target and instant was there already.
+    duplicate: u64,
+}
+
+/// Fixes that no sample holds, by reason.
+#[derive(Serialize, ToSchema)]
+struct UnusedFixes {
+    /// They name no receiver, and nobody claims them.
+    no_receiver: u64,
+    /// No box shows the target.
+    no_box_of_target: u64,
+    /// No box was there to take them.
+    no_box_near: u64,
+    /// A fix of that target and instant was there already.
+    duplicate: u64,
+}
+
+/// What the files tell of one receiver's clock.
+#[derive(Serialize, ToSchema)]
+struct ClockOffsetEstimate {
+    /// The receiver.
+    receiver_id: String,
+    /// The target that carries it.
+    target_id: String,
+    /// Seconds to be added to the receiver's time to get the camera's; missing, as all below, where
+    /// the files do not tell it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    clock_offset_s: Option<f64>,
+    /// Standard deviation of the estimate.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sigma_s: Option<f64>,
+    /// Share of the movement that the boxes explain at that offset.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    explained: Option<f64>,
+    /// The same without an offset.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    explained_at_zero: Option<f64>,
+}
+
+/// Import detections and fixes that come apart
+///
+/// Both parts are paired by time: with the method `nearest` box and fix make a sample when each is
+/// the other's nearest within the window; with `interpolate` every box between two fixes gets a fix
+/// of its own time. Whose a receiver is and how far its clock is off stands in the camera's
+/// `receivers`. Fixes that name no receiver are those of `receiver_id`; else of the camera's only
+/// receiver; else of the only target among the detections. The device that a report of gpsd names is
+/// a receiver if it is among the camera's, and no name else.
+///
+/// One bad row never loses the others. Sending the same again does no harm.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/samples/pairings", tag = "samples",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("method" = Option<String>, Query, description = "`nearest` (if left out) or `interpolate`"),
+        ("window_s" = Option<f64>, Query, description = "Box and fix are at most this far apart (nearest), 0.5 if left out"),
+        ("longest_gap_s" = Option<f64>, Query, description = "Fixes are joined over at most this long a gap (interpolate), 2.5 if left out"),
+        ("target_id" = Option<String>, Query, description = "The target of boxes that name none"),
+        ("receiver_id" = Option<String>, Query, description = "The receiver of fixes that name none"),
+        ("estimate_offset" = Option<bool>, Query, description = "Tell the receivers' clock offsets as the files show them; they are not applied"),
+    ),
+    request_body(content = PairingParts, content_type = "multipart/form-data"),
+    responses((status = 200, description = "What became of the rows", body = PairedSamples))
+)]
+async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> Answer {
+    let (head, content) = request.into_parts();
+    let mut params = Params::of(&head.uri)?;
+    let settings = settings(&mut params)?;
+    let target_id = params.take("target_id", TargetId::new)?;
+    let receiver_id = params.take("receiver_id", ReceiverId::new)?;
+    let estimates_offsets = params.take("estimate_offset", truth)?.unwrap_or(false);
+    params.end()?;
+    app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
+    let names = [Part::Detections, Part::Fixes].map(Part::as_str);
+    let [detections, fixes] = parts(&head.headers, content, &app.limits, names).await?;
+    let readable = |format: &Format| *format != Format::GeoJson;
+    let detections_format = detections.format(
+        names[0],
+        |essence| Format::from_media_type(essence).filter(readable),
+        |path| Format::from_path(path).filter(readable),
+        "CSV, NDJSON or JSON",
+    )?;
+    let fixes_format = fixes.format(
+        names[1],
+        FixFormat::from_media_type,
+        FixFormat::from_path,
+        "CSV, NMEA, GPX or gpsd's reports",
+    )?;
+    let import = PairedImport {
+        detections: detections.content,
+        detections_format,
+        fixes: fixes.content,
+        fixes_format,
+        settings,
+        target_id,
+        receiver_id,
+        estimates_offsets,
+    };
+    let report = app.import_paired(&id, import).await?;
+    Ok(json(&told(report, estimates_offsets))?)
+}
+
+fn settings(params: &mut Params) -> Result<PairingSettings> {
+    let method = params.take("method", str::parse::<PairingRule>)?.unwrap_or_default();
+    let mut seconds = |name: &str| {
+        params
+            .take(name, |text| text.parse().map_err(|_| Error::invalid(name, "must be a number of seconds")))
+    };
+    let (window_s, longest_gap_s) = (seconds("window_s")?, seconds("longest_gap_s")?);
+    PairingSettings::new(method, window_s, longest_gap_s)
+}
+
+fn truth(text: &str) -> Result<bool> {
+    text.parse().map_err(|_| Error::invalid("estimate_offset", "must be true or false"))
+}
+
+fn told(report: PairedReport, with_offsets: bool) -> PairedSamples {
+    let PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets } = report;
+    let estimates = clock_offsets.iter().map(|(receiver, found)| offset(receiver, found.as_ref()));
+    PairedSamples {
+        accepted: samples.accepted,
+        duplicate: samples.duplicate,
+        rejected: rejected.count,
+        rejected_rows: rejected.rows.into_iter().map(|(part, row)| rejected_row(part, row)).collect(),
+        pairing: counts.into(),
+        unnamed_fixes_of: unnamed_fixes_of.as_ref().map(Receiver::from),
+        clock_offsets: with_offsets.then(|| estimates.collect()),
+    }
+}
+
+fn rejected_row(part: Part, row: RowError) -> RejectedPartRow {
+    RejectedPartRow { part: part.as_str(), line: row.line, field: row.field, reason: row.reason }
+}
+
+fn offset(receiver: &domain::Receiver, found: Option<&OffsetEstimate>) -> ClockOffsetEstimate {
+    ClockOffsetEstimate {
+        receiver_id: receiver.receiver_id.as_str().to_owned(),
+        target_id: receiver.target_id.as_str().to_owned(),
+        clock_offset_s: found.map(|found| found.clock_offset.as_secs_f64()),
+        sigma_s: found.map(|found| found.sigma_s),
+        explained: found.map(|found| found.explained),
+        explained_at_zero: found.map(|found| found.explained_at_zero),
+    }
+}
+
+impl From<PairingCounts> for Pairing {
+    fn from(counts: PairingCounts) -> Self {
+        Self {
+            detections: counts.detections,
+            fixes: counts.fixes,
+            paired: counts.paired,
+            unpaired_detections: UnpairedDetections {
+                no_fix_of_target: counts.detections_without_fixes,
+                no_fix_near: counts.detections_far_from_fixes,
+                fix_nearer_to_another: counts.detections_outbid,
+                duplicate: counts.detections_duplicate,
+            },
+            unused_fixes: UnusedFixes {
+                no_receiver: counts.fixes_unbound,
+                no_box_of_target: counts.fixes_without_detections,
+                no_box_near: counts.fixes_unused,
+                duplicate: counts.fixes_duplicate,
+            },
+        }
+    }
+}

@@ -136,7 +136,7 @@ impl Default for Limits {
             batch_observations: 1_000,
             page_items: 1_000,
             pairing_rows: 500_000,
-            pairings: 2,
+            pairings: 1,
             rejected_rows: 100,
             header_bytes: 32 << 10,
             header_s: 10,

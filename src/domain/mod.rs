@@ -8,6 +8,7 @@ mod bounding_box;
 mod camera;
 mod error;
 mod gnss_error;
+mod job;
 mod names;
 mod observation;
 mod recipe;
@@ -19,6 +20,7 @@ pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, NewCamera, Revision};
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use gnss_error::{GnssError, SigmaM};
+pub use job::JobState;
 pub use names::{CameraId, TargetClass, TargetId, check_labels, check_text};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, Observation};
 pub use recipe::Recipe;
@@ -26,5 +28,5 @@ pub use sample::{Sample, Score};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, ModelMetadata, ModelVersion,
-    OriginDeg, RunId, RunProgress, RunState, TrainingOptions, TrainingRun,
+    OriginDeg, RunId, RunProgress, TrainingOptions, TrainingRun,
 };

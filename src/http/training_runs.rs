@@ -79,7 +79,7 @@ fn instant(field: &str, text: Option<&str>) -> Result<Option<Timestamp>> {
 /// Where a run stands. Queued and running runs are live; the others have ended.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
-enum RunState {
+enum JobState {
     /// Waits for a worker.
     Queued,
     /// A worker fits it.
@@ -92,14 +92,14 @@ enum RunState {
     Cancelled,
 }
 
-impl From<domain::RunState> for RunState {
-    fn from(state: domain::RunState) -> Self {
+impl From<domain::JobState> for JobState {
+    fn from(state: domain::JobState) -> Self {
         match state {
-            domain::RunState::Queued => Self::Queued,
-            domain::RunState::Running => Self::Running,
-            domain::RunState::Succeeded => Self::Succeeded,
-            domain::RunState::Failed => Self::Failed,
-            domain::RunState::Cancelled => Self::Cancelled,
+            domain::JobState::Queued => Self::Queued,
+            domain::JobState::Running => Self::Running,
+            domain::JobState::Succeeded => Self::Succeeded,
+            domain::JobState::Failed => Self::Failed,
+            domain::JobState::Cancelled => Self::Cancelled,
         }
     }
 }
@@ -128,7 +128,7 @@ struct TrainingRun {
     #[schema(value_type = Option<String>, format = DateTime)]
     until: Option<Timestamp>,
     /// Where it stands.
-    state: RunState,
+    state: JobState,
     /// How far it has come.
     progress: RunProgress,
     /// How often a worker has taken it up.

@@ -87,6 +87,14 @@ pub struct Limits {
     pub epochs: u32,
     /// Samples of one training run; the latest are taken.
     pub samples_per_run: u32,
+    /// Evaluations that have not ended, over all cameras.
+    pub live_evaluations: u32,
+    /// Seeds of one evaluation.
+    pub evaluation_seeds: u32,
+    /// Samples of one evaluation, those to learn from and those to judge on together.
+    pub rows_per_evaluation: u32,
+    /// Positions of the line that is an evaluation's truth.
+    pub truth_line_positions: usize,
     /// Seconds that open requests get when the server ends.
     pub drain_s: u64,
 }
@@ -132,6 +140,10 @@ impl Default for Limits {
             live_runs: 256,
             epochs: 10_000,
             samples_per_run: 100_000,
+            live_evaluations: 64,
+            evaluation_seeds: 20,
+            rows_per_evaluation: 100_000,
+            truth_line_positions: 1_000,
             drain_s: 10,
         }
     }

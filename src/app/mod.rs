@@ -3,6 +3,7 @@
 //! What never happens here: SQL, status codes, wire formats, reading the wall clock.
 
 mod cameras;
+mod evaluations;
 mod fusion;
 mod models;
 mod registry;
@@ -18,6 +19,7 @@ use crate::config::Limits;
 use crate::store::Store;
 use crate::telemetry::Metrics;
 
+pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use models::GnssErrorEstimate;
 pub use registry::Registry;
 pub use samples::{ImportReport, RejectedRow};
@@ -43,6 +45,8 @@ pub struct Parts {
     pub metrics: Metrics,
     /// Rung when a run was queued, so that a worker need not wait for its next look.
     pub run_queued: Notify,
+    /// The same of evaluations.
+    pub evaluation_queued: Notify,
 }
 
 impl App {
@@ -59,8 +63,9 @@ impl App {
     ) -> crate::domain::Result<Self> {
         let registry = Registry::default();
         registry.refresh(&store).await?;
-        let run_queued = Notify::new();
-        let parts = Parts { store, registry, clock, randomness, limits, metrics, run_queued };
+        let (run_queued, evaluation_queued) = (Notify::new(), Notify::new());
+        let parts =
+            Parts { store, registry, clock, randomness, limits, metrics, run_queued, evaluation_queued };
         Ok(Self(Arc::new(parts)))
     }
 }

@@ -31,6 +31,8 @@ pub enum ErrorKind {
     CameraNotFound,
     /// No such training run.
     RunNotFound,
+    /// No such evaluation.
+    EvaluationNotFound,
     /// No such model version.
     ModelNotFound,
     /// A camera of that id exists already.
@@ -45,6 +47,8 @@ pub enum ErrorKind {
     RunLive,
     /// The training run has ended already.
     RunEnded,
+    /// The evaluation has ended already.
+    EvaluationEnded,
     /// The stored samples cannot support a fit.
     UnusableSamples,
     /// The caller went away or cancelled.
@@ -146,6 +150,15 @@ impl Error {
         match self {
             Self::Refused(refusal) => refusal.kind,
             Self::Fault(_) => ErrorKind::Internal,
+        }
+    }
+
+    /// The same refusal, said of that field.
+    #[must_use]
+    pub fn at(self, field: &str) -> Self {
+        match self {
+            Self::Refused(refusal) => Self::field(refusal.kind, field, refusal.message),
+            fault @ Self::Fault(_) => fault,
         }
     }
 

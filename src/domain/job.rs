@@ -1,5 +1,48 @@
 //! Work in the background: training runs and evaluations.
 
+use std::fmt;
+use std::str::FromStr;
+
+use uuid::Uuid;
+
+use super::error::{Error, ErrorKind, Result};
+
+/// Id of a job: a UUID of version 7, so that jobs sort by the time they were asked for.
+macro_rules! job_id {
+    ($(#[$doc:meta])* $name:ident, $unknown:expr, $refusal:literal) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+        pub struct $name(pub Uuid);
+
+        impl fmt::Display for $name {
+            fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+                self.0.fmt(out)
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = Error;
+
+            fn from_str(text: &str) -> Result<Self> {
+                Uuid::parse_str(text).map(Self).map_err(|_| Error::refused($unknown, $refusal))
+            }
+        }
+    };
+}
+
+job_id!(
+    /// Id of a training run: a UUID of version 7, so that runs sort by the time they were asked for.
+    RunId,
+    ErrorKind::RunNotFound,
+    "a training run's id is a UUID"
+);
+job_id!(
+    /// Id of an evaluation: a UUID of version 7, so that they sort by the time they were asked for.
+    EvaluationId,
+    ErrorKind::EvaluationNotFound,
+    "an evaluation's id is a UUID"
+);
+
 /// Where a job stands. Queued and running jobs are live; the others have ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum JobState {

@@ -1,37 +1,12 @@
 //! Training runs and the model versions they yield.
 
-use std::fmt;
-use std::str::FromStr;
-
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
-use uuid::Uuid;
 
-use super::error::{Error, ErrorKind, Result};
-use super::job::JobState;
+use super::job::{JobState, RunId};
 use super::names::CameraId;
 use super::recipe::Recipe;
-
-/// Id of a training run: a UUID of version 7, so that runs sort by the time they were asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct RunId(pub Uuid);
-
-impl fmt::Display for RunId {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(out)
-    }
-}
-
-impl FromStr for RunId {
-    type Err = Error;
-
-    fn from_str(text: &str) -> Result<Self> {
-        Uuid::parse_str(text)
-            .map(Self)
-            .map_err(|_| Error::refused(ErrorKind::RunNotFound, "a training run's id is a UUID"))
-    }
-}
 
 /// What a run is asked to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

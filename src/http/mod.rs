@@ -7,6 +7,7 @@
 mod body;
 mod cameras;
 mod description;
+mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
@@ -90,6 +91,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(models::routes())
         .merge(fusions::routes())
         .merge(gnss_error::routes())
+        .merge(evaluations::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
     router

@@ -17,9 +17,9 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::extract::{CameraPath, JsonBody, Params, RunPath};
 use super::problem::{Answer, Problem};
-use super::wire::{Recipe, empty, json, made};
+use super::wire::{JobState, Recipe, empty, instant, json, made};
 use crate::app::{App, RunRequest};
-use crate::domain::{self, EpochReport, Error, ErrorKind, Result, RunProgress, parse_time};
+use crate::domain::{self, EpochReport, Error, ErrorKind, Result, RunProgress};
 use crate::exchange::{foreign_cursor, read_cursor, write_cursor};
 
 /// How often a silent event stream says that it is still there.
@@ -65,42 +65,6 @@ impl RunDraft {
             from: instant("from", self.from.as_deref())?,
             until: instant("until", self.until.as_deref())?,
         })
-    }
-}
-
-fn instant(field: &str, text: Option<&str>) -> Result<Option<Timestamp>> {
-    let Some(text) = text else { return Ok(None) };
-    parse_time(text).map(Some).map_err(|error| match error {
-        Error::Refused(refusal) => Error::invalid(field, refusal.message),
-        fault @ Error::Fault(_) => fault,
-    })
-}
-
-/// Where a run stands. Queued and running runs are live; the others have ended.
-#[derive(Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-enum JobState {
-    /// Waits for a worker.
-    Queued,
-    /// A worker fits it.
-    Running,
-    /// Yielded a model version.
-    Succeeded,
-    /// Ended by an error.
-    Failed,
-    /// Ended by the operator.
-    Cancelled,
-}
-
-impl From<domain::JobState> for JobState {
-    fn from(state: domain::JobState) -> Self {
-        match state {
-            domain::JobState::Queued => Self::Queued,
-            domain::JobState::Running => Self::Running,
-            domain::JobState::Succeeded => Self::Succeeded,
-            domain::JobState::Failed => Self::Failed,
-            domain::JobState::Cancelled => Self::Cancelled,
-        }
     }
 }
 

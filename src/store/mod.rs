@@ -10,6 +10,7 @@
 
 mod cameras;
 mod connection;
+mod evaluations;
 mod faults;
 mod fields;
 mod group_commit;

@@ -5,6 +5,7 @@
 //! never happens here: a database transaction held across the work, work on a thread of tokio's.
 
 mod aside;
+mod evaluation;
 mod promotion;
 mod training;
 
@@ -16,9 +17,9 @@ use uuid::Uuid;
 
 use crate::app::App;
 use crate::config::Workers;
-use crate::domain::{CameraId, Error, JobState, Result, TrainingRun};
+use crate::domain::{CameraId, Error, EvaluationJob, JobState, Result, Sample, TrainingRun};
 use crate::shutdown::Shutdown;
-use crate::store::{Claim, Heartbeat};
+use crate::store::{Claim, Heartbeat, SampleFilter};
 use crate::telemetry::Metrics;
 
 use aside::{Aside, Said, Voice};
@@ -35,6 +36,11 @@ const PAGE_SAMPLES: u32 = 10_000;
 /// Works on queued training runs until the server ends.
 pub async fn train(app: App, settings: Workers, shutdown: Shutdown) {
     work::<TrainingRun>(app, settings, shutdown).await;
+}
+
+/// Carries out queued evaluations until the server ends.
+pub async fn evaluate(app: App, settings: Workers, shutdown: Shutdown) {
+    work::<EvaluationJob>(app, settings, shutdown).await;
 }
 
 /// What a job does on its thread.
@@ -186,4 +192,26 @@ async fn try_once<J: Job>(
     let (yielded, said) = aside.finish().await;
     let yielded = yielded.ok_or_else(|| Error::fault("the work's thread ended without a word"))?;
     J::end(app, claim, Ended { yielded, said, server_is_ending }, lease).await
+}
+
+/// Stored samples by time and target, the latest where there are too many.
+async fn load_samples(app: &App, camera: &CameraId, filter: &SampleFilter, most: u32) -> Result<Vec<Sample>> {
+    let most = most as usize;
+    let mut samples = Vec::new();
+    let mut after = None;
+    loop {
+        let page = app.samples(camera, filter, after, PAGE_SAMPLES).await?;
+        samples.extend(page.items);
+        if samples.len() > 2 * most {
+            samples.drain(..samples.len() - most);
+        }
+        match page.next {
+            Some(next) => after = Some(next),
+            None => break,
+        }
+    }
+    if samples.len() > most {
+        samples.drain(..samples.len() - most);
+    }
+    Ok(samples)
 }

@@ -6,7 +6,7 @@ use tokio::sync::Notify;
 use uuid::Uuid;
 
 use super::aside::{Said, Voice};
-use super::{Ended, Job, PAGE_SAMPLES, Work, promotion};
+use super::{Ended, Job, Work, load_samples, promotion};
 use crate::app::App;
 use crate::domain::{CameraId, EpochReport, Error, JobState, Result, RunProgress, Sample, TrainingRun};
 use crate::model::{self, Artifact, FitError, FitEvent, FitOptions};
@@ -66,7 +66,8 @@ impl Job for TrainingRun {
     async fn prepare(app: &App, claim: &Claim<Self>) -> Result<Work<Self>> {
         let run = &claim.job;
         let camera = app.store.camera(&run.camera_id).await?;
-        let samples = load_samples(app, run).await?;
+        let filter = SampleFilter { from: run.options.from, until: run.options.until, target_id: None };
+        let samples = load_samples(app, &run.camera_id, &filter, app.limits.samples_per_run).await?;
         let options = FitOptions {
             recipe: run.options.recipe,
             seed: run.options.seed,
@@ -168,27 +169,4 @@ async fn leave(
     let (run, now) = (claim.job.id, app.clock.now());
     app.store.append_log(run, claim.fence, now, line).await?;
     Ok(app.store.finish_run(run, claim.fence, end, now).await?.map(|run| run.state))
-}
-
-/// The samples that a run learns from: by time and target, the latest where there are too many.
-async fn load_samples(app: &App, run: &TrainingRun) -> Result<Vec<Sample>> {
-    let filter = SampleFilter { from: run.options.from, until: run.options.until, target_id: None };
-    let most = app.limits.samples_per_run as usize;
-    let mut samples = Vec::new();
-    let mut after = None;
-    loop {
-        let page = app.samples(&run.camera_id, &filter, after, PAGE_SAMPLES).await?;
-        samples.extend(page.items);
-        if samples.len() > 2 * most {
-            samples.drain(..samples.len() - most);
-        }
-        match page.next {
-            Some(next) => after = Some(next),
-            None => break,
-        }
-    }
-    if samples.len() > most {
-        samples.drain(..samples.len() - most);
-    }
-    Ok(samples)
 }

@@ -140,7 +140,7 @@ fn evaluate_aloud(
     truth: &Truth,
     options: &EvaluateOptions,
 ) -> anyhow::Result<Evaluation> {
-    let mut progress = Progress::new("{spinner} {msg}");
+    let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
     let evaluation = evaluate(train, test, truth, options, &mut |doing| {
         progress.set(doing.done.into(), doing.planned.into(), doing.words);
         ControlFlow::Continue(())

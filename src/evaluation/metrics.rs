@@ -22,6 +22,7 @@ pub struct Judged {
 
 /// Figures of the horizontal error of one method with one seed, or their means over seeds.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+#[schema(as = ErrorFigures)]
 pub struct Metrics {
     /// Mean.
     pub mean_m: f64,

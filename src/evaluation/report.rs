@@ -35,6 +35,7 @@ impl MethodReport {
 
 /// All methods.
 #[derive(Debug, Clone, PartialEq, Serialize, Default, ToSchema)]
+#[schema(as = EvaluationReport)]
 pub struct Report {
     /// By name.
     pub methods: BTreeMap<String, MethodReport>,

@@ -126,7 +126,7 @@ async fn an_evaluation_is_taken_up_again_after_a_kill() {
     let server = TestServer::start_with(folder.path(), &short_lease);
     let (train, test) = square(400, 60);
     teach(&server, &train, &test).await;
-    let asked = json!({"camera_id": "square", "methods": ["gnss", "hybrid.denied"], "seeds": 8});
+    let asked = json!({"camera_id": "square", "methods": ["gnss", "hybrid.denied"], "seeds": 4});
     let queued = server.post("/v1/evaluations", &asked).await.expect(202);
     let path = queued.header("location").to_owned();
     until(&server, &path, runs).await;
@@ -138,7 +138,7 @@ async fn an_evaluation_is_taken_up_again_after_a_kill() {
     let ended = until(&server, &path, has_ended).await;
     assert_eq!((&ended["state"], &ended["attempt"]), (&json!("succeeded"), &json!(2)), "{ended}");
     let means = ended["report"]["methods"]["hybrid.denied"]["seed_means_m"].as_array().expect("means");
-    assert_eq!(means.len(), 8, "all seeds anew: {ended}");
+    assert_eq!(means.len(), 4, "all seeds anew: {ended}");
 }
 
 #[tokio::test]

@@ -11,7 +11,7 @@ use clap::Args;
 use super::import::image_size;
 use super::progress::Progress;
 use super::{format_of, open_file};
-use crate::clock::{Clock, process_cpu_s};
+use crate::clock::{Clock, process_cpu_s as cpu_s};
 use crate::domain::{ImageSize, Recipe, Sample, SigmaM, TargetId, TimeBounds};
 use crate::evaluation::{EvaluateOptions, Evaluation, Method, TestRow, Truth, evaluate, plots};
 use crate::exchange::{self, ObservedRow, RowRules};
@@ -95,7 +95,7 @@ impl Evaluate {
             image_size: self.image_size,
             gnss_sigma: self.gnss_sigma_m,
             box_shift_px: self.box_shift_px,
-            cpu_s: process_cpu_s,
+            cpu_s,
         };
         let evaluation = evaluate_aloud(&train, &test, &truth, &options)?;
         print!("{}", evaluation.report.table());

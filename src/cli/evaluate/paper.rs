@@ -11,8 +11,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use experiments::Experiment;
 
-use super::{DEFAULT_RECIPE, evaluate_aloud};
-use crate::clock::process_cpu_s;
+use super::{DEFAULT_RECIPE, cpu_s, evaluate_aloud};
 use crate::evaluation::{EvaluateOptions, Evaluation, Metrics};
 
 /// Epochs whose Es is shown.
@@ -50,7 +49,7 @@ pub(super) fn run(shared_data: Option<&Path>, out: &Path, seeds: u64) -> anyhow:
                 image_size: experiment.image_size,
                 gnss_sigma: Some(experiment.gnss_sigma),
                 box_shift_px: experiment.box_shift_px,
-                cpu_s: process_cpu_s,
+                cpu_s,
             },
         )?;
         section(&mut page, experiment, &evaluation);

@@ -1,6 +1,6 @@
 //! What time it is and what is random: handed in as values, so that tests and runs repeat exactly.
 //!
-//! This is the only module that reads the wall clock or the operating system's randomness.
+//! This is the only module that reads the wall clock, the CPU's time or the operating system's randomness.
 
 use std::sync::{Arc, Mutex};
 
@@ -31,6 +31,33 @@ impl Clock {
     pub fn now(&self) -> Timestamp {
         (self.0)()
     }
+}
+
+/// CPU seconds of this process, from any start.
+#[must_use]
+pub fn process_cpu_s() -> f64 {
+    cpu_s("/proc/self/stat")
+}
+
+/// CPU seconds of the calling thread, from any start.
+#[must_use]
+pub fn thread_cpu_s() -> f64 {
+    cpu_s("/proc/thread-self/stat")
+}
+
+/// In user and kernel, as the kernel counts them; the clock's own seconds where it tells none.
+fn cpu_s(path: &str) -> f64 {
+    let ticks = || -> Option<f64> {
+        let line = std::fs::read_to_string(path).ok()?;
+        // The name of the program may hold spaces; what follows its bracket does not.
+        let mut fields = line.rsplit_once(')')?.1.split_ascii_whitespace().skip(11);
+        Some(fields.next()?.parse::<f64>().ok()? + fields.next()?.parse::<f64>().ok()?)
+    };
+    ticks().map_or_else(
+        || Clock::system().now().as_microsecond() as f64 * 1e-6,
+        // Linux shows its times to programs in hundredths of a second.
+        |ticks| ticks / 100.0,
+    )
 }
 
 /// Makes ids and seeds.

@@ -19,8 +19,10 @@ pub struct Config {
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
     pub log_filter: String,
-    /// Training.
-    pub training: Training,
+    /// Who fits training runs.
+    pub training: Workers,
+    /// Who carries out evaluations.
+    pub evaluation: Workers,
     /// What an outside client may make large.
     pub limits: Limits,
 }
@@ -35,13 +37,13 @@ pub enum LogFormat {
     Json,
 }
 
-/// Settings of the training workers.
+/// Workers of one kind of background job.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Training {
-    /// Runs fitted at the same time, each on a thread of its own at the lowest priority.
+pub struct Workers {
+    /// Jobs carried out at the same time, each on a thread of its own at the lowest priority.
     pub workers: usize,
-    /// Seconds after which the run of a silent worker is taken up by another.
+    /// Seconds after which the job of a silent worker is taken up by another.
     pub lease_s: u32,
 }
 
@@ -103,6 +105,14 @@ pub struct Limits {
     pub epochs: u32,
     /// Samples of one training run; the latest are taken.
     pub samples_per_run: u32,
+    /// Evaluations that have not ended, over all cameras.
+    pub live_evaluations: u32,
+    /// Seeds of one evaluation.
+    pub evaluation_seeds: u32,
+    /// Samples of one evaluation, those to learn from and those to judge on together.
+    pub rows_per_evaluation: u32,
+    /// Positions of the line that is an evaluation's truth.
+    pub truth_line_positions: usize,
     /// Seconds that open requests get when the server ends.
     pub drain_s: u64,
 }
@@ -114,13 +124,14 @@ impl Default for Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
-            training: Training::default(),
+            training: Workers::default(),
+            evaluation: Workers::default(),
             limits: Limits::default(),
         }
     }
 }
 
-impl Default for Training {
+impl Default for Workers {
     fn default() -> Self {
         Self { workers: 1, lease_s: 15 }
     }
@@ -156,6 +167,10 @@ impl Default for Limits {
             live_runs: 256,
             epochs: 10_000,
             samples_per_run: 100_000,
+            live_evaluations: 64,
+            evaluation_seeds: 20,
+            rows_per_evaluation: 100_000,
+            truth_line_positions: 1_000,
             drain_s: 10,
         }
     }
@@ -218,9 +233,11 @@ impl Config {
     }
 
     fn check(&self) -> anyhow::Result<()> {
-        anyhow::ensure!(self.training.workers >= 1, "training.workers must be at least 1");
-        anyhow::ensure!(self.training.lease_s >= 3, "training.lease_s must be at least 3");
         anyhow::ensure!(self.limits.pairings >= 1, "limits.pairings must be at least 1");
+        for (name, workers) in [("training", &self.training), ("evaluation", &self.evaluation)] {
+            anyhow::ensure!(workers.workers >= 1, "{name}.workers must be at least 1");
+            anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
+        }
         anyhow::ensure!(self.limits.page_items >= 1, "limits.page_items must be at least 1");
         Ok(())
     }

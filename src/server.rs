@@ -78,7 +78,8 @@ impl Server {
     /// Requests that did not end within their time.
     pub async fn run(self) -> anyhow::Result<()> {
         let Self { config, app, listener, shutdown } = self;
-        shutdown.spawn(worker::work(app.clone(), config.training.clone(), shutdown.clone()));
+        shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
+        shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         shutdown.spawn(keep_up(app.clone(), shutdown.clone()));
         let entrance = Arc::new(Entrance::new(app.clone(), &shutdown));
         connection::accept(listener, entrance, &config.limits, &shutdown).await;

@@ -56,6 +56,9 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::CameraNotFound => (404, code::NOT_FOUND, "camera-not-found", "There is no such camera"),
         ErrorKind::RunNotFound => (404, code::NOT_FOUND, "run-not-found", "There is no such training run"),
         ErrorKind::TrackNotFound => (404, code::NOT_FOUND, "track-not-found", "No such target is followed"),
+        ErrorKind::EvaluationNotFound => {
+            (404, code::NOT_FOUND, "evaluation-not-found", "There is no such evaluation")
+        }
         ErrorKind::ModelNotFound => {
             (404, code::NOT_FOUND, "model-not-found", "There is no such model version")
         }
@@ -76,6 +79,9 @@ pub const fn of(kind: ErrorKind) -> Status {
             (409, code::FAILED_PRECONDITION, "run-live", "The camera has a training run that has not ended")
         }
         ErrorKind::RunEnded => (409, code::FAILED_PRECONDITION, "run-ended", "The training run has ended"),
+        ErrorKind::EvaluationEnded => {
+            (409, code::FAILED_PRECONDITION, "evaluation-ended", "The evaluation has ended")
+        }
         ErrorKind::UnusableSamples => {
             (422, code::FAILED_PRECONDITION, "unusable-samples", "The samples cannot support a fit")
         }

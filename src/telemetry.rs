@@ -10,7 +10,7 @@ use metrics::{
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
 
 use crate::config::{Config, LogFormat};
-use crate::domain::{Flag, FusedFix, RunState};
+use crate::domain::{Flag, FusedFix, JobState};
 use crate::fusion::track::{Rejection, RejectionReason};
 
 /// Starts the log of the process, on standard error.
@@ -40,10 +40,10 @@ pub struct Metrics {
     samples_accepted: Counter,
     samples_duplicate: Counter,
     samples_rejected: Counter,
-    runs_succeeded: Counter,
-    runs_failed: Counter,
-    runs_cancelled: Counter,
-    run_duration_s: Histogram,
+    /// Training runs.
+    pub training_runs: JobMetrics,
+    /// Evaluations.
+    pub evaluations: JobMetrics,
     connections: Gauge,
     http_requests: [Counter; 5],
     http_duration_s: Histogram,
@@ -58,6 +58,28 @@ pub struct Metrics {
 }
 
 const NIS: &str = "sightfix_track_nis";
+/// What is counted and timed of one kind of background job.
+#[derive(Clone)]
+pub struct JobMetrics {
+    succeeded: Counter,
+    failed: Counter,
+    cancelled: Counter,
+    duration_s: Histogram,
+}
+
+impl JobMetrics {
+    /// A job has ended.
+    pub fn ended(&self, state: JobState, time: Duration) {
+        match state {
+            JobState::Succeeded => self.succeeded.increment(1),
+            JobState::Failed => self.failed.increment(1),
+            JobState::Cancelled => self.cancelled.increment(1),
+            JobState::Queued | JobState::Running => return,
+        }
+        self.duration_s.record(time.as_secs_f64());
+    }
+}
+
 const METADATA: Metadata<'static> = Metadata::new("sightfix", Level::INFO, None);
 
 impl Default for Metrics {
@@ -90,15 +112,21 @@ impl Metrics {
         let labelled = |name, help, label, value| counter(name, help, vec![Label::new(label, value)]);
         let samples =
             |outcome| labelled("sightfix_samples_total", "Rows of imports, by outcome", "outcome", outcome);
-        let runs = |state: RunState| {
-            labelled("sightfix_training_runs_total", "Training runs that ended", "state", state.as_str())
-        };
         let http = |class| {
             labelled("sightfix_http_requests_total", "Requests answered, by class of status", "status", class)
         };
         let histogram = |name: &'static str, help: &'static str| {
             describe(&recorder, name, help, Recorder::describe_histogram);
             recorder.register_histogram(&Key::from_name(name), &METADATA)
+        };
+        let jobs = |name, help, duration_name, duration_help| {
+            let ended = |state: JobState| labelled(name, help, "state", state.as_str());
+            JobMetrics {
+                succeeded: ended(JobState::Succeeded),
+                failed: ended(JobState::Failed),
+                cancelled: ended(JobState::Cancelled),
+                duration_s: histogram(duration_name, duration_help),
+            }
         };
         describe(&recorder, "sightfix_connections", "Open connections", Recorder::describe_gauge);
         describe(&recorder, "sightfix_live_streams", "Open live streams", Recorder::describe_gauge);
@@ -116,10 +144,18 @@ impl Metrics {
             samples_accepted: samples("accepted"),
             samples_duplicate: samples("duplicate"),
             samples_rejected: samples("rejected"),
-            runs_succeeded: runs(RunState::Succeeded),
-            runs_failed: runs(RunState::Failed),
-            runs_cancelled: runs(RunState::Cancelled),
-            run_duration_s: histogram("sightfix_training_run_duration_seconds", "Time of a run"),
+            training_runs: jobs(
+                "sightfix_training_runs_total",
+                "Training runs that ended",
+                "sightfix_training_run_duration_seconds",
+                "Time of a run",
+            ),
+            evaluations: jobs(
+                "sightfix_evaluations_total",
+                "Evaluations that ended",
+                "sightfix_evaluation_duration_seconds",
+                "Time of an evaluation",
+            ),
             connections: recorder.register_gauge(&Key::from_name("sightfix_connections"), &METADATA),
             http_requests: [http("1xx"), http("2xx"), http("3xx"), http("4xx"), http("5xx")],
             http_duration_s: histogram("sightfix_http_request_duration_seconds", "Time to an answer's head"),
@@ -207,17 +243,6 @@ impl Metrics {
     /// A camera was found to have moved.
     pub fn camera_moved(&self) {
         self.cameras_moved.increment(1);
-    }
-
-    /// A run has ended.
-    pub fn run_ended(&self, state: RunState, time: Duration) {
-        match state {
-            RunState::Succeeded => self.runs_succeeded.increment(1),
-            RunState::Failed => self.runs_failed.increment(1),
-            RunState::Cancelled => self.runs_cancelled.increment(1),
-            RunState::Queued | RunState::Running => return,
-        }
-        self.run_duration_s.record(time.as_secs_f64());
     }
 
     /// A request was answered.

@@ -3,6 +3,7 @@
 //! What never happens here: SQL, status codes, wire formats, reading the wall clock.
 
 mod cameras;
+mod evaluations;
 mod fusion;
 mod live;
 mod models;
@@ -21,6 +22,7 @@ use crate::config::Limits;
 use crate::store::Store;
 use crate::telemetry::Metrics;
 
+pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use live::{CameraEvent, Followed, LiveItem, LiveStream, Moves, TrackPoint};
 pub use models::GnssErrorEstimate;
 pub use pairing::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
@@ -53,6 +55,8 @@ pub struct Parts {
     pub pairings: Semaphore,
     /// Rung when a run was queued, so that a worker need not wait for its next look.
     pub run_queued: Notify,
+    /// The same of evaluations.
+    pub evaluation_queued: Notify,
 }
 
 impl App {
@@ -71,7 +75,19 @@ impl App {
         registry.refresh(&store).await?;
         let (run_queued, pairings) = (Notify::new(), Semaphore::new(limits.pairings));
         let live = live::Live::default();
-        let parts = Parts { store, registry, live, clock, randomness, limits, metrics, pairings, run_queued };
+        let evaluation_queued = Notify::new();
+        let parts = Parts {
+            store,
+            registry,
+            live,
+            clock,
+            randomness,
+            limits,
+            metrics,
+            pairings,
+            run_queued,
+            evaluation_queued,
+        };
         Ok(Self(Arc::new(parts)))
     }
 }

@@ -143,7 +143,7 @@ impl App {
 }
 
 /// Refuses at once what no recipe can learn from; the fit looks closer.
-fn check_extent(id: &CameraId, count: u64, extent: Option<[Position; 2]>) -> Result<()> {
+pub(super) fn check_extent(id: &CameraId, count: u64, extent: Option<[Position; 2]>) -> Result<()> {
     let refused = |message| Err(Error::field(ErrorKind::UnusableSamples, "samples", message));
     if count < FEWEST_SAMPLES {
         return refused(format!(

@@ -11,7 +11,7 @@ use clap::Args;
 use super::import::image_size;
 use super::progress::Progress;
 use super::{format_of, open_file};
-use crate::clock::Clock;
+use crate::clock::{Clock, process_cpu_s as cpu_s};
 use crate::domain::{ImageSize, Recipe, Sample, SigmaM, TargetId, TimeBounds};
 use crate::evaluation::{EvaluateOptions, Evaluation, Method, TestRow, Truth, evaluate, plots};
 use crate::exchange::{self, ObservedRow, RowRules};
@@ -140,11 +140,9 @@ fn evaluate_aloud(
     truth: &Truth,
     options: &EvaluateOptions,
 ) -> anyhow::Result<Evaluation> {
-    let mut progress = Progress::new("{spinner} {msg}");
-    let mut steps = 0;
-    let evaluation = evaluate(train, test, truth, options, &mut |words| {
-        steps += 1;
-        progress.set(steps, steps, words);
+    let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
+    let evaluation = evaluate(train, test, truth, options, &mut |doing| {
+        progress.set(doing.done.into(), doing.planned.into(), doing.words);
         ControlFlow::Continue(())
     });
     progress.finish();
@@ -200,22 +198,6 @@ fn read(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<Observ
         eprintln!("{}: and {} rows more were left out", path.display(), faults - 20);
     }
     Ok(rows)
-}
-
-/// CPU seconds of this process in user and kernel, as the kernel counts them; the clock's own
-/// seconds where it tells none.
-fn cpu_s() -> f64 {
-    let ticks = || -> Option<f64> {
-        let line = std::fs::read_to_string("/proc/self/stat").ok()?;
-        // The name of the program may hold spaces; what follows its bracket does not.
-        let mut fields = line.rsplit_once(')')?.1.split_ascii_whitespace().skip(11);
-        Some(fields.next()?.parse::<f64>().ok()? + fields.next()?.parse::<f64>().ok()?)
-    };
-    ticks().map_or_else(
-        || Clock::system().now().as_microsecond() as f64 * 1e-6,
-        // Linux shows its times to programs in hundredths of a second.
-        |ticks| ticks / 100.0,
-    )
 }
 
 fn methods(text: &str) -> Result<Methods, String> {

@@ -10,7 +10,7 @@ use super::progress::Progress;
 use super::{DataFolder, camera_id, open_app, runtime};
 use crate::app::{App, RunRequest};
 use crate::config::Config;
-use crate::domain::{CameraId, Recipe, RunProgress, RunState, TrainingRun};
+use crate::domain::{CameraId, JobState, Recipe, RunProgress, TrainingRun};
 use crate::shutdown::Shutdown;
 use crate::worker;
 
@@ -48,7 +48,7 @@ impl Train {
             app.store.close().await;
             let ended = ended?;
             let outcome = ended.outcome.as_deref().unwrap_or("no outcome was recorded");
-            anyhow::ensure!(ended.state == RunState::Succeeded, "{}: {outcome}", ended.state.as_str());
+            anyhow::ensure!(ended.state == JobState::Succeeded, "{}: {outcome}", ended.state.as_str());
             println!("version {} {outcome}", ended.model_version.unwrap_or_default());
             Ok(())
         })
@@ -65,7 +65,7 @@ pub(super) async fn train(
 ) -> anyhow::Result<TrainingRun> {
     let queued = app.start_run(camera, request).await?;
     let shutdown = Shutdown::new();
-    shutdown.spawn(worker::work(app.clone(), settings.training.clone(), shutdown.clone()));
+    shutdown.spawn(worker::train(app.clone(), settings.training.clone(), shutdown.clone()));
     let mut progress = Progress::new("{bar:40} {pos}/{len} epochs {msg}");
     let mut seen = queued.clone();
     let mut changes = std::pin::pin!(app.watch_run(camera, queued.id).await?);

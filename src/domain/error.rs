@@ -33,6 +33,8 @@ pub enum ErrorKind {
     RunNotFound,
     /// No such target is followed.
     TrackNotFound,
+    /// No such evaluation.
+    EvaluationNotFound,
     /// No such model version.
     ModelNotFound,
     /// A camera of that id exists already.
@@ -47,6 +49,8 @@ pub enum ErrorKind {
     RunLive,
     /// The training run has ended already.
     RunEnded,
+    /// The evaluation has ended already.
+    EvaluationEnded,
     /// The stored samples cannot support a fit.
     UnusableSamples,
     /// The caller went away or cancelled.
@@ -148,6 +152,15 @@ impl Error {
         match self {
             Self::Refused(refusal) => refusal.kind,
             Self::Fault(_) => ErrorKind::Internal,
+        }
+    }
+
+    /// The same refusal, said of that field.
+    #[must_use]
+    pub fn at(self, field: &str) -> Self {
+        match self {
+            Self::Refused(refusal) => Self::field(refusal.kind, field, refusal.message),
+            fault @ Self::Fault(_) => fault,
         }
     }
 

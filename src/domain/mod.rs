@@ -7,7 +7,10 @@
 mod bounding_box;
 mod camera;
 mod error;
+mod evaluation;
 mod gnss_error;
+mod job;
+mod method;
 mod names;
 mod observation;
 mod receiver;
@@ -19,7 +22,10 @@ mod training;
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
+pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
+pub use job::{EvaluationId, JobState, RunId};
+pub use method::{Method, Step};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
@@ -28,5 +34,5 @@ pub use sample::{Sample, Score};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, ModelMetadata, ModelVersion,
-    OriginDeg, RunId, RunProgress, RunState, TrainingOptions, TrainingRun,
+    OriginDeg, RunProgress, TrainingOptions, TrainingRun,
 };

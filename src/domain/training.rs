@@ -1,36 +1,12 @@
 //! Training runs and the model versions they yield.
 
-use std::fmt;
-use std::str::FromStr;
-
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
-use uuid::Uuid;
 
-use super::error::{Error, ErrorKind, Result};
+use super::job::{JobState, RunId};
 use super::names::CameraId;
 use super::recipe::Recipe;
-
-/// Id of a training run: a UUID of version 7, so that runs sort by the time they were asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct RunId(pub Uuid);
-
-impl fmt::Display for RunId {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(out)
-    }
-}
-
-impl FromStr for RunId {
-    type Err = Error;
-
-    fn from_str(text: &str) -> Result<Self> {
-        Uuid::parse_str(text)
-            .map(Self)
-            .map_err(|_| Error::refused(ErrorKind::RunNotFound, "a training run's id is a UUID"))
-    }
-}
 
 /// What a run is asked to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,44 +21,6 @@ pub struct TrainingOptions {
     pub from: Option<Timestamp>,
     /// Only samples before this instant.
     pub until: Option<Timestamp>,
-}
-
-/// Where a run stands. Queued and running runs are live; the others have ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum RunState {
-    /// Waits for a worker.
-    Queued,
-    /// A worker fits it.
-    Running,
-    /// Yielded a model version.
-    Succeeded,
-    /// Ended by an error; the run's log says which.
-    Failed,
-    /// Ended by the operator.
-    Cancelled,
-}
-
-impl RunState {
-    /// All of them.
-    pub const ALL: [Self; 5] = [Self::Queued, Self::Running, Self::Succeeded, Self::Failed, Self::Cancelled];
-
-    /// The one name used everywhere.
-    #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Queued => "queued",
-            Self::Running => "running",
-            Self::Succeeded => "succeeded",
-            Self::Failed => "failed",
-            Self::Cancelled => "cancelled",
-        }
-    }
-
-    /// Whether the run will change no more.
-    #[must_use]
-    pub const fn has_ended(self) -> bool {
-        matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
-    }
 }
 
 /// How far a fit has come.
@@ -129,7 +67,7 @@ pub struct TrainingRun {
     /// What was asked for.
     pub options: TrainingOptions,
     /// Where it stands.
-    pub state: RunState,
+    pub state: JobState,
     /// How far it has come.
     pub progress: RunProgress,
     /// How often a worker has taken it up.

@@ -2,9 +2,8 @@
 
 use std::ops::ControlFlow;
 
-use super::method::Method;
 use super::runner::EvaluateOptions;
-use crate::domain::{EpochReport, GnssError, Recipe, Sample};
+use crate::domain::{EpochReport, GnssError, Method, Recipe, Sample};
 use crate::filters::{FixError, ImmUkf, ImmUkfOptions};
 use crate::fusion::track::{GnssNoise, ResidualAt, TrackSettings, estimate_gnss_noise};
 use crate::geo::{EastNorth, LocalPlane};

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
+use utoipa::ToSchema;
 
 /// Radii (m) whose share of errors is reported.
 pub const BOUNDS_M: [f64; 8] = [0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0];
@@ -20,7 +21,8 @@ pub struct Judged {
 }
 
 /// Figures of the horizontal error of one method with one seed, or their means over seeds.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+#[schema(as = ErrorFigures)]
 pub struct Metrics {
     /// Mean.
     pub mean_m: f64,

@@ -4,16 +4,15 @@
 //! comes from the training samples alone.
 
 mod learners;
-mod method;
 mod metrics;
 mod plots;
 mod report;
 mod runner;
 mod truth;
 
-pub use method::{Method, Step};
+// What is evaluated by which, in the words of the domain, where jobs keep them.
+pub use crate::domain::{Method, Step, Truth};
 pub use metrics::{BOUNDS_M, Judged, Metrics};
 pub use plots::plots;
 pub use report::{MethodReport, Report};
-pub use runner::{Curve, EvaluateOptions, Evaluation, TestRow, Trace, TracePoint, evaluate};
-pub use truth::Truth;
+pub use runner::{Curve, Doing, EvaluateOptions, Evaluation, TestRow, Trace, TracePoint, evaluate};

@@ -5,7 +5,7 @@
 use std::fmt::Write as _;
 
 use super::runner::{Evaluation, TestRow, Trace, TracePoint};
-use super::truth::Truth;
+use crate::domain::Truth;
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 /// The picture, and its frame within: left, top, right, bottom, all px.

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use serde::Serialize;
+use utoipa::ToSchema;
 
 use super::metrics::Metrics;
 
 /// One method's figures, the means over seeds.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct MethodReport {
     /// Figures of the errors.
     #[serde(flatten)]
@@ -33,7 +34,8 @@ impl MethodReport {
 }
 
 /// All methods.
-#[derive(Debug, Clone, PartialEq, Serialize, Default)]
+#[derive(Debug, Clone, PartialEq, Serialize, Default, ToSchema)]
+#[schema(as = EvaluationReport)]
 pub struct Report {
     /// By name.
     pub methods: BTreeMap<String, MethodReport>,

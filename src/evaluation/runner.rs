@@ -5,11 +5,11 @@ use std::ops::ControlFlow;
 use std::time::Instant;
 
 use super::learners::{Learnt, RecipeModel, learn_recipe, passes, recipes_of, track_settings, tune_imm_ukf};
-use super::method::{Method, Step};
 use super::metrics::{Judged, Metrics};
 use super::report::{MethodReport, Report};
-use super::truth::Truth;
-use crate::domain::{BoundingBox, EpochReport, ImageSize, Observation, Recipe, Result, Sample, SigmaM};
+use crate::domain::{
+    BoundingBox, EpochReport, ImageSize, Method, Observation, Recipe, Result, Sample, SigmaM, Step, Truth,
+};
 use crate::filters::ImmUkf;
 use crate::fusion::track::{Measured, Measurement, Track};
 use crate::fusion::two_step::fuse;
@@ -45,7 +45,7 @@ pub struct EvaluateOptions {
     pub gnss_sigma: Option<SigmaM>,
     /// Test boxes grow to the upper left by this, px.
     pub box_shift_px: f64,
-    /// CPU seconds that this process has used.
+    /// CPU seconds used so far by whoever evaluates.
     pub cpu_s: fn() -> f64,
 }
 
@@ -89,6 +89,30 @@ pub struct Evaluation {
     pub curves: Vec<Curve>,
 }
 
+/// What an evaluation is at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Doing<'a> {
+    /// In words.
+    pub words: &'a str,
+    /// Steps done. A step is a recipe's fit, or a method over all test rows, with one seed.
+    pub done: u32,
+    /// Steps to do.
+    pub planned: u32,
+}
+
+/// Who hears what is being done, and how many steps are behind.
+struct Steps<'a> {
+    tell: &'a mut dyn FnMut(&Doing<'_>) -> ControlFlow<()>,
+    done: u32,
+    planned: u32,
+}
+
+impl Steps<'_> {
+    fn say(&mut self, words: &str) -> ControlFlow<()> {
+        (self.tell)(&Doing { words, done: self.done, planned: self.planned })
+    }
+}
+
 /// A position with the radius that the method states for 95 %.
 #[derive(Debug, Clone, Copy)]
 struct Told {
@@ -110,7 +134,7 @@ pub fn evaluate(
     test: &[TestRow],
     truth: &Truth,
     options: &EvaluateOptions,
-    progress: &mut dyn FnMut(&str) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(&Doing<'_>) -> ControlFlow<()>,
 ) -> Result<Evaluation> {
     let mut test = test.to_vec();
     for row in &mut test {
@@ -127,8 +151,12 @@ pub fn evaluate(
         seeds: BTreeMap::new(),
         evaluation: Evaluation::default(),
     };
-    for seed in 1..=options.seeds.max(1) {
-        if run.seed(seed, progress).is_break() {
+    let seeds = options.seeds.max(1);
+    let a_seed = recipes_of(&options.methods, options.default_recipe).len() + options.methods.len();
+    let planned = u32::try_from(a_seed as u64 * seeds).unwrap_or(u32::MAX);
+    let mut steps = Steps { tell: progress, done: 0, planned };
+    for seed in 1..=seeds {
+        if run.seed(seed, &mut steps).is_break() {
             break;
         }
     }
@@ -176,18 +204,20 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    fn seed(&mut self, seed: u64, progress: &mut dyn FnMut(&str) -> ControlFlow<()>) -> ControlFlow<()> {
+    fn seed(&mut self, seed: u64, steps: &mut Steps<'_>) -> ControlFlow<()> {
         let mut models: BTreeMap<&str, Learnt<RecipeModel>> = BTreeMap::new();
         for recipe in recipes_of(&self.options.methods, self.options.default_recipe) {
-            progress(&format!("{recipe}, seed {seed}"))?;
-            let model = learn_recipe(recipe, seed, self.train, self.options, progress);
+            steps.say(&format!("{recipe}, seed {seed}"))?;
+            let mut say = |words: &str| steps.say(words);
+            let model = learn_recipe(recipe, seed, self.train, self.options, &mut say);
+            steps.done += 1;
             if let (1, Ok(learnt)) = (seed, &model.outcome) {
                 self.evaluation.curves.push(Curve { recipe, epochs: learnt.curve.clone() });
             }
             models.insert(recipe.as_str(), model);
         }
         for method in self.options.methods.clone() {
-            progress(&format!("{method}, seed {seed}"))?;
+            steps.say(&format!("{method}, seed {seed}"))?;
             let model = method.recipe(self.options.default_recipe).map(|recipe| &models[recipe.as_str()]);
             let begun_s = (self.options.cpu_s)();
             let answerer = match model {
@@ -203,6 +233,7 @@ impl Run<'_> {
                     self.evaluation.report.failed.insert(method.to_string(), reason);
                 }
             }
+            steps.done += 1;
         }
         ControlFlow::Continue(())
     }

@@ -5,19 +5,8 @@
 
 use geojson::{GeoJson, Geometry, GeometryValue};
 
-use crate::domain::{Error, Result};
+use crate::domain::{Error, Result, Truth};
 use crate::geo::{EastNorth, LocalPlane, Position, distance_m};
-
-/// Where the target truly was.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Truth {
-    /// Each row says so; rows that do not are not judged.
-    Columns,
-    /// It stood there.
-    Point(Position),
-    /// Somewhere on these lines; the error is the distance to the nearest.
-    Lines(Vec<Vec<Position>>),
-}
 
 impl Truth {
     /// The lines of a GeoJSON document: every LineString in it, however deep.

@@ -13,7 +13,7 @@ use super::proto;
 use super::proto::training_service_server::TrainingService;
 use super::statuses::{Reply, answer, request_id, to_status};
 use crate::app::{App, RunRequest};
-use crate::domain::{EpochReport, Error, ErrorKind, Result, RunId, RunProgress, RunState, TrainingRun};
+use crate::domain::{EpochReport, Error, ErrorKind, JobState, Result, RunId, RunProgress, TrainingRun};
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -192,14 +192,14 @@ impl From<TrainingRun> for proto::TrainingRun {
     }
 }
 
-impl From<RunState> for proto::TrainingRunState {
-    fn from(state: RunState) -> Self {
+impl From<JobState> for proto::TrainingRunState {
+    fn from(state: JobState) -> Self {
         match state {
-            RunState::Queued => Self::Queued,
-            RunState::Running => Self::Running,
-            RunState::Succeeded => Self::Succeeded,
-            RunState::Failed => Self::Failed,
-            RunState::Cancelled => Self::Cancelled,
+            JobState::Queued => Self::Queued,
+            JobState::Running => Self::Running,
+            JobState::Succeeded => Self::Succeeded,
+            JobState::Failed => Self::Failed,
+            JobState::Cancelled => Self::Cancelled,
         }
     }
 }

@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 use super::body;
 use super::problem::{Answer, Refused, no_route};
 use crate::app::App;
-use crate::domain::{CameraId, Error, ErrorKind, Result, RunId, TargetId, parse_time};
+use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time};
 use crate::exchange::wire;
 
 /// Items on a page whose length the client leaves open.
@@ -25,7 +25,7 @@ impl<S: Send + Sync> FromRequestParts<S> for CameraPath {
     type Rejection = Refused;
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
-        camera_of(&path::<CameraSegment, S>(parts, state).await?.camera).map(Self)
+        Ok(Self(camera_of(&path::<CameraSegment, S>(parts, state).await?.camera)?))
     }
 }
 
@@ -52,6 +52,17 @@ impl<S: Send + Sync> FromRequestParts<S> for TargetPath {
         let target = TargetId::new(&target)
             .map_err(|_| Error::refused(ErrorKind::TrackNotFound, "that is not the id of a target"))?;
         Ok(Self(camera_of(&camera)?, target))
+    }
+}
+
+/// An evaluation of the path.
+pub(super) struct EvaluationPath(pub(super) EvaluationId);
+
+impl<S: Send + Sync> FromRequestParts<S> for EvaluationPath {
+    type Rejection = Refused;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+        Ok(Self(path::<EvaluationSegment, S>(parts, state).await?.evaluation.parse()?))
     }
 }
 
@@ -88,6 +99,11 @@ struct TargetSegments {
 }
 
 #[derive(Deserialize)]
+struct EvaluationSegment {
+    evaluation: String,
+}
+
+#[derive(Deserialize)]
 struct ModelSegments {
     camera: String,
     model: String,
@@ -100,10 +116,11 @@ async fn path<T: DeserializeOwned + Send, S: Send + Sync>(parts: &mut Parts, sta
     }
 }
 
-fn camera_of(id: &str) -> Answer<CameraId> {
+/// A camera by its id in a path, parameter or body.
+pub(super) fn camera_of(id: &str) -> Result<CameraId> {
     CameraId::new(id).map_err(|_| {
         let shown: String = id.chars().take(80).collect();
-        Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera")).into()
+        Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera"))
     })
 }
 
@@ -131,10 +148,7 @@ impl Params {
     pub(super) fn time(&mut self, name: &str) -> Result<Option<Timestamp>> {
         self.take(name, |text| {
             // A plus sign that was not escaped arrives as a space.
-            parse_time(&text.replace(' ', "+")).map_err(|error| match error {
-                Error::Refused(refusal) => Error::invalid(name, refusal.message),
-                fault @ Error::Fault(_) => fault,
-            })
+            parse_time(&text.replace(' ', "+")).map_err(|error| error.at(name))
         })
     }
 

@@ -7,6 +7,7 @@
 mod body;
 mod cameras;
 mod description;
+mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
@@ -96,6 +97,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(fusions::routes())
         .merge(tracks::routes())
         .merge(gnss_error::routes())
+        .merge(evaluations::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
     router

@@ -2,6 +2,7 @@
 
 mod cameras;
 mod description;
+mod evaluations;
 mod fusions;
 mod samples;
 mod training;

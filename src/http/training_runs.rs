@@ -17,9 +17,9 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::extract::{CameraPath, JsonBody, Params, RunPath};
 use super::problem::{Answer, Problem};
-use super::wire::{Recipe, empty, json, made};
+use super::wire::{JobState, Recipe, empty, instant, json, made};
 use crate::app::{App, RunRequest};
-use crate::domain::{self, EpochReport, Error, ErrorKind, Result, RunProgress, parse_time};
+use crate::domain::{self, EpochReport, Error, ErrorKind, Result, RunProgress};
 use crate::exchange::{foreign_cursor, read_cursor, write_cursor};
 
 /// How often a silent event stream says that it is still there.
@@ -68,42 +68,6 @@ impl RunDraft {
     }
 }
 
-fn instant(field: &str, text: Option<&str>) -> Result<Option<Timestamp>> {
-    let Some(text) = text else { return Ok(None) };
-    parse_time(text).map(Some).map_err(|error| match error {
-        Error::Refused(refusal) => Error::invalid(field, refusal.message),
-        fault @ Error::Fault(_) => fault,
-    })
-}
-
-/// Where a run stands. Queued and running runs are live; the others have ended.
-#[derive(Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-enum RunState {
-    /// Waits for a worker.
-    Queued,
-    /// A worker fits it.
-    Running,
-    /// Yielded a model version.
-    Succeeded,
-    /// Ended by an error.
-    Failed,
-    /// Ended by the operator.
-    Cancelled,
-}
-
-impl From<domain::RunState> for RunState {
-    fn from(state: domain::RunState) -> Self {
-        match state {
-            domain::RunState::Queued => Self::Queued,
-            domain::RunState::Running => Self::Running,
-            domain::RunState::Succeeded => Self::Succeeded,
-            domain::RunState::Failed => Self::Failed,
-            domain::RunState::Cancelled => Self::Cancelled,
-        }
-    }
-}
-
 /// A training run.
 #[derive(Serialize, ToSchema)]
 struct TrainingRun {
@@ -128,7 +92,7 @@ struct TrainingRun {
     #[schema(value_type = Option<String>, format = DateTime)]
     until: Option<Timestamp>,
     /// Where it stands.
-    state: RunState,
+    state: JobState,
     /// How far it has come.
     progress: RunProgress,
     /// How often a worker has taken it up.

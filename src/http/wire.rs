@@ -5,10 +5,11 @@ use axum::response::Response;
 use hyper::StatusCode;
 use hyper::header::{CONTENT_TYPE, ETAG, IntoHeaderName, LOCATION};
 use hyper::http::HeaderValue;
+use jiff::Timestamp;
 use serde::{Deserialize, Deserializer, Serialize};
 use utoipa::ToSchema;
 
-use crate::domain::{Error, Result, Revision};
+use crate::domain::{self, Error, Result, Revision, parse_time};
 
 /// How a camera is learnt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -44,6 +45,40 @@ impl From<crate::domain::Recipe> for Recipe {
             crate::domain::Recipe::Auto => Self::Auto,
         }
     }
+}
+
+/// Where a job stands. Queued and running jobs are live; the others have ended.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum JobState {
+    /// Waits for a worker.
+    Queued,
+    /// A worker carries it out.
+    Running,
+    /// Yielded what it was asked for.
+    Succeeded,
+    /// Ended by an error.
+    Failed,
+    /// Ended by the operator.
+    Cancelled,
+}
+
+impl From<domain::JobState> for JobState {
+    fn from(state: domain::JobState) -> Self {
+        match state {
+            domain::JobState::Queued => Self::Queued,
+            domain::JobState::Running => Self::Running,
+            domain::JobState::Succeeded => Self::Succeeded,
+            domain::JobState::Failed => Self::Failed,
+            domain::JobState::Cancelled => Self::Cancelled,
+        }
+    }
+}
+
+/// An instant of a body (RFC 3339); its refusal names the field.
+pub(super) fn instant(field: &str, text: Option<&str>) -> Result<Option<Timestamp>> {
+    let Some(text) = text else { return Ok(None) };
+    parse_time(text).map(Some).map_err(|error| error.at(field))
 }
 
 /// A field that may be left out (`None`), or be null (`Some(None)`).

@@ -1,6 +1,6 @@
 //! Errors of the database as errors of the domain: the one place where they meet.
 
-use crate::domain::{CameraId, Error, ErrorKind, RunId};
+use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, RunId};
 
 /// A row that does not hold what was written: another program changed it, or the disk did.
 #[derive(Debug, thiserror::Error)]
@@ -55,6 +55,10 @@ pub(super) fn no_camera(id: &CameraId) -> Error {
 
 pub(super) fn no_run(id: RunId) -> Error {
     Error::refused(ErrorKind::RunNotFound, format!("no training run has the id {id}"))
+}
+
+pub(super) fn no_evaluation(id: EvaluationId) -> Error {
+    Error::refused(ErrorKind::EvaluationNotFound, format!("no evaluation has the id {id}"))
 }
 
 pub(super) fn no_model(camera: &CameraId, number: u32) -> Error {

@@ -2,7 +2,7 @@
 //!
 //! A file `sightfix.db` (SQLite, write-ahead log) with one writer connection and a few readers.
 //! Samples of many callers share transactions (`group_commit`); activations, profiles and the state of
-//! training runs are on the disk before they are acknowledged (`Durability::Synced`).
+//! background jobs are on the disk before they are acknowledged (`Durability::Synced`).
 //!
 //! What never happens here: clocks are read, numbers are checked (they are valid by construction),
 //! a transaction is held across anything but statements, a type of the database library gets out.
@@ -10,9 +10,11 @@
 
 mod cameras;
 mod connection;
+mod evaluations;
 mod faults;
 mod fields;
 mod group_commit;
+mod jobs;
 mod models;
 mod moves;
 mod runs;
@@ -29,7 +31,8 @@ use sqlx::SqlitePool;
 use crate::domain::{Error, ErrorKind, Result};
 
 pub use group_commit::Inserted;
-pub use runs::{Claim, Heartbeat, RunEnd};
+pub use jobs::{Claim, Heartbeat, JobEnd};
+pub use runs::{NewModel, RunEnd};
 pub use samples::{SampleFilter, SampleKey};
 
 use connection::{Durability, Writer};

@@ -1,11 +1,8 @@
-//! Training runs as jobs: whoever claims one holds a lease and a fence.
-//!
-//! A worker that stops beating loses its lease; the next claim raises the fence, and whatever the old
-//! worker still writes is left out. So a run ends exactly once, whatever crashes.
+//! Training runs: jobs that yield models.
 
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{SqliteConnection, SqliteExecutor};
 use uuid::Uuid;
@@ -14,58 +11,32 @@ use super::Store;
 use super::cameras::camera_key;
 use super::faults::{failed, no_run};
 use super::fields::Fields;
+use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
 use super::models::{activate, add_model};
 use crate::domain::{
-    CameraId, Error, ErrorKind, ModelMetadata, Recipe, Result, RunId, RunProgress, RunState, TrainingOptions,
+    CameraId, Error, ErrorKind, ModelMetadata, Recipe, Result, RunId, RunProgress, TrainingOptions,
     TrainingRun,
 };
 
-/// A run that was taken up.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Claim {
-    /// The run, now running.
-    pub run: TrainingRun,
-    /// What the worker must show to write anything about it.
-    pub fence: i64,
-    /// The operator has asked for its end already, while an earlier worker held it.
-    pub cancel_requested: bool,
-}
+pub(super) const RUNS: Jobs = Jobs {
+    table: "training_runs",
+    plural: "training runs",
+    fresh: "epoch_done = 0, epochs_planned = 0, reconstruction_error = 0, regression_error = 0, error_scale = 0",
+};
 
-/// What a worker learns from its heartbeat.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Heartbeat {
-    /// The lease is prolonged.
-    Continue,
-    /// The lease is prolonged, and the operator wants the run to end.
-    CancelRequested,
-    /// The run belongs to another worker now, has ended, or is gone: stop.
-    Lost,
+/// A model that a run yields.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewModel<'a> {
+    /// What the model says of itself.
+    pub metadata: &'a ModelMetadata,
+    /// Its weights.
+    pub weights: &'a [u8],
+    /// Whether it shall answer from now on.
+    pub activate: bool,
 }
 
 /// How a worker leaves a run.
-#[derive(Debug, Clone, PartialEq)]
-pub enum RunEnd<'a> {
-    /// With a model.
-    Succeeded {
-        /// What the model says of itself.
-        metadata: &'a ModelMetadata,
-        /// Its weights.
-        weights: &'a [u8],
-        /// Whether it shall answer from now on.
-        activate: bool,
-        /// Why or why not.
-        outcome: String,
-    },
-    /// By an error.
-    Failed {
-        /// Which.
-        outcome: String,
-    },
-    /// By the operator.
-    Cancelled,
-    /// Unfinished, because the server ends: the next worker takes it up at once.
-    Requeue,
-}
+pub type RunEnd<'a> = JobEnd<NewModel<'a>>;
 
 macro_rules! select {
     ($rest:literal) => {
@@ -97,7 +68,8 @@ impl Store {
         let mut turn = self.synced().await?;
         let mut transaction = turn.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
-        check_live_runs(&mut transaction, key, max_live).await?;
+        check_no_live_run(&mut transaction, key).await?;
+        RUNS.check_room(&mut transaction, max_live).await?;
         sqlx::query(
             "INSERT INTO training_runs (id, camera_key, recipe, seed, epochs, from_us, until_us, state, \
              created_at_us) VALUES (?, ?, ?, ?, ?, ?, ?, 'queued', ?)",
@@ -156,33 +128,19 @@ impl Store {
     ///
     /// # Errors
     /// Faults only.
-    pub async fn claim_run(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim>> {
+    pub async fn claim_run(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<TrainingRun>>> {
         let mut turn = self.synced().await?;
         let mut transaction = turn.begin().await?;
-        let claimed: Option<(String, i64, i64)> = sqlx::query_as(
-            "UPDATE training_runs SET state = 'running', attempt = attempt + 1, fence = fence + 1, \
-             lease_until_us = ?, started_at_us = ?, phase = '', epoch_done = 0, epochs_planned = 0, \
-             reconstruction_error = 0, regression_error = 0, error_scale = 0, remaining_s = NULL \
-             WHERE id = (SELECT id FROM training_runs WHERE state IN ('queued', 'running') \
-             AND (lease_until_us IS NULL OR lease_until_us <= ?) ORDER BY id LIMIT 1) \
-             RETURNING id, fence, cancel_requested",
-        )
-        .bind(lease_end(now, lease))
-        .bind(now.as_microsecond())
-        .bind(now.as_microsecond())
-        .fetch_optional(&mut *transaction)
-        .await
-        .map_err(failed)?;
-        let Some((id, fence, cancel_requested)) = claimed else { return Ok(None) };
+        let Some(claim) = RUNS.claim(&mut transaction, lease, now).await? else { return Ok(None) };
+        let id = RunId(claim.job);
         sqlx::query("DELETE FROM training_epochs WHERE run_id = ?")
-            .bind(&id)
+            .bind(id.to_string())
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
-        let id: RunId = id.parse()?;
-        let run = find_run(&mut *transaction, id).await?.ok_or_else(|| no_run(id))?;
+        let job = find_run(&mut *transaction, id).await?.ok_or_else(|| no_run(id))?;
         transaction.commit().await.map_err(failed)?;
-        Ok(Some(Claim { run, fence, cancel_requested: cancel_requested != 0 }))
+        Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
     }
 
     /// Prolongs the lease and shows how far the run has come.
@@ -199,12 +157,14 @@ impl Store {
     ) -> Result<Heartbeat> {
         let mut turn = self.relaxed().await?;
         let mut transaction = turn.begin().await?;
-        let cancel_requested: Option<i64> = sqlx::query_scalar(
-            "UPDATE training_runs SET lease_until_us = ?, phase = ?, epoch_done = ?, epochs_planned = ?, \
-             reconstruction_error = ?, regression_error = ?, error_scale = ?, remaining_s = ? \
-             WHERE id = ? AND fence = ? AND state = 'running' RETURNING cancel_requested",
+        let heartbeat = RUNS.beat(&mut transaction, (run.0, fence), lease, now).await?;
+        if heartbeat == Heartbeat::Lost {
+            return Ok(heartbeat);
+        }
+        sqlx::query(
+            "UPDATE training_runs SET phase = ?, epoch_done = ?, epochs_planned = ?, \
+             reconstruction_error = ?, regression_error = ?, error_scale = ?, remaining_s = ? WHERE id = ?",
         )
-        .bind(lease_end(now, lease))
         .bind(&progress.phase)
         .bind(progress.epoch)
         .bind(progress.epochs)
@@ -213,16 +173,11 @@ impl Store {
         .bind(progress.error_scale)
         .bind(progress.remaining_s)
         .bind(run.to_string())
-        .bind(fence)
-        .fetch_optional(&mut *transaction)
+        .execute(&mut *transaction)
         .await
         .map_err(failed)?;
         transaction.commit().await.map_err(failed)?;
-        Ok(match cancel_requested {
-            None => Heartbeat::Lost,
-            Some(0) => Heartbeat::Continue,
-            Some(_) => Heartbeat::CancelRequested,
-        })
+        Ok(heartbeat)
     }
 
     /// Asks for the end of a run: a queued one ends at once, a running one at its worker's next
@@ -239,14 +194,7 @@ impl Store {
             let ended = format!("the training run has ended already: {}", stored.state.as_str());
             return Err(Error::refused(ErrorKind::RunEnded, ended));
         }
-        if stored.state == RunState::Queued {
-            end_run(&mut transaction, run, RunState::Cancelled, None, None, now).await?;
-        }
-        sqlx::query("UPDATE training_runs SET cancel_requested = 1 WHERE id = ?")
-            .bind(run.to_string())
-            .execute(&mut *transaction)
-            .await
-            .map_err(failed)?;
+        RUNS.cancel(&mut transaction, run.0, stored.state, now).await?;
         let stored = find_run(&mut *transaction, run).await?;
         transaction.commit().await.map_err(failed)?;
         stored.ok_or_else(|| no_run(run))
@@ -267,35 +215,21 @@ impl Store {
     ) -> Result<Option<TrainingRun>> {
         let mut turn = self.synced().await?;
         let mut transaction = turn.begin().await?;
-        let held: Option<(i64, i64)> = sqlx::query_as(
-            "SELECT camera_key, cancel_requested FROM training_runs \
-             WHERE id = ? AND fence = ? AND state = 'running'",
-        )
-        .bind(run.to_string())
-        .bind(fence)
-        .fetch_optional(&mut *transaction)
-        .await
-        .map_err(failed)?;
-        let Some((key, cancel_requested)) = held else { return Ok(None) };
-        let end = match end {
-            RunEnd::Succeeded { .. } | RunEnd::Requeue if cancel_requested != 0 => RunEnd::Cancelled,
-            end => end,
+        let Some(left) = RUNS.leave(&mut transaction, (run.0, fence), end, now).await? else {
+            return Ok(None);
         };
-        match end {
-            RunEnd::Succeeded { metadata, weights, activate: wanted, outcome } => {
-                let number = add_model(&mut transaction, key, Some(run), metadata, weights, now).await?;
-                if wanted {
-                    activate(&mut transaction, key, number, now).await?;
-                }
-                end_run(&mut transaction, run, RunState::Succeeded, Some(number), Some(outcome), now).await?;
+        if let Some(NewModel { metadata, weights, activate: wanted }) = left.yielded {
+            let key = left.camera_key;
+            let number = add_model(&mut transaction, key, Some(run), metadata, weights, now).await?;
+            if wanted {
+                activate(&mut transaction, key, number, now).await?;
             }
-            RunEnd::Failed { outcome } => {
-                end_run(&mut transaction, run, RunState::Failed, None, Some(outcome), now).await?;
-            }
-            RunEnd::Cancelled => {
-                end_run(&mut transaction, run, RunState::Cancelled, None, None, now).await?;
-            }
-            RunEnd::Requeue => requeue(&mut transaction, run).await?,
+            sqlx::query("UPDATE training_runs SET model_version = ? WHERE id = ?")
+                .bind(number)
+                .bind(run.to_string())
+                .execute(&mut *transaction)
+                .await
+                .map_err(failed)?;
         }
         let stored = find_run(&mut *transaction, run).await?;
         transaction.commit().await.map_err(failed)?;
@@ -303,68 +237,22 @@ impl Store {
     }
 }
 
-/// Room for one more live run, of this camera and of all.
-async fn check_live_runs(connection: &mut SqliteConnection, camera_key: i64, max_live: u32) -> Result<()> {
-    let (all, own): (i64, i64) = sqlx::query_as(
-        "SELECT count(*), count(CASE WHEN camera_key = ? THEN 1 END) FROM training_runs \
-         WHERE state IN ('queued', 'running')",
+/// A camera has one live run at most.
+async fn check_no_live_run(connection: &mut SqliteConnection, camera_key: i64) -> Result<()> {
+    let live: Option<i64> = sqlx::query_scalar(
+        "SELECT 1 FROM training_runs WHERE camera_key = ? AND state IN ('queued', 'running')",
     )
     .bind(camera_key)
-    .fetch_one(connection)
+    .fetch_optional(connection)
     .await
     .map_err(failed)?;
-    if own > 0 {
+    if live.is_some() {
         return Err(Error::refused(
             ErrorKind::RunLive,
             "the camera has a training run that has not ended; wait for it or cancel it",
         ));
     }
-    if all >= i64::from(max_live) {
-        return Err(Error::refused(
-            ErrorKind::Overloaded,
-            format!(
-                "{all} training runs are queued or running, and no more than {max_live} may be; try later"
-            ),
-        ));
-    }
     Ok(())
-}
-
-async fn end_run(
-    connection: &mut SqliteConnection,
-    run: RunId,
-    state: RunState,
-    model_version: Option<u32>,
-    outcome: Option<String>,
-    now: Timestamp,
-) -> Result<()> {
-    sqlx::query(
-        "UPDATE training_runs SET state = ?, model_version = ?, outcome = ?, ended_at_us = ?, \
-         lease_until_us = NULL, remaining_s = NULL WHERE id = ?",
-    )
-    .bind(state.as_str())
-    .bind(model_version)
-    .bind(outcome)
-    .bind(now.as_microsecond())
-    .bind(run.to_string())
-    .execute(connection)
-    .await
-    .map_err(failed)?;
-    Ok(())
-}
-
-async fn requeue(connection: &mut SqliteConnection, run: RunId) -> Result<()> {
-    sqlx::query("UPDATE training_runs SET state = 'queued', lease_until_us = NULL WHERE id = ?")
-        .bind(run.to_string())
-        .execute(connection)
-        .await
-        .map_err(failed)?;
-    Ok(())
-}
-
-fn lease_end(now: Timestamp, lease: Duration) -> i64 {
-    let lease = SignedDuration::try_from(lease).unwrap_or(SignedDuration::MAX);
-    now.saturating_add(lease).unwrap_or(Timestamp::MAX).as_microsecond()
 }
 
 async fn find_run(executor: impl SqliteExecutor<'_>, run: RunId) -> Result<Option<TrainingRun>> {
@@ -410,8 +298,4 @@ fn read_run(row: &SqliteRow) -> Result<TrainingRun> {
         started_at: fields.some_time()?,
         ended_at: fields.some_time()?,
     })
-}
-
-fn read_state(name: &str) -> Result<RunState, &'static str> {
-    RunState::ALL.into_iter().find(|state| state.as_str() == name).ok_or("no state of a training run")
 }

@@ -9,7 +9,9 @@ use super::cameras::camera_key;
 use super::faults::failed;
 use super::fields::Fields;
 use super::group_commit::Inserted;
-use crate::domain::{BoundingBox, CameraId, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId};
+use crate::domain::{
+    BoundingBox, CameraId, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId, TimeRange,
+};
 use crate::geo::Position;
 
 /// Which samples of a camera.
@@ -21,6 +23,14 @@ pub struct SampleFilter {
     pub until: Option<Timestamp>,
     /// Of this target alone.
     pub target_id: Option<TargetId>,
+}
+
+impl SampleFilter {
+    /// All samples of a stretch of time.
+    #[must_use]
+    pub fn within(range: TimeRange) -> Self {
+        Self { from: range.from(), until: range.until(), target_id: None }
+    }
 }
 
 /// The place of a sample in its camera's order: by time, then by target (bytes of its UTF-8).
@@ -77,10 +87,34 @@ impl Store {
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
     pub async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+        self.count(id, filter, "SELECT count(*) FROM samples").await
+    }
+
+    /// How many of the samples that a filter selects state the truth.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`].
+    pub async fn count_truths(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+        self.count(id, filter, "SELECT count(truth_longitude_deg) FROM samples").await
+    }
+
+    async fn count(&self, id: &CameraId, filter: &SampleFilter, head: &'static str) -> Result<u64> {
         let range = Range::of(camera_key(self.readers(), id).await?, filter, None);
-        let sql = range.sql("SELECT count(*) FROM samples", "");
+        let sql = range.sql(head, "");
         let row = range.bind(&sql).fetch_one(self.readers()).await.map_err(failed)?;
         Fields::of("samples", &row).make(|stored: i64| u64::try_from(stored))
+    }
+
+    /// Time of the sample that has so many before it, in order of time; `None` behind the last.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`].
+    pub async fn sample_time(&self, id: &CameraId, before: u64) -> Result<Option<Timestamp>> {
+        let range = Range::of(camera_key(self.readers(), id).await?, &SampleFilter::default(), None);
+        let sql = range.sql("SELECT time_us FROM samples", " ORDER BY time_us, target_id LIMIT 1 OFFSET ?");
+        let offset = i64::try_from(before).unwrap_or(i64::MAX);
+        let row = range.bind(&sql).bind(offset).fetch_optional(self.readers()).await.map_err(failed)?;
+        row.map(|row| Fields::of("samples", &row).time()).transpose()
     }
 
     /// How many samples a filter selects, and the corners of the ground they cover (south-west,

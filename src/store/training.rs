@@ -1,11 +1,11 @@
 //! What a run leaves behind while it fits: its curve and its log.
 
 use jiff::Timestamp;
-use sqlx::SqliteConnection;
 
 use super::Store;
 use super::faults::{failed, no_run};
 use super::fields::Fields;
+use super::runs::RUNS;
 use crate::domain::{EpochReport, Result, RunId};
 
 /// Lines of a run's log; older ones are dropped.
@@ -23,7 +23,7 @@ impl Store {
     pub async fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()> {
         let mut turn = self.relaxed().await?;
         let mut transaction = turn.begin().await?;
-        if !is_mine(&mut transaction, run, fence).await? {
+        if RUNS.held(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
         for report in epochs {
@@ -55,7 +55,7 @@ impl Store {
     pub async fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()> {
         let mut turn = self.relaxed().await?;
         let mut transaction = turn.begin().await?;
-        if !is_mine(&mut transaction, run, fence).await? {
+        if RUNS.held(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
         let number: i64 = sqlx::query_scalar(
@@ -134,16 +134,4 @@ impl Store {
             .map_err(failed)?;
         known.map(|_| ()).ok_or_else(|| no_run(run))
     }
-}
-
-/// Whether the holder of a fence still fits the run.
-async fn is_mine(connection: &mut SqliteConnection, run: RunId, fence: i64) -> Result<bool> {
-    let mine: Option<i64> =
-        sqlx::query_scalar("SELECT 1 FROM training_runs WHERE id = ? AND fence = ? AND state = 'running'")
-            .bind(run.to_string())
-            .bind(fence)
-            .fetch_optional(connection)
-            .await
-            .map_err(failed)?;
-    Ok(mine.is_some())
 }

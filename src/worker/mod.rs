@@ -1,37 +1,104 @@
-//! Training jobs: claim, fit, heartbeat, finish.
+//! Background jobs, training runs and evaluations: claim, carry out, heartbeat, finish.
 //!
-//! A run is claimed in a short transaction, fitted on a thread of its own at the lowest priority,
-//! and finished in one transaction that only the holder of the newest fence can make. What never
-//! happens here: a database transaction held across a fit, a fit on a thread of tokio's.
+//! A job is claimed in a short transaction, carried out on a thread of its own at the lowest
+//! priority, and finished in one transaction that only the holder of the newest fence can make. What
+//! never happens here: a database transaction held across the work, work on a thread of tokio's.
 
-mod fitting;
+mod aside;
+mod evaluation;
 mod promotion;
+mod training;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use tokio::sync::Semaphore;
+use tokio::sync::{Notify, Semaphore};
+use uuid::Uuid;
 
 use crate::app::App;
-use crate::config::Training;
-use crate::domain::{Error, Result, RunState, Sample, TrainingRun};
-use crate::model::{Artifact, FitError, FitOptions};
+use crate::config::Workers;
+use crate::domain::{CameraId, Error, EvaluationJob, JobState, Result, Sample, TrainingRun};
 use crate::shutdown::Shutdown;
-use crate::store::{Claim, Heartbeat, RunEnd, SampleFilter};
+use crate::store::{Claim, Heartbeat, SampleFilter};
+use crate::telemetry::Metrics;
 
-use fitting::{Fitting, Update};
+use aside::{Aside, Said, Voice};
 
-/// How often a worker looks for runs that nobody rang for (another process, an expired lease).
+/// How often a worker looks for jobs that nobody rang for (another process, an expired lease).
 const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// How often progress is written while a run is fitted, if the lease does not ask for more.
+/// How often progress is written while a job is carried out, if the lease does not ask for more.
 const REPORT_EVERY: Duration = Duration::from_millis(400);
-/// Takes of a run after which it is given up: it has brought down every worker that tried.
+/// Takes of a job after which it is given up: it has brought down every worker that tried.
 const MOST_ATTEMPTS: u32 = 5;
 /// Samples read at a time.
 const PAGE_SAMPLES: u32 = 10_000;
 
-/// Works on queued runs until the server ends.
-pub async fn work(app: App, settings: Training, shutdown: Shutdown) {
+/// Works on queued training runs until the server ends.
+pub async fn train(app: App, settings: Workers, shutdown: Shutdown) {
+    work::<TrainingRun>(app, settings, shutdown).await;
+}
+
+/// Carries out queued evaluations until the server ends.
+pub async fn evaluate(app: App, settings: Workers, shutdown: Shutdown) {
+    work::<EvaluationJob>(app, settings, shutdown).await;
+}
+
+/// What a job does on its thread.
+type Work<J> = Box<dyn FnOnce(&Voice<<J as Job>::Said>) -> <J as Job>::Yield + Send>;
+
+/// A kind of job.
+trait Job: Send + Sync + Sized + 'static {
+    /// What one is called in the log; also its thread.
+    const NAME: &'static str;
+    /// What the work says while it is under way.
+    type Said: Said;
+    /// What it yields.
+    type Yield: Send + 'static;
+
+    fn id(&self) -> Uuid;
+    fn camera(&self) -> &CameraId;
+    fn attempt(&self) -> u32;
+    /// Rung when one was queued.
+    fn bell(app: &App) -> &Notify;
+    fn count(metrics: &Metrics, state: JobState, time: Duration);
+
+    /// Takes one up.
+    fn claim(app: &App, lease: Duration) -> impl Future<Output = Result<Option<Claim<Self>>>> + Send;
+    /// Reads what the work needs; a refusal ends the job with its words.
+    fn prepare(app: &App, claim: &Claim<Self>) -> impl Future<Output = Result<Work<Self>>> + Send;
+    /// Prolongs the lease and writes down what was said.
+    fn record(
+        app: &App,
+        claim: &Claim<Self>,
+        said: Self::Said,
+        lease: Duration,
+    ) -> impl Future<Output = Result<Heartbeat>> + Send;
+    /// Ends the job by what it yielded; `None` if the fence was lost.
+    fn end(
+        app: &App,
+        claim: &Claim<Self>,
+        ended: Ended<Self>,
+        lease: Duration,
+    ) -> impl Future<Output = Result<Option<JobState>>> + Send;
+    /// Ends the job with an error; `None` if the fence was lost.
+    fn fail(
+        app: &App,
+        claim: &Claim<Self>,
+        outcome: String,
+    ) -> impl Future<Output = Result<Option<JobState>>> + Send;
+}
+
+/// A job whose work has ended.
+struct Ended<J: Job> {
+    yielded: J::Yield,
+    /// What was said last.
+    said: J::Said,
+    /// If the work was broken off, the next server shall take it up.
+    server_is_ending: bool,
+}
+
+/// Works on queued jobs of a kind until the server ends.
+async fn work<J: Job>(app: App, settings: Workers, shutdown: Shutdown) {
     let slots = Arc::new(Semaphore::new(settings.workers));
     let lease = Duration::from_secs(settings.lease_s.into());
     loop {
@@ -39,7 +106,7 @@ pub async fn work(app: App, settings: Training, shutdown: Shutdown) {
             () = shutdown.begun() => return,
             slot = slots.clone().acquire_owned() => slot.expect("the semaphore is never closed"),
         };
-        match app.store.claim_run(lease, app.clock.now()).await {
+        match J::claim(&app, lease).await {
             Ok(Some(claim)) => {
                 let (app, ending) = (app.clone(), shutdown.clone());
                 shutdown.spawn(async move {
@@ -49,162 +116,91 @@ pub async fn work(app: App, settings: Training, shutdown: Shutdown) {
                 continue;
             }
             Ok(None) => {}
-            Err(error) => tracing::error!(%error, "cannot look for training runs"),
+            Err(error) => tracing::error!(%error, "cannot look for a {}", J::NAME),
         }
         drop(slot);
         tokio::select! {
             () = shutdown.begun() => return,
-            () = app.run_queued.notified() => {}
+            () = J::bell(&app).notified() => {}
             () = tokio::time::sleep(LOOK_EVERY) => {}
         }
     }
 }
 
-/// Carries out one claimed run to its end, whatever that is.
-pub async fn carry_out(app: &App, claim: Claim, lease: Duration, shutdown: &Shutdown) {
-    let run = claim.run.clone();
+/// Carries out one claimed job to its end, whatever that is.
+async fn carry_out<J: Job>(app: &App, claim: Claim<J>, lease: Duration, shutdown: &Shutdown) {
+    let (id, camera, attempt) = (claim.job.id(), claim.job.camera(), claim.job.attempt());
     let started = Instant::now();
-    tracing::info!(run.id = %run.id, camera.id = %run.camera_id, attempt = run.attempt, "training run begins");
-    let state = match attempt(app, &claim, lease, shutdown).await {
-        Ok(Some(ended)) => ended.state,
+    tracing::info!(job.id = %id, camera.id = %camera, attempt, "{} begins", J::NAME);
+    let state = match try_once(app, &claim, lease, shutdown).await {
+        Ok(Some(state)) => state,
         Ok(None) => {
-            tracing::warn!(run.id = %run.id, "training run was taken over by another worker");
+            tracing::warn!(job.id = %id, "{} was taken over by another worker, or deleted", J::NAME);
             return;
         }
         Err(error) => {
-            tracing::error!(run.id = %run.id, %error, "training run failed");
-            let outcome = "the server failed; its log says why".to_owned();
-            let end = RunEnd::Failed { outcome };
-            if let Err(error) = app.store.finish_run(run.id, claim.fence, end, app.clock.now()).await {
-                // The lease runs out and the run is taken up again.
-                tracing::error!(run.id = %run.id, %error, "cannot record the failed training run");
+            let outcome = match &error {
+                Error::Refused(refusal) => refusal.to_string(),
+                Error::Fault(_) => "the server failed; its log says why".to_owned(),
+            };
+            tracing::error!(job.id = %id, %error, "{} failed", J::NAME);
+            if let Err(error) = J::fail(app, &claim, outcome).await {
+                // The lease runs out and the job is taken up again.
+                tracing::error!(job.id = %id, %error, "cannot record the failed {}", J::NAME);
             }
-            RunState::Failed
+            JobState::Failed
         }
     };
     let time = started.elapsed();
-    app.metrics.run_ended(state, time);
-    tracing::info!(run.id = %run.id, state = state.as_str(), duration_s = time.as_secs_f64(), "training run ends");
+    J::count(&app.metrics, state, time);
+    let duration_s = time.as_secs_f64();
+    tracing::info!(job.id = %id, state = state.as_str(), duration_s, "{} ends", J::NAME);
 }
 
 /// `None` if the fence was lost.
-async fn attempt(
+async fn try_once<J: Job>(
     app: &App,
-    claim: &Claim,
+    claim: &Claim<J>,
     lease: Duration,
     shutdown: &Shutdown,
-) -> Result<Option<TrainingRun>> {
-    let run = &claim.run;
-    if run.attempt > MOST_ATTEMPTS {
+) -> Result<Option<JobState>> {
+    if claim.job.attempt() > MOST_ATTEMPTS {
         let outcome = format!("given up: {MOST_ATTEMPTS} workers took it up and none came to its end");
-        return app.store.finish_run(run.id, claim.fence, RunEnd::Failed { outcome }, app.clock.now()).await;
+        return J::fail(app, claim, outcome).await;
     }
-    let camera = app.store.camera(&run.camera_id).await?;
-    let samples = Arc::new(load_samples(app, run).await?);
-    let options = FitOptions {
-        recipe: run.options.recipe,
-        seed: run.options.seed,
-        epochs: run.options.epochs,
-        image_size: camera.profile.image_size,
-        gnss_error: camera.profile.gnss_error,
-    };
-    let line = format!("{} samples, recipe {}, seed {}", samples.len(), options.recipe, options.seed);
-    app.store.append_log(run.id, claim.fence, app.clock.now(), &line).await?;
-    let mut fitting = Fitting::begin(samples.clone(), options).map_err(Error::fault)?;
+    let mut aside = Aside::begin(J::NAME, J::prepare(app, claim).await?).map_err(Error::fault)?;
     if claim.cancel_requested {
-        fitting.cancel();
+        aside.cancel();
     }
     let every = REPORT_EVERY.min(lease / 3);
-    let mut ending = false;
+    let mut server_is_ending = false;
     loop {
         tokio::select! {
-            () = fitting.ended() => break,
+            () = aside.ended() => break,
             () = tokio::time::sleep(every) => {}
-            () = shutdown.begun(), if !ending => {
-                ending = true;
-                fitting.cancel();
+            () = shutdown.begun(), if !server_is_ending => {
+                server_is_ending = true;
+                aside.cancel();
             }
         }
-        match record(app, claim, fitting.take_update(), lease).await? {
+        match J::record(app, claim, aside.take_said(), lease).await? {
             Heartbeat::Continue => {}
-            Heartbeat::CancelRequested => fitting.cancel(),
-            Heartbeat::Lost => {
-                fitting.cancel();
-                return Ok(None);
-            }
+            Heartbeat::CancelRequested => aside.cancel(),
+            Heartbeat::Lost => return Ok(None),
         }
     }
-    let (fitted, mut update) = fitting.finish().await;
-    if fitted.is_ok() {
-        // A recipe may skip what it had counted on: a kept candidate without a network, say.
-        update.progress.epoch = update.progress.epochs;
-        update.progress.remaining_s = Some(0.0);
-    }
-    if matches!(record(app, claim, update, lease).await?, Heartbeat::Lost) {
-        return Ok(None);
-    }
-    end(app, claim, fitted, &samples, ending).await
+    let (yielded, said) = aside.finish().await;
+    let yielded = yielded.ok_or_else(|| Error::fault("the work's thread ended without a word"))?;
+    J::end(app, claim, Ended { yielded, said, server_is_ending }, lease).await
 }
 
-async fn record(app: &App, claim: &Claim, update: Update, lease: Duration) -> Result<Heartbeat> {
-    let (run, now) = (claim.run.id, app.clock.now());
-    if !update.epochs.is_empty() {
-        app.store.append_epochs(run, claim.fence, &update.epochs).await?;
-    }
-    for note in &update.notes {
-        app.store.append_log(run, claim.fence, now, note).await?;
-    }
-    app.store.heartbeat(run, claim.fence, &update.progress, lease, now).await
-}
-
-async fn end(
-    app: &App,
-    claim: &Claim,
-    fitted: std::result::Result<Artifact, FitError>,
-    samples: &[Sample],
-    server_is_ending: bool,
-) -> Result<Option<TrainingRun>> {
-    let run = &claim.run;
-    let (line, artifact, activate) = match fitted {
-        Ok(artifact) => {
-            let verdict = promotion::judge(app, &run.camera_id, &artifact, samples).await?;
-            (verdict.reason, Some(artifact), verdict.activate)
-        }
-        Err(FitError::Cancelled) if server_is_ending => {
-            ("the server ends; the run waits".to_owned(), None, false)
-        }
-        Err(FitError::Cancelled) => ("cancelled".to_owned(), None, false),
-        Err(FitError::Unusable(error)) => (error.to_string(), None, false),
-        Err(FitError::Fault(error)) => return Err(Error::fault(error)),
-    };
-    let now = app.clock.now();
-    app.store.append_log(run.id, claim.fence, now, &line).await?;
-    let end = match &artifact {
-        Some(artifact) => RunEnd::Succeeded {
-            metadata: &artifact.metadata,
-            weights: &artifact.weights,
-            activate,
-            outcome: line,
-        },
-        None if line == "cancelled" => RunEnd::Cancelled,
-        None if server_is_ending => RunEnd::Requeue,
-        None => RunEnd::Failed { outcome: line },
-    };
-    let ended = app.store.finish_run(run.id, claim.fence, end, now).await?;
-    if activate && ended.is_some() {
-        app.registry.refresh_camera(&app.store, &run.camera_id).await?;
-    }
-    Ok(ended)
-}
-
-/// The samples that a run learns from: by time and target, the latest where there are too many.
-async fn load_samples(app: &App, run: &TrainingRun) -> Result<Vec<Sample>> {
-    let filter = SampleFilter { from: run.options.from, until: run.options.until, target_id: None };
-    let most = app.limits.samples_per_run as usize;
+/// Stored samples by time and target, the latest where there are too many.
+async fn load_samples(app: &App, camera: &CameraId, filter: &SampleFilter, most: u32) -> Result<Vec<Sample>> {
+    let most = most as usize;
     let mut samples = Vec::new();
     let mut after = None;
     loop {
-        let page = app.samples(&run.camera_id, &filter, after, PAGE_SAMPLES).await?;
+        let page = app.samples(camera, filter, after, PAGE_SAMPLES).await?;
         samples.extend(page.items);
         if samples.len() > 2 * most {
             samples.drain(..samples.len() - most);

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod connections;
+mod evaluations;
 mod grpc;
 mod harness;
 mod layering;

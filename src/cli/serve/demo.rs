@@ -7,7 +7,7 @@ use futures_util::StreamExt as _;
 
 use crate::app::{App, RunRequest};
 use crate::cli::progress::Progress;
-use crate::domain::{CameraId, GnssError, NewCamera, RunState, SigmaM};
+use crate::domain::{CameraId, GnssError, JobState, NewCamera, SigmaM};
 use crate::simulation::{Options, SimulatedRow, simulate};
 
 const CAMERA: &str = "demo";
@@ -48,7 +48,7 @@ async fn train(app: &App, id: &CameraId) -> anyhow::Result<()> {
         let run = run?;
         progress.set(run.progress.epoch.into(), run.progress.epochs.into(), "epochs of the demonstration");
         anyhow::ensure!(
-            !run.state.has_ended() || run.state == RunState::Succeeded,
+            !run.state.has_ended() || run.state == JobState::Succeeded,
             "the demonstration's training run ended: {}",
             run.outcome.unwrap_or_default()
         );

@@ -99,3 +99,27 @@ fn what_cannot_run_is_named_and_the_rest_goes_on() {
             .expect("valid boxes");
     assert!(unjudged.report.failed.contains_key("gnss"));
 }
+
+#[test]
+fn steps_are_counted_to_the_end_and_breaking_stops_at_the_next() {
+    let square = Options { samples: 300, ..Options::new(Scene::Square) };
+    let (train, rows) = (simulate(&square).training_samples(), test_rows(&simulate(&square.test(50))));
+    let options = EvaluateOptions { seeds: 2, ..options("gnss,hybrid.denied,hybrid.two_step") };
+    let mut told = Vec::new();
+    let whole = evaluate(&train, &rows, &Truth::Columns, &options, &mut |doing| {
+        told.push((doing.done, doing.planned));
+        ControlFlow::Continue(())
+    });
+    assert_eq!(whole.expect("valid boxes").report.methods.len(), 3);
+    // One fit and three methods, with two seeds; the last step is told when it begins.
+    assert!(told.iter().all(|&(_, planned)| planned == 8), "{told:?}");
+    assert!(told.is_sorted() && told.first() == Some(&(0, 8)) && told.last() == Some(&(7, 8)), "{told:?}");
+
+    let mut heard = 0;
+    let broken_off = evaluate(&train, &rows, &Truth::Columns, &options, &mut |doing| {
+        heard += usize::from(doing.done >= 2);
+        if doing.done >= 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    let methods = broken_off.expect("valid boxes").report.methods;
+    assert_eq!((methods.len(), heard), (1, 1), "nothing goes on after the break");
+}

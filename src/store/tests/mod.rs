@@ -1,6 +1,7 @@
 //! The rules of the store, each shown on a file of its own.
 
 mod cameras;
+mod evaluations;
 mod file;
 mod group;
 mod models;
@@ -129,5 +130,6 @@ async fn futures_can_move_between_threads() {
     movable(store.heartbeat(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
     movable(store.append_epochs(run, 1, &[]));
     movable(store.finish_run(run, 1, super::RunEnd::Cancelled, at(0)));
+    movable(store.claim_evaluation(lease, at(0)));
     movable(store.roll_back(&camera, at(0)));
 }

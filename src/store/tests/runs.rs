@@ -1,8 +1,8 @@
 use std::time::Duration;
 
 use super::*;
-use crate::domain::{EpochReport, RunProgress, RunState, TrainingRun};
-use crate::store::{Claim, Heartbeat, RunEnd};
+use crate::domain::{EpochReport, JobState, RunProgress, TrainingRun};
+use crate::store::{Claim, Heartbeat, NewModel, RunEnd};
 
 const LEASE: Duration = Duration::from_secs(30);
 
@@ -11,7 +11,7 @@ impl Fixture {
         self.store.insert_run(run_id(n), &self.camera, &options(), 9, at(1)).await.expect("queued")
     }
 
-    async fn claim(&self, second: i64) -> Claim {
+    async fn claim(&self, second: i64) -> Claim<TrainingRun> {
         self.store.claim_run(LEASE, at(second)).await.expect("works").expect("a run")
     }
 
@@ -37,7 +37,8 @@ fn progress() -> RunProgress {
 }
 
 fn success<'a>(metadata: &'a ModelMetadata, activate: bool) -> RunEnd<'a> {
-    RunEnd::Succeeded { metadata, weights: b"weights", activate, outcome: "better".to_owned() }
+    let yielded = NewModel { metadata, weights: b"weights", activate };
+    RunEnd::Succeeded { yielded, outcome: Some("better".to_owned()) }
 }
 
 fn report(epoch: u32, loss: f64) -> EpochReport {
@@ -48,9 +49,9 @@ fn report(epoch: u32, loss: f64) -> EpochReport {
 async fn a_run_goes_from_queue_to_active_model() {
     let fixture = Fixture::new().await;
     let queued = fixture.queue(1).await;
-    assert_eq!((queued.state, queued.attempt, queued.options), (RunState::Queued, 0, options()));
-    let Claim { run, fence, cancel_requested } = fixture.claim(2).await;
-    assert_eq!((run.state, run.attempt, run.started_at), (RunState::Running, 1, Some(at(2))));
+    assert_eq!((queued.state, queued.attempt, queued.options), (JobState::Queued, 0, options()));
+    let Claim { job: run, fence, cancel_requested } = fixture.claim(2).await;
+    assert_eq!((run.state, run.attempt, run.started_at), (JobState::Running, 1, Some(at(2))));
     assert!(!cancel_requested);
     assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
     assert_eq!(fixture.beat(fence, 4).await, Heartbeat::Continue);
@@ -59,7 +60,7 @@ async fn a_run_goes_from_queue_to_active_model() {
     let ended = fixture.finish(fence, success(&metadata(), true)).await.expect("still mine");
     assert_eq!(
         (ended.state, ended.model_version, ended.ended_at),
-        (RunState::Succeeded, Some(1), Some(at(50)))
+        (JobState::Succeeded, Some(1), Some(at(50)))
     );
     assert_eq!(ended.outcome.as_deref(), Some("better"));
     assert_eq!(fixture.store.model(&fixture.camera, 1).await.expect("stored").run_id, Some(run_id(1)));
@@ -76,7 +77,7 @@ async fn a_worker_that_stopped_beating_can_write_nothing_more() {
     fixture.store.append_epochs(run_id(1), old.fence, &[report(1, 9.0)]).await.expect("works");
     assert!(fixture.store.claim_run(LEASE, at(31)).await.expect("works").is_none(), "the lease holds");
     let new = fixture.claim(32).await;
-    assert_eq!((new.run.attempt, new.fence), (2, old.fence + 1));
+    assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert_eq!(fixture.store.epochs(run_id(1)).await.expect("known"), [], "a new attempt, a new curve");
 
     assert_eq!(fixture.beat(old.fence, 33).await, Heartbeat::Lost);
@@ -107,7 +108,7 @@ async fn a_camera_has_one_live_run_and_the_server_a_limit() {
     assert_eq!(kind(store.insert_run(run_id(2), &other, &options(), 1, at(1)).await), ErrorKind::Overloaded);
     store.insert_run(run_id(2), &other, &options(), 2, at(1)).await.expect("queued");
     let (first, second) = (fixture.claim(2).await, fixture.claim(2).await);
-    assert_eq!((first.run.id, second.run.id), (run_id(1), run_id(2)), "the oldest first");
+    assert_eq!((first.job.id, second.job.id), (run_id(1), run_id(2)), "the oldest first");
     assert_eq!(kind(store.run(&other, run_id(1)).await), ErrorKind::RunNotFound);
     assert_eq!(kind(store.run(&id("none"), run_id(1)).await), ErrorKind::CameraNotFound);
     fixture
@@ -140,7 +141,7 @@ async fn a_cancelled_run_yields_nothing() {
     let store = &fixture.store;
     fixture.queue(1).await;
     let cancelled = store.request_cancel(&fixture.camera, run_id(1), at(5)).await.expect("cancelled");
-    assert_eq!((cancelled.state, cancelled.ended_at), (RunState::Cancelled, Some(at(5))));
+    assert_eq!((cancelled.state, cancelled.ended_at), (JobState::Cancelled, Some(at(5))));
     assert_eq!(kind(store.request_cancel(&fixture.camera, run_id(1), at(6)).await), ErrorKind::RunEnded);
     assert_eq!(kind(store.request_cancel(&fixture.camera, run_id(9), at(6)).await), ErrorKind::RunNotFound);
     assert!(store.claim_run(LEASE, at(7)).await.expect("works").is_none());
@@ -148,13 +149,13 @@ async fn a_cancelled_run_yields_nothing() {
     fixture.queue(2).await;
     let claim = fixture.claim(8).await;
     let flagged = store.request_cancel(&fixture.camera, run_id(2), at(9)).await.expect("flagged");
-    assert_eq!(flagged.state, RunState::Running);
+    assert_eq!(flagged.state, JobState::Running);
     let beat = store.heartbeat(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
     assert_eq!(beat.expect("works"), Heartbeat::CancelRequested);
     let taken_over = fixture.claim(100).await;
     assert!(taken_over.cancel_requested, "the wish outlives the worker");
     let ended = store.finish_run(run_id(2), taken_over.fence, success(&metadata(), true), at(101)).await;
-    assert_eq!(ended.expect("works").expect("mine").state, RunState::Cancelled);
+    assert_eq!(ended.expect("works").expect("mine").state, JobState::Cancelled);
     assert_eq!(store.models(&fixture.camera, None, 9).await.expect("a page"), []);
 }
 
@@ -165,9 +166,9 @@ async fn a_run_given_back_is_taken_up_at_once() {
     let first = fixture.claim(2).await;
     fixture.store.append_log(run_id(1), first.fence, at(3), "before").await.expect("works");
     let back = fixture.finish(first.fence, RunEnd::Requeue).await.expect("mine");
-    assert_eq!((back.state, back.ended_at), (RunState::Queued, None));
+    assert_eq!((back.state, back.ended_at), (JobState::Queued, None));
     let second = fixture.claim(4).await;
-    assert_eq!((second.run.attempt, second.run.progress), (2, RunProgress::default()));
+    assert_eq!((second.job.attempt, second.job.progress), (2, RunProgress::default()));
     assert_eq!(fixture.store.log(run_id(1)).await.expect("known"), [(at(3), "before".to_owned())]);
 }
 

@@ -3,7 +3,8 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::domain::{Error, Recipe, Result};
+use super::error::{Error, Result};
+use super::recipe::Recipe;
 
 /// How a recipe's model is asked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -19,6 +19,15 @@ impl Fusion {
 
 #[tonic::async_trait]
 impl FusionService for Fusion {
+    type StreamStream = futures_util::stream::Empty<Result<proto::StreamResponse, tonic::Status>>;
+
+    async fn stream(
+        &self,
+        _request: tonic::Request<tonic::Streaming<proto::StreamRequest>>,
+    ) -> Reply<Self::StreamStream> {
+        Err(tonic::Status::unimplemented("streams are not answered yet"))
+    }
+
     async fn fuse(&self, request: tonic::Request<proto::FuseRequest>) -> Reply<proto::FuseResponse> {
         answer(request, |asked| async move {
             let camera = camera_id(&asked.camera_id)?;

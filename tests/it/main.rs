@@ -6,4 +6,5 @@ mod grpc;
 mod harness;
 mod layering;
 mod openapi;
+mod replay;
 mod story;

@@ -79,6 +79,20 @@ pub struct Limits {
     pub requests: usize,
     /// Event streams open at a time.
     pub event_streams: usize,
+    /// Targets followed at a time, per camera.
+    pub tracks_per_camera: usize,
+    /// Points of a target's track that are kept, half a second or more apart.
+    pub track_points: usize,
+    /// Live streams open at a time.
+    pub live_streams: usize,
+    /// Live streams open at a time under one client name.
+    pub live_streams_per_client: usize,
+    /// Answers of a live stream that wait for a slow reader; beyond, the oldest are lost.
+    pub live_answers: usize,
+    /// Seconds after which a live stream without an item is ended.
+    pub live_idle_s: u64,
+    /// Seconds after which the client of a live stream is asked to open another.
+    pub live_age_s: u64,
     /// Training runs that have not ended, over all cameras.
     pub live_runs: u32,
     /// Passes of one training run.
@@ -126,6 +140,13 @@ impl Default for Limits {
             streams_per_connection: 256,
             requests: 1_024,
             event_streams: 256,
+            tracks_per_camera: 256,
+            track_points: 240,
+            live_streams: 2_048,
+            live_streams_per_client: 64,
+            live_answers: 256,
+            live_idle_s: 300,
+            live_age_s: 3_600,
             live_runs: 256,
             epochs: 10_000,
             samples_per_run: 100_000,

@@ -101,5 +101,8 @@ async fn keep_up(app: App, shutdown: Shutdown) {
         if let Err(error) = app.registry.refresh(&app.store).await {
             tracing::error!(%error, "cannot look for changed cameras");
         }
+        if let Err(error) = app.retrain_moved().await {
+            tracing::error!(%error, "cannot train moved cameras anew");
+        }
     }
 }

@@ -55,6 +55,7 @@ pub const fn of(kind: ErrorKind) -> Status {
         }
         ErrorKind::CameraNotFound => (404, code::NOT_FOUND, "camera-not-found", "There is no such camera"),
         ErrorKind::RunNotFound => (404, code::NOT_FOUND, "run-not-found", "There is no such training run"),
+        ErrorKind::TrackNotFound => (404, code::NOT_FOUND, "track-not-found", "No such target is followed"),
         ErrorKind::ModelNotFound => {
             (404, code::NOT_FOUND, "model-not-found", "There is no such model version")
         }

@@ -11,6 +11,7 @@ use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle, 
 
 use crate::config::{Config, LogFormat};
 use crate::domain::{Flag, FusedFix, RunState};
+use crate::fusion::track::{Rejection, RejectionReason};
 
 /// Starts the log of the process, on standard error.
 ///
@@ -47,8 +48,16 @@ pub struct Metrics {
     http_requests: [Counter; 5],
     http_duration_s: Histogram,
     requests_refused: Counter,
+    track_nis: Histogram,
+    track_rejections: [(RejectionReason, Counter); RejectionReason::ALL.len()],
+    live_streams: Gauge,
+    live_items: Counter,
+    live_item_errors: Counter,
+    live_answers_lost: Counter,
+    cameras_moved: Counter,
 }
 
+const NIS: &str = "sightfix_track_nis";
 const METADATA: Metadata<'static> = Metadata::new("sightfix", Level::INFO, None);
 
 impl Default for Metrics {
@@ -66,6 +75,11 @@ impl Metrics {
                 Matcher::Suffix("duration_seconds".to_owned()),
                 &[0.000_1, 0.000_3, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0],
             )
+            // Quantiles of chi-square with 2 degrees: 10, 25, 50, 75, 90, 95, 99 and 99.9 %.
+            .and_then(|builder| {
+                let bounds = &[0.21, 0.58, 1.39, 2.77, 4.61, 5.99, 9.21, 13.8];
+                builder.set_buckets_for_metric(Matcher::Full(NIS.to_owned()), bounds)
+            })
             .unwrap_or_else(|_| PrometheusBuilder::new())
             .build_recorder();
         let counter = |name: &'static str, help: &'static str, labels: Vec<Label>| {
@@ -87,6 +101,11 @@ impl Metrics {
             recorder.register_histogram(&Key::from_name(name), &METADATA)
         };
         describe(&recorder, "sightfix_connections", "Open connections", Recorder::describe_gauge);
+        describe(&recorder, "sightfix_live_streams", "Open live streams", Recorder::describe_gauge);
+        let rejections = |reason: RejectionReason| {
+            let help = "Measured positions that tracks did not take up, by reason";
+            (reason, labelled("sightfix_track_rejections_total", help, "reason", reason.as_str()))
+        };
         Self {
             fusions: plain("sightfix_fusions_total", "Observations answered"),
             fusions_denied: plain("sightfix_fusions_denied_total", "Observations answered without a fix"),
@@ -108,6 +127,22 @@ impl Metrics {
                 "sightfix_requests_refused_total",
                 "Requests refused because too many were in flight",
             ),
+            track_nis: histogram(
+                NIS,
+                "Normalised innovation squared of tracks, 2 degrees each; mean 2 if consistent",
+            ),
+            track_rejections: RejectionReason::ALL.map(rejections),
+            live_streams: recorder.register_gauge(&Key::from_name("sightfix_live_streams"), &METADATA),
+            live_items: plain("sightfix_live_items_total", "Items of live streams that were taken"),
+            live_item_errors: plain(
+                "sightfix_live_item_errors_total",
+                "Items of live streams that were not taken",
+            ),
+            live_answers_lost: plain(
+                "sightfix_live_answers_lost_total",
+                "Answers of live streams that slow readers lost",
+            ),
+            cameras_moved: plain("sightfix_cameras_moved_total", "Alarms that a camera was moved"),
             handle: recorder.handle(),
         }
     }
@@ -137,6 +172,41 @@ impl Metrics {
         self.samples_accepted.increment(accepted);
         self.samples_duplicate.increment(duplicate);
         self.samples_rejected.increment(rejected);
+    }
+
+    /// A track took up innovations, and did not take up others.
+    pub fn tracked(&self, nis: impl Iterator<Item = f64>, rejected: &[Rejection]) {
+        nis.for_each(|nis| self.track_nis.record(nis));
+        for rejection in rejected {
+            for (reason, counter) in &self.track_rejections {
+                counter.increment(u64::from(*reason == rejection.reason));
+            }
+        }
+    }
+
+    /// A live stream was opened.
+    pub fn stream_opened(&self) {
+        self.live_streams.increment(1.0);
+    }
+
+    /// A live stream was closed.
+    pub fn stream_closed(&self) {
+        self.live_streams.decrement(1.0);
+    }
+
+    /// An item of a live stream was answered, well or with its error.
+    pub fn item_answered(&self, taken: bool) {
+        if taken { self.live_items.increment(1) } else { self.live_item_errors.increment(1) }
+    }
+
+    /// A slow reader lost an answer.
+    pub fn answer_lost(&self) {
+        self.live_answers_lost.increment(1);
+    }
+
+    /// A camera was found to have moved.
+    pub fn camera_moved(&self) {
+        self.cameras_moved.increment(1);
     }
 
     /// A run has ended.

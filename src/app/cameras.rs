@@ -58,6 +58,7 @@ impl App {
     pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
         self.store.delete_camera(id, expected).await?;
         self.registry.forget(id);
+        self.live.forget(id);
         Ok(())
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::App;
 use super::registry::Serving;
-use crate::domain::{CameraId, Error, ErrorKind, FusedFix, Observation, Result};
+use crate::domain::{CameraId, Error, ErrorKind, Flag, FusedFix, Observation, Result};
 use crate::fusion::two_step;
 
 impl App {
@@ -16,13 +16,9 @@ impl App {
     pub async fn fuse(&self, id: &CameraId, observations: &[Observation]) -> Result<Vec<FusedFix>> {
         self.check_batch(observations.len())?;
         let serving = self.serving(id).await?;
-        let model = serving.model.as_ref().map(|(regressor, number)| (&**regressor, *number));
         let fused = observations
             .iter()
-            .map(|observation| {
-                two_step::fuse(observation, model, serving.image_size, serving.e_gnss_m2)
-                    .ok_or_else(|| no_model(id))
-            })
+            .map(|observation| fuse_one(&serving, observation).ok_or_else(|| no_model(id)))
             .collect::<Result<Vec<_>>>()?;
         self.metrics.fused(&fused);
         Ok(fused)
@@ -54,6 +50,16 @@ impl App {
             None => self.registry.refresh_camera(&self.store, id).await,
         }
     }
+}
+
+/// The position of one observation; `None` for a box while the camera has no model.
+pub(super) fn fuse_one(serving: &Serving, observation: &Observation) -> Option<FusedFix> {
+    let model = serving.model.as_ref().map(|(regressor, number)| (&**regressor, *number));
+    let mut fused = two_step::fuse(observation, model, serving.image_size, serving.e_gnss_m2)?;
+    if serving.moved.is_some() && fused.regressed.is_some() {
+        fused.flags.push(Flag::CameraMoved);
+    }
+    Some(fused)
 }
 
 fn no_model(id: &CameraId) -> Error {

@@ -4,6 +4,7 @@
 
 mod cameras;
 mod fusion;
+mod live;
 mod models;
 mod registry;
 mod samples;
@@ -18,6 +19,7 @@ use crate::config::Limits;
 use crate::store::Store;
 use crate::telemetry::Metrics;
 
+pub use live::{CameraEvent, Followed, LiveItem, LiveStream, Moves, TrackPoint};
 pub use models::GnssErrorEstimate;
 pub use registry::Registry;
 pub use samples::{ImportReport, RejectedRow};
@@ -33,6 +35,8 @@ pub struct Parts {
     pub store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
+    /// Tracks, streams and the watch on the cameras.
+    pub live: live::Live,
     /// What time it is.
     pub clock: Clock,
     /// Ids and seeds.
@@ -60,7 +64,8 @@ impl App {
         let registry = Registry::default();
         registry.refresh(&store).await?;
         let run_queued = Notify::new();
-        let parts = Parts { store, registry, clock, randomness, limits, metrics, run_queued };
+        let live = live::Live::default();
+        let parts = Parts { store, registry, live, clock, randomness, limits, metrics, run_queued };
         Ok(Self(Arc::new(parts)))
     }
 }

@@ -9,7 +9,9 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 use tokio::sync::Mutex;
 
-use crate::domain::{CameraId, Error, ErrorKind, GnssError, ImageSize, Result, Revision};
+use crate::domain::{
+    CameraId, CameraMoved, Error, ErrorKind, GnssError, ImageSize, Receivers, Result, Revision,
+};
 use crate::model::{Artifact, Regressor};
 use crate::store::Store;
 
@@ -21,6 +23,10 @@ pub struct Serving {
     pub image_size: Option<ImageSize>,
     /// The receiver's variance per axis in m2, if the profile tells it.
     pub e_gnss_m2: Option<f64>,
+    /// Whose the receivers are, for pairing.
+    pub receivers: Receivers,
+    /// What the watch found with that model.
+    pub moved: Option<Arc<CameraMoved>>,
     /// The active model and its version number.
     pub model: Option<(Arc<Regressor>, u32)>,
 }
@@ -110,13 +116,19 @@ impl Registry {
             (Some(number), Some(loaded)) if loaded.1 == number => Some(loaded),
             (Some(number), _) => Some((Arc::new(load_regressor(store, id, number).await?), number)),
         };
+        let moved = match camera.active_model {
+            Some(number) => store.camera_move(id, number).await?.map(Arc::new),
+            None => None,
+        };
         Ok(Arc::new(Serving {
+            moved,
             revision: camera.revision,
             image_size: camera.profile.image_size,
             e_gnss_m2: match camera.profile.gnss_error {
                 GnssError::Known(sigma) => Some(sigma.variance_m2()),
                 GnssError::Unknown => None,
             },
+            receivers: camera.profile.receivers,
             model,
         }))
     }

@@ -8,6 +8,7 @@ use super::bounding_box::ImageSize;
 use super::error::{Error, Result};
 use super::gnss_error::GnssError;
 use super::names::{CameraId, TargetClass, check_labels, check_text};
+use super::receiver::Receivers;
 use super::recipe::Recipe;
 
 /// Counts the changes of a profile, from 1.
@@ -31,6 +32,10 @@ pub struct NewCamera {
     pub target_classes: Vec<TargetClass>,
     /// Free-form labels.
     pub labels: BTreeMap<String, String>,
+    /// Whose the GNSS receivers are, and how far their clocks are off.
+    pub receivers: Receivers,
+    /// Whether a training run is started by itself once the camera is found to have moved.
+    pub retrain_when_moved: bool,
 }
 
 impl NewCamera {
@@ -45,6 +50,8 @@ impl NewCamera {
             recipe: Recipe::default(),
             target_classes: Vec::new(),
             labels: BTreeMap::new(),
+            receivers: Receivers::default(),
+            retrain_when_moved: false,
         }
     }
 
@@ -105,6 +112,10 @@ pub struct CameraChange {
     pub target_classes: Option<Vec<TargetClass>>,
     /// New labels, all of them.
     pub labels: Option<BTreeMap<String, String>>,
+    /// New receivers, all of them.
+    pub receivers: Option<Receivers>,
+    /// Whether to train anew by itself.
+    pub retrain_when_moved: Option<bool>,
 }
 
 impl CameraChange {
@@ -121,6 +132,8 @@ impl CameraChange {
             recipe: self.recipe.unwrap_or(profile.recipe),
             target_classes: self.target_classes.unwrap_or(profile.target_classes),
             labels: self.labels.unwrap_or(profile.labels),
+            receivers: self.receivers.unwrap_or(profile.receivers),
+            retrain_when_moved: self.retrain_when_moved.unwrap_or(profile.retrain_when_moved),
         }
         .check()
     }
@@ -147,4 +160,24 @@ impl Camera {
     pub const fn id(&self) -> &CameraId {
         &self.profile.id
     }
+}
+
+/// A camera no longer looks where it looked when its model was trained: its positions have left the
+/// fixes, beyond what the errors of both explain.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraMoved {
+    /// The model version that no longer fits.
+    pub model_version: u32,
+    /// When it began, as well as can be told.
+    pub began_at: Timestamp,
+    /// When the evidence was enough.
+    pub raised_at: Timestamp,
+    /// Mean shift of the regressed positions against the fixes since then, m.
+    pub shift_east_m: f64,
+    /// The same towards north, m.
+    pub shift_north_m: f64,
+    /// The test's statistic.
+    pub statistic: f64,
+    /// Targets that bear witness.
+    pub targets: u32,
 }

@@ -31,6 +31,8 @@ pub enum ErrorKind {
     CameraNotFound,
     /// No such training run.
     RunNotFound,
+    /// No such target is followed.
+    TrackNotFound,
     /// No such model version.
     ModelNotFound,
     /// A camera of that id exists already.

@@ -79,10 +79,22 @@ name!(
     "target_id"
 );
 name!(
+    /// Id of a GNSS receiver, chosen by the operator or the receiver.
+    ReceiverId,
+    "receiver_id"
+);
+name!(
     /// Class of a target: `person`, `car`, `aircraft`.
     TargetClass,
     "class"
 );
+
+/// A receiver of which nothing is said carries its own id as target id.
+impl From<ReceiverId> for TargetId {
+    fn from(receiver_id: ReceiverId) -> Self {
+        Self(receiver_id.0)
+    }
+}
 
 impl fmt::Display for CameraId {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {

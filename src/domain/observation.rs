@@ -75,6 +75,8 @@ pub enum Flag {
     OutsideTraining,
     /// The camera has no model; only fixes can pass.
     NoModel,
+    /// The camera no longer looks where it looked when its model was trained.
+    CameraMoved,
 }
 
 impl Flag {
@@ -87,6 +89,7 @@ impl Flag {
             Self::BoxAtBorder => "box_at_border",
             Self::OutsideTraining => "outside_training",
             Self::NoModel => "no_model",
+            Self::CameraMoved => "camera_moved",
         }
     }
 }

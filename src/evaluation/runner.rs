@@ -421,8 +421,7 @@ fn measurement(
     });
     let regressed = observation.bounding_box.as_ref().map(|drawn| {
         let regression = regress(drawn, fix.map(|fix| fix.position));
-        let calibrated = (regression.r95_scale / R95_PER_SIGMA).powi(2);
-        Measured::isotropic(regression.regressed, calibrated * regression.e_regression_m2)
+        Measured::isotropic(regression.regressed, regression.variance_m2())
     });
     Measurement { time: observation.time, fix, regressed }
 }

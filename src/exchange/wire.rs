@@ -302,6 +302,8 @@ pub enum Flag {
     OutsideTraining,
     /// The camera has no model; only fixes can pass.
     NoModel,
+    /// The camera no longer looks where it looked when its model was trained.
+    CameraMoved,
 }
 
 /// Flags by their names.

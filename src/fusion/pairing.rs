@@ -1,6 +1,6 @@
 //! Detections and fixes that come apart, brought together by time.
 //!
-//! Each receiver is bound to a target and has a fixed clock offset. Under [`PairingRule::Nearest`] a
+//! Each receiver is bound to a target and has a fixed clock offset ([`Receivers`]). Under [`PairingRule::Nearest`] a
 //! fix and a box make a sample when each is the other's nearest within the window, so no fix labels
 //! two boxes; under [`PairingRule::Interpolated`] every box between two neighbouring fixes gets a
 //! fix of its own time. What never happens here: files, clocks, unbounded memory on a live stream.
@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::domain::{Detection, Fix, Sample, TargetId};
+use crate::domain::{Detection, Fix, ReceiverId, Receivers, Sample, TargetId};
 use crate::geo::{EastNorth, LocalPlane};
 
 /// A fix as a receiver sent it, by the receiver's own clock.
@@ -17,44 +17,10 @@ use crate::geo::{EastNorth, LocalPlane};
 pub struct ReceivedFix {
     /// When, by the receiver's clock.
     pub time: Timestamp,
-    /// Which receiver; `None` where the file names none.
-    pub receiver_id: Option<TargetId>,
+    /// Which receiver; a fix that names none belongs to nobody.
+    pub receiver_id: Option<ReceiverId>,
     /// Where it says it is.
     pub fix: Fix,
-}
-
-/// Whose a receiver is.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Receiver {
-    /// The target that carries it.
-    pub target_id: TargetId,
-    /// Added to the receiver's time to get the camera's.
-    pub clock_offset: SignedDuration,
-}
-
-/// All receivers of a camera.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Receivers {
-    /// By receiver id; a receiver that is not named here carries its own id as target id.
-    pub bound: BTreeMap<TargetId, Receiver>,
-    /// Whose the fixes without a receiver id are.
-    pub nameless: Option<Receiver>,
-}
-
-impl Receivers {
-    /// Target and camera time of a fix; `None` for a fix without a receiver id that nobody claims.
-    #[must_use]
-    pub fn resolve(&self, received: &ReceivedFix) -> Option<(TargetId, Timestamp)> {
-        let receiver = match &received.receiver_id {
-            Some(id) => match self.bound.get(id) {
-                Some(receiver) => receiver,
-                None => return Some((id.clone(), received.time)),
-            },
-            None => self.nameless.as_ref()?,
-        };
-        let time = received.time.saturating_add(receiver.clock_offset).unwrap_or(received.time);
-        Some((receiver.target_id.clone(), time))
-    }
 }
 
 /// How a box finds its fix.
@@ -78,9 +44,9 @@ pub struct PairingSettings {
     pub longest_gap: SignedDuration,
     /// On a stream, items may come this late and still find their partner.
     pub lateness: SignedDuration,
-    /// On a stream, items kept per target and kind.
+    /// On a stream, items kept per target and kind; beyond, the target is decided early.
     pub items_per_target: usize,
-    /// On a stream, targets kept.
+    /// On a stream, targets kept; beyond, the one heard of longest ago is decided early.
     pub targets: usize,
 }
 
@@ -108,10 +74,8 @@ pub struct Unpaired {
     pub fixes: u64,
     /// Boxes or fixes of a target and instant that was there already.
     pub duplicates: u64,
-    /// Fixes of receivers that are bound to nobody.
+    /// Fixes that name no receiver.
     pub unbound: u64,
-    /// Items lost to the limits of a stream.
-    pub dropped: u64,
 }
 
 /// Two recorded lists as training samples.
@@ -134,23 +98,39 @@ pub fn pair(
     detections.sort_by_key(|detection| detection.time);
     fixes.sort_by_key(|fix| fix.time);
     let settings = PairingSettings { items_per_target: usize::MAX, targets: usize::MAX, ..*settings };
-    let mut pairer = Pairer::new(settings, receivers.clone());
+    let mut pairer = Pairer::new(settings);
     for detection in detections {
         pairer.insert_detection(detection);
     }
-    for fix in fixes {
-        pairer.insert_fix(fix);
+    for received in fixes {
+        let Some(receiver_id) = &received.receiver_id else {
+            pairer.unpaired.unbound += 1;
+            continue;
+        };
+        let (target_id, time) = receivers.resolve(receiver_id, received.time);
+        pairer.insert_fix(&target_id, time, received.fix);
     }
     let samples = pairer.finish();
     Paired { samples, unpaired: pairer.unpaired }
 }
 
+/// What has become certain of one target.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Decided {
+    /// Whose.
+    pub target_id: TargetId,
+    /// New samples, in order of time.
+    pub samples: Vec<Sample>,
+    /// Items of that target from before this instant will never be looked at again.
+    pub settled_before: Timestamp,
+}
+
 /// Pairs a live stream in bounded memory. A sample comes out once nothing that may still arrive in
-/// time could change it; [`Pairer::finish`] gives what is left.
+/// time could change it; [`Pairer::finish`] gives what is left. Where memory is short, targets are
+/// decided early and nothing is dropped.
 #[derive(Debug, Clone)]
 pub struct Pairer {
     settings: PairingSettings,
-    receivers: Receivers,
     lanes: BTreeMap<TargetId, Lane>,
     unpaired: Unpaired,
 }
@@ -175,8 +155,8 @@ struct Kept<T> {
 impl Pairer {
     /// Nothing kept yet.
     #[must_use]
-    pub fn new(settings: PairingSettings, receivers: Receivers) -> Self {
-        Self { settings, receivers, lanes: BTreeMap::new(), unpaired: Unpaired::default() }
+    pub fn new(settings: PairingSettings) -> Self {
+        Self { settings, lanes: BTreeMap::new(), unpaired: Unpaired::default() }
     }
 
     /// What has not become part of a sample so far.
@@ -185,78 +165,94 @@ impl Pairer {
         self.unpaired
     }
 
-    /// Takes a box; returns the samples that are now certain.
-    pub fn push_detection(&mut self, detection: Detection) -> Vec<Sample> {
+    /// Takes a box; returns what is now certain.
+    pub fn push_detection(&mut self, detection: Detection) -> Vec<Decided> {
         let target_id = detection.target_id.clone();
+        let mut decided = self.make_room(&target_id);
         self.insert_detection(detection);
-        self.decide(&target_id)
+        decided.extend(self.decide(&target_id));
+        decided
     }
 
-    /// Takes a fix; returns the samples that are now certain.
-    pub fn push_fix(&mut self, received: ReceivedFix) -> Vec<Sample> {
-        match self.insert_fix(received) {
-            Some(target_id) => self.decide(&target_id),
-            None => Vec::new(),
-        }
+    /// Takes the fix of a target, at the camera's time; returns what is now certain.
+    pub fn push_fix(&mut self, target_id: &TargetId, time: Timestamp, fix: Fix) -> Vec<Decided> {
+        let mut decided = self.make_room(target_id);
+        self.insert_fix(target_id, time, fix);
+        decided.extend(self.decide(target_id));
+        decided
+    }
+
+    /// Decides all that is kept of a target, as if its stream had ended.
+    pub fn end(&mut self, target_id: &TargetId) -> Option<Decided> {
+        let mut lane = self.lanes.remove(target_id)?;
+        let mut samples = Vec::new();
+        lane.decide(&self.settings, None, &mut samples);
+        lane.forget(None, &mut self.unpaired, self.settings.rule);
+        Some(Decided { target_id: target_id.clone(), samples, settled_before: Timestamp::MAX })
     }
 
     /// Decides everything kept, as if the stream had ended. In order of time, then target.
     pub fn finish(&mut self) -> Vec<Sample> {
-        let mut samples = Vec::new();
-        for lane in self.lanes.values_mut() {
-            lane.decide(&self.settings, None, &mut samples);
-            lane.forget(None, &mut self.unpaired, self.settings.rule);
-        }
-        self.lanes.clear();
+        let targets: Vec<TargetId> = self.lanes.keys().cloned().collect();
+        let ended = targets.iter().filter_map(|target_id| self.end(target_id));
+        let mut samples: Vec<Sample> = ended.flat_map(|decided| decided.samples).collect();
         samples.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
         samples
     }
 
-    fn insert_detection(&mut self, detection: Detection) {
-        let (target_id, time) = (detection.target_id.clone(), detection.time);
-        let limit = self.settings.items_per_target;
-        let Some(lane) = lane_of(&mut self.lanes, &self.settings, target_id, &mut self.unpaired) else {
-            return;
+    /// Ends the target itself if too much of it is kept, and the one heard of longest ago if there
+    /// are too many.
+    fn make_room(&mut self, target_id: &TargetId) -> Vec<Decided> {
+        let crowded = match self.lanes.get(target_id) {
+            Some(lane) => {
+                let most = self.settings.items_per_target;
+                (lane.detections.len() >= most || lane.fixes.len() >= most).then(|| target_id.clone())
+            }
+            None if self.lanes.len() >= self.settings.targets => {
+                let stalest = self.lanes.iter().min_by_key(|(_, lane)| lane.latest);
+                stalest.map(|(stalest, _)| stalest.clone())
+            }
+            None => None,
         };
+        crowded.and_then(|target_id| self.end(&target_id)).into_iter().collect()
+    }
+
+    fn insert_detection(&mut self, detection: Detection) {
+        let time = detection.time;
+        let lane = self.lanes.entry(detection.target_id.clone()).or_default();
         if lane.is_decided(time) {
             self.unpaired.detections += 1;
             return;
         }
         lane.latest = lane.latest.max(Some(time));
-        keep(&mut lane.detections, time, detection, limit, &mut self.unpaired);
+        keep(&mut lane.detections, time, detection, &mut self.unpaired);
     }
 
-    fn insert_fix(&mut self, received: ReceivedFix) -> Option<TargetId> {
-        let Some((target_id, time)) = self.receivers.resolve(&received) else {
-            self.unpaired.unbound += 1;
-            return None;
-        };
-        let limit = self.settings.items_per_target;
-        let lane = lane_of(&mut self.lanes, &self.settings, target_id.clone(), &mut self.unpaired)?;
+    fn insert_fix(&mut self, target_id: &TargetId, time: Timestamp, fix: Fix) {
+        let lane = self.lanes.entry(target_id.clone()).or_default();
         if lane.is_decided(time) {
             self.unpaired.fixes += 1;
-            return None;
+            return;
         }
         lane.latest = lane.latest.max(Some(time));
-        keep(&mut lane.fixes, time, received.fix, limit, &mut self.unpaired);
-        Some(target_id)
+        keep(&mut lane.fixes, time, fix, &mut self.unpaired);
     }
 
-    fn decide(&mut self, target_id: &TargetId) -> Vec<Sample> {
-        let mut samples = Vec::new();
+    fn decide(&mut self, target_id: &TargetId) -> Option<Decided> {
         let settings = &self.settings;
-        let Some(lane) = self.lanes.get_mut(target_id) else { return samples };
+        let lane = self.lanes.get_mut(target_id)?;
         // A partner's own partner may lie one window further on.
         let reach = reach(settings);
-        let until = lane.latest.and_then(|latest| latest.checked_sub(reach + settings.lateness).ok());
-        let Some(until) = until.filter(|until| !lane.is_decided(*until)) else { return samples };
+        let until = lane.latest?.checked_sub(reach + settings.lateness).ok()?;
+        if lane.is_decided(until) {
+            return None;
+        }
+        let mut samples = Vec::new();
         lane.decide(settings, Some(until), &mut samples);
         lane.decided = Some(until);
-        let forgotten = until.checked_sub(reach).ok();
-        if forgotten.is_some() {
-            lane.forget(forgotten, &mut self.unpaired, settings.rule);
-        }
-        samples
+        let settled_before = until.checked_sub(reach).ok()?;
+        lane.forget(Some(settled_before), &mut self.unpaired, settings.rule);
+        Some(Decided { target_id: target_id.clone(), samples, settled_before })
     }
 }
 
@@ -268,33 +264,13 @@ fn reach(settings: &PairingSettings) -> SignedDuration {
     }
 }
 
-/// The target's lane, made if there is room for it; else the target heard of longest ago gives way.
-fn lane_of<'a>(
-    lanes: &'a mut BTreeMap<TargetId, Lane>,
-    settings: &PairingSettings,
-    target_id: TargetId,
-    unpaired: &mut Unpaired,
-) -> Option<&'a mut Lane> {
-    if !lanes.contains_key(&target_id) && lanes.len() >= settings.targets {
-        let stalest = lanes.iter().min_by_key(|(_, lane)| lane.latest).map(|(id, _)| id.clone())?;
-        let gone = lanes.remove(&stalest)?;
-        let unused = |used: bool| u64::from(!used);
-        unpaired.dropped += gone.detections.iter().map(|kept| unused(kept.used)).sum::<u64>();
-        unpaired.dropped += gone.fixes.iter().map(|kept| unused(kept.used)).sum::<u64>();
-    }
-    Some(lanes.entry(target_id).or_default())
-}
-
-/// Puts an item at its place in time; the oldest gives way when there is no room.
-fn keep<T>(kept: &mut VecDeque<Kept<T>>, time: Timestamp, item: T, limit: usize, unpaired: &mut Unpaired) {
+/// Puts an item at its place in time.
+fn keep<T>(kept: &mut VecDeque<Kept<T>>, time: Timestamp, item: T, unpaired: &mut Unpaired) {
     let place = kept.partition_point(|other| other.time < time);
     if kept.get(place).is_some_and(|other| other.time == time) {
         unpaired.duplicates += 1;
-        return;
-    }
-    kept.insert(place, Kept { time, item, used: false });
-    if kept.len() > limit {
-        unpaired.dropped += u64::from(kept.pop_front().is_some_and(|oldest| !oldest.used));
+    } else {
+        kept.insert(place, Kept { time, item, used: false });
     }
 }
 

@@ -1,7 +1,7 @@
 //! The two-step fusion of Liang et al. 2022: (5) the regression's error from its reconstruction
 //! error, (6) and (7) the confidences, (8) the weighted mean.
 
-use crate::domain::{Confidences, Flag, FusedFix, ImageSize, Observation};
+use crate::domain::{Confidences, Flag, FusedFix, ImageSize, Observation, SigmaM};
 use crate::geo::EastNorth;
 use crate::model::{R95_PER_SIGMA, Regression, Regressor};
 
@@ -48,10 +48,9 @@ pub fn fuse(
     };
     let (regressor, version) = serving?;
     let plane = regressor.plane();
-    let fix = observation.fix.map(|fix| {
-        let e_gnss_m2 = fix.sigma_m.map_or(e_gnss_m2, |sigma| Some(sigma.variance_m2()));
-        (plane.to_plane(fix.position), e_gnss_m2.unwrap_or_else(|| regressor.e_gnss_m2()))
-    });
+    let fix = observation
+        .fix
+        .map(|fix| (plane.to_plane(fix.position), fix_variance_m2(observation, Some(regressor), e_gnss_m2)));
     let regression = regressor.regress(bounding_box, fix.map(|(point, _)| point));
     if fix.is_none() {
         flags.push(Flag::GnssDenied);
@@ -93,10 +92,22 @@ pub fn fuse(
 /// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
 pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 
+/// The error variance per axis, m2, of an observation's fix: by its own word, else by the camera's
+/// profile, else by the model, else that of a phone in the open.
+#[must_use]
+pub fn fix_variance_m2(
+    observation: &Observation,
+    regressor: Option<&Regressor>,
+    e_gnss_m2: Option<f64>,
+) -> f64 {
+    let own_m2 = observation.fix.and_then(|fix| fix.sigma_m).map(SigmaM::variance_m2);
+    own_m2.or(e_gnss_m2).or(regressor.map(Regressor::e_gnss_m2)).unwrap_or(UNKNOWN_RECEIVER_M2)
+}
+
 /// The answer for an observation without a box: its fix.
 fn pass_through(observation: &Observation, has_model: bool, e_gnss_m2: Option<f64>) -> Option<FusedFix> {
     let fix = observation.fix?;
-    let e_gnss_m2 = fix.sigma_m.map(|sigma| sigma.variance_m2()).or(e_gnss_m2).unwrap_or(UNKNOWN_RECEIVER_M2);
+    let e_gnss_m2 = fix_variance_m2(observation, None, e_gnss_m2);
     let mut flags = vec![Flag::BoxMissing];
     if !has_model {
         flags.push(Flag::NoModel);

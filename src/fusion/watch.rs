@@ -7,12 +7,14 @@
 //! then with the mean before. What never happens here: one receiver alone among several, or one
 //! stop, raising the alarm; a model being blamed for a constant offset that was there from the start.
 
+mod meeting;
 mod pool;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use jiff::Timestamp;
 
+pub use self::meeting::{Meeting, Spot};
 use self::pool::{Block, Cell, Estimate, Ground, Pool, combined, reference, statistic};
 use super::track::GnssNoise;
 use crate::domain::TargetId;

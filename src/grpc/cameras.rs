@@ -7,8 +7,8 @@ use super::proto::camera_service_server::CameraService;
 use super::statuses::{Reply, answer};
 use crate::app::App;
 use crate::domain::{
-    Camera, CameraChange, CameraId, Error, GnssError, ImageSize, NewCamera, Result, Revision, SigmaM,
-    TargetClass,
+    Camera, CameraChange, CameraId, ClockOffset, Error, GnssError, ImageSize, NewCamera, Receiver,
+    ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
 };
 
 pub(super) struct Cameras {
@@ -33,7 +33,7 @@ impl CameraService for Cameras {
                 .and_then(NewCamera::check)
                 .map_err(|error| error.under("profile"))?;
             let camera = self.app.create_camera(profile).await?;
-            Ok(proto::CreateCameraResponse { camera: Some(camera.into()) })
+            Ok(proto::CreateCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
         })
         .await
     }
@@ -44,7 +44,7 @@ impl CameraService for Cameras {
     ) -> Reply<proto::GetCameraResponse> {
         answer(request, |asked| async move {
             let camera = self.app.camera(&camera_id(&asked.camera_id)?).await?;
-            Ok(proto::GetCameraResponse { camera: Some(camera.into()) })
+            Ok(proto::GetCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
         })
         .await
     }
@@ -59,7 +59,7 @@ impl CameraService for Cameras {
             let page = self.app.cameras(after.as_ref(), size).await?;
             Ok(proto::ListCamerasResponse {
                 next_page_token: pages::token(page.next.as_ref()),
-                cameras: page.items.into_iter().map(Into::into).collect(),
+                cameras: page.items.into_iter().map(|camera| proto::Camera::of(&self.app, camera)).collect(),
             })
         })
         .await
@@ -75,7 +75,7 @@ impl CameraService for Cameras {
             let change = camera_change(&id, required(asked.profile, "profile")?, asked.update_mask)?;
             let changed = self.app.change_camera(&id, change, expected).await;
             let camera = changed.map_err(|error| of_field(error, "profile"))?;
-            Ok(proto::UpdateCameraResponse { camera: Some(camera.into()) })
+            Ok(proto::UpdateCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
         })
         .await
     }
@@ -108,6 +108,8 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
         recipe: recipe(profile.recipe)?.unwrap_or_default(),
         target_classes: classes.collect::<Result<_>>()?,
         labels: profile.labels.into_iter().collect(),
+        receivers: receivers(&profile.receivers)?,
+        retrain_when_moved: profile.retrain_when_moved.unwrap_or(named.retrain_when_moved),
         id: named.id,
     })
 }
@@ -120,6 +122,24 @@ fn renamed(mut error: Error, field: String) -> Error {
         first.field = field;
     }
     error
+}
+
+/// The list as a value; the path of a field at fault begins at `receivers`.
+fn receivers(given: &[proto::Receiver]) -> Result<Receivers> {
+    let receiver = |(index, given): (usize, &proto::Receiver)| {
+        receiver(given).map_err(|error| error.under(&format!("receivers[{index}]")))
+    };
+    Receivers::new(given.iter().enumerate().map(receiver).collect::<Result<Vec<_>>>()?)
+}
+
+fn receiver(given: &proto::Receiver) -> Result<Receiver> {
+    let named = Receiver::named(ReceiverId::new(&given.receiver_id)?);
+    let target_id = Some(given.target_id.as_str()).filter(|id| !id.is_empty());
+    Ok(Receiver {
+        target_id: target_id.map_or(Ok(named.target_id), TargetId::new)?,
+        clock_offset: ClockOffset::from_seconds(given.clock_offset_s)?,
+        receiver_id: named.receiver_id,
+    })
 }
 
 fn image_size(size: proto::ImageSize) -> Result<ImageSize> {
@@ -136,7 +156,16 @@ fn gnss_error(error: Option<proto::GnssError>) -> Result<GnssError> {
 }
 
 /// The fields of a profile, as a mask names them.
-const FIELDS: [&str; 6] = ["display_name", "image_size", "gnss_error", "recipe", "target_classes", "labels"];
+const FIELDS: [&str; 8] = [
+    "display_name",
+    "image_size",
+    "gnss_error",
+    "recipe",
+    "target_classes",
+    "labels",
+    "receivers",
+    "retrain_when_moved",
+];
 
 /// The fields that the mask names, or those that the profile has.
 fn camera_change(
@@ -165,6 +194,8 @@ fn camera_change(
         recipe: named("recipe").then_some(profile.recipe),
         target_classes: named("target_classes").then_some(profile.target_classes),
         labels: named("labels").then_some(profile.labels),
+        receivers: named("receivers").then_some(profile.receivers),
+        retrain_when_moved: named("retrain_when_moved").then_some(profile.retrain_when_moved),
     })
 }
 
@@ -177,13 +208,16 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         profile.recipe != proto::Recipe::Unspecified as i32,
         !profile.target_classes.is_empty(),
         !profile.labels.is_empty(),
+        !profile.receivers.is_empty(),
+        profile.retrain_when_moved.is_some(),
     ];
     FIELDS.into_iter().zip(has).filter_map(|(field, has)| has.then_some(field)).collect()
 }
 
-impl From<Camera> for proto::Camera {
-    fn from(camera: Camera) -> Self {
+impl proto::Camera {
+    fn of(app: &App, camera: Camera) -> Self {
         Self {
+            moved: app.camera_moved(camera.id()).map(|moved| (*moved).clone().into()),
             id: camera.id().as_str().to_owned(),
             warnings: camera.profile.warnings(),
             profile: Some(camera.profile.into()),
@@ -210,6 +244,18 @@ impl From<NewCamera> for proto::CameraProfile {
             recipe: proto::Recipe::from(profile.recipe).into(),
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels.into_iter().collect(),
+            receivers: profile.receivers.iter().map(Into::into).collect(),
+            retrain_when_moved: Some(profile.retrain_when_moved),
+        }
+    }
+}
+
+impl From<&Receiver> for proto::Receiver {
+    fn from(receiver: &Receiver) -> Self {
+        Self {
+            receiver_id: receiver.receiver_id.as_str().to_owned(),
+            target_id: receiver.target_id.as_str().to_owned(),
+            clock_offset_s: receiver.clock_offset.seconds(),
         }
     }
 }

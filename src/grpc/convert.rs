@@ -4,9 +4,10 @@
 use jiff::Timestamp;
 
 use super::proto;
+use crate::app::LiveItem;
 use crate::domain::{
-    self, CameraId, Error, ErrorKind, Observation, Refusal, Result, RunId, Sample, Score, TargetClass,
-    TargetId,
+    self, CameraId, Error, ErrorKind, Observation, ReceiverId, Refusal, Result, RunId, Sample, Score,
+    TargetClass, TargetId,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -142,6 +143,19 @@ pub(super) fn observation(observation: proto::Observation, rules: &RowRules) -> 
         observation.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,
         observation.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,
     )
+}
+
+/// An item of a live stream that keeps the rules of its camera.
+pub(super) fn live_item(item: proto::StreamItem, rules: &RowRules) -> Result<LiveItem> {
+    Ok(LiveItem {
+        time: believable(item.time, rules)?,
+        target_id: target_id(item.target_id.as_deref())?,
+        receiver_id: item.receiver_id.as_deref().map(ReceiverId::new).transpose()?,
+        bounding_box: item.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,
+        fix: item.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,
+        class: item.class.as_deref().map(TargetClass::new).transpose()?,
+        score: item.score.map(Score::new).transpose()?,
+    })
 }
 
 /// Which samples are meant; all, if left out.

@@ -1,31 +1,39 @@
 //! `FusionService`.
 
+use tonic::Streaming;
+
 use super::convert::{camera_id, observation, timestamp};
+use super::outbox::Responses;
 use super::proto;
 use super::proto::fusion_service_server::FusionService;
-use super::statuses::{Reply, answer};
+use super::statuses::{Reply, answer, request_id};
+use super::stream;
 use crate::app::App;
 use crate::domain::{Flag, FusedFix, TargetId};
+use crate::shutdown::Shutdown;
 
 pub(super) struct Fusion {
     app: App,
+    shutdown: Shutdown,
 }
 
 impl Fusion {
-    pub(super) fn new(app: &App) -> Self {
-        Self { app: app.clone() }
+    pub(super) fn new(app: &App, shutdown: &Shutdown) -> Self {
+        Self { app: app.clone(), shutdown: shutdown.clone() }
     }
 }
 
 #[tonic::async_trait]
 impl FusionService for Fusion {
-    type StreamStream = futures_util::stream::Empty<Result<proto::StreamResponse, tonic::Status>>;
+    type StreamStream = Responses;
 
     async fn stream(
         &self,
-        _request: tonic::Request<tonic::Streaming<proto::StreamRequest>>,
+        request: tonic::Request<Streaming<proto::StreamRequest>>,
     ) -> Reply<Self::StreamStream> {
-        Err(tonic::Status::unimplemented("streams are not answered yet"))
+        let id = request_id(request.extensions());
+        let responses = stream::serve(&self.app, &self.shutdown, id, request.into_inner());
+        Ok(tonic::Response::new(responses))
     }
 
     async fn fuse(&self, request: tonic::Request<proto::FuseRequest>) -> Reply<proto::FuseResponse> {
@@ -75,6 +83,7 @@ impl From<Flag> for proto::Flag {
             Flag::BoxAtBorder => Self::BoxAtBorder,
             Flag::OutsideTraining => Self::OutsideTraining,
             Flag::NoModel => Self::NoModel,
+            Flag::CameraMoved => Self::CameraMoved,
         }
     }
 }

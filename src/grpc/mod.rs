@@ -9,9 +9,11 @@ mod convert;
 mod ending;
 mod fusion;
 mod models;
+mod outbox;
 mod pages;
 mod samples;
 mod statuses;
+mod stream;
 mod training;
 
 use futures_util::FutureExt as _;
@@ -54,7 +56,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
     let training =
         TrainingServiceServer::new(training::Training::new(app, shutdown)).max_decoding_message_size(most);
     let models = ModelServiceServer::new(models::Models::new(app)).max_decoding_message_size(most);
-    let fusion = FusionServiceServer::new(fusion::Fusion::new(app)).max_decoding_message_size(most);
+    let fusion = FusionServiceServer::new(fusion::Fusion::new(app, shutdown)).max_decoding_message_size(most);
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -70,6 +72,9 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .add_service(fusion)
         .prepare()
 }
+
+/// The path of the live stream, which has an idle limit of its own.
+pub const LIVE_STREAM: &str = "/sightfix.v1.FusionService/Stream";
 
 /// A refusal before any service was asked, as a whole answer.
 #[must_use]

@@ -14,6 +14,7 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::extract::{CameraPath, JsonBody, Params};
 use super::problem::{Answer, Problem};
+use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, empty, json, made, nullable, with_etag};
 use crate::app::App;
 use crate::domain::{self, CameraId, Error, ErrorKind, NewCamera, Result, Revision, SigmaM, TargetClass};
@@ -99,6 +100,13 @@ struct CameraDraft {
     /// Free-form labels.
     #[serde(default)]
     labels: BTreeMap<String, String>,
+    /// Whose the GNSS receivers are; one that is not named here carries its own id as target id.
+    #[serde(default)]
+    #[schema(max_items = 1_024)]
+    receivers: Vec<Receiver>,
+    /// Whether a training run is started by itself once the camera is found to have moved.
+    #[serde(default)]
+    retrain_when_moved: bool,
 }
 
 impl CameraDraft {
@@ -111,6 +119,8 @@ impl CameraDraft {
             recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
             target_classes: classes(&self.target_classes)?,
             labels: self.labels,
+            receivers: receivers(&self.receivers)?,
+            retrain_when_moved: self.retrain_when_moved,
             id: blank.id,
         })
     }
@@ -147,6 +157,11 @@ struct CameraChange {
     target_classes: Option<Vec<String>>,
     /// New labels, all of them.
     labels: Option<BTreeMap<String, String>>,
+    /// New receivers, all of them.
+    #[schema(max_items = 1_024)]
+    receivers: Option<Vec<Receiver>>,
+    /// Whether to train anew by itself once the camera is found to have moved.
+    retrain_when_moved: Option<bool>,
 }
 
 impl CameraChange {
@@ -161,6 +176,8 @@ impl CameraChange {
             recipe: self.recipe.map(domain::Recipe::from),
             target_classes: self.target_classes.as_deref().map(classes).transpose()?,
             labels: self.labels,
+            receivers: self.receivers.as_deref().map(receivers).transpose()?,
+            retrain_when_moved: self.retrain_when_moved,
         })
     }
 }
@@ -184,6 +201,10 @@ pub(super) struct Camera {
     target_classes: Vec<String>,
     /// Free-form labels.
     labels: BTreeMap<String, String>,
+    /// Whose the GNSS receivers are, and how far their clocks are off, by receiver id.
+    receivers: Vec<Receiver>,
+    /// Whether a training run is started by itself once the camera is found to have moved.
+    retrain_when_moved: bool,
     /// Counts the changes of the profile, from 1; also in the header `etag`.
     revision: u64,
     /// When it was made.
@@ -195,12 +216,16 @@ pub(super) struct Camera {
     /// Number of the model version that answers, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     active_model: Option<u32>,
+    /// Set if the camera no longer looks where it looked when its active model was trained.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    moved: Option<CameraMoved>,
     /// What is lost by what was left out.
     warnings: Vec<String>,
 }
 
-impl From<domain::Camera> for Camera {
-    fn from(camera: domain::Camera) -> Self {
+impl Camera {
+    fn of(app: &App, camera: domain::Camera) -> Self {
+        let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let warnings = camera.profile.warnings();
         let domain::Camera { profile, revision, created_at, updated_at, active_model } = camera;
         Self {
@@ -213,12 +238,45 @@ impl From<domain::Camera> for Camera {
             recipe: profile.recipe.into(),
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels,
+            receivers: shown(&profile.receivers),
+            retrain_when_moved: profile.retrain_when_moved,
             revision: revision.0,
             created_at,
             updated_at,
             active_model,
+            moved,
             warnings,
         }
+    }
+}
+
+/// The camera no longer looks where it looked when its model was trained: its positions have left the
+/// receivers' fixes, beyond what the errors of both explain.
+#[derive(Serialize, ToSchema)]
+pub(super) struct CameraMoved {
+    /// Number of the model version that no longer fits.
+    model_version: u32,
+    /// When it began, as well as can be told.
+    #[schema(value_type = String, format = DateTime)]
+    began_at: Timestamp,
+    /// When the evidence was enough.
+    #[schema(value_type = String, format = DateTime)]
+    raised_at: Timestamp,
+    /// Mean shift of the regressed positions against the fixes since then, towards east in metres.
+    shift_east_m: f64,
+    /// The same towards north.
+    shift_north_m: f64,
+    /// The test's statistic: chi-square of 2 degrees at one known onset without a change.
+    statistic: f64,
+    /// Targets that bear witness.
+    targets: u32,
+}
+
+impl From<&domain::CameraMoved> for CameraMoved {
+    fn from(moved: &domain::CameraMoved) -> Self {
+        let &domain::CameraMoved { model_version, began_at, raised_at, .. } = moved;
+        let &domain::CameraMoved { shift_east_m, shift_north_m, statistic, targets, .. } = moved;
+        Self { model_version, began_at, raised_at, shift_east_m, shift_north_m, statistic, targets }
     }
 }
 
@@ -244,7 +302,7 @@ struct CameraPage {
 async fn create_camera(State(app): State<App>, body: JsonBody) -> Answer {
     let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
     let (location, revision) = (format!("/v1/cameras/{}", camera.id()), camera.revision);
-    Ok(with_etag(made(StatusCode::CREATED, &location, &Camera::from(camera))?, revision)?)
+    Ok(with_etag(made(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, revision)?)
 }
 
 /// List cameras by id
@@ -263,7 +321,7 @@ async fn list_cameras(State(app): State<App>, uri: Uri) -> Answer {
     params.end()?;
     let page = app.cameras(after.as_ref(), limit).await?;
     Ok(json(&CameraPage {
-        items: page.items.into_iter().map(Camera::from).collect(),
+        items: page.items.into_iter().map(|camera| Camera::of(&app, camera)).collect(),
         next_cursor: page.next.map(|id| write_cursor("cameras", id.as_str())),
     })?)
 }
@@ -276,7 +334,7 @@ async fn list_cameras(State(app): State<App>, uri: Uri) -> Answer {
 async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
     let camera = app.camera(&id).await?;
     let revision = camera.revision;
-    Ok(with_etag(json(&Camera::from(camera))?, revision)?)
+    Ok(with_etag(json(&Camera::of(&app, camera))?, revision)?)
 }
 
 /// Change a camera's profile
@@ -310,7 +368,7 @@ async fn change_camera(
     let change = body.read::<CameraChange>()?.into_domain()?;
     let camera = app.change_camera(&id, change, expected.revision()).await?;
     let revision = camera.revision;
-    Ok(with_etag(json(&Camera::from(camera))?, revision)?)
+    Ok(with_etag(json(&Camera::of(&app, camera))?, revision)?)
 }
 
 /// Delete a camera with its samples, runs and models

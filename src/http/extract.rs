@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 use super::body;
 use super::problem::{Answer, Refused, no_route};
 use crate::app::App;
-use crate::domain::{CameraId, Error, ErrorKind, Result, RunId, parse_time};
+use crate::domain::{CameraId, Error, ErrorKind, Result, RunId, TargetId, parse_time};
 use crate::exchange::wire;
 
 /// Items on a page whose length the client leaves open.
@@ -41,6 +41,20 @@ impl<S: Send + Sync> FromRequestParts<S> for RunPath {
     }
 }
 
+/// A target of the path. What is no name of a target names none that is followed.
+pub(super) struct TargetPath(pub(super) CameraId, pub(super) TargetId);
+
+impl<S: Send + Sync> FromRequestParts<S> for TargetPath {
+    type Rejection = Refused;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+        let TargetSegments { camera, target } = path(parts, state).await?;
+        let target = TargetId::new(&target)
+            .map_err(|_| Error::refused(ErrorKind::TrackNotFound, "that is not the id of a target"))?;
+        Ok(Self(camera_of(&camera)?, target))
+    }
+}
+
 /// A model version of the path.
 pub(super) struct ModelPath(pub(super) CameraId, pub(super) u32);
 
@@ -65,6 +79,12 @@ struct CameraSegment {
 struct RunSegments {
     camera: String,
     run: String,
+}
+
+#[derive(Deserialize)]
+struct TargetSegments {
+    camera: String,
+    target: String,
 }
 
 #[derive(Deserialize)]

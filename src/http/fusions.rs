@@ -27,7 +27,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 /// One observation as it is, or many as `observations`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Request<'a> {
+pub(super) struct Request<'a> {
     #[serde(borrow)]
     observations: Option<Vec<wire::Observation<'a>>>,
     #[serde(borrow)]
@@ -41,7 +41,7 @@ struct Request<'a> {
 /// Observations of one camera.
 #[derive(ToSchema)]
 #[expect(dead_code, reason = "the shape of a batch, for the description alone")]
-struct Batch {
+pub(super) struct Batch {
     /// Boxes, fixes, or both.
     #[schema(min_items = 1)]
     observations: Vec<wire::Observation<'static>>,
@@ -52,7 +52,7 @@ struct Batch {
 #[schema(title = "FusionRequest")]
 #[serde(untagged)]
 #[expect(dead_code, reason = "the shape of a request, for the description alone")]
-enum FusionRequest {
+pub(super) enum FusionRequest {
     One(wire::Observation<'static>),
     Many(Batch),
 }
@@ -85,7 +85,7 @@ async fn fuse(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody
     Ok(json_of_about(&Fusions { items }, 64 + ITEM_BYTES * fused.len())?)
 }
 
-fn observations(app: &App, request: &Request<'_>, rules: &RowRules) -> Result<Vec<Observation>> {
+pub(super) fn observations(app: &App, request: &Request<'_>, rules: &RowRules) -> Result<Vec<Observation>> {
     let RowRules { time_bounds, image_size } = rules;
     let Some(batch) = &request.observations else {
         let one = wire::Observation {

@@ -12,10 +12,12 @@ mod fusions;
 mod gnss_error;
 mod models;
 mod problem;
+mod receivers;
 mod samples;
 mod service;
 #[cfg(test)]
 mod tests;
+mod tracks;
 mod training_runs;
 mod wire;
 
@@ -89,6 +91,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(training_runs::routes())
         .merge(models::routes())
         .merge(fusions::routes())
+        .merge(tracks::routes())
         .merge(gnss_error::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());

@@ -32,6 +32,23 @@ pub struct Regression {
     pub r95_scale: f64,
 }
 
+impl Regression {
+    /// The error variance per axis, m2, at the size that the 95 % radius promises.
+    #[must_use]
+    pub fn variance_m2(&self) -> f64 {
+        (self.r95_scale / R95_PER_SIGMA).powi(2) * self.e_regression_m2
+    }
+}
+
+/// How a receiver's error is spread over time, as a model's training fixes tell it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FixSpread {
+    /// Share of the variance that is new with each fix, 0 to 1; the rest stays for a while.
+    pub white_share: f64,
+    /// Time in which the rest's correlation falls to 1/e, s.
+    pub time_constant_s: f64,
+}
+
 #[derive(Debug, Clone)]
 enum Kind {
     Paper(Box<PaperRegressor>),
@@ -51,6 +68,7 @@ pub struct Regressor {
     border_factor: f64,
     image_size: Option<ImageSize>,
     coverage: CoverageTable,
+    fix_spread: Option<FixSpread>,
     kind: Kind,
 }
 
@@ -68,6 +86,7 @@ impl Regressor {
         };
         let image_size = image_size_of(&parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
+        let fix_spread = fix_spread_of(&parts)?;
         let (reconstruction_usual, border_factor) = match kind {
             Kind::Paper(_) => (0.0, 1.0),
             _ => (
@@ -86,6 +105,7 @@ impl Regressor {
             border_factor,
             image_size,
             coverage,
+            fix_spread,
             kind,
         })
     }
@@ -100,6 +120,12 @@ impl Regressor {
     #[must_use]
     pub const fn e_gnss_m2(&self) -> f64 {
         self.e_gnss_m2
+    }
+
+    /// How the receiver's error is spread over time, if the model tells it.
+    #[must_use]
+    pub const fn fix_spread(&self) -> Option<FixSpread> {
+        self.fix_spread
     }
 
     /// Size of the image that it was trained on, if known.
@@ -153,6 +179,16 @@ impl Regressor {
             usual_m2 * border * (1.0 + beyond * beyond) + self.error_scale * (excess + astray * astray);
         (regressed, reconstruction_error, e_m2)
     }
+}
+
+fn fix_spread_of(parts: &Parts) -> Result<Option<FixSpread>> {
+    if !parts.parameters.contains_key("fix_white_share") {
+        return Ok(None);
+    }
+    Ok(Some(FixSpread {
+        white_share: parts.parameter("fix_white_share")?.clamp(0.0, 1.0),
+        time_constant_s: parts.positive_parameter("fix_time_constant_s")?,
+    }))
 }
 
 fn image_size_of(parts: &Parts) -> Result<Option<ImageSize>> {

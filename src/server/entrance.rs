@@ -52,7 +52,13 @@ impl Entrance {
     /// Answers a request: id, span, place, time, then the transport.
     pub(super) async fn answer(&self, request: Request<Incoming>) -> Response<Body> {
         let began = Instant::now();
-        let mut request = request.map(|body| Body::new(TimeoutBody::new(self.idle_time, body)));
+        // A live stream may be silent for longer, and looks after that itself.
+        let is_live = request.uri().path() == grpc::LIVE_STREAM;
+        let mut request = if is_live {
+            request.map(Body::new)
+        } else {
+            request.map(|body| Body::new(TimeoutBody::new(self.idle_time, body)))
+        };
         let id = self.request_id(&request);
         let is_grpc = request
             .headers()

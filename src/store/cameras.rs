@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{Sqlite, SqliteExecutor};
 
@@ -10,14 +11,14 @@ use super::Store;
 use super::faults::{failed, no_camera};
 use super::fields::Fields;
 use crate::domain::{
-    Camera, CameraId, Error, ErrorKind, GnssError, ImageSize, NewCamera, Result, Revision, SigmaM,
-    TargetClass,
+    Camera, CameraId, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver, ReceiverId,
+    Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
 };
 
 macro_rules! columns {
     () => {
         "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, target_classes, \
-         labels, revision, created_at_us, updated_at_us, active_model"
+         labels, receivers, retrain_when_moved, revision, created_at_us, updated_at_us, active_model"
     };
 }
 
@@ -33,8 +34,8 @@ impl Store {
         let mut transaction = turn.begin().await?;
         let insert = sqlx::query(concat!(
             "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, \
-             target_classes, labels, updated_at_us, id, created_at_us, revision) \
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
+             target_classes, labels, receivers, retrain_when_moved, updated_at_us, id, created_at_us, revision) \
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
         let row = bind_profile(insert, profile, now)?
@@ -109,7 +110,8 @@ impl Store {
         check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
-             gnss_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, updated_at_us = ?, \
+             gnss_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, retrain_when_moved = ?, \
+             updated_at_us = ?, \
              revision = revision + 1 WHERE id = ? RETURNING ",
             columns!()
         ));
@@ -203,6 +205,8 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
         .bind(profile.recipe.as_str())
         .bind(serde_json::to_string(&classes).map_err(Error::fault)?)
         .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
+        .bind(write_receivers(&profile.receivers)?)
+        .bind(profile.retrain_when_moved)
         .bind(now.as_microsecond()))
 }
 
@@ -218,14 +222,55 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
     let recipe = fields.make(|name: &str| name.parse())?;
     let target_classes = fields.make(read_classes)?;
     let labels = fields.make(serde_json::from_str::<BTreeMap<String, String>>)?;
+    let receivers = fields.make(read_receivers)?;
+    let retrain_when_moved = fields.take()?;
     let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
     let (created_at, updated_at) = (fields.time()?, fields.time()?);
     let active_model = fields.some_count()?;
-    let profile = NewCamera { id, display_name, image_size, gnss_error, recipe, target_classes, labels };
+    let profile = NewCamera {
+        id,
+        display_name,
+        image_size,
+        gnss_error,
+        recipe,
+        target_classes,
+        labels,
+        receivers,
+        retrain_when_moved,
+    };
     Ok(Camera { profile, revision, created_at, updated_at, active_model })
 }
 
 fn read_classes(json: &str) -> Result<Vec<TargetClass>> {
     let names: Vec<String> = serde_json::from_str(json).map_err(Error::fault)?;
     names.iter().map(|name| TargetClass::new(name)).collect()
+}
+
+/// A receiver as it is stored.
+#[derive(Serialize, Deserialize)]
+struct StoredReceiver {
+    receiver_id: String,
+    target_id: String,
+    clock_offset_us: i64,
+}
+
+fn write_receivers(receivers: &Receivers) -> Result<String> {
+    let stored = receivers.iter().map(|receiver| StoredReceiver {
+        receiver_id: receiver.receiver_id.as_str().to_owned(),
+        target_id: receiver.target_id.as_str().to_owned(),
+        clock_offset_us: receiver.clock_offset.microseconds(),
+    });
+    serde_json::to_string(&stored.collect::<Vec<_>>()).map_err(Error::fault)
+}
+
+fn read_receivers(json: &str) -> Result<Receivers> {
+    let stored: Vec<StoredReceiver> = serde_json::from_str(json).map_err(Error::fault)?;
+    let receiver = |stored: &StoredReceiver| {
+        Ok(Receiver {
+            receiver_id: ReceiverId::new(&stored.receiver_id)?,
+            target_id: TargetId::new(&stored.target_id)?,
+            clock_offset: ClockOffset::from_microseconds(stored.clock_offset_us)?,
+        })
+    };
+    Receivers::new(stored.iter().map(receiver).collect::<Result<Vec<_>>>()?)
 }

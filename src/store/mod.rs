@@ -14,6 +14,7 @@ mod faults;
 mod fields;
 mod group_commit;
 mod models;
+mod moves;
 mod runs;
 mod samples;
 #[cfg(test)]

@@ -92,6 +92,9 @@ pub enum RejectionReason {
 }
 
 impl RejectionReason {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance];
+
     /// The one name used everywhere.
     #[must_use]
     pub const fn as_str(self) -> &'static str {

@@ -6,7 +6,7 @@
 
 use jiff::Timestamp;
 
-use super::settings::{GnssNoise, RegressionNoise};
+use super::settings::{GnssNoise, RegressionNoise, SMALLEST_WHITE_SHARE};
 use crate::geo::EastNorth;
 
 /// Lags of the correlation, in steps of the fixes' interval (at least one second).
@@ -16,10 +16,6 @@ const TIME_CONSTANTS: [f64; 14] =
     [2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 75.0, 100.0, 150.0, 240.0];
 /// Fewer pairs at a lag tell nothing.
 const FEWEST_PAIRS: u32 = 30;
-/// A white share below this is beyond what residuals can tell, and a filter that believed it would
-/// take every motion of the bias for the target's.
-const SMALLEST_WHITE_SHARE: f64 = 0.01;
-
 /// Fix less regressed position of one instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ResidualAt {

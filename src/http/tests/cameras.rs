@@ -6,6 +6,10 @@ async fn a_camera_is_made_read_changed_and_deleted() {
     let profile = json!({
         "id": "north-gate", "display_name": "North gate", "image_size": {"width_px": 1920, "height_px": 1080},
         "gnss_error": {"sigma_m": 2.5}, "recipe": "paper", "target_classes": ["person"], "labels": {"site": "a"},
+        "receivers": [
+            {"receiver_id": "phone-7", "target_id": "person-1", "clock_offset_s": -18.35},
+            {"receiver_id": "tag", "target_id": "tag", "clock_offset_s": 0.0},
+        ],
     });
     let made = rest.post("/v1/cameras", &profile).await.expect(201);
     assert_eq!(made.header("location"), "/v1/cameras/north-gate");
@@ -29,7 +33,16 @@ async fn a_camera_is_made_read_changed_and_deleted() {
     let camera = changed.json();
     assert_eq!((camera.get("image_size"), &camera["gnss_error"]), (None, &json!("unknown")));
     assert_eq!(camera["display_name"], "North gate", "what is left out stays");
+    assert_eq!(camera["receivers"], profile["receivers"], "what is left out stays");
     assert_eq!(camera["warnings"].as_array().map(Vec::len), Some(2));
+
+    let bare = json!({"receivers": [{"receiver_id": "b"}, {"receiver_id": "a", "clock_offset_s": 2}]});
+    let expected = json!([
+        {"receiver_id": "a", "target_id": "a", "clock_offset_s": 2.0},
+        {"receiver_id": "b", "target_id": "b", "clock_offset_s": 0.0},
+    ]);
+    assert_eq!(patch("*", bare).await.expect(200).json()["receivers"], expected);
+    assert_eq!(patch("*", json!({"receivers": []})).await.expect(200).json()["receivers"], json!([]));
 
     patch("\"1\"", json!({"recipe": "auto"})).await.problem(412, "revision-mismatch");
     patch("1", json!({"recipe": "auto"})).await.problem(412, "revision-mismatch");
@@ -69,6 +82,25 @@ async fn bad_profiles_name_their_fields() {
         (json!({"id": "d", "recipe": "best"}), 422, "invalid-argument", "recipe"),
         (json!({"id": "d", "target_classes": ["a", ""]}), 422, "invalid-argument", "target_classes[1]"),
         (json!({"id": "d", "target_classes": ["a", "a"]}), 422, "invalid-argument", "target_classes[1]"),
+        (json!({"id": "d", "receivers": [{}]}), 422, "invalid-argument", "receivers[0].receiver_id"),
+        (
+            json!({"id": "d", "receivers": [{"receiver_id": "a"}, {"receiver_id": "a"}]}),
+            422,
+            "invalid-argument",
+            "receivers[1].receiver_id",
+        ),
+        (
+            json!({"id": "d", "receivers": [{"receiver_id": "a", "target_id": ""}]}),
+            422,
+            "invalid-argument",
+            "receivers[0].target_id",
+        ),
+        (
+            json!({"id": "d", "receivers": [{"receiver_id": "a", "clock_offset_s": 86_401}]}),
+            422,
+            "invalid-argument",
+            "receivers[0].clock_offset_s",
+        ),
         (json!({"id": "d", "labels": {"a": 1}}), 422, "invalid-argument", "labels.a"),
         (json!({"id": "c"}), 409, "camera-exists", "id"),
     ] {

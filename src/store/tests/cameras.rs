@@ -1,5 +1,7 @@
 use super::*;
-use crate::domain::{Camera, GnssError, ImageSize, Revision, SigmaM, TargetClass};
+use crate::domain::{
+    Camera, ClockOffset, GnssError, ImageSize, Receiver, ReceiverId, Receivers, Revision, SigmaM, TargetClass,
+};
 use crate::store::SampleFilter;
 
 /// A profile in which every field says something.
@@ -15,6 +17,15 @@ fn full(name: &str) -> NewCamera {
             TargetClass::new("a\"b").expect("a class"),
         ],
         labels: [("site".to_owned(), "ö\\\"".to_owned())].into(),
+        receivers: Receivers::new([
+            Receiver::named(ReceiverId::new("a \"b\"").expect("a name")),
+            Receiver {
+                receiver_id: ReceiverId::new("phone-7").expect("a name"),
+                target_id: target("person-1"),
+                clock_offset: ClockOffset::from_seconds(-18.000_001).expect("within a day"),
+            },
+        ])
+        .expect("two receivers"),
     }
 }
 
@@ -110,6 +121,19 @@ async fn a_deleted_camera_takes_all_along_and_its_name_starts_anew() {
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 0);
     assert_eq!(kind(store.model(&camera, 1).await), ErrorKind::ModelNotFound);
     assert_eq!(kind(store.roll_back(&camera, at(6)).await), ErrorKind::NoModel);
+}
+
+#[tokio::test]
+async fn a_camera_stored_before_there_were_receivers_has_none() {
+    let fixture = Fixture::new().await;
+    fixture
+        .tamper(
+            "INSERT INTO cameras (id, display_name, recipe, target_classes, labels, revision, created_at_us, \
+             updated_at_us) VALUES ('old', 'old', 'auto', '[]', '{}', 1, 0, 0)",
+        )
+        .await;
+    let old = fixture.store.camera(&id("old")).await.expect("readable");
+    assert!(old.profile.receivers.is_empty());
 }
 
 #[tokio::test]

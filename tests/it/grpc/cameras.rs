@@ -13,7 +13,12 @@ fn yard() -> proto::CameraProfile {
         recipe: proto::Recipe::Paper.into(),
         target_classes: vec!["person".to_owned()],
         labels: [("site".to_owned(), "north".to_owned())].into(),
+        receivers: vec![receiver("phone-7", "person-1", -18.35), receiver("tag", "tag", 0.0)],
     }
+}
+
+fn receiver(receiver_id: &str, target_id: &str, clock_offset_s: f64) -> proto::Receiver {
+    proto::Receiver { receiver_id: receiver_id.to_owned(), target_id: target_id.to_owned(), clock_offset_s }
 }
 
 fn get(id: &str) -> proto::GetCameraRequest {
@@ -33,12 +38,23 @@ async fn a_camera_lives_from_creation_to_deletion() {
 
     let update = proto::UpdateCameraRequest {
         camera_id: "yard".to_owned(),
-        profile: Some(proto::CameraProfile { display_name: "Court".to_owned(), ..Default::default() }),
-        update_mask: Some(prost_types::FieldMask { paths: vec!["display_name".into(), "image_size".into()] }),
+        profile: Some(proto::CameraProfile {
+            display_name: "Court".to_owned(),
+            receivers: vec![receiver("watch", "", 0.5)],
+            ..Default::default()
+        }),
+        update_mask: Some(prost_types::FieldMask {
+            paths: ["display_name", "image_size", "receivers"].map(Into::into).to_vec(),
+        }),
         expected_revision: Some(1),
     };
     let updated = cameras.update_camera(update.clone()).await.expect("changed").into_inner().camera;
-    let expected = proto::CameraProfile { display_name: "Court".to_owned(), image_size: None, ..yard() };
+    let expected = proto::CameraProfile {
+        display_name: "Court".to_owned(),
+        image_size: None,
+        receivers: vec![receiver("watch", "watch", 0.5)],
+        ..yard()
+    };
     assert_eq!(updated.as_ref().and_then(|camera| camera.profile.clone()), Some(expected));
     assert_eq!(updated.as_ref().map(|camera| (camera.revision, camera.warnings.len())), Some((2, 1)));
     let status = cameras.update_camera(update).await.expect_err("an old revision");
@@ -100,6 +116,9 @@ async fn bad_profiles_are_refused_by_the_path_of_the_field() {
             "profile.gnss_error.sigma_m",
         ),
         (with(|it| it.recipe = 77), "profile.recipe"),
+        (with(|it| it.receivers.push(receiver("tag", "", 0.0))), "profile.receivers[2].receiver_id"),
+        (with(|it| it.receivers.push(receiver("", "a", 0.0))), "profile.receivers[2].receiver_id"),
+        (with(|it| it.receivers[0].clock_offset_s = f64::NAN), "profile.receivers[0].clock_offset_s"),
         (with(|it| it.target_classes.push("person".to_owned())), "profile.target_classes[1]"),
         (with(|it| it.target_classes.push(String::new())), "profile.target_classes[1]"),
     ] {

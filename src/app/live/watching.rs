@@ -1,0 +1,107 @@
+//! The watch on a camera: compares what its model says with what receivers say, and raises the alarm.
+
+use std::sync::{Arc, Mutex};
+
+use super::lock;
+use crate::app::App;
+use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Result};
+use crate::fusion::track::GnssNoise;
+use crate::fusion::watch::{Alarm, CameraWatch, Compared, WatchSettings};
+use crate::model::Regressor;
+
+/// One camera's watch; begun anew with every model version.
+#[derive(Default)]
+pub(super) struct Watching(Mutex<Option<Watched>>);
+
+struct Watched {
+    model_version: u32,
+    watch: CameraWatch,
+    /// Raised, but not yet kept: keeping it has failed.
+    unsaved: Option<Alarm>,
+}
+
+impl Watching {
+    /// Takes up a comparison of a model version; `Some` while there is an alarm to be kept.
+    pub(super) fn compare(
+        &self,
+        (regressor, model_version): (&Regressor, u32),
+        compared: &Compared,
+    ) -> Option<CameraMoved> {
+        let mut watched = lock(&self.0);
+        if watched.as_ref().is_none_or(|watched| watched.model_version != model_version) {
+            let gnss = GnssNoise::learnt_by(regressor);
+            let watch = CameraWatch::new(WatchSettings { gnss, ..WatchSettings::default() });
+            *watched = Some(Watched { model_version, watch, unsaved: None });
+        }
+        let watched = watched.as_mut()?;
+        if let Some(alarm) = watched.watch.observe(compared) {
+            watched.unsaved = Some(alarm);
+        }
+        watched.unsaved.map(|alarm| moved(model_version, &alarm))
+    }
+
+    fn saved(&self) {
+        if let Some(watched) = lock(&self.0).as_mut() {
+            watched.unsaved = None;
+        }
+    }
+}
+
+fn moved(model_version: u32, alarm: &Alarm) -> CameraMoved {
+    CameraMoved {
+        model_version,
+        began_at: alarm.began_at,
+        raised_at: alarm.raised_at,
+        shift_east_m: alarm.shift.east_m,
+        shift_north_m: alarm.shift.north_m,
+        statistic: alarm.statistic,
+        targets: u32::try_from(alarm.targets).unwrap_or(u32::MAX),
+    }
+}
+
+impl App {
+    /// Keeps an alarm and tells everyone, once per model version.
+    ///
+    /// # Errors
+    /// A fault of the store; then the next comparison brings the alarm again.
+    pub(super) async fn raise(&self, id: &CameraId, moved: CameraMoved) -> Result<()> {
+        let is_new = match self.store.insert_move(id, &moved).await {
+            Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraNotFound => return Ok(()),
+            kept => kept?,
+        };
+        let live = self.live.of(id);
+        live.watching.saved();
+        self.registry.refresh_camera(&self.store, id).await?;
+        if is_new {
+            tracing::warn!(
+                camera.id = %id, model = moved.model_version, began_at = %moved.began_at,
+                shift_east_m = moved.shift_east_m, shift_north_m = moved.shift_north_m,
+                "the camera no longer looks where it looked when its model was trained"
+            );
+            self.metrics.camera_moved();
+            live.tell_moved(Arc::new(moved));
+        }
+        Ok(())
+    }
+
+    /// Starts a training run for every camera that was moved, wants it and has the samples; each
+    /// move starts one run. To be called every now and then.
+    ///
+    /// # Errors
+    /// A fault of the store.
+    pub async fn retrain_moved(&self) -> Result<()> {
+        for (id, moved) in self.store.moves_to_retrain().await? {
+            let request = crate::app::RunRequest { from: Some(moved.began_at), ..Default::default() };
+            match self.start_run(&id, request).await {
+                Ok(run) => {
+                    self.store.note_retraining(&id, moved.model_version, run.id).await?;
+                    tracing::info!(camera.id = %id, run.id = %run.id, "training anew, for the camera was moved");
+                }
+                // Too few samples since then, or another run is live: later.
+                Err(Error::Refused(_)) => {}
+                Err(fault) => return Err(fault),
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,150 @@
+//! What a live stream has to tell a client who may read slowly.
+//!
+//! Answers beyond the limit push out the oldest, counted; what must not be lost (acknowledgements,
+//! alarms, the end) takes a place each, whatever the client does.
+
+use std::collections::VecDeque;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll, Waker};
+
+use futures_util::Stream;
+use tonic::Status;
+
+use super::proto::stream_response::Kind;
+use super::proto::{
+    CameraMoved, StreamAcknowledgement, StreamAnswer, StreamOpened, StreamReconnect, StreamResponse,
+};
+
+/// The writer's side.
+pub(super) struct Outbox(Arc<Shared>);
+
+/// The reader's side: the stream of responses that the transport sends.
+pub(super) struct Responses(Arc<Shared>);
+
+struct Shared {
+    waiting: Mutex<Waiting>,
+    most_answers: usize,
+}
+
+#[derive(Default)]
+struct Waiting {
+    opened: Option<StreamOpened>,
+    answers: VecDeque<StreamAnswer>,
+    acknowledged: Option<u64>,
+    moved: Option<CameraMoved>,
+    reconnect: Option<StreamReconnect>,
+    end: Option<Option<Status>>,
+    lost_answers: u64,
+    reader: Option<Waker>,
+    reader_gone: bool,
+}
+
+/// Both sides of an empty outbox.
+pub(super) fn outbox(most_answers: usize) -> (Outbox, Responses) {
+    let shared = Arc::new(Shared { waiting: Mutex::default(), most_answers: most_answers.max(1) });
+    (Outbox(shared.clone()), Responses(shared))
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn put(&self, put: impl FnOnce(&mut Waiting)) {
+        let reader = {
+            let mut waiting = self.lock();
+            put(&mut waiting);
+            waiting.reader.take()
+        };
+        if let Some(reader) = reader {
+            reader.wake();
+        }
+    }
+}
+
+impl Outbox {
+    pub(super) fn opened(&self, opened: StreamOpened) {
+        self.0.put(|waiting| waiting.opened = Some(opened));
+    }
+
+    /// Says whether an older answer was lost for it.
+    pub(super) fn answer(&self, mut answer: StreamAnswer) -> bool {
+        let mut lost = false;
+        self.0.put(|waiting| {
+            if waiting.answers.len() >= self.0.most_answers {
+                waiting.answers.pop_front();
+                waiting.lost_answers += 1;
+                lost = true;
+            }
+            answer.lost_answers = waiting.lost_answers;
+            waiting.answers.push_back(answer);
+        });
+        lost
+    }
+
+    /// An acknowledgement takes the place of those before it.
+    pub(super) fn acknowledge(&self, seq: u64) {
+        self.0.put(|waiting| waiting.acknowledged = Some(seq));
+    }
+
+    pub(super) fn moved(&self, moved: CameraMoved) {
+        self.0.put(|waiting| waiting.moved = Some(moved));
+    }
+
+    pub(super) fn reconnect(&self, reason: &str) {
+        self.0.put(|waiting| waiting.reconnect = Some(StreamReconnect { reason: reason.to_owned() }));
+    }
+
+    /// Ends the stream once all before was read: well, or with a status.
+    pub(super) fn end(&self, status: Option<Status>) {
+        self.0.put(|waiting| waiting.end = Some(status));
+    }
+
+    /// Whether nobody will ever read what is put in.
+    pub(super) fn reader_is_gone(&self) -> bool {
+        self.0.lock().reader_gone
+    }
+}
+
+impl Drop for Outbox {
+    fn drop(&mut self) {
+        // A writer that was dropped in the middle says nothing: the stream must end all the same.
+        self.0.put(|waiting| {
+            waiting.end.get_or_insert_with(|| Some(Status::cancelled("the stream was dropped")));
+        });
+    }
+}
+
+impl Drop for Responses {
+    fn drop(&mut self) {
+        let mut waiting = self.0.lock();
+        waiting.reader_gone = true;
+        waiting.answers = VecDeque::new();
+    }
+}
+
+impl Stream for Responses {
+    type Item = Result<StreamResponse, Status>;
+
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let mut waiting = self.0.lock();
+        let kind = if let Some(opened) = waiting.opened.take() {
+            Kind::Opened(opened)
+        } else if let Some(moved) = waiting.moved.take() {
+            Kind::CameraMoved(moved)
+        } else if let Some(answer) = waiting.answers.pop_front() {
+            Kind::Answer(answer)
+        } else if let Some(seq) = waiting.acknowledged.take() {
+            Kind::Acknowledgement(StreamAcknowledgement { seq })
+        } else if let Some(reconnect) = waiting.reconnect.take() {
+            Kind::Reconnect(reconnect)
+        } else if let Some(end) = &mut waiting.end {
+            return Poll::Ready(end.take().map(Err));
+        } else {
+            waiting.reader = Some(context.waker().clone());
+            return Poll::Pending;
+        };
+        Poll::Ready(Some(Ok(StreamResponse { kind: Some(kind) })))
+    }
+}

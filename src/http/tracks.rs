@@ -1,0 +1,305 @@
+//! `/v1/cameras/{camera}/tracks`: where targets go; `/v1/cameras/{camera}/events`: live, as events.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::response::IntoResponse as _;
+use axum::response::sse::{Event, KeepAlive, Sse};
+use futures_util::{StreamExt as _, stream};
+use hyper::header::CONTENT_TYPE;
+use hyper::http::HeaderValue;
+use jiff::Timestamp;
+use serde::Serialize;
+use tokio::sync::broadcast::error::RecvError;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::cameras::CameraMoved;
+use super::extract::{CameraPath, JsonBody, TargetPath};
+use super::fusions::{FusionRequest, observations};
+use super::problem::{Answer, Problem};
+use super::wire::{json, json_of_about};
+use crate::app::{App, CameraEvent, Followed, TrackPoint};
+use crate::domain::{Error, ErrorKind, Result};
+use crate::exchange::wire;
+use crate::fusion::track;
+
+/// How often a silent event stream says that it is still there.
+const KEEP_ALIVE: Duration = Duration::from_secs(15);
+/// A followed observation as JSON is seldom longer.
+const ITEM_BYTES: usize = 1_024;
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new()
+        .routes(routes!(list_tracks, follow))
+        .routes(routes!(get_track))
+        .routes(routes!(watch_camera))
+}
+
+/// Why a measured position was not taken up.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum RejectionReason {
+    /// Too far from where the track expects it, by the chi-square gate.
+    OutsideGate,
+    /// Older than the window of late items.
+    TooLate,
+    /// The same source has spoken for this instant before.
+    Duplicate,
+    /// Its error variance is not positive.
+    UnusableVariance,
+}
+
+impl From<track::RejectionReason> for RejectionReason {
+    fn from(reason: track::RejectionReason) -> Self {
+        match reason {
+            track::RejectionReason::OutsideGate => Self::OutsideGate,
+            track::RejectionReason::TooLate => Self::TooLate,
+            track::RejectionReason::Duplicate => Self::Duplicate,
+            track::RejectionReason::UnusableVariance => Self::UnusableVariance,
+        }
+    }
+}
+
+/// Where a measured position came from.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum Source {
+    /// The box, through the camera's model.
+    Regressed,
+    /// The receiver.
+    Fix,
+}
+
+/// A measured position that a track did not take up.
+#[derive(Serialize, ToSchema)]
+struct Rejection {
+    /// Which half of the observation.
+    source: Source,
+    /// Why.
+    reason: RejectionReason,
+    /// Squared Mahalanobis length of its innovation, where one was computed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    nis: Option<f64>,
+}
+
+impl From<&track::Rejection> for Rejection {
+    fn from(rejection: &track::Rejection) -> Self {
+        let source = match rejection.source {
+            track::Source::Regressed => Source::Regressed,
+            track::Source::Fix => Source::Fix,
+        };
+        Self { source, reason: rejection.reason.into(), nis: rejection.nis }
+    }
+}
+
+/// What a track says of its target at one instant.
+#[derive(Serialize, ToSchema)]
+struct TrackState {
+    /// Who.
+    target_id: String,
+    /// When: the latest instant measured.
+    #[schema(value_type = String, format = DateTime)]
+    time: Timestamp,
+    /// Velocity towards east, m/s.
+    velocity_east_m_s: f64,
+    /// Velocity towards north, m/s.
+    velocity_north_m_s: f64,
+    /// Radius about the position that holds the true one with 95 % probability, m.
+    r95_m: f64,
+    /// Probability that the target stands, 0 to 1.
+    still: f64,
+    /// Normalised innovation squared of what was taken up; 2 on average for each of box and fix.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    nis: Option<f64>,
+    /// What was not taken up.
+    rejections: Vec<Rejection>,
+    /// Whether the track began anew.
+    restarted: bool,
+}
+
+impl From<&TrackPoint> for TrackState {
+    fn from(point: &TrackPoint) -> Self {
+        Self {
+            target_id: point.target_id.as_str().to_owned(),
+            time: point.time,
+            velocity_east_m_s: point.velocity.east_m_s,
+            velocity_north_m_s: point.velocity.north_m_s,
+            r95_m: point.r95_m,
+            still: point.still,
+            nis: point.nis,
+            rejections: point.rejected.iter().map(Into::into).collect(),
+            restarted: point.restarted,
+        }
+    }
+}
+
+/// The GeoJSON geometry of a position (RFC 7946).
+#[derive(Serialize, ToSchema)]
+struct PointGeometry {
+    /// `Point`.
+    #[schema(example = "Point")]
+    r#type: &'static str,
+    /// Longitude and latitude in degrees, WGS 84.
+    coordinates: [f64; 2],
+}
+
+/// A position of a target as a GeoJSON feature.
+#[derive(Serialize, ToSchema)]
+struct TrackFeature {
+    /// `Feature`.
+    #[schema(example = "Feature")]
+    r#type: &'static str,
+    /// Where.
+    geometry: PointGeometry,
+    /// Time, error and motion.
+    properties: TrackState,
+}
+
+impl From<&TrackPoint> for TrackFeature {
+    fn from(point: &TrackPoint) -> Self {
+        // A centimetre is the seventh decimal; more would only look precise.
+        let rounded = |degrees: f64| (degrees * 1e7).round() / 1e7;
+        let coordinates = [rounded(point.position.longitude_deg()), rounded(point.position.latitude_deg())];
+        Self {
+            r#type: "Feature",
+            geometry: PointGeometry { r#type: "Point", coordinates },
+            properties: point.into(),
+        }
+    }
+}
+
+/// Positions as a GeoJSON feature collection (RFC 7946).
+#[derive(Serialize, ToSchema)]
+struct TrackFeatures {
+    /// `FeatureCollection`.
+    #[schema(example = "FeatureCollection")]
+    r#type: &'static str,
+    /// One per position.
+    features: Vec<TrackFeature>,
+}
+
+fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
+    let features = points.iter().map(|point| point.as_ref().into()).collect();
+    let mut response = json(&TrackFeatures { r#type: "FeatureCollection", features })?;
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/geo+json"));
+    Ok(response)
+}
+
+/// List the targets that are followed, with their latest positions
+///
+/// A target that was not measured for a minute is left out.
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/tracks", tag = "tracks",
+    params(("camera" = String, Path, description = "The camera's id")),
+    responses((status = 200, description = "Positions, by target", body = TrackFeatures, content_type = "application/geo+json"))
+)]
+async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+    Ok(geojson(&app.tracks(&id).await?)?)
+}
+
+/// Read where a target was
+///
+/// Oldest first, as far back as is kept.
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/tracks/{target}", tag = "tracks",
+    params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id")),
+    responses((status = 200, description = "Positions, oldest first", body = TrackFeatures, content_type = "application/geo+json"))
+)]
+async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> Answer {
+    Ok(geojson(&app.track_history(&id, &target).await?)?)
+}
+
+/// One observation's own position, and its target's track with it.
+#[derive(Serialize, ToSchema)]
+struct FollowedObservation<'a> {
+    /// The observation's own position; missing for a box while the camera has no model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fused: Option<wire::FusedFix<'a>>,
+    /// The track's position, the best there is; missing without a target.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    track: Option<TrackFeature>,
+}
+
+impl<'a> From<&'a Followed> for FollowedObservation<'a> {
+    fn from(followed: &'a Followed) -> Self {
+        Self {
+            fused: followed.fused.as_ref().map(Into::into),
+            track: followed.track.as_ref().map(|point| point.as_ref().into()),
+        }
+    }
+}
+
+/// One answer per observation, in their order.
+#[derive(Serialize, ToSchema)]
+struct FollowedObservations<'a> {
+    /// Answers.
+    items: Vec<FollowedObservation<'a>>,
+}
+
+/// Follow targets
+///
+/// Takes what `fusions` takes, box and fix together or apart, and takes each observation up into
+/// the track of its target.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/tracks", tag = "tracks", params(("camera" = String, Path, description = "The camera's id")),
+    request_body = FusionRequest,
+    responses(
+        (status = 200, description = "Positions and tracks", body = FollowedObservations<'static>),
+        (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
+    let rules = app.row_rules(&id).await?;
+    let observations = observations(&app, &body.read()?, &rules)?;
+    app.check_batch(observations.len())?;
+    let mut followed = Vec::with_capacity(observations.len());
+    for observation in &observations {
+        followed.push(app.follow(&id, observation).await?);
+    }
+    let items = followed.iter().map(Into::into).collect();
+    Ok(json_of_about(&FollowedObservations { items }, 64 + ITEM_BYTES * followed.len())?)
+}
+
+/// Watch a camera
+///
+/// Server-sent events from now on: `track` with a position as GeoJSON whenever a target was
+/// measured, `camera_moved` when the camera is found to look elsewhere than it did, and `lost` with
+/// the number of events that were lost because the client read too slowly.
+#[utoipa::path(
+    get, path = "/v1/cameras/{camera}/events", tag = "tracks",
+    params(("camera" = String, Path, description = "The camera's id")),
+    responses((status = 200, description = "Events", body = TrackFeature, content_type = "text/event-stream"))
+)]
+async fn watch_camera(State(rest): State<Rest>, CameraPath(id): CameraPath) -> Answer {
+    let place = rest.event_streams.clone().try_acquire_owned().map_err(|_| {
+        Error::refused(ErrorKind::Overloaded, "too many event streams are open; poll the tracks instead")
+    })?;
+    let events = rest.app.camera_events(&id).await?;
+    let shutdown = rest.shutdown.clone();
+    let told = stream::unfold(events, |mut events| async move {
+        let event = match events.recv().await {
+            Ok(CameraEvent::Track(point)) => event_of("track", &TrackFeature::from(&*point)),
+            Ok(CameraEvent::Moved(moved)) => event_of("camera_moved", &CameraMoved::from(&*moved)),
+            Err(RecvError::Lagged(lost)) => event_of("lost", &lost),
+            Err(RecvError::Closed) => return None,
+        };
+        Some((event, events))
+    });
+    let told = told.take_until(async move { shutdown.begun().await }).map(move |event| {
+        let _held = &place; // until the stream is dropped
+        Ok::<_, Infallible>(event)
+    });
+    Ok(Sse::new(told).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
+}
+
+fn event_of(name: &str, value: &impl Serialize) -> Event {
+    Event::default().event(name).json_data(value).unwrap_or_else(|error| {
+        tracing::error!(%error, "an event cannot be written");
+        Event::default().event("error").data("the server failed")
+    })
+}

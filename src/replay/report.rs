@@ -204,7 +204,7 @@ impl fmt::Display for Report {
         let Self { cameras, elapsed_s, items, resent, answers_per_s, .. } = self;
         writeln!(
             out,
-            "{items} items by {cameras} cameras in {elapsed_s:.1} s: {answers_per_s:.0} answers a second"
+            "items {items}, cameras {cameras}, {elapsed_s:.1} s, {answers_per_s:.0} answers a second"
         )?;
         let refused: u64 = self.refused.values().sum();
         writeln!(
@@ -218,7 +218,9 @@ impl fmt::Display for Report {
         }
         let LatencyMs { p50, p90, p99, max } = self.latency_ms;
         writeln!(out, "send to answer: p50 {p50:.2} ms, p90 {p90:.2} ms, p99 {p99:.2} ms, max {max:.2} ms")?;
-        writeln!(out, "at most {:.1} ms behind the pace", self.furthest_behind_ms)?;
+        if self.furthest_behind_ms > 0.0 {
+            writeln!(out, "at most {:.1} ms behind the pace", self.furthest_behind_ms)?;
+        }
         writeln!(
             out,
             "streams {}, reconnects {}, by invitation {}, items sent again {resent}",

@@ -8,3 +8,4 @@ mod layering;
 mod openapi;
 mod replay;
 mod story;
+mod stream;

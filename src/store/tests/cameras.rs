@@ -26,6 +26,7 @@ fn full(name: &str) -> NewCamera {
             },
         ])
         .expect("two receivers"),
+        retrain_when_moved: true,
     }
 }
 

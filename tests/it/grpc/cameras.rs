@@ -14,6 +14,7 @@ fn yard() -> proto::CameraProfile {
         target_classes: vec!["person".to_owned()],
         labels: [("site".to_owned(), "north".to_owned())].into(),
         receivers: vec![receiver("phone-7", "person-1", -18.35), receiver("tag", "tag", 0.0)],
+        retrain_when_moved: Some(true),
     }
 }
 

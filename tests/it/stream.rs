@@ -1,0 +1,594 @@
+//! The live stream from the outside: its rules, its acknowledgements, its limits.
+
+use std::time::{Duration, Instant};
+
+use futures_util::{Stream, StreamExt as _, stream};
+use serde_json::{Value, json};
+use sightfix::domain::Observation;
+use sightfix::geo::{Position, distance_m};
+use sightfix::grpc::proto;
+use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
+use sightfix::grpc::proto::stream_answer::Outcome;
+use sightfix::grpc::proto::stream_request::Kind as Sent;
+use sightfix::grpc::proto::stream_response::Kind as Told;
+use sightfix::simulation::{Options, SimulatedRow, simulate};
+use tokio::sync::mpsc;
+use tonic::transport::Channel;
+use tonic::{Code, Status, Streaming};
+use tonic_types::StatusExt as _;
+
+use crate::harness::{TestServer, data_folder};
+
+const MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.safetensors");
+
+/// A stream as a client holds it.
+struct Client {
+    items: mpsc::Sender<proto::StreamRequest>,
+    told: Streaming<proto::StreamResponse>,
+    seq: u64,
+}
+
+impl Client {
+    async fn send(&mut self, kind: Sent) {
+        // A stream that the server has ended takes nothing more; what it told is looked at instead.
+        let _ = self.items.send(proto::StreamRequest { kind: Some(kind) }).await;
+    }
+
+    async fn item(&mut self, item: proto::StreamItem) -> u64 {
+        self.seq += 1;
+        self.send(Sent::Item(proto::StreamItem { seq: self.seq, ..item })).await;
+        self.seq
+    }
+
+    async fn next(&mut self) -> Result<Option<Told>, Status> {
+        let message = tokio::time::timeout(Duration::from_secs(60), self.told.message());
+        Ok(message.await.expect("the server tells something in time")?.and_then(|message| message.kind))
+    }
+
+    /// The next answer; acknowledgements on the way are passed over.
+    async fn answer(&mut self) -> proto::StreamAnswer {
+        loop {
+            match self.next().await.expect("no end") {
+                Some(Told::Answer(answer)) => return answer,
+                Some(Told::Opened(_) | Told::Acknowledgement(_)) => {}
+                other => panic!("no answer but {other:?}"),
+            }
+        }
+    }
+
+    /// Half-closes and reads to the end; the last acknowledgement, the answers, and how it ended.
+    async fn finish(self) -> (Option<u64>, Vec<proto::StreamAnswer>, Option<Status>) {
+        let Self { items, mut told, .. } = self;
+        drop(items);
+        let (mut acknowledged, mut answers) = (None, Vec::new());
+        loop {
+            match told.message().await {
+                Ok(Some(message)) => match message.kind.expect("set") {
+                    Told::Acknowledgement(acknowledgement) => acknowledged = Some(acknowledgement.seq),
+                    Told::Answer(answer) => answers.push(answer),
+                    _ => {}
+                },
+                Ok(None) => return (acknowledged, answers, None),
+                Err(status) => return (acknowledged, answers, Some(status)),
+            }
+        }
+    }
+}
+
+async fn channel(server: &TestServer) -> Channel {
+    let endpoint = Channel::from_shared(format!("http://{}", server.address)).expect("an address");
+    endpoint.connect().await.expect("a connection")
+}
+
+fn opening(client_name: &str, store_samples: bool) -> Sent {
+    Sent::Opening(proto::StreamOpening {
+        camera_id: "yard".to_owned(),
+        client_name: client_name.to_owned(),
+        resume_after_seq: 0,
+        store_samples,
+    })
+}
+
+fn messages(queue: mpsc::Receiver<proto::StreamRequest>) -> impl Stream<Item = proto::StreamRequest> {
+    stream::unfold(queue, |mut queue| async move { queue.recv().await.map(|message| (message, queue)) })
+}
+
+/// A stream whose first message is this.
+async fn begin(channel: &Channel, first: Sent) -> Client {
+    let (items, requests) = mpsc::channel(64);
+    let first = proto::StreamRequest { kind: Some(first) };
+    items.send(first).await.expect("room");
+    let mut service = FusionServiceClient::new(channel.clone());
+    let told = service.stream(messages(requests)).await.expect("errors come as the end").into_inner();
+    Client { items, told, seq: 0 }
+}
+
+async fn open(channel: &Channel, client_name: &str, store_samples: bool) -> Client {
+    let mut client = begin(channel, opening(client_name, store_samples)).await;
+    let Ok(Some(Told::Opened(_))) = client.next().await else { panic!("the stream is not opened") };
+    client
+}
+
+/// A server with the camera `yard`, and the reference model if wanted.
+async fn yard(
+    folder: &std::path::Path,
+    settings: &[(&str, &str)],
+    profile: Value,
+    model: bool,
+) -> TestServer {
+    let server = TestServer::start_with(folder, settings);
+    let mut camera = json!({
+        "id": "yard", "image_size": {"width_px": 1920, "height_px": 1080}, "gnss_error": {"sigma_m": 2.2}
+    });
+    camera.as_object_mut().expect("an object").extend(profile.as_object().expect("an object").clone());
+    server.post("/v1/cameras", &camera).await.expect(201);
+    if model {
+        add_model(&server).await;
+    }
+    server
+}
+
+/// The reference model as the next version, active.
+async fn add_model(server: &TestServer) {
+    let file = std::fs::read(MODEL).expect("the reference model");
+    let kind = [("content-type", "application/vnd.safetensors")];
+    let model = server.send("POST", "/v1/cameras/yard/models", &kind, file).await.expect(201).json();
+    let activate = json!({"number": model["number"]}).to_string();
+    let kind = [("content-type", "application/json")];
+    server.send("PUT", "/v1/cameras/yard/active-model", &kind, activate).await.expect(200);
+}
+
+fn rows(options: &Options) -> Vec<SimulatedRow> {
+    simulate(options).rows
+}
+
+fn time(observation: &Observation) -> Option<prost_types::Timestamp> {
+    Some(prost_types::Timestamp {
+        seconds: observation.time.as_second(),
+        nanos: observation.time.subsec_nanosecond(),
+    })
+}
+
+/// Both halves of a row.
+fn whole(row: &SimulatedRow) -> proto::StreamItem {
+    let observation = Observation {
+        time: row.time,
+        target_id: Some(row.target_id.clone()),
+        bounding_box: row.bounding_box,
+        fix: row.fix,
+    };
+    proto::StreamItem {
+        time: time(&observation),
+        target_id: Some(row.target_id.as_str().to_owned()),
+        bounding_box: row.bounding_box.map(Into::into),
+        fix: row.fix.map(Into::into),
+        ..proto::StreamItem::default()
+    }
+}
+
+fn boxed(row: &SimulatedRow) -> proto::StreamItem {
+    proto::StreamItem { fix: None, ..whole(row) }
+}
+
+fn fixed(row: &SimulatedRow) -> proto::StreamItem {
+    proto::StreamItem { bounding_box: None, ..whole(row) }
+}
+
+#[tokio::test]
+async fn boxes_and_fixes_apart_become_tracks_that_everyone_can_read() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), true).await;
+    let mut client = open(&channel(&server).await, "edge-1", false).await;
+    let rows = rows(&Options { seed: 31, samples: 400, ..Options::demo() });
+    let (mut track_m, mut gnss_m, mut told) = (0.0, 0.0, 0.0);
+    for row in &rows {
+        let seq = client.item(boxed(row)).await;
+        let answer = client.answer().await;
+        assert_eq!(answer.seq, seq);
+        let Some(Outcome::Fused(fused)) = answer.outcome else { panic!("{answer:?}") };
+        assert!(
+            fused.regressed.is_some() && fused.gnss.is_none() && fused.model_version == Some(1),
+            "{fused:?}"
+        );
+        let seq = client.item(fixed(row)).await;
+        let answer = client.answer().await;
+        assert_eq!(answer.seq, seq);
+        let track = answer.track.expect("the target is followed");
+        let position = track.position.expect("set");
+        let position = Position::new(position.longitude_deg(), position.latitude_deg()).expect("valid");
+        track_m += distance_m(position, row.truth);
+        gnss_m += distance_m(row.fix.expect("no gaps").position, row.truth);
+        told += 1.0;
+    }
+    assert!(track_m < 0.7 * gnss_m, "track {} m, GNSS {} m", track_m / told, gnss_m / told);
+
+    let tracks = server.get("/v1/cameras/yard/tracks").await.expect(200);
+    assert_eq!(tracks.header("content-type"), "application/geo+json");
+    let tracks = tracks.json();
+    let feature = &tracks["features"][0];
+    assert_eq!(
+        (&tracks["type"], &feature["geometry"]["type"]),
+        (&json!("FeatureCollection"), &json!("Point"))
+    );
+    let target = feature["properties"]["target_id"].as_str().expect("a name").to_owned();
+    let history = server.get(&format!("/v1/cameras/yard/tracks/{target}")).await.expect(200).json();
+    let times: Vec<&str> = history["features"]
+        .as_array()
+        .expect("features")
+        .iter()
+        .map(|feature| feature["properties"]["time"].as_str().expect("a time"))
+        .collect();
+    assert!(times.len() > 100 && times.is_sorted(), "{}", times.len());
+    server.get("/v1/cameras/yard/tracks/nobody").await.expect(404);
+    let metrics = server.get("/metrics").await.expect(200).text();
+    assert!(metrics.contains("sightfix_track_nis_count"), "{metrics}");
+    assert!(metrics.contains("sightfix_live_streams 1"), "{metrics}");
+
+    let (acknowledged, _, ended) = client.finish().await;
+    assert!(acknowledged.is_none() && ended.is_none(), "{acknowledged:?} {ended:?}");
+}
+
+#[tokio::test]
+async fn rest_clients_follow_targets_and_watch_them() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), true).await;
+    let mut events = server.open("GET", "/v1/cameras/yard/events", &[], "").await.into_body();
+    let rows = rows(&Options { seed: 32, samples: 20, ..Options::demo() });
+    let sides = |row: &SimulatedRow| {
+        let [left_px, top_px, width_px, height_px] = row.bounding_box.expect("a box").sides_px();
+        json!({"left_px": left_px, "top_px": top_px, "width_px": width_px, "height_px": height_px})
+    };
+    let observations: Vec<Value> = rows
+        .iter()
+        .map(|row| json!({"time": row.time, "target_id": row.target_id.as_str(), "bounding_box": sides(row)}))
+        .collect();
+    let body = json!({ "observations": observations });
+    let followed = server.post("/v1/cameras/yard/tracks", &body).await.expect(200).json();
+    let items = followed["items"].as_array().expect("items");
+    assert_eq!(items.len(), rows.len());
+    let r95_m = |item: &Value| item["track"]["properties"]["r95_m"].as_f64().expect("a radius");
+    assert!(
+        items.iter().all(|item| r95_m(item) > 0.0 && item["fused"]["flags"][0] == "gnss_denied"),
+        "{items:?}"
+    );
+    let mut seen = String::new();
+    while seen.matches("event: track").count() < rows.len() {
+        let frame = http_body_util::BodyExt::frame(&mut events).await.expect("more").expect("no break");
+        seen.push_str(std::str::from_utf8(&frame.into_data().unwrap_or_default()).expect("UTF-8"));
+    }
+    let problem = server.post("/v1/cameras/yard/tracks", &json!({"observations": [{"time": "now"}]})).await;
+    assert_eq!(problem.expect(422).json()["errors"][0]["field"], "observations[0].time");
+}
+
+#[tokio::test]
+async fn what_two_devices_bring_is_paired_and_stored_exactly_once() {
+    let folder = data_folder();
+    let profile = json!({"receivers": [
+        {"receiver_id": "phone-1", "target_id": "walker-1", "clock_offset_s": -18.0},
+    ]});
+    let server = yard(folder.path(), &[], profile, false).await;
+    let channel = channel(&server).await;
+    let rows = rows(&Options { seed: 33, samples: 600, targets: 1, ..Options::demo() });
+    let count = async || {
+        let samples = server.get("/v1/cameras/yard/samples/count").await.expect(200).json();
+        samples["count"].as_u64().expect("a number")
+    };
+    for round in 1..=2 {
+        let mut detector = open(&channel, "detector", true).await;
+        let mut receiver = open(&channel, "receiver", true).await;
+        for row in &rows {
+            let name = Some("walker-1".to_owned());
+            detector.item(proto::StreamItem { target_id: name, ..boxed(row) }).await;
+            let mut fix = fixed(row);
+            if let Some(time) = &mut fix.time {
+                time.seconds += 18; // the receiver's clock counts no leap seconds
+            }
+            receiver
+                .item(proto::StreamItem { target_id: None, receiver_id: Some("phone-1".to_owned()), ..fix })
+                .await;
+            let answer = detector.answer().await;
+            let flags: Vec<_> = answer.flags().collect();
+            assert!(answer.outcome.is_none() && flags == [proto::Flag::NoModel], "{answer:?}");
+            receiver.answer().await;
+        }
+        let sent = rows.len() as u64;
+        let (detected, received) = tokio::join!(detector.finish(), receiver.finish());
+        for (acknowledged, _, ended) in [detected, received] {
+            assert!(ended.is_none(), "{ended:?}");
+            assert_eq!(acknowledged, Some(sent), "round {round}");
+        }
+        assert_eq!(count().await, sent, "round {round}");
+    }
+}
+
+#[tokio::test]
+async fn a_bad_first_message_ends_the_stream_with_its_reason() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[("SIGHTFIX_LIMITS__HEADER_S", "1")], json!({}), false).await;
+    let channel = channel(&server).await;
+    let refused = async |first: Sent| {
+        let mut client = begin(&channel, first).await;
+        client.next().await.expect_err("refused")
+    };
+    let named = |status: &Status| {
+        let details = status.get_error_details();
+        let violations = details.bad_request().map_or(&[][..], |bad| &bad.field_violations);
+        violations.first().map(|violation| violation.field.clone()).unwrap_or_default()
+    };
+    let status = refused(Sent::Item(proto::StreamItem::default())).await;
+    assert_eq!((status.code(), named(&status).as_str()), (Code::InvalidArgument, "opening"), "{status:?}");
+    let status = refused(opening("", true)).await;
+    assert_eq!(
+        (status.code(), named(&status).as_str()),
+        (Code::InvalidArgument, "client_name"),
+        "{status:?}"
+    );
+    let elsewhere = proto::StreamOpening {
+        camera_id: "nowhere".to_owned(),
+        client_name: "a".to_owned(),
+        ..Default::default()
+    };
+    assert_eq!(refused(Sent::Opening(elsewhere)).await.code(), Code::NotFound);
+    // Nothing at all.
+    let (_items, requests) = mpsc::channel::<proto::StreamRequest>(1);
+    let told = FusionServiceClient::new(channel.clone()).stream(messages(requests)).await;
+    let status = told.expect("opened").into_inner().message().await.expect_err("too late");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+}
+
+#[tokio::test]
+async fn a_bad_item_is_answered_and_never_ends_the_stream() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), true).await;
+    let mut client = open(&channel(&server).await, "edge-1", true).await;
+    let row = &rows(&Options { samples: 1, ..Options::demo() })[0];
+    let narrow = |item: proto::StreamItem| {
+        let sides = item.bounding_box.expect("a box");
+        proto::StreamItem { bounding_box: Some(proto::BoundingBox { width_px: Some(0.0), ..sides }), ..item }
+    };
+    for (bad, field) in [
+        (proto::StreamItem { time: None, ..whole(row) }, "time"),
+        (proto::StreamItem { bounding_box: None, fix: None, ..whole(row) }, "bounding_box"),
+        (narrow(whole(row)), "bounding_box.width_px"),
+        (proto::StreamItem { score: Some(2.0), ..whole(row) }, "score"),
+        (proto::StreamItem { target_id: Some(String::new()), ..whole(row) }, "target_id"),
+    ] {
+        let seq = client.item(bad).await;
+        let answer = client.answer().await;
+        let Some(Outcome::Error(error)) = answer.outcome else { panic!("{field}: {answer:?}") };
+        assert_eq!((answer.seq, error.field.as_str()), (seq, field), "{error:?}");
+        assert_eq!(error.reason, "invalid-argument");
+    }
+    // A seq that does not rise, a second opening, an empty message.
+    client.send(Sent::Item(proto::StreamItem { seq: 2, ..whole(row) })).await;
+    let Some(Outcome::Error(error)) = client.answer().await.outcome else { panic!("seq") };
+    assert_eq!(error.field, "seq");
+    client.send(opening("again", false)).await;
+    let Some(Outcome::Error(error)) = client.answer().await.outcome else { panic!("opening") };
+    assert_eq!(error.field, "opening");
+    let _ = client.items.send(proto::StreamRequest { kind: None }).await;
+    assert!(matches!(client.answer().await.outcome, Some(Outcome::Error(_))));
+
+    let seq = client.item(whole(row)).await;
+    let answer = client.answer().await;
+    assert!(answer.seq == seq && matches!(answer.outcome, Some(Outcome::Fused(_))), "{answer:?}");
+    let (acknowledged, _, ended) = client.finish().await;
+    assert!(ended.is_none() && acknowledged == Some(seq), "{acknowledged:?} {ended:?}");
+    let samples = server.get("/v1/cameras/yard/samples/count").await.expect(200).json();
+    assert_eq!(samples["count"], 1);
+}
+
+#[tokio::test]
+async fn a_new_model_speaks_in_mid_stream() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), true).await;
+    let mut client = open(&channel(&server).await, "edge-1", false).await;
+    for (index, row) in rows(&Options { samples: 40, ..Options::demo() }).iter().enumerate() {
+        if index == 20 {
+            add_model(&server).await;
+        }
+        client.item(boxed(row)).await;
+        let Some(Outcome::Fused(fused)) = client.answer().await.outcome else { panic!("no hiccup") };
+        assert_eq!(fused.model_version, Some(if index < 20 { 1 } else { 2 }));
+    }
+}
+
+#[tokio::test]
+async fn silence_and_age_end_a_stream() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[("SIGHTFIX_LIMITS__LIVE_IDLE_S", "2")], json!({}), false).await;
+    let mut client = open(&channel(&server).await, "edge-1", false).await;
+    let status = client.next().await.expect_err("silent for too long");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+
+    let folder = data_folder();
+    let server = yard(folder.path(), &[("SIGHTFIX_LIMITS__LIVE_AGE_S", "1")], json!({}), false).await;
+    let mut client = open(&channel(&server).await, "edge-1", true).await;
+    let row = &rows(&Options { samples: 1, ..Options::demo() })[0];
+    let seq = client.item(boxed(row)).await;
+    loop {
+        match client.next().await.expect("an invitation") {
+            Some(Told::Reconnect(reconnect)) => {
+                break assert!(reconnect.reason.contains("age"), "{reconnect:?}");
+            }
+            Some(_) => {}
+            None => panic!("ended without an invitation"),
+        }
+    }
+    let (acknowledged, _, ended) = client.finish().await;
+    assert!(ended.is_none() && acknowledged == Some(seq), "{acknowledged:?} {ended:?}");
+}
+
+#[tokio::test]
+async fn the_end_of_the_server_invites_to_reconnect_and_acknowledges_what_it_stored() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), false).await;
+    let mut client = open(&channel(&server).await, "edge-1", true).await;
+    let rows = rows(&Options { samples: 50, ..Options::demo() });
+    for row in &rows {
+        client.item(whole(row)).await;
+        client.answer().await;
+    }
+    let ended = tokio::task::spawn_blocking(move || server.terminate());
+    let (mut invited, mut acknowledged) = (false, 0);
+    let status = loop {
+        match client.next().await {
+            Ok(Some(Told::Reconnect(_))) => invited = true,
+            Ok(Some(Told::Acknowledgement(told))) => acknowledged = told.seq,
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("ended without a reason"),
+            Err(status) => break status,
+        }
+    };
+    assert!(invited && acknowledged == rows.len() as u64, "{acknowledged}");
+    assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+    assert!(ended.await.expect("no panic"), "the server ends well");
+}
+
+/// Memory that the server holds, in KiB.
+fn resident_kib(server: &TestServer) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", server.pid())).expect("Linux");
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("a line");
+    line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_that_never_reads_loses_positions_and_no_samples() {
+    const STREAMS: usize = 8;
+    const ITEMS: usize = 4_000;
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), true).await;
+    let rows = rows(&Options { seed: 34, samples: ITEMS, targets: 1, ..Options::demo() });
+    let mut clients = Vec::new();
+    for index in 0..STREAMS {
+        clients.push(open(&channel(&server).await, &format!("edge-{index}"), true).await);
+    }
+    let before_kib = resident_kib(&server);
+    for row in &rows {
+        for (index, client) in clients.iter_mut().enumerate() {
+            let target = Some(format!("walker-{index}"));
+            client.item(proto::StreamItem { target_id: target, ..whole(row) }).await;
+        }
+    }
+    let all = (STREAMS * ITEMS) as u64;
+    let begun = Instant::now();
+    loop {
+        let samples = server.get("/v1/cameras/yard/samples/count").await.expect(200).json();
+        if samples["count"] == all {
+            break;
+        }
+        assert!(begun.elapsed() < Duration::from_secs(60), "{samples}");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    let grown_kib = resident_kib(&server).saturating_sub(before_kib);
+    assert!(grown_kib < 1_024 * STREAMS as u64, "{grown_kib} KiB for {STREAMS} streams");
+    for client in clients {
+        let (acknowledged, answers, ended) = client.finish().await;
+        assert!(ended.is_none(), "{ended:?}");
+        assert_eq!(acknowledged, Some(ITEMS as u64));
+        let last = answers.last().expect("the latest are there");
+        assert!(last.seq == ITEMS as u64 && last.lost_answers > 0, "{last:?}");
+        assert_eq!(last.lost_answers + answers.len() as u64, ITEMS as u64);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn ten_thousand_streams_are_attempted_and_the_server_goes_on() {
+    const CONNECTIONS: usize = 40;
+    const STREAMS: usize = 250;
+    const TAKEN: usize = 100;
+    let folder = data_folder();
+    let limits =
+        [("SIGHTFIX_LIMITS__LIVE_STREAMS", "100"), ("SIGHTFIX_LIMITS__LIVE_STREAMS_PER_CLIENT", "30")];
+    let server = yard(folder.path(), &limits, json!({}), true).await;
+    let mut held = Vec::new();
+    let mut refused = 0;
+    for connection in 0..CONNECTIONS {
+        let channel = channel(&server).await;
+        let attempts = (0..STREAMS).map(|stream| {
+            let channel = channel.clone();
+            async move {
+                let mut client =
+                    begin(&channel, opening(&format!("c-{}", (connection * STREAMS + stream) % 7), false))
+                        .await;
+                match client.next().await {
+                    Ok(Some(Told::Opened(_))) => Some(client),
+                    Ok(other) => panic!("{other:?}"),
+                    Err(status) => {
+                        assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+                        None
+                    }
+                }
+            }
+        });
+        let attempts: Vec<Option<Client>> = stream::iter(attempts).buffer_unordered(STREAMS).collect().await;
+        refused += attempts.iter().filter(|attempt| attempt.is_none()).count();
+        held.extend(attempts.into_iter().flatten());
+    }
+    assert_eq!((held.len(), refused), (TAKEN, CONNECTIONS * STREAMS - TAKEN));
+    // Those that were taken work, and so does everything else.
+    let row = &rows(&Options { samples: 1, ..Options::demo() })[0];
+    let client = held.last_mut().expect("taken");
+    client.item(whole(row)).await;
+    assert!(matches!(client.answer().await.outcome, Some(Outcome::Fused(_))));
+    server.get("/v1/cameras/yard/tracks").await.expect(200);
+    // A place that is given back is there for others.
+    drop(held);
+    let begun = Instant::now();
+    let channel = channel(&server).await;
+    loop {
+        let mut client = begin(&channel, opening("late", false)).await;
+        if let Ok(Some(Told::Opened(_))) = client.next().await {
+            break;
+        }
+        assert!(begun.elapsed() < Duration::from_secs(20), "no place is given back");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+#[tokio::test]
+async fn a_camera_that_was_turned_is_told_everywhere_and_trained_anew() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({"retrain_when_moved": true}), true).await;
+    let scene = Options { seed: 35, samples: 3_000, targets: 3, ..Options::demo() };
+    let knocked = Options { pan_deg_from: Some((scene.start, 10.0)), seed: 36, ..scene.clone() };
+    let later = |row: &SimulatedRow| {
+        let mut item = whole(row);
+        item.time.as_mut().expect("set").seconds += 86_400;
+        item
+    };
+    let mut client = open(&channel(&server).await, "edge-1", true).await;
+    let mut told = None;
+    let before = rows(&scene);
+    let after = rows(&knocked);
+    for item in before.iter().map(whole).chain(after.iter().map(later)) {
+        client.item(item).await;
+        loop {
+            match client.next().await.expect("no end") {
+                Some(Told::Answer(_)) => break,
+                Some(Told::CameraMoved(moved)) => told = Some((client.seq, moved)),
+                _ => {}
+            }
+        }
+    }
+    let (seq, moved) = told.expect("the stream tells it");
+    assert!(seq > before.len() as u64 && moved.model_version == 1, "{seq} {moved:?}");
+    let camera = server.get("/v1/cameras/yard").await.expect(200).json();
+    assert!(camera["moved"]["statistic"].as_f64().is_some_and(|statistic| statistic > 0.0), "{camera}");
+    assert!(server.get("/metrics").await.text().contains("sightfix_cameras_moved_total 1"));
+    client.item(later(&after[0])).await;
+    let Some(Outcome::Fused(fused)) = client.answer().await.outcome else { panic!("no position") };
+    let flags: Vec<_> = fused.flags().collect();
+    assert!(flags.contains(&proto::Flag::CameraMoved), "{flags:?}");
+    client.finish().await;
+    let begun = Instant::now();
+    loop {
+        let runs = server.get("/v1/cameras/yard/training-runs").await.expect(200).json();
+        if let Some(run) = runs["items"].as_array().and_then(|runs| runs.first()) {
+            assert!(run["from"].is_string(), "{run}");
+            break;
+        }
+        assert!(begun.elapsed() < Duration::from_secs(30), "no run was started");
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+}

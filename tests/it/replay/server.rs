@@ -91,12 +91,13 @@ async fn kept_of(server: &TestServer, sent: &[Sample]) -> usize {
 
 /// Rows of three walkers of a simulated square, in a file.
 fn simulated(folder: &Path, rows: usize) -> (PathBuf, Vec<Sample>) {
-    let samples =
-        simulate(&Options { samples: rows, targets: 3, ..Options::new(Scene::Square) }).training_samples();
+    let options = Options { samples: rows, targets: 3, ..Options::new(Scene::Square) };
+    let mut csv = Vec::new();
+    write_samples(&mut csv, Format::Csv, &simulate(&options).training_samples())
+        .expect("memory can be written");
     let path = folder.join("simulated.csv");
-    let file = std::fs::File::create(&path).expect("a file");
-    write_samples(file, Format::Csv, &samples).expect("the file can be written");
-    (path, samples)
+    std::fs::write(&path, &csv).expect("the file can be written");
+    (path, samples(&csv))
 }
 
 /// Replays with faults while the server is killed and started again; every item that was not lost on

@@ -9,6 +9,7 @@ mod import;
 mod load;
 mod ratio;
 mod served;
+mod streams;
 mod train;
 mod transports;
 
@@ -19,10 +20,11 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
-    let parts: [(&str, fn()); 6] = [
+    let parts: [(&str, fn()); 7] = [
         ("fuse", fuse::run),
         ("http", transports::http),
         ("grpc", transports::grpc),
+        ("streams", streams::run),
         ("import", import::run),
         ("train", train::run),
         ("beside", beside::run),

@@ -95,6 +95,15 @@ struct Bare(proto::FuseResponse);
 
 #[tonic::async_trait]
 impl FusionService for Bare {
+    type StreamStream = futures_util::stream::Empty<Result<proto::StreamResponse, tonic::Status>>;
+
+    async fn stream(
+        &self,
+        _: tonic::Request<tonic::Streaming<proto::StreamRequest>>,
+    ) -> Result<tonic::Response<Self::StreamStream>, tonic::Status> {
+        Err(tonic::Status::unimplemented("unary only"))
+    }
+
     async fn fuse(
         &self,
         request: tonic::Request<proto::FuseRequest>,

@@ -110,15 +110,24 @@ impl Registry {
 
     async fn load(&self, store: &Store, id: &CameraId) -> Result<Arc<Serving>> {
         let camera = store.camera(id).await?;
-        let loaded = self.get(id).and_then(|serving| serving.model.clone());
-        let model = match (camera.active_model, loaded) {
-            (None, _) => None,
-            (Some(number), Some(loaded)) if loaded.1 == number => Some(loaded),
-            (Some(number), _) => Some((Arc::new(load_regressor(store, id, number).await?), number)),
-        };
         let moved = match camera.active_model {
             Some(number) => store.camera_move(id, number).await?.map(Arc::new),
             None => None,
+        };
+        let loaded = self.get(id).filter(|serving| serving.moved == moved);
+        let loaded = loaded.and_then(|serving| serving.model.clone());
+        let model = match (camera.active_model, loaded) {
+            (None, _) => None,
+            (Some(number), Some(loaded)) if loaded.1 == number => Some(loaded),
+            (Some(number), _) => {
+                let regressor = load_regressor(store, id, number).await?;
+                // Wrong by about the shift, it must not go on being confident.
+                let regressor = match &moved {
+                    Some(moved) => regressor.with_added_error(moved.added_m2()),
+                    None => regressor,
+                };
+                Some((Arc::new(regressor), number))
+            }
         };
         Ok(Arc::new(Serving {
             moved,

@@ -181,3 +181,11 @@ pub struct CameraMoved {
     /// Targets that bear witness.
     pub targets: u32,
 }
+
+impl CameraMoved {
+    /// Error variance per axis, m2, that the move adds to what the model says.
+    #[must_use]
+    pub fn added_m2(&self) -> f64 {
+        0.5 * (self.shift_east_m.powi(2) + self.shift_north_m.powi(2))
+    }
+}

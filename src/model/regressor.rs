@@ -69,6 +69,8 @@ pub struct Regressor {
     image_size: Option<ImageSize>,
     coverage: CoverageTable,
     fix_spread: Option<FixSpread>,
+    /// Added to every error variance, m2 per axis.
+    added_m2: f64,
     kind: Kind,
 }
 
@@ -106,8 +108,15 @@ impl Regressor {
             image_size,
             coverage,
             fix_spread,
+            added_m2: 0.0,
             kind,
         })
+    }
+
+    /// The same model, less sure of all it says: for a camera that was moved since.
+    #[must_use]
+    pub fn with_added_error(&self, added_m2: f64) -> Self {
+        Self { added_m2, ..self.clone() }
     }
 
     /// The plane in which it answers.
@@ -150,7 +159,7 @@ impl Regressor {
             regressed,
             reconstruction_error,
             // The bounds keep every weight and radius finite whatever the net says.
-            e_regression_m2: e_m2.clamp(1e-6, 1e12),
+            e_regression_m2: (e_m2 + self.added_m2).clamp(1e-6, 1e12),
             outside_training: radii > OUTSIDE_RADII,
             r95_scale: self.r95_scale,
         }

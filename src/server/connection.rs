@@ -25,6 +25,8 @@ use crate::shutdown::Shutdown;
 const SMALLEST_BUFFER: u32 = 8 << 10;
 /// Time for the answer to a keep-alive ping.
 const PING_TIME: Duration = Duration::from_secs(10);
+/// Bytes of one HTTP/2 stream that wait for a client who does not read.
+const SEND_BUFFER: usize = 128 << 10;
 
 /// Accepts connections until the shutdown begins.
 pub(super) async fn accept(
@@ -75,6 +77,7 @@ fn builder(limits: &Limits) -> Builder<TokioExecutor> {
         .keep_alive_interval(limits.idle_time())
         .keep_alive_timeout(PING_TIME)
         .max_concurrent_streams(limits.streams_per_connection)
+        .max_send_buf_size(SEND_BUFFER)
         .max_header_list_size(limits.header_bytes);
     builder
 }

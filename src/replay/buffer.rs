@@ -14,6 +14,8 @@ struct Kept {
     turn: Turn,
     /// When it was sent on this stream, until its answer comes.
     awaited_since: Option<Instant>,
+    /// Whether it was sent at all, on this stream or an earlier one.
+    sent: bool,
     /// Whether an answer has come or was given up, on this stream or an earlier one.
     answered: bool,
 }
@@ -99,7 +101,7 @@ impl Buffer {
 
     /// Takes a new item in, to be sent.
     pub(super) fn push(&mut self, turn: Turn) {
-        self.kept.push_back(Kept { turn, awaited_since: None, answered: false });
+        self.kept.push_back(Kept { turn, awaited_since: None, sent: false, answered: false });
     }
 
     /// The next item to be sent on this stream, with its seq.
@@ -112,13 +114,13 @@ impl Buffer {
         Some((self.first + self.sent as u64, kept.turn))
     }
 
-    /// That item was sent.
-    pub(super) fn mark_sent(&mut self, now: Instant) {
-        if let Some(kept) = self.kept.get_mut(self.sent) {
-            kept.awaited_since = Some(now);
-            self.sent += 1;
-            self.awaited += 1;
-        }
+    /// That item was sent. Says whether it had been sent before, on an earlier stream.
+    pub(super) fn mark_sent(&mut self, now: Instant) -> bool {
+        let Some(kept) = self.kept.get_mut(self.sent) else { return false };
+        kept.awaited_since = Some(now);
+        self.sent += 1;
+        self.awaited += 1;
+        std::mem::replace(&mut kept.sent, true)
     }
 
     /// An answer came. `None` if nobody waits for it.
@@ -156,17 +158,14 @@ impl Buffer {
         news
     }
 
-    /// The stream is over: what is not done is sent again on the next. Gives how many of those had
-    /// been sent before.
-    pub(super) fn rewind(&mut self) -> u64 {
+    /// The stream is over: what is not done is sent again on the next.
+    pub(super) fn rewind(&mut self) {
         for kept in &mut self.kept {
             kept.awaited_since = None;
         }
-        let sent = std::mem::take(&mut self.sent) as u64;
-        let before = self.first;
+        self.sent = 0;
         self.awaited = 0;
         self.let_go();
-        sent.saturating_sub(self.first - before)
     }
 
     /// Lets go of what is done at the front.
@@ -204,7 +203,7 @@ mod tests {
         for row in 0..items {
             buffer.push(turn(row));
             assert_eq!(buffer.next_to_send(), Some((row as u64 + 1, turn(row))));
-            buffer.mark_sent(Instant::now());
+            assert!(!buffer.mark_sent(Instant::now()));
         }
         buffer
     }
@@ -219,9 +218,9 @@ mod tests {
         assert_eq!(buffer.answer(4, now), None, "nobody sent it");
         assert!(buffer.answer(1, now).expect("awaited").first);
         assert_eq!(buffer.resume_after(), 2);
-        assert_eq!(buffer.rewind(), 1);
+        buffer.rewind();
         assert_eq!(buffer.next_to_send(), Some((3, turn(2))));
-        buffer.mark_sent(now);
+        assert!(buffer.mark_sent(now), "it was sent before");
         buffer.answer(3, now).expect("awaited");
         assert!(buffer.is_empty());
         assert_eq!((buffer.dealt(), buffer.unanswered(), buffer.lost()), (3, 0, 0));
@@ -237,9 +236,9 @@ mod tests {
         assert!(buffer.acknowledge(1));
         assert!(!buffer.acknowledge(1), "that was known");
         assert_eq!((buffer.resume_after(), buffer.unacknowledged()), (1, 3));
-        assert_eq!(buffer.rewind(), 3);
+        buffer.rewind();
         assert_eq!(buffer.next_to_send(), Some((2, turn(1))));
-        buffer.mark_sent(now);
+        assert!(buffer.mark_sent(now), "it was sent before");
         assert!(!buffer.answer(2, now).expect("awaited").first);
         assert!(buffer.acknowledge(4));
         assert!(buffer.is_empty(), "4 was acknowledged and is awaited no more");

@@ -94,7 +94,7 @@ impl SimulatedCamera {
     pub(super) async fn run(mut self, stop: CancellationToken) -> Tally {
         loop {
             let ended = self.stream(&stop).await;
-            self.tally.resent += self.buffer.rewind();
+            self.buffer.rewind();
             let error = match ended {
                 Ok(Ended::Done) if self.buffer.is_empty() => break,
                 Ok(Ended::Done) => ClientError::broken_line("the server ended the stream with items left"),
@@ -187,7 +187,7 @@ impl SimulatedCamera {
                             if self.buffer.awaited() == 0 {
                                 state.heard = now;
                             }
-                            self.buffer.mark_sent(now);
+                            self.tally.resent += u64::from(self.buffer.mark_sent(now));
                         }
                     }
                     // The events will say why.

@@ -14,6 +14,7 @@ pub mod geo;
 pub mod grpc;
 pub mod http;
 pub mod model;
+pub mod replay;
 pub mod server;
 pub mod shutdown;
 pub mod simulation;

@@ -12,6 +12,7 @@ mod import;
 mod openapi;
 mod pair;
 mod progress;
+mod replay;
 mod serve;
 mod simulate;
 mod train;
@@ -59,6 +60,8 @@ enum Command {
     Evaluate(evaluate::Evaluate),
     /// Write a seeded synthetic world with its truth
     Simulate(simulate::Simulate),
+    /// Stream recorded boxes and fixes to a server, as one or many cameras
+    Replay(replay::Replay),
     /// Ask a server whether it is alive
     Health(health::Health),
     /// Print the settings in force
@@ -89,6 +92,7 @@ impl Cli {
             Command::GnssError(command) => command.run(),
             Command::Evaluate(command) => command.run(),
             Command::Simulate(command) => command.run(),
+            Command::Replay(command) => command.run(),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),

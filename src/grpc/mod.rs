@@ -4,6 +4,7 @@
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
 mod cameras;
+pub mod client;
 mod convert;
 mod ending;
 mod fusion;
@@ -36,7 +37,7 @@ use proto::training_service_server::TrainingServiceServer;
 pub use statuses::explain;
 
 /// Messages, services and clients generated from `proto/`.
-#[expect(clippy::allow_attributes, reason = "generated code")]
+#[expect(clippy::allow_attributes, clippy::large_enum_variant, reason = "generated code")]
 pub mod proto {
     tonic::include_proto!("sightfix.v1");
 

@@ -4,6 +4,7 @@ use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicU16, Ordering};
 
 use http_body_util::{BodyExt as _, Full};
 use hyper::body::{Bytes, Incoming};
@@ -75,6 +76,14 @@ impl TestServer {
         let mut command = sightfix();
         command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
         command.envs(settings.iter().copied()).stdout(Stdio::null());
+        Self::run(command)
+    }
+
+    /// Starts over a data folder at an address of [`own_address`], so that it can be started there again.
+    pub(crate) fn start_at(folder: &Path, address: SocketAddr) -> Self {
+        let mut command = sightfix();
+        command.args(["serve", "--listen", &address.to_string(), "--data"]).arg(folder);
+        command.stdout(Stdio::null());
         Self::run(command)
     }
 
@@ -188,6 +197,20 @@ impl Drop for TestServer {
     fn drop(&mut self) {
         let _ = self.process.kill();
         let _ = self.process.wait();
+    }
+}
+
+/// An address for one server after another. Below the ports that systems give to clients, so that
+/// none of those takes it while no server is there.
+pub(crate) fn own_address() -> SocketAddr {
+    static GIVEN: AtomicU16 = AtomicU16::new(0);
+    let first = 20_000 + (std::process::id() % 10_000) as u16;
+    loop {
+        let port = first + GIVEN.fetch_add(1, Ordering::Relaxed);
+        let address = SocketAddr::from(([127, 0, 0, 1], port));
+        if std::net::TcpListener::bind(address).is_ok() {
+            return address;
+        }
     }
 }
 

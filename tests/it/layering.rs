@@ -25,6 +25,7 @@ const FLOORS: &[(&str, u32)] = &[
     ("http", 8),
     ("grpc", 8),
     ("server", 9),
+    ("replay", 9),
     ("cli", 10),
 ];
 

@@ -8,5 +8,6 @@ mod harness;
 mod layering;
 mod openapi;
 mod pairing;
+mod replay;
 mod story;
 mod stream;

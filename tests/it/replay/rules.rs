@@ -1,0 +1,219 @@
+//! A client keeps its side of the stream's rules, whatever the server and the line do.
+
+use std::collections::BTreeSet;
+use std::num::NonZeroU64;
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::SignedDuration;
+use sightfix::domain::{CameraId, TimeBounds};
+use sightfix::exchange::{Format, RowRules, read_observations};
+use sightfix::replay::{FaultShares, Live, Options, Pace, Recording, Report, replay};
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
+
+use super::fake::{Fake, Script};
+
+const BEGIN_S: i64 = 1_700_000_000;
+
+/// So many boxes, a second apart.
+fn recording(rows: i64) -> Recording {
+    let mut csv = "time,target_id,left,top,width,height\n".to_owned();
+    for second in 0..rows {
+        let time = jiff::Timestamp::from_second(BEGIN_S + second).expect("in range");
+        csv.push_str(&format!("{time},person-1,10,20,30,40\n"));
+    }
+    let bounds = TimeBounds::at("2027-01-01T00:00:00Z".parse().expect("a time"));
+    let rules = RowRules { time_bounds: bounds, image_size: None };
+    let rows = read_observations(csv.as_bytes(), Format::Csv, &rules).expect("a header");
+    Recording::of_rows(rows.map(|row| row.expect("a file").expect("a row"))).expect("rows")
+}
+
+fn options(fake: &Fake) -> Options {
+    Options {
+        server: format!("http://{}", fake.address),
+        camera_ids: vec![CameraId::new("yard").expect("a slug")],
+        cameras: 1,
+        client_name: "test".to_owned(),
+        pace: Pace::FastAsItGoes,
+        passes: NonZeroU64::MIN,
+        duration: None,
+        shift: SignedDuration::ZERO,
+        in_flight: 8,
+        kept: 40,
+        store_samples: true,
+        faults: FaultShares::NONE,
+        seed: 1,
+        attempts: 5,
+        patience: Duration::from_secs(20),
+    }
+}
+
+/// Replays 200 rows and holds the report to its sums.
+async fn run(fake: &Fake, options: Options) -> Report {
+    let must_acknowledge = options.store_samples;
+    let replaying = replay(
+        Arc::new(recording(200)),
+        Arc::new(options),
+        Arc::new(Live::default()),
+        CancellationToken::new(),
+    );
+    let report = replaying.await.expect("an address");
+    let refused: u64 = report.refused.values().sum();
+    assert_eq!(
+        report.answered + refused + report.lost_answers + report.unanswered,
+        report.items,
+        "{report:?}"
+    );
+    if must_acknowledge {
+        let sum = report.acknowledged.expect("asked for") + report.unacknowledged.expect("asked for");
+        assert_eq!(sum, report.items, "{report:?}");
+    }
+    assert_eq!(fake.seen().broken_rules, BTreeSet::new());
+    assert!(!report.to_string().is_empty());
+    report
+}
+
+/// Every item acknowledged was committed; what was committed twice was sent twice.
+fn committed_seqs(fake: &Fake) -> BTreeSet<u64> {
+    fake.seen().committed.iter().map(|(seq, ..)| *seq).collect()
+}
+
+fn acknowledging(every: u64) -> Script {
+    Script { acknowledge_every: every, ..Script::default() }
+}
+
+#[tokio::test]
+async fn what_was_not_acknowledged_is_sent_again_after_every_break() {
+    let broken = [17, 1, 30].map(|items| Script { break_after: Some(items), ..acknowledging(5) });
+    let fake = Fake::start(broken.into_iter().chain([acknowledging(5)])).await;
+    let report = run(&fake, options(&fake)).await;
+    assert!(report.is_complete(), "{report:?}");
+    assert_eq!((report.items, report.answered, report.streams, report.reconnects), (200, 200, 4, 3));
+    assert_eq!(report.broken.values().sum::<u64>(), 3);
+    assert_eq!(committed_seqs(&fake), (1..=200).collect());
+    let seen = fake.seen();
+    assert_eq!(seen.committed.len(), 200, "what was committed is not sent again");
+    let resumed: Vec<_> = seen.openings.iter().map(|opening| opening.resume_after_seq).collect();
+    assert_eq!(resumed, [0, 15, 15, 40], "17 items, then 1 more, then 30 more, acknowledged by fives");
+    assert!(report.resent >= 8, "{report:?}");
+}
+
+#[tokio::test]
+async fn an_invitation_to_reconnect_costs_nothing() {
+    let fake = Fake::start([Script { invite_after: Some(50), ..acknowledging(7) }, acknowledging(7)]).await;
+    let report = run(&fake, options(&fake)).await;
+    assert!(report.is_complete(), "{report:?}");
+    assert_eq!((report.invitations, report.reconnects, report.resent), (1, 1, 0));
+    assert!(report.broken.is_empty(), "{report:?}");
+    assert_eq!(fake.seen().items, 200);
+    assert_eq!(committed_seqs(&fake), (1..=200).collect());
+}
+
+#[tokio::test]
+async fn without_acknowledgements_only_unanswered_items_are_sent_again() {
+    let fake = Fake::start([Script { break_after: Some(60), ..Script::default() }]).await;
+    let report = run(&fake, Options { store_samples: false, ..options(&fake) }).await;
+    assert!(report.is_complete(), "{report:?}");
+    assert_eq!((report.answered, report.acknowledged, report.unacknowledged), (200, None, None));
+    assert_eq!(fake.seen().openings[1].resume_after_seq, 60);
+    assert_eq!(fake.seen().items, 200);
+}
+
+#[tokio::test]
+async fn lost_answers_and_refused_items_are_counted_and_halt_nothing() {
+    let script = Script { lose_every: Some(10), refuse_every: Some(8), ..acknowledging(5) };
+    let fake = Fake::start([script]).await;
+    let report = run(&fake, options(&fake)).await;
+    // Every 40th item is both refused and without an answer.
+    assert_eq!((report.lost_answers, report.refused["invalid-argument"]), (19, 20), "{report:?}");
+    // The answer to the very last item is lost and no later one says so.
+    assert_eq!((report.unanswered, report.unacknowledged), (1, Some(0)), "{report:?}");
+    assert!(!report.is_complete());
+}
+
+#[tokio::test]
+async fn a_full_buffer_waits_for_acknowledgements() {
+    let fake = Fake::start([acknowledging(40)]).await;
+    let report = run(&fake, Options { kept: 40, ..options(&fake) }).await;
+    assert!(report.is_complete(), "{report:?}");
+    assert_eq!(committed_seqs(&fake), (1..=200).collect());
+}
+
+#[tokio::test]
+async fn a_silent_server_counts_as_gone() {
+    let silent = Script { silent: true, ..Script::default() };
+    let fake = Fake::start([silent.clone(), acknowledging(5)]).await;
+    let patience = Duration::from_millis(300);
+    let report = run(&fake, Options { patience, ..options(&fake) }).await;
+    assert!(report.is_complete(), "{report:?}");
+    assert_eq!(report.broken.get("silence"), Some(&1), "{report:?}");
+
+    let fake = Fake::start(vec![silent; 10]).await;
+    let report = run(&fake, Options { patience, attempts: 1, ..options(&fake) }).await;
+    assert!(!report.is_complete());
+    assert_eq!((report.given_up, report.broken["silence"], report.unanswered), (1, 2, 8), "{report:?}");
+}
+
+#[tokio::test]
+async fn a_refusal_that_stays_is_not_tried_again() {
+    let refuse = Some(Status::not_found("there is no such camera"));
+    let fake = Fake::start([Script { refuse, ..Script::default() }]).await;
+    let report = run(&fake, options(&fake)).await;
+    assert!(!report.is_complete());
+    assert_eq!((report.given_up, report.streams, report.items), (1, 0, 0), "{report:?}");
+    assert!(report.reasons[0].contains("no such camera"), "{report:?}");
+}
+
+#[tokio::test]
+async fn cameras_that_share_one_are_other_clients_with_other_targets() {
+    let fake = Fake::start(vec![acknowledging(5); 5]).await;
+    let ids = ["yard", "gate"].map(|id| CameraId::new(id).expect("a slug")).to_vec();
+    let passes = NonZeroU64::new(2).expect("not 0");
+    let report = run(&fake, Options { cameras: 5, camera_ids: ids, passes, ..options(&fake) }).await;
+    assert!(report.is_complete(), "{report:?}");
+    assert_eq!((report.items, report.streams), (2_000, 5));
+    let seen = fake.seen();
+    let clients: BTreeSet<_> = seen.openings.iter().map(|opening| opening.client_name.clone()).collect();
+    assert_eq!(clients.len(), 5);
+    assert_eq!(seen.openings.iter().filter(|opening| opening.camera_id == "yard").count(), 3);
+    // Target and time are unique within each of the two cameras: 3 targets in one, 2 in the other.
+    let targets: BTreeSet<_> = seen.committed.iter().map(|(_, target, _)| target.as_str()).collect();
+    assert_eq!(targets, BTreeSet::from(["person-1", "person-1@1", "person-1@2"]));
+    let times: BTreeSet<_> = seen.committed.iter().map(|(_, target, time)| (target, time)).collect();
+    assert_eq!(times.len(), 3 * 400, "no two of one target meet in time");
+}
+
+#[tokio::test]
+async fn faults_on_purpose_change_what_is_sent_and_nothing_else() {
+    let fake = Fake::start([acknowledging(5)]).await;
+    let faults = FaultShares { lose: 0.1, duplicate: 0.1, reorder: 0.2, latest: 3 };
+    let report = run(&fake, Options { faults, ..options(&fake) }).await;
+    assert!(report.is_complete(), "{report:?}");
+    let injected = report.injected;
+    assert!(injected.lost > 0 && injected.duplicated > 0 && injected.reordered > 0, "{report:?}");
+    assert_eq!(report.items, 200 - injected.lost + injected.duplicated);
+    let seen = fake.seen();
+    let times: BTreeSet<_> = seen.committed.iter().map(|(_, _, time)| *time).collect();
+    assert_eq!(times.len() as u64, 200 - injected.lost);
+    let in_order = seen.committed.is_sorted_by_key(|(_, _, time)| *time);
+    assert!(!in_order, "some came late");
+}
+
+#[tokio::test]
+async fn after_a_stop_the_streams_end_in_order() {
+    let fake = Fake::start([acknowledging(5)]).await;
+    let stop = CancellationToken::new();
+    let live = Arc::new(Live::default());
+    let slow = Options { pace: Pace::Even { items_per_s: 100.0 }, ..options(&fake) };
+    let replaying =
+        tokio::spawn(replay(Arc::new(recording(2_000)), Arc::new(slow), live.clone(), stop.clone()));
+    while live.answered.load(std::sync::atomic::Ordering::Relaxed) < 3 {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    stop.cancel();
+    let report = replaying.await.expect("no panic").expect("an address");
+    assert!(report.is_complete(), "{report:?}");
+    assert!((3..2_000).contains(&report.items), "{report:?}");
+    assert_eq!(report.acknowledged, Some(report.items));
+}

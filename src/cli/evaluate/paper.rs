@@ -71,9 +71,13 @@ const HEAD: &str = "\
 
 Generated; do not edit. Errors are horizontal and geodesic (WGS 84), in metres, means over seeds;
 `spread` is the standard deviation of the seeds' means. `cov50` and `cov95` are the shares of true
-positions inside the stated 50 % and 95 % radius. Nothing was chosen on these test rows. The error to
-a line is the distance to its nearest point, so it is smaller than the error to a known position, and
-coverage of it larger.
+positions inside the stated 50 % and 95 % radius. The error to a line is the distance to its nearest
+point, so it is smaller than the error to a known position, and coverage of it larger.
+
+What was looked at while the method was built: the truth of simulated worlds (seeds 1 to 6, 101 to 103,
+201 and 202), after which constants of the stated errors were set, and the surveyed line of the real
+square, after which those constants and the settings of the track were compared and kept. So the figures
+of the real square are not those of untouched data, and neither are those of a world named above.
 
 ";
 

@@ -10,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::artifact::{Artifact, FORMAT, Parts};
 use super::projection::{self, Form};
+use super::projective::Doubt;
 use super::regressor::{R95_PER_SIGMA, Regressor};
 use super::rows::{Rows, hash_of};
 use super::run::{Phase, Run};
@@ -87,7 +88,8 @@ pub fn fit(
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
     let rows = Rows::new(samples)?;
-    let noise = noise_of(&rows, options.seed);
+    let about = about_geometry(&rows, options.seed);
+    let noise = about.noise;
     let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &noise);
     let common = Common { e_gnss_m2, noise, epochs: options.epochs, seed: options.seed };
     let candidates = select::candidates(options.recipe);
@@ -107,8 +109,8 @@ pub fn fit(
         reports.push(CandidateReport { candidate: candidate.name.to_owned(), held_out: report });
         residuals.push(misses);
     }
-    let kept = select::choose(&rows, &residuals);
-    tell_choice(&reports, kept, &mut run)?;
+    let (kept, scores) = select::choose(&rows, &residuals);
+    tell_choice(candidates, kept, &scores, &mut run)?;
 
     let candidate = candidates[kept];
     // The final fit may be shorter than the longest candidate's.
@@ -122,6 +124,8 @@ pub fn fit(
     }
     let mut held_out = reports[kept].held_out.clone();
     if candidate.way != Way::Paper {
+        // A network leaves open at least what a geometry does.
+        parts.doubt.get_or_insert_with(|| Doubt::of_geometry(about.doubt));
         let calibration = uncertainty::calibrate(&mut parts, &rows, &residuals[kept], &noise)?;
         held_out.e_regression_m2 = calibration.error_m2;
         if e_gnss_source == GnssErrorSource::Estimated {
@@ -140,10 +144,11 @@ pub fn fit(
     artifact_of(parts, &rows, samples, &summary, held_out, reports)
 }
 
-/// The error of the fixes about the richest geometry: coloured or white, and how large.
-fn noise_of(rows: &Rows, seed: u64) -> FixNoise {
+/// The richest geometry, for the error of the fixes about it (coloured or white, and how large) and
+/// for what they leave open.
+fn about_geometry(rows: &Rows, seed: u64) -> projection::Fitted {
     let form = Form { sides: true, extra_sigma: 1.0 };
-    projection::fit(&rows.rows, form, &[], &mut ChaCha8Rng::seed_from_u64(seed)).noise
+    projection::fit(&rows.rows, form, &[], &mut ChaCha8Rng::seed_from_u64(seed))
 }
 
 fn receiver_variance(rows: &Rows, known: GnssError, noise: &FixNoise) -> (f64, GnssErrorSource) {
@@ -175,17 +180,25 @@ fn tell_samples(rows: &Rows, common: &Common, run: &mut Run<'_>) -> Result<(), F
     ))
 }
 
-fn tell_choice(reports: &[CandidateReport], kept: usize, run: &mut Run<'_>) -> Result<(), FitError> {
-    let (first, own) = (&reports[0], &reports[kept]);
-    if reports.len() == 1 {
+fn tell_choice(
+    candidates: &[Candidate],
+    kept: usize,
+    scores: &[f64],
+    run: &mut Run<'_>,
+) -> Result<(), FitError> {
+    if candidates.len() == 1 {
         return Ok(());
     }
-    let gain = 1.0 - own.held_out.error_to_fix_m2 / first.held_out.error_to_fix_m2;
+    let gain = |other: usize| 100.0 * (1.0 - scores[kept] / scores[other]);
+    let richest = candidates.len() - 1;
     run.note(&format!(
-        "kept {}: its mean square to the held-out fixes is {:.1} % below that of {}",
-        own.candidate,
-        100.0 * gain,
-        first.candidate
+        "kept {}: its mean squared miss to the held-out fixes, wild ones bounded, is {:.1} % below that of \
+         {} and {:.1} % below that of {}",
+        candidates[kept].name,
+        gain(0),
+        candidates[0].name,
+        gain(richest),
+        candidates[richest].name
     ))
 }
 

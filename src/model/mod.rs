@@ -5,6 +5,7 @@
 //! threads of its own.
 
 mod artifact;
+mod cells;
 mod coverage;
 pub mod dnn;
 mod file;
@@ -33,3 +34,6 @@ pub use tensors::LARGEST_WEIGHTS_BYTES;
 
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod behaviour_tests;

@@ -3,6 +3,7 @@
 //! What never happens here: candle, training, GNSS fusion (that is the floor above).
 
 use super::artifact::Parts;
+use super::cells::Cells;
 use super::coverage::CoverageTable;
 use super::hybrid::HybridRegressor;
 use super::paper::PaperRegressor;
@@ -17,6 +18,9 @@ pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
 /// a box is outside.
 const OUTSIDE_RADII: f64 = 1.5;
 
+/// Share of a regression's error that is new with each box, where the model does not say.
+const UNKNOWN_UNREST_SHARE: f64 = 0.3;
+
 /// The one-step answer for one box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Regression {
@@ -30,6 +34,16 @@ pub struct Regression {
     pub outside_training: bool,
     /// `r95_m = r95_scale * sqrt(e)` of the regressed and of the fused position.
     pub r95_scale: f64,
+}
+
+/// What the training boxes say of one box.
+struct Near {
+    /// Distance to the nearest of them, in radii.
+    radii: f64,
+    /// Error variance there, m2.
+    usual_m2: f64,
+    /// What a box that looks like none of them adds, m2.
+    astray_m2: f64,
 }
 
 #[derive(Debug, Clone)]
@@ -49,14 +63,18 @@ pub struct Regressor {
     error_scale: f64,
     reconstruction_usual: f64,
     border_factor: f64,
+    unrest_share: f64,
     image_size: Option<ImageSize>,
     coverage: CoverageTable,
+    cells: Cells,
     kind: Kind,
 }
 
 impl Regressor {
     pub(super) fn build(mut parts: Parts) -> Result<Self> {
-        let coverage = parts.take_coverage()?.table();
+        let coverage = parts.take_coverage()?;
+        let cells = parts.take_cells(&coverage)?;
+        let coverage = coverage.table();
         let kind = match parts.recipe {
             Recipe::Paper => Kind::Paper(Box::new(PaperRegressor::build(&mut parts)?)),
             Recipe::Hybrid => Kind::Hybrid(Box::new(HybridRegressor::build(&mut parts)?)),
@@ -75,6 +93,11 @@ impl Regressor {
                 parts.positive_parameter("border_factor")?,
             ),
         };
+        // Models of before do not tell it.
+        let unrest_share = match parts.parameters.contains_key("unrest_share") {
+            true => parts.parameter("unrest_share")?.clamp(0.0, 1.0),
+            false => UNKNOWN_UNREST_SHARE,
+        };
         let Parts { plane, e_gnss_m2, error_scale, tensors, .. } = parts;
         tensors.finish()?;
         Ok(Self {
@@ -84,8 +107,10 @@ impl Regressor {
             error_scale,
             reconstruction_usual,
             border_factor,
+            unrest_share,
             image_size,
             coverage,
+            cells,
             kind,
         })
     }
@@ -102,6 +127,13 @@ impl Regressor {
         self.e_gnss_m2
     }
 
+    /// Share of its error variance that is new with each box, 0 to 1; the rest is the same wherever
+    /// the target comes by again.
+    #[must_use]
+    pub const fn unrest_share(&self) -> f64 {
+        self.unrest_share
+    }
+
     /// Size of the image that it was trained on, if known.
     pub(super) const fn image_size(&self) -> Option<ImageSize> {
         self.image_size
@@ -111,13 +143,13 @@ impl Regressor {
     /// of the recipe `paper` that has it among its inputs.
     #[must_use]
     pub fn regress(&self, bounding_box: &BoundingBox, fix: Option<EastNorth>) -> Regression {
-        let (radii, usual_m2) = self.coverage.look_up(bounding_box);
+        let near = self.near(bounding_box);
         let (regressed, reconstruction_error, e_m2) = match &self.kind {
             // To the letter: the error is Es * eX and nothing else.
             Kind::Paper(paper) => paper.regress(&self.plane, bounding_box, fix),
-            Kind::Hybrid(hybrid) => self.judged(bounding_box, radii, usual_m2, hybrid.regress(bounding_box)),
+            Kind::Hybrid(hybrid) => self.judged(bounding_box, &near, hybrid.regress(bounding_box)),
             Kind::Projective(projective) => {
-                self.judged(bounding_box, radii, usual_m2, projective.regress(bounding_box))
+                self.judged(bounding_box, &near, projective.regress(bounding_box))
             }
         };
         Regression {
@@ -125,9 +157,25 @@ impl Regressor {
             reconstruction_error,
             // The bounds keep every weight and radius finite whatever the net says.
             e_regression_m2: e_m2.clamp(1e-6, 1e12),
-            outside_training: radii > OUTSIDE_RADII,
+            outside_training: near.radii > OUTSIDE_RADII,
             r95_scale: self.r95_scale,
         }
+    }
+
+    /// Position, and the sides (foot x, foot y, width, height, px) that the decoder rebuilds from it;
+    /// those of the box itself where the recipe has no such decoder.
+    pub(super) fn encode(&self, bounding_box: &BoundingBox) -> (EastNorth, [f64; SIDES]) {
+        match &self.kind {
+            Kind::Paper(paper) => (paper.regress(&self.plane, bounding_box, None).0, sides_of(bounding_box)),
+            Kind::Hybrid(hybrid) => hybrid.regress(bounding_box),
+            Kind::Projective(projective) => projective.regress(bounding_box),
+        }
+    }
+
+    #[inline]
+    fn near(&self, bounding_box: &BoundingBox) -> Near {
+        let (radii, usual_m2, centre) = self.coverage.look_up(bounding_box);
+        Near { radii, usual_m2, astray_m2: self.cells.astray_m2(centre, bounding_box) }
     }
 
     /// Reconstruction error, in squared box heights, and error variance: what is usual at that
@@ -136,8 +184,7 @@ impl Regressor {
     fn judged(
         &self,
         bounding_box: &BoundingBox,
-        radii: f64,
-        usual_m2: f64,
+        near: &Near,
         (regressed, rebuilt): (EastNorth, [f64; SIDES]),
     ) -> (EastNorth, f64, f64) {
         let sides = sides_of(bounding_box);
@@ -145,12 +192,13 @@ impl Regressor {
         let reconstruction_error =
             squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px());
         let excess = (reconstruction_error - self.reconstruction_usual).max(0.0);
-        let beyond = (radii - OUTSIDE_RADII).max(0.0);
+        let beyond = (near.radii - OUTSIDE_RADII).max(0.0);
         let border = if bounding_box.touches_border(self.image_size) { self.border_factor } else { 1.0 };
         // A box beyond those of training may be a wrong box; then its foot is as far from the truth.
         let astray = beyond * self.coverage.radius_px() / bounding_box.height_px();
-        let e_m2 =
-            usual_m2 * border * (1.0 + beyond * beyond) + self.error_scale * (excess + astray * astray);
+        let e_m2 = near.usual_m2 * border * (1.0 + beyond * beyond)
+            + near.astray_m2
+            + self.error_scale * (excess + astray * astray);
         (regressed, reconstruction_error, e_m2)
     }
 }

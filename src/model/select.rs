@@ -154,10 +154,11 @@ impl Candidate {
     }
 }
 
-/// Index of the candidate to keep, from the residuals of each: the simplest one, unless a richer
+/// The candidate to keep and the score of each, in m2: its mean squared miss per axis, where wild
+/// misses count no more than a bound. That is the simplest one, unless a richer
 /// one's misses are smaller by more than the standard error of that difference.
-pub(super) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> usize {
-    let Some(first) = residuals.first() else { return 0 };
+pub(super) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> (usize, Vec<f64>) {
+    let Some(first) = residuals.first() else { return (0, Vec::new()) };
     let square = |[east, north]: &[f64; 2]| 0.5 * (east * east + north * north);
     // A fix that is far off says nothing of the candidates.
     let bound_m2 = 10.0 * median(first.iter().map(square).collect());
@@ -181,5 +182,9 @@ pub(super) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> usize {
             kept = at;
         }
     }
-    kept
+    let scores = residuals
+        .iter()
+        .map(|misses| misses.iter().map(|miss| square(miss).min(bound_m2)).sum::<f64>() / misses.len() as f64)
+        .collect();
+    (kept, scores)
 }

@@ -17,6 +17,12 @@ const ACCELERATIONS_MPS2: [f64; 7] = [0.03, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2];
 
 /// Time in which a track takes the model's own error for the same, s.
 const MODEL_STAYS_S: f64 = 86_400.0;
+/// The same for its place, in standard deviations of the training positions: most of what a map errs
+/// is the same shift or stretch all over the scene.
+const MODEL_REACHES: f64 = 3.0;
+
+/// Fewer samples do not tell how a receiver's error stays; then it is taken for a phone's.
+const FEWEST_FOR_COLOUR: usize = 200;
 
 /// Something learnt, or why it could not be, with what it cost.
 pub(super) struct Learnt<T> {
@@ -154,12 +160,15 @@ pub(super) fn track_settings(train: &[Sample], regressor: &Regressor, variance_m
             white_share: regressor.unrest_share(),
             // What the model has learnt wrongly it does not unlearn while a target stands.
             time_constant_s: MODEL_STAYS_S,
-            length_m: spread_m(&points),
+            length_m: MODEL_REACHES * spread_m(&points),
             ..RegressionNoise::default()
         },
         ..TrackSettings::default()
     };
     let e_regression_m2 = squares_m2.iter().sum::<f64>() / squares_m2.len().max(1) as f64;
+    if train.len() < FEWEST_FOR_COLOUR {
+        return settings;
+    }
     let gnss = estimate_gnss_noise(&residuals, e_regression_m2, &settings.regression)
         .map_or_else(|| split(train, plane, variance_m2), |estimate| estimate.noise);
     TrackSettings { gnss, ..settings }

@@ -134,9 +134,7 @@ impl Parts {
     pub(super) fn take_cells(&mut self, coverage: &Coverage) -> Result<Cells> {
         match self.tensors.rows("cells") {
             None => Ok(Cells::default()),
-            Some(count) => {
-                Cells::from_numbers(coverage, &self.tensors.take_f32("cells", &[count, NUMBERS])?)
-            }
+            Some(count) => Cells::from_numbers(coverage, &self.tensors.take_f32("cells", &[count, NUMBERS])?),
         }
     }
 

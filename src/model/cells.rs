@@ -31,7 +31,7 @@ pub(super) const NUMBERS: usize = 30;
 
 /// Pixels by which a box may go along with the target's place wherever geometry says so, though
 /// training has not gone there.
-const PLACES_PX: f64 = 100.0;
+const PLACES_PX: f64 = 40.0;
 
 /// What an encoder makes of a box: the answer, and the sides (foot x, foot y, width, height, px) that
 /// its decoder rebuilds from that.
@@ -101,18 +101,13 @@ pub(super) fn edge_variance_m2(slopes: &Slopes) -> f64 {
 
 impl Cells {
     /// Cells of the training boxes, with the slopes of an encoder at the middle of each.
-    pub(super) fn new(
-        coverage: &Coverage,
-        rows: &[Row],
-        encode: &Encode<'_>,
-    ) -> Self {
+    pub(super) fn new(coverage: &Coverage, rows: &[Row], encode: &Encode<'_>) -> Self {
         let count = (rows.len() / ROWS_PER_CELL).clamp(1, MOST_CELLS).min(coverage.centres.len());
         let coarse = coverage.coarse(count);
         let of_centre = cells_of(coverage, count);
         let mut members: Vec<Vec<Vector4<f64>>> = vec![Vec::new(); count];
         for row in rows {
-            members[coarse.nearest(&row.bounding_box)]
-                .push(Vector4::from(edges_of(&row.bounding_box)));
+            members[coarse.nearest(&row.bounding_box)].push(Vector4::from(edges_of(&row.bounding_box)));
         }
         let mut cells = Vec::with_capacity(count);
         let whole: Vec<Vector4<f64>> = members.iter().flatten().copied().collect();
@@ -243,8 +238,7 @@ impl Cell {
 
 /// Mean and covariance with boxes far off counted less, from medians on.
 fn robust_moments(members: &[Vector4<f64>]) -> (Vector4<f64>, Matrix4<f64>) {
-    let mut middle =
-        Vector4::from_fn(|edge, _| median(members.iter().map(|member| member[edge]).collect()));
+    let mut middle = Vector4::from_fn(|edge, _| median(members.iter().map(|member| member[edge]).collect()));
     let mut covariance = Matrix4::zeros();
     for edge in 0..4 {
         let away = members.iter().map(|member| (member[edge] - middle[edge]).abs()).collect();

@@ -27,7 +27,7 @@ mod uncertainty;
 mod whitening;
 
 pub use artifact::{Artifact, FORMAT};
-pub use fit::{FitError, FitEvent, FitOptions, fit};
+pub use fit::{FitError, FitEvent, FitOptions, Trial, fit, fit_trial};
 pub use regressor::{R95_PER_SIGMA, Regression, Regressor};
 pub use rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use tensors::LARGEST_WEIGHTS_BYTES;

@@ -14,7 +14,7 @@ use super::FitError;
 use super::artifact::Parts;
 use super::hybrid::batch_of;
 use super::net::{Activation, Net, NetShape};
-use super::projection::{self, COEFFICIENTS, Form, MapDoubt, Projection, SIDES, sides_of};
+use super::projection::{self, COEFFICIENTS, Form, MapDoubt, Projection, SIDES, same_starts, sides_of};
 use super::rows::{Row, Rows};
 use super::run::Phase;
 use super::tensors::Tensors;
@@ -58,7 +58,7 @@ pub(super) fn fit(
     phase: &mut Phase<'_, '_>,
 ) -> Result<Parts, FitError> {
     let form = Form { sides: variant.sides, extra_sigma: RESIDUAL_SIGMA };
-    let mut fitted = projection::fit(&rows.rows, form, &[], &mut phase.rng);
+    let mut fitted = projection::fit(&rows.rows, form, &[], &mut same_starts());
     let mut parts = Parts {
         recipe: Recipe::Projective,
         plane: rows.plane,
@@ -81,7 +81,7 @@ pub(super) fn fit(
         let layer = shape().layer(0);
         let trained = Net::new(shape(), &parameters);
         let columns = hidden_columns(&trained, &inputs);
-        fitted = projection::fit(&rows.rows, form, &columns, &mut phase.rng);
+        fitted = projection::fit(&rows.rows, form, &columns, &mut same_starts());
         parts.tensors.put_f32("residual.0.weight", &[HIDDEN, SIDES], parameters[..layer.biases].to_vec());
         let biases = parameters[layer.biases..layer.biases + HIDDEN].to_vec();
         parts.tensors.put_f32("residual.0.bias", &[HIDDEN], biases);

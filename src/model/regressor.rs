@@ -36,6 +36,21 @@ pub struct Regression {
     pub r95_scale: f64,
 }
 
+/// How much of the error given to unusual boxes training has shown to be there.
+#[derive(Debug, Clone, Copy)]
+struct Shown {
+    /// Up to this error variance, m2.
+    upto_m2: f64,
+    /// So much of it.
+    factor: f64,
+}
+
+impl Default for Shown {
+    fn default() -> Self {
+        Self { upto_m2: 0.0, factor: 1.0 }
+    }
+}
+
 /// What the training boxes say of one box.
 struct Near {
     /// Distance to the nearest of them, in radii.
@@ -64,6 +79,8 @@ pub struct Regressor {
     reconstruction_usual: f64,
     border_factor: f64,
     unrest_share: f64,
+    /// What training has shown of unusual boxes, those in full sight and those at the border.
+    shown: [Shown; 2],
     image_size: Option<ImageSize>,
     coverage: CoverageTable,
     cells: Cells,
@@ -71,6 +88,11 @@ pub struct Regressor {
 }
 
 impl Regressor {
+    /// Parameters that tell how far, and how much, the error given to unusual boxes was there in
+    /// training; by [`Self::sight`].
+    pub(super) const SHOWN_NAMES: [[&'static str; 2]; 2] =
+        [["extra_shown_m2", "extra_factor"], ["border_extra_shown_m2", "border_extra_factor"]];
+
     pub(super) fn build(mut parts: Parts) -> Result<Self> {
         let coverage = parts.take_coverage()?;
         let cells = parts.take_cells(&coverage)?;
@@ -94,10 +116,15 @@ impl Regressor {
             ),
         };
         // Models of before do not tell it.
-        let unrest_share = match parts.parameters.contains_key("unrest_share") {
-            true => parts.parameter("unrest_share")?.clamp(0.0, 1.0),
-            false => UNKNOWN_UNREST_SHARE,
+        let or = |name: &str, unknown: f64| match parts.parameters.contains_key(name) {
+            true => parts.parameter(name),
+            false => Ok(unknown),
         };
+        let unrest_share = or("unrest_share", UNKNOWN_UNREST_SHARE)?.clamp(0.0, 1.0);
+        let mut shown = [Shown::default(); 2];
+        for (shown, [upto_m2, factor]) in shown.iter_mut().zip(Self::SHOWN_NAMES) {
+            *shown = Shown { upto_m2: or(upto_m2, 0.0)?.max(0.0), factor: or(factor, 1.0)?.max(0.0) };
+        }
         let Parts { plane, e_gnss_m2, error_scale, tensors, .. } = parts;
         tensors.finish()?;
         Ok(Self {
@@ -108,6 +135,7 @@ impl Regressor {
             reconstruction_usual,
             border_factor,
             unrest_share,
+            shown,
             image_size,
             coverage,
             cells,
@@ -187,20 +215,49 @@ impl Regressor {
         near: &Near,
         (regressed, rebuilt): (EastNorth, [f64; SIDES]),
     ) -> (EastNorth, f64, f64) {
-        let sides = sides_of(bounding_box);
-        let squares = sides.iter().zip(&rebuilt).map(|(one, other)| (one - other) * (one - other));
-        let reconstruction_error =
-            squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px());
-        let excess = (reconstruction_error - self.reconstruction_usual).max(0.0);
+        let reconstruction_error = reconstruction_error(bounding_box, &rebuilt);
         let beyond = (near.radii - OUTSIDE_RADII).max(0.0);
         let border = if bounding_box.touches_border(self.image_size) { self.border_factor } else { 1.0 };
-        // A box beyond those of training may be a wrong box; then its foot is as far from the truth.
-        let astray = beyond * self.coverage.radius_px() / bounding_box.height_px();
+        let extra_m2 = self.unusual_m2(bounding_box, near, reconstruction_error);
+        // What training has shown of such boxes counts as it was there, the rest in full.
+        let shown = self.shown[self.sight(bounding_box)];
+        let shown_m2 = extra_m2.min(shown.upto_m2);
         let e_m2 = near.usual_m2 * border * (1.0 + beyond * beyond)
-            + near.astray_m2
-            + self.error_scale * (excess + astray * astray);
+            + shown.factor * shown_m2
+            + (extra_m2 - shown_m2);
         (regressed, reconstruction_error, e_m2)
     }
+
+    /// 0 for a box in full sight, 1 for one at the border of the image.
+    #[inline]
+    pub(super) fn sight(&self, bounding_box: &BoundingBox) -> usize {
+        usize::from(bounding_box.touches_border(self.image_size))
+    }
+
+    /// Error variance that a box's unusual looks add, by geometry alone, m2.
+    #[inline]
+    fn unusual_m2(&self, bounding_box: &BoundingBox, near: &Near, reconstruction_error: f64) -> f64 {
+        let excess = (reconstruction_error - self.reconstruction_usual).max(0.0);
+        let beyond = (near.radii - OUTSIDE_RADII).max(0.0);
+        // A box beyond those of training may be a wrong box; then its foot is as far from the truth.
+        let astray = beyond * self.coverage.radius_px() / bounding_box.height_px();
+        near.astray_m2 + self.error_scale * (excess + astray * astray)
+    }
+
+    /// The same before it is known how much of it there is, for calibration.
+    pub(super) fn extra_m2(&self, bounding_box: &BoundingBox) -> f64 {
+        let (_, rebuilt) = self.encode(bounding_box);
+        let near = self.near(bounding_box);
+        self.unusual_m2(bounding_box, &near, reconstruction_error(bounding_box, &rebuilt))
+    }
+}
+
+/// Mean square of what the decoder missed of the sides, in squared box heights.
+#[inline]
+fn reconstruction_error(bounding_box: &BoundingBox, rebuilt: &[f64; SIDES]) -> f64 {
+    let sides = sides_of(bounding_box);
+    let squares = sides.iter().zip(rebuilt).map(|(one, other)| (one - other) * (one - other));
+    squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px())
 }
 
 fn image_size_of(parts: &Parts) -> Result<Option<ImageSize>> {

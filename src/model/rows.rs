@@ -236,9 +236,8 @@ pub(super) fn second_differences<'a>(
         let (first, middle, last) = (&rows[at - 1], &rows[at], &rows[at + 1]);
         let (first_s, second_s) = (middle.time_s - first.time_s, last.time_s - middle.time_s);
         let even = first_s > 0.0 && first_s < 2.5 && (first_s - second_s).abs() < 0.1 * first_s;
-        let jump = |of: fn(&EastNorth) -> f64| {
-            of(&points[at + 1]) - 2.0 * of(&points[at]) + of(&points[at - 1])
-        };
+        let jump =
+            |of: fn(&EastNorth) -> f64| of(&points[at + 1]) - 2.0 * of(&points[at]) + of(&points[at - 1]);
         let square_m2 = jump(|point| point.east_m).powi(2) + jump(|point| point.north_m).powi(2);
         (even && first.pass == last.pass).then_some((at, square_m2))
     })

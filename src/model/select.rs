@@ -13,6 +13,7 @@ use super::projective::Variant;
 use super::regressor::Regressor;
 use super::rows::{Rows, median};
 use super::run::{Phase, Run};
+use super::train::LossWeights;
 use super::whitening::FixNoise;
 use super::{FitError, hybrid, paper, projective, uncertainty};
 use crate::domain::Recipe;
@@ -71,6 +72,8 @@ pub(super) struct Common {
     /// Passes over the samples, if the run says so.
     pub(super) epochs: Option<u32>,
     pub(super) seed: u64,
+    /// Weights of the loss in place of the recipe's own.
+    pub(super) balance: Option<LossWeights>,
 }
 
 impl Candidate {
@@ -139,7 +142,11 @@ impl Candidate {
             let mut rng = ChaCha8Rng::seed_from_u64(common.seed);
             rng.set_stream(u64::from(block) + 1);
             let name = format!("{}: held-out block {} of {BLOCKS}", self.name, block + 1);
-            let parts = self.fit(&train, common, &mut Phase { run, name, rng, is_final: false })?;
+            let parts = self.fit(
+                &train,
+                common,
+                &mut Phase { run, name, rng, is_final: false, balance: common.balance },
+            )?;
             let regressor = Regressor::build(parts).map_err(|error| FitError::Fault(error.into()))?;
             for (at, row) in rows.rows.iter().enumerate().filter(|(at, _)| blocks[*at] == block) {
                 let fix = regressor.plane().to_plane(row.position);

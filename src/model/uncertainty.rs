@@ -26,6 +26,12 @@ const CREDIBLE_SIGMAS: f64 = 3.0;
 const DOUBT_OF_SHARED: f64 = 0.5;
 /// The receiver's variance may be this many times what the fits have left of it.
 const MOST_UNDERSTATED: f64 = 1.5;
+/// A squared residual counts up to this many times what is expected of it.
+const WILD: f64 = 6.0;
+/// Share of the unusual boxes of training that show what such boxes are like; the rest are single.
+const SHOWN: f64 = 0.95;
+/// Variance of the factor on an unusual box's error before anything is known of it.
+const PRIOR_VARIANCE: f64 = 0.5;
 /// Taken where no three boxes follow each other, px2.
 const UNKNOWN_EDGE_NOISE_PX2: f64 = 1.0;
 /// The error varies over the image, so its distribution has longer tails than a normal one.
@@ -107,7 +113,81 @@ pub(super) fn calibrate(
     }
     parts.put_coverage(&coverage);
     parts.put_cells(&cells);
+    calibrate_extra(parts, rows, residuals, independent_fixes(&rows.rows, noise))?;
     Ok(Calibration { error_m2, receiver_m2: scatter_m2(&own) + lasting_m2 })
+}
+
+/// Holds the error that unusual boxes are given (cut, astray, contradicting themselves) against the
+/// held-out residuals of such boxes in training: how much of it there was, up to the largest given.
+fn calibrate_extra(
+    parts: &mut Parts,
+    rows: &Rows,
+    residuals: &[[f64; 2]],
+    independent: f64,
+) -> Result<(), FitError> {
+    let regressor = Regressor::build(parts.clone()).map_err(|error| FitError::Fault(error.into()))?;
+    for (sight, [upto, factor]) in Regressor::SHOWN_NAMES.into_iter().enumerate() {
+        if let Some(found) = extra_of(&regressor, rows, residuals, independent, sight) {
+            put(parts, factor, found.0);
+            put(parts, upto, found.1);
+        }
+    }
+    Ok(())
+}
+
+/// The factor on the error given to the unusual boxes of one sight, and the error up to which there
+/// were enough of them, m2; `None` where there were none.
+fn extra_of(
+    regressor: &Regressor,
+    rows: &Rows,
+    residuals: &[[f64; 2]],
+    independent: f64,
+    sight: usize,
+) -> Option<(f64, f64)> {
+    let (mut calm, mut unusual) = (Sum::default(), Sum::default());
+    let (mut given, mut passes, mut last) = (Vec::new(), 0.0, None);
+    let usual_m2 = scatter_m2(residuals);
+    for (row, [east, north]) in rows.rows.iter().zip(residuals) {
+        let extra_m2 = regressor.extra_m2(&row.bounding_box);
+        // A wild fix must not speak for the boxes, nor a wild box for more than its error says.
+        let square_m2 = (0.5 * (east * east + north * north)).min(WILD * (usual_m2 + extra_m2));
+        if extra_m2 <= 0.0 {
+            calm.add(square_m2);
+        } else if regressor.sight(&row.bounding_box) == sight {
+            unusual.add(square_m2);
+            given.push(extra_m2);
+            passes += f64::from(u8::from(last.replace(row.pass) != Some(row.pass)));
+        }
+    }
+    if given.is_empty() || calm.count < 1.0 {
+        return None;
+    }
+    given.sort_by(f64::total_cmp);
+    let given_m2 = given.iter().sum::<f64>() / given.len() as f64;
+    let found = (unusual.mean() - calm.mean()) / given_m2;
+    // Fixes of one pass may err alike, so what counts is how many independent ones there were; the
+    // geometry's own word stands beside.
+    let worth = (unusual.count * independent / rows.rows.len() as f64).max(passes);
+    let doubt = (calm.mean() / given_m2).powi(2) / worth;
+    let factor = (found * PRIOR_VARIANCE + doubt) / (PRIOR_VARIANCE + doubt);
+    Some((factor.clamp(0.01, 2.0), given[((given.len() - 1) as f64 * SHOWN) as usize]))
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct Sum {
+    sum: f64,
+    count: f64,
+}
+
+impl Sum {
+    fn add(&mut self, value: f64) {
+        self.sum += value;
+        self.count += 1.0;
+    }
+
+    fn mean(self) -> f64 {
+        self.sum / self.count
+    }
 }
 
 fn put(parts: &mut Parts, name: &str, value: f64) {
@@ -142,12 +222,7 @@ struct Places {
 }
 
 impl Places {
-    fn new(
-        coverage: &Coverage,
-        rows: &Rows,
-        doubt: Option<&Doubt>,
-        encode: &Encode<'_>,
-    ) -> Self {
+    fn new(coverage: &Coverage, rows: &Rows, doubt: Option<&Doubt>, encode: &Encode<'_>) -> Self {
         let of_row: Vec<usize> = rows.rows.iter().map(|row| coverage.nearest(&row.bounding_box)).collect();
         let mut counts = vec![0.0; coverage.centres.len()];
         of_row.iter().for_each(|at| counts[*at] += 1.0);

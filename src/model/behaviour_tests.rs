@@ -3,7 +3,8 @@
 use jiff::Timestamp;
 
 use super::tests::{options, silent, walk};
-use super::{Artifact, fit, homography};
+use super::train::LossWeights;
+use super::{Artifact, Trial, fit, fit_trial, homography};
 use crate::domain::{BoundingBox, Recipe, Sample, TargetId};
 use crate::geo::{EastNorth, LocalPlane};
 
@@ -90,4 +91,39 @@ fn rows_of_one_instant_still_fit() {
     }
     let artifact = fit(&samples, &options(Recipe::Auto), &mut silent).expect("fits");
     assert_eq!((artifact.metadata.targets, artifact.metadata.passes), (120, 120));
+}
+
+#[test]
+fn edges_that_do_not_go_together_raise_the_error_and_those_of_training_do_not() {
+    let samples = walk(24, 40, 2.0, 51);
+    let tests = walk(8, 40, 2.0, 52);
+    let artifact = fit(&samples, &options(Recipe::Projective), &mut silent).expect("fits");
+    let regressor = artifact.load().expect("loads");
+    let error_m2 = |drawn: &BoundingBox| regressor.regress(drawn, None).e_regression_m2;
+    let (mut as_seen, mut higher) = (Vec::new(), Vec::new());
+    for sample in &tests {
+        let [left, top, width, height] = sample.bounding_box.sides_px();
+        let taller = BoundingBox::new(left, top - 0.4 * height, width, 1.4 * height).expect("a box");
+        as_seen.push(error_m2(&sample.bounding_box));
+        higher.push(error_m2(&taller));
+    }
+    let raised = as_seen.iter().zip(&higher).filter(|(as_seen, higher)| higher > as_seen).count();
+    assert!(raised * 10 > 9 * tests.len(), "{raised} of {}", tests.len());
+    as_seen.sort_by(f64::total_cmp);
+    assert!(as_seen[tests.len() * 9 / 10] < 4.0 * as_seen[tests.len() / 2], "{as_seen:?}");
+}
+
+#[test]
+fn a_trial_fits_its_candidate_with_its_balance_or_says_that_there_is_none() {
+    let samples = walk(6, 40, 2.0, 61);
+    let own = LossWeights { reconstruction: 0.5, regression: 1.0 };
+    let trial = |candidate, balance| {
+        fit_trial(&samples, &options(Recipe::Auto), Trial { candidate, balance }, &mut silent)
+    };
+    let plain = trial(Some("hybrid"), None).expect("fits");
+    assert_eq!(plain.metadata.candidates.len(), 1);
+    assert_eq!(plain.weights, trial(Some("hybrid"), Some(own)).expect("fits").weights);
+    let other = LossWeights { reconstruction: 5.0, regression: 1.0 };
+    assert_ne!(plain.weights, trial(Some("hybrid"), Some(other)).expect("fits").weights);
+    assert!(trial(Some("nothing"), None).is_err());
 }

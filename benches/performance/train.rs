@@ -7,8 +7,11 @@ use std::time::Instant;
 
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
+use sightfix::domain::{GnssError, Recipe, SigmaM};
+use sightfix::model::FitOptions;
 use sightfix::model::net::{Activation, NetShape};
 use sightfix::model::train::{LossWeights, Schedule, TrainingSet, train};
+use sightfix::simulation::{Options, Scene, simulate};
 
 use crate::ratio::{self, in_turn, median};
 
@@ -17,6 +20,7 @@ const INPUTS: usize = 4;
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/peers/train_torch.py");
 
 pub(crate) fn run() {
+    whole();
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let set = Arc::new(training_set(&mut rng));
     let ours = || fit(&set);
@@ -30,6 +34,28 @@ pub(crate) fn run() {
             let mut rounds: Vec<f64> = (0..7).map(|_| ours()).collect();
             println!("ours: {:.3} s; set PEERS_PYTHON for the peer (benches/peers)", median(&mut rounds));
         }
+    }
+}
+
+/// A whole default run: every candidate, held-out blocks, the final fit.
+fn whole() {
+    println!("\n### The default recipe on 10,000 simulated rows, one thread\n");
+    println!("| scene | s (mark 20) | model bytes (mark 65536) |\n|---|---|---|");
+    for scene in Scene::ALL {
+        let options = Options { seed: 1001, camera_seed: 1001, ..Options::new(scene) };
+        let world = simulate(&options);
+        let samples = world.training_samples();
+        let fit_options = FitOptions {
+            recipe: Recipe::Auto,
+            seed: 1,
+            epochs: None,
+            image_size: Some(world.image_size),
+            gnss_error: GnssError::Known(SigmaM::new(options.gnss_sigma_m).expect("above 0")),
+        };
+        let began = Instant::now();
+        let artifact = sightfix::model::fit(&samples, &fit_options, &mut |_| ControlFlow::Continue(()))
+            .expect("a simulated world can be learnt");
+        println!("| {scene} | {:.2} | {} |", began.elapsed().as_secs_f64(), artifact.weights.len());
     }
 }
 

@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use super::runner::EvaluateOptions;
 use crate::domain::{EpochReport, GnssError, Method, Recipe, Sample};
 use crate::filters::{FixError, ImmUkf, ImmUkfOptions};
-use crate::fusion::track::{GnssNoise, ResidualAt, TrackSettings, estimate_gnss_noise};
+use crate::fusion::track::{GnssNoise, RegressionNoise, ResidualAt, TrackSettings, estimate_gnss_noise};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::model::{FitEvent, FitOptions, Regressor, fit};
 
@@ -13,6 +13,15 @@ use crate::model::{FitEvent, FitOptions, Regressor, fit};
 const PASS_HOLE_S: f64 = 10.0;
 /// Accelerations that the IMM-UKF is tuned over, m/s2.
 const ACCELERATIONS_MPS2: [f64; 7] = [0.03, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2];
+
+/// Time in which a track takes the model's own error for the same, s.
+const MODEL_STAYS_S: f64 = 86_400.0;
+/// The same for its place, in standard deviations of the training positions: most of what a map errs
+/// is the same shift or stretch all over the scene.
+const MODEL_REACHES: f64 = 3.0;
+
+/// Fewer samples do not tell how a receiver's error stays; then it is taken for a phone's.
+const FEWEST_FOR_COLOUR: usize = 200;
 
 /// Something learnt, or why it could not be, with what it cost.
 pub(super) struct Learnt<T> {
@@ -127,6 +136,7 @@ pub(super) fn tune_imm_ukf(passes: &[Pass], variance_m2: f64) -> ImmUkfOptions {
 pub(super) fn track_settings(train: &[Sample], regressor: &Regressor, variance_m2: f64) -> TrackSettings {
     let plane = regressor.plane();
     let mut squares_m2 = Vec::new();
+    let mut points = Vec::new();
     let residuals: Vec<Vec<ResidualAt>> = by_pass(train)
         .into_iter()
         .map(|pass| {
@@ -134,6 +144,7 @@ pub(super) fn track_settings(train: &[Sample], regressor: &Regressor, variance_m
                 .map(|sample| {
                     let fix = plane.to_plane(sample.fix.position);
                     let regression = regressor.regress(&sample.bounding_box, Some(fix));
+                    points.push(regression.regressed);
                     squares_m2.push(regression.e_regression_m2);
                     let EastNorth { east_m, north_m } = regression.regressed;
                     let difference =
@@ -143,11 +154,32 @@ pub(super) fn track_settings(train: &[Sample], regressor: &Regressor, variance_m
                 .collect()
         })
         .collect();
-    let settings = TrackSettings::default();
+    let settings = TrackSettings {
+        regression: RegressionNoise {
+            white_share: regressor.unrest_share(),
+            // What the model has learnt wrongly it does not unlearn while a target stands.
+            time_constant_s: MODEL_STAYS_S,
+            length_m: MODEL_REACHES * spread_m(&points),
+            ..RegressionNoise::default()
+        },
+        ..TrackSettings::default()
+    };
     let e_regression_m2 = squares_m2.iter().sum::<f64>() / squares_m2.len().max(1) as f64;
+    if train.len() < FEWEST_FOR_COLOUR {
+        return settings;
+    }
     let gnss = estimate_gnss_noise(&residuals, e_regression_m2, &settings.regression)
         .map_or_else(|| split(train, plane, variance_m2), |estimate| estimate.noise);
     TrackSettings { gnss, ..settings }
+}
+
+/// Standard deviation per axis of positions, at least 1 m.
+fn spread_m(points: &[EastNorth]) -> f64 {
+    let count = points.len().max(1) as f64;
+    let mean = |of: fn(&EastNorth) -> f64| points.iter().map(of).sum::<f64>() / count;
+    let middle = EastNorth { east_m: mean(|point| point.east_m), north_m: mean(|point| point.north_m) };
+    let square_m2 = points.iter().map(|point| point.distance_m(middle).powi(2)).sum::<f64>() / (2.0 * count);
+    square_m2.sqrt().max(1.0)
 }
 
 /// The same from the fixes alone, where residuals are too few.

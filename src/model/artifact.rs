@@ -7,8 +7,10 @@ use std::collections::BTreeMap;
 
 use bytes::Bytes;
 
+use super::cells::{Cells, NUMBERS};
 use super::coverage::{Coverage, DIMENSIONS, MOST_CENTRES};
 use super::net::{Net, NetShape};
+use super::projective::Doubt;
 use super::regressor::Regressor;
 use super::tensors::Tensors;
 use crate::domain::{Error, FeatureScale, ModelMetadata, Recipe, Result};
@@ -48,6 +50,7 @@ impl Artifact {
             e_gnss_m2: positive("e_gnss_m2", metadata.e_gnss_m2)?,
             parameters: metadata.parameters.clone(),
             tensors: Tensors::from_bytes(&self.weights)?,
+            doubt: None,
         };
         Regressor::build(parts)
     }
@@ -71,6 +74,8 @@ pub(super) struct Parts {
     pub(super) e_gnss_m2: f64,
     pub(super) parameters: BTreeMap<String, f64>,
     pub(super) tensors: Tensors,
+    /// What the fixes leave open in a geometric map; only beside a fit, never stored.
+    pub(super) doubt: Option<Doubt>,
 }
 
 impl Parts {
@@ -118,6 +123,19 @@ impl Parts {
         self.tensors.put_f32("coverage.errors_m2", &[coverage.centres.len()], coverage.errors_m2.clone());
         self.tensors.put_f32("coverage.units", &[DIMENSIONS], coverage.units.to_vec());
         self.tensors.put_f32("coverage.radius", &[1], vec![coverage.radius]);
+    }
+
+    pub(super) fn put_cells(&mut self, cells: &Cells) {
+        let numbers = cells.numbers();
+        self.tensors.put_f32("cells", &[numbers.len() / NUMBERS, NUMBERS], numbers);
+    }
+
+    /// Cells; none in models of before there were any.
+    pub(super) fn take_cells(&mut self, coverage: &Coverage) -> Result<Cells> {
+        match self.tensors.rows("cells") {
+            None => Ok(Cells::default()),
+            Some(count) => Cells::from_numbers(coverage, &self.tensors.take_f32("cells", &[count, NUMBERS])?),
+        }
     }
 
     pub(super) fn take_coverage(&mut self) -> Result<Coverage> {

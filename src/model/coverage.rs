@@ -6,6 +6,11 @@ use crate::domain::BoundingBox;
 
 /// Representative boxes at most; each costs some nanoseconds in every answer.
 pub(super) const MOST_CENTRES: usize = 64;
+/// From so many boxes on, centres with so few of them hold wild boxes, as long as those are no more
+/// than one in so many of all.
+const PLENTY: usize = 20 * MOST_CENTRES;
+const ALONE: usize = 2;
+const MOST_WILD: usize = 20;
 /// Numbers per centre.
 pub(super) const DIMENSIONS: usize = 4;
 
@@ -23,9 +28,33 @@ pub(super) struct Coverage {
 }
 
 impl Coverage {
-    /// Picks the centres by always taking the box farthest from those picked.
-    pub(super) fn new(boxes: impl Iterator<Item = BoundingBox> + Clone) -> Self {
-        let raw: Vec<[f32; DIMENSIONS]> = boxes.map(coordinates).collect();
+    /// Picks the centres by always taking the box farthest from those picked. Where there are
+    /// plenty of boxes, those that stand alone are wild ones and are left out.
+    pub(super) fn new(boxes: impl Iterator<Item = BoundingBox>) -> Self {
+        let mut raw: Vec<[f32; DIMENSIONS]> = boxes.map(coordinates).collect();
+        let mut coverage = Self::of_points(&raw);
+        let most_wild = raw.len() / MOST_WILD;
+        let mut wild = 0;
+        while raw.len() >= PLENTY {
+            let point = |raw: &[f32; DIMENSIONS]| -> [f32; DIMENSIONS] {
+                std::array::from_fn(|axis| raw[axis] / coverage.units[axis])
+            };
+            let of_row: Vec<usize> = raw.iter().map(|raw| coverage.nearest_to(&point(raw))).collect();
+            let mut counts = vec![0; coverage.centres.len()];
+            of_row.iter().for_each(|at| counts[*at] += 1);
+            let alone: usize = counts.iter().filter(|count| **count <= ALONE).sum();
+            wild += alone;
+            if alone == 0 || wild > most_wild {
+                break;
+            }
+            let mut of_row = of_row.iter();
+            raw.retain(|_| of_row.next().is_some_and(|at| counts[*at] > ALONE));
+            coverage = Self::of_points(&raw);
+        }
+        coverage
+    }
+
+    fn of_points(raw: &[[f32; DIMENSIONS]]) -> Self {
         let units = std::array::from_fn(|axis| {
             let deviation = super::rows::spread(raw.iter().map(|point| f64::from(point[axis])));
             // Sizes that hardly vary must not make a pixel's jitter look far away.
@@ -63,20 +92,25 @@ impl Coverage {
         coarse
     }
 
-    /// The boxes at the centres.
-    pub(super) fn boxes(&self) -> impl Iterator<Item = BoundingBox> + '_ {
-        self.centres.iter().filter_map(|centre| {
-            let [foot_x, foot_y, width, height]: [f64; DIMENSIONS] =
-                std::array::from_fn(|axis| f64::from(centre[axis] * self.units[axis]));
-            let (width, height) = (width.exp(), height.exp());
-            BoundingBox::new(foot_x - 0.5 * width, foot_y - height, width, height).ok()
-        })
+    fn box_at(&self, centre: &[f32; DIMENSIONS]) -> Option<BoundingBox> {
+        let [foot_x, foot_y, width, height]: [f64; DIMENSIONS] =
+            std::array::from_fn(|axis| f64::from(centre[axis] * self.units[axis]));
+        let (width, height) = (width.exp(), height.exp());
+        BoundingBox::new(foot_x - 0.5 * width, foot_y - height, width, height).ok()
+    }
+
+    /// The boxes at all centres, in their order; `None` where a centre is none.
+    pub(super) fn boxes(&self) -> impl Iterator<Item = Option<BoundingBox>> + '_ {
+        self.centres.iter().map(|centre| self.box_at(centre))
     }
 
     /// Index of the nearest centre.
     pub(super) fn nearest(&self, bounding_box: &BoundingBox) -> usize {
-        let point = self.point(bounding_box);
-        let distances = self.centres.iter().map(|centre| squared(centre, &point)).enumerate();
+        self.nearest_to(&self.point(bounding_box))
+    }
+
+    fn nearest_to(&self, point: &[f32; DIMENSIONS]) -> usize {
+        let distances = self.centres.iter().map(|centre| squared(centre, point)).enumerate();
         distances.min_by(|one, other| one.1.total_cmp(&other.1)).map_or(0, |(at, _)| at)
     }
 
@@ -130,19 +164,21 @@ pub(super) struct CoverageTable {
 
 impl CoverageTable {
     /// Distance to the nearest centre in radii (up to 1 among the training boxes), and the error
-    /// variance there, blended between centres by the inverse fourth power of their distance, m2.
+    /// variance there, blended between centres by the inverse fourth power of their distance, m2;
+    /// then the index of that centre.
     #[expect(
         clippy::needless_range_loop,
         reason = "in this form the compiler makes vectors of the lanes, with iterators it does not (4 times slower)"
     )]
     #[inline]
-    pub(super) fn look_up(&self, bounding_box: &BoundingBox) -> (f64, f64) {
+    pub(super) fn look_up(&self, bounding_box: &BoundingBox) -> (f64, f64, usize) {
         let raw = coordinates(*bounding_box);
         // A few percent of a radius, squared, so that a box upon a centre has a finite weight.
         let soft = 1e-3 * self.radius * self.radius;
         let (mut least, mut sums, mut weights) = ([f32::INFINITY; LANES], [0.0f32; LANES], [0.0f32; LANES]);
         let point: [f32; DIMENSIONS] = std::array::from_fn(|axis| raw[axis] / self.units[axis]);
-        for group in &self.groups {
+        let mut nearest = [0u32; LANES];
+        for (at, group) in (0u32..).zip(&self.groups) {
             for lane in 0..LANES {
                 let mut distance = 0.0;
                 for axis in 0..DIMENSIONS {
@@ -150,16 +186,21 @@ impl CoverageTable {
                     distance += miss * miss;
                 }
                 let near = 1.0 / (distance + soft);
+                nearest[lane] = if distance < least[lane] { at } else { nearest[lane] };
                 least[lane] = if distance < least[lane] { distance } else { least[lane] };
                 sums[lane] += near * near * group.errors_m2[lane];
                 weights[lane] += near * near;
             }
         }
-        let least = least.iter().fold(f32::INFINITY, |least, lane| least.min(*lane));
+        let mut lane = 0;
+        for other in 1..LANES {
+            lane = if least[other] < least[lane] { other } else { lane };
+        }
+        let (least, nearest) = (least[lane], nearest[lane] as usize * LANES + lane);
         let weight: f32 = weights.iter().sum();
         // Far away all weights vanish in f32; the factor on the distance rules there anyway.
         let error_m2 = if weight > 1e-30 { sums.iter().sum::<f32>() / weight } else { self.worst_m2 };
-        (f64::from(least.sqrt() / self.radius), f64::from(error_m2))
+        (f64::from(least.sqrt() / self.radius), f64::from(error_m2), nearest)
     }
 
     /// Pixels of the foot point that make one radius.

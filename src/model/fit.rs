@@ -10,11 +10,12 @@ use rand_chacha::ChaCha8Rng;
 
 use super::artifact::{Artifact, FORMAT, Parts};
 use super::projection::{self, Form};
+use super::projective::Doubt;
 use super::regressor::{R95_PER_SIGMA, Regressor};
 use super::rows::{Rows, hash_of};
 use super::run::{Phase, Run};
 use super::select::{self, BLOCKS, Candidate, Common, Way};
-use super::train::TrainError;
+use super::train::{LossWeights, TrainError};
 use super::uncertainty;
 use super::whitening::FixNoise;
 use crate::domain::{
@@ -86,11 +87,42 @@ pub fn fit(
     options: &FitOptions,
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
+    fit_trial(samples, options, Trial::default(), observer)
+}
+
+/// What a trial changes about a fit. Evaluations ask for it; no operator can.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Trial<'a> {
+    /// Only this one of the recipe's candidates, by the name that its report has.
+    pub candidate: Option<&'a str>,
+    /// Weights of the loss in place of the recipe's own.
+    pub balance: Option<LossWeights>,
+}
+
+/// The same with something changed.
+///
+/// # Errors
+/// As [`fit`], and where the recipe has no such candidate.
+pub fn fit_trial(
+    samples: &[Sample],
+    options: &FitOptions,
+    trial: Trial<'_>,
+    observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
+) -> Result<Artifact, FitError> {
     let rows = Rows::new(samples)?;
-    let noise = noise_of(&rows, options.seed);
+    let about = about_geometry(&rows);
+    let noise = about.noise;
     let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &noise);
-    let common = Common { e_gnss_m2, noise, epochs: options.epochs, seed: options.seed };
-    let candidates = select::candidates(options.recipe);
+    let common =
+        Common { e_gnss_m2, noise, epochs: options.epochs, seed: options.seed, balance: trial.balance };
+    let candidates: Vec<&Candidate> = select::candidates(options.recipe)
+        .iter()
+        .filter(|candidate| trial.candidate.is_none_or(|only| only == candidate.name))
+        .collect();
+    if candidates.is_empty() {
+        let message = format!("must be one of the candidates of {}", options.recipe);
+        return Err(FitError::Fault(Error::invalid("candidate", message).into()));
+    }
     let most = candidates.iter().map(|candidate| candidate.all_epochs(&common)).max().unwrap_or(1);
     let held_out = candidates.iter().map(|candidate| BLOCKS * candidate.all_epochs(&common)).sum::<u32>();
     let mut run =
@@ -100,21 +132,22 @@ pub fn fit(
     let blocks = rows.blocks(BLOCKS);
     let mut residuals = Vec::with_capacity(candidates.len());
     let mut reports = Vec::with_capacity(candidates.len());
-    for candidate in candidates {
+    for candidate in &candidates {
         let (misses, claims) = candidate.held_out(&rows, &blocks, &common, &mut run)?;
         let report = held_out_error(&misses, &claims, e_gnss_m2);
         run.note(&format!("{}: {:.3} m from the held-out fixes", candidate.name, report.mean_to_fix_m))?;
         reports.push(CandidateReport { candidate: candidate.name.to_owned(), held_out: report });
         residuals.push(misses);
     }
-    let kept = select::choose(&rows, &residuals);
-    tell_choice(&reports, kept, &mut run)?;
+    let (kept, scores) = select::choose(&rows, &residuals);
+    tell_choice(&candidates, kept, &scores, &mut run)?;
 
-    let candidate = candidates[kept];
+    let candidate = *candidates[kept];
     // The final fit may be shorter than the longest candidate's.
     run.progress.epochs = held_out + candidate.all_epochs(&common);
     let rng = ChaCha8Rng::seed_from_u64(options.seed);
-    let mut phase = Phase { run: &mut run, name: "final fit".to_owned(), rng, is_final: true };
+    let mut phase =
+        Phase { run: &mut run, name: "final fit".to_owned(), rng, is_final: true, balance: common.balance };
     let mut parts = candidate.fit(&rows, &common, &mut phase)?;
     if let Some(size) = options.image_size {
         parts.parameters.insert("image_width_px".to_owned(), f64::from(size.width_px()));
@@ -122,6 +155,8 @@ pub fn fit(
     }
     let mut held_out = reports[kept].held_out.clone();
     if candidate.way != Way::Paper {
+        // A network leaves open at least what a geometry does.
+        parts.doubt.get_or_insert_with(|| Doubt::of_geometry(about.doubt));
         let calibration = uncertainty::calibrate(&mut parts, &rows, &residuals[kept], &noise)?;
         held_out.e_regression_m2 = calibration.error_m2;
         if e_gnss_source == GnssErrorSource::Estimated {
@@ -140,10 +175,11 @@ pub fn fit(
     artifact_of(parts, &rows, samples, &summary, held_out, reports)
 }
 
-/// The error of the fixes about the richest geometry: coloured or white, and how large.
-fn noise_of(rows: &Rows, seed: u64) -> FixNoise {
+/// The richest geometry, for the error of the fixes about it (coloured or white, and how large) and
+/// for what they leave open.
+fn about_geometry(rows: &Rows) -> projection::Fitted {
     let form = Form { sides: true, extra_sigma: 1.0 };
-    projection::fit(&rows.rows, form, &[], &mut ChaCha8Rng::seed_from_u64(seed)).noise
+    projection::fit(&rows.rows, form, &[], &mut projection::same_starts())
 }
 
 fn receiver_variance(rows: &Rows, known: GnssError, noise: &FixNoise) -> (f64, GnssErrorSource) {
@@ -175,17 +211,25 @@ fn tell_samples(rows: &Rows, common: &Common, run: &mut Run<'_>) -> Result<(), F
     ))
 }
 
-fn tell_choice(reports: &[CandidateReport], kept: usize, run: &mut Run<'_>) -> Result<(), FitError> {
-    let (first, own) = (&reports[0], &reports[kept]);
-    if reports.len() == 1 {
+fn tell_choice(
+    candidates: &[&Candidate],
+    kept: usize,
+    scores: &[f64],
+    run: &mut Run<'_>,
+) -> Result<(), FitError> {
+    if candidates.len() == 1 {
         return Ok(());
     }
-    let gain = 1.0 - own.held_out.error_to_fix_m2 / first.held_out.error_to_fix_m2;
+    let gain = |other: usize| 100.0 * (1.0 - scores[kept] / scores[other]);
+    let richest = candidates.len() - 1;
     run.note(&format!(
-        "kept {}: its mean square to the held-out fixes is {:.1} % below that of {}",
-        own.candidate,
-        100.0 * gain,
-        first.candidate
+        "kept {}: its mean squared miss to the held-out fixes, wild ones bounded, is {:.1} % below that of \
+         {} and {:.1} % below that of {}",
+        candidates[kept].name,
+        gain(0),
+        candidates[0].name,
+        gain(richest),
+        candidates[richest].name
     ))
 }
 

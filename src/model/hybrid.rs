@@ -92,6 +92,7 @@ pub(super) fn fit(
         .map(|(name, value)| (name.to_owned(), value))
         .into(),
         tensors: Tensors::default(),
+        doubt: None,
     };
     parts.put_net("", &shape(), &parameters);
     Ok(parts)

@@ -2,7 +2,8 @@
 //!
 //! Samples stand beside each other in lanes, units in rows, so that every inner loop runs over
 //! whole vectors; a tile of [`LANES`] samples stays in the first cache through all layers.
-//! What never happens here: allocation per batch, threads, a step of the optimiser.
+//! What never happens here: allocation per batch, threads, a step of the optimiser; and no closure around
+//! a vector operation, since closures are compiled for the plain processor and then called one by one.
 
 use pulp::{Simd, WithSimd};
 
@@ -163,10 +164,16 @@ impl BatchLoss<'_> {
             return;
         }
         match self.shape.activation() {
-            Activation::Tanh => output.iter_mut().for_each(|unit| *unit = tanh_of(simd, *unit)),
+            Activation::Tanh => {
+                for unit in output {
+                    *unit = tanh_of(simd, *unit);
+                }
+            }
             Activation::Relu => {
                 let zero = simd.splat_f32s(0.0);
-                output.iter_mut().for_each(|unit| *unit = simd.max_f32s(*unit, zero));
+                for unit in output {
+                    *unit = simd.max_f32s(*unit, zero);
+                }
             }
         }
     }
@@ -240,20 +247,24 @@ impl BatchLoss<'_> {
             sums_of_rows::<S, 1>(simd, weights, (1, layer.inputs), None, delta, below, first);
         }
         if let Some(kept) = kept {
-            below.iter_mut().zip(kept).for_each(|(sum, own)| *sum = simd.add_f32s(*sum, own));
+            for (sum, own) in below.iter_mut().zip(kept) {
+                *sum = simd.add_f32s(*sum, own);
+            }
             return;
         }
         let one = simd.splat_f32s(1.0);
         match self.shape.activation() {
-            Activation::Tanh => below.iter_mut().zip(input).for_each(|(delta, unit)| {
-                *delta = simd.mul_f32s(*delta, simd.sub_f32s(one, simd.mul_f32s(*unit, *unit)));
-            }),
+            Activation::Tanh => {
+                for (delta, unit) in below.iter_mut().zip(input) {
+                    *delta = simd.mul_f32s(*delta, simd.sub_f32s(one, simd.mul_f32s(*unit, *unit)));
+                }
+            }
             Activation::Relu => {
                 let zero = simd.splat_f32s(0.0);
-                below.iter_mut().zip(input).for_each(|(delta, unit)| {
+                for (delta, unit) in below.iter_mut().zip(input) {
                     let on = simd.greater_than_f32s(*unit, zero);
                     *delta = simd.select_f32s(on, *delta, zero);
-                });
+                }
             }
         }
     }
@@ -272,8 +283,12 @@ fn sums_of_rows<S: Simd, const ROWS: usize>(
     first: usize,
 ) {
     let vectors = LANES / S::F32_LANES;
-    let start: [S::f32s; ROWS] =
-        std::array::from_fn(|row| simd.splat_f32s(biases.map_or(0.0, |biases| biases[first + row])));
+    let mut start = [simd.splat_f32s(0.0); ROWS];
+    if let Some(biases) = biases {
+        for (value, bias) in start.iter_mut().zip(&biases[first..first + ROWS]) {
+            *value = simd.splat_f32s(*bias);
+        }
+    }
     for from in (0..vectors).step_by(WIDE) {
         let mut sums = [[simd.splat_f32s(0.0); WIDE]; ROWS];
         for (row, value) in sums.iter_mut().zip(start) {
@@ -327,7 +342,10 @@ fn gradient_of_rows<S: Simd, const ROWS: usize>(
     let rows: [&[S::f32s]; ROWS] =
         std::array::from_fn(|row| &delta[(first + row) * vectors..(first + row + 1) * vectors]);
     for (row, lanes) in rows.iter().enumerate() {
-        let sum = lanes.iter().fold(zero, |sum, lane| simd.add_f32s(sum, *lane));
+        let mut sum = zero;
+        for lane in *lanes {
+            sum = simd.add_f32s(sum, *lane);
+        }
         gradient[layer.biases + first + row] += simd.reduce_sum_f32s(sum);
     }
     let mut column = 0;

@@ -5,6 +5,7 @@
 //! threads of its own.
 
 mod artifact;
+mod cells;
 mod coverage;
 pub mod dnn;
 mod file;
@@ -26,10 +27,13 @@ mod uncertainty;
 mod whitening;
 
 pub use artifact::{Artifact, FORMAT};
-pub use fit::{FitError, FitEvent, FitOptions, fit};
+pub use fit::{FitError, FitEvent, FitOptions, Trial, fit, fit_trial};
 pub use regressor::{FixSpread, R95_PER_SIGMA, Regression, Regressor};
 pub use rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use tensors::LARGEST_WEIGHTS_BYTES;
 
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod behaviour_tests;

@@ -55,6 +55,7 @@ pub(super) fn fit(
         e_gnss_m2,
         parameters: [("r95_scale".to_owned(), R95_PER_SIGMA)].into(),
         tensors: Tensors::default(),
+        doubt: None,
     };
     let schedule = Schedule { epochs, batch: BATCH, learning_rate: 0.005, last_rate_share: 1.0 };
     for (prefix, inputs) in [("joint.", 6), ("denied.", 4)] {

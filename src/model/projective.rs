@@ -14,7 +14,7 @@ use super::FitError;
 use super::artifact::Parts;
 use super::hybrid::batch_of;
 use super::net::{Activation, Net, NetShape};
-use super::projection::{self, COEFFICIENTS, Form, Projection, SIDES, sides_of};
+use super::projection::{self, COEFFICIENTS, Form, MapDoubt, Projection, SIDES, same_starts, sides_of};
 use super::rows::{Row, Rows};
 use super::run::Phase;
 use super::tensors::Tensors;
@@ -33,6 +33,8 @@ pub(super) const FEATURES: [&str; 4] = ["foot_x_px", "foot_y_px", "width_px", "h
 /// Numbers of the reverse camera: 3 per side, and 2 of the common denominator.
 const REVERSE: usize = 3 * SIDES + 2;
 const LEAST_DENOMINATOR: f64 = 0.02;
+/// Stands for no bound on answers, in units of position.
+const UNBOUNDED: f64 = 1e9;
 
 /// What of the recipe is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,7 +58,7 @@ pub(super) fn fit(
     phase: &mut Phase<'_, '_>,
 ) -> Result<Parts, FitError> {
     let form = Form { sides: variant.sides, extra_sigma: RESIDUAL_SIGMA };
-    let mut fitted = projection::fit(&rows.rows, form, &[], &mut phase.rng);
+    let mut fitted = projection::fit(&rows.rows, form, &[], &mut same_starts());
     let mut parts = Parts {
         recipe: Recipe::Projective,
         plane: rows.plane,
@@ -71,6 +73,7 @@ pub(super) fn fit(
         .map(|(name, value)| (name.to_owned(), value))
         .into(),
         tensors: Tensors::default(),
+        doubt: None,
     };
     let mut net = None;
     if variant.residual {
@@ -78,7 +81,7 @@ pub(super) fn fit(
         let layer = shape().layer(0);
         let trained = Net::new(shape(), &parameters);
         let columns = hidden_columns(&trained, &inputs);
-        fitted = projection::fit(&rows.rows, form, &columns, &mut phase.rng);
+        fitted = projection::fit(&rows.rows, form, &columns, &mut same_starts());
         parts.tensors.put_f32("residual.0.weight", &[HIDDEN, SIDES], parameters[..layer.biases].to_vec());
         let biases = parameters[layer.biases..layer.biases + HIDDEN].to_vec();
         parts.tensors.put_f32("residual.0.bias", &[HIDDEN], biases);
@@ -88,12 +91,53 @@ pub(super) fn fit(
     }
     let coefficients = fitted.projection.coefficients.to_vec();
     parts.tensors.put_f64("projection", &[COEFFICIENTS], coefficients);
+    let bounds = bounds_of(&fitted.projection, &rows.rows);
+    parts.tensors.put_f64("bounds", &[2, 2], bounds.into_iter().flatten().collect());
     let encoder = Encoder {
+        bounds,
         residual: net.map(|net| Residual { net, weights: fitted.extra.clone() }),
         projection: fitted.projection,
     };
+    let net = encoder.residual.as_ref().map(|residual| residual.net.clone());
+    parts.doubt = Some(Doubt { map: fitted.doubt, net });
     parts.tensors.put_f64("reverse", &[REVERSE], reverse_of(&encoder, &rows.rows).to_vec());
     Ok(parts)
+}
+
+/// Least and greatest position per axis that an answer may have, in units: the fixes' own range but
+/// for the wildest, and as much again on either side. A wild box near the horizon ends there.
+fn bounds_of(projection: &Projection, rows: &[Row]) -> [[f64; 2]; 2] {
+    std::array::from_fn(|axis| {
+        let mut values: Vec<f64> = rows.iter().map(|row| projection.in_units(row.label)[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        let wild = values.len() / 100;
+        let (low, high) = (values[wild], values[values.len() - 1 - wild]);
+        let range = (high - low).max(1.0);
+        [low - range, high + range]
+    })
+}
+
+/// What the fixes leave open in a fitted encoder.
+#[derive(Debug, Clone)]
+pub(super) struct Doubt {
+    map: MapDoubt,
+    net: Option<Net>,
+}
+
+impl Doubt {
+    /// That of a geometry without a network.
+    pub(super) const fn of_geometry(map: MapDoubt) -> Self {
+        Self { map, net: None }
+    }
+
+    /// Error variance per axis at a box that the noise of the fixes has left, m2.
+    pub(super) fn variance_m2(&self, bounding_box: &BoundingBox) -> f64 {
+        let Some(net) = &self.net else {
+            return self.map.variance_m2(bounding_box, &[]);
+        };
+        let hidden: [f32; HIDDEN] = net.first_hidden(&scaled(self.map.projection(), bounding_box));
+        self.map.variance_m2(bounding_box, &hidden.map(f64::from))
+    }
 }
 
 fn features_of(projection: &Projection) -> Vec<FeatureScale> {
@@ -211,20 +255,21 @@ struct Residual {
 #[derive(Debug, Clone)]
 struct Encoder {
     projection: Projection,
+    bounds: [[f64; 2]; 2],
     residual: Option<Residual>,
 }
 
 impl Encoder {
     #[inline]
     fn regress(&self, bounding_box: &BoundingBox) -> EastNorth {
-        let Some(residual) = &self.residual else {
-            return self.projection.project(bounding_box, [0.0; 2]);
-        };
-        let hidden: [f32; HIDDEN] = residual.net.first_hidden(&scaled(&self.projection, bounding_box));
-        let extra = std::array::from_fn(|axis: usize| {
-            residual.weights[axis].iter().zip(&hidden).map(|(weight, unit)| weight * f64::from(*unit)).sum()
+        let extra = self.residual.as_ref().map_or([0.0; 2], |residual| {
+            let hidden: [f32; HIDDEN] = residual.net.first_hidden(&scaled(&self.projection, bounding_box));
+            std::array::from_fn(|axis: usize| {
+                let terms = residual.weights[axis].iter().zip(&hidden);
+                terms.map(|(weight, unit)| weight * f64::from(*unit)).sum()
+            })
         });
-        self.projection.project(bounding_box, extra)
+        self.projection.project_within(bounding_box, extra, &self.bounds)
     }
 }
 
@@ -261,8 +306,21 @@ impl ProjectiveRegressor {
         } else {
             None
         };
+        // Models of before answers were bounded have none.
+        let bounds = if parts.tensors.holds("bounds") {
+            parts.tensors.take_f64("bounds", &[2, 2])?
+        } else {
+            vec![-UNBOUNDED, UNBOUNDED, -UNBOUNDED, UNBOUNDED]
+        };
+        let bounds = [[bounds[0], bounds[1]], [bounds[2], bounds[3]]];
+        if bounds.iter().any(|[low, high]| low > high) {
+            return Err(Error::invalid("weights", "bounds must have the least before the greatest"));
+        }
         let reverse = parts.tensors.take_f64("reverse", &[REVERSE])?;
-        Ok(Self { encoder: Encoder { projection, residual }, reverse: std::array::from_fn(|at| reverse[at]) })
+        Ok(Self {
+            encoder: Encoder { projection, bounds, residual },
+            reverse: std::array::from_fn(|at| reverse[at]),
+        })
     }
 
     /// Position, and the sides (foot x, foot y, width, height, px) that belong to it.

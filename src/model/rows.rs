@@ -129,7 +129,23 @@ impl Rows {
                 times[at]
             })
             .collect();
-        self.rows.iter().map(|row| cuts.iter().filter(|cut| row.time_s >= **cut).count() as u32).collect()
+        let blocks: Vec<u32> = self
+            .rows
+            .iter()
+            .map(|row| cuts.iter().filter(|cut| row.time_s >= **cut).count() as u32)
+            .collect();
+        let least = (0..count).map(|block| blocks.iter().filter(|of| **of == block).count()).min();
+        if least.unwrap_or(0) * 4 >= share {
+            return blocks;
+        }
+        // Too many rows at one instant to cut by time: by rank then.
+        let mut order: Vec<usize> = (0..self.rows.len()).collect();
+        order.sort_by(|one, other| self.rows[*one].time_s.total_cmp(&self.rows[*other].time_s));
+        let mut blocks = vec![0; self.rows.len()];
+        for (rank, at) in order.into_iter().enumerate() {
+            blocks[at] = (rank * count as usize / self.rows.len()) as u32;
+        }
+        blocks
     }
 
     /// Some of the rows, in the same plane.
@@ -203,6 +219,36 @@ pub(super) fn median(mut values: Vec<f64>) -> f64 {
     }
     let middle = values.len() / 2;
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// Smallest share of second differences, by size, that steady motion explains; and what share of
+/// the mean of exponential squares the smallest so many hold.
+const STEADY: f64 = 0.97;
+const STEADY_SHARE: f64 = 0.89;
+
+/// Squared second differences, m2, of positions of rows that follow each other evenly within a pass,
+/// with the row in the middle. White noise of a variance per axis makes 12 times that.
+pub(super) fn second_differences<'a>(
+    rows: &'a [Row],
+    points: &'a [EastNorth],
+) -> impl Iterator<Item = (usize, f64)> + 'a {
+    (1..rows.len().saturating_sub(1)).filter_map(|at| {
+        let (first, middle, last) = (&rows[at - 1], &rows[at], &rows[at + 1]);
+        let (first_s, second_s) = (middle.time_s - first.time_s, last.time_s - middle.time_s);
+        let even = first_s > 0.0 && first_s < 2.5 && (first_s - second_s).abs() < 0.1 * first_s;
+        let jump =
+            |of: fn(&EastNorth) -> f64| of(&points[at + 1]) - 2.0 * of(&points[at]) + of(&points[at - 1]);
+        let square_m2 = jump(|point| point.east_m).powi(2) + jump(|point| point.north_m).powi(2);
+        (even && first.pass == last.pass).then_some((at, square_m2))
+    })
+}
+
+/// Mean of squares without the largest few, which are halts, turns and wild boxes; `None` of none.
+pub(super) fn steady_mean(mut squares: Vec<f64>) -> Option<f64> {
+    squares.sort_by(f64::total_cmp);
+    squares.truncate((squares.len() as f64 * STEADY).ceil() as usize);
+    let count = squares.len() as f64;
+    (count > 0.0).then(|| squares.iter().sum::<f64>() / (count * STEADY_SHARE))
 }
 
 /// The plane about the median fix; medians are taken in a first plane, so that the antimeridian

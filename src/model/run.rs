@@ -41,6 +41,8 @@ pub(super) struct Phase<'r, 'a> {
     pub(super) rng: ChaCha8Rng,
     /// Whether its epochs are those of the run's curve.
     pub(super) is_final: bool,
+    /// Weights of the loss in place of the recipe's own.
+    pub(super) balance: Option<LossWeights>,
 }
 
 impl Phase<'_, '_> {
@@ -54,7 +56,8 @@ impl Phase<'_, '_> {
         weights: LossWeights,
         schedule: Schedule,
     ) -> Result<(Vec<f32>, LossSums), FitError> {
-        let Self { run, name, rng, is_final } = self;
+        let Self { run, name, rng, is_final, balance } = self;
+        let weights = balance.unwrap_or(weights);
         run.progress.phase = format!("{name} {}", part.trim_end_matches('.')).trim().to_owned();
         // The curve shows the network that answers when there is a fix.
         let curve = *is_final && part != "denied.";

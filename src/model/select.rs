@@ -13,6 +13,7 @@ use super::projective::Variant;
 use super::regressor::Regressor;
 use super::rows::{Rows, median};
 use super::run::{Phase, Run};
+use super::train::LossWeights;
 use super::whitening::FixNoise;
 use super::{FitError, hybrid, paper, projective, uncertainty};
 use crate::domain::Recipe;
@@ -71,6 +72,8 @@ pub(super) struct Common {
     /// Passes over the samples, if the run says so.
     pub(super) epochs: Option<u32>,
     pub(super) seed: u64,
+    /// Weights of the loss in place of the recipe's own.
+    pub(super) balance: Option<LossWeights>,
 }
 
 impl Candidate {
@@ -139,7 +142,11 @@ impl Candidate {
             let mut rng = ChaCha8Rng::seed_from_u64(common.seed);
             rng.set_stream(u64::from(block) + 1);
             let name = format!("{}: held-out block {} of {BLOCKS}", self.name, block + 1);
-            let parts = self.fit(&train, common, &mut Phase { run, name, rng, is_final: false })?;
+            let parts = self.fit(
+                &train,
+                common,
+                &mut Phase { run, name, rng, is_final: false, balance: common.balance },
+            )?;
             let regressor = Regressor::build(parts).map_err(|error| FitError::Fault(error.into()))?;
             for (at, row) in rows.rows.iter().enumerate().filter(|(at, _)| blocks[*at] == block) {
                 let fix = regressor.plane().to_plane(row.position);
@@ -154,10 +161,11 @@ impl Candidate {
     }
 }
 
-/// Index of the candidate to keep, from the residuals of each: the simplest one, unless a richer
+/// The candidate to keep and the score of each, in m2: its mean squared miss per axis, where wild
+/// misses count no more than a bound. That is the simplest one, unless a richer
 /// one's misses are smaller by more than the standard error of that difference.
-pub(super) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> usize {
-    let Some(first) = residuals.first() else { return 0 };
+pub(super) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> (usize, Vec<f64>) {
+    let Some(first) = residuals.first() else { return (0, Vec::new()) };
     let square = |[east, north]: &[f64; 2]| 0.5 * (east * east + north * north);
     // A fix that is far off says nothing of the candidates.
     let bound_m2 = 10.0 * median(first.iter().map(square).collect());
@@ -181,5 +189,9 @@ pub(super) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> usize {
             kept = at;
         }
     }
-    kept
+    let scores = residuals
+        .iter()
+        .map(|misses| misses.iter().map(|miss| square(miss).min(bound_m2)).sum::<f64>() / misses.len() as f64)
+        .collect();
+    (kept, scores)
 }

@@ -197,7 +197,7 @@ pub(super) fn options(recipe: Recipe) -> FitOptions {
     }
 }
 
-fn silent(_: FitEvent<'_>) -> ControlFlow<()> {
+pub(super) fn silent(_: FitEvent<'_>) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 

@@ -30,6 +30,13 @@ impl FixNoise {
         Self { variance_m2, white_share: 1.0, time_constant_s: 1.0 }
     }
 
+    /// The same with at least that variance new with each fix, m2.
+    pub(super) fn with_white_m2(self, least_m2: f64) -> Self {
+        let white_m2 = (self.variance_m2 * self.white_share).max(least_m2);
+        let variance_m2 = self.variance_m2 * (1.0 - self.white_share) + white_m2;
+        Self { variance_m2, white_share: white_m2 / variance_m2, ..self }
+    }
+
     /// The likeliest one for residuals (m, rows by target and time); its variance is theirs.
     pub(super) fn of_residuals(rows: &[Row], residuals: &[Vec<f64>; 2], doubts: &[f64]) -> Self {
         let mut best = (f64::INFINITY, Self::white(1.0));
@@ -114,5 +121,65 @@ impl Whitener {
             let nis = nis * spread / own.max(1e-12);
             *doubt = own * (nis / CREDIBLE_NIS - 1.0).max(0.0) / noise.variance_m2;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::BoundingBox;
+    use crate::geo::{EastNorth, Position};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    /// Rows of targets that are seen for 2,000 s each.
+    fn rows(count: usize) -> Vec<Row> {
+        let row = |at: usize| Row {
+            time_s: at as f64,
+            target: (at / 2000) as u32,
+            pass: (at / 2000) as u32,
+            bounding_box: BoundingBox::new(0.0, 0.0, 1.0, 1.0).expect("a box"),
+            position: Position::new(0.0, 0.0).expect("a place"),
+            label: EastNorth::default(),
+            own_variance_m2: None,
+        };
+        (0..count).map(row).collect()
+    }
+
+    fn normal(rng: &mut ChaCha8Rng) -> f64 {
+        let sum: f64 = (0..12).map(|_| rng.random::<f64>()).sum();
+        sum - 6.0
+    }
+
+    #[test]
+    fn coloured_residuals_come_out_white_and_of_unit_variance() {
+        let rows = rows(8000);
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let truth = FixNoise { variance_m2: 4.0, white_share: 0.1, time_constant_s: 40.0 };
+        let keep = (-1.0 / truth.time_constant_s).exp();
+        let mut column = || {
+            let mut state = 0.0;
+            let mut values = Vec::new();
+            for at in 0..rows.len() {
+                let kept = if at % 2000 == 0 { 0.0 } else { keep };
+                state = kept * state + (3.6 * (1.0 - kept * kept)).sqrt() * normal(&mut rng);
+                values.push(state + 0.4f64.sqrt() * normal(&mut rng));
+            }
+            values
+        };
+        let residuals = [column(), column()];
+        let doubts = vec![0.0; rows.len()];
+        let found = FixNoise::of_residuals(&rows, &residuals, &doubts);
+        assert!((15.0..=100.0).contains(&found.time_constant_s), "{found:?}");
+        assert!((0.03..=0.25).contains(&found.white_share), "{found:?}");
+        assert!((2.5..=6.0).contains(&found.variance_m2), "{found:?}");
+        let mut whitened = residuals[0].clone();
+        Whitener::new(&rows, &truth, &doubts).apply(&mut whitened);
+        let count = whitened.len() as f64;
+        let variance = whitened.iter().map(|value| value * value).sum::<f64>() / count;
+        let product = whitened.windows(2).map(|pair| pair[0] * pair[1]).sum::<f64>() / count;
+        // Five standard errors of 8,000 values.
+        assert!((variance - 1.0).abs() < 0.08, "{variance}");
+        assert!(product.abs() < 0.056, "{product}");
     }
 }

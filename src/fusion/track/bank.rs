@@ -206,7 +206,7 @@ impl Bank {
         let split = split(settings, source, measured, crowd);
         let (innovation, nis) = self.innovation(&split);
         let mut judgement = Judgement { source, innovation, nis, rejected: None, restarted: false };
-        if nis > settings.gate {
+        if nis.min(self.likeliest_length(&split)) > settings.gate {
             match self.appeal(settings, source, measured, &split) {
                 Appeal::Refused => {
                     judgement.rejected = Some(RejectionReason::OutsideGate);
@@ -263,6 +263,18 @@ impl Bank {
         (innovation, total.squared_length(innovation))
     }
 
+    /// Squared Mahalanobis length under the way of moving that explains the measurement best, dearer
+    /// by how little that way is believed: a target that stood and now starts is no outlier, though
+    /// the three ways taken together hardly expect it.
+    fn likeliest_length(&self, split: &Split) -> f64 {
+        let lengths = self.hypotheses.iter().zip(self.weights).map(|(hypothesis, weight)| {
+            let (innovation, moments, _) = hypothesis.foretell(split);
+            let innovation = EastNorth { east_m: innovation[0], north_m: innovation[1] };
+            moments.squared_length(innovation) - 2.0 * weight.max(1e-12).ln()
+        });
+        lengths.fold(f64::INFINITY, f64::min)
+    }
+
     fn update(&mut self, split: &Split) {
         let mut logs = [0.0; MODES];
         for (log, (hypothesis, weight)) in logs.iter_mut().zip(self.hypotheses.iter_mut().zip(self.weights)) {
@@ -300,7 +312,7 @@ impl Bank {
             for hypothesis in &mut reopened.hypotheses {
                 hypothesis.forget_bias(split.bias);
             }
-            if reopened.innovation(split).1 <= settings.gate {
+            if reopened.innovation(split).1.min(reopened.likeliest_length(split)) <= settings.gate {
                 *self = reopened;
                 return Appeal::Reopened;
             }

@@ -246,6 +246,27 @@ fn a_bias_that_jumped_is_believed_again_without_a_jump_of_the_position() {
 }
 
 #[test]
+fn whoever_stood_and_sets_out_is_believed_at_once() {
+    let regressed_at = |second: u32, east_m: f64| Measurement {
+        time: at_s(f64::from(second)),
+        fix: None,
+        regressed: Some(Measured::isotropic(EastNorth { east_m, north_m: 0.0 }, 0.1)),
+    };
+    let regression = RegressionNoise { white_share: 0.1, ..RegressionNoise::default() };
+    let settings = TrackSettings { regression, ..TrackSettings::default() };
+    let mut track = Track::start(settings, &regressed_at(0, 0.0)).expect("a position");
+    for second in 1..40 {
+        track.update(&regressed_at(second, 0.0));
+    }
+    for second in 40..60 {
+        let east_m = 1.25 * f64::from(second - 39);
+        let state = track.update(&regressed_at(second, east_m));
+        assert!(state.rejected.is_empty(), "{state:?}");
+        assert!((state.position.east_m - east_m).abs() < 1.0, "{state:?}");
+    }
+}
+
+#[test]
 fn a_lone_source_that_contradicts_the_track_restarts_it() {
     let mut track = Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 4.0)).expect("a fix");
     for second in 1..30 {

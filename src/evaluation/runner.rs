@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-use super::learners::{Learnt, RecipeModel, learn_recipe, passes, recipes_of, track_settings, tune_imm_ukf};
+use super::learners::{Learnt, RecipeModel, learn_recipe, recipes_of, tune_imm_ukf};
 use super::metrics::{Judged, Metrics};
 use super::report::{MethodReport, Report};
 use crate::domain::{
     BoundingBox, EpochReport, ImageSize, Method, Observation, Recipe, Result, Sample, SigmaM, Step, Truth,
 };
 use crate::filters::ImmUkf;
-use crate::fusion::track::{Measured, Measurement, Track};
+use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, passes};
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, dnn, homography};
@@ -418,7 +418,7 @@ impl<'a> Run<'a> {
                 })
             }),
             Method::Track | Method::TrackDenied => {
-                let settings = track_settings(self.train, regressor, e_gnss_m2);
+                let settings = TrackSettings::learn(self.train, regressor);
                 let test = self.test;
                 let denied = method == Method::TrackDenied;
                 Box::new(move |target| {
@@ -460,7 +460,7 @@ fn measurement(
 /// Goes on with a track, or begins one; a row without any measurement is told from what came before.
 fn step_track(
     track: &mut Option<Track>,
-    settings: crate::fusion::track::TrackSettings,
+    settings: TrackSettings,
     measurement: &Measurement,
     plane: &LocalPlane,
 ) -> Option<Told> {

@@ -22,15 +22,17 @@ mod rows;
 mod run;
 mod select;
 mod tensors;
+mod track_beliefs;
 pub mod train;
 mod uncertainty;
 mod whitening;
 
 pub use artifact::{Artifact, FORMAT};
 pub use fit::{FitError, FitEvent, FitOptions, Trial, fit, fit_trial};
-pub use regressor::{FixSpread, R95_PER_SIGMA, Regression, Regressor};
+pub use regressor::{R95_PER_SIGMA, Regression, Regressor};
 pub use rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use tensors::LARGEST_WEIGHTS_BYTES;
+pub use track_beliefs::TrackBeliefs;
 
 #[cfg(test)]
 mod tests;

@@ -9,6 +9,7 @@ use super::hybrid::HybridRegressor;
 use super::paper::PaperRegressor;
 use super::projection::{SIDES, sides_of};
 use super::projective::ProjectiveRegressor;
+use super::track_beliefs::TrackBeliefs;
 use crate::domain::{BoundingBox, Error, ImageSize, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane};
 
@@ -42,15 +43,6 @@ impl Regression {
     pub fn variance_m2(&self) -> f64 {
         (self.r95_scale / R95_PER_SIGMA).powi(2) * self.e_regression_m2
     }
-}
-
-/// How a receiver's error is spread over time, as a model's training fixes tell it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FixSpread {
-    /// Share of the variance that is new with each fix, 0 to 1; the rest stays for a while.
-    pub white_share: f64,
-    /// Time in which the rest's correlation falls to 1/e, s.
-    pub time_constant_s: f64,
 }
 
 /// How much of the error given to unusual boxes training has shown to be there.
@@ -100,7 +92,7 @@ pub struct Regressor {
     shown: [Shown; 2],
     image_size: Option<ImageSize>,
     coverage: CoverageTable,
-    fix_spread: Option<FixSpread>,
+    track_beliefs: Option<TrackBeliefs>,
     /// Added to every error variance, m2 per axis.
     added_m2: f64,
     cells: Cells,
@@ -128,7 +120,7 @@ impl Regressor {
         };
         let image_size = image_size_of(&parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
-        let fix_spread = fix_spread_of(&parts)?;
+        let track_beliefs = TrackBeliefs::read(&parts)?;
         let (reconstruction_usual, border_factor) = match kind {
             Kind::Paper(_) => (0.0, 1.0),
             _ => (
@@ -159,7 +151,7 @@ impl Regressor {
             shown,
             image_size,
             coverage,
-            fix_spread,
+            track_beliefs,
             added_m2: 0.0,
             cells,
             kind,
@@ -184,10 +176,10 @@ impl Regressor {
         self.e_gnss_m2
     }
 
-    /// How the receiver's error is spread over time, if the model tells it.
+    /// What a track should believe of receiver and model, if the model tells it.
     #[must_use]
-    pub const fn fix_spread(&self) -> Option<FixSpread> {
-        self.fix_spread
+    pub const fn track_beliefs(&self) -> Option<TrackBeliefs> {
+        self.track_beliefs
     }
 
     /// Share of its error variance that is new with each box, 0 to 1; the rest is the same wherever
@@ -293,16 +285,6 @@ fn reconstruction_error(bounding_box: &BoundingBox, rebuilt: &[f64; SIDES]) -> f
     let sides = sides_of(bounding_box);
     let squares = sides.iter().zip(rebuilt).map(|(one, other)| (one - other) * (one - other));
     squares.sum::<f64>() / (SIDES as f64 * bounding_box.height_px() * bounding_box.height_px())
-}
-
-fn fix_spread_of(parts: &Parts) -> Result<Option<FixSpread>> {
-    if !parts.parameters.contains_key("fix_white_share") {
-        return Ok(None);
-    }
-    Ok(Some(FixSpread {
-        white_share: parts.parameter("fix_white_share")?.clamp(0.0, 1.0),
-        time_constant_s: parts.positive_parameter("fix_time_constant_s")?,
-    }))
 }
 
 fn image_size_of(parts: &Parts) -> Result<Option<ImageSize>> {

@@ -9,6 +9,7 @@ use super::aside::{Said, Voice};
 use super::{Ended, Job, Work, load_samples, promotion};
 use crate::app::App;
 use crate::domain::{CameraId, EpochReport, Error, JobState, Result, RunProgress, Sample, TrainingRun};
+use crate::fusion::track::TrackSettings;
 use crate::model::{self, Artifact, FitError, FitEvent, FitOptions};
 use crate::store::{Claim, Heartbeat, NewModel, RunEnd, SampleFilter};
 use crate::telemetry::Metrics;
@@ -79,6 +80,7 @@ impl Job for TrainingRun {
         app.store.append_log(run.id, claim.fence, app.clock.now(), &line).await?;
         Ok(Box::new(move |voice| {
             let outcome = model::fit(&samples, &options, &mut |event| hear(voice, event));
+            let outcome = outcome.and_then(|artifact| with_track_beliefs(artifact, &samples));
             Fitted { outcome, samples }
         }))
     }
@@ -128,6 +130,14 @@ impl Job for TrainingRun {
         let ended = app.store.finish_run(claim.job.id, claim.fence, end, app.clock.now()).await?;
         Ok(ended.map(|run| run.state))
     }
+}
+
+/// The model with what its samples tell of how errors stay, for the tracks that it will serve.
+fn with_track_beliefs(mut artifact: Artifact, samples: &[Sample]) -> std::result::Result<Artifact, FitError> {
+    let regressor = artifact.load().map_err(|error| FitError::Fault(error.into()))?;
+    let settings = TrackSettings::learn(samples, &regressor);
+    settings.beliefs().write(&mut artifact.metadata.parameters);
+    Ok(artifact)
 }
 
 fn hear(voice: &Voice<Update>, event: FitEvent<'_>) -> std::ops::ControlFlow<()> {

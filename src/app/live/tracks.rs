@@ -10,7 +10,7 @@ use jiff::{SignedDuration, Timestamp};
 use crate::config::Limits;
 use crate::domain::{CameraId, Error, ErrorKind, Observation, Result, TargetId};
 use crate::fusion::track::{
-    GnssNoise, Innovation, Measured, Measurement, Rejection, Track, TrackSettings, TrackState, Velocity,
+    Innovation, Measured, Measurement, Rejection, Track, TrackSettings, TrackState, Velocity,
 };
 use crate::fusion::watch::{Compared, Meeting, Spot};
 use crate::geo::{LocalPlane, Position};
@@ -221,8 +221,8 @@ impl Followed {
 }
 
 fn start(regressor: Option<&Regressor>, measurement: &Measurement) -> Option<(Track, TrackState)> {
-    let gnss = regressor.map_or_else(GnssNoise::default, GnssNoise::learnt_by);
-    let track = Track::start(TrackSettings { gnss, ..TrackSettings::default() }, measurement)?;
+    let settings = regressor.map_or_else(TrackSettings::default, TrackSettings::learnt_by);
+    let track = Track::start(settings, measurement)?;
     let state = track.state_at(measurement.time);
     Some((track, state))
 }

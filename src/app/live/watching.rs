@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use super::lock;
 use crate::app::App;
 use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Result};
-use crate::fusion::track::GnssNoise;
+use crate::fusion::track::TrackSettings;
 use crate::fusion::watch::{Alarm, CameraWatch, Compared, WatchSettings};
 use crate::model::Regressor;
 
@@ -29,7 +29,7 @@ impl Watching {
     ) -> Option<CameraMoved> {
         let mut watched = lock(&self.0);
         if watched.as_ref().is_none_or(|watched| watched.model_version != model_version) {
-            let gnss = GnssNoise::learnt_by(regressor);
+            let gnss = TrackSettings::learnt_by(regressor).gnss;
             let watch = CameraWatch::new(WatchSettings { gnss, ..WatchSettings::default() });
             *watched = Some(Watched { model_version, watch, unsaved: None });
         }

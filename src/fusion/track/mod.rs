@@ -7,6 +7,7 @@
 //! same items in another order within the window give the same state to the last bit.
 
 mod bank;
+mod learnt;
 mod noise;
 mod settings;
 #[cfg(test)]
@@ -19,6 +20,7 @@ use std::collections::VecDeque;
 
 use jiff::Timestamp;
 
+pub use learnt::{Pass, passes};
 pub use noise::{GnssNoiseEstimate, ResidualAt, estimate_gnss_noise};
 pub use settings::{GnssNoise, Motion, RegressionNoise, TrackSettings};
 

@@ -1,8 +1,6 @@
 //! What a track believes of receivers, cameras and targets. Every number here is a belief about the
 //! world, none is a limit of the machine but the last three.
 
-use crate::model::Regressor;
-
 /// How a receiver's error, of a known variance, is spread over time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GnssNoise {
@@ -15,17 +13,6 @@ pub struct GnssNoise {
 /// A white share below this is beyond what fixes can tell, and a filter that believed it would take
 /// every motion of the bias for the target's.
 pub(super) const SMALLEST_WHITE_SHARE: f64 = 0.01;
-
-impl GnssNoise {
-    /// What the fixes that a model was trained on tell; the default where it does not say.
-    #[must_use]
-    pub fn learnt_by(regressor: &Regressor) -> Self {
-        regressor.fix_spread().map_or_else(Self::default, |spread| Self {
-            white_share: spread.white_share.max(SMALLEST_WHITE_SHARE),
-            time_constant_s: spread.time_constant_s,
-        })
-    }
-}
 
 impl Default for GnssNoise {
     /// A phone in the open: almost all of the error is a bias of about 40 s.

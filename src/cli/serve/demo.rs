@@ -1,5 +1,6 @@
 //! The demonstration: a simulated camera, through the same ways that a real one goes.
 
+use std::io::Write as _;
 use std::net::SocketAddr;
 
 use anyhow::Context as _;
@@ -36,7 +37,8 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
         .iter()
         .find(|row| row.bounding_box.is_some() && row.fix.is_some())
         .context("the simulation shows no target")?;
-    println!("{}", things_to_try(address, row));
+    // Whoever started the server may have stopped reading; it serves all the same.
+    let _ = writeln!(std::io::stdout(), "{}", things_to_try(address, row));
     Ok(())
 }
 

@@ -267,17 +267,18 @@ fn refused(seq: u64, error: &Error) -> proto::StreamAnswer {
 
 impl From<&TrackPoint> for proto::TrackPoint {
     fn from(point: &TrackPoint) -> Self {
+        let state = &point.state;
         Self {
             target_id: point.target_id.as_str().to_owned(),
-            time: Some(timestamp(point.time)),
+            time: Some(timestamp(state.time)),
             position: Some(point.position.into()),
-            velocity_east_m_s: point.velocity.east_m_s,
-            velocity_north_m_s: point.velocity.north_m_s,
-            r95_m: point.r95_m,
-            still: point.still,
-            nis: point.nis,
-            rejections: point.rejected.iter().map(Into::into).collect(),
-            restarted: point.restarted,
+            velocity_east_m_s: state.velocity.east_m_s,
+            velocity_north_m_s: state.velocity.north_m_s,
+            r95_m: state.r95_m,
+            still: state.still,
+            nis: state.nis,
+            rejections: state.rejected.iter().map(Into::into).collect(),
+            restarted: state.restarted,
         }
     }
 }

@@ -124,16 +124,17 @@ struct TrackState {
 
 impl From<&TrackPoint> for TrackState {
     fn from(point: &TrackPoint) -> Self {
+        let state = &point.state;
         Self {
             target_id: point.target_id.as_str().to_owned(),
-            time: point.time,
-            velocity_east_m_s: point.velocity.east_m_s,
-            velocity_north_m_s: point.velocity.north_m_s,
-            r95_m: point.r95_m,
-            still: point.still,
-            nis: point.nis,
-            rejections: point.rejected.iter().map(Into::into).collect(),
-            restarted: point.restarted,
+            time: state.time,
+            velocity_east_m_s: state.velocity.east_m_s,
+            velocity_north_m_s: state.velocity.north_m_s,
+            r95_m: state.r95_m,
+            still: state.still,
+            nis: state.nis,
+            rejections: state.rejected.iter().map(Into::into).collect(),
+            restarted: state.restarted,
         }
     }
 }

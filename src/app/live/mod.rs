@@ -130,7 +130,7 @@ impl App {
         };
         let (track, compared) = lock(&live.tracks).take_up(id, &seen, &self.limits)?;
         if let Some(point) = &track {
-            self.metrics.tracked(point.innovations.iter().map(|it| it.nis), &point.rejected);
+            self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
             // Without a listener there is nobody to tell.
             let _ = live.events.send(CameraEvent::Track(point.clone()));
         }

@@ -9,9 +9,7 @@ use jiff::{SignedDuration, Timestamp};
 
 use crate::config::Limits;
 use crate::domain::{CameraId, Error, ErrorKind, Observation, Result, TargetId};
-use crate::fusion::track::{
-    Innovation, Measured, Measurement, Rejection, Track, TrackSettings, TrackState, Velocity,
-};
+use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, TrackState};
 use crate::fusion::watch::{Compared, Meeting, Spot};
 use crate::geo::{LocalPlane, Position};
 use crate::model::Regressor;
@@ -24,24 +22,10 @@ const HISTORY_STEP: SignedDuration = SignedDuration::from_millis(500);
 pub struct TrackPoint {
     /// Who.
     pub target_id: TargetId,
-    /// When.
-    pub time: Timestamp,
     /// Where.
     pub position: Position,
-    /// How fast and where to.
-    pub velocity: Velocity,
-    /// Radius about `position` that holds the truth with 95 % probability, m.
-    pub r95_m: f64,
-    /// Probability that the target stands, 0 to 1.
-    pub still: f64,
-    /// Normalised innovation squared of what was taken up; mean 2 for each of box and fix.
-    pub nis: Option<f64>,
-    /// The innovations taken up, one for each of box and fix.
-    pub innovations: Vec<Innovation>,
-    /// What was not taken up, and why.
-    pub rejected: Vec<Rejection>,
-    /// Whether the track began anew at this measurement.
-    pub restarted: bool,
+    /// All that the track says, in the camera's plane.
+    pub state: TrackState,
 }
 
 /// Everything that is followed in one camera's view.
@@ -138,7 +122,7 @@ impl Tracks {
         self.drop_gone(now);
         let followed = self.targets.get(target_id)?;
         let mut points: Vec<_> = followed.history.iter().cloned().collect();
-        if points.last().is_none_or(|last| last.time < followed.latest.time) {
+        if points.last().is_none_or(|last| last.state.time < followed.latest.state.time) {
             points.push(followed.latest.clone());
         }
         Some(points)
@@ -165,18 +149,7 @@ impl Tracks {
 
     fn point(&self, target_id: &TargetId, state: TrackState) -> TrackPoint {
         let plane = self.plane.as_ref().expect("a state comes from a measurement, which makes the plane");
-        TrackPoint {
-            target_id: target_id.clone(),
-            time: state.time,
-            position: plane.to_position(state.position),
-            velocity: state.velocity,
-            r95_m: state.r95_m,
-            still: state.still,
-            nis: state.nis,
-            innovations: state.innovations,
-            rejected: state.rejected,
-            restarted: state.restarted,
-        }
+        TrackPoint { target_id: target_id.clone(), position: plane.to_position(state.position), state }
     }
 
     fn make_room(&mut self, id: &CameraId, now: Timestamp, most: usize) -> Result<()> {
@@ -210,7 +183,7 @@ impl Followed {
     fn remember(&mut self, point: &Arc<TrackPoint>, most: usize) {
         self.latest = point.clone();
         let last = self.history.back();
-        if last.is_some_and(|last| point.time.duration_since(last.time) < HISTORY_STEP) {
+        if last.is_some_and(|last| point.state.time.duration_since(last.state.time) < HISTORY_STEP) {
             return;
         }
         while self.history.len() >= most.max(1) {

@@ -31,7 +31,7 @@ const WILD: f64 = 6.0;
 /// Share of the unusual boxes of training that show what such boxes are like; the rest are single.
 const SHOWN: f64 = 0.95;
 /// Variance of the factor on an unusual box's error before anything is known of it.
-const PRIOR_VARIANCE: f64 = 0.5;
+const PRIOR_VARIANCE: f64 = 4.0;
 /// Taken where no three boxes follow each other, px2.
 const UNKNOWN_EDGE_NOISE_PX2: f64 = 1.0;
 /// The error varies over the image, so its distribution has longer tails than a normal one.

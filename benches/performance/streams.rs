@@ -3,6 +3,7 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt as _;
@@ -28,6 +29,8 @@ const ITEMS: usize = 64_000;
 const CAMERAS: usize = 200;
 const RATE_HZ: f64 = 25.0;
 const SECONDS: f64 = 60.0;
+/// Times stay in the past: the observations begin in January 2026.
+const FURTHEST_S: i64 = 240 * 86_400;
 /// Streams of one connection.
 const STREAMS_PER_CONNECTION: usize = 50;
 
@@ -70,8 +73,12 @@ async fn bare_echo(answer: proto::StreamAnswer) -> SocketAddr {
     address
 }
 
+/// Where the next feed's time begins, s after the first observation: a track takes no steps back.
+static NEXT_BEGIN_S: AtomicI64 = AtomicI64::new(0);
+
 /// The observations over and over, each round of them later than the one before.
 struct Feed {
+    begin_s: i64,
     observations: Arc<Vec<Observation>>,
     round_s: i64,
     target: String,
@@ -83,7 +90,9 @@ impl Feed {
     fn new(observations: &Arc<Vec<Observation>>, target: String, step: Option<Duration>) -> Self {
         let (first, last) = (observations[0].time, observations[observations.len() - 1].time);
         let round_s = last.duration_since(first).as_secs() + 60;
-        Self { observations: observations.clone(), round_s, target, next: 0, step }
+        let rounds = (ITEMS / observations.len()) as i64 + 1;
+        let begin_s = NEXT_BEGIN_S.fetch_add(rounds * round_s, Ordering::Relaxed) % FURTHEST_S;
+        Self { begin_s, observations: observations.clone(), round_s, target, next: 0, step }
     }
 
     fn item(&mut self) -> proto::StreamRequest {
@@ -93,12 +102,15 @@ impl Feed {
         let (seconds, nanos) = match self.step {
             None => {
                 let rounds = (index / self.observations.len()) as i64;
-                (observation.time.as_second() + rounds * self.round_s, observation.time.subsec_nanosecond())
+                (
+                    self.begin_s + observation.time.as_second() + rounds * self.round_s,
+                    observation.time.subsec_nanosecond(),
+                )
             }
             Some(step) => {
                 let passed = step * u32::try_from(index).expect("a short bench");
                 let nanos = i32::try_from(passed.subsec_nanos()).expect("below a second");
-                (self.observations[0].time.as_second() + passed.as_secs() as i64, nanos)
+                (self.begin_s + self.observations[0].time.as_second() + passed.as_secs() as i64, nanos)
             }
         };
         let [left_px, top_px, width_px, height_px] =
@@ -166,7 +178,10 @@ async fn throughput(
             let mut answered = 0;
             while answered < each {
                 let message = told.message().await.expect("no end").expect("no end");
-                if matches!(message.kind, Some(Told::Answer(_))) {
+                if let Some(Told::Answer(answer)) = message.kind {
+                    let track = answer.track.expect("the target is followed");
+                    let late = proto::track_rejection::Reason::TooLate;
+                    assert!(track.rejections.iter().all(|rejection| rejection.reason() != late), "{track:?}");
                     answered += 1;
                     room.add_permits(1);
                 }

@@ -48,7 +48,7 @@ pub struct Live {
 
 /// What is live of one camera.
 struct CameraLive {
-    tracks: Mutex<Tracks>,
+    tracks: Tracks,
     watching: Watching,
     events: broadcast::Sender<CameraEvent>,
     moved: watch::Sender<Option<Arc<CameraMoved>>>,
@@ -73,7 +73,7 @@ impl Live {
 impl CameraLive {
     fn new() -> Arc<Self> {
         Arc::new(Self {
-            tracks: Mutex::default(),
+            tracks: Tracks::default(),
             watching: Watching::default(),
             events: broadcast::channel(EVENTS_BEHIND).0,
             moved: watch::channel(None).0,
@@ -128,7 +128,7 @@ impl App {
             e_gnss_m2,
             now: self.clock.now(),
         };
-        let (track, compared) = lock(&live.tracks).take_up(id, &seen, &self.limits)?;
+        let (track, compared) = live.tracks.take_up(id, &seen, &self.limits)?;
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
             // Without a listener there is nobody to tell.
@@ -149,7 +149,7 @@ impl App {
     pub async fn tracks(&self, id: &CameraId) -> Result<Vec<Arc<TrackPoint>>> {
         self.serving(id).await?;
         let live = self.live.of(id);
-        let points = lock(&live.tracks).latest(self.clock.now());
+        let points = live.tracks.latest(self.clock.now());
         Ok(points)
     }
 
@@ -160,7 +160,7 @@ impl App {
     pub async fn track_history(&self, id: &CameraId, target_id: &TargetId) -> Result<Vec<Arc<TrackPoint>>> {
         self.serving(id).await?;
         let live = self.live.of(id);
-        let history = lock(&live.tracks).history(target_id, self.clock.now());
+        let history = live.tracks.history(target_id, self.clock.now());
         history.ok_or_else(|| {
             let message = format!("camera {id} does not follow a target {target_id} now");
             Error::refused(ErrorKind::TrackNotFound, message)

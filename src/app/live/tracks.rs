@@ -1,12 +1,14 @@
 //! The tracks of one camera's targets, and what was seen of them lately.
 //!
-//! What never happens here: waiting, and growth beyond the limits.
+//! Each target has a lock of its own, so that streams do not wait for each other's filters. What
+//! never happens here: waiting for anything else, and growth beyond the limits.
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, OnceLock};
 
 use jiff::{SignedDuration, Timestamp};
 
+use super::lock;
 use crate::config::Limits;
 use crate::domain::{CameraId, Error, ErrorKind, Observation, Result, TargetId};
 use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, TrackState};
@@ -32,15 +34,19 @@ pub struct TrackPoint {
 #[derive(Default)]
 pub(super) struct Tracks {
     /// Of the first position: models come and go, the tracks stay in their plane.
-    plane: Option<LocalPlane>,
-    targets: HashMap<TargetId, Followed>,
+    plane: OnceLock<LocalPlane>,
+    targets: Mutex<HashMap<TargetId, Arc<Mutex<Target>>>>,
 }
+
+/// A place for a target; empty until something usable was measured of it.
+#[derive(Default)]
+struct Target(Option<Followed>);
 
 struct Followed {
     track: Track,
     /// By the server's clock.
     heard_at: Timestamp,
-    latest: Arc<TrackPoint>,
+    /// In order of time; the last is the latest.
     history: VecDeque<Arc<TrackPoint>>,
     meeting: Meeting,
 }
@@ -63,72 +69,78 @@ impl Tracks {
     /// # Errors
     /// `Overloaded` if as many targets are followed as may be, none of them gone.
     pub(super) fn take_up(
-        &mut self,
+        &self,
         id: &CameraId,
         seen: &Seen<'_>,
         limits: &Limits,
     ) -> Result<(Option<Arc<TrackPoint>>, Option<Compared>)> {
-        let Some(measurement) = self.measurement(seen) else { return Ok((None, None)) };
-        let state = match self.targets.get_mut(seen.target_id) {
+        let Some((plane, measurement)) = self.measurement(seen) else { return Ok((None, None)) };
+        let target = self.target(id, seen, limits.tracks_per_camera)?;
+        let mut target = lock(&target);
+        let state = match &mut target.0 {
             Some(followed) if !followed.track.is_gone(measurement.time) => {
-                followed.heard_at = seen.now;
                 followed.track.update(&measurement)
             }
-            Some(followed) => {
-                let Some((track, state)) = start(seen.regressor, &measurement) else {
-                    return Ok((None, None));
-                };
-                followed.track = track;
-                followed.heard_at = seen.now;
-                followed.meeting = Meeting::default();
+            gone_or_new => {
+                let settings = seen.regressor.map_or_else(TrackSettings::default, TrackSettings::learnt_by);
+                let Some(track) = Track::start(settings, &measurement) else { return Ok((None, None)) };
+                let state = track.state_at(measurement.time);
+                *gone_or_new = Some(Followed::new(track, seen.now));
                 state
             }
-            None => {
-                self.make_room(id, seen.now, limits.tracks_per_camera)?;
-                let Some((track, state)) = start(seen.regressor, &measurement) else {
-                    return Ok((None, None));
-                };
-                let latest = Arc::new(self.point(seen.target_id, state));
-                let followed = Followed {
-                    track,
-                    heard_at: seen.now,
-                    latest: latest.clone(),
-                    history: VecDeque::from([latest.clone()]),
-                    meeting: Meeting::default(),
-                };
-                let followed = self.targets.entry(seen.target_id.clone()).or_insert(followed);
-                let compared = compare(&mut followed.meeting, seen.target_id, &measurement);
-                return Ok((Some(latest), compared));
-            }
         };
-        let point = Arc::new(self.point(seen.target_id, state));
-        let compared = self.targets.get_mut(seen.target_id).and_then(|followed| {
-            followed.remember(&point, limits.track_points);
-            compare(&mut followed.meeting, seen.target_id, &measurement)
-        });
+        let Some(followed) = &mut target.0 else { return Ok((None, None)) };
+        followed.heard_at = seen.now;
+        let position = plane.to_position(state.position);
+        let point = Arc::new(TrackPoint { target_id: seen.target_id.clone(), position, state });
+        followed.remember(&point, limits.track_points);
+        let compared = compare(&mut followed.meeting, seen.target_id, &measurement);
         Ok((Some(point), compared))
     }
 
     /// Where every target is that is not gone, by target.
-    pub(super) fn latest(&mut self, now: Timestamp) -> Vec<Arc<TrackPoint>> {
-        self.drop_gone(now);
-        let mut points: Vec<_> = self.targets.values().map(|followed| followed.latest.clone()).collect();
+    pub(super) fn latest(&self, now: Timestamp) -> Vec<Arc<TrackPoint>> {
+        let targets = self.present(now);
+        let mut points: Vec<_> =
+            targets.iter().filter_map(|target| lock(target).0.as_ref()?.history.back().cloned()).collect();
         points.sort_by(|a, b| a.target_id.cmp(&b.target_id));
         points
     }
 
     /// Where a target was, oldest first, as far back as is kept; `None` if it is not followed.
-    pub(super) fn history(&mut self, target_id: &TargetId, now: Timestamp) -> Option<Vec<Arc<TrackPoint>>> {
-        self.drop_gone(now);
-        let followed = self.targets.get(target_id)?;
-        let mut points: Vec<_> = followed.history.iter().cloned().collect();
-        if points.last().is_none_or(|last| last.state.time < followed.latest.state.time) {
-            points.push(followed.latest.clone());
-        }
-        Some(points)
+    pub(super) fn history(&self, target_id: &TargetId, now: Timestamp) -> Option<Vec<Arc<TrackPoint>>> {
+        drop(self.present(now));
+        let target = lock(&self.targets).get(target_id).cloned()?;
+        let target = lock(&target);
+        Some(target.0.as_ref()?.history.iter().cloned().collect())
     }
 
-    fn measurement(&mut self, seen: &Seen<'_>) -> Option<Measurement> {
+    /// The target's place, made if there is room for it.
+    fn target(&self, id: &CameraId, seen: &Seen<'_>, most: usize) -> Result<Arc<Mutex<Target>>> {
+        let mut targets = lock(&self.targets);
+        if let Some(target) = targets.get(seen.target_id) {
+            return Ok(target.clone());
+        }
+        if targets.len() >= most {
+            drop_gone(&mut targets, seen.now);
+        }
+        if targets.len() >= most {
+            let message = format!(
+                "camera {id} follows {most} targets already; target ids that change with every frame do that"
+            );
+            return Err(Error::refused(ErrorKind::Overloaded, message));
+        }
+        Ok(targets.entry(seen.target_id.clone()).or_default().clone())
+    }
+
+    /// The targets that are not gone.
+    fn present(&self, now: Timestamp) -> Vec<Arc<Mutex<Target>>> {
+        let mut targets = lock(&self.targets);
+        drop_gone(&mut targets, now);
+        targets.values().cloned().collect()
+    }
+
+    fn measurement(&self, seen: &Seen<'_>) -> Option<(&LocalPlane, Measurement)> {
         let Observation { time, bounding_box, fix, .. } = seen.observation;
         // From the box alone, also where the recipe could look at the fix: the track must not be
         // told the fix twice.
@@ -138,66 +150,52 @@ impl Tracks {
             .map(|(drawn, regressor)| (regressor.plane(), regressor.regress(drawn, None)));
         let regressed = regression.map(|(plane, it)| (plane.to_position(it.regressed), it.variance_m2()));
         let anywhere = fix.map(|fix| fix.position).or(regressed.map(|(position, _)| position))?;
-        let plane = self.plane.get_or_insert_with(|| LocalPlane::new(anywhere));
+        let plane = self.plane.get_or_init(|| LocalPlane::new(anywhere));
         let measured = |(position, variance_m2)| Measured::isotropic(plane.to_plane(position), variance_m2);
-        Some(Measurement {
+        let measurement = Measurement {
             time: *time,
             fix: fix.map(|fix| measured((fix.position, seen.e_gnss_m2))),
             regressed: regressed.map(measured),
-        })
-    }
-
-    fn point(&self, target_id: &TargetId, state: TrackState) -> TrackPoint {
-        let plane = self.plane.as_ref().expect("a state comes from a measurement, which makes the plane");
-        TrackPoint { target_id: target_id.clone(), position: plane.to_position(state.position), state }
-    }
-
-    fn make_room(&mut self, id: &CameraId, now: Timestamp, most: usize) -> Result<()> {
-        if self.targets.len() >= most {
-            self.drop_gone(now);
-        }
-        if self.targets.len() < most {
-            return Ok(());
-        }
-        Err(Error::refused(
-            ErrorKind::Overloaded,
-            format!(
-                "camera {id} follows {most} targets already; target ids that change with every frame do that"
-            ),
-        ))
-    }
-
-    /// By the server's clock, for recorded times may be of any year; and by the latest time told,
-    /// for recordings may be played fast.
-    fn drop_gone(&mut self, now: Timestamp) {
-        let told = self.targets.values().map(|followed| followed.track.measured_at()).max();
-        self.targets.retain(|_, followed| {
-            let silent_s = now.duration_since(followed.heard_at).as_secs_f64();
-            let gone = told.is_some_and(|told| followed.track.is_gone(told));
-            !gone && silent_s <= followed.track.settings().time_to_live_s
-        });
+        };
+        Some((plane, measurement))
     }
 }
 
+/// By the server's clock, for recorded times may be of any year; and by the latest time told, for
+/// recordings may be played fast.
+fn drop_gone(targets: &mut HashMap<TargetId, Arc<Mutex<Target>>>, now: Timestamp) {
+    let measured_at = |target: &Arc<Mutex<Target>>| Some(lock(target).0.as_ref()?.track.measured_at());
+    let told = targets.values().filter_map(measured_at).max();
+    targets.retain(|_, target| {
+        let target = lock(target);
+        target.0.as_ref().is_some_and(|followed| {
+            let silent_s = now.duration_since(followed.heard_at).as_secs_f64();
+            let gone = told.is_some_and(|told| followed.track.is_gone(told));
+            !gone && silent_s <= followed.track.settings().time_to_live_s
+        })
+    });
+}
+
 impl Followed {
+    fn new(track: Track, now: Timestamp) -> Self {
+        Self { track, heard_at: now, history: VecDeque::new(), meeting: Meeting::default() }
+    }
+
+    /// Keeps the latest point, and before it only points some time apart.
     fn remember(&mut self, point: &Arc<TrackPoint>, most: usize) {
-        self.latest = point.clone();
-        let last = self.history.back();
-        if last.is_some_and(|last| point.state.time.duration_since(last.state.time) < HISTORY_STEP) {
-            return;
+        let time = |at: usize| self.history.get(at).map(|point| point.state.time);
+        let last = self.history.len().saturating_sub(1);
+        let too_near = time(last)
+            .zip(last.checked_sub(1).and_then(time))
+            .is_some_and(|(latest, before)| latest.duration_since(before) < HISTORY_STEP);
+        if too_near {
+            self.history.pop_back();
         }
-        while self.history.len() >= most.max(1) {
+        while self.history.len() >= most.max(2) {
             self.history.pop_front();
         }
         self.history.push_back(point.clone());
     }
-}
-
-fn start(regressor: Option<&Regressor>, measurement: &Measurement) -> Option<(Track, TrackState)> {
-    let settings = regressor.map_or_else(TrackSettings::default, TrackSettings::learnt_by);
-    let track = Track::start(settings, measurement)?;
-    let state = track.state_at(measurement.time);
-    Some((track, state))
 }
 
 fn compare(meeting: &mut Meeting, target_id: &TargetId, measurement: &Measurement) -> Option<Compared> {

@@ -87,6 +87,16 @@ struct Split {
     white: PlaneCovariance,
 }
 
+/// What one way of moving expects of a measurement.
+struct Foretold {
+    /// Measured less expected, m.
+    innovation: [f64; 2],
+    /// Its covariance.
+    moments: PlaneCovariance,
+    /// The covariance of the states with the measured position.
+    cross: SMatrix<f64, STATES, 2>,
+}
+
 impl Bank {
     /// A filter that knows one measured position and nothing else.
     pub(super) fn start(
@@ -204,9 +214,10 @@ impl Bank {
         }
         let crowd = self.crowding(settings, source);
         let split = split(settings, source, measured, crowd);
-        let (innovation, nis) = self.innovation(&split);
+        let mut foretold = self.foretell(&split);
+        let (innovation, nis) = self.innovation(&foretold);
         let mut judgement = Judgement { source, innovation, nis, rejected: None, restarted: false };
-        if nis.min(self.likeliest_length(&split)) > settings.gate {
+        if nis > settings.gate && self.likeliest_length(&foretold) > settings.gate {
             match self.appeal(settings, source, measured, &split) {
                 Appeal::Refused => {
                     judgement.rejected = Some(RejectionReason::OutsideGate);
@@ -216,10 +227,10 @@ impl Bank {
                     judgement.restarted = true;
                     return judgement;
                 }
-                Appeal::Reopened => {}
+                Appeal::Reopened => foretold = self.foretell(&split),
             }
         }
-        self.update(&split);
+        self.update(&foretold);
         self.standings[source as usize] =
             Standing { accepted_at: Some(self.time), rejected_since: None, rejections: 0 };
         if source == Source::Regressed {
@@ -239,18 +250,19 @@ impl Bank {
         }
     }
 
+    fn foretell(&self, split: &Split) -> [Foretold; MODES] {
+        std::array::from_fn(|mode| self.hypotheses[mode].foretell(split))
+    }
+
     /// Mean innovation over the ways of moving, and its squared Mahalanobis length.
-    fn innovation(&self, split: &Split) -> (EastNorth, f64) {
+    fn innovation(&self, foretold: &[Foretold; MODES]) -> (EastNorth, f64) {
         let mut mean = [0.0; 2];
-        let mut parts = [([0.0; 2], PlaneCovariance::default()); MODES];
-        for (part, (hypothesis, weight)) in parts.iter_mut().zip(self.hypotheses.iter().zip(self.weights)) {
-            let (innovation, moments, _) = hypothesis.foretell(split);
+        for (Foretold { innovation, .. }, weight) in foretold.iter().zip(self.weights) {
             mean[0] += weight * innovation[0];
             mean[1] += weight * innovation[1];
-            *part = (innovation, moments);
         }
         let mut total = PlaneCovariance::default();
-        for ((innovation, moments), weight) in parts.iter().zip(self.weights) {
+        for (Foretold { innovation, moments, .. }, weight) in foretold.iter().zip(self.weights) {
             let (east, north) = (innovation[0] - mean[0], innovation[1] - mean[1]);
             let spread = PlaneCovariance {
                 east_m2: east * east,
@@ -266,19 +278,19 @@ impl Bank {
     /// Squared Mahalanobis length under the way of moving that explains the measurement best, dearer
     /// by how little that way is believed: a target that stood and now starts is no outlier, though
     /// the three ways taken together hardly expect it.
-    fn likeliest_length(&self, split: &Split) -> f64 {
-        let lengths = self.hypotheses.iter().zip(self.weights).map(|(hypothesis, weight)| {
-            let (innovation, moments, _) = hypothesis.foretell(split);
-            let innovation = EastNorth { east_m: innovation[0], north_m: innovation[1] };
-            moments.squared_length(innovation) - 2.0 * weight.max(1e-12).ln()
-        });
+    fn likeliest_length(&self, foretold: &[Foretold; MODES]) -> f64 {
+        let lengths =
+            foretold.iter().zip(self.weights).map(|(Foretold { innovation, moments, .. }, weight)| {
+                let innovation = EastNorth { east_m: innovation[0], north_m: innovation[1] };
+                moments.squared_length(innovation) - 2.0 * weight.max(1e-12).ln()
+            });
         lengths.fold(f64::INFINITY, f64::min)
     }
 
-    fn update(&mut self, split: &Split) {
+    fn update(&mut self, foretold: &[Foretold; MODES]) {
         let mut logs = [0.0; MODES];
-        for (log, (hypothesis, weight)) in logs.iter_mut().zip(self.hypotheses.iter_mut().zip(self.weights)) {
-            *log = weight.max(1e-12).ln() + hypothesis.update(split);
+        for (mode, log) in logs.iter_mut().enumerate() {
+            *log = self.weights[mode].max(1e-12).ln() + self.hypotheses[mode].update(&foretold[mode]);
         }
         // Log-sum-exp: a far measurement must not turn every weight to zero.
         let highest = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -312,7 +324,8 @@ impl Bank {
             for hypothesis in &mut reopened.hypotheses {
                 hypothesis.forget_bias(split.bias);
             }
-            if reopened.innovation(split).1.min(reopened.likeliest_length(split)) <= settings.gate {
+            let foretold = reopened.foretell(split);
+            if reopened.innovation(&foretold).1.min(reopened.likeliest_length(&foretold)) <= settings.gate {
                 *self = reopened;
                 return Appeal::Reopened;
             }
@@ -452,8 +465,7 @@ impl Hypothesis {
         }
     }
 
-    /// Innovation, its covariance, and the covariance of the states with the measured position.
-    fn foretell(&self, split: &Split) -> ([f64; 2], PlaneCovariance, SMatrix<f64, STATES, 2>) {
+    fn foretell(&self, split: &Split) -> Foretold {
         let [east, north, across] = split.root_m;
         let bias = split.bias;
         let innovation = [
@@ -477,12 +489,12 @@ impl Hypothesis {
             north_m2: cross[(POSITION + 1, 1)] + across * cross[(bias, 1)] + north * cross[(bias + 1, 1)],
             east_north_m2: cross[(POSITION, 1)] + east * cross[(bias, 1)] + across * cross[(bias + 1, 1)],
         };
-        (innovation, moments.plus(split.white), cross)
+        Foretold { innovation, moments: moments.plus(split.white), cross }
     }
 
     /// Takes the measurement up and returns the log of its likelihood, less a constant.
-    fn update(&mut self, split: &Split) -> f64 {
-        let (innovation, moments, cross) = self.foretell(split);
+    fn update(&mut self, foretold: &Foretold) -> f64 {
+        let Foretold { innovation, moments, cross } = foretold;
         let determinant = moments.determinant();
         let inverse = [
             moments.north_m2 / determinant,

@@ -15,7 +15,13 @@ impl App {
     /// limit of observations.
     pub async fn fuse(&self, id: &CameraId, observations: &[Observation]) -> Result<Vec<FusedFix>> {
         self.check_batch(observations.len())?;
-        let serving = self.serving(id).await?;
+        let mut serving = self.serving(id).await?;
+        if serving.model.is_none()
+            && observations.iter().any(|observation| observation.bounding_box.is_some())
+        {
+            // A run may have ended a moment ago, here or in another process.
+            serving = self.registry.refresh_camera(&self.store, id).await?;
+        }
         let fused = observations
             .iter()
             .map(|observation| fuse_one(&serving, observation).ok_or_else(|| no_model(id)))

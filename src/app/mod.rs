@@ -23,7 +23,7 @@ use crate::store::Store;
 use crate::telemetry::Metrics;
 
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
-pub use live::{CameraEvent, Followed, LiveItem, LiveStream, Moves, TrackPoint};
+pub use live::{CameraEvent, Followed, LiveStream, Moves, TrackPoint};
 pub use models::GnssErrorEstimate;
 pub use pairing::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use recording::{PairedImport, PairedReport};

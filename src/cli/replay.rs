@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use super::progress::Progress;
 use super::{camera_id, format_of, open_file, runtime};
 use crate::clock::Clock;
-use crate::domain::{CameraId, TargetId, TimeBounds};
+use crate::domain::{CameraId, ReceiverId, TargetId, TimeBounds};
 use crate::exchange::{self, ObservedRow, RowRules};
 use crate::replay::{FaultShares, FixesOf, Live, Options, Pace, Recording, Report, replay};
 
@@ -36,8 +36,8 @@ pub(super) struct Replay {
     #[arg(long, value_name = "ID", value_parser = target_id, requires = "fixes")]
     fix_target: Option<TargetId>,
     /// The receiver of the fixes that name no target; the camera's profile says whose it is
-    #[arg(long, value_name = "ID", value_parser = target_id, requires = "fixes", conflicts_with = "fix_target")]
-    receiver: Option<TargetId>,
+    #[arg(long, value_name = "ID", value_parser = receiver_id, requires = "fixes", conflicts_with = "fix_target")]
+    receiver: Option<ReceiverId>,
     #[command(flatten)]
     to: To,
     #[command(flatten)]
@@ -235,6 +235,10 @@ async fn watched(recording: Recording, options: Options) -> anyhow::Result<Repor
 
 fn target_id(text: &str) -> Result<TargetId, String> {
     TargetId::new(text).map_err(|error| error.to_string())
+}
+
+fn receiver_id(text: &str) -> Result<ReceiverId, String> {
+    ReceiverId::new(text).map_err(|error| error.to_string())
 }
 
 fn speed(text: &str) -> Result<Pace, String> {

@@ -27,7 +27,7 @@ pub use gnss_error::{GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};
 pub use method::{Method, Step};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
-pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, Observation};
+pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use sample::{Sample, Score};

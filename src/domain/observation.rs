@@ -5,7 +5,7 @@ use jiff::Timestamp;
 use super::bounding_box::BoundingBox;
 use super::error::{Error, Result};
 use super::gnss_error::SigmaM;
-use super::names::{TargetClass, TargetId};
+use super::names::{ReceiverId, TargetClass, TargetId};
 use super::sample::Score;
 use crate::geo::Position;
 
@@ -27,6 +27,25 @@ pub struct Detection {
     pub target_id: TargetId,
     /// Where in the image.
     pub bounding_box: BoundingBox,
+    /// What the detector takes the target for.
+    pub class: Option<TargetClass>,
+    /// How sure the detector is.
+    pub score: Option<Score>,
+}
+
+/// A box, a fix, or both, as a device sent it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LiveItem {
+    /// When, by the clock of whoever measured.
+    pub time: Timestamp,
+    /// Who, if known.
+    pub target_id: Option<TargetId>,
+    /// Which receiver measured the fix, for a fix that does not name its target.
+    pub receiver_id: Option<ReceiverId>,
+    /// What the camera saw.
+    pub bounding_box: Option<BoundingBox>,
+    /// What the receiver said.
+    pub fix: Option<Fix>,
     /// What the detector takes the target for.
     pub class: Option<TargetClass>,
     /// How sure the detector is.

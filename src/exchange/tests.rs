@@ -144,7 +144,8 @@ proptest! {
 
     #[test]
     fn a_bad_row_loses_only_itself(bad in "[^\n\r,]{1,80}", before in 0..4_usize, after in 0..4_usize) {
-        prop_assume!(!bad.trim().is_empty());
+        // A byte order mark alone is no more than a blank line.
+        prop_assume!(!bad.trim_matches(|it: char| it.is_whitespace() || it == '\u{feff}').is_empty());
         let expect = |rows: Rows| {
             assert_eq!(rows.len(), before + 1 + after, "{rows:?}");
             assert_eq!(rows.iter().filter(|row| row.is_err()).count(), 1);

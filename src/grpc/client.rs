@@ -9,7 +9,6 @@ use std::fmt;
 use std::time::Duration;
 
 use futures_util::stream;
-use jiff::Timestamp;
 use tokio::sync::mpsc;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status, Streaming};
@@ -18,7 +17,7 @@ use tonic_types::StatusExt as _;
 use super::convert::timestamp;
 use super::proto;
 use super::proto::fusion_service_client::FusionServiceClient;
-use crate::domain::{BoundingBox, CameraId, Fix, Score, TargetClass, TargetId};
+use crate::domain::{CameraId, LiveItem, Score};
 
 /// A server that does not take the connection within this time counts as unreachable.
 const CONNECT_TIME: Duration = Duration::from_secs(5);
@@ -40,25 +39,6 @@ pub struct Opening {
     pub resume_after_seq: u64,
     /// Whether the items become training samples and are acknowledged.
     pub store_samples: bool,
-}
-
-/// A box, a fix, or both, of one target at one instant.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Item {
-    /// When, by the clock of whoever measured.
-    pub time: Timestamp,
-    /// Who.
-    pub target_id: Option<TargetId>,
-    /// Which receiver measured the fix; instead of a target for a fix alone.
-    pub receiver_id: Option<TargetId>,
-    /// What the camera saw.
-    pub bounding_box: Option<BoundingBox>,
-    /// What the receiver said.
-    pub fix: Option<Fix>,
-    /// What the detector takes the target for.
-    pub class: Option<TargetClass>,
-    /// How sure the detector is.
-    pub score: Option<Score>,
 }
 
 /// What the server tells on a stream.
@@ -190,7 +170,7 @@ pub struct Room<'a>(mpsc::Permit<'a, proto::StreamRequest>);
 
 impl Room<'_> {
     /// Sends the item. Seqs must rise.
-    pub fn send(self, seq: u64, item: Item) {
+    pub fn send(self, seq: u64, item: LiveItem) {
         let item = proto::StreamItem {
             seq,
             time: Some(timestamp(item.time)),

@@ -4,10 +4,9 @@
 use jiff::Timestamp;
 
 use super::proto;
-use crate::app::LiveItem;
 use crate::domain::{
-    self, CameraId, Error, ErrorKind, Observation, ReceiverId, Refusal, Result, RunId, Sample, Score,
-    TargetClass, TargetId,
+    self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Sample,
+    Score, TargetClass, TargetId,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};

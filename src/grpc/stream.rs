@@ -136,7 +136,7 @@ impl Conversation {
                     heard_at = Instant::now();
                     self.answer(camera, stream, message).await?;
                     items += 1;
-                    if items % ITEMS_PER_LOOK == 0 {
+                    if items.is_multiple_of(ITEMS_PER_LOOK) {
                         self.acknowledge(stream, &mut acknowledged)?;
                         // Others on this thread, and the branches below, get their turn.
                         tokio::task::yield_now().await;

@@ -12,8 +12,8 @@ use super::buffer::{Answered, Buffer};
 use super::feed::Feed;
 use super::report::Tally;
 use super::{Live, Options};
-use crate::domain::TargetId;
-use crate::grpc::client::{ClientError, Connection, Event, Events, Item, ItemSender, Opening};
+use crate::domain::{LiveItem, ReceiverId, TargetId};
+use crate::grpc::client::{ClientError, Connection, Event, Events, ItemSender, Opening};
 use crate::grpc::proto::StreamAnswer;
 use crate::grpc::proto::stream_answer::Outcome;
 
@@ -263,11 +263,12 @@ impl SimulatedCamera {
     }
 
     /// The item with its target's id as this camera spells it.
-    fn own(&self, mut item: Item) -> Item {
+    fn own(&self, mut item: LiveItem) -> LiveItem {
         if let Some(suffix) = &self.suffix {
-            let renamed = |id: TargetId| TargetId::new(&format!("{id}{suffix}")).unwrap_or(id);
-            item.target_id = item.target_id.map(renamed);
-            item.receiver_id = item.receiver_id.map(renamed);
+            let target = |id: TargetId| TargetId::new(&format!("{id}{suffix}")).unwrap_or(id);
+            let receiver = |id: ReceiverId| ReceiverId::new(&format!("{id}{suffix}")).unwrap_or(id);
+            item.target_id = item.target_id.map(target);
+            item.receiver_id = item.receiver_id.map(receiver);
         }
         item
     }

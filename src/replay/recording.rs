@@ -2,9 +2,8 @@
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::domain::{Error, Result, TargetId};
+use crate::domain::{Error, LiveItem, ReceiverId, Result, TargetId};
 use crate::exchange::ObservedRow;
-use crate::grpc::client::Item;
 
 /// Whose the fixes of a file without targets are.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -12,13 +11,13 @@ pub enum FixesOf {
     /// This target's.
     Target(TargetId),
     /// This receiver's; the server knows whose it is.
-    Receiver(TargetId),
+    Receiver(ReceiverId),
 }
 
 /// Items to be replayed, at least one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recording {
-    items: Vec<Item>,
+    items: Vec<LiveItem>,
     first: Timestamp,
     last: Timestamp,
     interval: SignedDuration,
@@ -69,7 +68,7 @@ impl Recording {
         Self::of_items(items)
     }
 
-    fn of_items(items: Vec<Item>) -> Result<Self> {
+    fn of_items(items: Vec<LiveItem>) -> Result<Self> {
         let mut times: Vec<_> = items.iter().map(|item| item.time).collect();
         times.sort_unstable();
         times.dedup();
@@ -115,7 +114,7 @@ impl Recording {
     }
 
     /// The item as it is in that pass, its time shifted.
-    pub(super) fn item(&self, row: usize, pass: u64, shift: SignedDuration) -> Item {
+    pub(super) fn item(&self, row: usize, pass: u64, shift: SignedDuration) -> LiveItem {
         let mut item = self.items[row].clone();
         item.time = item.time.saturating_add(shift + self.later(pass)).unwrap_or(item.time);
         item
@@ -129,9 +128,9 @@ impl Recording {
     }
 }
 
-fn item(row: ObservedRow) -> Item {
+fn item(row: ObservedRow) -> LiveItem {
     let ObservedRow { observation, class, score, truth: _ } = row;
-    Item {
+    LiveItem {
         time: observation.time,
         target_id: observation.target_id,
         receiver_id: None,
@@ -199,7 +198,7 @@ pub(super) mod tests {
         assert_eq!(told, expected.map(|(second, is_fix)| (time(second), is_fix)));
         assert!(merged.items.iter().all(|item| item.target_id.as_ref().is_some_and(|id| id.as_str() == "a")));
 
-        let receiver = FixesOf::Receiver(TargetId::new("phone").expect("a name"));
+        let receiver = FixesOf::Receiver(ReceiverId::new("phone").expect("a name"));
         let merged = Recording::of_both(rows(&boxes), rows(&fixes), Some(receiver)).expect("rows");
         let receivers =
             merged.items.iter().filter(|item| item.receiver_id.is_some() && item.target_id.is_none());

@@ -24,7 +24,7 @@ use super::registry::Serving;
 use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, FusedFix, Observation, Result, TargetId};
 use crate::fusion::two_step;
 
-pub use stream::{LiveItem, LiveStream, Moves};
+pub use stream::{LiveStream, Moves};
 pub use tracks::TrackPoint;
 
 /// Events that a slow reader may lag behind before it loses some.

@@ -3,38 +3,18 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
-use jiff::Timestamp;
 use tokio::sync::watch;
 
 use super::keeping::{Half, Keeping, Ledger};
 use super::{CameraLive, Followed, lock};
 use crate::app::App;
 use crate::domain::{
-    BoundingBox, CameraId, CameraMoved, Detection, Error, ErrorKind, Fix, Observation, ReceiverId, Result,
-    Sample, Score, TargetClass, TargetId, check_text,
+    CameraId, CameraMoved, Detection, Error, ErrorKind, LiveItem, Observation, Result, Sample, Score,
+    TargetClass, check_text,
 };
 
 /// Longest name of a client, in bytes.
 const LONGEST_CLIENT_NAME: usize = 128;
-
-/// A box, a fix, or both, as a device sent it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct LiveItem {
-    /// When, by the clock of whoever measured.
-    pub time: Timestamp,
-    /// Who, if known.
-    pub target_id: Option<TargetId>,
-    /// Which receiver measured the fix, for a fix that does not name its target.
-    pub receiver_id: Option<ReceiverId>,
-    /// What the camera saw.
-    pub bounding_box: Option<BoundingBox>,
-    /// What the receiver said.
-    pub fix: Option<Fix>,
-    /// What the detector takes the target for.
-    pub class: Option<TargetClass>,
-    /// How sure the detector is.
-    pub score: Option<Score>,
-}
 
 /// Streams that are open, counted by client.
 #[derive(Default)]

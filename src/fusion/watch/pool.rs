@@ -50,6 +50,8 @@ pub(super) struct Pool<'a> {
     pub(super) bias_m2: f64,
     pub(super) e_regression_m2: f64,
     pub(super) blocks: f64,
+    /// Over all targets, kept up with every block: a pool is asked after each of them.
+    total: Part,
 }
 
 /// One target's part of a pool.
@@ -59,6 +61,33 @@ pub(super) struct Share {
     sum: [f64; 2],
     bias_m2: f64,
     slow: SlowUnits,
+    part: Part,
+}
+
+/// A weight, and weighted means.
+#[derive(Debug, Clone, Copy, Default)]
+struct Part {
+    weight: f64,
+    sum: [f64; 2],
+}
+
+impl Part {
+    fn plus(self, other: Self) -> Self {
+        Self { weight: self.weight + other.weight, sum: [0, 1].map(|axis| self.sum[axis] + other.sum[axis]) }
+    }
+
+    fn less(self, other: Self) -> Self {
+        Self { weight: self.weight - other.weight, sum: [0, 1].map(|axis| self.sum[axis] - other.sum[axis]) }
+    }
+}
+
+impl Share {
+    /// What the target adds to a mean, its slow error counted once for each stretch.
+    fn part(&self, settings: &WatchSettings) -> Part {
+        let slow_m2 = settings.receiver_share.powi(2) * self.bias_m2 / f64::from(self.slow.count);
+        let weight = 1.0 / (1.0 / self.weight + slow_m2);
+        Part { weight, sum: self.sum.map(|sum| weight * sum / self.weight) }
+    }
 }
 
 /// Counts stretches of time whose slow errors are independent.
@@ -87,6 +116,7 @@ impl<'a> Pool<'a> {
             bias_m2: 0.0,
             e_regression_m2: 0.0,
             blocks: 0.0,
+            total: Part::default(),
         }
     }
 
@@ -99,6 +129,9 @@ impl<'a> Pool<'a> {
         }
         share.bias_m2 = share.bias_m2.max(block.bias_m2);
         share.slow.add(block.began_at, self.settings.slow_s);
+        let part = share.part(self.settings);
+        self.total = self.total.less(share.part).plus(part);
+        share.part = part;
         self.slow.add(block.began_at, self.settings.slow_s);
         self.blocks += 1.0;
         self.bias_m2 += (block.bias_m2 - self.bias_m2) / self.blocks;
@@ -109,22 +142,14 @@ impl<'a> Pool<'a> {
     /// brings an error of the model that was not there before.
     pub(super) fn estimate(&self, without: Option<&TargetId>, ground: Ground) -> Option<Estimate> {
         let settings = self.settings;
-        let (mut weight, mut sum) = (0.0, [0.0; 2]);
-        for (target_id, share) in &self.targets {
-            if without == Some(*target_id) {
-                continue;
-            }
-            let slow_m2 = settings.receiver_share.powi(2) * share.bias_m2 / f64::from(share.slow.count);
-            let its = 1.0 / (1.0 / share.weight + slow_m2);
-            weight += its;
-            for (total, part) in sum.iter_mut().zip(share.sum) {
-                *total += its * part / share.weight;
-            }
-        }
+        let left_out = without.and_then(|target_id| self.targets.get(target_id));
+        let others = self.targets.len() > usize::from(left_out.is_some());
+        let Part { weight, sum } = self.total.less(left_out.map_or_else(Part::default, |share| share.part));
         let common_m2 = settings.common_share.powi(2) * self.bias_m2 / f64::from(self.slow.count.max(1));
         let cells = f64::from(ground.cells.max(1));
         let model_m2 = self.e_regression_m2 * f64::from(ground.new) / (cells * cells);
-        (weight > 0.0).then(|| Estimate {
+        // What is left of a weight that was taken away again is rounding, not evidence.
+        (others && weight > 0.0).then(|| Estimate {
             mean: sum.map(|total| total / weight),
             variance_m2: 1.0 / weight + common_m2 + model_m2,
         })

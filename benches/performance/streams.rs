@@ -55,7 +55,9 @@ impl FusionService for Echo {
         let made = self.0.clone();
         let answers = request.into_inner().map(move |message| {
             let kind = match message?.kind {
-                Some(Sent::Item(item)) => Told::Answer(proto::StreamAnswer { seq: item.seq, ..made.clone() }),
+                Some(Sent::Item(item)) => {
+                    Told::Answer(Box::new(proto::StreamAnswer { seq: item.seq, ..made.clone() }))
+                }
                 _ => Told::Opened(proto::StreamOpened::default()),
             };
             Ok(proto::StreamResponse { kind: Some(kind) })
@@ -205,7 +207,7 @@ async fn sample_answer(served: &Served, observations: &Arc<Vec<Observation>>) ->
         if let Some(Told::Answer(answer)) = message.kind
             && answer.seq == 2
         {
-            return answer;
+            return *answer;
         }
     }
 }

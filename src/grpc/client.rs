@@ -202,7 +202,7 @@ impl Events {
             return Ok(Some(match response.kind {
                 None => continue,
                 Some(Kind::Opened(opened)) => Event::Opened { model_version: opened.model_version },
-                Some(Kind::Answer(answer)) => Event::Answer(Box::new(answer)),
+                Some(Kind::Answer(answer)) => Event::Answer(answer),
                 Some(Kind::Acknowledgement(upto)) => Event::Acknowledged { seq: upto.seq },
                 Some(Kind::CameraMoved(moved)) => Event::CameraMoved(moved),
                 Some(Kind::Reconnect(invitation)) => Event::Reconnect { reason: invitation.reason },

@@ -30,7 +30,7 @@ struct Shared {
 #[derive(Default)]
 struct Waiting {
     opened: Option<StreamOpened>,
-    answers: VecDeque<StreamAnswer>,
+    answers: VecDeque<Box<StreamAnswer>>,
     acknowledged: Option<u64>,
     moved: Option<CameraMoved>,
     reconnect: Option<StreamReconnect>,
@@ -68,19 +68,23 @@ impl Outbox {
         self.0.put(|waiting| waiting.opened = Some(opened));
     }
 
-    /// Says whether an older answer was lost for it.
-    pub(super) fn answer(&self, mut answer: StreamAnswer) -> bool {
-        let mut lost = false;
-        self.0.put(|waiting| {
-            if waiting.answers.len() >= self.0.most_answers {
-                waiting.answers.pop_front();
-                waiting.lost_answers += 1;
-                lost = true;
-            }
-            answer.lost_answers = waiting.lost_answers;
-            waiting.answers.push_back(answer);
-        });
+    /// Says whether an older answer was lost for it. The reader is not woken before
+    /// [`Outbox::flush`]: answers go out together.
+    pub(super) fn answer(&self, mut answer: Box<StreamAnswer>) -> bool {
+        let mut waiting = self.0.lock();
+        let lost = waiting.answers.len() >= self.0.most_answers;
+        if lost {
+            waiting.answers.pop_front();
+            waiting.lost_answers += 1;
+        }
+        answer.lost_answers = waiting.lost_answers;
+        waiting.answers.push_back(answer);
         lost
+    }
+
+    /// Wakes the reader.
+    pub(super) fn flush(&self) {
+        self.0.put(|_| {});
     }
 
     /// An acknowledgement takes the place of those before it.

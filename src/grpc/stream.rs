@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
+use futures_util::FutureExt as _;
 use tokio::time::Instant;
-use tonic::Streaming;
+use tonic::{Status, Streaming};
 
 use super::convert::{camera_id, live_item, timestamp};
 use super::outbox::{Outbox, Responses, outbox};
@@ -22,8 +23,8 @@ use crate::telemetry::RequestId;
 const TICK: Duration = Duration::from_secs(1);
 /// Time that a client gets to half-close after it was asked to reconnect.
 const FAREWELL: Duration = Duration::from_secs(5);
-/// Items between two looks at what is settled, while items come without a pause.
-const ITEMS_PER_LOOK: u32 = 32;
+/// Items that are answered together, if they are there.
+const BATCH: u32 = 32;
 
 /// Begins to answer a stream; all errors come as its end.
 pub(super) fn serve(
@@ -125,19 +126,17 @@ impl Conversation {
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut moves = stream.moves();
         let mut acknowledged = None;
-        let mut items = 0_u32;
         loop {
             tokio::select! {
                 biased;
                 message = self.requests.message() => {
-                    let Some(message) = message.map_err(|status| broken(&status))? else {
-                        return Ok(Stop::HalfClosed);
+                    let whole_batch = match self.answer_batch(camera, stream, message).await? {
+                        Some(answered) => answered == BATCH,
+                        None => return Ok(Stop::HalfClosed),
                     };
                     heard_at = Instant::now();
-                    self.answer(camera, stream, message).await?;
-                    items += 1;
-                    if items.is_multiple_of(ITEMS_PER_LOOK) {
-                        self.acknowledge(stream, &mut acknowledged)?;
+                    self.acknowledge(stream, &mut acknowledged)?;
+                    if whole_batch {
                         // Others on this thread, and the branches below, get their turn.
                         tokio::task::yield_now().await;
                     }
@@ -168,6 +167,28 @@ impl Conversation {
         }
     }
 
+    /// Answers a message and those behind it that are there already; how many, or `None` at the end.
+    async fn answer_batch(
+        &mut self,
+        camera: &CameraId,
+        stream: &mut LiveStream,
+        first: Result<Option<proto::StreamRequest>, Status>,
+    ) -> Result<Option<u32>> {
+        let mut next = Some(first);
+        let mut answered = 0;
+        while let Some(message) = next {
+            let Some(message) = message.map_err(|status| broken(&status))? else {
+                self.outbox.flush();
+                return Ok(None);
+            };
+            self.answer(camera, stream, message).await?;
+            answered += 1;
+            next = if answered < BATCH { self.requests.message().now_or_never() } else { None };
+        }
+        self.outbox.flush();
+        Ok(Some(answered))
+    }
+
     fn acknowledge(&self, stream: &LiveStream, acknowledged: &mut Option<u64>) -> Result<()> {
         let now = stream.acknowledged()?;
         if let Some(seq) = now
@@ -194,7 +215,7 @@ impl Conversation {
             None => refused(0, &Error::invalid("item", "the message is empty")),
         };
         self.app.metrics.item_answered(!matches!(answer.outcome, Some(Outcome::Error(_))));
-        if self.outbox.answer(answer) {
+        if self.outbox.answer(Box::new(answer)) {
             self.app.metrics.answer_lost();
         }
         Ok(())

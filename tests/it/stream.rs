@@ -49,7 +49,7 @@ impl Client {
     async fn answer(&mut self) -> proto::StreamAnswer {
         loop {
             match self.next().await.expect("no end") {
-                Some(Told::Answer(answer)) => return answer,
+                Some(Told::Answer(answer)) => return *answer,
                 Some(Told::Opened(_) | Told::Acknowledgement(_)) => {}
                 other => panic!("no answer but {other:?}"),
             }
@@ -65,7 +65,7 @@ impl Client {
             match told.message().await {
                 Ok(Some(message)) => match message.kind.expect("set") {
                     Told::Acknowledgement(acknowledgement) => acknowledged = Some(acknowledgement.seq),
-                    Told::Answer(answer) => answers.push(answer),
+                    Told::Answer(answer) => answers.push(*answer),
                     _ => {}
                 },
                 Ok(None) => return (acknowledged, answers, None),

@@ -136,12 +136,12 @@ impl Served {
             let error =
                 proto::StreamItemError { reason: "invalid-argument".to_owned(), ..Default::default() };
             let outcome = refused.then_some(proto::stream_answer::Outcome::Error(error));
-            self.tell(Told::Answer(proto::StreamAnswer {
+            self.tell(Told::Answer(Box::new(proto::StreamAnswer {
                 seq,
                 outcome,
                 lost_answers: self.lost,
                 ..Default::default()
-            }))
+            })))
             .await;
         }
         if self.script.break_after == Some(self.items) {

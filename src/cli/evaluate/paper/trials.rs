@@ -49,8 +49,8 @@ fn balance(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
                 let (_, error_m) = mean_over(&Options::new(scene), worlds, recipe, trial)?;
                 let _ = write!(cells, " {error_m:.3} |");
             }
-            let _ = writeln!(page, "| `{recipe}` | 1 : {} |{cells}", 1.0 / ratio);
-            eprintln!("{recipe}, wX : wZ = 1 : {}", 1.0 / ratio);
+            let _ = writeln!(page, "| `{recipe}` | 1 : {} |{cells}", (1e6 / ratio).round() / 1e6);
+            eprintln!("{recipe}, wX : wZ = 1 : {}", (1e6 / ratio).round() / 1e6);
         }
     }
     page.push('\n');

@@ -27,6 +27,7 @@ impl App {
             .map(|observation| fuse_one(&serving, observation).ok_or_else(|| no_model(id)))
             .collect::<Result<Vec<_>>>()?;
         self.metrics.fused(&fused);
+        self.watch_over(id, &serving, observations).await;
         Ok(fused)
     }
 

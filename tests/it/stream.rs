@@ -615,3 +615,36 @@ async fn a_camera_that_was_turned_is_told_everywhere_and_trained_anew() {
         tokio::time::sleep(Duration::from_millis(200)).await;
     }
 }
+
+#[tokio::test]
+async fn who_only_asks_for_positions_learns_of_a_turned_camera_too() {
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), true).await;
+    let scene = Options { seed: 37, samples: 3_000, targets: 3, ..Options::demo() };
+    let knocked = Options { pan_deg_from: Some((scene.start, 10.0)), seed: 38, ..scene.clone() };
+    let observed = |row: &SimulatedRow, days: i64| {
+        let [left_px, top_px, width_px, height_px] = row.bounding_box?.sides_px();
+        let position = row.fix?.position;
+        Some(json!({
+            "time": row.time + jiff::SignedDuration::from_hours(24 * days),
+            "target_id": row.target_id.as_str(),
+            "bounding_box": {"left_px": left_px, "top_px": top_px, "width_px": width_px, "height_px": height_px},
+            "fix": {"longitude_deg": position.longitude_deg(), "latitude_deg": position.latitude_deg()},
+        }))
+    };
+    let (before, after) = (rows(&scene), rows(&knocked));
+    let all: Vec<Value> = before
+        .iter()
+        .filter_map(|row| observed(row, 0))
+        .chain(after.iter().filter_map(|row| observed(row, 1)))
+        .collect();
+    let moved = async || server.get("/v1/cameras/yard").await.expect(200).json()["moved"].clone();
+    // The last of each four is compared, so each of the three targets in turn.
+    for (index, batch) in all.chunks(4).enumerate() {
+        server.post("/v1/cameras/yard/fusions", &json!({ "observations": batch })).await.expect(200);
+        if index == before.len() / 4 {
+            assert!(moved().await.is_null(), "nothing was turned yet");
+        }
+    }
+    assert_eq!(moved().await["model_version"], 1);
+}

@@ -134,10 +134,8 @@ impl App {
             // Without a listener there is nobody to tell.
             let _ = live.events.send(CameraEvent::Track(point.clone()));
         }
-        if let (Some(model), Some(compared)) = (model, compared)
-            && let Some(moved) = live.watching.compare(model, &compared)
-        {
-            self.raise(id, moved).await?;
+        if let (Some(model), Some(compared)) = (model, compared) {
+            self.compare(id, live, model, &compared).await;
         }
         Ok(Followed { fused, track })
     }

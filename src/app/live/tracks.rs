@@ -140,6 +140,11 @@ impl Tracks {
         targets.values().cloned().collect()
     }
 
+    /// The plane of all tracks and comparisons; about the first position that is asked for.
+    pub(super) fn plane(&self, anywhere: Position) -> &LocalPlane {
+        self.plane.get_or_init(|| LocalPlane::new(anywhere))
+    }
+
     fn measurement(&self, seen: &Seen<'_>) -> Option<(&LocalPlane, Measurement)> {
         let Observation { time, bounding_box, fix, .. } = seen.observation;
         // From the box alone, also where the recipe could look at the fix: the track must not be
@@ -150,7 +155,7 @@ impl Tracks {
             .map(|(drawn, regressor)| (regressor.plane(), regressor.regress(drawn, None)));
         let regressed = regression.map(|(plane, it)| (plane.to_position(it.regressed), it.variance_m2()));
         let anywhere = fix.map(|fix| fix.position).or(regressed.map(|(position, _)| position))?;
-        let plane = self.plane.get_or_init(|| LocalPlane::new(anywhere));
+        let plane = self.plane(anywhere);
         let measured = |(position, variance_m2)| Measured::isotropic(plane.to_plane(position), variance_m2);
         let measurement = Measurement {
             time: *time,

@@ -2,10 +2,12 @@
 
 use std::sync::{Arc, Mutex};
 
-use super::lock;
+use super::{CameraLive, lock};
 use crate::app::App;
-use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Result};
+use crate::app::registry::Serving;
+use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Observation, Result};
 use crate::fusion::track::TrackSettings;
+use crate::fusion::two_step;
 use crate::fusion::watch::{Alarm, CameraWatch, Compared, WatchSettings};
 use crate::model::Regressor;
 
@@ -60,16 +62,62 @@ fn moved(model_version: u32, alarm: &Alarm) -> CameraMoved {
 }
 
 impl App {
+    /// Compares the last of some observations, of those with box, fix and target: for clients who
+    /// only ask for positions. One of a batch is enough, and costs the others nothing.
+    pub(in crate::app) async fn watch_over(
+        &self,
+        id: &CameraId,
+        serving: &Serving,
+        observations: &[Observation],
+    ) {
+        let Some((regressor, version)) = &serving.model else { return };
+        let live = self.live.of(id);
+        let comparable = observations.iter().rev().find_map(|observation| {
+            let Observation { time, target_id: Some(target_id), bounding_box: Some(drawn), fix: Some(fix) } =
+                observation
+            else {
+                return None;
+            };
+            let regression = regressor.regress(drawn, None);
+            let plane = live.tracks.plane(fix.position);
+            Some(Compared {
+                time: *time,
+                target_id: target_id.clone(),
+                regressed: plane.to_plane(regressor.plane().to_position(regression.regressed)),
+                fix: plane.to_plane(fix.position),
+                e_regression_m2: regression.variance_m2(),
+                e_gnss_m2: two_step::fix_variance_m2(observation, Some(regressor), serving.e_gnss_m2),
+            })
+        });
+        if let Some(compared) = comparable {
+            self.compare(id, &live, (regressor, *version), &compared).await;
+        }
+    }
+
+    /// Takes up a comparison, and raises the alarm if it comes to that. An alarm that cannot be kept
+    /// is logged and comes again with the next comparison; positions are answered all the same.
+    pub(super) async fn compare(
+        &self,
+        id: &CameraId,
+        live: &CameraLive,
+        model: (&Regressor, u32),
+        compared: &Compared,
+    ) {
+        let Some(moved) = live.watching.compare(model, compared) else { return };
+        if let Err(error) = self.raise(id, live, moved).await {
+            tracing::error!(camera.id = %id, %error, "the alarm that the camera was moved cannot be kept");
+        }
+    }
+
     /// Keeps an alarm and tells everyone, once per model version.
     ///
     /// # Errors
-    /// A fault of the store; then the next comparison brings the alarm again.
-    pub(super) async fn raise(&self, id: &CameraId, moved: CameraMoved) -> Result<()> {
+    /// A fault of the store.
+    async fn raise(&self, id: &CameraId, live: &CameraLive, moved: CameraMoved) -> Result<()> {
         let is_new = match self.store.insert_move(id, &moved).await {
             Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraNotFound => return Ok(()),
             kept => kept?,
         };
-        let live = self.live.of(id);
         live.watching.saved();
         self.registry.refresh_camera(&self.store, id).await?;
         if is_new {

@@ -127,3 +127,26 @@ fn a_trial_fits_its_candidate_with_its_balance_or_says_that_there_is_none() {
     assert_ne!(plain.weights, trial(Some("hybrid"), Some(other)).expect("fits").weights);
     assert!(trial(Some("nothing"), None).is_err());
 }
+
+/// Two recordings of the same ground, the fixes of one shifted: which is right nobody can tell, and
+/// the map between them must say so.
+#[test]
+fn sessions_that_contradict_each_other_raise_the_error() {
+    let (first, second) = (walk(24, 40, 2.0, 21), walk(24, 40, 2.0, 22));
+    let usual_m = |shift_m: f64| {
+        let next_day = second.iter().cloned().map(|mut sample| {
+            sample.time += jiff::SignedDuration::from_hours(24);
+            let plane = LocalPlane::new(sample.fix.position);
+            sample.fix.position = plane.to_position(EastNorth { east_m: shift_m, north_m: 0.0 });
+            sample
+        });
+        let both: Vec<Sample> = first.iter().cloned().chain(next_day).collect();
+        let artifact = fit(&both, &options(Recipe::Projective), &mut silent).expect("fits");
+        let regressor = artifact.load().expect("loads");
+        let error_m = |sample: &Sample| regressor.regress(&sample.bounding_box, None).e_regression_m2.sqrt();
+        first.iter().map(error_m).sum::<f64>() / first.len() as f64
+    };
+    let (alike_m, apart_m) = (usual_m(0.0), usual_m(4.0));
+    // The map lies between the two, 2 m from either.
+    assert!(alike_m < 0.8 && apart_m > 1.2 && apart_m < 3.0, "{alike_m} m, {apart_m} m");
+}

@@ -36,6 +36,10 @@ const PRIOR_VARIANCE: f64 = 4.0;
 const UNKNOWN_EDGE_NOISE_PX2: f64 = 1.0;
 /// The error varies over the image, so its distribution has longer tails than a normal one.
 const TAIL: f64 = 1.1;
+/// A hole longer than this ends a session, s.
+const SESSION_HOLE_S: f64 = 1_800.0;
+/// Independent fixes that a session needs to be heard.
+const FEWEST_OF_SESSION: f64 = 4.0;
 /// Factor on the error variance of boxes that the image's border cuts, where training had few.
 const RARE_BORDER_FACTOR: f64 = 4.0;
 /// Share of training boxes whose reconstruction error is usual for certain, and the factor on it up
@@ -81,7 +85,9 @@ pub(super) fn calibrate(
     let cells = Cells::new(&coverage, &rows.rows, &encode);
     let edge_px2 = edge_noise_px2(&rows.rows, &answers, &places, &cells);
 
-    let everywhere_m2 = misfit_m2 + lasting_m2 / f64::from(BLOCKS);
+    // Both tell of errors that outlast a pass; the larger has it.
+    let session_m2 = session_m2(&rows.rows, &own, noise);
+    let everywhere_m2 = misfit_m2 + session_m2.max(lasting_m2 / f64::from(BLOCKS));
     coverage.errors_m2 = places
         .doubts_m2
         .iter()
@@ -107,6 +113,7 @@ pub(super) fn calibrate(
         ("error_doubt_m2", understated * mean_doubt_m2),
         ("error_misfit_m2", misfit_m2),
         ("error_lasting_m2", lasting_m2),
+        ("error_session_m2", session_m2),
         ("edge_noise_px2", edge_px2),
     ] {
         put(parts, name, value);
@@ -282,6 +289,40 @@ fn lasting_m2(held_out: &[[f64; 2]], own: &[[f64; 2]], doubt_m2: f64) -> f64 {
     let others = f64::from(BLOCKS - 1);
     let of_noise_m2 = doubt_m2 * (f64::from(BLOCKS) / others + 1.0);
     (scatter_m2(held_out) - scatter_m2(own) - of_noise_m2).max(0.0) * others / (others + 1.0)
+}
+
+/// Variance per axis that a map has from sessions whose fixes are all shifted, m2: half an hour without
+/// a row ends a session, and with it the errors that no filter inside of it can tell from the truth.
+/// The sessions' mean residuals about one map scatter by those shifts and by what the coloured noise
+/// leaves of a mean; the map has the mean of the shifts. 0 for a single session, which tells nothing.
+fn session_m2(rows: &[Row], own: &[[f64; 2]], noise: &FixNoise) -> f64 {
+    let credible_m2 = 2.0 * CREDIBLE_SIGMAS * CREDIBLE_SIGMAS * scatter_m2(own);
+    let mut order: Vec<usize> = (0..rows.len())
+        .filter(|index| own[*index][0].powi(2) + own[*index][1].powi(2) <= credible_m2)
+        .collect();
+    order.sort_by(|one, other| rows[*one].time_s.total_cmp(&rows[*other].time_s));
+    let (mut means, mut of_noise_m2) = (Vec::new(), 0.0);
+    for session in order.chunk_by(|one, next| rows[*next].time_s - rows[*one].time_s <= SESSION_HOLE_S) {
+        let mut session = session.to_vec();
+        // Rows of a pass stand together again.
+        session.sort_unstable();
+        let its: Vec<Row> = session.iter().map(|index| rows[*index].clone()).collect();
+        let worth = independent_fixes(&its, noise);
+        if worth < FEWEST_OF_SESSION {
+            continue;
+        }
+        let count = session.len() as f64;
+        means.push([0, 1].map(|axis| session.iter().map(|index| own[*index][axis]).sum::<f64>() / count));
+        of_noise_m2 += noise.variance_m2 / worth;
+    }
+    let count = means.len() as f64;
+    if means.len() < 2 {
+        return 0.0;
+    }
+    let middle = [0, 1].map(|axis| means.iter().map(|mean| mean[axis]).sum::<f64>() / count);
+    let squares = means.iter().map(|mean| (mean[0] - middle[0]).powi(2) + (mean[1] - middle[1]).powi(2));
+    let between_m2 = squares.sum::<f64>() / (2.0 * (count - 1.0));
+    (between_m2 - of_noise_m2 / count).max(0.0) / count
 }
 
 /// Variance per axis of residuals by their median, which a few wild ones do not move, m2.

@@ -116,8 +116,10 @@ the real square.
 What was looked at while the method was built: the truth of simulated worlds (seeds 1 to 6, 101 to 103,
 201, 202, and 1000 to 1099), after which constants of the stated errors and of the track were set, and
 the surveyed line of the real square, after which earlier constants and settings of the track were
-compared. So the figures of the real square are not those of untouched data. The simulated worlds of
-this page (from seed 2001 on) were looked at by nobody before, and nothing was changed after.
+compared, and after which the error that contradicting sessions leave was added. So the figures of the
+real square are not those of untouched data. The simulated worlds of this page (from seed 2001 on) were
+looked at by nobody before, and nothing was changed after but that same addition, which changes none of
+their figures: each is one session.
 
 Where a receiver's error stays for minutes, one map is off by much the same everywhere, so in one world
 nearly all or nearly none of the true positions are inside a radius; coverage of such cases means

@@ -37,7 +37,7 @@ use proto::training_service_server::TrainingServiceServer;
 pub use statuses::explain;
 
 /// Messages, services and clients generated from `proto/`.
-#[expect(clippy::allow_attributes, clippy::large_enum_variant, reason = "generated code")]
+#[expect(clippy::allow_attributes, reason = "generated code")]
 pub mod proto {
     tonic::include_proto!("sightfix.v1");
 

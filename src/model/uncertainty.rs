@@ -306,7 +306,7 @@ fn session_m2(rows: &[Row], own: &[[f64; 2]], noise: &FixNoise) -> f64 {
         let mut session = session.to_vec();
         // Rows of a pass stand together again.
         session.sort_unstable();
-        let its: Vec<Row> = session.iter().map(|index| rows[*index].clone()).collect();
+        let its: Vec<Row> = session.iter().map(|index| rows[*index]).collect();
         let worth = independent_fixes(&its, noise);
         if worth < FEWEST_OF_SESSION {
             continue;

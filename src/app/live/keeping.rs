@@ -73,13 +73,7 @@ impl Ledger {
         let entries = lock(&self.entries);
         match entries.failed {
             None => Ok(entries.outstanding.is_empty()),
-            Some(ErrorKind::CameraNotFound) => {
-                Err(Error::refused(ErrorKind::CameraNotFound, "the camera was deleted"))
-            }
-            Some(_) => Err(Error::refused(
-                ErrorKind::Overloaded,
-                "samples could not be stored; open the stream again behind the last acknowledged seq",
-            )),
+            Some(kind) => Err(not_kept(kind)),
         }
     }
 
@@ -88,9 +82,21 @@ impl Ledger {
         self.changed.notified().await;
     }
 
-    fn fail(&self, kind: ErrorKind) {
-        lock(&self.entries).failed = Some(kind);
+    /// Nothing more is acknowledged. The first reason stays.
+    fn fail(&self, kind: ErrorKind) -> Error {
+        let kind = *lock(&self.entries).failed.get_or_insert(kind);
         self.changed.notify_one();
+        not_kept(kind)
+    }
+}
+
+fn not_kept(kind: ErrorKind) -> Error {
+    match kind {
+        ErrorKind::CameraNotFound => Error::refused(kind, "the camera was deleted"),
+        _ => Error::refused(
+            ErrorKind::Overloaded,
+            "samples could not be stored; open the stream again behind the last acknowledged seq",
+        ),
     }
 }
 
@@ -153,6 +159,11 @@ impl Keeping {
         keeping
     }
 
+    /// Whether nothing more can be kept: a commit has failed.
+    pub(super) fn has_failed(&self) -> bool {
+        self.commits.is_closed()
+    }
+
     /// How late items may come and still find their partner.
     pub(super) fn lateness(&self) -> Duration {
         self.settings.lateness.unsigned_abs()
@@ -198,11 +209,10 @@ impl Keeping {
     }
 }
 
+/// The queue is closed by a commit that failed, and never else while a stream holds the keeping: a
+/// stream that had nothing in that commit must end too, or it would acknowledge what nobody keeps.
 fn stopped(ledger: &Ledger) -> Error {
-    match ledger.is_settled() {
-        Err(error) => error,
-        Ok(_) => Error::refused(ErrorKind::ShuttingDown, "the server is ending"),
-    }
+    ledger.fail(ErrorKind::Internal)
 }
 
 impl Waiting {
@@ -314,7 +324,7 @@ async fn store_all(store: &Store, id: &CameraId, commit: Commit, metrics: &Metri
         match store.insert_samples(id, samples).await {
             Ok(inserted) => metrics.imported(inserted.accepted, inserted.duplicate, 0),
             Err(error) => {
-                receipts.iter().for_each(|receipt| receipt.ledger.fail(error.kind()));
+                receipts.iter().for_each(|receipt| drop(receipt.ledger.fail(error.kind())));
                 return Err(error);
             }
         }
@@ -330,18 +340,38 @@ fn fail(keeping: &Weak<Keeping>, queue: &mut mpsc::Receiver<Commit>, id: &Camera
     }
     queue.close();
     while let Ok(commit) = queue.try_recv() {
-        commit.receipts.iter().for_each(|receipt| receipt.ledger.fail(error.kind()));
+        commit.receipts.iter().for_each(|receipt| drop(receipt.ledger.fail(error.kind())));
     }
     if let Some(keeping) = keeping.upgrade() {
         for unsettled in lock(&keeping.waiting).targets.values() {
-            unsettled.receipts.iter().for_each(|(_, receipt)| receipt.ledger.fail(error.kind()));
+            unsettled.receipts.iter().for_each(|(_, receipt)| drop(receipt.ledger.fail(error.kind())));
         }
     }
 }
 
-impl Keeping {
-    /// Whether nothing more can be kept: a commit has failed.
-    pub(super) fn has_failed(&self) -> bool {
-        self.commits.is_closed()
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulation::{Options, simulate};
+
+    #[tokio::test]
+    async fn a_failed_commit_ends_every_stream_and_acknowledges_nothing() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Store::open(folder.path()).await.expect("a new store");
+        let nowhere = CameraId::new("nowhere").expect("a slug");
+        let keeping = Keeping::start(nowhere, store, Metrics::new());
+        let samples = simulate(&Options { samples: 2, ..Options::demo() }).training_samples();
+        let (first, second) = (Ledger::beginning_after(0), Ledger::beginning_after(7));
+        keeping.whole(&first, 1, samples[0].clone()).await.expect("handed in");
+        while first.is_settled().is_ok() {
+            first.changed().await;
+        }
+        assert_eq!(first.settled(), 0);
+        assert!(keeping.has_failed());
+        // The other stream had nothing in the commit that failed.
+        assert!(second.is_settled().is_ok());
+        keeping.whole(&second, 8, samples[1].clone()).await.expect_err("kept by nobody");
+        second.is_settled().expect_err("must end");
+        assert_eq!(second.settled(), 7);
     }
 }

@@ -1,0 +1,103 @@
+//! An import of two files that are paired on the way.
+
+use std::io::Read;
+
+use super::pairing::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
+use super::samples::{BATCH_ROWS, told_what_is_stored};
+use super::{App, ImportReport};
+use crate::domain::{CameraId, Error, Receiver, ReceiverId, Receivers, Result, Sample, TargetId};
+use crate::exchange::{self, FixFormat, Format, RowRules};
+use crate::fusion::clock_offset::OffsetEstimate;
+use crate::fusion::pairing::PairingSettings;
+
+/// Two files to be paired, and how.
+pub struct PairedImport<D, F> {
+    /// Rows of boxes.
+    pub detections: D,
+    /// Their format.
+    pub detections_format: Format,
+    /// Rows of fixes.
+    pub fixes: F,
+    /// Their format.
+    pub fixes_format: FixFormat,
+    /// How a box finds its fix.
+    pub settings: PairingSettings,
+    /// The target of boxes that name none.
+    pub target_id: Option<TargetId>,
+    /// The receiver of fixes that name none.
+    pub receiver_id: Option<ReceiverId>,
+    /// Whether the clock offsets are estimated, too. They are told, never applied.
+    pub estimates_offsets: bool,
+}
+
+/// What became of two files.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PairedReport {
+    /// What became of the samples.
+    pub samples: ImportReport,
+    /// What became of the rows.
+    pub counts: PairingCounts,
+    /// Rows that are none.
+    pub rejected: RejectedParts,
+    /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
+    pub unnamed_fixes_of: Option<Receiver>,
+    /// Clock offsets by receiver, if they were asked for; `None` where the files do not tell them.
+    pub clock_offsets: Vec<(Receiver, Option<OffsetEstimate>)>,
+}
+
+/// What was paired, before it is stored.
+struct Work {
+    samples: Vec<Sample>,
+    report: PairedReport,
+}
+
+impl App {
+    /// Pairs two files by the receivers of the camera's profile and stores the samples. One bad row
+    /// never loses the others.
+    ///
+    /// Both files are held in memory while they are paired, so their rows have a limit and so has
+    /// the number of imports that do it at the same time.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, before anything is read; `MalformedBody` and `TooLarge`, naming the file,
+    /// before anything is stored.
+    pub async fn import_paired(
+        &self,
+        id: &CameraId,
+        import: PairedImport<impl Read + Send + 'static, impl Read + Send + 'static>,
+    ) -> Result<PairedReport> {
+        let rules = self.row_rules(id).await?;
+        let receivers = self.serving(id).await?.receivers.clone();
+        let limits =
+            RecordingLimits { rows: self.limits.pairing_rows, rejected_rows: self.limits.rejected_rows };
+        let _place = self.pairings.acquire().await.map_err(Error::fault)?;
+        let pairing = tokio::task::spawn_blocking(move || import.paired(&rules, &receivers, limits));
+        let Work { mut samples, mut report } = pairing.await.map_err(Error::fault)??;
+        while !samples.is_empty() {
+            let rest = samples.split_off(samples.len().min(BATCH_ROWS));
+            let batch = std::mem::replace(&mut samples, rest).into_iter().map(Ok).collect();
+            let stored = self.store_batch(id, batch, &mut report.samples).await;
+            stored.map_err(|error| told_what_is_stored(error, &report.samples))?;
+        }
+        let ImportReport { accepted, duplicate, .. } = report.samples;
+        self.metrics.imported(accepted, duplicate, report.rejected.count);
+        Ok(report)
+    }
+}
+
+impl<D: Read, F: Read> PairedImport<D, F> {
+    fn paired(self, rules: &RowRules, receivers: &Receivers, limits: RecordingLimits) -> Result<Work> {
+        let boxes = exchange::read_detections(self.detections, self.detections_format, rules, self.target_id)
+            .map_err(|error| of_part(Part::Detections, error))?;
+        let fixes = exchange::read_received_fixes(self.fixes, self.fixes_format, rules.time_bounds)
+            .map_err(|error| of_part(Part::Fixes, error))?;
+        let mut recording = Recording::read(boxes, fixes, limits)?;
+        let unnamed_fixes_of = recording.name_fixes(self.fixes_format, receivers, self.receiver_id)?;
+        let clock_offsets =
+            if self.estimates_offsets { recording.clock_offsets(receivers) } else { Vec::new() };
+        let (paired, counts, rejected) = recording.paired(receivers, &self.settings);
+        let samples = ImportReport::default();
+        let report = PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets };
+        Ok(Work { samples: paired.samples, report })
+    }
+}

@@ -2,7 +2,7 @@
 
 use std::io::Read;
 
-use super::pairing::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
+use super::recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use super::samples::{BATCH_ROWS, told_what_is_stored};
 use super::{App, ImportReport};
 use crate::domain::{CameraId, Error, Receiver, ReceiverId, Receivers, Result, Sample, TargetId};

@@ -26,7 +26,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::app::App;
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
-use crate::domain::CameraId;
+use crate::domain::{CameraId, ReceiverId, TargetId};
 use crate::exchange::Format;
 use crate::store::Store;
 use crate::telemetry::Metrics;
@@ -130,6 +130,14 @@ fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
 
 fn camera_id(text: &str) -> Result<CameraId, String> {
     CameraId::new(text).map_err(|error| error.to_string())
+}
+
+fn receiver_id(text: &str) -> Result<ReceiverId, String> {
+    ReceiverId::new(text).map_err(|error| error.to_string())
+}
+
+fn target_id(text: &str) -> Result<TargetId, String> {
+    TargetId::new(text).map_err(|error| error.to_string())
 }
 
 /// Opens a file to read, with its name in the error.

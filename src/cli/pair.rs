@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 use clap::Args;
 
-use super::{format_of, open_file};
+use super::{format_of, open_file, receiver_id, target_id};
 use crate::app::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use crate::clock::Clock;
 use crate::config::Limits;
@@ -193,14 +193,6 @@ fn tell_counts(counts: &PairingCounts) {
         "unused fixes: no receiver named {}, no box of the target {}, no box to take it {}, duplicate {}",
         counts.fixes_unbound, counts.fixes_without_detections, counts.fixes_unused, counts.fixes_duplicate,
     );
-}
-
-fn receiver_id(text: &str) -> Result<ReceiverId, String> {
-    ReceiverId::new(text).map_err(|error| error.to_string())
-}
-
-fn target_id(text: &str) -> Result<TargetId, String> {
-    TargetId::new(text).map_err(|error| error.to_string())
 }
 
 /// A receiver as `phone-7=person-1`.

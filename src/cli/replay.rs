@@ -11,7 +11,7 @@ use jiff::SignedDuration;
 use tokio_util::sync::CancellationToken;
 
 use super::progress::Progress;
-use super::{camera_id, format_of, open_file, runtime};
+use super::{camera_id, format_of, open_file, receiver_id, runtime, target_id};
 use crate::clock::Clock;
 use crate::domain::{CameraId, ReceiverId, TargetId, TimeBounds};
 use crate::exchange::{self, ObservedRow, RowRules};
@@ -231,14 +231,6 @@ async fn watched(recording: Recording, options: Options) -> anyhow::Result<Repor
             }
         }
     }
-}
-
-fn target_id(text: &str) -> Result<TargetId, String> {
-    TargetId::new(text).map_err(|error| error.to_string())
-}
-
-fn receiver_id(text: &str) -> Result<ReceiverId, String> {
-    ReceiverId::new(text).map_err(|error| error.to_string())
 }
 
 fn speed(text: &str) -> Result<Pace, String> {

@@ -121,7 +121,6 @@ pub struct CameraWatch {
     anchor: Option<Estimate>,
     /// Ground they covered.
     known_cells: BTreeSet<Cell>,
-    statistic: f64,
     alarm: Option<Alarm>,
 }
 
@@ -146,7 +145,6 @@ impl CameraWatch {
             blocks: VecDeque::new(),
             anchor: None,
             known_cells: BTreeSet::new(),
-            statistic: 0.0,
             alarm: None,
         }
     }
@@ -155,12 +153,6 @@ impl CameraWatch {
     #[must_use]
     pub const fn alarm(&self) -> Option<Alarm> {
         self.alarm
-    }
-
-    /// The statistic after the latest block, for the metrics.
-    #[must_use]
-    pub const fn statistic(&self) -> f64 {
-        self.statistic
     }
 
     /// Takes up one comparison. `Some` at the moment the alarm is raised, and never again.
@@ -234,13 +226,11 @@ impl CameraWatch {
         // Without the model's error on new ground the statistic is never lower, and the ground need
         // not be gone through as long as even that is not enough.
         let (bound, _) = self.best_onset(&befores, &[])?;
-        self.statistic = bound;
         if bound < self.settings.threshold {
             return None;
         }
         let grounds = self.grounds();
         let (statistic, onset) = self.best_onset(&befores, &grounds)?;
-        self.statistic = statistic;
         if statistic < self.settings.threshold {
             return None;
         }

@@ -243,7 +243,7 @@ impl Jobs {
 }
 
 pub(super) fn read_state(name: &str) -> Result<JobState, &'static str> {
-    JobState::ALL.into_iter().find(|state| state.as_str() == name).ok_or("no state of a job")
+    JobState::ALL.iter().copied().find(|state| state.as_str() == name).ok_or("no state of a job")
 }
 
 fn lease_end(now: Timestamp, lease: Duration) -> i64 {

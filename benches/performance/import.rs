@@ -26,7 +26,10 @@ pub(crate) fn run() {
         runtime.block_on(served.app.create_camera(NewCamera::named(id.clone()))).expect("a new camera");
         id
     };
-    ratio::head("Import of rows, against rusqlite's one prepared statement in one transaction", "rows/s");
+    ratio::head(
+        "Import of rows, compared with one prepared statement of rusqlite in one transaction",
+        "rows/s",
+    );
     let csv = write_samples(Vec::new(), Format::Csv, &samples).expect("memory can be written");
     let csv = String::from_utf8(csv).expect("CSV is text");
     let folder = tempfile::tempdir().expect("a folder");

@@ -1,5 +1,5 @@
-//! Detects that a camera's pose has changed since its model was trained: a knocked or re-aimed camera
-//! otherwise goes on giving confident wrong positions.
+//! Detects that a camera's pose has changed since its model was trained: a camera that was
+//! bumped or re-aimed otherwise continues to give confident wrong positions.
 //!
 //! The difference d between regressed position and fix is averaged over blocks of two minutes per
 //! target. A generalised likelihood ratio test over all onsets k (Basseville and Nikiforov 1993, 2.4)

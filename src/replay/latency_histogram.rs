@@ -6,7 +6,7 @@ use hdrhistogram::Histogram;
 
 /// Decimal digits that are kept: a quantile is at most 1 % above the true one.
 const SIGNIFICANT_DIGITS: u8 = 2;
-/// Largest latency that is told apart, microseconds: an hour.
+/// Largest resolved latency, microseconds: an hour.
 const MAX_US: u64 = 3_600_000_000;
 
 /// A histogram of latencies in microseconds; its memory grows with the logarithm of the largest.

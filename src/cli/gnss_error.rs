@@ -14,13 +14,13 @@ use crate::exchange::{self, FixFormat};
 
 /// Estimate a receiver's error from many fixes at one fixed point
 #[derive(Args)]
-pub(super) struct GnssError {
+pub(super) struct EstimateGnssError {
     /// Fixes as CSV (longitude, latitude), NMEA (GGA), GPX or gpsd reports, by file extension
     #[arg(value_name = "FILE")]
     file: PathBuf,
 }
 
-impl GnssError {
+impl EstimateGnssError {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let format = FixFormat::from_path(&self.file)
             .context("the extension must be .csv, .nmea, .log, .txt, .gpx or .json")?;

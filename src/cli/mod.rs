@@ -55,7 +55,7 @@ enum Command {
     /// Fuse observations from a file, without a server
     Fuse(fuse::Fuse),
     /// Estimate a receiver's error from many fixes at one fixed point
-    GnssError(gnss_error::GnssError),
+    GnssError(gnss_error::EstimateGnssError),
     /// Compare methods on a test file, without a server
     Evaluate(evaluate::Evaluate),
     /// Write a simulated world with its truth

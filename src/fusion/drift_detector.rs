@@ -25,7 +25,7 @@ pub use self::block::ResidualSample;
 pub use self::settings::DriftDetectorSettings;
 pub use self::time_aligner::{TimeAligner, TimedEstimate};
 
-use self::block::{Block, Cell, OpenBlock};
+use self::block::{Block, GroundCell, OpenBlock};
 use self::pooling::{MeanDifference, PooledBlocks, SpatialCoverage, combine, glr_statistic, offset_prior};
 use crate::domain::TargetId;
 use crate::geo::EastNorth;
@@ -62,7 +62,7 @@ pub struct DriftDetector {
     /// The constant offset as estimated from the blocks that are no longer retained.
     archived_prior: Option<MeanDifference>,
     /// Ground covered by those blocks.
-    archived_cells: BTreeSet<Cell>,
+    archived_cells: BTreeSet<GroundCell>,
     alarm: Option<DriftAlarm>,
 }
 

@@ -1,7 +1,7 @@
-//! The values sightfix speaks of, valid by construction.
+//! Domain values, valid by construction.
 //!
-//! Every check on a number lives in a constructor here or in [`crate::geo`]; the floors above take
-//! these values as they are and check nothing again. What never happens here: I/O, clocks,
+//! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
+//! it and do not check again. What never happens here: I/O, clocks,
 //! randomness, wire formats, status codes.
 
 mod bounding_box;

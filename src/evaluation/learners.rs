@@ -34,7 +34,8 @@ pub(super) struct RecipeModel {
 /// The recipes that some methods need, each once.
 pub(super) fn recipes_of(methods: &[Method], default: Recipe) -> Vec<Recipe> {
     Recipe::ALL
-        .into_iter()
+        .iter()
+        .copied()
         .filter(|recipe| methods.iter().any(|method| method.recipe(default) == Some(*recipe)))
         .collect()
 }

@@ -6,6 +6,7 @@
 
 mod bounding_box;
 mod camera;
+mod durability;
 mod error;
 mod evaluation;
 mod gnss_error;
@@ -21,6 +22,7 @@ mod training;
 
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
+pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};

@@ -25,6 +25,9 @@ async fn livez() -> &'static str {
 }
 
 /// Whether the server can take work
+///
+/// Ready is a server that answers fusions. What does not keep it from that follows in lines that begin
+/// with `warning: `, such as a full disk.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -32,12 +35,16 @@ async fn livez() -> &'static str {
         (status = 503, description = "It is ending, or its store does not answer", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn readyz(State(rest): State<Rest>) -> Answer<&'static str> {
+async fn readyz(State(rest): State<Rest>) -> Answer<String> {
     if rest.shutdown.has_begun() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }
     rest.app.store.ping().await?;
-    Ok("ready\n")
+    let mut detail = "ready\n".to_owned();
+    if rest.app.store.is_full() {
+        detail.push_str("warning: insufficient-storage: imports are refused until space is freed\n");
+    }
+    Ok(detail)
 }
 
 /// Counters and times, in the text format of Prometheus

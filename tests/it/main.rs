@@ -8,6 +8,8 @@ mod harness;
 mod layering;
 mod openapi;
 mod pairing;
+mod power_cut;
 mod replay;
+mod storage;
 mod story;
 mod stream;

@@ -53,6 +53,10 @@ pub enum ErrorKind {
     RunEnded,
     /// The evaluation has ended already.
     EvaluationEnded,
+    /// The model version is the active one.
+    ModelActive,
+    /// The disk is full, or as much is stored as the settings allow.
+    InsufficientStorage,
     /// The stored samples cannot support a fit.
     UnusableSamples,
     /// The caller went away or cancelled.

@@ -7,6 +7,7 @@
 mod bounding_box;
 mod camera;
 mod checksum;
+mod durability;
 mod error;
 mod evaluation;
 mod gnss_error;
@@ -23,6 +24,7 @@ mod training;
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
 pub use checksum::model_sha256;
+pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};

@@ -45,12 +45,18 @@ pub enum ErrorKind {
     RevisionRequired,
     /// The camera has no active model yet.
     NoModel,
+    /// The stored model version is damaged or cannot be loaded.
+    ModelUnusable,
     /// The camera has a training run that has not ended.
     RunLive,
     /// The training run has ended already.
     RunEnded,
     /// The evaluation has ended already.
     EvaluationEnded,
+    /// The model version is the active one.
+    ModelActive,
+    /// The disk is full, or as much is stored as the settings allow.
+    InsufficientStorage,
     /// The stored samples cannot support a fit.
     UnusableSamples,
     /// The caller went away or cancelled.

@@ -45,6 +45,12 @@ impl TimeRange {
         self.until
     }
 
+    /// Whether an instant lies within.
+    #[must_use]
+    pub fn contains(self, time: Timestamp) -> bool {
+        self.from.is_none_or(|from| from <= time) && self.until.is_none_or(|until| time < until)
+    }
+
     /// Whether some instant is in both ranges.
     #[must_use]
     pub fn overlaps(self, other: Self) -> bool {
@@ -101,7 +107,7 @@ pub struct EvaluationProgress {
 /// An evaluation as stored, without its report.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvaluationJob {
-    /// Its id.
+    /// The evaluation's id.
     pub id: EvaluationId,
     /// The camera whose samples are used.
     pub camera_id: CameraId,
@@ -111,7 +117,7 @@ pub struct EvaluationJob {
     pub state: JobState,
     /// Progress of the job.
     pub progress: EvaluationProgress,
-    /// Number of times that a worker has claimed it.
+    /// Number of times that a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
     /// The error, if it failed.
     pub outcome: Option<String>,

@@ -48,7 +48,7 @@ job_id!(
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "snake_case")]
 pub enum JobState {
-    /// Waits for a worker.
+    /// It waits for a worker.
     Queued,
     /// Claimed by a worker.
     Running,
@@ -56,7 +56,7 @@ pub enum JobState {
     Succeeded,
     /// Ended by an error, which the outcome describes.
     Failed,
-    /// Ended by the operator.
+    /// The operator cancelled it.
     Cancelled,
 }
 

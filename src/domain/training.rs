@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::job::{JobState, RunId};
-use super::names::CameraId;
+use super::names::{CameraId, TargetId};
 use super::recipe::Recipe;
 
 /// The parameters of a training run.
@@ -70,7 +70,7 @@ pub struct TrainingRun {
     pub state: JobState,
     /// Progress of the fit.
     pub progress: RunProgress,
-    /// Number of times that a worker has claimed it.
+    /// Number of times that a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
     /// The model version it produced.
     pub model_version: Option<u32>,
@@ -99,6 +99,17 @@ pub struct HeldOutError {
     pub e_regression_m2: f64,
     /// Share of the fixes inside the 95 % radius predicted for regression and receiver together.
     pub coverage95_of_fixes: f64,
+}
+
+/// The error of a held-out sample: predicted by a fit that had not seen its block of time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HeldOutSampleError {
+    /// The sample's time.
+    pub time: Timestamp,
+    /// The sample's target.
+    pub target_id: TargetId,
+    /// Distance from the predicted position to the sample's fix, m.
+    pub distance_m: f64,
 }
 
 /// Scaling of one input of the network: `(value - offset) * factor`.
@@ -134,7 +145,7 @@ pub enum GnssErrorSource {
 /// A candidate of the model selection, and its held-out error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CandidateReport {
-    /// The recipe or its variant.
+    /// Name of the candidate.
     pub candidate: String,
     /// Its error on the held-out blocks.
     pub held_out: HeldOutError,

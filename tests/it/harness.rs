@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicU16, Ordering};
+use std::sync::{Arc, Mutex};
 
 use http_body_util::{BodyExt as _, Full};
 use hyper::body::{Bytes, Incoming};
@@ -35,6 +36,7 @@ pub(crate) struct TestServer {
     process: Child,
     pub(crate) address: SocketAddr,
     client: Client<HttpConnector, Full<Bytes>>,
+    log: Arc<Mutex<Vec<Value>>>,
 }
 
 /// A complete response.
@@ -105,11 +107,13 @@ impl TestServer {
         (server, printed)
     }
 
-    fn run(mut command: Command) -> Self {
+    /// Starts a command that ends up as a server, and waits until it listens.
+    pub(crate) fn run(mut command: Command) -> Self {
         let command = command.env("SIGHTFIX_LOG_FORMAT", "json").stderr(Stdio::piped());
         let mut process = command.spawn().expect("the binary starts");
         let mut lines = BufReader::new(process.stderr.take().expect("piped")).lines();
         let mut address = None;
+        let log = Arc::new(Mutex::new(Vec::new()));
         for line in lines.by_ref() {
             let line = line.expect("UTF-8");
             let entry: Value =
@@ -118,11 +122,34 @@ impl TestServer {
                 address = Some(text.parse().expect("an address"));
                 break;
             }
+            log.lock().expect("no panic").push(entry);
         }
         // Keep reading: a full pipe would block the server.
-        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
+        let rest = log.clone();
+        std::thread::spawn(move || {
+            for line in lines.map_while(Result::ok) {
+                rest.lock().expect("no panic").extend(serde_json::from_str::<Value>(&line).ok());
+            }
+        });
         let client = Client::builder(TokioExecutor::new()).build_http();
-        Self { process, address: address.expect("the server logs its address"), client }
+        Self { process, address: address.expect("the server logs its address"), client, log }
+    }
+
+    /// Entries of the server's log, as text, that contain a text.
+    pub(crate) fn log_lines(&self, text: &str) -> Vec<String> {
+        let log = self.log.lock().expect("no panic");
+        log.iter().map(Value::to_string).filter(|line| line.contains(text)).collect()
+    }
+
+    /// Waits until the log has an entry of which this is true, and returns it.
+    pub(crate) async fn logged(&self, is_wanted: impl Fn(&Value) -> bool) -> Value {
+        loop {
+            let found = self.log.lock().expect("no panic").iter().find(|entry| is_wanted(entry)).cloned();
+            match found {
+                Some(entry) => return entry,
+                None => tokio::time::sleep(std::time::Duration::from_millis(50)).await,
+            }
+        }
     }
 
     pub(crate) fn pid(&self) -> u32 {

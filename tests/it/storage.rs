@@ -202,8 +202,9 @@ async fn a_full_disk_refuses_imports_fuses_on_and_recovers_by_deleting() {
     }
 
     let folder = data_folder();
-    let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
-    assert!(mounted.status().expect("mount runs").success(), "needs the superuser");
+    let mut mount = Command::new("mount");
+    mount.args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
+    assert!(mount.status().expect("mount runs").success(), "needs the superuser");
     let _mounted = Mounted(folder.path());
     let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__RESERVE_BYTES", "20971520")]);
     create_camera(&server, "c").await.expect(201);

@@ -39,8 +39,9 @@ use crate::domain::{Durability, Error, ErrorKind, Result};
 
 pub use group_commit::Inserted;
 pub use jobs::{Claim, Heartbeat, JobEnd};
+pub use models::{NewModel, StoredHeldOutError};
 pub use occupants::Occupant;
-pub use runs::{NewModel, RunEnd};
+pub use runs::{RunEnd, RunOutput};
 pub use samples::{SampleFilter, SampleKey};
 pub use space::{StorageStatus, StoreLimits};
 

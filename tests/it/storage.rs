@@ -151,7 +151,7 @@ async fn check_full_storage(server: &TestServer, refused: &Answer) {
     assert_eq!(details.error_info().expect("ErrorInfo").reason, "insufficient-storage");
 
     let ready = server.get("/readyz").await.expect(200).text();
-    assert!(ready.starts_with("ready\n") && ready.contains("warning: insufficient-storage"), "{ready}");
+    assert!(ready.starts_with("ready\n") && ready.contains("degraded: insufficient-storage"), "{ready}");
     metric(server, "sightfix_storage_full 1").await;
     let observation = json!({"observations": [{
         "time": "2026-01-01T00:00:00Z",

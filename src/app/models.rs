@@ -134,7 +134,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`; `InvalidArgument` naming what in the file cannot be used.
     pub async fn import_model(&self, id: &CameraId, file: &[u8]) -> Result<ModelVersion> {
-        self.serving(id).await?;
+        self.active_camera(id).await?;
         let artifact = Artifact::from_file(file)?;
         artifact.load()?;
         self.store.insert_model(id, &artifact.metadata, &artifact.weights, self.clock.now()).await

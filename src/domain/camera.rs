@@ -139,9 +139,16 @@ impl CameraChange {
     }
 }
 
+/// Identifies a stored camera for good: a camera that is deleted and created again under the same id has
+/// another key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct CameraKey(pub i64);
+
 /// A stored camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
+    /// Which one of those that had this id.
+    pub key: CameraKey,
     /// What the operator said.
     pub profile: NewCamera,
     /// Counts the changes of the profile.

@@ -20,7 +20,7 @@ mod time;
 mod training;
 
 pub use bounding_box::{BoundingBox, ImageSize};
-pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
+pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, NewCamera, Revision};
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};

@@ -96,6 +96,15 @@ pub enum Flag {
     NoModel,
     /// The camera no longer looks where it looked when its model was trained.
     CameraMoved,
+    /// Box and fix contradict each other beyond their stated errors (chi-square gate, 99.9 %).
+    SourcesDisagree,
+    /// The fix was not used for the position: it contradicts the box, or it is out of range.
+    FixRejected,
+    /// The box was not used for the position: it contradicts the fix and is unusual, or the model gives
+    /// no position for it.
+    BoxRejected,
+    /// The fix lies farther than 20 km from the camera's scene.
+    FixOutOfRange,
 }
 
 impl Flag {
@@ -109,6 +118,10 @@ impl Flag {
             Self::OutsideTraining => "outside_training",
             Self::NoModel => "no_model",
             Self::CameraMoved => "camera_moved",
+            Self::SourcesDisagree => "sources_disagree",
+            Self::FixRejected => "fix_rejected",
+            Self::BoxRejected => "box_rejected",
+            Self::FixOutOfRange => "fix_out_of_range",
         }
     }
 }

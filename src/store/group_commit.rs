@@ -15,7 +15,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::connection::{Durability, Turn, Writer};
 use super::faults::{closed, failed, no_camera, same};
-use crate::domain::{CameraId, Error, Result, Sample};
+use crate::domain::{CameraId, CameraKey, Error, Result, Sample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -49,6 +49,8 @@ enum Request {
 
 struct Batch {
     camera: CameraId,
+    /// The camera must still be this one; `None` for whichever has the id.
+    key: Option<CameraKey>,
     samples: Vec<Sample>,
     reply: oneshot::Sender<Result<Inserted>>,
     /// Makes room for other rows when the batch is done.
@@ -62,11 +64,16 @@ impl GroupCommit {
         Self { queue, rows: Arc::new(Semaphore::new(ROWS_IN_FLIGHT as usize)) }
     }
 
-    pub(super) async fn insert(&self, camera: CameraId, samples: Vec<Sample>) -> Result<Inserted> {
+    pub(super) async fn insert(
+        &self,
+        camera: CameraId,
+        key: Option<CameraKey>,
+        samples: Vec<Sample>,
+    ) -> Result<Inserted> {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
         let room = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = Batch { camera, samples, reply, _room: room };
+        let batch = Batch { camera, key, samples, reply, _room: room };
         self.queue.send(Request::Insert(batch)).await.map_err(|_| self.gone())?;
         answer.await.map_err(|_| self.gone())?
     }
@@ -212,7 +219,8 @@ async fn store(
     let mut rows = Vec::with_capacity(group.iter().map(|batch| batch.samples.len()).sum());
     let mut borders = Vec::new();
     for (index, batch) in group.iter().enumerate() {
-        let key = keys.get(batch.camera.as_str());
+        let is_wanted = |key: &&i64| batch.key.is_none_or(|wanted| wanted == CameraKey(**key));
+        let key = keys.get(batch.camera.as_str()).filter(is_wanted);
         outcomes.push(key.map_or_else(|| Err(no_camera(&batch.camera)), |_| Ok(Inserted::default())));
         if let Some(&camera_key) = key {
             rows.extend(batch.samples.iter().map(|sample| Row { batch: index, camera_key, sample }));

@@ -10,7 +10,7 @@ use super::faults::failed;
 use super::fields::Fields;
 use super::group_commit::Inserted;
 use crate::domain::{
-    BoundingBox, CameraId, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId, TimeRange,
+    BoundingBox, CameraId, CameraKey, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId, TimeRange,
 };
 use crate::geo::Position;
 
@@ -58,7 +58,21 @@ impl Store {
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
     pub async fn insert_samples(&self, id: &CameraId, samples: Vec<Sample>) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), samples).await
+        self.inner.samples.insert(id.clone(), None, samples).await
+    }
+
+    /// As [`Store::insert_samples`], for the camera of that key alone: if it was deleted and created again
+    /// under the same id, nothing is stored.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`].
+    pub async fn insert_samples_of(
+        &self,
+        id: &CameraId,
+        key: CameraKey,
+        samples: Vec<Sample>,
+    ) -> Result<Inserted> {
+        self.inner.samples.insert(id.clone(), Some(key), samples).await
     }
 
     /// A page of samples ordered by time and target, after a key.

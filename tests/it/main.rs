@@ -6,6 +6,8 @@ mod evaluations;
 mod grpc;
 mod harness;
 mod layering;
+mod live_client;
+mod live_faults;
 mod openapi;
 mod pairing;
 mod replay;

@@ -91,11 +91,14 @@ pub enum RejectionReason {
     Duplicate,
     /// Its covariance is not positive.
     UnusableVariance,
+    /// Farther than 20 km from the origin of the track's plane.
+    OutOfRange,
 }
 
 impl RejectionReason {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance];
+    pub const ALL: [Self; 5] =
+        [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance, Self::OutOfRange];
 
     /// The one name used everywhere.
     #[must_use]
@@ -105,6 +108,7 @@ impl RejectionReason {
             Self::TooLate => "too_late",
             Self::Duplicate => "duplicate",
             Self::UnusableVariance => "unusable_variance",
+            Self::OutOfRange => "out_of_range",
         }
     }
 }

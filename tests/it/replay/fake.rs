@@ -176,7 +176,7 @@ impl Served {
             )
         });
         self.fake.seen().committed.extend(committed);
-        self.tell(Told::Acknowledgement(proto::StreamAcknowledgement { seq })).await;
+        self.tell(Told::Acknowledgement(proto::StreamAcknowledgement { seq, ..Default::default() })).await;
     }
 }
 

@@ -189,6 +189,12 @@ impl Regressor {
         self.unrest_share
     }
 
+    /// Whether the regressed position depends on the fix: the network of `paper` has it among its inputs.
+    #[must_use]
+    pub const fn uses_fix(&self) -> bool {
+        matches!(self.kind, Kind::Paper(_))
+    }
+
     /// Size of the image that it was trained on, if known.
     pub(super) const fn image_size(&self) -> Option<ImageSize> {
         self.image_size

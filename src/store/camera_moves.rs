@@ -5,8 +5,9 @@ use sqlx::sqlite::SqliteRow;
 use super::Store;
 use super::cameras::camera_key;
 use super::errors::failed;
+use super::jobs::read_state;
 use super::row_decoder::RowDecoder;
-use crate::domain::{CameraId, CameraMoved, Result, RunId};
+use crate::domain::{CameraId, CameraMoved, Error, JobState, Result, RunId};
 
 impl Store {
     /// Stores a pose change, unless one was stored for that model version before; returns whether it is new.
@@ -55,26 +56,23 @@ impl Store {
         row.as_ref().map(read_move).transpose()
     }
 
-    /// Cameras whose pose has changed since their active model was trained and that are to be retrained
-    /// but were not yet, each with the change.
+    /// State of the run that was started last because of the pose change found with a model version; `None` if
+    /// there was none, or it was deleted.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn moves_to_retrain(&self) -> Result<Vec<(CameraId, CameraMoved)>> {
-        let rows = sqlx::query(
-            "SELECT cameras.id, model_number, began_at_us, raised_at_us, shift_east_m, shift_north_m, statistic, \
-             targets FROM camera_moves JOIN cameras ON cameras.key = camera_key \
-             AND cameras.active_model = model_number \
-             WHERE retrain_when_moved AND retraining_run IS NULL ORDER BY cameras.id",
+    pub async fn retraining_state(&self, camera: &CameraId, model_version: u32) -> Result<Option<JobState>> {
+        let state: Option<String> = sqlx::query_scalar(
+            "SELECT state FROM camera_moves JOIN cameras ON cameras.key = camera_moves.camera_key \
+             JOIN training_runs ON training_runs.id = retraining_run \
+             WHERE cameras.id = ? AND model_number = ?",
         )
-        .fetch_all(self.readers())
+        .bind(camera.as_str())
+        .bind(model_version)
+        .fetch_optional(self.readers())
         .await
         .map_err(failed)?;
-        let read = |row: &SqliteRow| {
-            let id = RowDecoder::new("camera_moves", row).parse(CameraId::new)?;
-            Ok((id, read_move(row)?))
-        };
-        rows.iter().map(read).collect()
+        state.as_deref().map(read_state).transpose().map_err(Error::fault)
     }
 
     /// Stores which run was started because of a pose change.

@@ -11,8 +11,8 @@ use super::Store;
 use super::errors::{failed, no_camera};
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    Camera, CameraId, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver, ReceiverId,
-    Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver,
+    ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
 };
 
 macro_rules! columns {
@@ -77,20 +77,21 @@ impl Store {
         rows.iter().map(read_camera).collect()
     }
 
-    /// Id, revision and active model of every camera: enough to see what has changed.
+    /// Id, key, revision and active model of every camera: enough to see what has changed.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn camera_versions(&self) -> Result<Vec<(CameraId, Revision, Option<u32>)>> {
-        let rows = sqlx::query("SELECT id, revision, active_model FROM cameras")
+    pub async fn camera_versions(&self) -> Result<Vec<(CameraId, CameraKey, Revision, Option<u32>)>> {
+        let rows = sqlx::query("SELECT id, key, revision, active_model FROM cameras")
             .fetch_all(self.readers())
             .await
             .map_err(failed)?;
         let read = |row| {
             let mut fields = RowDecoder::new("cameras", row);
             let id = fields.parse(CameraId::new)?;
+            let key = CameraKey(fields.get()?);
             let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
-            Ok((id, revision, fields.optional_count()?))
+            Ok((id, key, revision, fields.optional_count()?))
         };
         rows.iter().map(read).collect()
     }
@@ -229,7 +230,8 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
 }
 
 fn read_camera(row: &SqliteRow) -> Result<Camera> {
-    let mut fields = RowDecoder::new("cameras", row).skip(1);
+    let mut fields = RowDecoder::new("cameras", row);
+    let key = CameraKey(fields.get()?);
     let id = fields.parse(CameraId::new)?;
     let display_name = fields.get()?;
     let width_px = fields.optional_count()?;
@@ -256,7 +258,7 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
         receivers,
         retrain_when_moved,
     };
-    Ok(Camera { profile, revision, created_at, updated_at, active_model })
+    Ok(Camera { key, profile, revision, created_at, updated_at, active_model })
 }
 
 fn read_classes(json: &str) -> Result<Vec<TargetClass>> {

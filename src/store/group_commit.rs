@@ -16,7 +16,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use super::errors::{closed, copy_of, failed, no_camera};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
-use crate::domain::{CameraId, Durability, Error, Result, Sample};
+use crate::domain::{CameraId, CameraKey, Durability, Error, Result, Sample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -50,6 +50,8 @@ enum Request {
 
 struct Batch {
     camera: CameraId,
+    /// The camera must still be this one; `None` for whichever has the id.
+    key: Option<CameraKey>,
     samples: Vec<Sample>,
     durability: Durability,
     reply: oneshot::Sender<Result<Inserted>>,
@@ -67,13 +69,14 @@ impl GroupCommit {
     pub(super) async fn insert(
         &self,
         camera: CameraId,
+        key: Option<CameraKey>,
         samples: Vec<Sample>,
         durability: Durability,
     ) -> Result<Inserted> {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
         let permit = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = Batch { camera, samples, durability, reply, _permit: permit };
+        let batch = Batch { camera, key, samples, durability, reply, _permit: permit };
         self.queue.send(Request::Insert(batch)).await.map_err(|_| self.task_ended())?;
         answer.await.map_err(|_| self.task_ended())?
     }
@@ -246,16 +249,19 @@ async fn store(
     let mut rows = Vec::with_capacity(group.iter().map(|batch| batch.samples.len()).sum());
     let mut borders = Vec::new();
     for (index, batch) in group.iter().enumerate() {
-        let admitted = match cameras.get_mut(batch.camera.as_str()) {
-            Some(camera) => quota.admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64),
+        let camera = cameras
+            .get_mut(batch.camera.as_str())
+            .filter(|camera| batch.key.is_none_or(|key| key == CameraKey(camera.key)));
+        let admitted = match camera {
+            Some(camera) => quota
+                .admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64)
+                .map(|()| camera.key),
             None => Err(no_camera(&batch.camera)),
         };
-        if let (Ok(()), Some(&Known { key: camera_key, .. })) =
-            (&admitted, cameras.get(batch.camera.as_str()))
-        {
+        if let Ok(camera_key) = admitted {
             rows.extend(batch.samples.iter().map(|sample| Row { batch: index, camera_key, sample }));
         }
-        outcomes.push(admitted.map(|()| Inserted::default()));
+        outcomes.push(admitted.map(|_| Inserted::default()));
         if counting == Counting::Apart {
             borders.push(rows.len());
         }

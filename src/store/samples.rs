@@ -10,7 +10,8 @@ use super::errors::failed;
 use super::group_commit::Inserted;
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    BoundingBox, CameraId, Durability, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId, TimeRange,
+    BoundingBox, CameraId, CameraKey, Durability, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId,
+    TimeRange,
 };
 use crate::geo::Position;
 
@@ -64,7 +65,22 @@ impl Store {
         samples: Vec<Sample>,
         durability: Durability,
     ) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), samples, durability).await
+        self.inner.samples.insert(id.clone(), None, samples, durability).await
+    }
+
+    /// As [`Store::insert_samples`], for the camera of that key alone: if it was deleted and created again
+    /// under the same id, nothing is stored.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`], [`crate::domain::ErrorKind::InsufficientStorage`].
+    pub async fn insert_samples_of(
+        &self,
+        id: &CameraId,
+        key: CameraKey,
+        samples: Vec<Sample>,
+        durability: Durability,
+    ) -> Result<Inserted> {
+        self.inner.samples.insert(id.clone(), Some(key), samples, durability).await
     }
 
     /// A page of samples ordered by time and target, after a key.

@@ -35,6 +35,7 @@ async fn a_profile_is_read_as_it_was_stored() {
     let Fixture { store, folder: _folder, .. } = Fixture::new().await;
     let made = store.insert_camera(&full("gate"), at(5)).await.expect("new");
     let expected = Camera {
+        key: made.key,
         profile: full("gate"),
         revision: Revision(1),
         created_at: at(5),

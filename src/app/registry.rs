@@ -79,7 +79,7 @@ impl Registry {
     /// A fault if the store cannot be read.
     pub async fn refresh(&self, store: &Store) -> Result<()> {
         let _change = self.change.lock().await;
-        let heads = store.camera_heads().await?;
+        let heads = store.camera_versions().await?;
         let known = self.cameras.load_full();
         let unchanged = |id: &CameraId, revision: Revision, active: Option<u32>| {
             known.get(id).filter(|serving| {
@@ -144,7 +144,7 @@ impl Registry {
                 Ok(regressor) => {
                     // Wrong by about the shift, it must not go on being confident.
                     let regressor = match &moved {
-                        Some(moved) => regressor.with_added_error(moved.added_m2()),
+                        Some(moved) => regressor.with_added_error(moved.change_variance_m2()),
                         None => regressor,
                     };
                     Some((Arc::new(regressor), number))

@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 use super::FitError;
 use super::whitening::FixNoise;
 use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
-use crate::filters::{FixError, smooth_pass, tune_acceleration};
+use crate::filters::{FixError, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 /// Fewer samples cannot tell a camera from its noise.
@@ -193,8 +193,9 @@ impl Rows {
             .map(|pass| pass.iter().map(|row| (row.time_s, row.label)).unzip())
             .collect();
         let acceleration_mps2 = tune_acceleration(&passes, &error);
-        let labels =
-            passes.iter().flat_map(|(times_s, fixes)| smooth_pass(times_s, fixes, &error, acceleration_mps2));
+        let labels = passes
+            .iter()
+            .flat_map(|(times_s, fixes)| smooth_traverse(times_s, fixes, &error, acceleration_mps2));
         let mut smoothed = self.clone();
         for (row, label) in smoothed.rows.iter_mut().zip(labels) {
             row.label = label.position;

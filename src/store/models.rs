@@ -7,8 +7,9 @@ use uuid::Uuid;
 
 use super::Store;
 use super::cameras::{camera_key, find_camera};
-use super::faults::{failed, no_model};
-use super::fields::Fields;
+use super::errors::{failed, no_model};
+use super::retention::prune_models;
+use super::row_decoder::RowDecoder;
 use crate::domain::{
     BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata, ModelVersion, Result,
     RunId, TargetId, model_sha256,
@@ -38,11 +39,12 @@ impl Store {
         weights: &[u8],
         now: Timestamp,
     ) -> Result<ModelVersion> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         let model = NewModel { metadata, weights, held_out: &[] };
         let number = add_model(&mut transaction, key, None, &model, now).await?;
+        prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
         let version = find_model(&mut transaction, camera, number).await?;
         transaction.commit().await.map_err(failed)?;
         version.ok_or_else(|| no_model(camera, number))
@@ -58,7 +60,7 @@ impl Store {
         find_model(&mut reader, camera, number).await?.ok_or_else(|| no_model(camera, number))
     }
 
-    /// Metadata and weights of one version, as they were handed in.
+    /// Metadata and weights of one version, as they were stored.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`]; [`ErrorKind::ModelUnusable`] where what
@@ -87,8 +89,8 @@ impl Store {
     /// # Errors
     /// Faults only.
     pub async fn fill_in_model_checksums(&self) -> Result<u64> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let missing: Vec<(i64, i64)> =
             sqlx::query_as("SELECT camera_key, number FROM models WHERE sha256 IS NULL")
                 .fetch_all(&mut *transaction)
@@ -164,8 +166,8 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
     pub async fn activate_model(&self, camera: &CameraId, number: u32, now: Timestamp) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         if find_model(&mut transaction, camera, number).await?.is_none() {
             return Err(no_model(camera, number));
@@ -181,8 +183,8 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none was active before.
     pub async fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         let latest: Vec<(i64, i64)> = sqlx::query_as(
             "SELECT position, model_number FROM activations \
@@ -222,8 +224,8 @@ impl Store {
                 .await
                 .map_err(failed)?;
         let read = |row| {
-            let mut fields = Fields::of("cameras", row);
-            Ok((fields.make(CameraId::new)?, fields.count()?))
+            let mut fields = RowDecoder::new("cameras", row);
+            Ok((fields.parse(CameraId::new)?, fields.count()?))
         };
         rows.iter().map(read).collect()
     }
@@ -240,7 +242,7 @@ pub struct NewModel<'a> {
     pub held_out: &'a [HeldOutSampleError],
 }
 
-/// Adds the next version of a camera; returns its number.
+/// Adds the next version of a camera; returns its number, which no version had before.
 pub(super) async fn add_model(
     connection: &mut SqliteConnection,
     camera_key: i64,
@@ -254,18 +256,26 @@ pub(super) async fn add_model(
     serde_json::from_str::<ModelMetadata>(&metadata)
         .map_err(|error| Error::fault(format!("the metadata of a model cannot be stored: {error}")))?;
     let number: i64 = sqlx::query_scalar(
-        "INSERT INTO models (camera_key, number, run_id, created_at_us, sha256, metadata, weights) \
-         SELECT ?, coalesce(max(number), 0) + 1, ?, ?, ?, ?, ? FROM models WHERE camera_key = ? \
-         RETURNING number",
+        "UPDATE cameras SET last_model_number = 1 + max(last_model_number, \
+         (SELECT coalesce(max(number), 0) FROM models WHERE camera_key = ?1)) WHERE key = ?1 \
+         RETURNING last_model_number",
     )
     .bind(camera_key)
+    .fetch_one(&mut *connection)
+    .await
+    .map_err(failed)?;
+    sqlx::query(
+        "INSERT INTO models (camera_key, number, run_id, created_at_us, sha256, metadata, weights) \
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+    )
+    .bind(camera_key)
+    .bind(number)
     .bind(run.map(|run| run.to_string()))
     .bind(now.as_microsecond())
     .bind(model_sha256(metadata.as_bytes(), weights))
     .bind(metadata)
     .bind(*weights)
-    .bind(camera_key)
-    .fetch_one(&mut *connection)
+    .execute(&mut *connection)
     .await
     .map_err(failed)?;
     for error in *held_out {
@@ -305,13 +315,13 @@ pub struct StoredHeldOutError {
 }
 
 fn read_held_out_error(row: &SqliteRow) -> Result<StoredHeldOutError> {
-    let mut fields = Fields::of("held_out_errors", row).skip(1);
-    let time = fields.time()?;
-    let target_id = fields.make(TargetId::new)?;
-    let error = HeldOutSampleError { time, target_id, distance_m: fields.take()? };
+    let mut fields = RowDecoder::new("held_out_errors", row).skip(1);
+    let time = fields.timestamp()?;
+    let target_id = fields.parse(TargetId::new)?;
+    let error = HeldOutSampleError { time, target_id, distance_m: fields.get()? };
     let mut columns = [None; 6];
     for column in &mut columns {
-        *column = fields.take::<Option<f64>>()?;
+        *column = fields.get::<Option<f64>>()?;
     }
     let [
         Some(left_px),
@@ -324,8 +334,8 @@ fn read_held_out_error(row: &SqliteRow) -> Result<StoredHeldOutError> {
     else {
         return Ok(StoredHeldOutError { error, sample: None });
     };
-    let bounding_box = fields.made(BoundingBox::new(left_px, top_px, width_px, height_px))?;
-    let position = fields.made(Position::new(longitude_deg, latitude_deg))?;
+    let bounding_box = fields.checked(BoundingBox::new(left_px, top_px, width_px, height_px))?;
+    let position = fields.checked(Position::new(longitude_deg, latitude_deg))?;
     Ok(StoredHeldOutError { error, sample: Some((bounding_box, position)) })
 }
 
@@ -383,13 +393,13 @@ async fn find_model(
 }
 
 fn read_model(row: &SqliteRow) -> Result<ModelVersion> {
-    let mut fields = Fields::of("models", row);
+    let mut fields = RowDecoder::new("models", row);
     Ok(ModelVersion {
-        camera_id: fields.make(CameraId::new)?,
+        camera_id: fields.parse(CameraId::new)?,
         number: fields.count()?,
-        run_id: fields.make_some(Uuid::parse_str)?.map(RunId),
-        created_at: fields.time()?,
-        weights_bytes: fields.make(|stored: i64| u64::try_from(stored))?,
-        metadata: fields.make(serde_json::from_str)?,
+        run_id: fields.parse_optional(Uuid::parse_str)?.map(RunId),
+        created_at: fields.timestamp()?,
+        weights_bytes: fields.parse(|stored: i64| u64::try_from(stored))?,
+        metadata: fields.parse(serde_json::from_str)?,
     })
 }

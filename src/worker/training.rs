@@ -145,8 +145,8 @@ impl Job for TrainingRun {
 /// `Unusable` where the fitted model does not pass the checks of every loaded model.
 fn with_track_noise(mut artifact: Artifact, samples: &[Sample]) -> std::result::Result<Artifact, FitError> {
     let regressor = artifact.load().map_err(FitError::Unusable)?;
-    let settings = TrackSettings::learn(samples, &regressor);
-    settings.beliefs().write(&mut artifact.metadata.parameters);
+    let settings = TrackSettings::estimate(samples, &regressor);
+    settings.noise_model().write(&mut artifact.metadata.parameters);
     Ok(artifact)
 }
 

@@ -15,7 +15,7 @@ impl Fixture {
         self.store.claim_run(LEASE, at(second)).await.expect("works").expect("a run")
     }
 
-    async fn beat(&self, fence: i64, second: i64) -> Heartbeat {
+    async fn heartbeat(&self, fence: i64, second: i64) -> Heartbeat {
         self.store.heartbeat_run(run_id(1), fence, &progress(), LEASE, at(second)).await.expect("works")
     }
 
@@ -54,7 +54,7 @@ async fn a_run_goes_from_queue_to_active_model() {
     assert_eq!((run.state, run.attempt, run.started_at), (JobState::Running, 1, Some(at(2))));
     assert!(!cancel_requested);
     assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
-    assert_eq!(fixture.beat(fence, 4).await, Heartbeat::Continue);
+    assert_eq!(fixture.heartbeat(fence, 4).await, Heartbeat::Continue);
     let seen = fixture.store.run(&fixture.camera, run_id(1)).await.expect("known");
     assert_eq!(seen.progress, progress());
     let ended = fixture.finish(fence, success(&metadata(), true)).await.expect("still mine");
@@ -65,7 +65,7 @@ async fn a_run_goes_from_queue_to_active_model() {
     assert_eq!(ended.outcome.as_deref(), Some("better"));
     assert_eq!(fixture.store.model(&fixture.camera, 1).await.expect("stored").run_id, Some(run_id(1)));
     assert_eq!(fixture.store.active_models().await.expect("known"), [(fixture.camera.clone(), 1)]);
-    assert_eq!(fixture.beat(fence, 51).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(fence, 51).await, Heartbeat::Lost);
     assert!(fixture.finish(fence, RunEnd::Requeue).await.is_none(), "a run ends once");
 }
 
@@ -80,7 +80,7 @@ async fn a_worker_that_lost_its_lease_can_write_nothing_more() {
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert_eq!(fixture.store.epochs(run_id(1)).await.expect("known"), [], "a new attempt, a new curve");
 
-    assert_eq!(fixture.beat(old.fence, 33).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(old.fence, 33).await, Heartbeat::Lost);
     fixture.store.append_epochs(run_id(1), old.fence, &[report(2, 9.0)]).await.expect("ignored");
     fixture.store.append_log(run_id(1), old.fence, at(33), "old").await.expect("ignored");
     assert!(fixture.finish(old.fence, success(&metadata(), true)).await.is_none());
@@ -136,7 +136,7 @@ async fn of_claims_at_once_one_gets_the_run() {
 }
 
 #[tokio::test]
-async fn a_cancelled_run_yields_nothing() {
+async fn a_cancelled_run_stores_no_model() {
     let fixture = Fixture::new().await;
     let store = &fixture.store;
     fixture.queue(1).await;
@@ -173,7 +173,7 @@ async fn a_run_returned_to_the_queue_is_claimed_at_once_and_the_attempt_does_not
 }
 
 #[tokio::test]
-async fn curve_and_log_keep_what_they_were_told_within_limits() {
+async fn curve_and_log_are_stored_within_limits() {
     let fixture = Fixture::new().await;
     let store = &fixture.store;
     fixture.queue(1).await;

@@ -1,4 +1,4 @@
-//! Model versions, and which of them is active.
+//! Model versions with their checksums and held-out errors, and which version is active.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -161,7 +161,7 @@ impl Store {
         rows.iter().map(read_model).collect()
     }
 
-    /// Makes a version the one that answers. Naming the active one changes nothing.
+    /// Makes a version the active one. Naming the active one changes nothing.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
@@ -178,8 +178,7 @@ impl Store {
         Ok(camera)
     }
 
-    /// Goes back to the version that was active before the one that is; again and again, until none
-    /// was.
+    /// Makes the version active that was before the active one. Repeated calls go further back.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none was active before.
@@ -208,7 +207,7 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
-        point_at(&mut transaction, key, number).await?;
+        set_active(&mut transaction, key, number).await?;
         let camera = find_camera(&mut *transaction, camera).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
@@ -340,7 +339,7 @@ fn read_held_out_error(row: &SqliteRow) -> Result<StoredHeldOutError> {
     Ok(StoredHeldOutError { error, sample: Some((bounding_box, position)) })
 }
 
-/// Moves the pointer to a version that exists, and writes it into the history.
+/// Points the camera to a version that exists, and records it in the history of activations.
 pub(super) async fn activate(
     connection: &mut SqliteConnection,
     camera_key: i64,
@@ -366,10 +365,10 @@ pub(super) async fn activate(
     .execute(&mut *connection)
     .await
     .map_err(failed)?;
-    point_at(connection, camera_key, i64::from(number)).await
+    set_active(connection, camera_key, i64::from(number)).await
 }
 
-async fn point_at(connection: &mut SqliteConnection, camera_key: i64, number: i64) -> Result<()> {
+async fn set_active(connection: &mut SqliteConnection, camera_key: i64, number: i64) -> Result<()> {
     sqlx::query("UPDATE cameras SET active_model = ? WHERE key = ?")
         .bind(number)
         .bind(camera_key)

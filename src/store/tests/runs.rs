@@ -209,3 +209,40 @@ async fn pages_show_the_newest_runs_first() {
     let page = fixture.store.runs(&fixture.camera, Some(run_id(3)), 3).await.expect("a page");
     assert_eq!(page.iter().map(|run| run.id).collect::<Vec<_>>(), [2, 1].map(run_id));
 }
+
+/// A day of the clock in which a run was claimed by mistake.
+const DAY_S: i64 = 86_400;
+
+#[tokio::test]
+async fn a_lease_that_ends_further_ahead_than_its_length_counts_as_expired() {
+    let fixture = Fixture::new().await;
+    fixture.queue(1).await;
+    let ahead = fixture.claim(400 * DAY_S).await;
+    // The clock was set right: the lease ends in 400 days.
+    let now = fixture.claim(2).await;
+    assert_eq!((now.job.attempt, now.fence), (2, ahead.fence + 1));
+    assert_eq!(fixture.beat(ahead.fence, 400 * DAY_S + 1).await, Heartbeat::Lost);
+    assert_eq!(fixture.beat(now.fence, 3).await, Heartbeat::Continue);
+    assert!(fixture.store.claim_run(LEASE, at(4)).await.expect("works").is_none(), "a sound lease holds");
+}
+
+#[tokio::test]
+async fn a_worker_with_a_longer_lease_keeps_its_run() {
+    let fixture = Fixture::new().await;
+    fixture.queue(1).await;
+    let hour = Duration::from_secs(3_600);
+    fixture.store.claim_run(hour, at(2)).await.expect("works").expect("a run");
+    assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is claimed");
+}
+
+#[tokio::test]
+async fn cancelling_a_run_without_a_live_lease_ends_it_at_once() {
+    for second in [400 * DAY_S, -400 * DAY_S] {
+        let fixture = Fixture::new().await;
+        fixture.queue(1).await;
+        fixture.claim(second).await;
+        let cancelled = fixture.store.cancel_run(&fixture.camera, run_id(1), at(2)).await.expect("cancelled");
+        assert_eq!(cancelled.state, JobState::Cancelled);
+        fixture.queue(2).await;
+    }
+}

@@ -9,8 +9,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use sightfix::domain::{GnssError, Recipe, SigmaM};
 use sightfix::model::FitOptions;
-use sightfix::model::net::{Activation, NetShape};
-use sightfix::model::train::{LossWeights, Schedule, TrainingSet, train};
+use sightfix::model::network::{Activation, LossWeights, NetShape, Schedule, TrainingSet, train};
 use sightfix::simulation::{Options, Scene, simulate};
 
 use crate::ratio::{self, in_turn, median};

@@ -3,11 +3,14 @@
 //! What never happens here: a choice made on test rows. All that is learnt, and all that is tuned,
 //! comes from the training samples alone.
 
-mod learners;
+pub mod baselines;
 mod metrics;
 mod plots;
 mod report;
 mod runner;
+#[cfg(test)]
+mod tests;
+mod training;
 mod truth;
 
 // What is evaluated by which, in the words of the domain, where jobs keep them.

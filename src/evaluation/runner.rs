@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-use super::learners::{Learnt, RecipeModel, learn_recipe, recipes_of, tune_imm_ukf};
+use super::baselines::{dnn, homography};
 use super::metrics::{Judged, Metrics};
 use super::report::{MethodReport, Report};
+use super::training::{Learnt, RecipeModel, learn_recipe, recipes_of, tune_imm_ukf};
 use crate::domain::{
     BoundingBox, EpochReport, ImageSize, Method, Observation, Recipe, Result, Sample, SigmaM, Step, Truth,
 };
@@ -14,7 +15,7 @@ use crate::filters::ImmUkf;
 use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, passes};
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, dnn, homography};
+use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression};
 
 /// Standard deviation per axis taken for a receiver of which nothing is known, m.
 const UNKNOWN_RECEIVER_M: f64 = 5.0;
@@ -479,6 +480,3 @@ fn step_track(
     };
     Some(Told { position: plane.to_position(state.position), r95_m: Some(state.r95_m) })
 }
-
-#[cfg(test)]
-mod tests;

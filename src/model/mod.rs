@@ -5,37 +5,20 @@
 //! threads of its own.
 
 mod artifact;
-mod cells;
-mod coverage;
-pub mod dnn;
-mod file;
-mod fit;
-pub mod homography;
-mod hybrid;
-mod kernel;
-pub mod net;
-mod paper;
-mod projection;
-mod projective;
+mod encoder;
+mod fitting;
+pub mod network;
+mod progress;
 mod regressor;
-mod rows;
-mod run;
-mod select;
-mod tensors;
-mod track_beliefs;
-pub mod train;
+mod samples;
 mod uncertainty;
-mod whitening;
 
-pub use artifact::{Artifact, FORMAT};
-pub use fit::{FitError, FitEvent, FitOptions, Trial, fit, fit_trial};
+pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackBeliefs};
+pub use encoder::projection::{Projection, fit_foot_points};
+pub use fitting::fit::{FitOptions, Trial, fit, fit_trial};
+pub use progress::{FitError, FitEvent};
 pub use regressor::{R95_PER_SIGMA, Regression, Regressor};
-pub use rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
-pub use tensors::LARGEST_WEIGHTS_BYTES;
-pub use track_beliefs::TrackBeliefs;
+pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M, spread};
 
 #[cfg(test)]
 mod tests;
-
-#[cfg(test)]
-mod behaviour_tests;

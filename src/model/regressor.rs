@@ -2,16 +2,16 @@
 //!
 //! What never happens here: candle, training, GNSS fusion (that is the floor above).
 
-use super::artifact::Parts;
-use super::cells::Cells;
-use super::coverage::CoverageTable;
-use super::hybrid::HybridRegressor;
-use super::paper::PaperRegressor;
-use super::projection::{SIDES, sides_of};
-use super::projective::ProjectiveRegressor;
-use super::track_beliefs::TrackBeliefs;
 use crate::domain::{BoundingBox, Error, ImageSize, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane};
+use crate::model::artifact::Parts;
+use crate::model::artifact::TrackBeliefs;
+use crate::model::encoder::hybrid::HybridRegressor;
+use crate::model::encoder::paper::PaperRegressor;
+use crate::model::encoder::projection::{SIDES, sides_of};
+use crate::model::encoder::projective::ProjectiveRegressor;
+use crate::model::uncertainty::coverage::CoverageTable;
+use crate::model::uncertainty::local_boxes::Cells;
 
 /// Radius that holds 95 % of a circular normal distribution, in standard deviations per axis.
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;

@@ -10,7 +10,7 @@ use super::experiments::{Split, Worlds, conditions};
 use crate::cli::evaluate::cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;
-use crate::model::train::LossWeights;
+use crate::model::network::LossWeights;
 use crate::model::{Artifact, FitOptions, Trial, fit_trial};
 use crate::simulation::{Options, Route, Scene};
 

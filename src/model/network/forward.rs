@@ -150,9 +150,9 @@ pub fn tanh(value: f32) -> f32 {
 }
 
 /// Beyond it f32's tangent is 1.
-pub(super) const TANH_BOUND: f32 = 7.905_311;
+pub(crate) const TANH_BOUND: f32 = 7.905_311;
 /// Numerator of [`tanh`] in the square, highest power first.
-pub(super) const TANH_TOP: [f32; 7] = [
+pub(crate) const TANH_TOP: [f32; 7] = [
     -2.760_768_5e-16,
     2.000_188e-13,
     -8.604_672e-11,
@@ -162,7 +162,7 @@ pub(super) const TANH_TOP: [f32; 7] = [
     4.893_524_6e-3,
 ];
 /// Denominator of [`tanh`] in the square, highest power first.
-pub(super) const TANH_BOTTOM: [f32; 4] = [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3];
+pub(crate) const TANH_BOTTOM: [f32; 4] = [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3];
 
 /// A network ready to answer: the weights turned so that the inner loop runs over outputs.
 #[derive(Debug, Clone)]

@@ -7,10 +7,46 @@ use std::sync::Arc;
 
 use rand_chacha::ChaCha8Rng;
 
-use super::fit::{FitError, FitEvent, Observer};
-use super::net::NetShape;
-use super::train::{LossSums, LossWeights, Schedule, TrainingSet, train};
-use crate::domain::{EpochReport, RunProgress};
+use crate::domain::{EpochReport, Error, RunProgress};
+use crate::model::network::forward::NetShape;
+use crate::model::network::training::{LossSums, LossWeights, Schedule, TrainError, TrainingSet, train};
+
+/// What a fit tells on its way.
+#[derive(Debug)]
+pub enum FitEvent<'a> {
+    /// How far it has come; `remaining_s` is left to the caller, who has a clock.
+    Progress(&'a RunProgress),
+    /// One epoch of the final fit.
+    Epoch(&'a EpochReport),
+    /// A line for the log.
+    Note(&'a str),
+}
+
+/// Why a fit gave no model.
+#[derive(Debug, thiserror::Error)]
+pub enum FitError {
+    /// The observer asked for it.
+    #[error("cancelled")]
+    Cancelled,
+    /// The samples cannot support a fit; a refusal that names `samples` and the remedy.
+    #[error("{0}")]
+    Unusable(Error),
+    /// Ours.
+    #[error("the fit failed: {0}")]
+    Fault(Box<dyn std::error::Error + Send + Sync>),
+}
+
+impl From<TrainError> for FitError {
+    fn from(error: TrainError) -> Self {
+        match error {
+            TrainError::Cancelled => Self::Cancelled,
+            TrainError::Candle(cause) => Self::Fault(cause.into()),
+        }
+    }
+}
+
+/// The observer of a fit; returning `Break` ends it.
+pub(crate) type Observer<'a> = dyn FnMut(FitEvent<'_>) -> ControlFlow<()> + 'a;
 
 /// One fit with its observer and progress.
 pub(super) struct Run<'a> {

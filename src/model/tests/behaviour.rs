@@ -2,11 +2,12 @@
 
 use jiff::Timestamp;
 
-use super::tests::{options, silent, walk};
-use super::train::LossWeights;
-use super::{Artifact, Trial, fit, fit_trial, homography};
+use super::{options, silent, walk};
 use crate::domain::{BoundingBox, Recipe, Sample, TargetId};
+use crate::evaluation::baselines::homography;
 use crate::geo::{EastNorth, LocalPlane};
+use crate::model::network::training::LossWeights;
+use crate::model::{Artifact, Trial, fit, fit_trial};
 
 /// Mean distance to the truth of regressed and fused positions, and the share of truths inside the
 /// stated 95 % radius.

@@ -6,17 +6,17 @@
 //! image the receiver's errors of different passes are independent, so what their means share is
 //! the regression's own error. What never happens here: a look at the truth.
 
-use super::FitError;
-use super::artifact::Parts;
-use super::cells::{Cells, Encode, Slopes, edge_variance_m2, slopes_at};
 use super::coverage::Coverage;
-use super::projective::Doubt;
-use super::regressor::{R95_PER_SIGMA, Regression, Regressor};
-use super::rows::{Row, Rows, median, second_differences, steady_mean};
-use super::select::BLOCKS;
-use super::whitening::FixNoise;
+use super::local_boxes::{Cells, Encode, Slopes, edge_variance_m2, slopes_at};
 use crate::domain::BoundingBox;
 use crate::geo::EastNorth;
+use crate::model::artifact::Parts;
+use crate::model::encoder::projective::Doubt;
+use crate::model::fitting::candidates::BLOCKS;
+use crate::model::progress::FitError;
+use crate::model::regressor::{R95_PER_SIGMA, Regression, Regressor};
+use crate::model::samples::rows::{Row, Rows, median, second_differences, steady_mean};
+use crate::model::samples::whitening::FixNoise;
 
 /// Patches of the image.
 const PATCHES: usize = 64;
@@ -49,17 +49,17 @@ const USUAL_FACTOR: f64 = 2.0;
 
 /// What [`calibrate`] found, per axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Calibration {
+pub(crate) struct Calibration {
     /// Error variance of the regression, mean over the training boxes, m2.
-    pub(super) error_m2: f64,
+    pub(crate) error_m2: f64,
     /// The receiver's variance as the rows show it, with what lasts for a whole block of time, m2.
-    pub(super) receiver_m2: f64,
+    pub(crate) receiver_m2: f64,
 }
 
 /// Sets the error's size and shape in the parts of a model.
 ///
 /// `residuals` are regressed position less fix (m) of each row, by encoders that had not seen it.
-pub(super) fn calibrate(
+pub(crate) fn calibrate(
     parts: &mut Parts,
     rows: &Rows,
     residuals: &[[f64; 2]],
@@ -263,7 +263,7 @@ fn foot_variance_m2(slopes: &Slopes) -> f64 {
 }
 
 /// Values with which the encoder can be built before it is calibrated.
-pub(super) fn set_plain(parts: &mut Parts, coverage: &Coverage) {
+pub(crate) fn set_plain(parts: &mut Parts, coverage: &Coverage) {
     parts.put_coverage(coverage);
     parts.parameters.insert("border_factor".to_owned(), 1.0);
     parts.parameters.insert("reconstruction_usual".to_owned(), 1.0);
@@ -271,7 +271,7 @@ pub(super) fn set_plain(parts: &mut Parts, coverage: &Coverage) {
 }
 
 /// How many independent fixes the rows are worth, per axis.
-pub(super) fn independent_fixes(rows: &[Row], noise: &FixNoise) -> f64 {
+pub(crate) fn independent_fixes(rows: &[Row], noise: &FixNoise) -> f64 {
     let stays = 1.0 - noise.white_share;
     let mut sum = 0.0;
     for pass in rows.chunk_by(|one, other| one.pass == other.pass) {

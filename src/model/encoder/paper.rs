@@ -7,15 +7,16 @@
 
 use std::sync::Arc;
 
-use super::artifact::Parts;
-use super::net::{Activation, Net, NetShape};
-use super::regressor::R95_PER_SIGMA;
-use super::rows::Rows;
-use super::run::Phase;
-use super::train::{LossSums, LossWeights, Schedule, TrainingSet};
-use super::{FitError, tensors::Tensors};
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::model::artifact::Parts;
+use crate::model::artifact::tensors::Tensors;
+use crate::model::network::forward::{Activation, Net, NetShape};
+use crate::model::network::training::{LossSums, LossWeights, Schedule, TrainingSet};
+use crate::model::progress::FitError;
+use crate::model::progress::Phase;
+use crate::model::regressor::R95_PER_SIGMA;
+use crate::model::samples::rows::Rows;
 
 /// Degrees to units.
 const UNITS_PER_DEGREE: f64 = 1e4;
@@ -24,13 +25,13 @@ const METRES_PER_DEGREE: f64 = 111_320.0;
 /// Hidden units; the paper leaves them open.
 const HIDDEN: usize = 32;
 /// Passes over the samples unless the run says otherwise; the paper leaves them open.
-pub(super) const EPOCHS: u32 = 100;
+pub(crate) const EPOCHS: u32 = 100;
 const BATCH: usize = 128;
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 1.0, regression: 2000.0 };
 const FEATURES: [&str; 6] = ["left_px", "top_px", "width_px", "height_px", "longitude_deg", "latitude_deg"];
 
 /// Fits both networks.
-pub(super) fn fit(
+pub(crate) fn fit(
     rows: &Rows,
     e_gnss_m2: f64,
     epochs: u32,
@@ -121,7 +122,7 @@ fn standardised(offset: Position, position: Position) -> [f32; 2] {
 
 /// Both networks, ready to answer.
 #[derive(Debug, Clone)]
-pub(super) struct PaperRegressor {
+pub(crate) struct PaperRegressor {
     joint: Net,
     denied: Net,
     /// Es of (4) of both, units2 per unit of eX.
@@ -131,7 +132,7 @@ pub(super) struct PaperRegressor {
 }
 
 impl PaperRegressor {
-    pub(super) fn build(parts: &mut Parts) -> Result<Self> {
+    pub(crate) fn build(parts: &mut Parts) -> Result<Self> {
         parts.scales(FEATURES)?;
         let plane = &parts.plane;
         let corner = Position::new(
@@ -147,7 +148,7 @@ impl PaperRegressor {
         })
     }
 
-    pub(super) fn regress(
+    pub(crate) fn regress(
         &self,
         plane: &LocalPlane,
         bounding_box: &BoundingBox,

@@ -1,5 +1,7 @@
 //! The floor as others use it, and the hand-written code against candle's own.
 
+mod behaviour;
+
 use std::ops::ControlFlow;
 
 use candle_core::{DType, Device, Tensor, Var};
@@ -9,11 +11,11 @@ use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::kernel::{BatchLoss, LossWeights, Scratch, TrainingSet};
-use super::net::{Activation, Net, NetShape};
-use super::{Artifact, FitError, FitEvent, FitOptions, fit};
 use crate::domain::{BoundingBox, Fix, GnssError, Recipe, Sample, SigmaM, TargetId};
 use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::model::network::forward::{Activation, Net, NetShape};
+use crate::model::network::kernel::{BatchLoss, LossWeights, Scratch, TrainingSet};
+use crate::model::{Artifact, FitError, FitEvent, FitOptions, fit};
 
 /// The same network built of candle's layers over the flat parameters.
 fn candle_layers(shape: &NetShape, flat: &Tensor) -> Vec<Linear> {
@@ -209,7 +211,7 @@ fn the_same_seed_gives_the_same_bits() {
         let second = fit(&samples, &options(recipe), &mut silent).expect("fits");
         assert_eq!(first.weights, second.weights, "{recipe}");
         assert_eq!(first.metadata, second.metadata, "{recipe}");
-        assert!(first.weights.len() <= super::LARGEST_WEIGHTS_BYTES);
+        assert!(first.weights.len() <= crate::model::LARGEST_WEIGHTS_BYTES);
         let other = FitOptions { seed: 8, ..options(recipe) };
         let other = fit(&samples, &other, &mut silent).expect("fits");
         assert!(recipe == Recipe::Projective || recipe == Recipe::Auto || other.weights != first.weights);

@@ -8,20 +8,20 @@ use std::ops::ControlFlow;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::artifact::{Artifact, FORMAT, Parts};
-use super::projection::{self, Form};
-use super::projective::Doubt;
-use super::regressor::{R95_PER_SIGMA, Regressor};
-use super::rows::{Rows, hash_of};
-use super::run::{Phase, Run};
-use super::select::{self, BLOCKS, Candidate, Common, Way};
-use super::train::{LossWeights, TrainError};
-use super::uncertainty;
-use super::whitening::FixNoise;
+use super::candidates::{self, BLOCKS, Candidate, Common, Way};
 use crate::domain::{
-    CandidateReport, EpochReport, Error, GnssError, GnssErrorSource, HeldOutError, ImageSize, ModelMetadata,
-    OriginDeg, Recipe, RunProgress, Sample,
+    CandidateReport, Error, GnssError, GnssErrorSource, HeldOutError, ImageSize, ModelMetadata, OriginDeg,
+    Recipe, RunProgress, Sample,
 };
+use crate::model::artifact::{Artifact, FORMAT, Parts};
+use crate::model::encoder::projection::{self, Form};
+use crate::model::encoder::projective::Doubt;
+use crate::model::network::training::LossWeights;
+use crate::model::progress::{FitError, FitEvent, Phase, Run};
+use crate::model::regressor::{R95_PER_SIGMA, Regressor};
+use crate::model::samples::rows::{Rows, hash_of};
+use crate::model::samples::whitening::FixNoise;
+use crate::model::uncertainty::calibration as uncertainty;
 
 /// What a fit is asked to do.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,43 +37,6 @@ pub struct FitOptions {
     /// What is known of the receiver.
     pub gnss_error: GnssError,
 }
-
-/// What a fit tells on its way.
-#[derive(Debug)]
-pub enum FitEvent<'a> {
-    /// How far it has come; `remaining_s` is left to the caller, who has a clock.
-    Progress(&'a RunProgress),
-    /// One epoch of the final fit.
-    Epoch(&'a EpochReport),
-    /// A line for the log.
-    Note(&'a str),
-}
-
-/// Why a fit gave no model.
-#[derive(Debug, thiserror::Error)]
-pub enum FitError {
-    /// The observer asked for it.
-    #[error("cancelled")]
-    Cancelled,
-    /// The samples cannot support a fit; a refusal that names `samples` and the remedy.
-    #[error("{0}")]
-    Unusable(Error),
-    /// Ours.
-    #[error("the fit failed: {0}")]
-    Fault(Box<dyn std::error::Error + Send + Sync>),
-}
-
-impl From<TrainError> for FitError {
-    fn from(error: TrainError) -> Self {
-        match error {
-            TrainError::Cancelled => Self::Cancelled,
-            TrainError::Candle(cause) => Self::Fault(cause.into()),
-        }
-    }
-}
-
-/// The observer of a fit; returning `Break` ends it.
-pub(super) type Observer<'a> = dyn FnMut(FitEvent<'_>) -> ControlFlow<()> + 'a;
 
 /// Fits a model on the calling thread.
 ///
@@ -115,7 +78,7 @@ pub fn fit_trial(
     let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &noise);
     let common =
         Common { e_gnss_m2, noise, epochs: options.epochs, seed: options.seed, balance: trial.balance };
-    let candidates: Vec<&Candidate> = select::candidates(options.recipe)
+    let candidates: Vec<&Candidate> = candidates::of_recipe(options.recipe)
         .iter()
         .filter(|candidate| trial.candidate.is_none_or(|only| only == candidate.name))
         .collect();
@@ -139,7 +102,7 @@ pub fn fit_trial(
         reports.push(CandidateReport { candidate: candidate.name.to_owned(), held_out: report });
         residuals.push(misses);
     }
-    let (kept, scores) = select::choose(&rows, &residuals);
+    let (kept, scores) = candidates::choose(&rows, &residuals);
     tell_choice(&candidates, kept, &scores, &mut run)?;
 
     let candidate = *candidates[kept];

@@ -7,7 +7,7 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::net::{Activation, Layer, NetShape, TANH_BOTTOM, TANH_BOUND, TANH_TOP};
+use super::forward::{Activation, Layer, NetShape, TANH_BOTTOM, TANH_BOUND, TANH_TOP};
 
 /// Samples of one tile.
 const LANES: usize = 64;
@@ -78,7 +78,7 @@ impl LossSums {
 
 /// Buffers of one training run, reused by every batch.
 #[derive(Debug)]
-pub(super) struct Scratch {
+pub(crate) struct Scratch {
     /// Outputs of every node layer, `width * LANES` each.
     units: Vec<Vec<f32>>,
     /// Gradient of the loss by the sums of every node layer.
@@ -88,14 +88,14 @@ pub(super) struct Scratch {
 impl Scratch {
     /// Room for one tile of a shape.
     #[must_use]
-    pub(super) fn new(shape: &NetShape) -> Self {
+    pub(crate) fn new(shape: &NetShape) -> Self {
         let rooms: Vec<Vec<f32>> = shape.widths().iter().map(|width| vec![0.0; width * LANES]).collect();
         Self { deltas: rooms.clone(), units: rooms }
     }
 }
 
 /// One batch to differentiate.
-pub(super) struct BatchLoss<'a> {
+pub(crate) struct BatchLoss<'a> {
     /// Shape of the network.
     pub shape: &'a NetShape,
     /// Its flat parameters.
@@ -374,7 +374,7 @@ fn gradient_of_rows<S: Simd, const ROWS: usize>(
     }
 }
 
-/// [`super::net::tanh`] on a vector.
+/// [`super::forward::tanh`] on a vector.
 #[inline(always)]
 fn tanh_of<S: Simd>(simd: S, value: S::f32s) -> S::f32s {
     let bound = simd.splat_f32s(TANH_BOUND);

@@ -9,15 +9,15 @@ use nalgebra::{DMatrix, DVector};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::rows::{Row, median, second_differences, spread, steady_mean};
-use super::whitening::{FixNoise, Whitener};
 use crate::domain::BoundingBox;
-use crate::geo::EastNorth;
+use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::model::samples::rows::{Row, median, second_differences, spread, steady_mean};
+use crate::model::samples::whitening::{FixNoise, Whitener};
 
 /// Numbers of a box: foot x, foot y, width, height.
-pub(super) const SIDES: usize = 4;
+pub(crate) const SIDES: usize = 4;
 /// Numerators of both axes and the denominator without its 1: columns 1, x, y, width, height.
-pub(super) const COEFFICIENTS: usize = 14;
+pub(crate) const COEFFICIENTS: usize = 14;
 /// The denominator is kept above it, so that a box near the horizon stays finite.
 const LEAST_DENOMINATOR: f64 = 0.02;
 /// Widths and heights beyond so many units say no more, lest a wild box land far away.
@@ -36,49 +36,49 @@ const UNREST_FACTOR: f64 = 20.0;
 
 /// The map itself.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Projection {
+pub struct Projection {
     /// Middle and unit of foot x, foot y, width, height, px.
-    pub(super) scales: [[f64; 2]; SIDES],
+    pub(crate) scales: [[f64; 2]; SIDES],
     /// Middle of the positions, and their unit, m.
-    pub(super) middle: EastNorth,
-    pub(super) unit_m: f64,
+    pub(crate) middle: EastNorth,
+    pub(crate) unit_m: f64,
     /// 5 of east, 5 of north, 4 of the denominator, all in units.
-    pub(super) coefficients: [f64; COEFFICIENTS],
+    pub(crate) coefficients: [f64; COEFFICIENTS],
 }
 
 /// What a fit may use.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Form {
+pub(crate) struct Form {
     /// Whether width and height count.
-    pub(super) sides: bool,
+    pub(crate) sides: bool,
     /// Standard deviation of an extra column's weight, in units of position.
-    pub(super) extra_sigma: f64,
+    pub(crate) extra_sigma: f64,
 }
 
 /// A fitted map with the weights of the extra columns and the error about it.
 #[derive(Debug, Clone)]
-pub(super) struct Fitted {
-    pub(super) projection: Projection,
+pub(crate) struct Fitted {
+    pub(crate) projection: Projection,
     /// Weights of the extra columns for east, then north, in units of position.
-    pub(super) extra: [Vec<f64>; 2],
-    pub(super) noise: FixNoise,
-    pub(super) doubt: MapDoubt,
+    pub(crate) extra: [Vec<f64>; 2],
+    pub(crate) noise: FixNoise,
+    pub(crate) doubt: MapDoubt,
 }
 
 /// What the noise of so many fixes leaves open in a map: the covariance of its parameters.
 #[derive(Debug, Clone)]
-pub(super) struct MapDoubt {
+pub(crate) struct MapDoubt {
     projection: Projection,
     covariance: DMatrix<f64>,
 }
 
 impl MapDoubt {
-    pub(super) const fn projection(&self) -> &Projection {
+    pub(crate) const fn projection(&self) -> &Projection {
         &self.projection
     }
 
     /// Variance per axis of the map at a box, m2; `columns` are the values of the extra ones there.
-    pub(super) fn variance_m2(&self, bounding_box: &BoundingBox, columns: &[f64]) -> f64 {
+    pub(crate) fn variance_m2(&self, bounding_box: &BoundingBox, columns: &[f64]) -> f64 {
         let Projection { unit_m, .. } = self.projection;
         let terms = self.projection.terms(bounding_box);
         let ratio = self.projection.ratio(&terms);
@@ -101,14 +101,14 @@ impl MapDoubt {
 }
 
 #[inline]
-pub(super) fn sides_of(bounding_box: &BoundingBox) -> [f64; SIDES] {
+pub(crate) fn sides_of(bounding_box: &BoundingBox) -> [f64; SIDES] {
     let [foot_x, foot_y] = bounding_box.foot_px();
     [foot_x, foot_y, bounding_box.width_px(), bounding_box.height_px()]
 }
 
 impl Projection {
     /// Scales of some rows, and a map to their middle.
-    pub(super) fn of_rows(rows: &[Row]) -> Self {
+    pub(crate) fn of_rows(rows: &[Row]) -> Self {
         let count = rows.len() as f64;
         let sides: Vec<[f64; SIDES]> = rows.iter().map(|row| sides_of(&row.bounding_box)).collect();
         let mut scales: [[f64; 2]; SIDES] = std::array::from_fn(|at| {
@@ -145,7 +145,8 @@ impl Projection {
 
     /// Where the target of a box stands; `extra` is added in units of position.
     #[inline]
-    pub(super) fn project(&self, bounding_box: &BoundingBox, extra: [f64; 2]) -> EastNorth {
+    #[must_use]
+    pub fn project(&self, bounding_box: &BoundingBox, extra: [f64; 2]) -> EastNorth {
         let [east, north, _] = self.ratio(&self.terms(bounding_box));
         EastNorth {
             east_m: self.middle.east_m + self.unit_m * (east + extra[0]),
@@ -155,7 +156,7 @@ impl Projection {
 
     /// The same, kept between the least and greatest of each axis, in units of position.
     #[inline]
-    pub(super) fn project_within(
+    pub(crate) fn project_within(
         &self,
         bounding_box: &BoundingBox,
         extra: [f64; 2],
@@ -170,13 +171,14 @@ impl Projection {
     }
 
     /// Whether a box lies on the ground's side of the horizon.
-    pub(super) fn sees_ground(&self, bounding_box: &BoundingBox) -> bool {
+    #[must_use]
+    pub fn sees_ground(&self, bounding_box: &BoundingBox) -> bool {
         self.ratio(&self.terms(bounding_box))[2] > LEAST_DENOMINATOR
     }
 
     /// A position in units about the middle.
     #[inline]
-    pub(super) fn in_units(&self, label: EastNorth) -> [f64; 2] {
+    pub(crate) fn in_units(&self, label: EastNorth) -> [f64; 2] {
         [
             (label.east_m - self.middle.east_m) / self.unit_m,
             (label.north_m - self.middle.north_m) / self.unit_m,
@@ -242,12 +244,40 @@ impl Projection {
 }
 
 /// The draw of starts of every recipe's fit.
-pub(super) fn same_starts() -> ChaCha8Rng {
+pub(crate) fn same_starts() -> ChaCha8Rng {
     ChaCha8Rng::seed_from_u64(START_SEED)
 }
 
+/// Fits a map of the foot points alone to pairs of boxes and positions in one plane (m), whose errors
+/// are independent; `None` for fewer than 8 pairs, or pairs that are all at one spot.
+#[must_use]
+pub fn fit_foot_points(pairs: &[(BoundingBox, EastNorth)], rng: &mut ChaCha8Rng) -> Option<Projection> {
+    let nowhere = LocalPlane::new(Position::new(0.0, 0.0).ok()?).origin();
+    // Every pair is its own target, so that none is taken to err like its neighbour.
+    let rows: Vec<Row> = pairs
+        .iter()
+        .enumerate()
+        .map(|(at, (bounding_box, label))| Row {
+            time_s: 0.0,
+            target: at as u32,
+            pass: at as u32,
+            bounding_box: *bounding_box,
+            position: nowhere,
+            label: *label,
+            own_variance_m2: None,
+        })
+        .collect();
+    if rows.len() < 8 {
+        return None;
+    }
+    let form = Form { sides: false, extra_sigma: 1.0 };
+    let fitted = fit(&rows, form, &[], rng);
+    let moves = fitted.projection.coefficients.iter().any(|coefficient| coefficient.abs() > 1e-9);
+    moves.then_some(fitted.projection)
+}
+
 /// Fits a map of a form to rows in the order of target and time; `columns` are the extra ones.
-pub(super) fn fit(rows: &[Row], form: Form, columns: &[Vec<f64>], rng: &mut ChaCha8Rng) -> Fitted {
+pub(crate) fn fit(rows: &[Row], form: Form, columns: &[Vec<f64>], rng: &mut ChaCha8Rng) -> Fitted {
     let projection = Projection::start(rows, rng);
     let mut doubts = vec![0.0; rows.len()];
     let mut fitted = Fitted {
@@ -291,7 +321,7 @@ pub(super) fn fit(rows: &[Row], form: Form, columns: &[Vec<f64>], rng: &mut ChaC
 
 impl Fitted {
     /// Fix less map, m.
-    pub(super) fn residuals(&self, rows: &[Row], columns: &[Vec<f64>]) -> [Vec<f64>; 2] {
+    pub(crate) fn residuals(&self, rows: &[Row], columns: &[Vec<f64>]) -> [Vec<f64>; 2] {
         let mut residuals = [Vec::with_capacity(rows.len()), Vec::with_capacity(rows.len())];
         for (at, row) in rows.iter().enumerate() {
             let extra = std::array::from_fn(|axis: usize| {

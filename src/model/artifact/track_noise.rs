@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use super::artifact::Parts;
+use super::Parts;
 use crate::domain::Result;
 
 /// How the errors of receiver and model, of known variances, are spread over time and ground.
@@ -46,7 +46,7 @@ impl TrackBeliefs {
     ///
     /// # Errors
     /// Names the parameter that is missing beside others, not finite, or out of range.
-    pub(super) fn read(parts: &Parts) -> Result<Option<Self>> {
+    pub(crate) fn read(parts: &Parts) -> Result<Option<Self>> {
         if !NAMES.iter().any(|name| parts.parameters.contains_key(*name)) {
             return Ok(None);
         }

@@ -27,30 +27,30 @@ struct Tensor {
 
 /// Tensors by name.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(super) struct Tensors(BTreeMap<String, Tensor>);
+pub(crate) struct Tensors(BTreeMap<String, Tensor>);
 
 impl Tensors {
-    pub(super) fn put_f32(&mut self, name: impl Into<String>, shape: &[usize], values: Vec<f32>) {
+    pub(crate) fn put_f32(&mut self, name: impl Into<String>, shape: &[usize], values: Vec<f32>) {
         self.0.insert(name.into(), Tensor { shape: shape.to_vec(), values: Values::F32(values) });
     }
 
-    pub(super) fn put_f64(&mut self, name: impl Into<String>, shape: &[usize], values: Vec<f64>) {
+    pub(crate) fn put_f64(&mut self, name: impl Into<String>, shape: &[usize], values: Vec<f64>) {
         self.0.insert(name.into(), Tensor { shape: shape.to_vec(), values: Values::F64(values) });
     }
 
     /// Whether there is a tensor of that name.
-    pub(super) fn holds(&self, name: &str) -> bool {
+    pub(crate) fn holds(&self, name: &str) -> bool {
         self.0.contains_key(name)
     }
 
     /// Rows of a matrix, if there is one of that name.
-    pub(super) fn rows(&self, name: &str) -> Option<usize> {
+    pub(crate) fn rows(&self, name: &str) -> Option<usize> {
         self.0.get(name).and_then(|tensor| tensor.shape.first().copied())
     }
 
     /// # Errors
     /// Names the tensor that is missing, of another shape or type.
-    pub(super) fn take_f32(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
+    pub(crate) fn take_f32(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
         match self.take(name, shape)? {
             Values::F32(values) => Ok(values),
             Values::F64(_) => Err(invalid(format!("tensor {name} must be of f32"))),
@@ -59,7 +59,7 @@ impl Tensors {
 
     /// # Errors
     /// Names the tensor that is missing, of another shape or type.
-    pub(super) fn take_f64(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
+    pub(crate) fn take_f64(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
         match self.take(name, shape)? {
             Values::F64(values) => Ok(values),
             Values::F32(_) => Err(invalid(format!("tensor {name} must be of f64"))),
@@ -77,7 +77,7 @@ impl Tensors {
 
     /// # Errors
     /// Names a tensor that nobody took.
-    pub(super) fn finish(self) -> Result<()> {
+    pub(crate) fn finish(self) -> Result<()> {
         match self.0.keys().next() {
             Some(name) => Err(invalid(format!("tensor {name} is none of this recipe's"))),
             None => Ok(()),
@@ -85,7 +85,7 @@ impl Tensors {
     }
 
     /// The file; the same tensors give the same bytes.
-    pub(super) fn to_bytes(&self) -> Result<Bytes, safetensors::SafeTensorError> {
+    pub(crate) fn to_bytes(&self) -> Result<Bytes, safetensors::SafeTensorError> {
         let raw: Vec<(&String, Dtype, &[usize], Vec<u8>)> = self
             .0
             .iter()
@@ -113,7 +113,7 @@ impl Tensors {
     /// # Errors
     /// Refuses files that are too large, not safetensors, of other types than f32 and f64, or hold
     /// numbers that are not finite; the field is named `weights`.
-    pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self> {
+    pub(crate) fn from_bytes(bytes: &[u8]) -> Result<Self> {
         if bytes.len() > LARGEST_WEIGHTS_BYTES {
             return Err(invalid(format!(
                 "must be at most {LARGEST_WEIGHTS_BYTES} bytes, not {}",

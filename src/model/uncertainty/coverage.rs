@@ -5,32 +5,32 @@
 use crate::domain::BoundingBox;
 
 /// Representative boxes at most; each costs some nanoseconds in every answer.
-pub(super) const MOST_CENTRES: usize = 64;
+pub(crate) const MOST_CENTRES: usize = 64;
 /// From so many boxes on, centres with so few of them hold wild boxes, as long as those are no more
 /// than one in so many of all.
 const PLENTY: usize = 20 * MOST_CENTRES;
 const ALONE: usize = 2;
 const MOST_WILD: usize = 20;
 /// Numbers per centre.
-pub(super) const DIMENSIONS: usize = 4;
+pub(crate) const DIMENSIONS: usize = 4;
 
 /// A set of representative training boxes, and the radius about them that holds all of those.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Coverage {
+pub(crate) struct Coverage {
     /// What coordinates are divided by: foot x, foot y (px), and the logarithms of the sides.
-    pub(super) units: [f32; DIMENSIONS],
+    pub(crate) units: [f32; DIMENSIONS],
     /// Centres in units.
-    pub(super) centres: Vec<[f32; DIMENSIONS]>,
+    pub(crate) centres: Vec<[f32; DIMENSIONS]>,
     /// No training box is farther from its nearest centre, in units.
-    pub(super) radius: f32,
+    pub(crate) radius: f32,
     /// Error variance of the regression at each centre, m2 per axis.
-    pub(super) errors_m2: Vec<f32>,
+    pub(crate) errors_m2: Vec<f32>,
 }
 
 impl Coverage {
     /// Picks the centres by always taking the box farthest from those picked. Where there are
     /// plenty of boxes, those that stand alone are wild ones and are left out.
-    pub(super) fn new(boxes: impl Iterator<Item = BoundingBox>) -> Self {
+    pub(crate) fn new(boxes: impl Iterator<Item = BoundingBox>) -> Self {
         let mut raw: Vec<[f32; DIMENSIONS]> = boxes.map(coordinates).collect();
         let mut coverage = Self::of_points(&raw);
         let most_wild = raw.len() / MOST_WILD;
@@ -56,7 +56,8 @@ impl Coverage {
 
     fn of_points(raw: &[[f32; DIMENSIONS]]) -> Self {
         let units = std::array::from_fn(|axis| {
-            let deviation = super::rows::spread(raw.iter().map(|point| f64::from(point[axis])));
+            let deviation =
+                crate::model::samples::rows::spread(raw.iter().map(|point| f64::from(point[axis])));
             // Sizes that hardly vary must not make a pixel's jitter look far away.
             (deviation as f32).max(if axis < 2 { 4.0 } else { 0.1 })
         });
@@ -85,7 +86,7 @@ impl Coverage {
     }
 
     /// The first centres alone, which cover the same boxes more coarsely.
-    pub(super) fn coarse(&self, centres: usize) -> Self {
+    pub(crate) fn coarse(&self, centres: usize) -> Self {
         let mut coarse = self.clone();
         coarse.centres.truncate(centres);
         coarse.errors_m2.truncate(centres);
@@ -100,12 +101,12 @@ impl Coverage {
     }
 
     /// The boxes at all centres, in their order; `None` where a centre is none.
-    pub(super) fn boxes(&self) -> impl Iterator<Item = Option<BoundingBox>> + '_ {
+    pub(crate) fn boxes(&self) -> impl Iterator<Item = Option<BoundingBox>> + '_ {
         self.centres.iter().map(|centre| self.box_at(centre))
     }
 
     /// Index of the nearest centre.
-    pub(super) fn nearest(&self, bounding_box: &BoundingBox) -> usize {
+    pub(crate) fn nearest(&self, bounding_box: &BoundingBox) -> usize {
         self.nearest_to(&self.point(bounding_box))
     }
 
@@ -121,7 +122,7 @@ impl Coverage {
     }
 
     /// The same, laid out for answers.
-    pub(super) fn table(&self) -> CoverageTable {
+    pub(crate) fn table(&self) -> CoverageTable {
         let groups = self
             .centres
             .chunks(LANES)
@@ -155,7 +156,7 @@ struct Group {
 /// A [`Coverage`] whose centres stand beside each other in lanes, so that one look takes some tens
 /// of nanoseconds.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct CoverageTable {
+pub(crate) struct CoverageTable {
     units: [f32; DIMENSIONS],
     radius: f32,
     groups: Vec<Group>,
@@ -171,7 +172,7 @@ impl CoverageTable {
         reason = "in this form the compiler makes vectors of the lanes, with iterators it does not (4 times slower)"
     )]
     #[inline]
-    pub(super) fn look_up(&self, bounding_box: &BoundingBox) -> (f64, f64, usize) {
+    pub(crate) fn look_up(&self, bounding_box: &BoundingBox) -> (f64, f64, usize) {
         let raw = coordinates(*bounding_box);
         // A few percent of a radius, squared, so that a box upon a centre has a finite weight.
         let soft = 1e-3 * self.radius * self.radius;
@@ -205,7 +206,7 @@ impl CoverageTable {
 
     /// Pixels of the foot point that make one radius.
     #[inline]
-    pub(super) fn radius_px(&self) -> f64 {
+    pub(crate) fn radius_px(&self) -> f64 {
         f64::from(self.radius * self.units[0].min(self.units[1]))
     }
 }

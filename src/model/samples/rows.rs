@@ -6,11 +6,11 @@
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
-use super::FitError;
 use super::whitening::FixNoise;
 use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
 use crate::filters::{FixError, smooth_pass, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::model::progress::FitError;
 
 /// Fewer samples cannot tell a camera from its noise.
 pub const FEWEST_SAMPLES: u64 = 20;
@@ -21,29 +21,29 @@ const PASS_HOLE_S: f64 = 3.0;
 
 /// One training sample.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Row {
+pub(crate) struct Row {
     /// Seconds since the first sample.
-    pub(super) time_s: f64,
+    pub(crate) time_s: f64,
     /// Counts targets from 0.
-    pub(super) target: u32,
+    pub(crate) target: u32,
     /// Counts passes from 0; rows of a pass stand together in the order of time.
-    pub(super) pass: u32,
-    pub(super) bounding_box: BoundingBox,
+    pub(crate) pass: u32,
+    pub(crate) bounding_box: BoundingBox,
     /// The fix.
-    pub(super) position: Position,
+    pub(crate) position: Position,
     /// The fix in the plane, or what the smoother made of it.
-    pub(super) label: EastNorth,
+    pub(crate) label: EastNorth,
     /// Error variance per axis that the receiver itself gave, m2.
-    pub(super) own_variance_m2: Option<f64>,
+    pub(crate) own_variance_m2: Option<f64>,
 }
 
 /// All samples of a fit.
 #[derive(Debug, Clone)]
-pub(super) struct Rows {
-    pub(super) plane: LocalPlane,
-    pub(super) rows: Vec<Row>,
-    pub(super) targets: u32,
-    pub(super) passes: u32,
+pub(crate) struct Rows {
+    pub(crate) plane: LocalPlane,
+    pub(crate) rows: Vec<Row>,
+    pub(crate) targets: u32,
+    pub(crate) passes: u32,
 }
 
 impl Rows {
@@ -51,7 +51,7 @@ impl Rows {
     ///
     /// # Errors
     /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], or all at one spot.
-    pub(super) fn new(samples: &[Sample]) -> Result<Self, FitError> {
+    pub(crate) fn new(samples: &[Sample]) -> Result<Self, FitError> {
         if samples.is_empty() {
             return Err(unusable("there are none; import samples that have a box and a fix first".into()));
         }
@@ -111,7 +111,7 @@ impl Rows {
 
     /// Block of time of each row, 0 to `count - 1`: cuts at the largest holes near equal shares, so
     /// that passes stay whole where they can. Rows of all targets at one time share a block.
-    pub(super) fn blocks(&self, count: u32) -> Vec<u32> {
+    pub(crate) fn blocks(&self, count: u32) -> Vec<u32> {
         let mut times: Vec<f64> = self.rows.iter().map(|row| row.time_s).collect();
         times.sort_by(f64::total_cmp);
         let share = times.len() / count as usize;
@@ -149,13 +149,13 @@ impl Rows {
     }
 
     /// Some of the rows, in the same plane.
-    pub(super) fn filtered(&self, keep: impl Fn(usize) -> bool) -> Self {
+    pub(crate) fn filtered(&self, keep: impl Fn(usize) -> bool) -> Self {
         let rows = self.rows.iter().enumerate().filter(|(at, _)| keep(*at)).map(|(_, row)| *row).collect();
         Self { rows, ..*self }
     }
 
     /// The same rows with labels that a kinematic smoother made of each pass's fixes.
-    pub(super) fn smoothed(&self, noise: &FixNoise) -> Self {
+    pub(crate) fn smoothed(&self, noise: &FixNoise) -> Self {
         let error = FixError {
             white_m: (noise.variance_m2 * noise.white_share).sqrt().max(0.01),
             coloured_m: (noise.variance_m2 * (1.0 - noise.white_share)).sqrt(),
@@ -177,14 +177,14 @@ impl Rows {
     }
 
     /// Mean of the variances that the receiver gave itself, where every fix has one.
-    pub(super) fn own_variance_m2(&self) -> Option<f64> {
+    pub(crate) fn own_variance_m2(&self) -> Option<f64> {
         let sum = self.rows.iter().try_fold(0.0, |sum, row| Some(sum + row.own_variance_m2?))?;
         Some(sum / self.rows.len() as f64)
     }
 }
 
 /// SHA-256 of the samples in their order: time, target, box and fix of each.
-pub(super) fn hash_of(samples: &[Sample]) -> String {
+pub(crate) fn hash_of(samples: &[Sample]) -> String {
     let mut hash = Sha256::new();
     for sample in samples {
         hash.update(sample.time.as_microsecond().to_le_bytes());
@@ -201,19 +201,19 @@ pub(super) fn hash_of(samples: &[Sample]) -> String {
     hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-pub(super) fn unusable(message: String) -> FitError {
+pub(crate) fn unusable(message: String) -> FitError {
     FitError::Unusable(Error::field(ErrorKind::UnusableSamples, "samples", message))
 }
 
 /// Standard deviation.
-pub(super) fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
+pub(crate) fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
     let count = values.clone().count().max(1) as f64;
     let mean = values.clone().sum::<f64>() / count;
     (values.map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()
 }
 
 /// Middle value; 0 for none.
-pub(super) fn median(mut values: Vec<f64>) -> f64 {
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     if values.is_empty() {
         return 0.0;
     }
@@ -228,7 +228,7 @@ const STEADY_SHARE: f64 = 0.89;
 
 /// Squared second differences, m2, of positions of rows that follow each other evenly within a pass,
 /// with the row in the middle. White noise of a variance per axis makes 12 times that.
-pub(super) fn second_differences<'a>(
+pub(crate) fn second_differences<'a>(
     rows: &'a [Row],
     points: &'a [EastNorth],
 ) -> impl Iterator<Item = (usize, f64)> + 'a {
@@ -244,7 +244,7 @@ pub(super) fn second_differences<'a>(
 }
 
 /// Mean of squares without the largest few, which are halts, turns and wild boxes; `None` of none.
-pub(super) fn steady_mean(mut squares: Vec<f64>) -> Option<f64> {
+pub(crate) fn steady_mean(mut squares: Vec<f64>) -> Option<f64> {
     squares.sort_by(f64::total_cmp);
     squares.truncate((squares.len() as f64 * STEADY).ceil() as usize);
     let count = squares.len() as f64;

@@ -3,18 +3,25 @@
 //! What never happens here: trust. An artifact may come from another server, so [`Artifact::load`]
 //! checks every name, shape and number before anything is computed from them.
 
+mod file;
+pub(crate) mod tensors;
+mod track_noise;
+
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
 
-use super::cells::{Cells, NUMBERS};
-use super::coverage::{Coverage, DIMENSIONS, MOST_CENTRES};
-use super::net::{Net, NetShape};
-use super::projective::Doubt;
-use super::regressor::Regressor;
-use super::tensors::Tensors;
+use self::tensors::Tensors;
 use crate::domain::{Error, FeatureScale, ModelMetadata, Recipe, Result};
 use crate::geo::{LocalPlane, Position};
+use crate::model::encoder::projective::Doubt;
+use crate::model::network::forward::{Net, NetShape};
+use crate::model::regressor::Regressor;
+use crate::model::uncertainty::coverage::{Coverage, DIMENSIONS, MOST_CENTRES};
+use crate::model::uncertainty::local_boxes::{Cells, NUMBERS};
+
+pub use self::tensors::LARGEST_WEIGHTS_BYTES;
+pub use self::track_noise::TrackBeliefs;
 
 /// Version of the metadata document.
 pub const FORMAT: u32 = 1;
@@ -66,16 +73,16 @@ fn positive(field: &str, value: f64) -> Result<f64> {
 
 /// A model taken apart: what a recipe's fit gives, and what a [`Regressor`] is built from.
 #[derive(Debug, Clone)]
-pub(super) struct Parts {
-    pub(super) recipe: Recipe,
-    pub(super) plane: LocalPlane,
-    pub(super) features: Vec<FeatureScale>,
-    pub(super) error_scale: f64,
-    pub(super) e_gnss_m2: f64,
-    pub(super) parameters: BTreeMap<String, f64>,
-    pub(super) tensors: Tensors,
+pub(crate) struct Parts {
+    pub(crate) recipe: Recipe,
+    pub(crate) plane: LocalPlane,
+    pub(crate) features: Vec<FeatureScale>,
+    pub(crate) error_scale: f64,
+    pub(crate) e_gnss_m2: f64,
+    pub(crate) parameters: BTreeMap<String, f64>,
+    pub(crate) tensors: Tensors,
     /// What the fixes leave open in a geometric map; only beside a fit, never stored.
-    pub(super) doubt: Option<Doubt>,
+    pub(crate) doubt: Option<Doubt>,
 }
 
 impl Parts {
@@ -83,7 +90,7 @@ impl Parts {
     ///
     /// # Errors
     /// Names the parameter that is missing or not finite.
-    pub(super) fn parameter(&self, name: &str) -> Result<f64> {
+    pub(crate) fn parameter(&self, name: &str) -> Result<f64> {
         match self.parameters.get(name) {
             Some(value) if value.is_finite() => Ok(*value),
             _ => Err(Error::invalid(format!("metadata.parameters.{name}"), "must be there and finite")),
@@ -94,7 +101,7 @@ impl Parts {
     ///
     /// # Errors
     /// Names the parameter.
-    pub(super) fn positive_parameter(&self, name: &str) -> Result<f64> {
+    pub(crate) fn positive_parameter(&self, name: &str) -> Result<f64> {
         self.parameter(name).and_then(|value| positive(&format!("parameters.{name}"), value))
     }
 
@@ -102,7 +109,7 @@ impl Parts {
     ///
     /// # Errors
     /// Names `metadata.features` where they are others, or a scale is not finite or 0.
-    pub(super) fn scales<const N: usize>(&self, names: [&str; N]) -> Result<[Scale; N]> {
+    pub(crate) fn scales<const N: usize>(&self, names: [&str; N]) -> Result<[Scale; N]> {
         let same = self.features.iter().map(|feature| feature.feature.as_str()).eq(names);
         let finite = |feature: &FeatureScale| {
             feature.offset.is_finite() && feature.factor.is_finite() && feature.factor != 0.0
@@ -117,7 +124,7 @@ impl Parts {
         }))
     }
 
-    pub(super) fn put_coverage(&mut self, coverage: &Coverage) {
+    pub(crate) fn put_coverage(&mut self, coverage: &Coverage) {
         let centres = coverage.centres.iter().flatten().copied().collect();
         self.tensors.put_f32("coverage.centres", &[coverage.centres.len(), DIMENSIONS], centres);
         self.tensors.put_f32("coverage.errors_m2", &[coverage.centres.len()], coverage.errors_m2.clone());
@@ -125,20 +132,20 @@ impl Parts {
         self.tensors.put_f32("coverage.radius", &[1], vec![coverage.radius]);
     }
 
-    pub(super) fn put_cells(&mut self, cells: &Cells) {
+    pub(crate) fn put_cells(&mut self, cells: &Cells) {
         let numbers = cells.numbers();
         self.tensors.put_f32("cells", &[numbers.len() / NUMBERS, NUMBERS], numbers);
     }
 
     /// Cells; none in models of before there were any.
-    pub(super) fn take_cells(&mut self, coverage: &Coverage) -> Result<Cells> {
+    pub(crate) fn take_cells(&mut self, coverage: &Coverage) -> Result<Cells> {
         match self.tensors.rows("cells") {
             None => Ok(Cells::default()),
             Some(count) => Cells::from_numbers(coverage, &self.tensors.take_f32("cells", &[count, NUMBERS])?),
         }
     }
 
-    pub(super) fn take_coverage(&mut self) -> Result<Coverage> {
+    pub(crate) fn take_coverage(&mut self) -> Result<Coverage> {
         let count = self.tensors.rows("coverage.centres").unwrap_or(1);
         if count == 0 || count > MOST_CENTRES {
             return Err(Error::invalid("weights", format!("must have 1 to {MOST_CENTRES} coverage.centres")));
@@ -158,7 +165,7 @@ impl Parts {
     }
 
     /// Stores a network as candle's `Linear` layers: `{prefix}encoder.0.weight` and so on.
-    pub(super) fn put_net(&mut self, prefix: &str, shape: &NetShape, parameters: &[f32]) {
+    pub(crate) fn put_net(&mut self, prefix: &str, shape: &NetShape, parameters: &[f32]) {
         for (index, layer) in shape.layers().enumerate() {
             let name = layer_name(prefix, shape, index);
             let weights = parameters[layer.weights..layer.biases].to_vec();
@@ -172,7 +179,7 @@ impl Parts {
     ///
     /// # Errors
     /// Names the tensor that is missing or of another shape.
-    pub(super) fn take_net(&mut self, prefix: &str, shape: NetShape) -> Result<Net> {
+    pub(crate) fn take_net(&mut self, prefix: &str, shape: NetShape) -> Result<Net> {
         let mut parameters = Vec::with_capacity(shape.parameter_count());
         for (index, layer) in shape.layers().enumerate() {
             let name = layer_name(prefix, &shape, index);
@@ -193,14 +200,14 @@ fn layer_name(prefix: &str, shape: &NetShape, index: usize) -> String {
 
 /// One scaled input: `(value - offset) * factor`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Scale {
-    pub(super) offset: f64,
-    pub(super) factor: f64,
+pub(crate) struct Scale {
+    pub(crate) offset: f64,
+    pub(crate) factor: f64,
 }
 
 impl Scale {
     #[inline]
-    pub(super) fn apply(self, value: f64) -> f32 {
+    pub(crate) fn apply(self, value: f64) -> f32 {
         ((value - self.offset) * self.factor) as f32
     }
 }

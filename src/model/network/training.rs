@@ -14,9 +14,9 @@ use candle_core::{CpuStorage, CustomOp1, Device, Layout, Shape, Tensor, Var};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
+use super::forward::NetShape;
 use super::kernel::{BatchLoss, Scratch};
 pub use super::kernel::{LossSums, LossWeights, TrainingSet};
-use super::net::NetShape;
 
 /// How long and how fast to learn.
 #[derive(Debug, Clone, Copy, PartialEq)]

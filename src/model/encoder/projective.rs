@@ -10,26 +10,26 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::FitError;
-use super::artifact::Parts;
 use super::hybrid::batch_of;
-use super::net::{Activation, Net, NetShape};
 use super::projection::{self, COEFFICIENTS, Form, MapDoubt, Projection, SIDES, same_starts, sides_of};
-use super::rows::{Row, Rows};
-use super::run::Phase;
-use super::tensors::Tensors;
-use super::train::{LossWeights, Schedule, TrainingSet};
 use crate::domain::{BoundingBox, Error, FeatureScale, Recipe, Result};
 use crate::geo::EastNorth;
+use crate::model::artifact::Parts;
+use crate::model::artifact::tensors::Tensors;
+use crate::model::network::forward::{Activation, Net, NetShape};
+use crate::model::network::training::{LossWeights, Schedule, TrainingSet};
+use crate::model::progress::FitError;
+use crate::model::progress::Phase;
+use crate::model::samples::rows::{Row, Rows};
 
 /// Hidden units of the residual network.
 const HIDDEN: usize = 16;
 /// Passes over the samples unless the run says otherwise.
-pub(super) const EPOCHS: u32 = 50;
+pub(crate) const EPOCHS: u32 = 50;
 /// Prior standard deviation of a residual column's weight, in units of position.
 const RESIDUAL_SIGMA: f64 = 0.1;
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.2, regression: 1.0 };
-pub(super) const FEATURES: [&str; 4] = ["foot_x_px", "foot_y_px", "width_px", "height_px"];
+pub(crate) const FEATURES: [&str; 4] = ["foot_x_px", "foot_y_px", "width_px", "height_px"];
 /// Numbers of the reverse camera: 3 per side, and 2 of the common denominator.
 const REVERSE: usize = 3 * SIDES + 2;
 const LEAST_DENOMINATOR: f64 = 0.02;
@@ -38,11 +38,11 @@ const UNBOUNDED: f64 = 1e9;
 
 /// What of the recipe is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Variant {
+pub(crate) struct Variant {
     /// Width and height tell the position too, not only the foot point.
-    pub(super) sides: bool,
+    pub(crate) sides: bool,
     /// A network's hidden units add what the geometry lacks.
-    pub(super) residual: bool,
+    pub(crate) residual: bool,
 }
 
 fn shape() -> NetShape {
@@ -50,7 +50,7 @@ fn shape() -> NetShape {
 }
 
 /// Fits a variant.
-pub(super) fn fit(
+pub(crate) fn fit(
     rows: &Rows,
     variant: Variant,
     e_gnss_m2: f64,
@@ -119,19 +119,19 @@ fn bounds_of(projection: &Projection, rows: &[Row]) -> [[f64; 2]; 2] {
 
 /// What the fixes leave open in a fitted encoder.
 #[derive(Debug, Clone)]
-pub(super) struct Doubt {
+pub(crate) struct Doubt {
     map: MapDoubt,
     net: Option<Net>,
 }
 
 impl Doubt {
     /// That of a geometry without a network.
-    pub(super) const fn of_geometry(map: MapDoubt) -> Self {
+    pub(crate) const fn of_geometry(map: MapDoubt) -> Self {
         Self { map, net: None }
     }
 
     /// Error variance per axis at a box that the noise of the fixes has left, m2.
-    pub(super) fn variance_m2(&self, bounding_box: &BoundingBox) -> f64 {
+    pub(crate) fn variance_m2(&self, bounding_box: &BoundingBox) -> f64 {
         let Some(net) = &self.net else {
             return self.map.variance_m2(bounding_box, &[]);
         };
@@ -275,13 +275,13 @@ impl Encoder {
 
 /// Encoder and reverse camera, ready to answer.
 #[derive(Debug, Clone)]
-pub(super) struct ProjectiveRegressor {
+pub(crate) struct ProjectiveRegressor {
     encoder: Encoder,
     reverse: [f64; REVERSE],
 }
 
 impl ProjectiveRegressor {
-    pub(super) fn build(parts: &mut Parts) -> Result<Self> {
+    pub(crate) fn build(parts: &mut Parts) -> Result<Self> {
         let scales = parts.scales(FEATURES)?;
         let coefficients = parts.tensors.take_f64("projection", &[COEFFICIENTS])?;
         let projection = Projection {
@@ -325,7 +325,7 @@ impl ProjectiveRegressor {
 
     /// Position, and the sides (foot x, foot y, width, height, px) that belong to it.
     #[inline]
-    pub(super) fn regress(&self, bounding_box: &BoundingBox) -> (EastNorth, [f64; SIDES]) {
+    pub(crate) fn regress(&self, bounding_box: &BoundingBox) -> (EastNorth, [f64; SIDES]) {
         let regressed = self.encoder.regress(bounding_box);
         let projection = &self.encoder.projection;
         let [east, north] = projection.in_units(regressed);

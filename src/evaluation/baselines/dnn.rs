@@ -10,11 +10,10 @@ use std::sync::Arc;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::net::{Activation, Net, NetShape};
-use super::rows::spread;
-use super::train::{LossWeights, Schedule, TrainingSet, train};
 use crate::domain::{BoundingBox, Sample};
 use crate::geo::{EastNorth, LocalPlane};
+use crate::model::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet, train};
+use crate::model::spread;
 
 const HIDDEN: [usize; 3] = [32, 32, 32];
 const EPOCHS: u32 = 150;

@@ -16,29 +16,29 @@ const CREDIBLE_NIS: f64 = 8.0;
 
 /// The error of a fix about what the box says, per axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct FixNoise {
+pub(crate) struct FixNoise {
     /// Variance of the whole, m2.
-    pub(super) variance_m2: f64,
+    pub(crate) variance_m2: f64,
     /// Share of it that is new with each fix.
-    pub(super) white_share: f64,
+    pub(crate) white_share: f64,
     /// Time in which the rest's correlation falls to 1/e, s.
-    pub(super) time_constant_s: f64,
+    pub(crate) time_constant_s: f64,
 }
 
 impl FixNoise {
-    pub(super) const fn white(variance_m2: f64) -> Self {
+    pub(crate) const fn white(variance_m2: f64) -> Self {
         Self { variance_m2, white_share: 1.0, time_constant_s: 1.0 }
     }
 
     /// The same with at least that variance new with each fix, m2.
-    pub(super) fn with_white_m2(self, least_m2: f64) -> Self {
+    pub(crate) fn with_white_m2(self, least_m2: f64) -> Self {
         let white_m2 = (self.variance_m2 * self.white_share).max(least_m2);
         let variance_m2 = self.variance_m2 * (1.0 - self.white_share) + white_m2;
         Self { variance_m2, white_share: white_m2 / variance_m2, ..self }
     }
 
     /// The likeliest one for residuals (m, rows by target and time); its variance is theirs.
-    pub(super) fn of_residuals(rows: &[Row], residuals: &[Vec<f64>; 2], doubts: &[f64]) -> Self {
+    pub(crate) fn of_residuals(rows: &[Row], residuals: &[Vec<f64>; 2], doubts: &[f64]) -> Self {
         let mut best = (f64::INFINITY, Self::white(1.0));
         let coloured = TIME_CONSTANTS_S.iter().flat_map(|time_constant_s| {
             WHITE_SHARES.iter().map(|white_share| Self {
@@ -70,7 +70,7 @@ impl FixNoise {
 
 /// The filter for rows in the order of target and time.
 #[derive(Debug, Clone)]
-pub(super) struct Whitener {
+pub(crate) struct Whitener {
     /// Per row: what is left of the state since the row before, the gain, and one over the
     /// standard deviation of the innovation.
     steps: Vec<[f64; 3]>,
@@ -80,7 +80,7 @@ pub(super) struct Whitener {
 
 impl Whitener {
     /// `doubts` are added to each row's white variance, as multiples of the whole variance.
-    pub(super) fn new(rows: &[Row], noise: &FixNoise, doubts: &[f64]) -> Self {
+    pub(crate) fn new(rows: &[Row], noise: &FixNoise, doubts: &[f64]) -> Self {
         let stays_m2 = noise.variance_m2 * (1.0 - noise.white_share);
         let white_m2 = noise.variance_m2 * noise.white_share;
         let mut steps = Vec::with_capacity(rows.len());
@@ -102,7 +102,7 @@ impl Whitener {
     }
 
     /// Whitens one column in place.
-    pub(super) fn apply(&self, column: &mut [f64]) {
+    pub(crate) fn apply(&self, column: &mut [f64]) {
         let mut state = 0.0;
         for (value, [keep, gain, factor]) in column.iter_mut().zip(&self.steps) {
             state *= keep;
@@ -113,7 +113,7 @@ impl Whitener {
     }
 
     /// What must be added to `doubts` so that rows that miss by far count less.
-    pub(super) fn doubt(&self, noise: &FixNoise, whitened: &[Vec<f64>; 2], doubts: &mut [f64]) {
+    pub(crate) fn doubt(&self, noise: &FixNoise, whitened: &[Vec<f64>; 2], doubts: &mut [f64]) {
         for (at, doubt) in doubts.iter_mut().enumerate() {
             let nis = whitened[0][at] * whitened[0][at] + whitened[1][at] * whitened[1][at];
             let spread = 1.0 / (self.steps[at][2] * self.steps[at][2]);

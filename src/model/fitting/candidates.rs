@@ -7,31 +7,33 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::artifact::Parts;
-use super::coverage::Coverage;
-use super::projective::Variant;
-use super::regressor::Regressor;
-use super::rows::{Rows, median};
-use super::run::{Phase, Run};
-use super::train::LossWeights;
-use super::whitening::FixNoise;
-use super::{FitError, hybrid, paper, projective, uncertainty};
 use crate::domain::Recipe;
+use crate::model::artifact::Parts;
+use crate::model::encoder::projective::Variant;
+use crate::model::encoder::{hybrid, paper, projective};
+use crate::model::network::training::LossWeights;
+use crate::model::progress::FitError;
+use crate::model::progress::{Phase, Run};
+use crate::model::regressor::Regressor;
+use crate::model::samples::rows::{Rows, median};
+use crate::model::samples::whitening::FixNoise;
+use crate::model::uncertainty::calibration as uncertainty;
+use crate::model::uncertainty::coverage::Coverage;
 
 /// Blocks of time that are held out in turn.
-pub(super) const BLOCKS: u32 = 4;
+pub(crate) const BLOCKS: u32 = 4;
 
 /// One way to fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Candidate {
-    pub(super) name: &'static str,
-    pub(super) way: Way,
+pub(crate) struct Candidate {
+    pub(crate) name: &'static str,
+    pub(crate) way: Way,
     /// Whether a kinematic smoother prepares the labels.
-    pub(super) smoothed: bool,
+    pub(crate) smoothed: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Way {
+pub(crate) enum Way {
     Paper,
     Hybrid,
     Projective(Variant),
@@ -55,7 +57,7 @@ const fn variant(sides: bool, residual: bool) -> Variant {
 }
 
 /// What a recipe tries, simplest first.
-pub(super) const fn candidates(recipe: Recipe) -> &'static [Candidate] {
+pub(crate) const fn of_recipe(recipe: Recipe) -> &'static [Candidate] {
     match recipe {
         Recipe::Paper => &[PAPER],
         Recipe::Hybrid => &[HYBRID, HYBRID_SMOOTHED],
@@ -66,19 +68,19 @@ pub(super) const fn candidates(recipe: Recipe) -> &'static [Candidate] {
 
 /// What every fit of a run shares.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Common {
-    pub(super) e_gnss_m2: f64,
-    pub(super) noise: FixNoise,
+pub(crate) struct Common {
+    pub(crate) e_gnss_m2: f64,
+    pub(crate) noise: FixNoise,
     /// Passes over the samples, if the run says so.
-    pub(super) epochs: Option<u32>,
-    pub(super) seed: u64,
+    pub(crate) epochs: Option<u32>,
+    pub(crate) seed: u64,
     /// Weights of the loss in place of the recipe's own.
-    pub(super) balance: Option<LossWeights>,
+    pub(crate) balance: Option<LossWeights>,
 }
 
 impl Candidate {
     /// Passes over the samples of one network.
-    pub(super) fn epochs(&self, common: &Common) -> u32 {
+    pub(crate) fn epochs(&self, common: &Common) -> u32 {
         let own = match self.way {
             Way::Paper => paper::EPOCHS,
             Way::Hybrid => hybrid::EPOCHS,
@@ -88,7 +90,7 @@ impl Candidate {
     }
 
     /// Passes over the samples of one fit.
-    pub(super) fn all_epochs(&self, common: &Common) -> u32 {
+    pub(crate) fn all_epochs(&self, common: &Common) -> u32 {
         let nets = match self.way {
             Way::Paper => 2,
             Way::Hybrid => 1,
@@ -98,7 +100,7 @@ impl Candidate {
     }
 
     /// Fits on rows; the error is not calibrated yet.
-    pub(super) fn fit(
+    pub(crate) fn fit(
         &self,
         rows: &Rows,
         common: &Common,
@@ -128,7 +130,7 @@ impl Candidate {
 
     /// Regressed position less fix (m) of every row, by fits that had not seen its block of time,
     /// and the error variance that they claimed, m2.
-    pub(super) fn held_out(
+    pub(crate) fn held_out(
         &self,
         rows: &Rows,
         blocks: &[u32],
@@ -164,7 +166,7 @@ impl Candidate {
 /// The candidate to keep and the score of each, in m2: its mean squared miss per axis, where wild
 /// misses count no more than a bound. That is the simplest one, unless a richer
 /// one's misses are smaller by more than the standard error of that difference.
-pub(super) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> (usize, Vec<f64>) {
+pub(crate) fn choose(rows: &Rows, residuals: &[Vec<[f64; 2]>]) -> (usize, Vec<f64>) {
     let Some(first) = residuals.first() else { return (0, Vec::new()) };
     let square = |[east, north]: &[f64; 2]| 0.5 * (east * east + north * north);
     // A fix that is far off says nothing of the candidates.

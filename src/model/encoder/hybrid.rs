@@ -5,21 +5,21 @@
 
 use std::sync::Arc;
 
-use super::FitError;
-use super::artifact::{Parts, Scale};
-use super::net::{Activation, Net, NetShape};
 use super::projection::sides_of;
 use super::projective::FEATURES;
-use super::rows::{Rows, spread};
-use super::run::Phase;
-use super::tensors::Tensors;
-use super::train::{LossWeights, Schedule, TrainingSet};
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
 use crate::geo::EastNorth;
+use crate::model::artifact::tensors::Tensors;
+use crate::model::artifact::{Parts, Scale};
+use crate::model::network::forward::{Activation, Net, NetShape};
+use crate::model::network::training::{LossWeights, Schedule, TrainingSet};
+use crate::model::progress::FitError;
+use crate::model::progress::Phase;
+use crate::model::samples::rows::{Rows, spread};
 
 const HIDDEN: [usize; 2] = [24, 24];
 /// Passes over the samples unless the run says otherwise.
-pub(super) const EPOCHS: u32 = 60;
+pub(crate) const EPOCHS: u32 = 60;
 /// wX : wZ on scaled inputs.
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.5, regression: 1.0 };
 
@@ -28,12 +28,12 @@ fn shape() -> NetShape {
 }
 
 /// Samples per step: small sets need small steps to make enough of them.
-pub(super) fn batch_of(samples: usize) -> usize {
+pub(crate) fn batch_of(samples: usize) -> usize {
     (samples / 20).clamp(16, 512)
 }
 
 /// Fits the network.
-pub(super) fn fit(
+pub(crate) fn fit(
     rows: &Rows,
     e_gnss_m2: f64,
     epochs: u32,
@@ -100,7 +100,7 @@ pub(super) fn fit(
 
 /// The network, ready to answer.
 #[derive(Debug, Clone)]
-pub(super) struct HybridRegressor {
+pub(crate) struct HybridRegressor {
     net: Net,
     scales: [Scale; 4],
     centre: EastNorth,
@@ -108,7 +108,7 @@ pub(super) struct HybridRegressor {
 }
 
 impl HybridRegressor {
-    pub(super) fn build(parts: &mut Parts) -> Result<Self> {
+    pub(crate) fn build(parts: &mut Parts) -> Result<Self> {
         Ok(Self {
             scales: parts.scales(FEATURES)?,
             centre: EastNorth {
@@ -122,7 +122,7 @@ impl HybridRegressor {
 
     /// Position, and the sides (foot x, foot y, width, height, px) that belong to it.
     #[inline]
-    pub(super) fn regress(&self, bounding_box: &BoundingBox) -> (EastNorth, [f64; 4]) {
+    pub(crate) fn regress(&self, bounding_box: &BoundingBox) -> (EastNorth, [f64; 4]) {
         let raw = sides_of(bounding_box);
         let inputs: [f32; 4] = std::array::from_fn(|at| self.scales[at].apply(raw[at]));
         let middle = self.net.encode(&inputs);

@@ -10,9 +10,9 @@
 use nalgebra::{Matrix4, Vector4};
 
 use super::coverage::Coverage;
-use super::rows::{Row, median};
 use crate::domain::{BoundingBox, Error, Result};
 use crate::geo::EastNorth;
+use crate::model::samples::rows::{Row, median};
 
 /// Training boxes per cell, at least, and cells at most.
 const ROWS_PER_CELL: usize = 40;
@@ -27,7 +27,7 @@ const USUAL: [(f64, f64); 2] = [(0.7, 4.0), (0.99, 1.5)];
 /// Share of a deviation's square that counts in the mean direction, where the exact one is unsure.
 const SIDEWAYS: f64 = 0.25;
 /// Numbers of a cell: middle 4, precision 16, pull 8, sideways 1, usual 1.
-pub(super) const NUMBERS: usize = 30;
+pub(crate) const NUMBERS: usize = 30;
 
 /// Pixels by which a box may go along with the target's place wherever geometry says so, though
 /// training has not gone there.
@@ -35,10 +35,10 @@ const PLACES_PX: f64 = 40.0;
 
 /// What an encoder makes of a box: the answer, and the sides (foot x, foot y, width, height, px) that
 /// its decoder rebuilds from that.
-pub(super) type Encode<'a> = dyn Fn(&BoundingBox) -> (EastNorth, [f64; 4]) + 'a;
+pub(crate) type Encode<'a> = dyn Fn(&BoundingBox) -> (EastNorth, [f64; 4]) + 'a;
 
 /// Metres that the answer moves for a pixel of each edge: east, then north.
-pub(super) type Slopes = [[f64; 4]; 2];
+pub(crate) type Slopes = [[f64; 4]; 2];
 
 /// One part of the image.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,20 +57,20 @@ struct Cell {
 
 /// All cells; the nearest centre of the coverage says which one a box belongs to.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(super) struct Cells {
+pub(crate) struct Cells {
     cells: Vec<Cell>,
     /// Cell of each centre.
     of_centre: Vec<u8>,
 }
 
-pub(super) fn edges_of(bounding_box: &BoundingBox) -> [f64; 4] {
+pub(crate) fn edges_of(bounding_box: &BoundingBox) -> [f64; 4] {
     let [left, top, width, height] = bounding_box.sides_px();
     [left, top, left + width, top + height]
 }
 
 /// Slopes of an encoder at a box, by central differences of a pixel, and the rebuilt edges' own slopes
 /// (rows by moved edge).
-pub(super) fn slopes_at(encode: &Encode<'_>, bounding_box: &BoundingBox) -> (Slopes, Matrix4<f64>) {
+pub(crate) fn slopes_at(encode: &Encode<'_>, bounding_box: &BoundingBox) -> (Slopes, Matrix4<f64>) {
     let edges = edges_of(bounding_box);
     let mut slopes = [[0.0; 4]; 2];
     let mut rebuilt = Matrix4::zeros();
@@ -95,13 +95,13 @@ pub(super) fn slopes_at(encode: &Encode<'_>, bounding_box: &BoundingBox) -> (Slo
 }
 
 /// Variance per axis that an independent pixel of noise in each edge makes, m2.
-pub(super) fn edge_variance_m2(slopes: &Slopes) -> f64 {
+pub(crate) fn edge_variance_m2(slopes: &Slopes) -> f64 {
     0.5 * slopes.iter().flatten().map(|slope| slope * slope).sum::<f64>()
 }
 
 impl Cells {
     /// Cells of the training boxes, with the slopes of an encoder at the middle of each.
-    pub(super) fn new(coverage: &Coverage, rows: &[Row], encode: &Encode<'_>) -> Self {
+    pub(crate) fn new(coverage: &Coverage, rows: &[Row], encode: &Encode<'_>) -> Self {
         let count = (rows.len() / ROWS_PER_CELL).clamp(1, MOST_CELLS).min(coverage.centres.len());
         let coarse = coverage.coarse(count);
         let of_centre = cells_of(coverage, count);
@@ -140,7 +140,7 @@ impl Cells {
     /// The error variance per axis that a box adds which looks like none of those in its part of
     /// the image, m2; 0 for all others.
     #[inline]
-    pub(super) fn astray_m2(&self, centre: usize, bounding_box: &BoundingBox) -> f64 {
+    pub(crate) fn astray_m2(&self, centre: usize, bounding_box: &BoundingBox) -> f64 {
         let Some(cell) = self.of_centre.get(centre).and_then(|at| self.cells.get(usize::from(*at))) else {
             return 0.0;
         };
@@ -153,7 +153,7 @@ impl Cells {
     }
 
     /// Rows of numbers, as they are stored.
-    pub(super) fn numbers(&self) -> Vec<f32> {
+    pub(crate) fn numbers(&self) -> Vec<f32> {
         let numbers = |cell: &Cell| {
             let mut numbers = cell.middle.to_vec();
             numbers.extend(cell.precision.iter().flatten());
@@ -168,7 +168,7 @@ impl Cells {
     ///
     /// # Errors
     /// Refuses numbers that are no cells.
-    pub(super) fn from_numbers(coverage: &Coverage, numbers: &[f32]) -> Result<Self> {
+    pub(crate) fn from_numbers(coverage: &Coverage, numbers: &[f32]) -> Result<Self> {
         let (rows, rest) = numbers.as_chunks::<NUMBERS>();
         let fits = rest.is_empty() && !rows.is_empty() && rows.len() <= coverage.centres.len();
         if !fits || rows.iter().any(|row| row[NUMBERS - 2] < 0.0 || row[NUMBERS - 1] <= 0.0) {

@@ -1,0 +1,4 @@
+//! Training samples as rows in a local plane, and the noise of their fixes over time.
+
+pub(crate) mod rows;
+pub(crate) mod whitening;

@@ -16,6 +16,7 @@ mod observation;
 mod receiver;
 mod recipe;
 mod sample;
+mod score;
 mod time;
 mod training;
 
@@ -30,7 +31,8 @@ pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
-pub use sample::{Sample, Score};
+pub use sample::Sample;
+pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, ModelMetadata, ModelVersion,

@@ -1,7 +1,7 @@
 use std::ops::ControlFlow;
 
 use super::*;
-use crate::domain::{Observation, Recipe, Sample, SigmaM};
+use crate::domain::{Observation, Recipe, SigmaM};
 use crate::simulation::{Options, Scene, World, simulate, simulate_split};
 
 fn options(methods: &str) -> EvaluateOptions {

@@ -206,7 +206,8 @@ pub(crate) fn unusable(message: String) -> FitError {
 }
 
 /// Standard deviation.
-pub(crate) fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
+#[must_use]
+pub fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
     let count = values.clone().count().max(1) as f64;
     let mean = values.clone().sum::<f64>() / count;
     (values.map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()

@@ -26,7 +26,7 @@ pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};
-pub use method::{Method, Step};
+pub use method::{InferenceMode, Method};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};

@@ -33,20 +33,20 @@ fn test_rows(world: &World) -> Vec<TestRow> {
         .collect()
 }
 
-fn judge(train: &World, test: &World, options: &EvaluateOptions) -> Evaluation {
+fn evaluated(train: &World, test: &World, options: &EvaluateOptions) -> Evaluation {
     let rows = test_rows(test);
     evaluate(&train.training_samples(), &rows, &Truth::Columns, options, &mut |_| ControlFlow::Continue(()))
         .expect("valid boxes")
 }
 
 #[test]
-fn every_method_answers_interleaved_targets_with_holes() {
+fn every_method_predicts_for_interleaved_targets_with_gaps() {
     let square = Options { samples: 800, targets: 3, ..Options::new(Scene::Square) };
     let test = Options { gnss_gaps: 0.2, occlusion: 0.2, targets: 5, ..square.test(500) };
     let test = simulate(&test);
     let names = "gnss,imm_ukf,dnn,dnn.denied,homography.denied,hybrid.one_step,hybrid.two_step,hybrid.denied,\
                  track,track.denied";
-    let evaluation = judge(&simulate(&square), &test, &options(names));
+    let evaluation = evaluated(&simulate(&square), &test, &options(names));
     assert!(evaluation.report.failed.is_empty(), "{:?}", evaluation.report.failed);
     let n = |name: &str| evaluation.report.methods[name].metrics.n;
     let count = |holds: &dyn Fn(&TestRow) -> bool| test_rows(&test).iter().filter(|row| holds(row)).count();
@@ -62,10 +62,10 @@ fn every_method_answers_interleaved_targets_with_holes() {
 }
 
 #[test]
-fn answers_repeat_and_seeds_spread() {
+fn predictions_are_repeatable_and_seeds_differ() {
     let (train, test) = simulate_split(&Options { samples: 400, ..Options::new(Scene::Square) }, 100);
     let two = EvaluateOptions { seeds: 2, ..options("gnss,hybrid.denied") };
-    let (first, again) = (judge(&train, &test, &two), judge(&train, &test, &two));
+    let (first, again) = (evaluated(&train, &test, &two), evaluated(&train, &test, &two));
     let means = |evaluation: &Evaluation, name: &str| evaluation.report.methods[name].seed_means_m.clone();
     for name in ["gnss", "hybrid.denied"] {
         let (one, other) = (means(&first, name), means(&again, name));
@@ -77,11 +77,11 @@ fn answers_repeat_and_seeds_spread() {
 }
 
 #[test]
-fn enlarged_boxes_hurt_the_camera_and_not_the_receiver() {
+fn enlarged_boxes_increase_the_error_of_the_camera_only() {
     let (train, test) = simulate_split(&Options { samples: 800, ..Options::new(Scene::Square) }, 200);
-    let plain = judge(&train, &test, &options("gnss,homography.denied"));
+    let plain = evaluated(&train, &test, &options("gnss,homography.denied"));
     let shifted = EvaluateOptions { box_shift_px: 100.0, ..options("gnss,homography.denied") };
-    let shifted = judge(&train, &test, &shifted);
+    let shifted = evaluated(&train, &test, &shifted);
     let mean_m = |evaluation: &Evaluation, name: &str| evaluation.report.methods[name].metrics.mean_m;
     assert!((mean_m(&plain, "gnss") - mean_m(&shifted, "gnss")).abs() < 1e-9);
     // The foot moves half the growth to the left.
@@ -89,40 +89,41 @@ fn enlarged_boxes_hurt_the_camera_and_not_the_receiver() {
 }
 
 #[test]
-fn what_cannot_run_is_named_and_the_rest_goes_on() {
+fn a_method_that_cannot_run_is_named_and_the_others_run() {
     let (train, test) = simulate_split(&Options { samples: 5, ..Options::new(Scene::Square) }, 50);
-    let evaluation = judge(&train, &test, &options("gnss,dnn,homography.denied,hybrid.one_step"));
+    let evaluation = evaluated(&train, &test, &options("gnss,dnn,homography.denied,hybrid.one_step"));
     assert_eq!(evaluation.report.methods.len(), 1);
     assert_eq!(evaluation.report.failed.len(), 3, "{:?}", evaluation.report.failed);
-    // Without any truth nothing can be judged, and that is said.
+    // Without any truth no prediction can be scored, and the report states that.
     let mut rows = test_rows(&test);
     rows.iter_mut().for_each(|row| row.truth = None);
-    let unjudged =
+    let unscored =
         evaluate(&[], &rows, &Truth::Columns, &options("gnss"), &mut |_| ControlFlow::Continue(()))
             .expect("valid boxes");
-    assert!(unjudged.report.failed.contains_key("gnss"));
+    assert!(unscored.report.failed.contains_key("gnss"));
 }
 
 #[test]
-fn steps_are_counted_to_the_end_and_breaking_stops_at_the_next() {
+fn steps_are_counted_and_a_break_stops_at_the_next_one() {
     let square = Options { samples: 300, ..Options::new(Scene::Square) };
     let (train, rows) = (simulate(&square).training_samples(), test_rows(&simulate(&square.test(50))));
     let options = EvaluateOptions { seeds: 2, ..options("gnss,hybrid.denied,hybrid.two_step") };
-    let mut told = Vec::new();
-    let whole = evaluate(&train, &rows, &Truth::Columns, &options, &mut |doing| {
-        told.push((doing.done, doing.planned));
+    let mut reported = Vec::new();
+    let whole = evaluate(&train, &rows, &Truth::Columns, &options, &mut |progress| {
+        reported.push((progress.done, progress.planned));
         ControlFlow::Continue(())
     });
     assert_eq!(whole.expect("valid boxes").report.methods.len(), 3);
-    // One fit and three methods, with two seeds; the last step is told when it begins.
-    assert!(told.iter().all(|&(_, planned)| planned == 8), "{told:?}");
-    assert!(told.is_sorted() && told.first() == Some(&(0, 8)) && told.last() == Some(&(7, 8)), "{told:?}");
+    // One fit and three methods, with two seeds; a step is reported when it starts.
+    assert!(reported.iter().all(|&(_, planned)| planned == 8), "{reported:?}");
+    assert!(reported.is_sorted(), "{reported:?}");
+    assert_eq!((reported.first(), reported.last()), (Some(&(0, 8)), Some(&(7, 8))), "{reported:?}");
 
-    let mut heard = 0;
-    let broken_off = evaluate(&train, &rows, &Truth::Columns, &options, &mut |doing| {
-        heard += usize::from(doing.done >= 2);
-        if doing.done >= 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    let mut calls = 0;
+    let interrupted = evaluate(&train, &rows, &Truth::Columns, &options, &mut |progress| {
+        calls += usize::from(progress.done >= 2);
+        if progress.done >= 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
-    let methods = broken_off.expect("valid boxes").report.methods;
-    assert_eq!((methods.len(), heard), (1, 1), "nothing goes on after the break");
+    let methods = interrupted.expect("valid boxes").report.methods;
+    assert_eq!((methods.len(), calls), (1, 1), "nothing goes on after the break");
 }

@@ -1,38 +1,33 @@
-//! Learns what a set of methods needs, from the training samples alone, once per seed.
+//! Fits the models that a set of methods needs, from the training samples alone, once per seed.
 
 use std::ops::ControlFlow;
 
-use super::runner::EvaluateOptions;
+use super::options::EvaluateOptions;
 use crate::domain::{EpochReport, GnssError, Method, Recipe, Sample};
-use crate::filters::{ImmUkf, ImmUkfOptions};
-use crate::fusion::track::Pass;
 use crate::model::{FitEvent, FitOptions, Regressor, fit};
 
-/// Accelerations that the IMM-UKF is tuned over, m/s2.
-const ACCELERATIONS_MPS2: [f64; 7] = [0.03, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2];
-
-/// Something learnt, or why it could not be, with what it cost.
-pub(super) struct Learnt<T> {
+/// The result of a computation, or the reason why it failed, with the CPU time that it took.
+pub(super) struct Timed<T> {
     pub(super) outcome: Result<T, String>,
     pub(super) cpu_s: f64,
 }
 
-impl<T> Learnt<T> {
-    /// Runs and times.
-    pub(super) fn by(options: &EvaluateOptions, learn: impl FnOnce() -> Result<T, String>) -> Self {
-        let begun_s = (options.cpu_s)();
-        let outcome = learn();
-        Self { outcome, cpu_s: (options.cpu_s)() - begun_s }
+impl<T> Timed<T> {
+    /// Runs a computation and measures its CPU time by the options' clock.
+    pub(super) fn run(options: &EvaluateOptions, compute: impl FnOnce() -> Result<T, String>) -> Self {
+        let start_s = (options.cpu_s)();
+        let outcome = compute();
+        Self { outcome, cpu_s: (options.cpu_s)() - start_s }
     }
 }
 
-/// A recipe's model with the curve of its fit.
+/// A recipe's model with its training curve.
 pub(super) struct RecipeModel {
     pub(super) regressor: Regressor,
     pub(super) curve: Vec<EpochReport>,
 }
 
-/// The recipes that some methods need, each once.
+/// The recipes whose models these methods use, each once.
 pub(super) fn recipes_of(methods: &[Method], default: Recipe) -> Vec<Recipe> {
     Recipe::ALL
         .into_iter()
@@ -40,14 +35,14 @@ pub(super) fn recipes_of(methods: &[Method], default: Recipe) -> Vec<Recipe> {
         .collect()
 }
 
-/// Fits one recipe.
-pub(super) fn learn_recipe(
+/// Fits one recipe; `progress` receives the phase of the fit in words.
+pub(super) fn fit_recipe(
     recipe: Recipe,
     seed: u64,
     train: &[Sample],
     options: &EvaluateOptions,
     progress: &mut dyn FnMut(&str) -> ControlFlow<()>,
-) -> Learnt<RecipeModel> {
+) -> Timed<RecipeModel> {
     let fit_options = FitOptions {
         recipe,
         seed,
@@ -55,7 +50,7 @@ pub(super) fn learn_recipe(
         image_size: options.image_size,
         gnss_error: options.gnss_sigma.map_or(GnssError::Unknown, GnssError::Known),
     };
-    Learnt::by(options, || {
+    Timed::run(options, || {
         let mut curve = Vec::new();
         let artifact = fit(train, &fit_options, &mut |event| match event {
             FitEvent::Progress(run) => {
@@ -71,27 +66,4 @@ pub(super) fn learn_recipe(
             artifact.map_err(|error| error.to_string())?.load().map_err(|error| error.to_string())?;
         Ok(RecipeModel { regressor, curve })
     })
-}
-
-/// The IMM-UKF whose acceleration makes the training fixes likeliest, the receiver's variance given.
-///
-/// Coloured errors look like motion, so the likelihood alone would follow every fix; the track's own
-/// split into white and coloured is not this baseline's to know.
-pub(super) fn tune_imm_ukf(passes: &[Pass], variance_m2: f64) -> ImmUkfOptions {
-    let likelihood = |acceleration_mps2: f64| -> f64 {
-        let mut filter = ImmUkf::new(ImmUkfOptions::of_acceleration(acceleration_mps2));
-        let mut sum = 0.0;
-        for (times_s, fixes) in passes {
-            filter.step(1e9, None);
-            for (index, fix) in fixes.iter().enumerate() {
-                let seconds = if index == 0 { 0.0 } else { times_s[index] - times_s[index - 1] };
-                let estimate = filter.step(seconds, Some((*fix, variance_m2)));
-                sum += estimate.map_or(0.0, |estimate| estimate.log_likelihood);
-            }
-        }
-        sum
-    };
-    let scored = ACCELERATIONS_MPS2.map(|candidate| (likelihood(candidate), candidate));
-    let best = scored.into_iter().max_by(|one, other| one.0.total_cmp(&other.0));
-    ImmUkfOptions::of_acceleration(best.map_or(0.4, |(_, candidate)| candidate))
 }

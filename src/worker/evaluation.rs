@@ -12,7 +12,7 @@ use crate::clock::thread_cpu_s;
 use crate::domain::{
     CameraId, Error, EvaluationJob, EvaluationProgress, JobState, Observation, Result, Sample,
 };
-use crate::evaluation::{Doing, EvaluateOptions, Report, TestRow, evaluate};
+use crate::evaluation::{EvaluateOptions, Progress, Report, TestRow, evaluate};
 use crate::store::{Claim, Heartbeat, JobEnd, SampleFilter};
 use crate::telemetry::Metrics;
 
@@ -77,13 +77,13 @@ impl Job for EvaluationJob {
         };
         Ok(Box::new(move |voice| {
             let mut broken_off = false;
-            let evaluated = evaluate(&train, &test, &truth, &options, &mut |doing: &Doing<'_>| {
+            let evaluated = evaluate(&train, &test, &truth, &options, &mut |step: &Progress<'_>| {
                 let going_on = voice.say(|progress| {
                     *progress = EvaluationProgress {
-                        phase: doing.words.to_owned(),
-                        steps_done: doing.done,
-                        steps: doing.planned,
-                        remaining_s: voice.remaining_s(doing.done, doing.planned),
+                        phase: step.phase.to_owned(),
+                        steps_done: step.done,
+                        steps: step.planned,
+                        remaining_s: voice.remaining_s(step.done, step.planned),
                     };
                 });
                 broken_off |= going_on.is_break();

@@ -1,8 +1,8 @@
 //! The supervised baseline of Liang et al. 2022: a network of 5 layers, mean squared error, Adam at
 //! 0.001, with the fix among its inputs (6D) or without (4D, GNSS denied).
 //!
-//! Inputs are scaled, which the paper does not say, since the baseline shall be as strong as its
-//! kind allows. What never happens here: a decoder, an error estimate.
+//! Inputs and outputs are standardised, which the paper does not specify, so that the baseline is as
+//! strong as its kind allows. It has no decoder and states no error.
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::domain::{BoundingBox, Sample};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::model::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet, train};
-use crate::model::spread;
+use crate::model::std_dev;
 
 const HIDDEN: [usize; 3] = [32, 32, 32];
 const EPOCHS: u32 = 150;
@@ -24,7 +24,7 @@ pub struct Dnn {
     net: Net,
     /// Offset and factor per input.
     scales: Vec<[f64; 2]>,
-    /// Offset and unit per axis of the position, m.
+    /// Offset (m) and factor (1/m) per axis of the position.
     outputs: [[f64; 2]; 2],
 }
 
@@ -44,7 +44,7 @@ pub fn fit(samples: &[Sample], plane: &LocalPlane, with_fix: bool, seed: u64) ->
     let scale = |values: &mut dyn Iterator<Item = f64>| {
         let values: Vec<f64> = values.collect();
         let mean = values.iter().sum::<f64>() / values.len().max(1) as f64;
-        [mean, 1.0 / spread(values.iter().copied()).max(1e-3)]
+        [mean, 1.0 / std_dev(values.iter().copied()).max(1e-3)]
     };
     let scales: Vec<[f64; 2]> =
         (0..count).map(|at| scale(&mut raw.iter().map(|inputs| inputs[at]))).collect();
@@ -55,8 +55,8 @@ pub fn fit(samples: &[Sample], plane: &LocalPlane, with_fix: bool, seed: u64) ->
     };
     let set = TrainingSet {
         inputs: (0..count).map(|at| column(scales[at], &mut raw.iter().map(|inputs| inputs[at]))).collect(),
-        rebuilt: Vec::new(),
-        targets: [
+        reconstruction_targets: Vec::new(),
+        position_targets: [
             column(east, &mut fixes.iter().map(|fix| fix.east_m)),
             column(north, &mut fixes.iter().map(|fix| fix.north_m)),
         ],
@@ -64,17 +64,17 @@ pub fn fit(samples: &[Sample], plane: &LocalPlane, with_fix: bool, seed: u64) ->
     };
     let shape = NetShape::regression(count, &HIDDEN, Activation::Relu);
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let start = shape.initial_parameters(&mut rng);
+    let initial = shape.initial_parameters(&mut rng);
     let schedule = Schedule { epochs: EPOCHS, batch: 64, learning_rate: 0.001, last_rate_share: 1.0 };
     let weights = LossWeights { reconstruction: 0.0, regression: 1.0 };
     let observer = &mut |_, _: &_| ControlFlow::Continue(());
-    // Without an observer that breaks, only candle itself could fail, and then the start stands.
-    let parameters = train(&shape, start.clone(), Arc::new(set), weights, schedule, &mut rng, observer);
-    Dnn { net: Net::new(shape, &parameters.unwrap_or(start)), scales, outputs: [east, north] }
+    // The observer never breaks, so only candle itself can fail; then the initial parameters remain.
+    let parameters = train(&shape, initial.clone(), Arc::new(set), weights, schedule, &mut rng, observer);
+    Dnn { net: Net::new(shape, &parameters.unwrap_or(initial)), scales, outputs: [east, north] }
 }
 
 impl Dnn {
-    /// Where the target stands; a network with the fix among its inputs needs one.
+    /// Position of a box's target in the plane, m; a network with the fix among its inputs needs one.
     #[must_use]
     pub fn regress(&self, bounding_box: &BoundingBox, fix: Option<EastNorth>) -> EastNorth {
         let raw = inputs_of(bounding_box, fix);
@@ -82,9 +82,9 @@ impl Dnn {
         for ((input, raw), [offset, factor]) in inputs.iter_mut().zip(raw).zip(&self.scales) {
             *input = ((raw - offset) * factor) as f32;
         }
-        let middle = self.net.encode(&inputs[..self.scales.len()]);
+        let position = self.net.encode(&inputs[..self.scales.len()]);
         let [east_m, north_m] = std::array::from_fn(|axis| {
-            f64::from(middle[axis]) / self.outputs[axis][1] + self.outputs[axis][0]
+            f64::from(position[axis]) / self.outputs[axis][1] + self.outputs[axis][0]
         });
         EastNorth { east_m, north_m }
     }

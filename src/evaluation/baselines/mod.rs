@@ -1,4 +1,5 @@
-//! What a practitioner would use in place of this project, for comparison.
+//! Methods of other authors and of common practice, for comparison.
 
 pub mod dnn;
 pub mod homography;
+pub mod imm_ukf;

@@ -68,8 +68,8 @@ fn training_set(rng: &mut ChaCha8Rng) -> TrainingSet {
         straight.iter().zip(bent).map(|(straight, bent)| 0.7 * straight + 0.3 * bent * bent).collect()
     };
     TrainingSet {
-        rebuilt: inputs.clone(),
-        targets: [target(0), target(1)],
+        reconstruction_targets: inputs.clone(),
+        position_targets: [target(0), target(1)],
         inputs,
         weights: vec![1.0; SAMPLES],
     }

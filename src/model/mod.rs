@@ -1,8 +1,9 @@
-//! Recipes, training loop, fast forward pass and model artifacts; the only floor that knows candle.
+//! Models of a camera: fitting them to samples, storing them, and regressing positions from boxes.
 //!
-//! [`fit`] turns samples into an [`Artifact`]; [`Artifact::load`] turns that into a [`Regressor`],
-//! which answers box by box from flat weights. What never happens here: storage, transport, clocks,
-//! threads of its own.
+//! [`fit`] turns samples into an [`Artifact`]; [`Artifact::load`] turns that into a [`Regressor`], which
+//! regresses box by box from flat weights. The folders in the order of their layers: `artifact`, `network`,
+//! `samples`, `progress`, `encoder`, `uncertainty`, `regressor`, `fitting`. This is the only module that
+//! uses candle; it has no I/O, clocks or threads.
 
 mod artifact;
 mod encoder;
@@ -13,12 +14,14 @@ mod regressor;
 mod samples;
 mod uncertainty;
 
+pub use crate::statistics::R95_PER_SIGMA;
 pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackBeliefs};
-pub use encoder::projection::{Projection, fit_foot_points};
-pub use fitting::fit::{FitOptions, Trial, fit, fit_trial};
+pub use encoder::projection::Projection;
+pub use encoder::projection_fit::fit_foot_points;
+pub use fitting::{FitOptions, FitOverrides, fit, fit_with};
 pub use progress::{FitError, FitEvent};
-pub use regressor::{R95_PER_SIGMA, Regression, Regressor};
-pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M, spread};
+pub use regressor::{Regression, Regressor};
+pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 
 #[cfg(test)]
 mod tests;

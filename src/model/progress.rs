@@ -1,6 +1,6 @@
-//! A fit under way: its observer, progress, and one training after another.
+//! The progress of a fit: what its observer receives, why it may end, and the training of its networks.
 //!
-//! What never happens here: a clock; the time that is left is for the caller to tell.
+//! The remaining time is left to the observer, which has a clock.
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
@@ -8,39 +8,45 @@ use std::sync::Arc;
 use rand_chacha::ChaCha8Rng;
 
 use crate::domain::{EpochReport, Error, RunProgress};
-use crate::model::network::forward::NetShape;
-use crate::model::network::training::{LossSums, LossWeights, Schedule, TrainError, TrainingSet, train};
+use crate::model::network::{LossSums, LossWeights, NetShape, Schedule, TrainError, TrainingSet, train};
 
-/// What a fit tells on its way.
+/// What the observer of a fit receives.
 #[derive(Debug)]
 pub enum FitEvent<'a> {
-    /// How far it has come; `remaining_s` is left to the caller, who has a clock.
+    /// The progress of the run; `remaining_s` is left to the observer, which has a clock.
     Progress(&'a RunProgress),
     /// One epoch of the final fit.
     Epoch(&'a EpochReport),
-    /// A line for the log.
+    /// A line for the run's log.
     Note(&'a str),
 }
 
 /// Why a fit gave no model.
 #[derive(Debug, thiserror::Error)]
 pub enum FitError {
-    /// The observer asked for it.
+    /// The observer requested it.
     #[error("cancelled")]
     Cancelled,
     /// The samples cannot support a fit; a refusal that names `samples` and the remedy.
     #[error("{0}")]
     Unusable(Error),
-    /// Ours.
+    /// A fault of this program.
     #[error("the fit failed: {0}")]
     Fault(Box<dyn std::error::Error + Send + Sync>),
+}
+
+impl FitError {
+    /// A fault, from its cause.
+    pub(crate) fn fault(cause: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Self {
+        Self::Fault(cause.into())
+    }
 }
 
 impl From<TrainError> for FitError {
     fn from(error: TrainError) -> Self {
         match error {
             TrainError::Cancelled => Self::Cancelled,
-            TrainError::Candle(cause) => Self::Fault(cause.into()),
+            TrainError::Candle(cause) => Self::fault(cause),
         }
     }
 }
@@ -48,43 +54,40 @@ impl From<TrainError> for FitError {
 /// The observer of a fit; returning `Break` ends it.
 pub(crate) type Observer<'a> = dyn FnMut(FitEvent<'_>) -> ControlFlow<()> + 'a;
 
-/// One fit with its observer and progress.
-pub(super) struct Run<'a> {
-    pub(super) observer: &'a mut Observer<'a>,
-    pub(super) progress: RunProgress,
+/// A fit under way: its observer and its progress over all phases.
+pub(crate) struct FitRun<'a> {
+    pub(crate) observer: &'a mut Observer<'a>,
+    pub(crate) progress: RunProgress,
 }
 
-impl Run<'_> {
-    pub(super) fn note(&mut self, line: &str) -> Result<(), FitError> {
-        self.tell(|observer, _| observer(FitEvent::Note(line)))
-    }
-
-    fn tell(
-        &mut self,
-        event: impl FnOnce(&mut Observer<'_>, &RunProgress) -> ControlFlow<()>,
-    ) -> Result<(), FitError> {
-        match event(self.observer, &self.progress) {
+impl FitRun<'_> {
+    /// Sends a line for the log.
+    ///
+    /// # Errors
+    /// [`FitError::Cancelled`] if the observer breaks.
+    pub(crate) fn note(&mut self, line: &str) -> Result<(), FitError> {
+        match (self.observer)(FitEvent::Note(line)) {
             ControlFlow::Continue(()) => Ok(()),
             ControlFlow::Break(()) => Err(FitError::Cancelled),
         }
     }
 }
 
-/// One part of a run: a held-out block, or the final fit.
-pub(super) struct Phase<'r, 'a> {
-    pub(super) run: &'r mut Run<'a>,
-    pub(super) name: String,
-    pub(super) rng: ChaCha8Rng,
-    /// Whether its epochs are those of the run's curve.
-    pub(super) is_final: bool,
-    /// Weights of the loss in place of the recipe's own.
-    pub(super) balance: Option<LossWeights>,
+/// One phase of a run: a held-out block, or the final fit.
+pub(crate) struct Phase<'r, 'a> {
+    pub(crate) run: &'r mut FitRun<'a>,
+    pub(crate) name: String,
+    pub(crate) rng: ChaCha8Rng,
+    /// Whether the epochs of this phase are those of the run's curve.
+    pub(crate) is_final: bool,
+    /// Loss weights that replace the recipe's own.
+    pub(crate) loss_weights: Option<LossWeights>,
 }
 
 impl Phase<'_, '_> {
-    /// Trains a network from fresh parameters; `part` tells networks of one phase apart. Returns
-    /// the parameters and the sums of the last epoch.
-    pub(super) fn train(
+    /// Trains a network from initial parameters; `part` names the network if the phase has several.
+    /// Returns the parameters and the sums of the last epoch.
+    pub(crate) fn train(
         &mut self,
         part: &str,
         shape: &NetShape,
@@ -92,11 +95,11 @@ impl Phase<'_, '_> {
         weights: LossWeights,
         schedule: Schedule,
     ) -> Result<(Vec<f32>, LossSums), FitError> {
-        let Self { run, name, rng, is_final, balance } = self;
-        let weights = balance.unwrap_or(weights);
+        let Self { run, name, rng, is_final, loss_weights } = self;
+        let weights = loss_weights.unwrap_or(weights);
         run.progress.phase = format!("{name} {}", part.trim_end_matches('.')).trim().to_owned();
-        // The curve shows the network that answers when there is a fix.
-        let curve = *is_final && part != "denied.";
+        // The curve is that of the network that is used when there is a fix.
+        let in_curve = *is_final && part != "denied.";
         let mut last = LossSums::default();
         let parameters = shape.initial_parameters(rng);
         let parameters = train(shape, parameters, set, weights, schedule, rng, &mut |epoch, sums| {
@@ -113,7 +116,7 @@ impl Phase<'_, '_> {
             run.progress.regression_error = report.regression_error;
             run.progress.error_scale = report.error_scale;
             (run.observer)(FitEvent::Progress(&run.progress))?;
-            if curve { (run.observer)(FitEvent::Epoch(&report)) } else { ControlFlow::Continue(()) }
+            if in_curve { (run.observer)(FitEvent::Epoch(&report)) } else { ControlFlow::Continue(()) }
         })?;
         Ok((parameters, last))
     }

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 /// A module imports only from modules of a lower number; those of one number do not know each other.
 const FLOORS: &[(&str, u32)] = &[
     ("geo", 0),
+    ("statistics", 0),
     ("domain", 1),
     ("clock", 2),
     ("config", 2),

@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::domain::{BoundingBox, Sample};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::model::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet, train};
-use crate::model::std_dev;
+use crate::statistics::std_dev;
 
 const HIDDEN: [usize; 3] = [32, 32, 32];
 const EPOCHS: u32 = 150;

@@ -1,6 +1,5 @@
-//! One file for one model version: safetensors, with the metadata document in the header.
-//!
-//! What one server gives another takes, and so does `sightfix fuse --model`.
+//! The exchange format of a model version: one safetensors file with the metadata document in its header,
+//! for downloads, uploads and `sightfix fuse --model`.
 
 use std::collections::HashMap;
 
@@ -10,16 +9,16 @@ use safetensors::{SafeTensorError, SafeTensors};
 use super::Artifact;
 use crate::domain::{Error, Result};
 
-/// Key of the metadata document in the header.
+/// Key of the metadata document in the safetensors header.
 const KEY: &str = "sightfix";
-/// No model is larger; the header adds some kB to the 64 kB of weights.
+/// Largest file that is read: the header adds some kB to the 64 KiB of weights.
 const LARGEST_FILE_BYTES: usize = 1 << 20;
 
 impl Artifact {
     /// The artifact as one file.
     ///
     /// # Errors
-    /// Weights that are not safetensors.
+    /// If the weights are not safetensors.
     pub fn to_file(&self) -> std::result::Result<Bytes, SafeTensorError> {
         let tensors = SafeTensors::deserialize(&self.weights)?;
         let document =
@@ -28,10 +27,10 @@ impl Artifact {
         safetensors::serialize(tensors.tensors(), Some(header)).map(Bytes::from)
     }
 
-    /// The artifact of a file that [`Artifact::to_file`] made.
+    /// The artifact of a file by [`Artifact::to_file`].
     ///
     /// # Errors
-    /// `InvalidArgument` naming `file`, or the place in its `metadata`.
+    /// Names `file`, or the field of its `metadata`.
     pub fn from_file(file: &[u8]) -> Result<Self> {
         if file.len() > LARGEST_FILE_BYTES {
             return Err(Error::invalid("file", format!("must be at most {LARGEST_FILE_BYTES} bytes")));

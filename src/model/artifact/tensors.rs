@@ -1,7 +1,6 @@
 //! Named tensors of a model and their safetensors form.
 //!
-//! What never happens here: meaning. A recipe says which tensors it has and of what shape; whatever
-//! else a file holds is refused.
+//! The recipe decides which tensors there are and of which shape; a file with any other tensor is refused.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +24,7 @@ struct Tensor {
     values: Values,
 }
 
-/// Tensors by name.
+/// Tensors by name; a tensor that is taken is removed.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct Tensors(BTreeMap<String, Tensor>);
 
@@ -49,7 +48,7 @@ impl Tensors {
     }
 
     /// # Errors
-    /// Names the tensor that is missing, of another shape or type.
+    /// Names the tensor that is missing or has another shape or type.
     pub(crate) fn take_f32(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
         match self.take(name, shape)? {
             Values::F32(values) => Ok(values),
@@ -58,7 +57,7 @@ impl Tensors {
     }
 
     /// # Errors
-    /// Names the tensor that is missing, of another shape or type.
+    /// Names the tensor that is missing or has another shape or type.
     pub(crate) fn take_f64(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
         match self.take(name, shape)? {
             Values::F64(values) => Ok(values),
@@ -76,15 +75,15 @@ impl Tensors {
     }
 
     /// # Errors
-    /// Names a tensor that nobody took.
+    /// Names a tensor that has not been taken.
     pub(crate) fn finish(self) -> Result<()> {
         match self.0.keys().next() {
-            Some(name) => Err(invalid(format!("tensor {name} is none of this recipe's"))),
+            Some(name) => Err(invalid(format!("tensor {name} is not one of this recipe's"))),
             None => Ok(()),
         }
     }
 
-    /// The file; the same tensors give the same bytes.
+    /// The tensors as safetensors; the same tensors give the same bytes.
     pub(crate) fn to_bytes(&self) -> Result<Bytes, safetensors::SafeTensorError> {
         let raw: Vec<(&String, Dtype, &[usize], Vec<u8>)> = self
             .0
@@ -111,7 +110,7 @@ impl Tensors {
     }
 
     /// # Errors
-    /// Refuses files that are too large, not safetensors, of other types than f32 and f64, or hold
+    /// Refuses files that are too large, are not safetensors, contain other types than f32 and f64, or
     /// numbers that are not finite; the field is named `weights`.
     pub(crate) fn from_bytes(bytes: &[u8]) -> Result<Self> {
         if bytes.len() > LARGEST_WEIGHTS_BYTES {

@@ -1,23 +1,24 @@
-//! What training shows of how errors stay, for tracks: numbers in a model's metadata, which the floor
-//! above learns and uses.
+//! How the errors of receiver and model are correlated over time and ground, for tracks: scalars of a
+//! model's metadata.
 
 use std::collections::BTreeMap;
 
-use super::Parts;
+use super::ModelParts;
 use crate::domain::Result;
 
-/// How the errors of receiver and model, of known variances, are spread over time and ground.
+/// Autocorrelation of the errors of receiver and model, whose variances are stated elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackBeliefs {
-    /// Share of the receiver's variance that is new with each fix, 0 to 1; the rest stays for a while.
+    /// White share of the receiver's error variance, 0 to 1; the rest is a Gauss-Markov process.
     pub gnss_white_share: f64,
-    /// Time in which that rest's correlation falls to 1/e, s.
+    /// Time in which the correlation of that process falls to 1/e, s.
     pub gnss_time_constant_s: f64,
-    /// Share of the model's variance that is new with each box, 0 to 1.
+    /// White share of the model's error variance, 0 to 1; the rest is a Gauss-Markov process of time and
+    /// distance.
     pub regression_white_share: f64,
-    /// Time in which the correlation of the rest falls to 1/e while the target stands, s.
+    /// Time in which the correlation of that process falls to 1/e for a stationary target, s.
     pub regression_time_constant_s: f64,
-    /// Way in which it does, m.
+    /// Distance over which it falls to 1/e, m.
     pub regression_length_m: f64,
 }
 
@@ -30,7 +31,7 @@ const NAMES: [&str; 5] = [
 ];
 
 impl TrackBeliefs {
-    /// Writes them into a model's metadata.
+    /// Adds the scalars to a model's metadata.
     pub fn write(&self, parameters: &mut BTreeMap<String, f64>) {
         let values = [
             self.gnss_white_share,
@@ -42,11 +43,11 @@ impl TrackBeliefs {
         parameters.extend(NAMES.map(str::to_owned).into_iter().zip(values));
     }
 
-    /// What a model's metadata says; nothing in models of before.
+    /// The scalars of a model's metadata; `None` in an earlier format, which has none of them.
     ///
     /// # Errors
-    /// Names the parameter that is missing beside others, not finite, or out of range.
-    pub(crate) fn read(parts: &Parts) -> Result<Option<Self>> {
+    /// Names the parameter that is not finite or out of range, or missing although others are there.
+    pub(crate) fn read(parts: &ModelParts) -> Result<Option<Self>> {
         if !NAMES.iter().any(|name| parts.parameters.contains_key(*name)) {
             return Ok(None);
         }

@@ -1,139 +1,142 @@
-//! The recipe `hybrid`: the paper's auto-encoder and loss on scaled boxes, in metres, without the
-//! fix among the inputs, so that a label can never predict itself.
-//!
-//! What never happens here: raw pixels, degrees, Es with a tail.
+//! The recipe `hybrid`: the paper's auto-encoder and loss on standardised boxes, in metres, without the
+//! fix among the inputs, so that a label cannot predict itself.
 
 use std::sync::Arc;
 
-use super::projection::sides_of;
-use super::projective::FEATURES;
+use super::FittedEncoder;
+use super::features::{Encoded, FEATURE_COUNT, FEATURES, features_of};
+use super::stored_network::{put_network, take_network};
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
 use crate::geo::EastNorth;
-use crate::model::artifact::tensors::Tensors;
-use crate::model::artifact::{Parts, Scale};
-use crate::model::network::forward::{Activation, Net, NetShape};
-use crate::model::network::training::{LossWeights, Schedule, TrainingSet};
-use crate::model::progress::FitError;
-use crate::model::progress::Phase;
-use crate::model::samples::rows::{Rows, spread};
+use crate::model::artifact::{ModelParts, Scale};
+use crate::model::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet};
+use crate::model::progress::{FitError, Phase};
+use crate::model::samples::rows::TrainingRows;
+use crate::statistics::std_dev;
 
 const HIDDEN: [usize; 2] = [24, 24];
-/// Passes over the samples unless the run says otherwise.
+/// Default number of epochs.
 pub(crate) const EPOCHS: u32 = 60;
-/// wX : wZ on scaled inputs.
+/// wX and wZ of (1), on standardised inputs.
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.5, regression: 1.0 };
 
 fn shape() -> NetShape {
-    NetShape::auto_encoder(FEATURES.len(), &HIDDEN, Activation::Tanh)
+    NetShape::auto_encoder(FEATURE_COUNT, &HIDDEN, Activation::Tanh)
 }
 
-/// Samples per step: small sets need small steps to make enough of them.
-pub(crate) fn batch_of(samples: usize) -> usize {
+/// Samples per step: about 20 steps per epoch of a small set, larger batches for a large one.
+pub(super) fn batch_size(samples: usize) -> usize {
     (samples / 20).clamp(16, 512)
+}
+
+/// The standardisation of the labels: position = centre + unit * output.
+#[derive(Debug, Clone, Copy)]
+struct OutputScale {
+    centre: EastNorth,
+    unit_m: f64,
+}
+
+impl OutputScale {
+    /// Mean of the labels, and the root mean square per axis of their distance from it.
+    fn of_labels(rows: &TrainingRows) -> Self {
+        let count = rows.rows.len() as f64;
+        let centre = EastNorth {
+            east_m: rows.rows.iter().map(|row| row.label.east_m).sum::<f64>() / count,
+            north_m: rows.rows.iter().map(|row| row.label.north_m).sum::<f64>() / count,
+        };
+        let variance_m2 =
+            rows.rows.iter().map(|row| row.label.error_per_axis_m2(centre)).sum::<f64>() / count;
+        Self { centre, unit_m: variance_m2.sqrt().max(0.1) }
+    }
 }
 
 /// Fits the network.
 pub(crate) fn fit(
-    rows: &Rows,
+    rows: &TrainingRows,
     e_gnss_m2: f64,
     epochs: u32,
     phase: &mut Phase<'_, '_>,
-) -> Result<Parts, FitError> {
-    let boxes: Vec<[f64; 4]> = rows.rows.iter().map(|row| sides_of(&row.bounding_box)).collect();
-    let scales: [Scale; 4] = std::array::from_fn(|at| {
+) -> Result<FittedEncoder, FitError> {
+    let boxes: Vec<[f64; FEATURE_COUNT]> =
+        rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect();
+    let scales: [Scale; FEATURE_COUNT] = std::array::from_fn(|at| {
         let values = boxes.iter().map(|features| features[at]);
         let offset = values.clone().sum::<f64>() / boxes.len() as f64;
-        Scale { offset, factor: 1.0 / spread(values).max(1.0) }
+        Scale { offset, factor: 1.0 / std_dev(values).max(1.0) }
     });
-    let count = rows.rows.len() as f64;
-    let centre = EastNorth {
-        east_m: rows.rows.iter().map(|row| row.label.east_m).sum::<f64>() / count,
-        north_m: rows.rows.iter().map(|row| row.label.north_m).sum::<f64>() / count,
-    };
-    let position_scale_m =
-        rows.rows.iter().map(|row| row.label.error_per_axis_m2(centre)).sum::<f64>() / count;
-    let position_scale_m = position_scale_m.sqrt().max(0.1);
-    let columns: Vec<Vec<f32>> =
-        (0..4).map(|at| boxes.iter().map(|features| scales[at].apply(features[at])).collect()).collect();
+    let output = OutputScale::of_labels(rows);
+    let set = Arc::new(training_set(rows, &boxes, &scales, output));
+    let schedule =
+        Schedule { epochs, batch: batch_size(rows.rows.len()), learning_rate: 0.01, last_rate_share: 0.01 };
+    let (parameters, _) = phase.train("", &shape(), set, WEIGHTS, schedule)?;
+    let features = FEATURES
+        .iter()
+        .zip(scales)
+        .map(|(name, Scale { offset, factor })| FeatureScale { feature: (*name).to_owned(), offset, factor })
+        .collect();
+    let mut parts = ModelParts::new(Recipe::Hybrid, rows.plane, features, e_gnss_m2);
+    parts.set_position_scale(output.centre, output.unit_m);
+    put_network(&mut parts.tensors, "", &shape(), &parameters);
+    Ok(FittedEncoder { parts, covariance: None })
+}
+
+fn training_set(
+    rows: &TrainingRows,
+    boxes: &[[f64; FEATURE_COUNT]],
+    scales: &[Scale; FEATURE_COUNT],
+    OutputScale { centre, unit_m }: OutputScale,
+) -> TrainingSet {
+    let columns: Vec<Vec<f32>> = (0..FEATURE_COUNT)
+        .map(|at| boxes.iter().map(|features| scales[at].apply(features[at])).collect())
+        .collect();
     let target = |value: &dyn Fn(EastNorth) -> f64| {
-        rows.rows.iter().map(|row| (value(row.label) / position_scale_m) as f32).collect()
+        rows.rows.iter().map(|row| (value(row.label) / unit_m) as f32).collect()
     };
-    let set = TrainingSet {
-        rebuilt: columns.clone(),
+    TrainingSet {
+        reconstruction_targets: columns.clone(),
         inputs: columns,
-        targets: [
+        position_targets: [
             target(&|label| label.east_m - centre.east_m),
             target(&|label| label.north_m - centre.north_m),
         ],
         weights: vec![1.0; rows.rows.len()],
-    };
-    let schedule =
-        Schedule { epochs, batch: batch_of(rows.rows.len()), learning_rate: 0.01, last_rate_share: 0.01 };
-    let (parameters, _) = phase.train("", &shape(), Arc::new(set), WEIGHTS, schedule)?;
-    let mut parts = Parts {
-        recipe: Recipe::Hybrid,
-        plane: rows.plane,
-        features: FEATURES
-            .iter()
-            .zip(scales)
-            .map(|(name, scale)| FeatureScale {
-                feature: (*name).to_owned(),
-                offset: scale.offset,
-                factor: scale.factor,
-            })
-            .collect(),
-        error_scale: 1.0,
-        e_gnss_m2,
-        parameters: [
-            ("east_offset_m", centre.east_m),
-            ("north_offset_m", centre.north_m),
-            ("position_scale_m", position_scale_m),
-        ]
-        .map(|(name, value)| (name.to_owned(), value))
-        .into(),
-        tensors: Tensors::default(),
-        doubt: None,
-    };
-    parts.put_net("", &shape(), &parameters);
-    Ok(parts)
+    }
 }
 
-/// The network, ready to answer.
+/// The network for inference.
 #[derive(Debug, Clone)]
-pub(crate) struct HybridRegressor {
+pub(crate) struct HybridEncoder {
     net: Net,
-    scales: [Scale; 4],
-    centre: EastNorth,
-    position_scale_m: f64,
+    scales: [Scale; FEATURE_COUNT],
+    output: OutputScale,
 }
 
-impl HybridRegressor {
-    pub(crate) fn build(parts: &mut Parts) -> Result<Self> {
+impl HybridEncoder {
+    pub(super) fn build(parts: &mut ModelParts) -> Result<Self> {
+        let (centre, unit_m) = parts.position_scale()?;
         Ok(Self {
             scales: parts.scales(FEATURES)?,
-            centre: EastNorth {
-                east_m: parts.parameter("east_offset_m")?,
-                north_m: parts.parameter("north_offset_m")?,
-            },
-            position_scale_m: parts.positive_parameter("position_scale_m")?,
-            net: parts.take_net("", shape())?,
+            output: OutputScale { centre, unit_m },
+            net: take_network(&mut parts.tensors, "", shape())?,
         })
     }
 
-    /// Position, and the sides (foot x, foot y, width, height, px) that belong to it.
+    /// Position and reconstruction of a box.
     #[inline]
-    pub(crate) fn regress(&self, bounding_box: &BoundingBox) -> (EastNorth, [f64; 4]) {
-        let raw = sides_of(bounding_box);
-        let inputs: [f32; 4] = std::array::from_fn(|at| self.scales[at].apply(raw[at]));
-        let middle = self.net.encode(&inputs);
-        let rebuilt = self.net.decode(middle);
-        let sides = std::array::from_fn(|at| {
-            f64::from(rebuilt[at]) / self.scales[at].factor + self.scales[at].offset
-        });
-        let regressed = EastNorth {
-            east_m: self.centre.east_m + f64::from(middle[0]) * self.position_scale_m,
-            north_m: self.centre.north_m + f64::from(middle[1]) * self.position_scale_m,
-        };
-        (regressed, sides)
+    pub(crate) fn encode(&self, bounding_box: &BoundingBox) -> Encoded {
+        let features = features_of(bounding_box);
+        let inputs: [f32; FEATURE_COUNT] = std::array::from_fn(|at| self.scales[at].apply(features[at]));
+        let bottleneck = self.net.encode(&inputs);
+        let outputs = self.net.decode(bottleneck);
+        let OutputScale { centre, unit_m } = self.output;
+        Encoded {
+            position: EastNorth {
+                east_m: centre.east_m + f64::from(bottleneck[0]) * unit_m,
+                north_m: centre.north_m + f64::from(bottleneck[1]) * unit_m,
+            },
+            reconstruction_px: std::array::from_fn(|at| {
+                f64::from(outputs[at]) / self.scales[at].factor + self.scales[at].offset
+            }),
+        }
     }
 }

@@ -1,4 +1,9 @@
-//! From samples to a model: candidates on held-out blocks of time, then the final fit.
+//! From samples to a model: the candidates are compared on held-out blocks of time, then the best is fitted
+//! to all samples.
 
-pub(crate) mod candidates;
-pub(crate) mod fit;
+mod candidates;
+mod held_out;
+mod pipeline;
+mod report;
+
+pub use self::pipeline::{FitOptions, FitOverrides, fit, fit_with};

@@ -1,43 +1,44 @@
-//! Loss and gradient of a minibatch by hand, in vector code.
+//! Loss and gradient of a minibatch in explicit vector code.
 //!
-//! Samples stand beside each other in lanes, units in rows, so that every inner loop runs over
-//! whole vectors; a tile of [`LANES`] samples stays in the first cache through all layers.
-//! What never happens here: allocation per batch, threads, a step of the optimiser; and no closure around
-//! a vector operation, since closures are compiled for the plain processor and then called one by one.
+//! Units are rows and samples are lanes, so that every inner loop runs over whole vectors; a tile of
+//! [`LANES`] samples stays in the first-level cache through all layers. Nothing is allocated per batch.
+//! Vector operations are not wrapped in closures: a closure is compiled for the baseline instruction set
+//! and called once per operation.
 
 use pulp::{Simd, WithSimd};
 
-use super::forward::{Activation, Layer, NetShape, TANH_BOTTOM, TANH_BOUND, TANH_TOP};
+use super::forward::{TANH_BOUND, TANH_DENOMINATOR, TANH_NUMERATOR};
+use super::shape::{Activation, Layer, NetShape};
 
 /// Samples of one tile.
 const LANES: usize = 64;
-/// Vectors that are summed side by side, to hide the latency of the multiplier.
+/// Vectors that are accumulated in parallel, to hide the latency of the multiplier.
 const WIDE: usize = 4;
 
-/// Samples in columns, scaled, ready for training.
+/// Scaled training samples, in columns.
 #[derive(Debug, Clone, Default)]
 pub struct TrainingSet {
     /// One column of all samples per input.
     pub inputs: Vec<Vec<f32>>,
-    /// What the last layer shall give, one column per unit; empty without decoder.
-    pub rebuilt: Vec<Vec<f32>>,
-    /// What the middle layer shall give (east, north), scaled.
-    pub targets: [Vec<f32>; 2],
+    /// Targets of the last layer, one column per unit; empty without a decoder.
+    pub reconstruction_targets: Vec<Vec<f32>>,
+    /// Targets of the bottleneck (east, north), scaled.
+    pub position_targets: [Vec<f32>; 2],
     /// Weight of each sample's regression error; their mean should be 1.
     pub weights: Vec<f32>,
 }
 
 impl TrainingSet {
-    /// Samples in it.
+    /// Number of samples.
     #[must_use]
     pub fn len(&self) -> usize {
-        self.targets[0].len()
+        self.position_targets[0].len()
     }
 
-    /// Whether it is empty.
+    /// Whether there are no samples.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.targets[0].is_empty()
+        self.position_targets[0].is_empty()
     }
 }
 
@@ -79,26 +80,26 @@ impl LossSums {
 /// Buffers of one training run, reused by every batch.
 #[derive(Debug)]
 pub(crate) struct Scratch {
-    /// Outputs of every node layer, `width * LANES` each.
+    /// Outputs of every layer of units, `width * LANES` each.
     units: Vec<Vec<f32>>,
-    /// Gradient of the loss by the sums of every node layer.
+    /// Gradient of the loss with respect to the weighted sums of every layer of units.
     deltas: Vec<Vec<f32>>,
 }
 
 impl Scratch {
-    /// Room for one tile of a shape.
+    /// Buffers for one tile of samples.
     #[must_use]
     pub(crate) fn new(shape: &NetShape) -> Self {
-        let rooms: Vec<Vec<f32>> = shape.widths().iter().map(|width| vec![0.0; width * LANES]).collect();
-        Self { deltas: rooms.clone(), units: rooms }
+        let buffers: Vec<Vec<f32>> = shape.widths().iter().map(|width| vec![0.0; width * LANES]).collect();
+        Self { deltas: buffers.clone(), units: buffers }
     }
 }
 
-/// One batch to differentiate.
+/// The mean loss of one batch, to be differentiated.
 pub(crate) struct BatchLoss<'a> {
     /// Shape of the network.
     pub shape: &'a NetShape,
-    /// Its flat parameters.
+    /// Flat parameters.
     pub parameters: &'a [f32],
     /// All samples.
     pub set: &'a TrainingSet,
@@ -106,7 +107,7 @@ pub(crate) struct BatchLoss<'a> {
     pub rows: &'a [u32],
     /// Weights of the two errors.
     pub weights: LossWeights,
-    /// Buffers.
+    /// Work space.
     pub scratch: &'a mut Scratch,
     /// Receives the gradient of the batch's mean loss.
     pub gradient: &'a mut [f32],
@@ -178,35 +179,35 @@ impl BatchLoss<'_> {
         }
     }
 
-    /// Errors of a tile; leaves the gradient by the middle in the scratch's delta of the middle
-    /// and that by the last layer in the last.
+    /// Errors of a tile. Stores the gradient with respect to the bottleneck and to the last layer in
+    /// their deltas.
     #[inline(always)]
     fn errors(&mut self, tile: &[u32], share: f32) -> LossSums {
-        let (middle, last) = (self.shape.middle(), self.shape.widths().len() - 1);
+        let (bottleneck, last) = (self.shape.bottleneck(), self.shape.widths().len() - 1);
         let mut regression = [0.0f32; LANES];
         let mut reconstruction = [0.0f32; LANES];
         let factor = self.weights.regression * share;
-        let units = self.scratch.units[middle].chunks_exact(LANES);
-        let deltas = self.scratch.deltas[middle].chunks_exact_mut(LANES);
-        for ((unit, delta), target) in units.zip(deltas).zip(&self.set.targets) {
+        let units = self.scratch.units[bottleneck].chunks_exact(LANES);
+        let deltas = self.scratch.deltas[bottleneck].chunks_exact_mut(LANES);
+        for ((unit, delta), target) in units.zip(deltas).zip(&self.set.position_targets) {
             delta.fill(0.0);
             for (lane, row) in tile.iter().enumerate() {
-                let miss = unit[lane] - target[*row as usize];
-                regression[lane] += 0.5 * miss * miss;
-                delta[lane] = factor * self.set.weights[*row as usize] * miss;
+                let error = unit[lane] - target[*row as usize];
+                regression[lane] += 0.5 * error * error;
+                delta[lane] = factor * self.set.weights[*row as usize] * error;
             }
         }
-        if last > middle {
+        if last > bottleneck {
             let mean = 1.0 / self.shape.widths()[last] as f32;
             let factor = self.weights.reconstruction * share * 2.0 * mean;
             let units = self.scratch.units[last].chunks_exact(LANES);
             let deltas = self.scratch.deltas[last].chunks_exact_mut(LANES);
-            for ((unit, delta), target) in units.zip(deltas).zip(&self.set.rebuilt) {
+            for ((unit, delta), target) in units.zip(deltas).zip(&self.set.reconstruction_targets) {
                 delta.fill(0.0);
                 for (lane, row) in tile.iter().enumerate() {
-                    let miss = unit[lane] - target[*row as usize];
-                    reconstruction[lane] += mean * miss * miss;
-                    delta[lane] = factor * miss;
+                    let error = unit[lane] - target[*row as usize];
+                    reconstruction[lane] += mean * error * error;
+                    delta[lane] = factor * error;
                 }
             }
         }
@@ -216,7 +217,7 @@ impl BatchLoss<'_> {
             let weight = f64::from(self.set.weights[*row as usize]);
             sums.reconstruction += ex;
             sums.regression += ez;
-            // Keeps a perfect reconstruction from making (4) infinite.
+            // A perfect reconstruction must not make (4) infinite.
             sums.ratio += ez / ex.max(f64::from(f32::MIN_POSITIVE));
             sums.loss += f64::from(self.weights.reconstruction) * ex
                 + f64::from(self.weights.regression) * weight * ez;
@@ -236,8 +237,8 @@ impl BatchLoss<'_> {
         }
         let weights = &self.parameters[layer.weights..layer.biases];
         let below = S::as_mut_simd_f32s(&mut before[index]).0;
-        // The middle keeps the regression's own gradient and gains that of the decoder.
-        let kept = if index == self.shape.middle() { Some(below.to_vec()) } else { None };
+        // The gradient of the bottleneck is that of the regression error plus that of the decoder.
+        let regression = if index == self.shape.bottleneck() { Some(below.to_vec()) } else { None };
         let mut first = 0;
         while first + 2 <= layer.inputs {
             sums_of_rows::<S, 2>(simd, weights, (1, layer.inputs), None, delta, below, first);
@@ -246,8 +247,8 @@ impl BatchLoss<'_> {
         if first < layer.inputs {
             sums_of_rows::<S, 1>(simd, weights, (1, layer.inputs), None, delta, below, first);
         }
-        if let Some(kept) = kept {
-            for (sum, own) in below.iter_mut().zip(kept) {
+        if let Some(regression) = regression {
+            for (sum, own) in below.iter_mut().zip(regression) {
                 *sum = simd.add_f32s(*sum, own);
             }
             return;
@@ -351,7 +352,7 @@ fn gradient_of_rows<S: Simd, const ROWS: usize>(
     let mut column = 0;
     while column < layer.inputs {
         let wide = WIDE.min(layer.inputs - column);
-        // A short last group repeats its last column; the surplus sums are dropped.
+        // A short last group repeats its last column; the surplus sums are discarded.
         let columns: [&[S::f32s]; WIDE] = std::array::from_fn(|at| {
             let at = column + at.min(wide - 1);
             &input[at * vectors..(at + 1) * vectors]
@@ -380,12 +381,12 @@ fn tanh_of<S: Simd>(simd: S, value: S::f32s) -> S::f32s {
     let bound = simd.splat_f32s(TANH_BOUND);
     let x = simd.max_f32s(simd.min_f32s(value, bound), simd.splat_f32s(-TANH_BOUND));
     let square = simd.mul_f32s(x, x);
-    let mut top = simd.splat_f32s(TANH_TOP[0]);
-    for coefficient in &TANH_TOP[1..] {
+    let mut top = simd.splat_f32s(TANH_NUMERATOR[0]);
+    for coefficient in &TANH_NUMERATOR[1..] {
         top = simd.mul_add_e_f32s(top, square, simd.splat_f32s(*coefficient));
     }
-    let mut bottom = simd.splat_f32s(TANH_BOTTOM[0]);
-    for coefficient in &TANH_BOTTOM[1..] {
+    let mut bottom = simd.splat_f32s(TANH_DENOMINATOR[0]);
+    for coefficient in &TANH_DENOMINATOR[1..] {
         bottom = simd.mul_add_e_f32s(bottom, square, simd.splat_f32s(*coefficient));
     }
     simd.div_f32s(simd.mul_f32s(x, top), bottom)

@@ -1,9 +1,13 @@
-//! A small fully connected network: its shape, plain forward pass, loss and gradient, and training.
+//! A small fully connected network: its shape, forward pass, loss and gradient, and training.
 
-pub(crate) mod forward;
+mod forward;
 pub(crate) mod kernel;
-pub(crate) mod training;
+mod optimizer;
+mod shape;
+mod training;
 
-pub use self::forward::{Activation, Layer, Net, NetShape};
+pub use self::forward::Net;
 pub use self::kernel::{LossSums, LossWeights, TrainingSet};
-pub use self::training::{Schedule, TrainError, train};
+pub use self::optimizer::Schedule;
+pub use self::shape::{Activation, Layer, NetShape};
+pub use self::training::{TrainError, train};

@@ -1,11 +1,10 @@
-//! The training loop: the whole loss of a minibatch as one candle operation over one flat
-//! parameter, and Adam over the same flat slice.
+//! The training loop: the loss of a minibatch as one candle operation over one flat parameter vector,
+//! and Adam over the same vector.
 //!
-//! Biases, small tensors and fresh buffers are what cost in candle on nets this small, so the
-//! network is not built of tensors: candle sees one variable and one operation, whose backward
-//! pass hands over the gradient that the kernel computed beside the loss. None of candle's own
-//! kernels runs, so none of its threads start, and the same seed gives the same bits.
-//! What never happens here: scaling, recipes, clocks.
+//! For networks this small, candle's time goes into biases, small tensors and fresh buffers. Therefore
+//! the network is not built of tensors: candle sees one variable and one operation, whose backward pass
+//! returns the gradient that the kernel computed together with the loss. None of candle's own kernels
+//! runs, so it starts no threads, and the same seed gives the same bits.
 
 use std::ops::ControlFlow;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -14,40 +13,27 @@ use candle_core::{CpuStorage, CustomOp1, Device, Layout, Shape, Tensor, Var};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::forward::NetShape;
-use super::kernel::{BatchLoss, Scratch};
-pub use super::kernel::{LossSums, LossWeights, TrainingSet};
+use super::kernel::{BatchLoss, LossSums, LossWeights, Scratch, TrainingSet};
+use super::optimizer::{Adam, Schedule};
+use super::shape::NetShape;
 
-/// How long and how fast to learn.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Schedule {
-    /// Passes over the samples.
-    pub epochs: u32,
-    /// Samples per step.
-    pub batch: usize,
-    /// Adam's rate at the start.
-    pub learning_rate: f64,
-    /// The rate falls by half a cosine to this share of the first; 1 keeps it.
-    pub last_rate_share: f64,
-}
-
-/// Why a training stopped early.
+/// Why a training ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
-    /// The observer asked for it.
+    /// The observer requested it.
     #[error("cancelled")]
     Cancelled,
-    /// candle refused.
+    /// A candle operation failed.
     #[error("the training step failed")]
     Candle(#[from] candle_core::Error),
 }
 
-/// Trains a network from given parameters and returns the new ones.
+/// Trains a network from initial parameters and returns the trained ones.
 ///
-/// The observer sees the sums of each epoch (from 1) as they were met on the way.
+/// The observer receives the sums of each epoch (from 1), accumulated while the parameters change.
 ///
 /// # Errors
-/// [`TrainError::Cancelled`] once the observer breaks; a fault of candle.
+/// [`TrainError::Cancelled`] when the observer breaks; [`TrainError::Candle`] when candle fails.
 pub fn train(
     shape: &NetShape,
     mut parameters: Vec<f32>,
@@ -93,14 +79,6 @@ pub fn train(
     Ok(parameters)
 }
 
-impl Schedule {
-    fn rate(&self, epoch: u32) -> f64 {
-        let part = f64::from(epoch - 1) / f64::from(self.epochs.max(2) - 1);
-        let share = 0.5 * (1.0 + (std::f64::consts::PI * part).cos());
-        self.learning_rate * (self.last_rate_share + (1.0 - self.last_rate_share) * share)
-    }
-}
-
 fn shuffle(order: &mut [u32], rng: &mut ChaCha8Rng) {
     for at in (1..order.len()).rev() {
         order.swap(at, rng.random_range(0..=at));
@@ -118,7 +96,7 @@ struct Workspace {
 }
 
 fn lock(workspace: &Mutex<Workspace>) -> std::sync::MutexGuard<'_, Workspace> {
-    // A panic in the kernel ends the run; what it left behind is overwritten by the next batch.
+    // A panic in the kernel ends the run; a partial batch is overwritten by the next one.
     workspace.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -151,44 +129,8 @@ impl CustomOp1 for LossOperation {
 
     fn bwd(&self, argument: &Tensor, _: &Tensor, upstream: &Tensor) -> candle_core::Result<Option<Tensor>> {
         let factor = upstream.to_scalar::<f32>()?;
-        let gradient: Vec<f32> = lock(&self.0).gradient.iter().map(|slope| slope * factor).collect();
+        let gradient: Vec<f32> =
+            lock(&self.0).gradient.iter().map(|derivative| derivative * factor).collect();
         Ok(Some(Tensor::from_vec(gradient, argument.shape(), argument.device())?))
-    }
-}
-
-/// Adam (Kingma and Ba 2015) with the usual constants.
-#[derive(Debug)]
-struct Adam {
-    first: Vec<f32>,
-    second: Vec<f32>,
-    steps: i32,
-}
-
-impl Adam {
-    const KEEP_FIRST: f64 = 0.9;
-    const KEEP_SECOND: f64 = 0.999;
-    /// Moments below it are flushed to zero: they would decay into denormals, which cost a hundred
-    /// cycles each and slow every later epoch threefold.
-    const FLUSH: f32 = 1e-30;
-
-    fn new(length: usize) -> Self {
-        Self { first: vec![0.0; length], second: vec![0.0; length], steps: 0 }
-    }
-
-    fn step(&mut self, parameters: &mut [f32], gradient: &[f32], rate: f64) {
-        self.steps = self.steps.saturating_add(1);
-        let unbias =
-            (1.0 - Self::KEEP_SECOND.powi(self.steps)).sqrt() / (1.0 - Self::KEEP_FIRST.powi(self.steps));
-        let rate = (rate * unbias) as f32;
-        let (keep_first, keep_second) = (Self::KEEP_FIRST as f32, Self::KEEP_SECOND as f32);
-        let flush = |moment: f32| if moment.abs() < Self::FLUSH { 0.0 } else { moment };
-        pulp::Arch::new().dispatch(|| {
-            let moments = self.first.iter_mut().zip(&mut self.second);
-            for ((parameter, slope), (first, second)) in parameters.iter_mut().zip(gradient).zip(moments) {
-                *first = flush(keep_first * *first + (1.0 - keep_first) * slope);
-                *second = flush(keep_second * *second + (1.0 - keep_second) * slope * slope);
-                *parameter -= rate * *first / (second.sqrt() + 1e-8);
-            }
-        });
     }
 }

@@ -1,67 +1,65 @@
-//! Training samples in the form that every recipe learns from: metres, sorted by target and time,
-//! cut into passes and into blocks of time.
+//! Training samples in the form that every recipe is fitted to: in metres, sorted by target and time,
+//! divided into traverses and into blocks of time.
 //!
-//! What never happens here: learning; a look at a sample's truth.
+//! A *traverse* is a stretch of one target's samples without a gap. The true position that a sample may
+//! state is never read here.
 
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
-use super::whitening::FixNoise;
-use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
+use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, Result, Sample};
 use crate::filters::{FixError, smooth_pass, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::progress::FitError;
+use crate::statistics::{median, std_dev};
 
-/// Fewer samples cannot tell a camera from its noise.
+/// Fewer samples do not determine a camera's map against the noise of the fixes.
 pub const FEWEST_SAMPLES: u64 = 20;
-/// Fixes that reach less far apart are all at one spot, m.
+/// Fixes within this distance of each other are all at one position, m.
 pub const SMALLEST_SPREAD_M: f64 = 1.0;
-/// A hole in a target's samples beyond this, and beyond ten times their usual step, ends a pass.
-const PASS_HOLE_S: f64 = 3.0;
+/// Blocks of time that are held out in turn.
+pub(crate) const HELD_OUT_BLOCKS: u32 = 4;
+/// A gap in a target's samples ends a traverse if it exceeds both this, s, and [`GAP_INTERVALS`].
+const TRAVERSE_GAP_S: f64 = 3.0;
+/// The same in median intervals between samples.
+const GAP_INTERVALS: f64 = 10.0;
+/// Least standard deviation of the fixes' white noise for the smoother, m.
+const LEAST_WHITE_SIGMA_M: f64 = 0.01;
 
 /// One training sample.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Row {
-    /// Seconds since the first sample.
+pub(crate) struct TrainingRow {
+    /// Time since the first sample, s.
     pub(crate) time_s: f64,
-    /// Counts targets from 0.
+    /// Index of the target, from 0.
     pub(crate) target: u32,
-    /// Counts passes from 0; rows of a pass stand together in the order of time.
-    pub(crate) pass: u32,
+    /// Index of the traverse, from 0; the rows of one are adjacent and in order of time.
+    pub(crate) traverse: u32,
     pub(crate) bounding_box: BoundingBox,
     /// The fix.
     pub(crate) position: Position,
-    /// The fix in the plane, or what the smoother made of it.
+    /// The regression target: the fix in the plane, or the smoothed position.
     pub(crate) label: EastNorth,
-    /// Error variance per axis that the receiver itself gave, m2.
-    pub(crate) own_variance_m2: Option<f64>,
+    /// Error variance per axis that the receiver stated, m2.
+    pub(crate) stated_variance_m2: Option<f64>,
 }
 
 /// All samples of a fit.
 #[derive(Debug, Clone)]
-pub(crate) struct Rows {
+pub(crate) struct TrainingRows {
     pub(crate) plane: LocalPlane,
-    pub(crate) rows: Vec<Row>,
+    pub(crate) rows: Vec<TrainingRow>,
     pub(crate) targets: u32,
-    pub(crate) passes: u32,
+    pub(crate) traverses: u32,
 }
 
-impl Rows {
-    /// Sorts, projects and cuts the samples.
+impl TrainingRows {
+    /// Sorts the samples by target and time, projects them into a plane and numbers their traverses.
     ///
     /// # Errors
-    /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], or all at one spot.
-    pub(crate) fn new(samples: &[Sample]) -> Result<Self, FitError> {
-        if samples.is_empty() {
-            return Err(unusable("there are none; import samples that have a box and a fix first".into()));
-        }
-        if (samples.len() as u64) < FEWEST_SAMPLES {
-            return Err(unusable(format!(
-                "there are {}, a fit needs at least {FEWEST_SAMPLES}; import more, best of several passes \
-                 through different parts of the image",
-                samples.len()
-            )));
-        }
+    /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], or all at one position in the image
+    /// or on the ground.
+    pub(crate) fn new(samples: &[Sample]) -> Result<Self> {
+        check_count(samples.len())?;
         let mut sorted: Vec<&Sample> = samples.iter().collect();
         sorted.sort_by(|left, right| (&left.target_id, left.time).cmp(&(&right.target_id, right.time)));
         let plane = central_plane(&sorted);
@@ -70,38 +68,38 @@ impl Rows {
         let mut target = 0;
         for (at, sample) in sorted.iter().enumerate() {
             target += u32::from(at > 0 && sorted[at - 1].target_id != sample.target_id);
-            rows.push(Row {
+            rows.push(TrainingRow {
                 time_s: (sample.time.as_microsecond() - first.as_microsecond()) as f64 * 1e-6,
                 target,
-                pass: 0,
+                traverse: 0,
                 bounding_box: sample.bounding_box,
                 position: sample.fix.position,
                 label: plane.to_plane(sample.fix.position),
-                own_variance_m2: sample.fix.sigma_m.map(|sigma| sigma.variance_m2()),
+                stated_variance_m2: sample.fix.sigma_m.map(|sigma| sigma.variance_m2()),
             });
         }
-        let passes = number_passes(&mut rows);
-        let all = Self { plane, rows, targets: target + 1, passes };
-        all.refuse_one_spot()?;
+        let traverses = number_traverses(&mut rows);
+        let all = Self { plane, rows, targets: target + 1, traverses };
+        all.check_spread()?;
         Ok(all)
     }
 
-    fn refuse_one_spot(&self) -> Result<(), FitError> {
-        let spread = |value: &dyn Fn(&Row) -> f64| spread(self.rows.iter().map(value));
-        let in_image = spread(&|row| row.bounding_box.foot_px()[0])
+    fn check_spread(&self) -> Result<()> {
+        let spread = |value: &dyn Fn(&TrainingRow) -> f64| std_dev(self.rows.iter().map(value));
+        let in_image_px = spread(&|row| row.bounding_box.foot_px()[0])
             .max(spread(&|row| row.bounding_box.foot_px()[1]))
             .max(spread(&|row| row.bounding_box.height_px()));
-        if in_image < 1.0 {
+        if in_image_px < 1.0 {
             return Err(unusable(format!(
-                "all {} boxes are at one spot of the image (they vary by {in_image:.1} px); let the target \
+                "all {} boxes are at one spot of the image (they vary by {in_image_px:.1} px); let the target \
                  walk through the whole picture while samples are taken",
                 self.rows.len()
             )));
         }
-        let on_ground = spread(&|row| row.label.east_m).max(spread(&|row| row.label.north_m));
-        if on_ground < 0.1 * SMALLEST_SPREAD_M {
+        let on_ground_m = spread(&|row| row.label.east_m).max(spread(&|row| row.label.north_m));
+        if on_ground_m < 0.1 * SMALLEST_SPREAD_M {
             return Err(unusable(format!(
-                "all {} fixes are at one spot (they vary by {on_ground:.2} m) though the boxes move; check \
+                "all {} fixes are at one spot (they vary by {on_ground_m:.2} m) though the boxes move; check \
                  that boxes and fixes are paired by time",
                 self.rows.len()
             )));
@@ -109,36 +107,26 @@ impl Rows {
         Ok(())
     }
 
-    /// Block of time of each row, 0 to `count - 1`: cuts at the largest holes near equal shares, so
-    /// that passes stay whole where they can. Rows of all targets at one time share a block.
+    /// Index of the block of time of each row, 0 to `count - 1`: blocks of about equal size, cut at the
+    /// largest gaps near the equal shares, so that traverses stay whole where possible. Rows of all
+    /// targets at one time are in one block.
     pub(crate) fn blocks(&self, count: u32) -> Vec<u32> {
         let mut times: Vec<f64> = self.rows.iter().map(|row| row.time_s).collect();
         times.sort_by(f64::total_cmp);
         let share = times.len() / count as usize;
-        let cuts: Vec<f64> = (1..count as usize)
-            .map(|cut| {
-                let (low, high) = (cut * share - share / 3, cut * share + share / 3);
-                let hole = |at: usize| times[at] - times[at - 1];
-                let at = (low.max(1)..=high.min(times.len() - 1))
-                    .max_by(|left, right| {
-                        hole(*left)
-                            .total_cmp(&hole(*right))
-                            .then_with(|| right.abs_diff(cut * share).cmp(&left.abs_diff(cut * share)))
-                    })
-                    .unwrap_or(cut * share);
-                times[at]
-            })
-            .collect();
+        let cuts: Vec<f64> =
+            (1..count as usize).map(|cut| cut_near(&times, cut * share, share / 3)).collect();
         let blocks: Vec<u32> = self
             .rows
             .iter()
             .map(|row| cuts.iter().filter(|cut| row.time_s >= **cut).count() as u32)
             .collect();
         let least = (0..count).map(|block| blocks.iter().filter(|of| **of == block).count()).min();
-        if least.unwrap_or(0) * 4 >= share {
-            return blocks;
-        }
-        // Too many rows at one instant to cut by time: by rank then.
+        if least.unwrap_or(0) * 4 >= share { blocks } else { self.blocks_by_rank(count) }
+    }
+
+    /// Blocks of equal size in the order of time, for rows of which too many have the same time.
+    fn blocks_by_rank(&self, count: u32) -> Vec<u32> {
         let mut order: Vec<usize> = (0..self.rows.len()).collect();
         order.sort_by(|one, other| self.rows[*one].time_s.total_cmp(&self.rows[*other].time_s));
         let mut blocks = vec![0; self.rows.len()];
@@ -154,21 +142,20 @@ impl Rows {
         Self { rows, ..*self }
     }
 
-    /// The same rows with labels that a kinematic smoother made of each pass's fixes.
-    pub(crate) fn smoothed(&self, noise: &FixNoise) -> Self {
+    /// The same rows with the fixes of each traverse smoothed by a kinematic smoother as labels.
+    pub(crate) fn smoothed(&self, noise: &GaussMarkovNoise) -> Self {
         let error = FixError {
-            white_m: (noise.variance_m2 * noise.white_share).sqrt().max(0.01),
-            coloured_m: (noise.variance_m2 * (1.0 - noise.white_share)).sqrt(),
+            white_m: noise.white_variance_m2().sqrt().max(LEAST_WHITE_SIGMA_M),
+            coloured_m: noise.coloured_variance_m2().sqrt(),
             time_constant_s: noise.time_constant_s,
         };
-        let passes: Vec<(Vec<f64>, Vec<EastNorth>)> = self
-            .rows
-            .chunk_by(|one, other| one.pass == other.pass)
-            .map(|pass| pass.iter().map(|row| (row.time_s, row.label)).unzip())
+        let traverses: Vec<(Vec<f64>, Vec<EastNorth>)> = traverses(&self.rows)
+            .map(|traverse| traverse.iter().map(|row| (row.time_s, row.label)).unzip())
             .collect();
-        let acceleration_mps2 = tune_acceleration(&passes, &error);
-        let labels =
-            passes.iter().flat_map(|(times_s, fixes)| smooth_pass(times_s, fixes, &error, acceleration_mps2));
+        let acceleration_mps2 = tune_acceleration(&traverses, &error);
+        let labels = traverses
+            .iter()
+            .flat_map(|(times_s, fixes)| smooth_pass(times_s, fixes, &error, acceleration_mps2));
         let mut smoothed = self.clone();
         for (row, label) in smoothed.rows.iter_mut().zip(labels) {
             row.label = label.position;
@@ -176,15 +163,32 @@ impl Rows {
         smoothed
     }
 
-    /// Mean of the variances that the receiver gave itself, where every fix has one.
-    pub(crate) fn own_variance_m2(&self) -> Option<f64> {
-        let sum = self.rows.iter().try_fold(0.0, |sum, row| Some(sum + row.own_variance_m2?))?;
+    /// Mean of the error variances that the receiver stated, m2; `None` unless every fix has one.
+    pub(crate) fn stated_variance_m2(&self) -> Option<f64> {
+        let sum = self.rows.iter().try_fold(0.0, |sum, row| Some(sum + row.stated_variance_m2?))?;
         Some(sum / self.rows.len() as f64)
     }
 }
 
-/// SHA-256 of the samples in their order: time, target, box and fix of each.
-pub(crate) fn hash_of(samples: &[Sample]) -> String {
+/// The rows of each traverse.
+pub(crate) fn traverses(rows: &[TrainingRow]) -> impl Iterator<Item = &[TrainingRow]> {
+    rows.chunk_by(|one, other| one.traverse == other.traverse)
+}
+
+/// The time after the largest gap within `reach` ranks of a rank; the nearest of equal gaps.
+fn cut_near(times: &[f64], rank: usize, reach: usize) -> f64 {
+    let (low, high) = (rank - reach, rank + reach);
+    let gap = |at: usize| times[at] - times[at - 1];
+    let at = (low.max(1)..=high.min(times.len() - 1))
+        .max_by(|left, right| {
+            gap(*left).total_cmp(&gap(*right)).then_with(|| right.abs_diff(rank).cmp(&left.abs_diff(rank)))
+        })
+        .unwrap_or(rank);
+    times[at]
+}
+
+/// SHA-256 of time, target, box and fix of each sample, in their order, hexadecimal.
+pub(crate) fn sha256_of(samples: &[Sample]) -> String {
     let mut hash = Sha256::new();
     for sample in samples {
         hash.update(sample.time.as_microsecond().to_le_bytes());
@@ -201,85 +205,51 @@ pub(crate) fn hash_of(samples: &[Sample]) -> String {
     hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-pub(crate) fn unusable(message: String) -> FitError {
-    FitError::Unusable(Error::field(ErrorKind::UnusableSamples, "samples", message))
-}
-
-/// Standard deviation.
-#[must_use]
-pub fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
-    let count = values.clone().count().max(1) as f64;
-    let mean = values.clone().sum::<f64>() / count;
-    (values.map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()
-}
-
-/// Middle value; 0 for none.
-pub(crate) fn median(mut values: Vec<f64>) -> f64 {
-    if values.is_empty() {
-        return 0.0;
+fn check_count(count: usize) -> Result<()> {
+    if count == 0 {
+        return Err(unusable("there are none; import samples that have a box and a fix first".into()));
     }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    if (count as u64) < FEWEST_SAMPLES {
+        return Err(unusable(format!(
+            "there are {count}, a fit needs at least {FEWEST_SAMPLES}; import more, best of several passes \
+             through different parts of the image"
+        )));
+    }
+    Ok(())
 }
 
-/// Smallest share of second differences, by size, that steady motion explains; and what share of
-/// the mean of exponential squares the smallest so many hold.
-const STEADY: f64 = 0.97;
-const STEADY_SHARE: f64 = 0.89;
-
-/// Squared second differences, m2, of positions of rows that follow each other evenly within a pass,
-/// with the row in the middle. White noise of a variance per axis makes 12 times that.
-pub(crate) fn second_differences<'a>(
-    rows: &'a [Row],
-    points: &'a [EastNorth],
-) -> impl Iterator<Item = (usize, f64)> + 'a {
-    (1..rows.len().saturating_sub(1)).filter_map(|at| {
-        let (first, middle, last) = (&rows[at - 1], &rows[at], &rows[at + 1]);
-        let (first_s, second_s) = (middle.time_s - first.time_s, last.time_s - middle.time_s);
-        let even = first_s > 0.0 && first_s < 2.5 && (first_s - second_s).abs() < 0.1 * first_s;
-        let jump =
-            |of: fn(&EastNorth) -> f64| of(&points[at + 1]) - 2.0 * of(&points[at]) + of(&points[at - 1]);
-        let square_m2 = jump(|point| point.east_m).powi(2) + jump(|point| point.north_m).powi(2);
-        (even && first.pass == last.pass).then_some((at, square_m2))
-    })
+fn unusable(message: String) -> Error {
+    Error::field(ErrorKind::UnusableSamples, "samples", message)
 }
 
-/// Mean of squares without the largest few, which are halts, turns and wild boxes; `None` of none.
-pub(crate) fn steady_mean(mut squares: Vec<f64>) -> Option<f64> {
-    squares.sort_by(f64::total_cmp);
-    squares.truncate((squares.len() as f64 * STEADY).ceil() as usize);
-    let count = squares.len() as f64;
-    (count > 0.0).then(|| squares.iter().sum::<f64>() / (count * STEADY_SHARE))
-}
-
-/// The plane about the median fix; medians are taken in a first plane, so that the antimeridian
-/// does no harm.
+/// The plane about the median fix. The medians are taken in a plane about the first fix, so that fixes
+/// on both sides of the antimeridian are handled.
 fn central_plane(samples: &[&Sample]) -> LocalPlane {
     let Some(first) = samples.first() else {
-        unreachable!("callers have samples");
+        unreachable!("the samples have been counted");
     };
     let plane = LocalPlane::new(first.fix.position);
     let points: Vec<EastNorth> = samples.iter().map(|sample| plane.to_plane(sample.fix.position)).collect();
-    let middle = EastNorth {
+    let centre = EastNorth {
         east_m: median(points.iter().map(|point| point.east_m).collect()),
         north_m: median(points.iter().map(|point| point.north_m).collect()),
     };
-    LocalPlane::new(plane.to_position(middle))
+    LocalPlane::new(plane.to_position(centre))
 }
 
-/// Numbers the passes of rows sorted by target and time; returns how many there are.
-fn number_passes(rows: &mut [Row]) -> u32 {
-    let steps = rows
+/// Numbers the traverses of rows sorted by target and time; returns how many there are.
+fn number_traverses(rows: &mut [TrainingRow]) -> u32 {
+    let intervals = rows
         .windows(2)
         .filter(|pair| pair[0].target == pair[1].target)
         .map(|pair| pair[1].time_s - pair[0].time_s)
         .collect();
-    let hole_s = (10.0 * median(steps)).max(PASS_HOLE_S);
-    let mut pass = 0;
+    let gap_s = (GAP_INTERVALS * median(intervals)).max(TRAVERSE_GAP_S);
+    let mut traverse = 0;
     for at in 1..rows.len() {
-        let same = rows[at].target == rows[at - 1].target && rows[at].time_s - rows[at - 1].time_s <= hole_s;
-        pass += u32::from(!same);
-        rows[at].pass = pass;
+        let same = rows[at].target == rows[at - 1].target && rows[at].time_s - rows[at - 1].time_s <= gap_s;
+        traverse += u32::from(!same);
+        rows[at].traverse = traverse;
     }
-    pass + 1
+    traverse + 1
 }

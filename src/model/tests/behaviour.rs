@@ -1,4 +1,4 @@
-//! What fits are worth: on a small simulated walk whose truth is known.
+//! The errors of fitted models on a small simulated walk whose true positions are known.
 
 use jiff::Timestamp;
 
@@ -6,8 +6,8 @@ use super::{options, silent, walk};
 use crate::domain::{BoundingBox, Recipe, Sample, TargetId};
 use crate::evaluation::baselines::homography;
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::network::training::LossWeights;
-use crate::model::{Artifact, Trial, fit, fit_trial};
+use crate::model::network::LossWeights;
+use crate::model::{Artifact, FitOverrides, fit, fit_with};
 
 /// Mean distance to the truth of regressed and fused positions, and the share of truths inside the
 /// stated 95 % radius.
@@ -33,13 +33,13 @@ fn scores(artifact: &Artifact, tests: &[Sample]) -> [f64; 3] {
 }
 
 #[test]
-fn the_default_beats_the_receiver_and_says_how_sure_it_is() {
+fn the_default_has_a_smaller_error_than_the_receiver_and_states_it() {
     let tests = walk(8, 40, 2.0, 99);
     for seed in [11, 12, 13] {
         let samples = walk(24, 40, 2.0, seed);
         let artifact = fit(&samples, &options(Recipe::Auto), &mut silent).expect("fits");
         let [regressed_m, fused_m, inside] = scores(&artifact, &tests);
-        // The receiver's own mean distance is 2.5 m; a fit that repeats its fixes cannot pass.
+        // The receiver's own mean distance is 2.5 m; a fit that reproduces its fixes fails.
         assert!(regressed_m < 1.2, "{regressed_m}");
         assert!(fused_m < 1.25 * regressed_m, "{fused_m} {regressed_m}");
         assert!(inside > 0.85, "{inside}");
@@ -95,12 +95,12 @@ fn rows_of_one_instant_still_fit() {
 }
 
 #[test]
-fn edges_that_do_not_go_together_raise_the_error_and_those_of_training_do_not() {
+fn inconsistent_edges_raise_the_error_and_those_of_the_training_do_not() {
     let samples = walk(24, 40, 2.0, 51);
     let tests = walk(8, 40, 2.0, 52);
     let artifact = fit(&samples, &options(Recipe::Projective), &mut silent).expect("fits");
     let regressor = artifact.load().expect("loads");
-    let error_m2 = |drawn: &BoundingBox| regressor.regress(drawn, None).e_regression_m2;
+    let error_m2 = |bounding_box: &BoundingBox| regressor.regress(bounding_box, None).e_regression_m2;
     let (mut as_seen, mut higher) = (Vec::new(), Vec::new());
     for sample in &tests {
         let [left, top, width, height] = sample.bounding_box.sides_px();
@@ -115,26 +115,26 @@ fn edges_that_do_not_go_together_raise_the_error_and_those_of_training_do_not() 
 }
 
 #[test]
-fn a_trial_fits_its_candidate_with_its_balance_or_says_that_there_is_none() {
+fn overrides_choose_candidate_and_loss_weights_and_an_unknown_candidate_is_refused() {
     let samples = walk(6, 40, 2.0, 61);
     let own = LossWeights { reconstruction: 0.5, regression: 1.0 };
-    let trial = |candidate, balance| {
-        fit_trial(&samples, &options(Recipe::Auto), Trial { candidate, balance }, &mut silent)
+    let fitted = |candidate, loss_weights| {
+        fit_with(&samples, &options(Recipe::Auto), FitOverrides { candidate, loss_weights }, &mut silent)
     };
-    let plain = trial(Some("hybrid"), None).expect("fits");
+    let plain = fitted(Some("hybrid"), None).expect("fits");
     assert_eq!(plain.metadata.candidates.len(), 1);
-    assert_eq!(plain.weights, trial(Some("hybrid"), Some(own)).expect("fits").weights);
+    assert_eq!(plain.weights, fitted(Some("hybrid"), Some(own)).expect("fits").weights);
     let other = LossWeights { reconstruction: 5.0, regression: 1.0 };
-    assert_ne!(plain.weights, trial(Some("hybrid"), Some(other)).expect("fits").weights);
-    assert!(trial(Some("nothing"), None).is_err());
+    assert_ne!(plain.weights, fitted(Some("hybrid"), Some(other)).expect("fits").weights);
+    assert!(fitted(Some("nothing"), None).is_err());
 }
 
-/// Two recordings of the same ground, the fixes of one shifted: which is right nobody can tell, and
-/// the map between them must say so.
+/// Two recordings of the same ground, the fixes of one shifted: which is right cannot be determined, and
+/// the stated error of the map between them must contain both.
 #[test]
 fn sessions_that_contradict_each_other_raise_the_error() {
     let (first, second) = (walk(24, 40, 2.0, 21), walk(24, 40, 2.0, 22));
-    let usual_m = |shift_m: f64| {
+    let mean_error_m = |shift_m: f64| {
         let next_day = second.iter().cloned().map(|mut sample| {
             sample.time += jiff::SignedDuration::from_hours(24);
             let plane = LocalPlane::new(sample.fix.position);
@@ -147,7 +147,7 @@ fn sessions_that_contradict_each_other_raise_the_error() {
         let error_m = |sample: &Sample| regressor.regress(&sample.bounding_box, None).e_regression_m2.sqrt();
         first.iter().map(error_m).sum::<f64>() / first.len() as f64
     };
-    let (alike_m, apart_m) = (usual_m(0.0), usual_m(4.0));
-    // The map lies between the two, 2 m from either.
+    let (alike_m, apart_m) = (mean_error_m(0.0), mean_error_m(4.0));
+    // The map lies between the two, 2 m from each.
     assert!(alike_m < 0.8 && apart_m > 1.2 && apart_m < 3.0, "{alike_m} m, {apart_m} m");
 }

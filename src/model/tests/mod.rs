@@ -1,4 +1,4 @@
-//! The floor as others use it, and the hand-written code against candle's own.
+//! The public interface of the module, and the explicit kernels against candle's own.
 
 mod behaviour;
 
@@ -13,8 +13,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::domain::{BoundingBox, Fix, GnssError, Recipe, Sample, SigmaM, TargetId};
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::network::forward::{Activation, Net, NetShape};
-use crate::model::network::kernel::{BatchLoss, LossWeights, Scratch, TrainingSet};
+use crate::model::network::kernel::{BatchLoss, Scratch};
+use crate::model::network::{Activation, LossWeights, Net, NetShape, TrainingSet};
 use crate::model::{Artifact, FitError, FitEvent, FitOptions, fit};
 
 /// The same network built of candle's layers over the flat parameters.
@@ -33,7 +33,7 @@ fn candle_layers(shape: &NetShape, flat: &Tensor) -> Vec<Linear> {
 /// Outputs of the middle and of the last layer, for rows of inputs.
 fn candle_forward(shape: &NetShape, flat: &Tensor, inputs: &Tensor) -> (Tensor, Tensor) {
     let mut units = inputs.clone();
-    let mut middle = None;
+    let mut bottleneck = None;
     for (index, (linear, layer)) in candle_layers(shape, flat).iter().zip(shape.layers()).enumerate() {
         units = linear.forward(&units).expect("linear");
         if !layer.linear {
@@ -43,11 +43,11 @@ fn candle_forward(shape: &NetShape, flat: &Tensor, inputs: &Tensor) -> (Tensor, 
             }
             .expect("activation");
         }
-        if index + 1 == shape.middle() {
-            middle = Some(units.clone());
+        if index + 1 == shape.bottleneck() {
+            bottleneck = Some(units.clone());
         }
     }
-    (middle.expect("a middle layer"), units)
+    (bottleneck.expect("a bottleneck"), units)
 }
 
 fn shapes() -> impl Strategy<Value = NetShape> {
@@ -65,26 +65,26 @@ fn shapes() -> impl Strategy<Value = NetShape> {
 fn random_set(shape: &NetShape, samples: usize, rng: &mut ChaCha8Rng) -> TrainingSet {
     let mut column = || (0..samples).map(|_| rng.random_range(-2.0f32..2.0)).collect::<Vec<f32>>();
     let inputs: Vec<Vec<f32>> = (0..shape.widths()[0]).map(|_| column()).collect();
-    let targets = [column(), column()];
-    let rebuilt = if shape.has_decoder() { inputs.clone() } else { Vec::new() };
+    let position_targets = [column(), column()];
+    let reconstruction_targets = if shape.has_decoder() { inputs.clone() } else { Vec::new() };
     let weights = column().iter().map(|weight| weight.abs()).collect();
-    TrainingSet { inputs, rebuilt, targets, weights }
+    TrainingSet { inputs, reconstruction_targets, position_targets, weights }
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn the_plain_loop_equals_candle(shape in shapes(), seed in any::<u64>()) {
+    fn the_forward_pass_equals_candles(shape in shapes(), seed in any::<u64>()) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let parameters = shape.initial_parameters(&mut rng);
         let inputs: Vec<f32> = (0..shape.widths()[0]).map(|_| rng.random_range(-3.0..3.0)).collect();
         let flat = Tensor::from_slice(&parameters, parameters.len(), &Device::Cpu).expect("flat");
         let row = Tensor::from_slice(&inputs, (1, inputs.len()), &Device::Cpu).expect("row");
-        let (middle, last) = candle_forward(&shape, &flat, &row);
+        let (bottleneck, last) = candle_forward(&shape, &flat, &row);
         let net = Net::new(shape.clone(), &parameters);
         let own = net.encode(&inputs);
-        let theirs: Vec<Vec<f32>> = middle.to_vec2().expect("middle");
+        let theirs: Vec<Vec<f32>> = bottleneck.to_vec2().expect("bottleneck");
         for (one, other) in own.iter().zip(&theirs[0]) {
             prop_assert!((one - other).abs() <= 1e-4 * (1.0 + other.abs()), "{one} {other}");
         }
@@ -97,7 +97,7 @@ proptest! {
     }
 
     #[test]
-    fn the_gradient_by_hand_equals_candles(
+    fn the_gradient_of_the_kernel_equals_candles(
         shape in shapes(), seed in any::<u64>(), samples in 1usize..150, wx in 0.1f32..3.0, wz in 0.1f32..3.0,
     ) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -119,28 +119,28 @@ proptest! {
             let flat: Vec<f32> = columns.iter().flatten().copied().collect();
             Tensor::from_vec(flat, (columns.len(), samples), &Device::Cpu).expect("columns").t().expect("rows")
         };
-        let (middle, last) = candle_forward(&shape, var.as_tensor(), &matrix(&set.inputs));
+        let (bottleneck, last) = candle_forward(&shape, var.as_tensor(), &matrix(&set.inputs));
         let weights = Tensor::from_slice(&set.weights, samples, &Device::Cpu).expect("weights");
-        let ez = (middle - matrix(&set.targets)).and_then(|miss| miss.sqr()).and_then(|miss| miss.mean(1));
+        let ez = (bottleneck - matrix(&set.position_targets)).and_then(|error| error.sqr()).and_then(|error| error.mean(1));
         let ez = (ez.expect("eZ") * weights).and_then(|ez| ez.mean_all()).expect("eZ");
         let mut loss = (ez * f64::from(wz)).expect("loss");
         if shape.has_decoder() {
-            let ex = (last - matrix(&set.rebuilt)).and_then(|miss| miss.sqr()).and_then(|miss| miss.mean_all());
+            let ex = (last - matrix(&set.reconstruction_targets)).and_then(|error| error.sqr()).and_then(|error| error.mean_all());
             loss = (loss + (ex.expect("eX") * f64::from(wx)).expect("loss")).expect("loss");
         }
         let theirs = loss.to_dtype(DType::F32).and_then(|loss| loss.to_scalar::<f32>()).expect("loss");
         let own = (sums.loss / sums.samples) as f32;
         prop_assert!((own - theirs).abs() <= 1e-4 * (1.0 + theirs.abs()), "{own} {theirs}");
-        let slopes = loss.backward().expect("backward");
-        let slopes: Vec<f32> = slopes.get(var.as_tensor()).expect("slopes").to_vec1().expect("slopes");
-        let size = slopes.iter().fold(0.0f32, |size, slope| size.max(slope.abs()));
-        for (one, other) in gradient.iter().zip(&slopes) {
+        let derivatives = loss.backward().expect("backward");
+        let derivatives: Vec<f32> = derivatives.get(var.as_tensor()).expect("derivatives").to_vec1().expect("derivatives");
+        let size = derivatives.iter().fold(0.0f32, |size, derivative| size.max(derivative.abs()));
+        for (one, other) in gradient.iter().zip(&derivatives) {
             prop_assert!((one - other).abs() <= 1e-3 * size + 1e-6, "{one} {other}");
         }
     }
 }
 
-/// A small simulated camera: passes of a walker over a square, seen from 6 m above.
+/// Samples of a small simulated camera 6 m above a square that a person crosses several times.
 pub(super) fn walk(passes: usize, per_pass: usize, sigma_m: f64, seed: u64) -> Vec<Sample> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let plane = LocalPlane::new(Position::new(103.9868, 30.628).expect("valid"));
@@ -158,7 +158,7 @@ pub(super) fn walk(passes: usize, per_pass: usize, sigma_m: f64, seed: u64) -> V
             samples.push(Sample {
                 time: Timestamp::from_second(1_600_000_000 + (pass * 1000 + step) as i64).expect("time"),
                 target_id: TargetId::new("walker").expect("name"),
-                bounding_box: seen(truth, &mut rng),
+                bounding_box: box_of(truth, &mut rng),
                 fix: Fix { position: plane.to_position(fix), sigma_m: None },
                 class: None,
                 score: None,
@@ -174,8 +174,8 @@ fn normal(rng: &mut ChaCha8Rng) -> f64 {
     (-2.0 * one.ln()).sqrt() * (std::f64::consts::TAU * other).cos()
 }
 
-/// The box of a person of 1.75 m at a place, for a camera 6 m up that looks north and 15 deg down.
-fn seen(truth: EastNorth, rng: &mut ChaCha8Rng) -> BoundingBox {
+/// The box of a person of 1.75 m at a position, for a camera 6 m up that looks north and 15 deg down.
+fn box_of(truth: EastNorth, rng: &mut ChaCha8Rng) -> BoundingBox {
     let (sin, cos) = 15f64.to_radians().sin_cos();
     let pixel = |up_m: f64| {
         let depth_m = truth.north_m * cos + (6.0 - up_m) * sin;

@@ -5,7 +5,7 @@ use super::options::{EvaluateOptions, TestRow};
 use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, Sample, SigmaM};
 use crate::filters::ImmUkf;
-use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, passes};
+use crate::fusion::track::{MeasuredPosition, Measurement, Track, TrackSettings, traverses};
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, Regressor};
@@ -127,7 +127,7 @@ impl<'a> Predictors<'a> {
         'a: 'b,
     {
         let variance_m2 = self.gnss_variance_m2(None);
-        let tuned = imm_ukf::tune(&passes(self.train, &self.plane), variance_m2);
+        let tuned = imm_ukf::tune(&traverses(self.train, &self.plane), variance_m2);
         let (plane, test) = (self.plane, self.test);
         Box::new(move |target| {
             let mut filter = ImmUkf::new(tuned);
@@ -195,7 +195,7 @@ impl<'a> Predictors<'a> {
     where
         'a: 'b,
     {
-        let settings = TrackSettings::learn(self.train, regressor);
+        let settings = TrackSettings::estimate(self.train, regressor);
         let (plane, test) = (*regressor.plane(), self.test);
         Box::new(move |target| {
             let mut track: Option<Track> = None;
@@ -221,11 +221,11 @@ fn measurement(
 ) -> Measurement {
     let fix = observation.fix.map(|fix| {
         let variance_m2 = fix.sigma_m.map_or(e_gnss_m2, SigmaM::variance_m2);
-        Measured::isotropic(plane.to_plane(fix.position), variance_m2)
+        MeasuredPosition::isotropic(plane.to_plane(fix.position), variance_m2)
     });
     let regressed = observation.bounding_box.as_ref().map(|bounding_box| {
         let regression = regress(bounding_box, fix.map(|fix| fix.position));
-        Measured::isotropic(regression.regressed, regression.variance_m2())
+        MeasuredPosition::isotropic(regression.regressed, regression.variance_m2())
     });
     Measurement { time: observation.time, fix, regressed }
 }
@@ -237,7 +237,7 @@ fn step_track(
     measurement: &Measurement,
     plane: &LocalPlane,
 ) -> Option<Prediction> {
-    if track.as_ref().is_some_and(|track| track.is_gone(measurement.time)) {
+    if track.as_ref().is_some_and(|track| track.is_expired(measurement.time)) {
         *track = None;
     }
     let state = match track {

@@ -14,7 +14,7 @@ use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
 use crate::app::{App, LiveStream, TrackPoint};
 use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Flag, Result};
-use crate::fusion::track::{Rejection, RejectionReason, Source};
+use crate::fusion::track::{MeasurementSource, Rejection, RejectionReason};
 use crate::shutdown::Shutdown;
 use crate::status;
 use crate::telemetry::RequestId;
@@ -296,10 +296,10 @@ impl From<&TrackPoint> for proto::TrackPoint {
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
-            still: state.still,
+            still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
-            restarted: state.restarted,
+            restarted: state.reinitialized,
         }
     }
 }
@@ -308,8 +308,8 @@ impl From<&Rejection> for proto::TrackRejection {
     fn from(rejection: &Rejection) -> Self {
         use proto::track_rejection as wire;
         let source = match rejection.source {
-            Source::Regressed => wire::Source::Regressed,
-            Source::Fix => wire::Source::Fix,
+            MeasurementSource::Regressed => wire::Source::Regressed,
+            MeasurementSource::Fix => wire::Source::Fix,
         };
         let reason = match rejection.reason {
             RejectionReason::OutsideGate => wire::Reason::OutsideGate,

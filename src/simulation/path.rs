@@ -3,7 +3,7 @@
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::noise::{GaussMarkov, normal};
+use super::noise::{GaussMarkov, standard_normal};
 use crate::geo::EastNorth;
 
 /// A polyline in the plane.
@@ -64,7 +64,8 @@ impl Path {
     /// One pass, a pose a second from one end to the other.
     pub(super) fn pass(&self, gait: &Gait, backwards: bool, random: &mut ChaCha8Rng) -> Vec<Pose> {
         let length_m = self.length_m();
-        let speed_mps = (gait.speed_mps + gait.speed_spread_mps * normal(random)).max(0.4 * gait.speed_mps);
+        let speed_mps =
+            (gait.speed_mps + gait.speed_spread_mps * standard_normal(random)).max(0.4 * gait.speed_mps);
         let halt_at_m = length_m * random.random_range(0.2..0.8);
         let mut halt_left_s = gait.halt_s * random.random_range(0.3..1.0);
         let mut wander = GaussMarkov::new(20.0, random);
@@ -72,7 +73,7 @@ impl Path {
         while along_m <= length_m {
             let halting = along_m > halt_at_m && halt_left_s >= 1.0;
             // A standing target does not wander.
-            let aside = wander.after(if halting { 0.05 } else { 1.0 }, random);
+            let aside = wander.advance(if halting { 0.05 } else { 1.0 }, random);
             let place_m = if backwards { length_m - along_m } else { along_m };
             let mut pose = self.pose(place_m, gait.wander_m * aside);
             if backwards {
@@ -82,7 +83,7 @@ impl Path {
             if halting {
                 halt_left_s -= 1.0;
             } else {
-                along_m += speed_mps * (1.0 + 0.05 * normal(random)).max(0.2);
+                along_m += speed_mps * (1.0 + 0.05 * standard_normal(random)).max(0.2);
             }
         }
         poses

@@ -5,7 +5,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::camera::Camera;
-use super::noise::{Episodes, Receiver, normal, stream};
+use super::noise::{Episodes, Receiver, standard_normal, stream};
 use super::path::{Path, Pose};
 use super::scene::Scene;
 use crate::domain::{BoundingBox, Fix, ImageSize, Sample, TargetClass, TargetId};
@@ -239,7 +239,7 @@ impl<'a> Target<'a> {
         let receiver_error = scene.receiver_error(options.gnss_sigma_m, &mut chance);
         let delay_s = if index == 0 { 0 } else { chance.random_range(0..30) };
         // The first target has the scene's usual size, so that one target is the paper's case.
-        let scale = if index == 0 { 1.0 } else { 1.0 + 0.08 * normal(&mut motion).clamp(-1.5, 1.5) };
+        let scale = if index == 0 { 1.0 } else { 1.0 + 0.08 * standard_normal(&mut motion).clamp(-1.5, 1.5) };
         let name = |text: &str| TargetId::new(text).expect("short printable names");
         Self {
             options,
@@ -298,7 +298,7 @@ impl<'a> Target<'a> {
         let (hidden, how) = self.occlusion.next_row();
         let mut bounding_box = if hidden { occlude(bounding_box, how) } else { Some(bounding_box) };
         let (silent, _) = self.gaps.next_row();
-        let mut place = self.receiver.fix(pose.place, self.silent_s);
+        let mut place = self.receiver.measure(pose.place, self.silent_s);
         self.silent_s = 0.0;
         if self.outlier.random::<f64>() < self.options.outliers {
             if self.outlier.random::<bool>() {
@@ -332,7 +332,7 @@ impl<'a> Target<'a> {
         let body = self.options.scene.body(pose, self.scale, &mut self.body);
         let mut edges = camera.extents(&body)?;
         for edge in &mut edges {
-            *edge += self.options.box_noise_px * normal(&mut self.detector);
+            *edge += self.options.box_noise_px * standard_normal(&mut self.detector);
         }
         let (width_px, height_px) = camera.size_px();
         let cut = [edges[0].max(0.0), edges[1].max(0.0), edges[2].min(width_px), edges[3].min(height_px)];

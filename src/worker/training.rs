@@ -135,8 +135,8 @@ impl Job for TrainingRun {
 /// The model with what its samples tell of how errors stay, for the tracks that it will serve.
 fn with_track_beliefs(mut artifact: Artifact, samples: &[Sample]) -> std::result::Result<Artifact, FitError> {
     let regressor = artifact.load().map_err(|error| FitError::Fault(error.into()))?;
-    let settings = TrackSettings::learn(samples, &regressor);
-    settings.beliefs().write(&mut artifact.metadata.parameters);
+    let settings = TrackSettings::estimate(samples, &regressor);
+    settings.noise_model().write(&mut artifact.metadata.parameters);
     Ok(artifact)
 }
 

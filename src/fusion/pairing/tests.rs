@@ -3,12 +3,13 @@
 use std::path::PathBuf;
 
 use proptest::prelude::*;
+use rand_chacha::ChaCha8Rng;
 
 use super::*;
 use crate::domain::{BoundingBox, ClockOffset, Receiver, ReceiverId, parse_time};
 use crate::fusion::clock_offset::{OffsetSearch, estimate_clock_offset};
-use crate::fusion::track::simulated::{Normal, World, at_s};
 use crate::geo::Position;
+use crate::simulation::{Walk, at_s, standard_normal, stream};
 
 fn target(name: &str) -> TargetId {
     TargetId::new(name).expect("a name")
@@ -119,15 +120,16 @@ fn the_squares_clocks_agree_and_a_shifted_one_is_found() {
 fn a_known_offset_is_found_in_a_simulated_walk() {
     let plane = LocalPlane::new(Position::new(8.0, 47.0).expect("valid"));
     for (seed, shift_s) in [(1, 0.0), (2, -1.3), (3, 4.2), (4, 0.4)] {
-        let walk = World { turn_s: 12, ..World::phone() }.walk(seed, 900);
-        let mut random = Normal::seeded(seed);
+        let walk = Walk { turn_interval_s: 12, ..Walk::pedestrian() }.simulate(seed, 900);
+        let mut random = stream(seed, 0);
         let (mut detections, mut fixes) = (Vec::new(), Vec::new());
-        for (second, (truth, measurement)) in walk.iter().enumerate() {
+        for (second, positions) in walk.iter().enumerate() {
+            let truth = positions.truth;
             // A camera 12 m above the ground, 150 m south of where the walk begins.
             let range_m = (truth.north_m + 150.0).max(20.0);
             let foot = [
-                900.0 + 1_200.0 * truth.east_m / range_m + random.draw(),
-                300.0 + 14_400.0 / range_m + random.draw(),
+                900.0 + 1_200.0 * truth.east_m / range_m + standard_normal(&mut random),
+                300.0 + 14_400.0 / range_m + standard_normal(&mut random),
             ];
             let height_px = 2_000.0 / range_m;
             detections.push(Detection {
@@ -135,7 +137,7 @@ fn a_known_offset_is_found_in_a_simulated_walk() {
                     .expect("valid"),
                 ..detection("walker", second as f64)
             });
-            let position = plane.to_position(measurement.fix.expect("always").position);
+            let position = plane.to_position(positions.fix);
             fixes.push((at_s(second as f64 - shift_s), Fix { position, sigma_m: None }));
         }
         let found = estimate_clock_offset(&detections, &fixes, &OffsetSearch::default()).expect("walks");
@@ -246,15 +248,15 @@ proptest! {
     fn a_stream_gives_what_the_lists_give(seed in 0..10_000u64, interpolated in any::<bool>()) {
         let rule = if interpolated { PairingRule::Interpolated } else { PairingRule::Nearest };
         let settings = PairingSettings { rule, ..PairingSettings::default() };
-        let mut random = Normal::seeded(seed);
+        let mut random = stream(seed, 0);
         let (mut detections, mut fixes) = (Vec::new(), Vec::new());
         for (name, rate_hz) in [("a", 5.0), ("b", 1.0)] {
             for index in 0..120 {
-                let jitter_s = 0.05 * random.draw().sin();
-                if random.draw() < 1.0 {
+                let jitter_s = 0.05 * standard_normal(&mut random).sin();
+                if standard_normal(&mut random) < 1.0 {
                     detections.push(detection(name, 100.0 + f64::from(index) / rate_hz + jitter_s));
                 }
-                if random.draw() < 1.0 {
+                if standard_normal(&mut random) < 1.0 {
                     fixes.push(received(Some(name), 100.3 + f64::from(index) + jitter_s, 5.0 + 1e-5 * f64::from(index)));
                 }
             }
@@ -262,7 +264,7 @@ proptest! {
         let batch = pair(detections.clone(), fixes.clone(), &Receivers::default(), &settings);
         // Every item arrives up to 2.8 s late.
         enum Item { Box(Detection), Fix(ReceivedFix) }
-        let late = |random: &mut Normal, time: Timestamp| time + SignedDuration::from_secs_f64(1.4 * (1.0 + random.draw().sin()));
+        let late = |random: &mut ChaCha8Rng, time: Timestamp| time + SignedDuration::from_secs_f64(1.4 * (1.0 + standard_normal(random).sin()));
         let mut items: Vec<(Timestamp, Item)> = Vec::new();
         for it in detections { items.push((late(&mut random, it.time), Item::Box(it))); }
         for it in fixes { items.push((late(&mut random, it.time), Item::Fix(it))); }

@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
 use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, Result, Sample};
-use crate::filters::{FixError, smooth_pass, tune_acceleration};
+use crate::filters::{FixError, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::statistics::{median, std_dev};
 
@@ -155,7 +155,7 @@ impl TrainingRows {
         let acceleration_mps2 = tune_acceleration(&traverses, &error);
         let labels = traverses
             .iter()
-            .flat_map(|(times_s, fixes)| smooth_pass(times_s, fixes, &error, acceleration_mps2));
+            .flat_map(|(times_s, fixes)| smooth_traverse(times_s, fixes, &error, acceleration_mps2));
         let mut smoothed = self.clone();
         for (row, label) in smoothed.rows.iter_mut().zip(labels) {
             row.label = label.position;

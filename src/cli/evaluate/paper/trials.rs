@@ -11,7 +11,7 @@ use crate::cli::evaluate::cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;
 use crate::model::network::LossWeights;
-use crate::model::{Artifact, FitOptions, Trial, fit_trial};
+use crate::model::{Artifact, FitOptions, FitOverrides, fit_with};
 use crate::simulation::{Options, Route, Scene};
 
 /// wX : wZ of the recipe `paper` (raw pixels and standardised degrees), and of `hybrid` (both scaled).
@@ -44,9 +44,11 @@ fn balance(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
             let weights = LossWeights { reconstruction: ratio, regression: 1.0 };
             let mut cells = String::new();
             for scene in Scene::ALL {
-                let trial =
-                    Trial { candidate: Some(recipe.as_str()), balance: Some(in_units(recipe, weights)) };
-                let (_, error_m) = mean_over(&Options::new(scene), worlds, recipe, trial)?;
+                let overrides = FitOverrides {
+                    candidate: Some(recipe.as_str()),
+                    loss_weights: Some(in_units(recipe, weights)),
+                };
+                let (_, error_m) = mean_over(&Options::new(scene), worlds, recipe, overrides)?;
                 let _ = write!(cells, " {error_m:.3} |");
             }
             let _ = writeln!(page, "| `{recipe}` | 1 : {} |{cells}", (1e6 / ratio).round() / 1e6);
@@ -81,8 +83,8 @@ fn prepared(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
             for pair in PREPARED {
                 let mut columns = [String::new(), String::new()];
                 for candidate in pair {
-                    let trial = Trial { candidate: Some(candidate), balance: None };
-                    let (held_out_m, error_m) = mean_over(&options, worlds, Recipe::Auto, trial)?;
+                    let overrides = FitOverrides { candidate: Some(candidate), loss_weights: None };
+                    let (held_out_m, error_m) = mean_over(&options, worlds, Recipe::Auto, overrides)?;
                     let _ = write!(columns[0], " {held_out_m:.3} |");
                     let _ = write!(columns[1], " {error_m:.3} |");
                 }
@@ -109,7 +111,7 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
             let base = Options::new(scene);
             let world = Split::of_world(&base, seed, 1, Route::Lines);
             let begun_s = cpu_s();
-            let artifact = learn(&world, &base, Recipe::Auto, Trial::default())?;
+            let artifact = learn(&world, &base, Recipe::Auto, FitOverrides::default())?;
             most_s = most_s.max(cpu_s() - begun_s);
             most_bytes = most_bytes.max(artifact.weights.len());
         }
@@ -120,11 +122,16 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
 }
 
 /// Held-out distance to fixes and true error (m) of a trial, means over worlds.
-fn mean_over(base: &Options, worlds: Worlds, recipe: Recipe, trial: Trial<'_>) -> anyhow::Result<(f64, f64)> {
+fn mean_over(
+    base: &Options,
+    worlds: Worlds,
+    recipe: Recipe,
+    overrides: FitOverrides<'_>,
+) -> anyhow::Result<(f64, f64)> {
     let (mut held_out_m, mut error_m) = (0.0, 0.0);
     for seed in worlds.seeds() {
         let world = Split::of_world(base, seed, 1_000, Route::Lines);
-        let artifact = learn(&world, base, recipe, trial)?;
+        let artifact = learn(&world, base, recipe, overrides)?;
         held_out_m += artifact.metadata.held_out.as_ref().map_or(f64::NAN, |found| found.mean_to_fix_m);
         let regressor = artifact.load()?;
         let (mut sum_m, mut count) = (0.0, 0.0);
@@ -139,7 +146,12 @@ fn mean_over(base: &Options, worlds: Worlds, recipe: Recipe, trial: Trial<'_>) -
     Ok((held_out_m / worlds.count as f64, error_m / worlds.count as f64))
 }
 
-fn learn(world: &Split, base: &Options, recipe: Recipe, trial: Trial<'_>) -> anyhow::Result<Artifact> {
+fn learn(
+    world: &Split,
+    base: &Options,
+    recipe: Recipe,
+    overrides: FitOverrides<'_>,
+) -> anyhow::Result<Artifact> {
     let options = FitOptions {
         recipe,
         seed: 1,
@@ -147,6 +159,6 @@ fn learn(world: &Split, base: &Options, recipe: Recipe, trial: Trial<'_>) -> any
         image_size: world.image_size,
         gnss_error: GnssError::Known(SigmaM::new(base.gnss_sigma_m)?),
     };
-    fit_trial(&world.train, &options, trial, &mut |_| ControlFlow::Continue(()))
+    fit_with(&world.train, &options, overrides, &mut |_| ControlFlow::Continue(()))
         .map_err(|error| anyhow::anyhow!("{error}"))
 }

@@ -1,3 +1,5 @@
+//! Agreement with a reference implementation, behaviour without fixes, and consistency.
+
 use proptest::prelude::*;
 
 use super::*;
@@ -88,16 +90,16 @@ const FILTERPY: [ReferenceStep; 12] = [
 
 #[test]
 fn every_step_agrees_with_filterpy() {
-    // The chain whose second is exactly that transition matrix.
+    // The chain whose transition matrix over one second is the one above.
     let total = -(0.85f64.ln());
     let options = ImmUkfOptions {
-        cruise_density: 0.01,
-        turn_density: 0.25,
-        turn_rate_density: 1e-4,
-        speed_sigma_mps: 3.0,
-        turn_rate_sigma: 0.1,
+        cruise_m2_s3: 0.01,
+        turn_m2_s3: 0.25,
+        turn_rate_rad2_s3: 1e-4,
+        initial_speed_sigma_m_s: 3.0,
+        initial_turn_rate_sigma_rad_s: 0.1,
         sojourn_s: [3.0 / total, 1.5 / total],
-        forget_s: 10.0,
+        max_gap_s: 10.0,
     };
     let mode = Mode {
         mean: State::new(0.0, 0.0, 5.0, 0.0, 0.0),
@@ -108,8 +110,8 @@ fn every_step_agrees_with_filterpy() {
     filter.log_probabilities = [0.6f64.ln(), 0.4f64.ln()];
     for (number, (fix, mean, variances, turn)) in FILTERPY.into_iter().enumerate() {
         let position = EastNorth { east_m: fix[0], north_m: fix[1] };
-        let estimate = filter.step(1.0, Some((position, 4.0))).expect("begun");
-        let mixed = mixture(&filter.modes.expect("begun"), estimate.mode_probabilities);
+        let estimate = filter.step(1.0, Some((position, 4.0))).expect("initialised");
+        let mixed = moment_match(&filter.modes.expect("initialised"), estimate.mode_probabilities);
         for state in 0..STATES {
             assert!((mixed.mean[state] - mean[state]).abs() < 1e-7, "step {number} {mixed:?}");
             let variance = mixed.covariance[(state, state)];
@@ -124,50 +126,50 @@ fn fix_at(east_m: f64, north_m: f64) -> Option<(EastNorth, f64)> {
 }
 
 #[test]
-fn missed_fixes_lead_the_modes_back_to_their_chain_and_a_long_gap_starts_anew() {
-    let options = ImmUkfOptions { forget_s: 60.0, ..ImmUkfOptions::of_acceleration(0.5) };
+fn without_fixes_the_modes_return_to_their_chain_and_a_long_gap_reinitialises() {
+    let options = ImmUkfOptions { max_gap_s: 60.0, ..ImmUkfOptions::from_acceleration(0.5) };
     let mut filter = ImmUkf::new(options);
     assert_eq!(filter.step(1.0, None), None);
-    let turn = |filter: &mut ImmUkf, fix| filter.step(1.0, fix).expect("begun").mode_probabilities[1];
+    let turn = |filter: &mut ImmUkf, fix| filter.step(1.0, fix).expect("initialised").mode_probabilities[1];
     for second in 0..60 {
         // A clear turn: a circle of 20 m at 8 m/s.
         let angle = 0.4 * f64::from(second);
         turn(&mut filter, fix_at(20.0 * angle.cos(), 20.0 * angle.sin()));
     }
-    let begun = turn(&mut filter, None);
-    let mut before = begun;
+    let in_turn = turn(&mut filter, None);
+    let mut before = in_turn;
     let mut variance_m2 = 0.0;
     for _ in 0..40 {
         let estimate = filter.step(1.0, None).expect("within the gap");
         assert!(estimate.variance_m2 > variance_m2, "{estimate:?}");
         assert_eq!(estimate.log_likelihood, 0.0);
         variance_m2 = estimate.variance_m2;
-        // The chain falls towards its stationary third without ever passing it.
+        // The probability falls towards its stationary value, a third, from above.
         assert!(estimate.mode_probabilities[1] <= before, "{estimate:?}");
         before = estimate.mode_probabilities[1];
     }
-    assert!(begun > 0.8 && (before - 1.0 / 3.0).abs() < 0.01, "{begun} {before}");
+    assert!(in_turn > 0.8 && (before - 1.0 / 3.0).abs() < 0.01, "{in_turn} {before}");
     assert_eq!(filter.step(30.0, None), None);
-    let anew = filter.step(1.0, fix_at(500.0, 0.0)).expect("starts");
-    assert!((anew.position.east_m - 500.0).abs() < 1e-9);
+    let restarted = filter.step(1.0, fix_at(500.0, 0.0)).expect("starts");
+    assert!((restarted.position.east_m - 500.0).abs() < 1e-9);
 }
 
 #[test]
-fn a_fix_that_no_mode_foresaw_leaves_probabilities_whole() {
-    let mut filter = ImmUkf::new(ImmUkfOptions::of_acceleration(0.1));
+fn a_distant_fix_leaves_probabilities_normalised() {
+    let mut filter = ImmUkf::new(ImmUkfOptions::from_acceleration(0.1));
     filter.step(1.0, fix_at(0.0, 0.0));
     filter.step(1.0, fix_at(0.0, 0.0));
-    let estimate = filter.step(1.0, fix_at(1e6, -1e6)).expect("begun");
+    let estimate = filter.step(1.0, fix_at(1e6, -1e6)).expect("initialised");
     let sum: f64 = estimate.mode_probabilities.iter().sum();
     assert!((sum - 1.0).abs() < 1e-9 && estimate.log_likelihood.is_finite(), "{estimate:?}");
 }
 
 proptest! {
     #[test]
-    fn no_input_breaks_the_filter(
+    fn the_filter_stays_finite_on_any_input(
         steps in proptest::collection::vec((0.01..20.0f64, -1e4..1e4f64, -1e4..1e4f64, any::<bool>()), 1..60),
     ) {
-        let mut filter = ImmUkf::new(ImmUkfOptions::of_acceleration(1.0));
+        let mut filter = ImmUkf::new(ImmUkfOptions::from_acceleration(1.0));
         for (seconds, east_m, north_m, missed) in steps {
             let fix = if missed { None } else { fix_at(east_m, north_m) };
             if let Some(estimate) = filter.step(seconds, fix) {
@@ -179,13 +181,13 @@ proptest! {
     }
 }
 
-/// Mean square per axis of fixes and estimates after 10 s of each pass, and mean error over
-/// variance.
-fn judge(world: &World) -> (f64, f64, f64) {
+/// Mean square error per axis of fixes and of estimates later than 10 s into each traverse, m2, and the
+/// mean ratio of squared error to stated variance.
+fn errors_and_ratio(world: &World) -> (f64, f64, f64) {
     let plane = crate::geo::LocalPlane::new(world.rows[0].truth);
-    let mut filter = ImmUkf::new(ImmUkfOptions::of_acceleration(0.3));
+    let mut filter = ImmUkf::new(ImmUkfOptions::from_acceleration(0.3));
     let variance_m2 = world.gnss_sigma_m.powi(2);
-    let (mut raw, mut kept, mut ratio, mut count) = (0.0, 0.0, 0.0, 0.0);
+    let (mut raw, mut filtered, mut ratio, mut count) = (0.0, 0.0, 0.0, 0.0);
     let (mut last, mut settled_s) = (world.rows[0].time, 0.0);
     for row in &world.rows {
         let seconds = row.time.duration_since(last).as_secs_f64();
@@ -193,21 +195,21 @@ fn judge(world: &World) -> (f64, f64, f64) {
         settled_s = if seconds > 5.0 { 0.0 } else { settled_s + seconds };
         let fix = plane.to_plane(row.fix.expect("no gaps").position);
         let truth = plane.to_plane(row.truth);
-        let estimate = filter.step(seconds, Some((fix, variance_m2))).expect("begun");
+        let estimate = filter.step(seconds, Some((fix, variance_m2))).expect("initialised");
         if settled_s > 10.0 {
             raw += fix.error_per_axis_m2(truth);
-            kept += estimate.position.error_per_axis_m2(truth);
+            filtered += estimate.position.error_per_axis_m2(truth);
             ratio += estimate.position.error_per_axis_m2(truth) / estimate.variance_m2;
             count += 1.0;
         }
     }
-    (raw / count, kept / count, ratio / count)
+    (raw / count, filtered / count, ratio / count)
 }
 
 #[test]
-fn white_noise_is_filtered_and_the_variance_is_honest() {
+fn white_noise_is_filtered_and_the_variance_is_consistent() {
     let world = simulate(&Options { samples: 3_000, seed: 8, ..Options::new(Scene::Airport) });
-    let (raw_m2, kept_m2, ratio) = judge(&world);
-    assert!(kept_m2 < 0.4 * raw_m2, "{kept_m2} of {raw_m2}");
+    let (raw_m2, filtered_m2, ratio) = errors_and_ratio(&world);
+    assert!(filtered_m2 < 0.4 * raw_m2, "{filtered_m2} of {raw_m2}");
     assert!((0.6..1.5).contains(&ratio), "{ratio}");
 }

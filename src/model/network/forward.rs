@@ -6,7 +6,7 @@ use super::shape::{Activation, Layer, NetShape, WIDEST_LAYER};
 /// approximation): free of branches, so that the compiler vectorises loops over it.
 #[inline(always)]
 #[must_use]
-pub fn tanh(value: f32) -> f32 {
+pub(super) fn tanh(value: f32) -> f32 {
     let x = value.clamp(-TANH_BOUND, TANH_BOUND);
     let square = x * x;
     let mut top = TANH_NUMERATOR[0];
@@ -75,7 +75,7 @@ impl Net {
     pub fn encode(&self, inputs: &[f32]) -> [f32; 2] {
         let mut units = [0.0; WIDEST_LAYER];
         units[..inputs.len()].copy_from_slice(inputs);
-        self.run(0..self.shape.bottleneck, &mut units);
+        self.run(0..self.shape.bottleneck(), &mut units);
         [units[0], units[1]]
     }
 
@@ -95,7 +95,7 @@ impl Net {
     pub fn decode(&self, bottleneck: [f32; 2]) -> [f32; WIDEST_LAYER] {
         let mut units = [0.0; WIDEST_LAYER];
         units[..2].copy_from_slice(&bottleneck);
-        self.run(self.shape.bottleneck..self.layers.len(), &mut units);
+        self.run(self.shape.bottleneck()..self.layers.len(), &mut units);
         units
     }
 
@@ -111,7 +111,7 @@ impl Net {
                     *sum += weight * unit;
                 }
             }
-            match (layer.linear, self.shape.activation) {
+            match (layer.linear, self.shape.activation()) {
                 (true, _) => {}
                 (false, Activation::Tanh) => sums.iter_mut().for_each(|sum| *sum = tanh(*sum)),
                 (false, Activation::Relu) => sums.iter_mut().for_each(|sum| *sum = sum.max(0.0)),

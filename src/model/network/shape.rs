@@ -7,7 +7,7 @@
 use rand::{Rng, RngExt};
 
 /// Most units of a layer: the forward pass works in arrays of this length.
-pub const WIDEST_LAYER: usize = 64;
+pub(super) const WIDEST_LAYER: usize = 64;
 
 /// Activation function of the hidden units.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -75,6 +75,9 @@ pub const fn of(kind: ErrorKind) -> Status {
             "The change needs the revision it is based on",
         ),
         ErrorKind::NoModel => (409, code::FAILED_PRECONDITION, "no-model", "The camera has no active model"),
+        ErrorKind::ModelUnusable => {
+            (409, code::FAILED_PRECONDITION, "model-unusable", "The stored model version cannot be used")
+        }
         ErrorKind::RunLive => {
             (409, code::FAILED_PRECONDITION, "run-live", "The camera has a training run that has not ended")
         }

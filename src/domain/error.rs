@@ -45,6 +45,8 @@ pub enum ErrorKind {
     RevisionRequired,
     /// The camera has no active model yet.
     NoModel,
+    /// The stored model version is damaged or cannot be loaded.
+    ModelUnusable,
     /// The camera has a training run that has not ended.
     RunLive,
     /// The training run has ended already.

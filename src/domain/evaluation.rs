@@ -1,4 +1,4 @@
-//! Evaluations over stored samples: what is asked for and how far it has come.
+//! Evaluations over stored samples: plan, progress, state.
 
 use jiff::Timestamp;
 use serde::Serialize;
@@ -12,7 +12,7 @@ use super::names::CameraId;
 use super::recipe::Recipe;
 use crate::geo::Position;
 
-/// A stretch of time; an end that is `None` is open.
+/// A range of time, half open: `from` is within, `until` is not. An end that is `None` is unbounded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct TimeRange {
     from: Option<Timestamp>,
@@ -39,10 +39,16 @@ impl TimeRange {
         self.from
     }
 
-    /// First instant behind.
+    /// First instant after the range.
     #[must_use]
     pub const fn until(self) -> Option<Timestamp> {
         self.until
+    }
+
+    /// Whether an instant lies within.
+    #[must_use]
+    pub fn contains(self, time: Timestamp) -> bool {
+        self.from.is_none_or(|from| from <= time) && self.until.is_none_or(|until| time < until)
     }
 
     /// Whether an instant lies in both.
@@ -53,29 +59,29 @@ impl TimeRange {
     }
 }
 
-/// Where the target truly was.
+/// The true position of the target, against which positions are measured.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Truth {
-    /// Each row says so; rows that do not are not judged.
+    /// The truth columns of each row; rows without are not measured.
     Columns,
-    /// It stood there.
+    /// One point: the target did not move.
     Point(Position),
-    /// Somewhere on these lines; the error is the distance to the nearest.
+    /// Somewhere on these lines; the error is the distance to the nearest one.
     Lines(Vec<Vec<Position>>),
 }
 
-/// What an evaluation is asked to do.
+/// The parameters of an evaluation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvaluationPlan {
-    /// The samples to learn from.
+    /// The samples to train on.
     pub train: TimeRange,
-    /// The samples to be told and judged; none of them is in `train`.
+    /// The samples to test on; none of them is in `train`.
     pub test: TimeRange,
-    /// What they are held against.
+    /// The truth of the test samples.
     pub truth: Truth,
     /// In the order of the table, each once.
     pub methods: Vec<Method>,
-    /// The recipe that tracks stand on.
+    /// The recipe whose model the tracks use.
     pub recipe: Recipe,
     /// Every seed from 1 to this.
     pub seeds: u32,
@@ -85,39 +91,39 @@ pub struct EvaluationPlan {
     pub gnss_sigma: Option<SigmaM>,
 }
 
-/// How far an evaluation has come.
+/// The progress of an evaluation.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, ToSchema)]
 pub struct EvaluationProgress {
-    /// What is being done: `auto, seed 2, held-out block 2 of 4 12/60`, `track, seed 2`.
+    /// The current step: `auto, seed 2, held-out block 2 of 4 12/60`, `track, seed 2`.
     pub phase: String,
     /// Steps done. A step is a recipe's fit, or a method over all test samples, with one seed.
     pub steps_done: u32,
     /// Steps to do.
     pub steps: u32,
-    /// Seconds left by the pace of the steps so far, which differ in length; `None` before there is one.
+    /// Estimated seconds left, from the mean duration of the steps so far; `None` before the first.
     pub remaining_s: Option<f64>,
 }
 
 /// An evaluation as stored, without its report.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvaluationJob {
-    /// Its id.
+    /// The evaluation's id.
     pub id: EvaluationId,
-    /// Whose samples.
+    /// The camera whose samples are evaluated.
     pub camera_id: CameraId,
-    /// What was asked for.
+    /// The parameters.
     pub plan: EvaluationPlan,
-    /// Where it stands.
+    /// The job's state.
     pub state: JobState,
-    /// How far it has come.
+    /// The progress.
     pub progress: EvaluationProgress,
-    /// How often a worker has taken it up.
+    /// Times a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
-    /// Why it failed.
+    /// Why it failed, if it did.
     pub outcome: Option<String>,
-    /// When it was asked for.
+    /// When it was requested.
     pub created_at: Timestamp,
-    /// When a worker took it up last.
+    /// When a worker claimed it last.
     pub started_at: Option<Timestamp>,
     /// When it ended.
     pub ended_at: Option<Timestamp>,

@@ -1,4 +1,4 @@
-//! Work in the background: training runs and evaluations.
+//! Background jobs: training runs and evaluations.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,7 +7,7 @@ use uuid::Uuid;
 
 use super::error::{Error, ErrorKind, Result};
 
-/// Id of a job: a UUID of version 7, so that jobs sort by the time they were asked for.
+/// Id of a job: a UUID of version 7, so that jobs sort by the time of their request.
 macro_rules! job_id {
     ($(#[$doc:meta])* $name:ident, $unknown:expr, $refusal:literal) => {
         $(#[$doc])*
@@ -31,30 +31,30 @@ macro_rules! job_id {
 }
 
 job_id!(
-    /// Id of a training run: a UUID of version 7, so that runs sort by the time they were asked for.
+    /// Id of a training run: a UUID of version 7, so that runs sort by the time of their request.
     RunId,
     ErrorKind::RunNotFound,
     "a training run's id is a UUID"
 );
 job_id!(
-    /// Id of an evaluation: a UUID of version 7, so that they sort by the time they were asked for.
+    /// Id of an evaluation: a UUID of version 7, so that they sort by the time of their request.
     EvaluationId,
     ErrorKind::EvaluationNotFound,
     "an evaluation's id is a UUID"
 );
 
-/// Where a job stands. Queued and running jobs are live; the others have ended.
+/// The state of a job. Queued and running jobs are live; the others have ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum JobState {
-    /// Waits for a worker.
+    /// It waits for a worker.
     Queued,
-    /// A worker carries it out.
+    /// A worker has claimed it.
     Running,
-    /// Yielded what it was asked for.
+    /// It produced its output.
     Succeeded,
-    /// Ended by an error; the outcome says which.
+    /// An error ended it; the outcome says which.
     Failed,
-    /// Ended by the operator.
+    /// The operator cancelled it.
     Cancelled,
 }
 
@@ -74,7 +74,7 @@ impl JobState {
         }
     }
 
-    /// Whether the job will change no more.
+    /// Whether the job has reached a final state.
     #[must_use]
     pub const fn has_ended(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)

@@ -6,6 +6,7 @@
 
 mod bounding_box;
 mod camera;
+mod checksum;
 mod error;
 mod evaluation;
 mod gnss_error;
@@ -23,6 +24,7 @@ mod training;
 
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
+pub use checksum::model_sha256;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
@@ -37,6 +39,6 @@ pub use sample::Sample;
 pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{
-    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, ModelMetadata, ModelVersion,
-    OriginDeg, RunProgress, TrainingOptions, TrainingRun,
+    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, HeldOutSampleError,
+    ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingRun,
 };

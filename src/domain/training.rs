@@ -1,21 +1,21 @@
-//! Training runs and the model versions they yield.
+//! Training runs and the model versions that they produce.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::job::{JobState, RunId};
-use super::names::CameraId;
+use super::names::{CameraId, TargetId};
 use super::recipe::Recipe;
 
-/// What a run is asked to do.
+/// The parameters of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TrainingOptions {
-    /// How to learn the camera.
+    /// The recipe to fit.
     pub recipe: Recipe,
-    /// Everything random in the run comes from it.
+    /// The seed of all random numbers of the run.
     pub seed: u64,
-    /// Passes over the samples, from 1; `None` for the recipe's own number.
+    /// Epochs, from 1; `None` for the recipe's default.
     pub epochs: Option<u32>,
     /// Only samples from this instant on.
     pub from: Option<Timestamp>,
@@ -23,14 +23,14 @@ pub struct TrainingOptions {
     pub until: Option<Timestamp>,
 }
 
-/// How far a fit has come.
+/// The progress of a fit.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct RunProgress {
-    /// What is being done: `held-out block 2 of 4`, `final fit`.
+    /// The current phase: `held-out block 2 of 4`, `final fit`.
     pub phase: String,
-    /// Passes done, over all phases.
+    /// Epochs done, over all phases.
     pub epoch: u32,
-    /// Passes to do, over all phases.
+    /// Epochs to do, over all phases.
     pub epochs: u32,
     /// eX of (2) in the latest epoch.
     pub reconstruction_error: f64,
@@ -38,7 +38,7 @@ pub struct RunProgress {
     pub regression_error: f64,
     /// Es of (4) so far.
     pub error_scale: f64,
-    /// Seconds left by the pace so far; `None` before there is one.
+    /// Estimated seconds left, from the mean duration of the epochs so far; `None` before the first.
     pub remaining_s: Option<f64>,
 }
 
@@ -62,29 +62,29 @@ pub struct EpochReport {
 pub struct TrainingRun {
     /// The run's id.
     pub id: RunId,
-    /// Whose model is fitted.
+    /// The camera whose model is fitted.
     pub camera_id: CameraId,
-    /// What was asked for.
+    /// The parameters.
     pub options: TrainingOptions,
-    /// Where it stands.
+    /// The job's state.
     pub state: JobState,
-    /// How far it has come.
+    /// The progress.
     pub progress: RunProgress,
-    /// How often a worker has taken it up.
+    /// Times a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
-    /// The version it yielded.
+    /// The model version that it produced.
     pub model_version: Option<u32>,
     /// Whether that version became active, and why or why not, or why the run failed.
     pub outcome: Option<String>,
-    /// When it was asked for.
+    /// When it was requested.
     pub created_at: Timestamp,
-    /// When a worker took it up last.
+    /// When a worker claimed it last.
     pub started_at: Option<Timestamp>,
     /// When it ended.
     pub ended_at: Option<Timestamp>,
 }
 
-/// How well a fit foretold blocks of time that it had not seen.
+/// The error of a fit on blocks of time that it had not seen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct HeldOutError {
     /// Blocks of time that were held out in turn.
@@ -95,20 +95,31 @@ pub struct HeldOutError {
     pub mean_to_fix_m: f64,
     /// Mean square per axis of that distance, m2.
     pub error_to_fix_m2: f64,
-    /// The same less the receiver's own variance, floored: the regression's own error, m2.
+    /// The same less the receiver's variance, at least 1 % of it: the regression's own error variance, m2.
     pub e_regression_m2: f64,
-    /// Share of the fixes inside the radius that regression and receiver together foretell for 95 %.
+    /// Share of the fixes inside the 95 % radius that the variances of regression and receiver predict.
     pub coverage95_of_fixes: f64,
 }
 
-/// One input of the network: what is subtracted, then what it is multiplied by.
+/// The error of a held-out sample: predicted by a fit that had not seen its block of time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HeldOutSampleError {
+    /// The sample's time.
+    pub time: Timestamp,
+    /// The sample's target.
+    pub target_id: TargetId,
+    /// Distance from the predicted position to the sample's fix, m.
+    pub distance_m: f64,
+}
+
+/// The scaling of one input: `(value - offset) * factor`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FeatureScale {
     /// `left_px`, `top_px`, `width_px`, `height_px`, `east_m`, ...
     pub feature: String,
-    /// Subtracted first.
+    /// Is subtracted, in the feature's unit.
     pub offset: f64,
-    /// Multiplied then.
+    /// Multiplies the difference.
     pub factor: f64,
 }
 
@@ -121,7 +132,7 @@ pub struct OriginDeg {
     pub latitude_deg: f64,
 }
 
-/// Where the receiver's error came from.
+/// The origin of the receiver's error variance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum GnssErrorSource {
@@ -131,23 +142,23 @@ pub enum GnssErrorSource {
     Estimated,
 }
 
-/// A recipe that was tried, and its held-out error.
+/// A candidate of the recipe, and its held-out error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CandidateReport {
-    /// The recipe or its variant.
+    /// Name of the candidate.
     pub candidate: String,
     /// Its error on the held-out blocks.
     pub held_out: HeldOutError,
 }
 
-/// All that a model version says of itself beside its weights. This is a document format: it is
-/// stored, downloaded and imported as JSON.
+/// The description of a model version, beside its weights. This is a document format: it is stored,
+/// downloaded and imported as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ModelMetadata {
     /// Version of this document, now 1.
     pub format: u32,
-    /// The recipe that was asked for.
+    /// The recipe that was requested.
     pub requested_recipe: String,
     /// The recipe that was fitted.
     pub recipe: String,
@@ -157,7 +168,7 @@ pub struct ModelMetadata {
     pub origin: OriginDeg,
     /// Seed of the run.
     pub seed: u64,
-    /// Passes of the final fit.
+    /// Epochs of the final fit.
     pub epochs: u32,
     /// SHA-256 of the training rows in their order, hexadecimal.
     pub training_rows_sha256: String,
@@ -165,17 +176,17 @@ pub struct ModelMetadata {
     pub samples: u32,
     /// Targets among them.
     pub targets: u32,
-    /// Passes (stretches of time without a hole) among them.
+    /// Passes among them: stretches of one target's time without a gap.
     pub passes: u32,
     /// Es of (4), or its robust form.
     pub error_scale: f64,
     /// The receiver's error variance per axis, m2.
     pub e_gnss_m2: f64,
-    /// Where that came from.
+    /// The origin of that variance.
     pub e_gnss_source: GnssErrorSource,
     /// Error on held-out blocks of time; `None` where the samples make too few blocks.
     pub held_out: Option<HeldOutError>,
-    /// What was tried beside it.
+    /// All candidates of the recipe, with their held-out errors.
     pub candidates: Vec<CandidateReport>,
     /// Names and values of the recipe's own scalars (noise floors, calibration factors).
     pub parameters: std::collections::BTreeMap<String, f64>,
@@ -184,16 +195,16 @@ pub struct ModelMetadata {
 /// An immutable model of one camera, without its weights.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelVersion {
-    /// Whose.
+    /// The camera.
     pub camera_id: CameraId,
     /// Counts from 1 per camera.
     pub number: u32,
-    /// The run that yielded it; `None` if it was imported.
+    /// The run that produced it; `None` if it was imported.
     pub run_id: Option<RunId>,
     /// When it was stored.
     pub created_at: Timestamp,
     /// Size of the weights in bytes.
     pub weights_bytes: u64,
-    /// What it says of itself.
+    /// The description.
     pub metadata: ModelMetadata,
 }

@@ -60,7 +60,7 @@ pub(super) fn fit_recipe(
                 curve.push(*epoch);
                 ControlFlow::Continue(())
             }
-            FitEvent::Note(_) => ControlFlow::Continue(()),
+            FitEvent::HeldOut(_) | FitEvent::Note(_) => ControlFlow::Continue(()),
         });
         let regressor =
             artifact.map_err(|error| error.to_string())?.load().map_err(|error| error.to_string())?;

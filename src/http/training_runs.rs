@@ -95,7 +95,7 @@ struct TrainingRun {
     state: JobState,
     /// How far it has come.
     progress: RunProgress,
-    /// How often a worker has taken it up.
+    /// Times a worker has claimed it without returning it to the queue in order.
     attempt: u32,
     /// The version it yielded.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -17,6 +17,9 @@ pub enum FitEvent<'a> {
     Progress(&'a RunProgress),
     /// One epoch of the final fit.
     Epoch(&'a EpochReport),
+    /// Distance of each sample (in the order of target and time) from its held-out prediction by the chosen
+    /// candidate, m.
+    HeldOut(&'a [f64]),
     /// A line for the run's log.
     Note(&'a str),
 }
@@ -66,7 +69,15 @@ impl FitRun<'_> {
     /// # Errors
     /// [`FitError::Cancelled`] if the observer breaks.
     pub(crate) fn note(&mut self, line: &str) -> Result<(), FitError> {
-        match (self.observer)(FitEvent::Note(line)) {
+        self.notify(FitEvent::Note(line))
+    }
+
+    /// Sends an event to the observer.
+    ///
+    /// # Errors
+    /// [`FitError::Cancelled`] if the observer breaks.
+    pub(crate) fn notify(&mut self, event: FitEvent<'_>) -> Result<(), FitError> {
+        match (self.observer)(event) {
             ControlFlow::Continue(()) => Ok(()),
             ControlFlow::Break(()) => Err(FitError::Cancelled),
         }

@@ -1,11 +1,11 @@
 //! A loaded model: from a box to a position with its error, without allocation.
 
-use super::artifact::{Artifact, ModelParts, TrackBeliefs};
+use super::artifact::{ModelParts, TrackBeliefs};
 use super::encoder::Encoder;
 use super::encoder::features::Encoded;
 use super::uncertainty::coverage::CoverageLookup;
 use super::uncertainty::error_model::{BoxError, ErrorModel, NOMINAL_RATIO};
-use crate::domain::{BoundingBox, Result};
+use crate::domain::{BoundingBox, ImageSize, Result};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::statistics::R95_PER_SIGMA;
 
@@ -51,17 +51,6 @@ pub struct Regressor {
     encoder: Encoder,
 }
 
-impl Artifact {
-    /// Loads the model.
-    ///
-    /// # Errors
-    /// Names `metadata.x` or `weights` where something is unknown, missing, of another shape, not
-    /// finite, or too large.
-    pub fn load(&self) -> Result<Regressor> {
-        Regressor::build(self.parts()?)
-    }
-}
-
 impl Regressor {
     /// # Errors
     /// Names the tensor or metadata field that is missing, unknown or cannot be used.
@@ -83,6 +72,11 @@ impl Regressor {
             error_model,
             encoder,
         })
+    }
+
+    /// Size of the image that it was trained on, if known.
+    pub(super) const fn image_size(&self) -> Option<ImageSize> {
+        self.error_model.image_size()
     }
 
     /// The same model with a larger error variance (m2 per axis), for a camera whose pose has changed

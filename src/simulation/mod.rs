@@ -6,14 +6,19 @@
 
 mod camera;
 mod noise;
+mod options;
 mod path;
 #[cfg(test)]
 mod positions;
+mod row;
 mod scene;
+mod target;
 mod world;
 
+pub use options::{Options, Route};
+pub use row::SimulatedRow;
 pub use scene::Scene;
-pub use world::{Options, Route, SimulatedRow, World, simulate, simulate_split};
+pub use world::{World, simulate, simulate_split};
 
 #[cfg(test)]
 pub(crate) use noise::{standard_normal, stream};

@@ -51,14 +51,14 @@ pub(super) struct ReceiverError {
 
 /// One receiver with independent errors on both axes.
 #[derive(Debug)]
-pub(super) struct Receiver {
+pub(super) struct SimulatedReceiver {
     error: ReceiverError,
     east: GaussMarkov,
     north: GaussMarkov,
     random: ChaCha8Rng,
 }
 
-impl Receiver {
+impl SimulatedReceiver {
     pub(super) fn new(error: ReceiverError, mut random: ChaCha8Rng) -> Self {
         let east = GaussMarkov::new(error.time_constant_s, &mut random);
         let north = GaussMarkov::new(error.time_constant_s, &mut random);
@@ -110,7 +110,7 @@ mod tests {
     #[test]
     fn a_receiver_has_its_variance_and_autocorrelation() {
         let error = ReceiverError { white_m: 0.13, coloured_m: 2.2, time_constant_s: 45.0 };
-        let mut receiver = Receiver::new(error, stream(3, 1));
+        let mut receiver = SimulatedReceiver::new(error, stream(3, 1));
         let easts: Vec<f64> =
             (0..40_000).map(|_| receiver.measure(EastNorth::default(), 1.0).east_m).collect();
         let mean = |values: &mut dyn Iterator<Item = f64>| {

@@ -32,7 +32,8 @@ use crate::domain::{Error, ErrorKind, Result};
 
 pub use group_commit::Inserted;
 pub use jobs::{Claim, Heartbeat, JobEnd};
-pub use runs::{NewModel, RunEnd};
+pub use models::{NewModel, StoredHeldOutError};
+pub use runs::{RunEnd, RunOutput};
 pub use samples::{SampleFilter, SampleKey};
 
 use connection::{Durability, Writer};

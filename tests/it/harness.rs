@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicU16, Ordering};
+use std::sync::{Arc, Mutex};
 
 use http_body_util::{BodyExt as _, Full};
 use hyper::body::{Bytes, Incoming};
@@ -35,6 +36,7 @@ pub(crate) struct TestServer {
     process: Child,
     pub(crate) address: SocketAddr,
     client: Client<HttpConnector, Full<Bytes>>,
+    log: Arc<Mutex<Vec<String>>>,
 }
 
 /// A whole answer.
@@ -109,9 +111,11 @@ impl TestServer {
         let command = command.env("SIGHTFIX_LOG_FORMAT", "json").stderr(Stdio::piped());
         let mut process = command.spawn().expect("the binary starts");
         let mut lines = BufReader::new(process.stderr.take().expect("piped")).lines();
+        let log = Arc::<Mutex<Vec<String>>>::default();
         let mut address = None;
         for line in lines.by_ref() {
             let line = line.expect("UTF-8");
+            log.lock().expect("the log").push(line.clone());
             let entry: Value =
                 serde_json::from_str(&line).unwrap_or_else(|_| panic!("the server says: {line}"));
             if let Some(told) = entry["address"].as_str() {
@@ -120,9 +124,18 @@ impl TestServer {
             }
         }
         // Read on, or the server's log would fill the pipe and halt it.
-        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
+        let kept = log.clone();
+        std::thread::spawn(move || {
+            lines.map_while(Result::ok).for_each(|line| kept.lock().expect("the log").push(line));
+        });
         let client = Client::builder(TokioExecutor::new()).build_http();
-        Self { process, address: address.expect("the server tells its address"), client }
+        Self { process, address: address.expect("the server tells its address"), client, log }
+    }
+
+    /// Lines of the server's log that contain a text.
+    pub(crate) fn log_lines(&self, text: &str) -> Vec<String> {
+        let lines = self.log.lock().expect("the log");
+        lines.iter().filter(|line| line.contains(text)).cloned().collect()
     }
 
     pub(crate) fn pid(&self) -> u32 {

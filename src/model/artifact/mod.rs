@@ -1,7 +1,7 @@
 //! A model as it is stored and exchanged: a metadata document and a safetensors file of weights.
 //!
-//! An artifact may come from another server, so every name, shape and number is checked when it is taken
-//! apart, before anything is computed from it.
+//! An artifact may come from another server or from a damaged disk, so every name, shape and number is
+//! checked when it is taken apart, before anything is computed from it.
 
 mod file;
 pub(crate) mod tensors;
@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 use bytes::Bytes;
 
-use self::tensors::Tensors;
+use self::tensors::{LARGEST_MAGNITUDE, Tensors, is_usable};
 use crate::domain::{Error, FeatureScale, ModelMetadata, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
@@ -55,11 +55,14 @@ impl Artifact {
     }
 }
 
+/// A number by which others are divided or multiplied.
 fn positive(field: &str, value: f64) -> Result<f64> {
-    if value.is_finite() && value > 0.0 {
+    if value >= LARGEST_MAGNITUDE.recip() && is_usable(value) {
         Ok(value)
     } else {
-        Err(Error::invalid(format!("metadata.{field}"), "must be a finite number above 0"))
+        let least = LARGEST_MAGNITUDE.recip();
+        let message = format!("must be a finite number from {least:e} to {LARGEST_MAGNITUDE:e}");
+        Err(Error::invalid(format!("metadata.{field}"), message))
     }
 }
 
@@ -107,11 +110,14 @@ impl ModelParts {
     /// A scalar of the recipe.
     ///
     /// # Errors
-    /// Names the parameter that is missing or not finite.
+    /// Names the parameter that is missing, not finite or too large.
     pub(crate) fn parameter(&self, name: &str) -> Result<f64> {
         match self.parameters.get(name) {
-            Some(value) if value.is_finite() => Ok(*value),
-            _ => Err(Error::invalid(format!("metadata.parameters.{name}"), "must be there and finite")),
+            Some(value) if is_usable(*value) => Ok(*value),
+            _ => {
+                let message = format!("must be there, finite and within {LARGEST_MAGNITUDE:e}");
+                Err(Error::invalid(format!("metadata.parameters.{name}"), message))
+            }
         }
     }
 
@@ -153,14 +159,18 @@ impl ModelParts {
     /// The scaling of exactly these features.
     ///
     /// # Errors
-    /// Names `metadata.features` if the features differ, or a scale is not finite or 0.
+    /// Names `metadata.features` if the features differ, or a scale is not finite, 0 or too large.
     pub(crate) fn scales<const N: usize>(&self, names: [&str; N]) -> Result<[Scale; N]> {
         let same = self.features.iter().map(|feature| feature.feature.as_str()).eq(names);
-        let finite = |feature: &FeatureScale| {
-            feature.offset.is_finite() && feature.factor.is_finite() && feature.factor != 0.0
+        let usable = |feature: &FeatureScale| {
+            let size = feature.factor.abs();
+            is_usable(feature.offset) && is_usable(size) && size >= LARGEST_MAGNITUDE.recip()
         };
-        if !same || !self.features.iter().all(finite) {
-            let message = format!("must be {} in that order, with finite scales", names.join(", "));
+        if !same || !self.features.iter().all(usable) {
+            let message = format!(
+                "must be {} in that order, with finite scales within {LARGEST_MAGNITUDE:e}",
+                names.join(", ")
+            );
             return Err(Error::invalid("metadata.features", message));
         }
         Ok(std::array::from_fn(|at| Scale {

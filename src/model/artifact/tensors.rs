@@ -12,6 +12,15 @@ use crate::domain::{Error, Result};
 /// Largest weight file, in bytes.
 pub const LARGEST_WEIGHTS_BYTES: usize = 64 * 1024;
 
+/// Bound of the absolute value of every number of a model, and inverse bound of every divisor: numbers beyond
+/// it come from a damaged or forged file and would overflow before they give a position.
+pub(crate) const LARGEST_MAGNITUDE: f64 = 1e12;
+
+/// Whether a number is finite and within [`LARGEST_MAGNITUDE`].
+pub(crate) fn is_usable(value: f64) -> bool {
+    value.abs() <= LARGEST_MAGNITUDE
+}
+
 #[derive(Debug, Clone, PartialEq)]
 enum Values {
     F32(Vec<f32>),
@@ -110,8 +119,8 @@ impl Tensors {
     }
 
     /// # Errors
-    /// Refuses files that are too large, are not safetensors, contain other types than f32 and f64, or
-    /// numbers that are not finite; the field is named `weights`.
+    /// Refuses files that are too large, not safetensors, of other types than f32 and f64, or hold
+    /// numbers that are not finite or beyond [`LARGEST_MAGNITUDE`]; the field is named `weights`.
     pub(crate) fn from_bytes(bytes: &[u8]) -> Result<Self> {
         if bytes.len() > LARGEST_WEIGHTS_BYTES {
             return Err(invalid(format!(
@@ -132,12 +141,14 @@ impl Tensors {
                 ),
                 other => return Err(invalid(format!("tensor {name} must be of f32 or f64, not {other:?}"))),
             };
-            let finite = match &values {
-                Values::F32(values) => values.iter().all(|value| value.is_finite()),
-                Values::F64(values) => values.iter().all(|value| value.is_finite()),
+            let usable = match &values {
+                Values::F32(values) => values.iter().all(|value| is_usable(f64::from(*value))),
+                Values::F64(values) => values.iter().all(|value| is_usable(*value)),
             };
-            if !finite {
-                return Err(invalid(format!("tensor {name} holds numbers that are not finite")));
+            if !usable {
+                return Err(invalid(format!(
+                    "tensor {name} holds numbers that are not finite or beyond {LARGEST_MAGNITUDE:e}"
+                )));
             }
             tensors.0.insert(name, Tensor { shape: view.shape().to_vec(), values });
         }

@@ -155,6 +155,8 @@ fn select(
     let residuals: Vec<&[[f64; 2]]> = validated.iter().map(|it| it.residuals.as_slice()).collect();
     let (chosen, scores) = choose(rows, &residuals);
     note_choice(candidates, chosen, &scores, run)?;
+    let distances_m: Vec<f64> = residuals[chosen].iter().map(|[east, north]| east.hypot(*north)).collect();
+    run.notify(FitEvent::HeldOut(&distances_m))?;
     // The final fit may be shorter than the longest candidate's.
     run.progress.epochs = in_blocks + candidates[chosen].total_epochs(context);
     Ok(Chosen {

@@ -4,6 +4,8 @@
 //! A *traverse* is a stretch of one target's samples without a gap. The true position that a sample may
 //! state is never read here.
 
+use std::collections::HashMap;
+
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
@@ -56,8 +58,8 @@ impl TrainingRows {
     /// Sorts the samples by target and time, projects them into a plane and numbers their traverses.
     ///
     /// # Errors
-    /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], or all at one position in the image
-    /// or on the ground.
+    /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], mostly one repeated row, or all
+    /// at one position in the image or on the ground.
     pub(crate) fn new(samples: &[Sample]) -> Result<Self> {
         check_count(samples.len())?;
         let mut sorted: Vec<&Sample> = samples.iter().collect();
@@ -80,8 +82,31 @@ impl TrainingRows {
         }
         let traverses = number_traverses(&mut rows);
         let all = Self { plane, rows, targets: target + 1, traverses };
+        all.check_repetition()?;
         all.check_spread()?;
         Ok(all)
+    }
+
+    /// Refuses sets of which more than half repeat one box and fix, from a detector or receiver that is
+    /// stuck: such rows outweigh all others, and a model that reproduces them has the least error.
+    fn check_repetition(&self) -> Result<()> {
+        let mut counts: HashMap<[u64; 6], usize> = HashMap::new();
+        for row in &self.rows {
+            let [left, top, width, height] = row.bounding_box.sides_px();
+            let values =
+                [left, top, width, height, row.position.longitude_deg(), row.position.latitude_deg()];
+            *counts.entry(values.map(f64::to_bits)).or_default() += 1;
+        }
+        let most = counts.into_values().max().unwrap_or(0);
+        if 2 * most > self.rows.len() {
+            return Err(unusable(format!(
+                "{most} of {} repeat one and the same box and fix, so detector or receiver were stuck; \
+                 delete those (DELETE /v1/cameras/{{camera}}/samples?from=...&until=...), or train on a \
+                 range of time without them",
+                self.rows.len()
+            )));
+        }
+        Ok(())
     }
 
     fn check_spread(&self) -> Result<()> {

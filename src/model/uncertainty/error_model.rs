@@ -95,6 +95,11 @@ impl ErrorModel {
         })
     }
 
+    /// Size of the image, if known.
+    pub(crate) const fn image_size(&self) -> Option<ImageSize> {
+        self.image_size
+    }
+
     #[inline]
     pub(crate) fn look_up(&self, bounding_box: &BoundingBox) -> CoverageLookup {
         self.coverage.look_up(bounding_box)

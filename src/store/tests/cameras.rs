@@ -109,7 +109,7 @@ async fn a_deleted_camera_takes_all_along_and_its_name_starts_anew() {
     store.activate_model(&camera, 1, at(2)).await.expect("active");
     store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
     assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::RunLive);
-    store.request_cancel(&camera, run_id(1), at(4)).await.expect("cancelled");
+    store.cancel_run(&camera, run_id(1), at(4)).await.expect("cancelled");
 
     store.delete_camera(&camera, Some(Revision(1))).await.expect("deleted");
     assert_eq!(kind(store.camera(&camera).await), ErrorKind::CameraNotFound);

@@ -32,7 +32,7 @@ async fn a_crash_keeps_all_that_was_acknowledged() {
         let store = Store::open(folder).await.expect("opens");
         assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 3_000);
         assert_eq!(store.camera(&camera).await.expect("known").active_model, Some(1));
-        assert_eq!(store.weights(&camera, 1).await.expect("known"), b"weights");
+        assert_eq!(store.model_content(&camera, 1).await.expect("known").1, b"weights");
         assert!(store.run(&camera, run_id(1)).await.is_ok());
     }
 }

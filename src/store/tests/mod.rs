@@ -127,7 +127,7 @@ async fn futures_can_move_between_threads() {
     movable(store.delete_samples(&camera, &filter));
     movable(store.insert_run(run, &camera, &options(), 1, at(0)));
     movable(store.claim_run(lease, at(0)));
-    movable(store.heartbeat(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
+    movable(store.heartbeat_run(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
     movable(store.append_epochs(run, 1, &[]));
     movable(store.finish_run(run, 1, super::RunEnd::Cancelled, at(0)));
     movable(store.claim_evaluation(lease, at(0)));

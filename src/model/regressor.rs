@@ -1,6 +1,6 @@
 //! A loaded model: from a box to a position with its error, without allocation.
 
-use super::artifact::{ModelParts, TrackBeliefs};
+use super::artifact::{ModelParts, TrackNoiseModel};
 use super::encoder::Encoder;
 use super::encoder::features::Encoded;
 use super::uncertainty::coverage::CoverageLookup;
@@ -44,7 +44,7 @@ pub struct Regressor {
     e_gnss_m2: f64,
     r95_scale: f64,
     white_share: f64,
-    track_beliefs: Option<TrackBeliefs>,
+    track_noise: Option<TrackNoiseModel>,
     /// Added to every error variance, m2 per axis.
     added_m2: f64,
     error_model: ErrorModel,
@@ -58,7 +58,7 @@ impl Regressor {
         let error_model = ErrorModel::build(&mut parts)?;
         let encoder = Encoder::build(&mut parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
-        let track_beliefs = TrackBeliefs::read(&parts)?;
+        let track_noise = TrackNoiseModel::read(&parts)?;
         let white_share = parts.parameter_or("unrest_share", DEFAULT_WHITE_SHARE)?.clamp(0.0, 1.0);
         let ModelParts { plane, e_gnss_m2, tensors, .. } = parts;
         tensors.finish()?;
@@ -67,7 +67,7 @@ impl Regressor {
             e_gnss_m2,
             r95_scale,
             white_share,
-            track_beliefs,
+            track_noise,
             added_m2: 0.0,
             error_model,
             encoder,
@@ -100,14 +100,14 @@ impl Regressor {
 
     /// The correlation of the errors of receiver and model over time, if the model states it.
     #[must_use]
-    pub const fn track_beliefs(&self) -> Option<TrackBeliefs> {
-        self.track_beliefs
+    pub const fn track_noise(&self) -> Option<TrackNoiseModel> {
+        self.track_noise
     }
 
     /// White share of the regression's error variance, 0 to 1, which is independent between boxes; the rest
     /// is the same whenever the target returns to a place.
     #[must_use]
-    pub const fn unrest_share(&self) -> f64 {
+    pub const fn white_share(&self) -> f64 {
         self.white_share
     }
 

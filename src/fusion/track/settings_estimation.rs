@@ -8,7 +8,7 @@ use super::settings::{GnssNoise, MIN_WHITE_SHARE, RegressionNoise, TrackSettings
 use crate::domain::Sample;
 use crate::filters::{FixError, Traverse};
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::{Regressor, TrackBeliefs};
+use crate::model::{Regressor, TrackNoiseModel};
 
 /// A gap longer than this ends a traverse, s.
 const MAX_GAP_S: f64 = 10.0;
@@ -44,7 +44,7 @@ impl TrackSettings {
             by_traverse(train).into_iter().map(|it| it.into_iter().map(&mut residual).collect()).collect();
         let settings = Self {
             regression: RegressionNoise {
-                white_share: regressor.unrest_share(),
+                white_share: regressor.white_share(),
                 time_constant_s: MODEL_TIME_CONSTANT_S,
                 correlation_length_m: MODEL_LENGTH_SIGMAS * position_sigma_m(&positions),
                 ..RegressionNoise::default()
@@ -63,7 +63,7 @@ impl TrackSettings {
     /// The settings stored with a model; the defaults for a model without them.
     #[must_use]
     pub fn from_model(regressor: &Regressor) -> Self {
-        let Some(stored) = regressor.track_beliefs() else { return Self::default() };
+        let Some(stored) = regressor.track_noise() else { return Self::default() };
         Self {
             gnss: GnssNoise {
                 white_share: stored.gnss_white_share.max(MIN_WHITE_SHARE),
@@ -81,8 +81,8 @@ impl TrackSettings {
 
     /// The parameters to store with a model, so that [`Self::from_model`] returns these settings.
     #[must_use]
-    pub const fn noise_model(&self) -> TrackBeliefs {
-        TrackBeliefs {
+    pub const fn noise_model(&self) -> TrackNoiseModel {
+        TrackNoiseModel {
             gnss_white_share: self.gnss.white_share,
             gnss_time_constant_s: self.gnss.time_constant_s,
             regression_white_share: self.regression.white_share,

@@ -16,7 +16,7 @@ use crate::domain::{Error, FeatureScale, ModelMetadata, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 pub use self::tensors::LARGEST_WEIGHTS_BYTES;
-pub use self::track_noise::TrackBeliefs;
+pub use self::track_noise::TrackNoiseModel;
 
 /// Version of the metadata document.
 pub const FORMAT: u32 = 1;

@@ -8,7 +8,7 @@ use crate::domain::Result;
 
 /// Autocorrelation of the errors of receiver and model, whose variances are stated elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TrackBeliefs {
+pub struct TrackNoiseModel {
     /// White share of the receiver's error variance, 0 to 1; the rest is a Gauss-Markov process.
     pub gnss_white_share: f64,
     /// Time in which the correlation of that process falls to 1/e, s.
@@ -30,7 +30,7 @@ const NAMES: [&str; 5] = [
     "track_regression_length_m",
 ];
 
-impl TrackBeliefs {
+impl TrackNoiseModel {
     /// Adds the scalars to a model's metadata.
     pub fn write(&self, parameters: &mut BTreeMap<String, f64>) {
         let values = [

@@ -85,6 +85,12 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::EvaluationEnded => {
             (409, code::FAILED_PRECONDITION, "evaluation-ended", "The evaluation has ended")
         }
+        ErrorKind::ModelActive => {
+            (409, code::FAILED_PRECONDITION, "model-active", "The model version is the active one")
+        }
+        ErrorKind::InsufficientStorage => {
+            (507, code::RESOURCE_EXHAUSTED, "insufficient-storage", "There is no space to store it")
+        }
         ErrorKind::UnusableSamples => {
             (422, code::FAILED_PRECONDITION, "unusable-samples", "The samples cannot support a fit")
         }

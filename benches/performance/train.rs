@@ -40,7 +40,7 @@ pub(crate) fn run() {
 fn whole() {
     println!("\n### The default recipe on 10,000 simulated rows, one thread\n");
     println!("| scene | s (mark 20) | model bytes (mark 65536) |\n|---|---|---|");
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let options = Options { seed: 1001, camera_seed: 1001, ..Options::new(scene) };
         let world = simulate(&options);
         let samples = world.training_samples();

@@ -19,7 +19,7 @@ use tokio::sync::{Notify, Semaphore};
 
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
-use crate::store::Store;
+use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
@@ -116,6 +116,24 @@ impl std::ops::Deref for App {
 
     fn deref(&self) -> &Parts {
         &self.0
+    }
+}
+
+/// The part of the limits that the store enforces.
+#[must_use]
+pub const fn store_limits(limits: &Limits) -> StoreLimits {
+    StoreLimits {
+        cameras: limits.cameras,
+        samples_per_camera: limits.samples_per_camera,
+        samples: limits.samples,
+        models_per_camera: limits.models_per_camera,
+        ended_runs_per_camera: limits.ended_runs_per_camera,
+        ended_evaluations: limits.ended_evaluations,
+        database_bytes: match limits.database_bytes {
+            0 => None,
+            bytes => Some(bytes),
+        },
+        reserve_bytes: limits.reserve_bytes,
     }
 }
 

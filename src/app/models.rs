@@ -141,6 +141,14 @@ impl App {
         self.store.insert_model(id, &artifact.metadata, &artifact.weights, self.clock.now()).await
     }
 
+    /// Deletes a version that is not the active one. Its number is never assigned again.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `ModelNotFound`, `ModelActive`.
+    pub async fn delete_model(&self, id: &CameraId, number: u32) -> Result<()> {
+        self.store.delete_model(id, number).await
+    }
+
     /// Makes a version the active one, which answers from now on.
     ///
     /// # Errors

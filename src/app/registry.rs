@@ -144,7 +144,7 @@ impl Registry {
                 Ok(regressor) => {
                     // Wrong by about the shift, it must not go on being confident.
                     let regressor = match &moved {
-                        Some(moved) => regressor.with_added_error(moved.added_m2()),
+                        Some(moved) => regressor.with_added_error(moved.change_variance_m2()),
                         None => regressor,
                     };
                     Some((Arc::new(regressor), number))

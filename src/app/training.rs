@@ -94,6 +94,14 @@ impl App {
         self.store.cancel_run(id, run, self.clock.now()).await
     }
 
+    /// Deletes a run that has ended, with its log and curve. The version that it yielded stays.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RunNotFound`, `RunLive`.
+    pub async fn delete_run(&self, id: &CameraId, run: RunId) -> Result<()> {
+        self.store.delete_run(id, run).await
+    }
+
     /// The run's curve: one report per epoch of the final fit.
     ///
     /// # Errors

@@ -1,12 +1,13 @@
-//! The values sightfix speaks of, valid by construction.
+//! Domain values, valid by construction.
 //!
-//! Every check on a number lives in a constructor here or in [`crate::geo`]; the floors above take
-//! these values as they are and check nothing again. What never happens here: I/O, clocks,
+//! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
+//! it and do not check again. What never happens here: I/O, clocks,
 //! randomness, wire formats, status codes.
 
 mod bounding_box;
 mod camera;
 mod checksum;
+mod durability;
 mod error;
 mod evaluation;
 mod gnss_error;
@@ -25,6 +26,7 @@ mod training;
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
 pub use checksum::model_sha256;
+pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};

@@ -17,7 +17,7 @@ impl Score {
         }
     }
 
-    /// The score.
+    /// The score, 0 to 1.
     #[must_use]
     pub const fn value(self) -> f64 {
         self.0

@@ -1,4 +1,4 @@
-//! Training runs and the model versions that they produce.
+//! Training runs and the model versions they produce.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -8,29 +8,29 @@ use super::job::{JobState, RunId};
 use super::names::{CameraId, TargetId};
 use super::recipe::Recipe;
 
-/// The parameters of a run.
+/// The parameters of a training run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TrainingOptions {
-    /// The recipe to fit.
+    /// Recipe to train.
     pub recipe: Recipe,
-    /// The seed of all random numbers of the run.
+    /// Seed of all randomness in the run.
     pub seed: u64,
-    /// Epochs, from 1; `None` for the recipe's default.
+    /// Number of epochs, from 1; `None` for the recipe's default.
     pub epochs: Option<u32>,
-    /// Only samples from this instant on.
+    /// Use only samples from this instant on.
     pub from: Option<Timestamp>,
-    /// Only samples before this instant.
+    /// Use only samples before this instant.
     pub until: Option<Timestamp>,
 }
 
-/// The progress of a fit.
+/// Progress of a fit.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct RunProgress {
-    /// The current phase: `held-out block 2 of 4`, `final fit`.
+    /// Current phase: `held-out block 2 of 4`, `final fit`.
     pub phase: String,
-    /// Epochs done, over all phases.
+    /// Completed epochs, over all phases.
     pub epoch: u32,
-    /// Epochs to do, over all phases.
+    /// Total epochs, over all phases.
     pub epochs: u32,
     /// eX of (2) in the latest epoch.
     pub reconstruction_error: f64,
@@ -38,11 +38,11 @@ pub struct RunProgress {
     pub regression_error: f64,
     /// Es of (4) so far.
     pub error_scale: f64,
-    /// Estimated seconds left, from the mean duration of the epochs so far; `None` before the first.
+    /// Estimated remaining time, s; `None` before the first epoch.
     pub remaining_s: Option<f64>,
 }
 
-/// One point of a run's curve: one epoch of the final fit.
+/// One point of a run's learning curve: one epoch of the final fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct EpochReport {
     /// From 1.
@@ -62,42 +62,42 @@ pub struct EpochReport {
 pub struct TrainingRun {
     /// The run's id.
     pub id: RunId,
-    /// The camera whose model is fitted.
+    /// The camera to train.
     pub camera_id: CameraId,
     /// The parameters.
     pub options: TrainingOptions,
-    /// The job's state.
+    /// State of the job.
     pub state: JobState,
-    /// The progress.
+    /// Progress of the fit.
     pub progress: RunProgress,
-    /// Times a worker has claimed it without returning it to the queue in order.
+    /// Number of times that a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
-    /// The model version that it produced.
+    /// The model version it produced.
     pub model_version: Option<u32>,
-    /// Whether that version became active, and why or why not, or why the run failed.
+    /// Whether that version was activated and why, or why the run failed.
     pub outcome: Option<String>,
-    /// When it was requested.
+    /// Time of creation.
     pub created_at: Timestamp,
-    /// When a worker claimed it last.
+    /// Time of the latest claim by a worker.
     pub started_at: Option<Timestamp>,
-    /// When it ended.
+    /// Time of completion.
     pub ended_at: Option<Timestamp>,
 }
 
-/// The error of a fit on blocks of time that it had not seen.
+/// Prediction error on blocks of time that were held out of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct HeldOutError {
-    /// Blocks of time that were held out in turn.
+    /// Number of blocks of time that were held out in turn.
     pub blocks: u32,
-    /// Samples in them.
+    /// Samples in those blocks.
     pub samples: u32,
     /// Mean horizontal distance in m from the regressed position to the (noisy) fix.
     pub mean_to_fix_m: f64,
     /// Mean square per axis of that distance, m2.
     pub error_to_fix_m2: f64,
-    /// The same less the receiver's variance, at least 1 % of it: the regression's own error variance, m2.
+    /// That less the receiver's variance, bounded below: the regression's own error variance, m2.
     pub e_regression_m2: f64,
-    /// Share of the fixes inside the 95 % radius that the variances of regression and receiver predict.
+    /// Share of the fixes inside the 95 % radius predicted for regression and receiver together.
     pub coverage95_of_fixes: f64,
 }
 
@@ -112,12 +112,12 @@ pub struct HeldOutSampleError {
     pub distance_m: f64,
 }
 
-/// The scaling of one input: `(value - offset) * factor`.
+/// Scaling of one input of the network: `(value - offset) * factor`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FeatureScale {
     /// `left_px`, `top_px`, `width_px`, `height_px`, `east_m`, ...
     pub feature: String,
-    /// Is subtracted, in the feature's unit.
+    /// Subtracted from the value.
     pub offset: f64,
     /// Multiplies the difference.
     pub factor: f64,
@@ -126,23 +126,23 @@ pub struct FeatureScale {
 /// A position in the metadata document.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct OriginDeg {
-    /// Degrees east.
+    /// Longitude, degrees east.
     pub longitude_deg: f64,
-    /// Degrees north.
+    /// Latitude, degrees north.
     pub latitude_deg: f64,
 }
 
-/// The origin of the receiver's error variance.
+/// Source of the receiver's error variance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum GnssErrorSource {
-    /// The camera's profile, or the fixes themselves.
+    /// The camera's profile, or the sigma of the fixes.
     Profile,
     /// Estimated from the training samples.
     Estimated,
 }
 
-/// A candidate of the recipe, and its held-out error.
+/// A candidate of the model selection, and its held-out error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CandidateReport {
     /// Name of the candidate.
@@ -151,18 +151,18 @@ pub struct CandidateReport {
     pub held_out: HeldOutError,
 }
 
-/// The description of a model version, beside its weights. This is a document format: it is stored,
+/// Metadata of a model version: all but its weights. This is a document format: it is stored,
 /// downloaded and imported as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ModelMetadata {
     /// Version of this document, now 1.
     pub format: u32,
-    /// The recipe that was requested.
+    /// The requested recipe.
     pub requested_recipe: String,
     /// The recipe that was fitted.
     pub recipe: String,
-    /// Inputs of the encoder in their order, with their scaling.
+    /// Inputs of the encoder in order, with their scaling.
     pub features: Vec<FeatureScale>,
     /// Origin of the local plane, or of the standardised degrees.
     pub origin: OriginDeg,
@@ -176,19 +176,19 @@ pub struct ModelMetadata {
     pub samples: u32,
     /// Targets among them.
     pub targets: u32,
-    /// Passes among them: stretches of one target's time without a gap.
+    /// Traverses (gap-free sequences of one target) among them.
     pub passes: u32,
     /// Es of (4), or its robust form.
     pub error_scale: f64,
     /// The receiver's error variance per axis, m2.
     pub e_gnss_m2: f64,
-    /// The origin of that variance.
+    /// Source of that variance.
     pub e_gnss_source: GnssErrorSource,
-    /// Error on held-out blocks of time; `None` where the samples make too few blocks.
+    /// Error on held-out blocks of time; `None` if the samples form too few blocks.
     pub held_out: Option<HeldOutError>,
-    /// All candidates of the recipe, with their held-out errors.
+    /// The candidates of the model selection.
     pub candidates: Vec<CandidateReport>,
-    /// Names and values of the recipe's own scalars (noise floors, calibration factors).
+    /// Names and values of the recipe's scalar parameters (noise floors, calibration factors).
     pub parameters: std::collections::BTreeMap<String, f64>,
 }
 
@@ -197,14 +197,14 @@ pub struct ModelMetadata {
 pub struct ModelVersion {
     /// The camera.
     pub camera_id: CameraId,
-    /// Counts from 1 per camera.
+    /// Version number, from 1 per camera.
     pub number: u32,
     /// The run that produced it; `None` if it was imported.
     pub run_id: Option<RunId>,
-    /// When it was stored.
+    /// Time of storage.
     pub created_at: Timestamp,
-    /// Size of the weights in bytes.
+    /// Size of the weights, bytes.
     pub weights_bytes: u64,
-    /// The description.
+    /// The metadata.
     pub metadata: ModelMetadata,
 }

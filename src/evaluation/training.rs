@@ -30,7 +30,8 @@ pub(super) struct RecipeModel {
 /// The recipes whose models these methods use, each once.
 pub(super) fn recipes_of(methods: &[Method], default: Recipe) -> Vec<Recipe> {
     Recipe::ALL
-        .into_iter()
+        .iter()
+        .copied()
         .filter(|recipe| methods.iter().any(|method| method.recipe(default) == Some(*recipe)))
         .collect()
 }

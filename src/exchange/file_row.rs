@@ -1,18 +1,18 @@
-//! One row of a file as it was read, before it is checked, and the error of a row that is refused.
+//! One row of a file as it was read, before it is checked, and the error of an invalid row.
 
 use serde::Deserialize;
 
 use super::wire::{self, Text};
 use crate::domain::{Error, Result};
 
-/// Why one row of a file was not taken.
+/// Why a row of a file is invalid.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RowError {
     /// Line of the file from 1 (a CSV file's header is line 1), or element of a JSON array from 1.
     pub line: u64,
-    /// Column, or path of the field in the row's JSON; empty if the row as a whole is at fault.
+    /// Column, or path of the field in the row's JSON; empty if the row as a whole is invalid.
     pub field: String,
-    /// What is wrong and what would be right.
+    /// What is wrong and what is valid.
     pub reason: String,
 }
 
@@ -21,7 +21,10 @@ impl RowError {
         Self { line, field: String::new(), reason: reason.to_owned() }
     }
 
-    /// A refusal as the row's fault; a fault of the machine stays an error of the file.
+    /// The row error of a refusal.
+    ///
+    /// # Errors
+    /// Passes a fault on: it concerns the whole file.
     pub fn of(line: u64, error: Error) -> Result<Self> {
         match error {
             Error::Refused(refusal) => Ok(match refusal.violations.into_iter().next() {
@@ -33,7 +36,7 @@ impl RowError {
     }
 }
 
-/// Any row as it stands in a file; what is required of it depends on who reads.
+/// A row of any file; the reader decides which fields are required.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct FileRow<'a> {
@@ -47,21 +50,21 @@ pub(super) struct FileRow<'a> {
     pub class: Option<Text<'a>>,
     pub score: Option<f64>,
     pub truth: Option<wire::Position>,
-    /// Only files of fixes have it, and these are not JSON.
+    /// Only CSV files of fixes have it.
     #[serde(skip)]
     pub receiver_id: Option<Text<'a>>,
 }
 
-/// The name, taken from the row before if it is the same.
+/// The name, shared with the previous row if it is the same.
 pub(super) fn shared<T: Clone>(
     text: Option<&Text<'_>>,
-    before: &mut Option<T>,
+    previous: &mut Option<T>,
     as_str: impl Fn(&T) -> &str,
     make: impl Fn(&str) -> Result<T>,
 ) -> Result<Option<T>> {
     let Some(text) = text else { return Ok(None) };
-    if before.as_ref().is_none_or(|name| as_str(name) != text.as_str()) {
-        *before = Some(make(text.as_str())?);
+    if previous.as_ref().is_none_or(|name| as_str(name) != text.as_str()) {
+        *previous = Some(make(text.as_str())?);
     }
-    Ok(before.clone())
+    Ok(previous.clone())
 }

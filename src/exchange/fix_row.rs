@@ -6,7 +6,7 @@ use super::file_row::RowError;
 use super::format::FixFormat;
 use crate::domain::{Fix, ReceivedFix, ReceiverId, Result, TimeBounds};
 
-/// A fix as it stands in a file.
+/// A fix of a file, not yet checked for completeness.
 pub(super) struct FixRow {
     pub(super) line: u64,
     pub(super) time: Option<Timestamp>,
@@ -15,7 +15,7 @@ pub(super) struct FixRow {
 }
 
 impl FixRow {
-    /// A fix of a believable time.
+    /// A fix with a valid time, if it has one.
     pub(super) fn checked(
         line: u64,
         time: Option<Timestamp>,
@@ -35,7 +35,7 @@ impl FixRow {
             return Ok(ReceivedFix { time, receiver_id, fix });
         }
         let reason = match format {
-            FixFormat::Nmea => "has no date: no RMC or ZDA sentence of the file tells it",
+            FixFormat::Nmea => "has no date: the file has no RMC or ZDA sentence",
             FixFormat::Csv | FixFormat::Gpx | FixFormat::Gpsd => "is required",
         };
         Err(RowError { line, field: "time".to_owned(), reason: reason.to_owned() })

@@ -1,4 +1,4 @@
-//! Files of fixes alone: for a receiver's error, and for pairing.
+//! Files of fixes: for estimating a receiver's error, and for pairing.
 
 use std::io::Read;
 
@@ -14,21 +14,20 @@ use super::gpx::GpxFixes;
 use super::nmea_fixes::NmeaFixes;
 use crate::domain::{Error, Fix, ReceivedFix, ReceiverId, Result, TimeBounds, parse_time};
 
-/// A fix, and its time where the file tells it.
+/// A fix, and its time if the file has it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TimedFix {
-    /// When.
+    /// Time by the receiver's clock.
     pub time: Option<Timestamp>,
-    /// Where.
+    /// The fix.
     pub fix: Fix,
 }
 
-/// Fixes of a file, one by one, in the file's order.
+/// Fixes of a file, in the order of the file.
 ///
 /// # Errors
-/// Outside, as an item and within an item as [`super::read_samples`]. NMEA sentences and gpsd's
-/// reports without a fix, of a wrong checksum or of estimated, manual or simulated positions are the
-/// row's fault.
+/// As [`super::read_samples`]. NMEA sentences and gpsd reports without a fix, with a wrong checksum or
+/// with estimated, manual or simulated positions are row errors.
 pub fn read_fixes<R: Read>(
     reader: R,
     format: FixFormat,
@@ -41,7 +40,7 @@ pub fn read_fixes<R: Read>(
     }))
 }
 
-/// The same with receivers; a fix without a time is the row's fault.
+/// Fixes with their receivers; a fix without a time is a row error.
 ///
 /// # Errors
 /// As [`read_fixes`].
@@ -91,15 +90,15 @@ impl<R: Read> FixRows<R> {
     }
 }
 
-/// The row but for its line, which its reader knows.
-fn csv_row(row: &FileRow<'_>, time_bounds: &TimeBounds, before: &mut Option<ReceiverId>) -> Result<FixRow> {
+/// The row without its line number, which the reader adds.
+fn csv_row(row: &FileRow<'_>, time_bounds: &TimeBounds, previous: &mut Option<ReceiverId>) -> Result<FixRow> {
     let time = row.time.as_ref().map(|text| time_bounds.check(parse_time(text.as_str())?)).transpose()?;
     let named = row.receiver_id.as_ref().or(row.target_id.as_ref());
     let fix = row.fix.ok_or_else(|| Error::invalid("fix", "is required"))?;
     Ok(FixRow {
         line: 0,
         time,
-        receiver_id: shared(named, before, ReceiverId::as_str, ReceiverId::new)?,
+        receiver_id: shared(named, previous, ReceiverId::as_str, ReceiverId::new)?,
         fix: fix.to_domain().map_err(|error| error.under("fix"))?,
     })
 }

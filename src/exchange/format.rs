@@ -1,25 +1,26 @@
-//! What kind of file it is, from its name or its media type.
+//! File formats, by file name or media type.
 
 use std::path::Path;
-use std::str::FromStr;
 
-use crate::domain::{Error, Result};
+use strum::{EnumString, IntoStaticStr, VariantArray};
+
+use crate::domain::Error;
 
 /// A format of sample, observation or fused rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Format {
-    /// Comma-separated, one header line.
+    /// Comma-separated values with a header line.
     Csv,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Ndjson,
     /// One JSON document.
     Json,
-    /// RFC 7946, written only.
+    /// GeoJSON (RFC 7946), written only.
     GeoJson,
 }
 
 impl Format {
-    /// All of them.
+    /// All formats.
     pub const ALL: [Self; 4] = [Self::Csv, Self::Ndjson, Self::Json, Self::GeoJson];
 
     /// The format of a media type such as `text/csv; charset=utf-8`.
@@ -37,7 +38,7 @@ impl Format {
         known.into_iter().find(|(name, _)| essence.eq_ignore_ascii_case(name)).map(|(_, format)| format)
     }
 
-    /// The format that a file's extension announces.
+    /// The format of a file's extension.
     #[must_use]
     pub fn from_path(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
@@ -50,7 +51,7 @@ impl Format {
         }
     }
 
-    /// What to announce it as.
+    /// The media type in responses.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {
@@ -63,24 +64,25 @@ impl Format {
 }
 
 /// A format of fixes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, EnumString, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_fix_format)]
 pub enum FixFormat {
-    /// Columns `longitude`, `latitude` and at will `time`, `sigma_m` and `receiver_id`; other columns
-    /// of sample files may stand beside them. Without a `receiver_id`, a `target_id` stands for it.
+    /// Columns `longitude`, `latitude` and optionally `time`, `sigma_m` and `receiver_id`; other columns
+    /// of sample files are accepted. Without a `receiver_id` the `target_id` is used instead.
     Csv,
-    /// NMEA 0183: positions of GGA, dates of RMC and ZDA; other sentences are passed over.
+    /// NMEA 0183: positions of GGA, dates of RMC and ZDA; other sentences are skipped.
     Nmea,
     /// GPX: track, route and way points.
     Gpx,
-    /// Reports of gpsd, one a line (`gpspipe -w`): those of class TPV. The receiver is the `device`.
+    /// Reports of gpsd, one per line (`gpspipe -w`): those of class TPV. The receiver is the `device`.
     Gpsd,
 }
 
 impl FixFormat {
-    /// All of them.
-    pub const ALL: [Self; 4] = [Self::Csv, Self::Nmea, Self::Gpx, Self::Gpsd];
+    /// All formats.
+    pub const ALL: &'static [Self] = Self::VARIANTS;
 
-    /// The format that a file's extension announces; `nmea`, `log` and `txt` are NMEA; `json`,
+    /// The format of a file's extension; `nmea`, `log` and `txt` are NMEA; `json`,
     /// `ndjson` and `jsonl` are gpsd's.
     #[must_use]
     pub fn from_path(path: &std::path::Path) -> Option<Self> {
@@ -109,25 +111,13 @@ impl FixFormat {
         }
     }
 
-    /// The one name used everywhere.
+    /// Name in commands and reports.
     #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Csv => "csv",
-            Self::Nmea => "nmea",
-            Self::Gpx => "gpx",
-            Self::Gpsd => "gpsd",
-        }
+    pub fn as_str(self) -> &'static str {
+        self.into()
     }
 }
 
-impl FromStr for FixFormat {
-    type Err = Error;
-
-    fn from_str(name: &str) -> Result<Self> {
-        Self::ALL
-            .into_iter()
-            .find(|format| format.as_str() == name)
-            .ok_or_else(|| Error::invalid("format", "must be one of csv, nmea, gpx, gpsd"))
-    }
+fn unknown_fix_format(_: &str) -> Error {
+    Error::invalid("format", "must be one of csv, nmea, gpx, gpsd")
 }

@@ -225,6 +225,7 @@ impl From<&Opening> for proto::StreamOpening {
             client_name: opening.client_name.clone(),
             resume_after_seq: opening.resume_after_seq,
             store_samples: opening.store_samples,
+            ..Self::default()
         }
     }
 }

@@ -6,7 +6,7 @@ use futures_util::FutureExt as _;
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
 
-use super::convert::{camera_id, live_item, timestamp};
+use super::convert::{camera_id, durability, live_item, timestamp};
 use super::outbox::{Outbox, Responses, outbox};
 use super::proto;
 use super::proto::stream_answer::Outcome;
@@ -69,6 +69,10 @@ impl Conversation {
         let opened = proto::StreamOpened {
             model_version: stream.model_version(),
             idle_limit: prost_types::Duration::try_from(idle_limit).ok(),
+            durability: stream
+                .durability()
+                .map_or(proto::Durability::Unspecified, proto::Durability::from)
+                .into(),
         };
         self.outbox.opened(opened);
         let stop = self.answer_items(&camera, &mut stream, idle_limit).await?;
@@ -105,9 +109,11 @@ impl Conversation {
             return Err(Error::invalid("opening", "must be the first message of a stream"));
         };
         let camera = camera_id(&opening.camera_id)?;
+        let durability = durability(opening.durability)?;
+        let store_samples = opening.store_samples.then_some(durability);
         let stream = self
             .app
-            .open_stream(&camera, &opening.client_name, opening.resume_after_seq, opening.store_samples)
+            .open_stream(&camera, &opening.client_name, opening.resume_after_seq, store_samples)
             .await?;
         Ok((camera, stream))
     }

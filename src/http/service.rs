@@ -30,7 +30,8 @@ const NAMED_CAMERAS: usize = 100;
 /// Whether the server can take work
 ///
 /// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
-/// since its fixes still pass through; each has a line `degraded: camera ...`.
+/// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
+/// a line `warning: insufficient-storage: ...`.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -45,6 +46,9 @@ async fn readyz(State(rest): State<Rest>) -> Answer<String> {
     rest.app.store.ping().await?;
     let faults = rest.app.registry.model_faults();
     let mut text = "ready\n".to_owned();
+    if rest.app.store.is_full() {
+        text.push_str("warning: insufficient-storage: imports are refused until space is freed\n");
+    }
     for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {
         text.push_str(&format!("degraded: camera {camera}: {}\n", fault.reason));
     }

@@ -1,22 +1,22 @@
 //! The two scenes: camera, paths, bodies and motion of the targets, receivers.
 
 use std::f64::consts::TAU;
-use std::fmt;
-use std::str::FromStr;
 
 use rand::{Rng, RngExt};
+use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::camera::{Camera, Point};
 use super::noise::ReceiverError;
 use super::path::{MotionProfile, Path, Pose};
-use crate::domain::{Error, ImageSize, Result};
+use crate::domain::{Error, ImageSize};
 use crate::geo::{EastNorth, Position};
 
 /// White part of a phone's error per axis, m, as measured; the rest is a Gauss-Markov bias.
 const PHONE_WHITE_M: f64 = 0.13;
 
 /// A kind of site with its targets and receivers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display, EnumString, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_scene)]
 pub enum Scene {
     /// The paper's scenario 1: an aircraft of 35 m taxiing along a straight and a curve, white
     /// GNSS noise.
@@ -27,15 +27,12 @@ pub enum Scene {
 
 impl Scene {
     /// All scenes.
-    pub const ALL: [Self; 2] = [Self::Airport, Self::Square];
+    pub const ALL: &'static [Self] = Self::VARIANTS;
 
     /// Name in commands and reports.
     #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Airport => "airport",
-            Self::Square => "square",
-        }
+    pub fn as_str(self) -> &'static str {
+        self.into()
     }
 
     /// Class of its targets, and prefix of their ids.
@@ -199,19 +196,6 @@ fn rotated(right_m: f64, ahead_m: f64, pan_deg: f64) -> EastNorth {
     }
 }
 
-impl fmt::Display for Scene {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(self.as_str())
-    }
-}
-
-impl FromStr for Scene {
-    type Err = Error;
-
-    fn from_str(name: &str) -> Result<Self> {
-        Self::ALL
-            .into_iter()
-            .find(|scene| scene.as_str() == name)
-            .ok_or_else(|| Error::invalid("scene", "must be one of airport, square"))
-    }
+fn unknown_scene(_: &str) -> Error {
+    Error::invalid("scene", "must be one of airport, square")
 }

@@ -12,6 +12,7 @@ use super::cameras::camera_key;
 use super::faults::{failed, no_evaluation};
 use super::fields::Fields;
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
+use super::retention::prune_evaluations;
 use crate::domain::{
     CameraId, Error, ErrorKind, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, Method,
     Result, SigmaM, TimeRange, Truth,
@@ -49,9 +50,10 @@ impl Store {
         max_live: u32,
         now: Timestamp,
     ) -> Result<EvaluationJob> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
+        prune_evaluations(&mut transaction, self.limits().ended_evaluations).await?;
         EVALUATIONS.check_capacity(&mut transaction, max_live).await?;
         let (point, lines) = written_truth(&plan.truth)?;
         let methods: Vec<String> = plan.methods.iter().map(Method::to_string).collect();
@@ -238,14 +240,15 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`].
     pub async fn delete_evaluation(&self, id: EvaluationId) -> Result<()> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut deletion = self.deletion().await?;
+        let mut transaction = deletion.begin().await?;
         let done = sqlx::query("DELETE FROM evaluations WHERE id = ?")
             .bind(id.to_string())
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
         transaction.commit().await.map_err(failed)?;
+        deletion.reclaim().await;
         if done.rows_affected() == 0 { Err(no_evaluation(id)) } else { Ok(()) }
     }
 }

@@ -271,7 +271,7 @@ impl Jobs {
 }
 
 pub(super) fn read_state(name: &str) -> Result<JobState, &'static str> {
-    JobState::ALL.into_iter().find(|state| state.as_str() == name).ok_or("is not the state of a job")
+    JobState::ALL.iter().copied().find(|state| state.as_str() == name).ok_or("is not the state of a job")
 }
 
 /// Microseconds of a lease; at most a century, so that the end of a lease stays in range.

@@ -9,6 +9,7 @@ use super::Store;
 use super::cameras::{camera_key, find_camera};
 use super::faults::{failed, no_model};
 use super::fields::Fields;
+use super::retention::prune_models;
 use crate::domain::{
     BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata, ModelVersion, Result,
     RunId, TargetId, model_sha256,
@@ -38,11 +39,12 @@ impl Store {
         weights: &[u8],
         now: Timestamp,
     ) -> Result<ModelVersion> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         let model = NewModel { metadata, weights, held_out: &[] };
         let number = add_model(&mut transaction, key, None, &model, now).await?;
+        prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
         let version = find_model(&mut transaction, camera, number).await?;
         transaction.commit().await.map_err(failed)?;
         version.ok_or_else(|| no_model(camera, number))
@@ -241,7 +243,7 @@ pub struct NewModel<'a> {
     pub held_out: &'a [HeldOutSampleError],
 }
 
-/// Adds the next version of a camera; returns its number.
+/// Adds the next version of a camera; returns its number, which no version had before.
 pub(super) async fn add_model(
     connection: &mut SqliteConnection,
     camera_key: i64,
@@ -255,18 +257,26 @@ pub(super) async fn add_model(
     serde_json::from_str::<ModelMetadata>(&metadata)
         .map_err(|error| Error::fault(format!("the metadata of a model cannot be stored: {error}")))?;
     let number: i64 = sqlx::query_scalar(
-        "INSERT INTO models (camera_key, number, run_id, created_at_us, sha256, metadata, weights) \
-         SELECT ?, coalesce(max(number), 0) + 1, ?, ?, ?, ?, ? FROM models WHERE camera_key = ? \
-         RETURNING number",
+        "UPDATE cameras SET last_model_number = 1 + max(last_model_number, \
+         (SELECT coalesce(max(number), 0) FROM models WHERE camera_key = ?1)) WHERE key = ?1 \
+         RETURNING last_model_number",
     )
     .bind(camera_key)
+    .fetch_one(&mut *connection)
+    .await
+    .map_err(failed)?;
+    sqlx::query(
+        "INSERT INTO models (camera_key, number, run_id, created_at_us, sha256, metadata, weights) \
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+    )
+    .bind(camera_key)
+    .bind(number)
     .bind(run.map(|run| run.to_string()))
     .bind(now.as_microsecond())
     .bind(model_sha256(metadata.as_bytes(), weights))
     .bind(metadata)
     .bind(*weights)
-    .bind(camera_key)
-    .fetch_one(&mut *connection)
+    .execute(&mut *connection)
     .await
     .map_err(failed)?;
     for error in *held_out {

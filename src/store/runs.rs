@@ -13,6 +13,7 @@ use super::faults::{failed, no_run};
 use super::fields::Fields;
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
 use super::models::{NewModel, activate, add_model};
+use super::retention::{prune_models, prune_runs};
 use crate::domain::{
     CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
 };
@@ -62,9 +63,10 @@ impl Store {
         max_live: u32,
         now: Timestamp,
     ) -> Result<TrainingRun> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
+        prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
         check_no_live_run(&mut transaction, key).await?;
         RUNS.check_capacity(&mut transaction, max_live).await?;
         sqlx::query(
@@ -221,6 +223,7 @@ impl Store {
             if wanted {
                 activate(&mut transaction, key, number, now).await?;
             }
+            prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
             sqlx::query("UPDATE training_runs SET model_version = ? WHERE id = ?")
                 .bind(number)
                 .bind(run.to_string())

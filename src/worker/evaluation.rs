@@ -64,18 +64,19 @@ impl Job for EvaluationJob {
         };
         Ok(Box::new(move |sink| {
             let mut cancelled = false;
-            let evaluated = evaluate(&train, &test, &truth, &options, &mut |step: &evaluation::Progress<'_>| {
-                let flow = sink.update(|progress| {
-                    *progress = EvaluationProgress {
-                        phase: step.phase.to_owned(),
-                        steps_done: step.done,
-                        steps: step.planned,
-                        remaining_s: sink.remaining_s(step.done, step.planned),
-                    };
+            let evaluated =
+                evaluate(&train, &test, &truth, &options, &mut |step: &evaluation::Progress<'_>| {
+                    let flow = sink.update(|progress| {
+                        *progress = EvaluationProgress {
+                            phase: step.phase.to_owned(),
+                            steps_done: step.done,
+                            steps: step.planned,
+                            remaining_s: sink.remaining_s(step.done, step.planned),
+                        };
+                    });
+                    cancelled |= flow.is_break();
+                    flow
                 });
-                cancelled |= flow.is_break();
-                flow
-            });
             if cancelled { Evaluated::Cancelled } else { Evaluated::Completed(evaluated.map(|it| it.report)) }
         }))
     }

@@ -23,6 +23,7 @@ const LAYERS: &[(&str, u32)] = &[
     ("simulation", 4),
     ("evaluation", 5),
     ("app", 6),
+    ("paper_experiments", 6),
     ("worker", 7),
     ("status", 7),
     ("http", 8),

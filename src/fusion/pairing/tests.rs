@@ -34,14 +34,10 @@ fn received(name: Option<&str>, seconds: f64, longitude_deg: f64) -> ReceivedFix
     ReceivedFix { time: at_s(seconds), receiver_id: name.map(receiver), fix: Fix { position, sigma_m: None } }
 }
 
-fn columns(name: &str) -> Option<Vec<Vec<String>>> {
+fn columns(name: &str) -> Vec<Vec<String>> {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
-    if !path.exists() {
-        println!("skipped: ../shared/data/square/{name} is not there");
-        return None;
-    }
     let mut reader = csv::Reader::from_path(path).expect("readable");
-    Some(reader.records().map(|row| row.expect("a row").iter().map(str::to_owned).collect()).collect())
+    reader.records().map(|row| row.expect("a row").iter().map(str::to_owned).collect()).collect()
 }
 
 fn number(row: &[String], column: usize) -> f64 {
@@ -65,9 +61,9 @@ fn fixed(row: &[String], column: usize) -> Fix {
 }
 
 /// The square's boxes and fixes, unpaired.
-fn square() -> Option<(Vec<Detection>, Vec<ReceivedFix>)> {
-    let detections = columns("detections.csv")?.iter().map(|row| boxed(row)).collect();
-    let fixes = columns("gnss.csv")?
+fn square() -> (Vec<Detection>, Vec<ReceivedFix>) {
+    let detections = columns("detections.csv").iter().map(|row| boxed(row)).collect();
+    let fixes = columns("gnss.csv")
         .iter()
         .map(|row| ReceivedFix {
             time: parse_time(&row[0]).expect("a time"),
@@ -75,7 +71,7 @@ fn square() -> Option<(Vec<Detection>, Vec<ReceivedFix>)> {
             fix: fixed(row, 1),
         })
         .collect();
-    Some((detections, fixes))
+    (detections, fixes)
 }
 
 fn carried_by(name: &str, phone: &str, offset_s: f64) -> Receivers {
@@ -85,8 +81,9 @@ fn carried_by(name: &str, phone: &str, offset_s: f64) -> Receivers {
 }
 
 #[test]
-fn the_paired_file_of_the_square_comes_back_row_by_row() {
-    let (Some((detections, fixes)), Some(paired)) = (square(), columns("training.csv")) else { return };
+#[ignore = "needs ../shared/data"]
+fn shared_files_are_paired_to_the_paired_file() {
+    let ((detections, fixes), paired) = (square(), columns("training.csv"));
     let expected: Vec<(Detection, Fix)> = paired.iter().map(|row| (boxed(row), fixed(row, 6))).collect();
     let (boxes, all_fixes) = (detections.len(), fixes.len());
     let receivers = carried_by("person-1", "phone", 0.0);
@@ -101,8 +98,9 @@ fn the_paired_file_of_the_square_comes_back_row_by_row() {
 }
 
 #[test]
-fn the_squares_clocks_agree_and_a_shifted_one_is_found() {
-    let Some((detections, fixes)) = square() else { return };
+#[ignore = "needs ../shared/data"]
+fn shared_clocks_agree_and_a_shifted_one_is_found() {
+    let (detections, fixes) = square();
     let plain: Vec<(Timestamp, Fix)> = fixes.iter().map(|it| (it.time, it.fix)).collect();
     let own = estimate_clock_offset(&detections, &plain, &OffsetSearch::default()).expect("he walks");
     println!("{own:?}");

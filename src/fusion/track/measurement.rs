@@ -1,6 +1,7 @@
 //! Input of a track: measured positions with their error covariances, and why some are rejected.
 
 use jiff::Timestamp;
+use strum::IntoStaticStr;
 
 use crate::fusion::plane_covariance::PlaneCovariance;
 use crate::geo::EastNorth;
@@ -34,7 +35,8 @@ pub struct Measurement {
 }
 
 /// The sensor that a measured position comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
 pub enum MeasurementSource {
     /// The bounding box, through the camera's model.
     Regressed,
@@ -45,16 +47,14 @@ pub enum MeasurementSource {
 impl MeasurementSource {
     /// Name in logs, metrics and wire formats.
     #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Regressed => "regressed",
-            Self::Fix => "fix",
-        }
+    pub fn as_str(self) -> &'static str {
+        self.into()
     }
 }
 
 /// Why a measured position did not update the track.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
 pub enum RejectionReason {
     /// Its NIS exceeds the chi-square gate.
     OutsideGate,
@@ -72,13 +72,8 @@ impl RejectionReason {
 
     /// Name in logs, metrics and wire formats.
     #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::OutsideGate => "outside_gate",
-            Self::TooLate => "too_late",
-            Self::Duplicate => "duplicate",
-            Self::UnusableVariance => "unusable_variance",
-        }
+    pub fn as_str(self) -> &'static str {
+        self.into()
     }
 }
 

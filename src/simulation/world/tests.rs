@@ -26,7 +26,7 @@ fn the_airport_has_the_papers_noise_and_rows() {
 
 #[test]
 fn a_world_is_a_function_of_its_options() {
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let options = Options { samples: 300, ..Options::new(scene) };
         assert_eq!(simulate(&options), simulate(&options));
         let other = simulate(&Options { seed: 2, ..options.clone() });
@@ -36,7 +36,7 @@ fn a_world_is_a_function_of_its_options() {
 
 #[test]
 fn every_box_is_in_its_image_and_far_targets_are_smaller() {
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let world = simulate(&Options { samples: 2_000, border_cuts: false, ..Options::new(scene) });
         assert_eq!(world.rows.len(), 2_000, "{scene}");
         let mut by_distance: Vec<(f64, f64)> = Vec::new();

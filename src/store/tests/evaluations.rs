@@ -197,7 +197,7 @@ async fn samples_are_found_by_their_place_and_truths_counted() {
         let truth = (n % 3 == 0).then(|| place(120.0));
         Sample { truth, ..sample(n / 2, if n % 2 == 0 { "a" } else { "b" }) }
     });
-    store.insert_samples(&fixture.camera, samples.collect()).await.expect("stored");
+    store.insert_samples(&fixture.camera, samples.collect(), Durability::Synced).await.expect("stored");
     let time = async |before| store.sample_time(&fixture.camera, before).await.expect("works");
     assert_eq!(time(0).await, Some(at(0)));
     assert_eq!((time(3).await, time(4).await), (Some(at(1)), Some(at(2))));

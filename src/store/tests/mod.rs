@@ -14,8 +14,8 @@ use uuid::Uuid;
 
 use super::Store;
 use crate::domain::{
-    BoundingBox, CameraId, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg, Recipe,
-    Result, RunId, Sample, TargetId, TrainingOptions,
+    BoundingBox, CameraId, Durability, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg,
+    Recipe, Result, RunId, Sample, TargetId, TrainingOptions,
 };
 use crate::geo::Position;
 
@@ -122,7 +122,7 @@ async fn futures_can_move_between_threads() {
     movable(store.ping());
     movable(store.cameras(Some(&camera), 1));
     movable(store.delete_camera(&camera, None));
-    movable(store.insert_samples(&camera, Vec::new()));
+    movable(store.insert_samples(&camera, Vec::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));
     movable(store.delete_samples(&camera, &filter));
     movable(store.insert_run(run, &camera, &options(), 1, at(0)));

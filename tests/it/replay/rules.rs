@@ -69,14 +69,14 @@ async fn run(fake: &Fake, options: ReplayOptions) -> Report {
         let sum = report.acknowledged.expect("asked for") + report.unacknowledged.expect("asked for");
         assert_eq!(sum, report.items, "{report:?}");
     }
-    assert_eq!(fake.seen().broken_rules, BTreeSet::new());
+    assert_eq!(fake.received().violations, BTreeSet::new());
     assert!(!report.to_string().is_empty());
     report
 }
 
 /// The seqs of all committed items.
 fn committed_seqs(fake: &Fake) -> BTreeSet<u64> {
-    fake.seen().committed.iter().map(|(seq, ..)| *seq).collect()
+    fake.received().committed.iter().map(|(seq, ..)| *seq).collect()
 }
 
 fn acknowledging(every: u64) -> Script {
@@ -92,21 +92,23 @@ async fn unacknowledged_items_are_sent_again_after_every_break() {
     assert_eq!((report.items, report.answered, report.streams, report.reconnects), (200, 200, 4, 3));
     assert_eq!(report.broken.values().sum::<u64>(), 3);
     assert_eq!(committed_seqs(&fake), (1..=200).collect());
-    let seen = fake.seen();
-    assert_eq!(seen.committed.len(), 200, "what was committed is not sent again");
-    let resumed: Vec<_> = seen.openings.iter().map(|opening| opening.resume_after_seq).collect();
+    let received = fake.received();
+    assert_eq!(received.committed.len(), 200, "what was committed is not sent again");
+    let resumed: Vec<_> = received.openings.iter().map(|opening| opening.resume_after_seq).collect();
     assert_eq!(resumed, [0, 15, 15, 40], "17 items, then 1 more, then 30 more, acknowledged by fives");
     assert!(report.resent >= 8, "{report:?}");
 }
 
 #[tokio::test]
 async fn a_requested_reconnect_resends_nothing() {
-    let fake = Fake::start([Script { invite_after: Some(50), ..acknowledging(7) }, acknowledging(7)]).await;
+    let fake =
+        Fake::start([Script { request_reconnect_after: Some(50), ..acknowledging(7) }, acknowledging(7)])
+            .await;
     let report = run(&fake, options(&fake)).await;
     assert!(report.is_complete(), "{report:?}");
     assert_eq!((report.invitations, report.reconnects, report.resent), (1, 1, 0));
     assert!(report.broken.is_empty(), "{report:?}");
-    assert_eq!(fake.seen().items, 200);
+    assert_eq!(fake.received().items, 200);
     assert_eq!(committed_seqs(&fake), (1..=200).collect());
 }
 
@@ -116,8 +118,8 @@ async fn without_acknowledgements_only_unanswered_items_are_sent_again() {
     let report = run(&fake, ReplayOptions { store_samples: false, ..options(&fake) }).await;
     assert!(report.is_complete(), "{report:?}");
     assert_eq!((report.answered, report.acknowledged, report.unacknowledged), (200, None, None));
-    assert_eq!(fake.seen().openings[1].resume_after_seq, 60);
-    assert_eq!(fake.seen().items, 200);
+    assert_eq!(fake.received().openings[1].resume_after_seq, 60);
+    assert_eq!(fake.received().items, 200);
 }
 
 #[tokio::test]
@@ -174,14 +176,14 @@ async fn simulated_cameras_that_share_one_are_distinct_clients_with_distinct_tar
         run(&fake, ReplayOptions { cameras: 5, camera_ids: ids, repetitions, ..options(&fake) }).await;
     assert!(report.is_complete(), "{report:?}");
     assert_eq!((report.items, report.streams), (2_000, 5));
-    let seen = fake.seen();
-    let clients: BTreeSet<_> = seen.openings.iter().map(|opening| opening.client_name.clone()).collect();
+    let received = fake.received();
+    let clients: BTreeSet<_> = received.openings.iter().map(|opening| opening.client_name.clone()).collect();
     assert_eq!(clients.len(), 5);
-    assert_eq!(seen.openings.iter().filter(|opening| opening.camera_id == "yard").count(), 3);
+    assert_eq!(received.openings.iter().filter(|opening| opening.camera_id == "yard").count(), 3);
     // Target and time are unique within each of the two cameras: 3 targets in one, 2 in the other.
-    let targets: BTreeSet<_> = seen.committed.iter().map(|(_, target, _)| target.as_str()).collect();
+    let targets: BTreeSet<_> = received.committed.iter().map(|(_, target, _)| target.as_str()).collect();
     assert_eq!(targets, BTreeSet::from(["person-1", "person-1@1", "person-1@2"]));
-    let times: BTreeSet<_> = seen.committed.iter().map(|(_, target, time)| (target, time)).collect();
+    let times: BTreeSet<_> = received.committed.iter().map(|(_, target, time)| (target, time)).collect();
     assert_eq!(times.len(), 3 * 400, "times are unique per target");
 }
 
@@ -194,10 +196,10 @@ async fn injected_faults_change_only_what_is_sent() {
     let injected = report.injected;
     assert!(injected.lost > 0 && injected.duplicated > 0 && injected.reordered > 0, "{report:?}");
     assert_eq!(report.items, 200 - injected.lost + injected.duplicated);
-    let seen = fake.seen();
-    let times: BTreeSet<_> = seen.committed.iter().map(|(_, _, time)| *time).collect();
+    let received = fake.received();
+    let times: BTreeSet<_> = received.committed.iter().map(|(_, _, time)| *time).collect();
     assert_eq!(times.len() as u64, 200 - injected.lost);
-    let in_order = seen.committed.is_sorted_by_key(|(_, _, time)| *time);
+    let in_order = received.committed.is_sorted_by_key(|(_, _, time)| *time);
     assert!(!in_order, "some came late");
 }
 

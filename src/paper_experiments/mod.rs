@@ -1,65 +1,102 @@
-//! The paper's experiments, and those this project adds, as one page of figures.
+//! The experiments of the paper, and further ones of this project, as a Markdown page of results
+//! (docs/accuracy.md).
 //!
-//! What never happens here: a choice. Everything is fitted on training rows with the recipes as they
-//! are; the page reports what came out, good or bad.
+//! All models are fitted on training rows with the recipes unchanged; nothing is selected by test
+//! results. What never happens here: I/O.
 
+mod ablations;
 mod experiments;
-mod trials;
 
 use std::fmt::Write as _;
-use std::path::Path;
 
-use anyhow::Context as _;
-use experiments::{Experiment, Worlds};
+use experiments::Experiment;
 
-use super::{DEFAULT_RECIPE, cpu_s, evaluate_aloud};
-use crate::evaluation::{EvaluateOptions, Evaluation, MethodReport, Metrics};
+use crate::clock::process_cpu_s;
+use crate::domain::{Recipe, Sample};
+use crate::evaluation::{EvaluateOptions, Evaluation, MethodReport, Metrics, TestRow, Truth};
 
-/// Epochs whose Es is shown.
+pub use experiments::Worlds;
+
+/// Epochs whose Es is listed.
 const SHOWN_EPOCHS: [u32; 8] = [1, 2, 5, 10, 20, 50, 100, 200];
 
-/// Runs everything and writes the page.
-pub(super) fn run(shared_data: Option<&Path>, out: &Path, first: u64, count: u64) -> anyhow::Result<()> {
-    let worlds = Worlds { first, count };
+/// The recipe of tracks, and the default recipe of a camera.
+const DEFAULT_RECIPE: Recipe = Recipe::Auto;
+
+/// A recording of a real camera with a surveyed line as ground truth.
+pub struct RealRecording {
+    /// Its samples, in order of time.
+    pub samples: Vec<Sample>,
+    /// The surveyed line.
+    pub truth: Truth,
+}
+
+/// Runs evaluations and shows the progress.
+pub trait Runner {
+    /// Evaluates methods on training and test rows.
+    ///
+    /// # Errors
+    /// The evaluation's own.
+    fn evaluate(
+        &mut self,
+        train: &[Sample],
+        test: &[TestRow],
+        truth: &Truth,
+        options: &EvaluateOptions,
+    ) -> anyhow::Result<Evaluation>;
+
+    /// Reports the experiment that begins.
+    fn begin(&mut self, experiment: &str);
+}
+
+/// Runs all experiments and returns the page.
+///
+/// # Errors
+/// An evaluation or a fit that fails.
+pub fn page(
+    worlds: Worlds,
+    recording: Option<&RealRecording>,
+    runner: &mut dyn Runner,
+) -> anyhow::Result<String> {
+    let Worlds { first, count } = worlds;
     let mut page = String::from(HEAD);
-    let data = shared_data.map_or_else(String::new, |_| " --shared-data DIR".to_owned());
+    let shared_data = if recording.is_some() { " --shared-data DIR" } else { "" };
     // Writing to a string cannot fail.
-    let _ =
-        writeln!(page, "Made by `sightfix evaluate --paper --seeds {count} --first-world {first}{data}`.\n");
+    let _ = writeln!(
+        page,
+        "Made by `sightfix evaluate --paper --seeds {count} --first-world {first}{shared_data}`.\n"
+    );
     let mut experiments = experiments::simulated(worlds)?;
-    if let Some(folder) = shared_data {
-        experiments.extend(experiments::real_square(folder, count)?);
+    if let Some(recording) = recording {
+        experiments.extend(experiments::real_square(recording, count)?);
     }
     let mut group = "";
     let mut pooled = Vec::new();
     for (number, experiment) in experiments.iter().enumerate() {
-        eprintln!("experiment {} of {}: {}", number + 1, experiments.len(), experiment.title);
+        let title = &experiment.title;
+        runner.begin(&format!("experiment {} of {}: {title}", number + 1, experiments.len()));
         if experiment.group != group {
             pool(&mut page, &mut pooled);
             group = experiment.group;
             let _ = writeln!(page, "## {group}\n");
         }
-        let evaluation = over_worlds(experiment)?;
+        let evaluation = over_worlds(experiment, runner)?;
         section(&mut page, experiment, &evaluation);
         if experiment.pooled {
             pooled.push(evaluation);
         }
     }
     pool(&mut page, &mut pooled);
-    trials::tables(&mut page, worlds)?;
-    if let Some(folder) = out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
-    }
-    std::fs::write(out, &page).with_context(|| format!("cannot write {}", out.display()))?;
-    println!("{page}");
-    Ok(())
+    ablations::tables(&mut page, worlds, runner)?;
+    Ok(page)
 }
 
-/// Every world of an experiment by itself, then the means over worlds; curves are the first one's.
-fn over_worlds(experiment: &Experiment) -> anyhow::Result<Evaluation> {
+/// Evaluates every world of an experiment, and averages over worlds; learning curves are those of the
+/// first.
+fn over_worlds(experiment: &Experiment, runner: &mut dyn Runner) -> anyhow::Result<Evaluation> {
     let mut evaluations = Vec::new();
     for world in &experiment.worlds {
-        evaluations.push(evaluate_aloud(
+        evaluations.push(runner.evaluate(
             &world.train,
             &world.test,
             &experiment.truth,
@@ -71,7 +108,7 @@ fn over_worlds(experiment: &Experiment) -> anyhow::Result<Evaluation> {
                 image_size: world.image_size,
                 gnss_sigma: Some(experiment.gnss_sigma),
                 box_shift_px: experiment.box_shift_px,
-                cpu_s,
+                cpu_s: process_cpu_s,
             },
         )?);
     }
@@ -127,9 +164,9 @@ something only over many worlds.
 
 ";
 
-/// One experiment: what was done, the table, and Es per epoch where it is asked for.
+/// The section of one experiment: description, table, and Es per epoch if requested.
 fn section(page: &mut String, experiment: &Experiment, evaluation: &Evaluation) {
-    let _ = writeln!(page, "### {}\n\n{}\n", experiment.title, experiment.what);
+    let _ = writeln!(page, "### {}\n\n{}\n", experiment.title, experiment.description);
     let _ = writeln!(
         page,
         "{} {}, {} training rows and {} test rows in the first, receiver sigma {} m per axis.\n",
@@ -190,7 +227,7 @@ fn curves(page: &mut String, evaluation: &Evaluation) {
     page.push('\n');
 }
 
-/// The experiments of a group taken together, each row of equal weight.
+/// The table of all experiments of a group together, every row with equal weight.
 fn pool(page: &mut String, evaluations: &mut Vec<Evaluation>) {
     let Some(first) = evaluations.first().filter(|_| evaluations.len() > 1) else {
         evaluations.clear();

@@ -1,27 +1,25 @@
-//! What is tried: worlds, recordings, and the methods worth comparing on each.
+//! The experiments: their worlds or recordings, and the methods compared on each.
 
-use std::path::Path;
-
-use anyhow::Context as _;
 use jiff::{SignedDuration, Timestamp};
 
+use super::RealRecording;
 use crate::domain::{ImageSize, Observation, Sample, SigmaM};
 use crate::evaluation::{Method, TestRow, Truth};
 use crate::simulation::{Options, Route, Scene, World, simulate};
 
-/// A hole in the recordings longer than this ends a stretch of time.
-const STRETCH_HOLE: SignedDuration = SignedDuration::from_mins(10);
-/// Fewer rows than this make no stretch of their own to test on.
-const FEWEST_STRETCH_ROWS: usize = 300;
-/// Standard deviation per axis of the recordings' receiver, m: 2.7 m mean error at a fixed point
-/// (METHOD.md section 1) over sqrt(pi / 2).
+/// A gap in a recording longer than this separates sessions.
+const MAX_GAP: SignedDuration = SignedDuration::from_mins(10);
+/// Sessions with fewer rows are not used as test sets.
+const MIN_SESSION_ROWS: usize = 300;
+/// Standard deviation per axis of the recordings' receiver, m: 2.7 m mean error at a fixed point,
+/// divided by sqrt(pi / 2).
 const REAL_SIGMA_M: f64 = 2.2;
 
-/// The methods that a user would choose among.
+/// The methods between which a user chooses.
 const DEFAULTS: &str =
     "gnss,imm_ukf,homography.denied,auto.one_step,auto.two_step,auto.denied,track,track.denied";
 
-/// Rows to learn from and rows to be tried on, of one camera.
+/// Training and test rows of one camera.
 pub(super) struct Split {
     pub(super) train: Vec<Sample>,
     pub(super) test: Vec<TestRow>,
@@ -29,26 +27,29 @@ pub(super) struct Split {
 }
 
 impl Split {
-    /// The world of a seed, with a camera of that seed, and its test rows on a route.
+    /// The world of a seed, also the camera's, with test rows on a route.
     pub(super) fn of_world(base: &Options, seed: u64, test_rows: usize, route: Route) -> Self {
         let train = Options { seed, camera_seed: seed, ..base.clone() };
-        let learnt = simulate(&train);
-        let tried = simulate(&Options { route, ..train.test(test_rows) });
+        let train_world = simulate(&train);
+        let test_world = simulate(&Options { route, ..train.test(test_rows) });
         Self {
-            train: learnt.training_samples(),
-            test: test_rows_of(&tried),
-            image_size: Some(learnt.image_size),
+            train: train_world.training_samples(),
+            test: test_rows_of(&test_world),
+            image_size: Some(train_world.image_size),
         }
     }
 }
 
-/// The methods whose answer may hang on a seed.
+/// The methods whose results may depend on the training seed.
 const SEEDED: &str = "auto.one_step,auto.two_step,track";
-/// Seeds of simulated worlds: so many from the first on.
+
+/// Consecutive seeds of simulated worlds.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Worlds {
-    pub(super) first: u64,
-    pub(super) count: u64,
+pub struct Worlds {
+    /// The first seed.
+    pub first: u64,
+    /// Number of worlds.
+    pub count: u64,
 }
 
 impl Worlds {
@@ -56,7 +57,7 @@ impl Worlds {
         (0..self.count).map(move |at| self.first.wrapping_add(at))
     }
 
-    /// So many times as many.
+    /// The same with a multiple of worlds.
     const fn times(self, factor: u64) -> Self {
         Self { count: self.count * factor, ..self }
     }
@@ -66,24 +67,24 @@ impl Worlds {
 pub(super) struct Experiment {
     pub(super) group: &'static str,
     pub(super) title: String,
-    pub(super) what: String,
-    /// The same with files, where `simulate` and `evaluate` can do it.
+    pub(super) description: String,
+    /// Commands that reproduce the experiment, where `simulate` and `evaluate` can.
     pub(super) command: Option<String>,
-    /// One world for each seed, or the one recording for all.
+    /// One per seed, or one recording.
     pub(super) worlds: Vec<Split>,
-    /// Seeds of training, each on every world.
+    /// Number of training seeds on every world.
     pub(super) seeds: u64,
     pub(super) truth: Truth,
     pub(super) gnss_sigma: SigmaM,
     pub(super) box_shift_px: f64,
     pub(super) methods: Vec<Method>,
     pub(super) show_curves: bool,
-    /// Whether the group has a table of all its experiments together.
+    /// Whether the group has a table over all its experiments.
     pub(super) pooled: bool,
 }
 
 impl Experiment {
-    /// An experiment on simulated worlds; `flags` is what the commands need beyond the scene.
+    /// An experiment on simulated worlds; `flags` are the flags of `simulate` beyond the scene.
     fn simulated(
         group: &'static str,
         title: &str,
@@ -106,7 +107,7 @@ impl Experiment {
         Ok(Self {
             group,
             title: title.to_owned(),
-            what: String::new(),
+            description: String::new(),
             command: Some(command),
             worlds: splits,
             seeds: 1,
@@ -133,11 +134,11 @@ fn test_rows_of(world: &World) -> Vec<TestRow> {
     world.rows.iter().map(test_row).collect()
 }
 
-/// Everything on simulated worlds; each table is over so many of them.
+/// All experiments on simulated worlds.
 pub(super) fn simulated(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     let mut all = tables_of_the_paper(worlds)?;
     all.extend(other_conditions(worlds)?);
-    all.extend(few_passes(worlds)?);
+    all.extend(few_traverses(worlds)?);
     all.extend(training_seeds(worlds)?);
     Ok(all)
 }
@@ -149,7 +150,7 @@ fn tables_of_the_paper(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     let square = Options::new(Scene::Square);
     let lines = (&airport, 400, Route::Lines);
     let mut one = Experiment::simulated(GROUP, "Scenario 1: airport", lines, worlds, "")?;
-    one.what =
+    one.description =
         "Table 1 of the paper has GNSS 36.95, IMM-UKF 25.42, DNN 27.32, one-step 15.95, two-step 17.67 m."
             .to_owned();
     one.methods = Method::all();
@@ -173,23 +174,23 @@ fn tables_of_the_paper(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     Ok(all)
 }
 
-/// One place tells little, for its 450 rows hold about six independent fixes; so four times as many
-/// worlds.
+/// Four times as many worlds: the 450 rows of one place contain only about six independent fixes.
 fn standing(square: &Options, worlds: Worlds) -> anyhow::Result<Experiment> {
     const GROUP: &str = "Standing, and Table 2 (denied)";
     let base = Options { samples: 4_000, ..square.clone() };
     let test = (&base, 450, Route::Standing);
     let title = "Scenario 2: standing at a fixed point, each world another camera and place";
     let mut one = Experiment::simulated(GROUP, title, test, worlds.times(4), " --test-route standing")?;
-    one.what = "Table 1 of the paper has GNSS 2.72, IMM-UKF 2.02, DNN 3.03, one-step 2.00, two-step 1.87 m; \
+    one.description =
+        "Table 1 of the paper has GNSS 2.72, IMM-UKF 2.02, DNN 3.03, one-step 2.00, two-step 1.87 m; \
                 Table 2 has, denied, mean/variance/max DNN 3.02/0.01/3.57, one-step 2.40/0.004/2.86. Here \
                 the variance is the mean of those within each place."
-        .to_owned();
+            .to_owned();
     one.methods = Method::all();
     Ok(one)
 }
 
-/// What real cameras suffer: its name, the flags of the commands, the options.
+/// Disturbances of real cameras: name, flags of `simulate`, options.
 pub(super) fn conditions(scene: Scene) -> [(&'static str, &'static str, Options); 8] {
     let base = Options { samples: 4_000, ..Options::new(scene) };
     [
@@ -211,7 +212,7 @@ pub(super) fn conditions(scene: Scene) -> [(&'static str, &'static str, Options)
 fn other_conditions(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     const GROUP: &str = "Other conditions on simulated worlds";
     let mut all = Vec::new();
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         for (name, flags, options) in conditions(scene) {
             let title = format!("{scene}: {name}");
             let test = (&options, 1_000, Route::Lines);
@@ -221,16 +222,16 @@ fn other_conditions(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     Ok(all)
 }
 
-/// Four passes of ten boxes each.
-fn few_passes(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
+/// Four traverses of ten boxes each.
+fn few_traverses(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     const GROUP: &str = "Few passes: 4 passes, 40 boxes";
     let mut all = Vec::new();
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let base = Options { samples: 600, ..Options::new(scene) };
         let mut one =
             Experiment::simulated(GROUP, scene.as_str(), (&base, 1_000, Route::Lines), worlds.times(2), "")?;
         for world in &mut one.worlds {
-            world.train = forty_of_four_passes(&world.train);
+            world.train = forty_rows_of_four_traverses(&world.train);
         }
         one.command = None;
         all.push(one);
@@ -238,11 +239,11 @@ fn few_passes(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     Ok(all)
 }
 
-/// The first world with several seeds of training.
+/// The first world with several training seeds.
 fn training_seeds(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     const GROUP: &str = "Seeds of training alone, one world";
     let mut all = Vec::new();
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let plain = [("as it is", "", Options { samples: 4_000, ..Options::new(scene) })];
         let harder = conditions(scene);
         let chosen = harder.into_iter().filter(|(name, ..)| ["5 % outliers", "6 targets"].contains(name));
@@ -260,39 +261,35 @@ fn training_seeds(worlds: Worlds) -> anyhow::Result<Vec<Experiment>> {
     Ok(all)
 }
 
-/// Ten rows, evenly spread, of each of the first four passes.
-fn forty_of_four_passes(samples: &[Sample]) -> Vec<Sample> {
-    let together = |one: &Sample, next: &Sample| next.time.duration_since(one.time).as_secs() < 20;
-    let passes = samples.chunk_by(together).take(4);
-    let ten = |pass: &[Sample]| {
-        (0..10).filter_map(|index| pass.get(index * pass.len() / 10).cloned()).collect::<Vec<_>>()
+/// Ten evenly spaced rows of each of the first four traverses.
+fn forty_rows_of_four_traverses(samples: &[Sample]) -> Vec<Sample> {
+    let is_same = |one: &Sample, next: &Sample| next.time.duration_since(one.time).as_secs() < 20;
+    let traverses = samples.chunk_by(is_same).take(4);
+    let ten = |traverse: &[Sample]| {
+        (0..10).filter_map(|index| traverse.get(index * traverse.len() / 10).cloned()).collect::<Vec<_>>()
     };
-    passes.flat_map(ten).collect()
+    traverses.flat_map(ten).collect()
 }
 
-/// The real square, each stretch of time told by a model of the others.
-pub(super) fn real_square(folder: &Path, seeds: u64) -> anyhow::Result<Vec<Experiment>> {
-    let file = folder.join("square/training.csv");
-    let rows = super::super::read_train(&file, None)?;
-    let line = folder.join("square/truth_line.geojson");
-    let text = std::fs::read_to_string(&line).with_context(|| format!("cannot read {}", line.display()))?;
-    let truth = Truth::from_geojson(&text)?;
-    let together = |one: &Sample, next: &Sample| next.time.duration_since(one.time) < STRETCH_HOLE;
-    let stretches: Vec<&[Sample]> =
-        rows.chunk_by(together).filter(|stretch| stretch.len() >= FEWEST_STRETCH_ROWS).collect();
+/// The real square: each session is the test set of a model trained on the others.
+pub(super) fn real_square(recording: &RealRecording, seeds: u64) -> anyhow::Result<Vec<Experiment>> {
+    let RealRecording { samples: rows, truth } = recording;
+    let is_same = |one: &Sample, next: &Sample| next.time.duration_since(one.time) < MAX_GAP;
+    let sessions: Vec<&[Sample]> =
+        rows.chunk_by(is_same).filter(|session| session.len() >= MIN_SESSION_ROWS).collect();
     let mut all = Vec::new();
-    for (index, stretch) in stretches.iter().enumerate() {
-        let (from, until): (Timestamp, Timestamp) = (stretch[0].time, stretch[stretch.len() - 1].time);
+    for (index, session) in sessions.iter().enumerate() {
+        let (from, until): (Timestamp, Timestamp) = (session[0].time, session[session.len() - 1].time);
         let outside = |sample: &&Sample| sample.time < from || sample.time > until;
         all.push(Experiment {
             group: "The real square, by stretches of time",
             title: format!("Stretch {}, {from} to {until}", index + 1),
-            what: "Learnt from the other stretches; the error is the distance to the surveyed line."
+            description: "Trained on the other sessions; the error is the distance to the surveyed line."
                 .to_owned(),
             command: None,
             worlds: vec![Split {
                 train: rows.iter().filter(outside).cloned().collect(),
-                test: stretch.iter().map(test_row).collect(),
+                test: session.iter().map(test_row).collect(),
                 image_size: None,
             }],
             seeds,

@@ -1,13 +1,11 @@
-//! Tables of what a fit does with something changed: the loss's balance, the labels' preparation; and
-//! what the default costs.
-//!
-//! What never happens here: a choice. These tables are read by people, no code reads them.
+//! Ablations: the balance of the loss and the smoothing of labels; and the cost of the default recipe.
 
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
 
+use super::Runner;
 use super::experiments::{Split, Worlds, conditions};
-use crate::cli::evaluate::cpu_s;
+use crate::clock::process_cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;
 use crate::model::network::LossWeights;
@@ -19,18 +17,18 @@ const BALANCES: [(Recipe, [f32; 5]); 2] = [
     (Recipe::Paper, [1.0 / 20.0, 1.0 / 200.0, 1.0 / 2_000.0, 1.0 / 20_000.0, 1.0 / 200_000.0]),
     (Recipe::Hybrid, [50.0, 5.0, 0.5, 0.05, 0.005]),
 ];
-/// Candidates on fixes as they come, and on fixes that a smoother has prepared.
-const PREPARED: [[&str; 2]; 2] =
+/// Candidates on raw labels, and on labels from a kinematic smoother.
+const SMOOTHED: [[&str; 2]; 2] =
     [["projective/sides", "projective/sides+smoothed"], ["hybrid", "hybrid+smoothed"]];
 
-/// All of them.
-pub(super) fn tables(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
-    balance(page, worlds)?;
-    prepared(page, worlds)?;
+/// All ablation tables.
+pub(super) fn tables(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> anyhow::Result<()> {
+    loss_balance(page, worlds, runner)?;
+    label_smoothing(page, worlds, runner)?;
     cost(page, worlds)
 }
 
-fn balance(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
+fn loss_balance(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> anyhow::Result<()> {
     let _ = writeln!(
         page,
         "## Error against the weight ratio wX : wZ\n\nMean error (m) of the regressed position from the box \
@@ -43,7 +41,7 @@ fn balance(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
         for ratio in ratios {
             let weights = LossWeights { reconstruction: ratio, regression: 1.0 };
             let mut cells = String::new();
-            for scene in Scene::ALL {
+            for &scene in Scene::ALL {
                 let overrides = FitOverrides {
                     candidate: Some(recipe.as_str()),
                     loss_weights: Some(in_units(recipe, weights)),
@@ -52,21 +50,21 @@ fn balance(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
                 let _ = write!(cells, " {error_m:.3} |");
             }
             let _ = writeln!(page, "| `{recipe}` | 1 : {} |{cells}", (1e6 / ratio).round() / 1e6);
-            eprintln!("{recipe}, wX : wZ = 1 : {}", (1e6 / ratio).round() / 1e6);
+            runner.begin(&format!("{recipe}, wX : wZ = 1 : {}", (1e6 / ratio).round() / 1e6));
         }
     }
     page.push('\n');
     Ok(())
 }
 
-/// `paper` writes its weights as 1 : 2000, `hybrid` as 0.5 : 1; the steps of Adam hardly know the
-/// difference, but a trial of a recipe's own ratio must be that recipe.
+/// `paper` normalises its weights as 1 : 2000, `hybrid` as 0.5 : 1. Adam is nearly invariant to the scale
+/// of the loss, but a trial with a recipe's own ratio must reproduce that recipe exactly.
 fn in_units(recipe: Recipe, weights: LossWeights) -> LossWeights {
     let unit = if recipe == Recipe::Paper { 1.0 / weights.reconstruction } else { 1.0 };
     LossWeights { reconstruction: unit * weights.reconstruction, regression: unit * weights.regression }
 }
 
-fn prepared(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
+fn label_smoothing(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> anyhow::Result<()> {
     let _ = writeln!(
         page,
         "## Labels prepared by a kinematic smoother, or not\n\nMeans over {} worlds, m: distance to the \
@@ -75,12 +73,12 @@ fn prepared(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
          smoothed | truth, as they come | smoothed |\n|---|---|---|---|---|---|",
         worlds.count
     );
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let sized = |samples: usize| Options { samples, ..Options::new(scene) };
         let cases = [("4,000 rows", "", sized(4_000)), ("300 rows", "", sized(300))];
         let harder = conditions(scene).into_iter().filter(|(name, ..)| name.contains('%'));
         for (name, _, options) in cases.into_iter().chain(harder) {
-            for pair in PREPARED {
+            for pair in SMOOTHED {
                 let mut columns = [String::new(), String::new()];
                 for candidate in pair {
                     let overrides = FitOverrides { candidate: Some(candidate), loss_weights: None };
@@ -90,7 +88,7 @@ fn prepared(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
                 }
                 let _ = writeln!(page, "| {scene}: {name} | `{}` |{}{}", pair[0], columns[0], columns[1]);
             }
-            eprintln!("labels prepared or not: {scene}: {name}");
+            runner.begin(&format!("label smoothing: {scene}: {name}"));
         }
     }
     page.push('\n');
@@ -105,14 +103,14 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
          |---|---|---|",
         worlds.count
     );
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let (mut most_s, mut most_bytes) = (0.0f64, 0);
         for seed in worlds.seeds() {
             let base = Options::new(scene);
             let world = Split::of_world(&base, seed, 1, Route::Lines);
-            let begun_s = cpu_s();
-            let artifact = learn(&world, &base, Recipe::Auto, FitOverrides::default())?;
-            most_s = most_s.max(cpu_s() - begun_s);
+            let started_s = process_cpu_s();
+            let artifact = train(&world, &base, Recipe::Auto, FitOverrides::default())?;
+            most_s = most_s.max(process_cpu_s() - started_s);
             most_bytes = most_bytes.max(artifact.weights.len());
         }
         let _ = writeln!(page, "| {scene} | {most_s:.2} | {most_bytes} |");
@@ -121,7 +119,7 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Held-out distance to fixes and true error (m) of a trial, means over worlds.
+/// Mean held-out distance to the fixes and mean true error (m) of a fit over the worlds.
 fn mean_over(
     base: &Options,
     worlds: Worlds,
@@ -131,14 +129,14 @@ fn mean_over(
     let (mut held_out_m, mut error_m) = (0.0, 0.0);
     for seed in worlds.seeds() {
         let world = Split::of_world(base, seed, 1_000, Route::Lines);
-        let artifact = learn(&world, base, recipe, overrides)?;
+        let artifact = train(&world, base, recipe, overrides)?;
         held_out_m += artifact.metadata.held_out.as_ref().map_or(f64::NAN, |found| found.mean_to_fix_m);
         let regressor = artifact.load()?;
         let (mut sum_m, mut count) = (0.0, 0.0);
         for row in &world.test {
             let (Some(drawn), Some(truth)) = (&row.observation.bounding_box, row.truth) else { continue };
-            let told = regressor.plane().to_position(regressor.regress(drawn, None).regressed);
-            sum_m += distance_m(truth, told);
+            let position = regressor.plane().to_position(regressor.regress(drawn, None).regressed);
+            sum_m += distance_m(truth, position);
             count += 1.0;
         }
         error_m += sum_m / count;
@@ -146,7 +144,7 @@ fn mean_over(
     Ok((held_out_m / worlds.count as f64, error_m / worlds.count as f64))
 }
 
-fn learn(
+fn train(
     world: &Split,
     base: &Options,
     recipe: Recipe,

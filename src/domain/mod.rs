@@ -33,7 +33,7 @@ pub use gnss_error::{GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};
 pub use method::{InferenceMode, Method};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
-pub use noise::GaussMarkovNoise;
+pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;

@@ -5,10 +5,10 @@ use super::options::{EvaluateOptions, TestRow};
 use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, Sample, SigmaM};
 use crate::filters::ImmUkf;
-use crate::fusion::track::{MeasuredPosition, Measurement, Track, TrackSettings, traverses};
+use crate::fusion::track::{MeasuredPosition, Measurement, Track, TrackSettings};
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, Regressor};
+use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, Regressor, fix_sequences};
 
 /// Standard deviation per axis assumed for a receiver whose error is unknown, m.
 const UNKNOWN_RECEIVER_SIGMA_M: f64 = 5.0;
@@ -127,7 +127,7 @@ impl<'a> Predictors<'a> {
         'a: 'b,
     {
         let variance_m2 = self.gnss_variance_m2(None);
-        let tuned = imm_ukf::tune(&traverses(self.train, &self.plane), variance_m2);
+        let tuned = imm_ukf::tune(&fix_sequences(self.train, &self.plane), variance_m2);
         let (plane, test) = (self.plane, self.test);
         Box::new(move |target| {
             let mut filter = ImmUkf::new(tuned);
@@ -195,7 +195,7 @@ impl<'a> Predictors<'a> {
     where
         'a: 'b,
     {
-        let settings = TrackSettings::estimate(self.train, regressor);
+        let settings = TrackSettings::from_model(regressor);
         let (plane, test) = (*regressor.plane(), self.test);
         Box::new(move |target| {
             let mut track: Option<Track> = None;

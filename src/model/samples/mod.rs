@@ -2,4 +2,5 @@
 
 pub(crate) mod rows;
 pub(crate) mod second_differences;
+pub(crate) mod sequences;
 pub(crate) mod whitening;

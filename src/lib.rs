@@ -19,6 +19,7 @@ pub mod replay;
 pub mod server;
 pub mod shutdown;
 pub mod simulation;
+pub mod statistics;
 pub mod status;
 pub mod store;
 pub mod telemetry;

@@ -9,8 +9,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use sightfix::domain::{GnssError, Recipe, SigmaM};
 use sightfix::model::FitOptions;
-use sightfix::model::net::{Activation, NetShape};
-use sightfix::model::train::{LossWeights, Schedule, TrainingSet, train};
+use sightfix::model::network::{Activation, LossWeights, NetShape, Schedule, TrainingSet, train};
 use sightfix::simulation::{Options, Scene, simulate};
 
 use crate::ratio::{self, in_turn, median};
@@ -69,8 +68,8 @@ fn training_set(rng: &mut ChaCha8Rng) -> TrainingSet {
         straight.iter().zip(bent).map(|(straight, bent)| 0.7 * straight + 0.3 * bent * bent).collect()
     };
     TrainingSet {
-        rebuilt: inputs.clone(),
-        targets: [target(0), target(1)],
+        reconstruction_targets: inputs.clone(),
+        position_targets: [target(0), target(1)],
         inputs,
         weights: vec![1.0; SAMPLES],
     }

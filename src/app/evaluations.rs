@@ -5,8 +5,8 @@ use jiff::{SignedDuration, Timestamp};
 use super::training::check_extent;
 use super::{App, Page, page_of};
 use crate::domain::{
-    Camera, CameraId, Error, EvaluationId, EvaluationJob, EvaluationPlan, GnssError, Method, Result, SigmaM,
-    Step, TimeRange, Truth,
+    Camera, CameraId, Error, EvaluationId, EvaluationJob, EvaluationPlan, GnssError, InferenceMode, Method,
+    Result, SigmaM, TimeRange, Truth,
 };
 use crate::store::SampleFilter;
 
@@ -100,8 +100,8 @@ impl App {
     async fn plan(&self, camera: &Camera, request: EvaluationRequest) -> Result<EvaluationPlan> {
         let recipe = camera.profile.recipe;
         let methods = request.methods.unwrap_or_else(|| {
-            let of_recipe =
-                [Step::OneStep, Step::TwoStep, Step::Denied].map(|step| Method::Recipe(recipe, step));
+            let of_recipe = [InferenceMode::OneStep, InferenceMode::TwoStep, InferenceMode::Denied]
+                .map(|step| Method::Recipe(recipe, step));
             let baselines = [Method::Gnss, Method::ImmUkf, Method::HomographyDenied];
             let tracks = [Method::Track, Method::TrackDenied];
             baselines.into_iter().chain(of_recipe).chain(tracks).collect()

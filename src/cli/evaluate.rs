@@ -188,8 +188,8 @@ fn evaluate_with_progress(
     options: &EvaluateOptions,
 ) -> anyhow::Result<Evaluation> {
     let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
-    let evaluation = evaluate(train, test, truth, options, &mut |doing| {
-        progress.set(doing.done.into(), doing.planned.into(), doing.words);
+    let evaluation = evaluate(train, test, truth, options, &mut |step| {
+        progress.set(step.done.into(), step.planned.into(), step.phase);
         ControlFlow::Continue(())
     });
     progress.finish();

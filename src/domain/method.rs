@@ -8,7 +8,7 @@ use super::recipe::Recipe;
 
 /// How a recipe's model is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Step {
+pub enum InferenceMode {
     /// The regressed position.
     OneStep,
     /// The regressed position and the fix, weighted by (6) to (8).
@@ -31,7 +31,7 @@ pub enum Method {
     /// The robust homography of the foot point.
     HomographyDenied,
     /// A recipe's model.
-    Recipe(Recipe, Step),
+    Recipe(Recipe, InferenceMode),
     /// Sequence fusion over the default recipe.
     Track,
     /// Sequence fusion without fixes.
@@ -44,7 +44,10 @@ impl Method {
     pub fn all() -> Vec<Self> {
         let mut all = vec![Self::Gnss, Self::ImmUkf, Self::Dnn, Self::DnnDenied, Self::HomographyDenied];
         for &recipe in Recipe::ALL {
-            all.extend([Step::OneStep, Step::TwoStep, Step::Denied].map(|step| Self::Recipe(recipe, step)));
+            all.extend(
+                [InferenceMode::OneStep, InferenceMode::TwoStep, InferenceMode::Denied]
+                    .map(|mode| Self::Recipe(recipe, mode)),
+            );
         }
         all.extend([Self::Track, Self::TrackDenied]);
         all
@@ -82,13 +85,13 @@ impl fmt::Display for Method {
             Self::HomographyDenied => out.pad("homography.denied"),
             Self::Track => out.pad("track"),
             Self::TrackDenied => out.pad("track.denied"),
-            Self::Recipe(recipe, step) => {
-                let step = match step {
-                    Step::OneStep => "one_step",
-                    Step::TwoStep => "two_step",
-                    Step::Denied => "denied",
+            Self::Recipe(recipe, mode) => {
+                let mode = match mode {
+                    InferenceMode::OneStep => "one_step",
+                    InferenceMode::TwoStep => "two_step",
+                    InferenceMode::Denied => "denied",
                 };
-                out.pad(&format!("{recipe}.{step}"))
+                out.pad(&format!("{recipe}.{mode}"))
             }
         }
     }
@@ -118,7 +121,7 @@ mod tests {
         }
         assert_eq!(Method::list("all").expect("all"), all);
         let two = Method::list("gnss, auto.denied").expect("two");
-        assert_eq!(two, [Method::Gnss, Method::Recipe(Recipe::Auto, Step::Denied)]);
+        assert_eq!(two, [Method::Gnss, Method::Recipe(Recipe::Auto, InferenceMode::Denied)]);
         assert!(Method::list("gnss,guess").is_err());
     }
 }

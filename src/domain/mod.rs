@@ -14,10 +14,12 @@ mod gnss_error;
 mod job;
 mod method;
 mod names;
+mod noise;
 mod observation;
 mod receiver;
 mod recipe;
 mod sample;
+mod score;
 mod time;
 mod training;
 
@@ -29,12 +31,14 @@ pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};
-pub use method::{Method, Step};
+pub use method::{InferenceMode, Method};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
+pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
-pub use sample::{Sample, Score};
+pub use sample::Sample;
+pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, HeldOutSampleError,

@@ -7,7 +7,7 @@ use super::bounding_box::BoundingBox;
 use super::error::{Error, Result};
 use super::gnss_error::SigmaM;
 use super::names::{ReceiverId, TargetClass, TargetId};
-use super::sample::Score;
+use super::score::Score;
 use crate::geo::Position;
 
 /// A GNSS position; its time is that of the [`Observation`] or [`super::Sample`] that holds it.

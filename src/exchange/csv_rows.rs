@@ -9,8 +9,8 @@ use super::columns::{
     CLASS, COUNT, HEIGHT, Header, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA,
     TARGET_ID, TIME, TRUTH_LATITUDE, TRUTH_LONGITUDE,
 };
+use super::file_row::{FileRow, RowError};
 use super::lines::{Line, Lines};
-use super::rows::{Row, RowError};
 use super::wire::{self, Text};
 use crate::domain::{Error, ErrorKind, Result};
 
@@ -62,7 +62,7 @@ impl<R: Read> CsvRows<R> {
     /// Converts the next row that is not blank.
     pub(super) fn next_row<T>(
         &mut self,
-        convert: impl FnOnce(Row<'_>) -> Result<T>,
+        convert: impl FnOnce(FileRow<'_>) -> Result<T>,
     ) -> Option<Result<Result<T, RowError>>> {
         loop {
             let (line, text) = match self.lines.next_line() {
@@ -138,8 +138,8 @@ impl<'a> CsvCells<'a> {
         Ok(Self { cells })
     }
 
-    fn row(&self) -> CellResult<Row<'a>> {
-        Ok(Row {
+    fn row(&self) -> CellResult<FileRow<'a>> {
+        Ok(FileRow {
             time: self.text(TIME),
             target_id: self.text(TARGET_ID),
             bounding_box: self.numbers([LEFT, LEFT + 1, LEFT + 2, HEIGHT])?.map(

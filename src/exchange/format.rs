@@ -2,6 +2,10 @@
 
 use std::path::Path;
 
+use strum::{EnumString, IntoStaticStr, VariantArray};
+
+use crate::domain::Error;
+
 /// A format of sample, observation or fused rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Format {
@@ -57,4 +61,63 @@ impl Format {
             Self::GeoJson => "application/geo+json",
         }
     }
+}
+
+/// A format of fixes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, EnumString, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_fix_format)]
+pub enum FixFormat {
+    /// Columns `longitude`, `latitude` and optionally `time`, `sigma_m` and `receiver_id`; other columns
+    /// of sample files are accepted. Without a `receiver_id` the `target_id` is used instead.
+    Csv,
+    /// NMEA 0183: positions of GGA, dates of RMC and ZDA; other sentences are skipped.
+    Nmea,
+    /// GPX: track, route and way points.
+    Gpx,
+    /// Reports of gpsd, one per line (`gpspipe -w`): those of class TPV. The receiver is the `device`.
+    Gpsd,
+}
+
+impl FixFormat {
+    /// All formats.
+    pub const ALL: &'static [Self] = Self::VARIANTS;
+
+    /// The format of a file's extension; `nmea`, `log` and `txt` are NMEA; `json`,
+    /// `ndjson` and `jsonl` are gpsd's.
+    #[must_use]
+    pub fn from_path(path: &std::path::Path) -> Option<Self> {
+        let extension = path.extension()?.to_str()?.to_ascii_lowercase();
+        match extension.as_str() {
+            "csv" => Some(Self::Csv),
+            "nmea" | "log" | "txt" => Some(Self::Nmea),
+            "gpx" => Some(Self::Gpx),
+            "json" | "ndjson" | "jsonl" => Some(Self::Gpsd),
+            _ => None,
+        }
+    }
+
+    /// The format of a media type.
+    #[must_use]
+    pub fn from_media_type(media_type: &str) -> Option<Self> {
+        let essence = media_type.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
+        match essence.as_str() {
+            "text/csv" => Some(Self::Csv),
+            "application/nmea" | "application/x-nmea" | "text/x-nmea" | "text/plain" => Some(Self::Nmea),
+            "application/gpx+xml" => Some(Self::Gpx),
+            "application/json" | "application/x-ndjson" | "application/ndjson" | "application/jsonl" => {
+                Some(Self::Gpsd)
+            }
+            _ => None,
+        }
+    }
+
+    /// Name in commands and reports.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
+}
+
+fn unknown_fix_format(_: &str) -> Error {
+    Error::invalid("format", "must be one of csv, nmea, gpx, gpsd")
 }

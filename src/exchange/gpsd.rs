@@ -8,9 +8,9 @@ use std::io::Read;
 use jiff::Timestamp;
 use serde::Deserialize;
 
-use super::fixes::FixRow;
+use super::file_row::RowError;
+use super::fix_row::FixRow;
 use super::lines::{Line, Lines};
-use super::rows::RowError;
 use super::wire::{self, Text};
 use crate::domain::{Error, ReceiverId, Result, TimeBounds, parse_time};
 

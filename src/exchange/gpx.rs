@@ -9,8 +9,8 @@ use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
 use super::MAX_ROW_BYTES;
-use super::fixes::FixRow;
-use super::rows::RowError;
+use super::file_row::RowError;
+use super::fix_row::FixRow;
 use super::wire;
 use crate::domain::{Error, ErrorKind, Fix, Result, TimeBounds, parse_time};
 

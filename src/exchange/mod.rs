@@ -11,6 +11,8 @@ mod columns;
 mod csv_rows;
 mod cursor;
 mod elements;
+mod file_row;
+mod fix_row;
 mod fixes;
 mod format;
 mod gpsd;
@@ -24,9 +26,10 @@ pub mod wire;
 mod write;
 
 pub use cursor::{foreign_cursor, read_cursor, write_cursor};
-pub use fixes::{FixFormat, TimedFix, read_fixes, read_received_fixes};
-pub use format::Format;
-pub use rows::{ObservedRow, RowError, RowRules, read_detections, read_observations, read_samples};
+pub use file_row::RowError;
+pub use fixes::{TimedFix, read_fixes, read_received_fixes};
+pub use format::{FixFormat, Format};
+pub use rows::{ObservedRow, RowRules, read_detections, read_observations, read_samples};
 pub use write::{FusedWriter, SampleWriter, write_fused, write_samples};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.

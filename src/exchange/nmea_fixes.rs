@@ -13,9 +13,9 @@ use nmea::sentences::rmc::RmcStatusOfFix;
 use nmea::sentences::{FixType, GgaData, RmcData, ZdaData};
 use nmea::{ParseResult, SentenceType};
 
-use super::fixes::FixRow;
+use super::file_row::RowError;
+use super::fix_row::FixRow;
 use super::lines::{Line, Lines};
-use super::rows::RowError;
 use super::wire;
 use crate::domain::{Error, Fix, Result, TimeBounds};
 

@@ -2,50 +2,18 @@
 
 use std::io::Read;
 
-use serde::Deserialize;
-
 use super::columns::{HEIGHT, LATITUDE, LEFT, LONGITUDE, TARGET_ID, TIME};
 use super::csv_rows::CsvRows;
 use super::elements::Elements;
+use super::file_row::{FileRow, RowError, shared};
 use super::format::Format;
 use super::lines::{Line, Lines};
-use super::wire::{self, Text, box_within};
+use super::wire::{self, box_within};
 use crate::domain::{
     Detection, Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, TargetClass, TargetId,
     TimeBounds, parse_time,
 };
 use crate::geo::Position;
-
-/// Why a row of a file is invalid.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RowError {
-    /// Line of the file from 1 (a CSV file's header is line 1), or element of a JSON array from 1.
-    pub line: u64,
-    /// Column, or path of the field in the row's JSON; empty if the row as a whole is invalid.
-    pub field: String,
-    /// What is wrong and what is valid.
-    pub reason: String,
-}
-
-impl RowError {
-    pub(super) fn whole(line: u64, reason: &str) -> Self {
-        Self { line, field: String::new(), reason: reason.to_owned() }
-    }
-
-    /// The row error of a refusal.
-    ///
-    /// # Errors
-    /// Passes a fault on: it concerns the whole file.
-    pub fn of(line: u64, error: Error) -> Result<Self> {
-        match error {
-            Error::Refused(refusal) => Ok(match refusal.violations.into_iter().next() {
-                Some(violation) => Self { line, field: violation.field, reason: violation.message },
-                None => Self { line, field: String::new(), reason: refusal.message },
-            }),
-            Error::Fault(_) => Err(error),
-        }
-    }
-}
 
 /// What rows are checked against.
 #[derive(Debug, Clone, Copy)]
@@ -123,25 +91,6 @@ pub fn read_detections<R: Read>(
     Ok(std::iter::from_fn(move || rows.next_row(|row| converter.detection(&row, target_id.as_ref()))))
 }
 
-/// A row of any file; the reader decides which fields are required.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct Row<'a> {
-    #[serde(borrow)]
-    pub time: Option<Text<'a>>,
-    #[serde(borrow)]
-    pub target_id: Option<Text<'a>>,
-    pub bounding_box: Option<wire::BoundingBox>,
-    pub fix: Option<wire::Fix>,
-    #[serde(borrow)]
-    pub class: Option<Text<'a>>,
-    pub score: Option<f64>,
-    pub truth: Option<wire::Position>,
-    /// Only CSV files of fixes have it.
-    #[serde(skip)]
-    pub receiver_id: Option<Text<'a>>,
-}
-
 /// Converts rows into domain values. Adjacent rows mostly have the same target and class, whose text is
 /// then shared.
 struct RowConverter {
@@ -155,7 +104,7 @@ impl RowConverter {
         Self { rules, target_id: None, class: None }
     }
 
-    fn sample(&mut self, row: &Row<'_>) -> Result<Sample> {
+    fn sample(&mut self, row: &FileRow<'_>) -> Result<Sample> {
         let ObservedRow { observation, class, score, truth } = self.observed(row)?;
         let Observation { time, target_id, bounding_box, fix } = observation;
         Ok(Sample {
@@ -169,7 +118,7 @@ impl RowConverter {
         })
     }
 
-    fn detection(&mut self, row: &Row<'_>, default_target: Option<&TargetId>) -> Result<Detection> {
+    fn detection(&mut self, row: &FileRow<'_>, default_target: Option<&TargetId>) -> Result<Detection> {
         let ObservedRow { observation, class, score, .. } = self.observed(row)?;
         let target_id = observation.target_id.or_else(|| default_target.cloned());
         Ok(Detection {
@@ -181,7 +130,7 @@ impl RowConverter {
         })
     }
 
-    fn observed(&mut self, row: &Row<'_>) -> Result<ObservedRow> {
+    fn observed(&mut self, row: &FileRow<'_>) -> Result<ObservedRow> {
         let time = parse_time(row.time.as_ref().ok_or_else(|| missing("time"))?.as_str())?;
         let observation = Observation {
             time: self.rules.time_bounds.check(time)?,
@@ -209,20 +158,6 @@ fn missing(path: &str) -> Error {
     Error::invalid(path, "is required")
 }
 
-/// The name, shared with the previous row if it is the same.
-pub(super) fn shared<T: Clone>(
-    text: Option<&Text<'_>>,
-    previous: &mut Option<T>,
-    as_str: impl Fn(&T) -> &str,
-    make: impl Fn(&str) -> Result<T>,
-) -> Result<Option<T>> {
-    let Some(text) = text else { return Ok(None) };
-    if previous.as_ref().is_none_or(|name| as_str(name) != text.as_str()) {
-        *previous = Some(make(text.as_str())?);
-    }
-    Ok(previous.clone())
-}
-
 /// A reader for each format.
 enum Rows<R> {
     Csv(CsvRows<R>),
@@ -245,7 +180,7 @@ impl<R: Read> Rows<R> {
 
     fn next_row<T>(
         &mut self,
-        convert: impl FnOnce(Row<'_>) -> Result<T>,
+        convert: impl FnOnce(FileRow<'_>) -> Result<T>,
     ) -> Option<Result<Result<T, RowError>>> {
         match self {
             Self::Csv(rows) => rows.next_row(convert),
@@ -268,7 +203,7 @@ impl<R: Read> Rows<R> {
 fn json_row<T>(
     line: u64,
     text: &Line<'_>,
-    convert: impl FnOnce(Row<'_>) -> Result<T>,
+    convert: impl FnOnce(FileRow<'_>) -> Result<T>,
 ) -> Result<Result<T, RowError>> {
     let text = match text {
         Line::Text(text) => text,

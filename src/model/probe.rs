@@ -1,34 +1,51 @@
-//! Runs a loaded model on a fixed set of boxes before it may answer.
+//! Loads a model and tests it on a fixed set of boxes before it is used.
 //!
-//! Finite parameters do not make finite answers: products overflow, and bounds or offsets may lie anywhere.
-//! Every answer must be finite. Where the model knows what it sees (its training boxes), the position must
-//! lie within [`FARTHEST_AT_TRAINING_BOX_M`] of the plane's origin; anywhere in the image within
-//! [`FARTHEST_IN_IMAGE_M`], far inside the range of the local plane.
+//! Finite parameters do not guarantee finite answers: products overflow, and bounds or offsets may have any
+//! value. Every answer must be finite. At the training boxes the position must be within
+//! [`FARTHEST_AT_TRAINING_BOX_M`] of the plane's origin, anywhere in the image within
+//! [`FARTHEST_IN_IMAGE_M`], which is well inside the range of the local plane.
 
+use super::artifact::Artifact;
 use super::regressor::{Regression, Regressor};
+use super::uncertainty::coverage::Coverage;
 use crate::domain::{BoundingBox, Error, Result};
 use crate::geo::EastNorth;
 
-/// No camera sees a target so far away, m; the origin lies among the training fixes.
+/// Largest distance at a training box, m; the origin is the median of the training fixes.
 const FARTHEST_AT_TRAINING_BOX_M: f64 = 1e5;
-/// Extrapolation within the image, near the horizon for one, may go so far, m.
+/// Largest distance at any box in the image, m; positions near the horizon are extrapolated.
 const FARTHEST_IN_IMAGE_M: f64 = 1e6;
-/// Factors from a standard deviation to the radius of 95 % that a calibration can give; a normal
-/// distribution has 2.45.
+/// Valid ratios of the 95 % radius to the standard deviation; that of a normal distribution is 2.45.
 const R95_SCALES: std::ops::RangeInclusive<f64> = 0.1..=100.0;
-/// Feet of the boxes lie on a grid of so many columns and rows over the image.
+/// Columns and rows of the grid of foot points over the image.
 const GRID: usize = 5;
 /// Widths and heights of the boxes on the grid, px.
 const SIZES_PX: [[f64; 2]; 4] = [[1.0, 1.0], [20.0, 60.0], [400.0, 100.0], [1_000.0, 2_000.0]];
-/// Edges (left, top) and sides of boxes at the limits of what a [`BoundingBox`] may be, px.
+/// Edges (left, top) and sides at the limits of a valid [`BoundingBox`], px.
 const LIMIT_EDGES_PX: [f64; 3] = [-131_072.0, 0.0, 131_072.0];
 const LIMIT_SIDES_PX: [f64; 2] = [1e-3, 131_072.0];
+
+impl Artifact {
+    /// Loads the model and checks its answers.
+    ///
+    /// # Errors
+    /// Names `metadata.x` or `weights` where something is unknown, missing, of another shape, not
+    /// finite, or too large, and the check that the model's answers do not pass.
+    pub fn load(&self) -> Result<Regressor> {
+        let parts = self.parts()?;
+        let coverage = Coverage::take(&mut parts.tensors.clone())?;
+        let training_boxes: Vec<BoundingBox> = coverage.boxes().flatten().collect();
+        let regressor = Regressor::build(parts)?;
+        check(&regressor, &training_boxes)?;
+        Ok(regressor)
+    }
+}
 
 /// Checks a model on its training boxes, on a grid over its image, and at the limits of all boxes.
 ///
 /// # Errors
-/// Names the check that an answer did not pass, and the box.
-pub(super) fn check(regressor: &Regressor, training_boxes: &[BoundingBox]) -> Result<()> {
+/// Names the check that an answer does not pass, and the box.
+fn check(regressor: &Regressor, training_boxes: &[BoundingBox]) -> Result<()> {
     if training_boxes.is_empty() {
         return Err(failed("coverage.centres hold no box".to_owned()));
     }
@@ -46,7 +63,7 @@ pub(super) fn check(regressor: &Regressor, training_boxes: &[BoundingBox]) -> Re
 
 /// Boxes whose feet lie on a grid over the image, or over the training boxes where its size is unknown.
 fn image_boxes(regressor: &Regressor, training_boxes: &[BoundingBox]) -> Vec<BoundingBox> {
-    let feet = |axis: usize| training_boxes.iter().map(move |drawn| drawn.foot_px()[axis]);
+    let feet = |axis: usize| training_boxes.iter().map(move |bounding_box| bounding_box.foot_px()[axis]);
     let range = |axis: usize, size_px: Option<u32>| match size_px {
         Some(size_px) => [0.0, f64::from(size_px)],
         None => [feet(axis).fold(f64::INFINITY, f64::min), feet(axis).fold(f64::NEG_INFINITY, f64::max)],
@@ -74,7 +91,7 @@ fn limit_boxes() -> impl Iterator<Item = BoundingBox> {
     boxes.filter_map(Result::ok)
 }
 
-/// The recipe `paper` has a second network for boxes with a fix, so every box is tried with and without.
+/// Every box is tested with and without a fix: the recipe `paper` has a network for either.
 fn check_box(regressor: &Regressor, bounding_box: &BoundingBox, farthest_m: f64) -> Result<()> {
     let origin = EastNorth::default();
     for fix in [None, Some(origin), Some(EastNorth { east_m: 1_000.0, north_m: -1_000.0 })] {
@@ -103,7 +120,7 @@ fn fault_of(regressor: &Regressor, answer: &Regression, farthest_m: f64) -> Opti
     }
     let position = regressor.plane().to_position(answer.regressed);
     if !(position.longitude_deg().is_finite() && position.latitude_deg().is_finite()) {
-        return Some("the position is none on earth".to_owned());
+        return Some("the position is not on the earth".to_owned());
     }
     if !answer.reconstruction_error.is_finite() {
         return Some("the reconstruction error is not finite".to_owned());
@@ -119,5 +136,5 @@ fn fault_of(regressor: &Regressor, answer: &Regression, farthest_m: f64) -> Opti
 }
 
 fn failed(reason: String) -> Error {
-    Error::invalid("weights", format!("make no model that can answer: {reason}"))
+    Error::invalid("weights", format!("make no usable model: {reason}"))
 }

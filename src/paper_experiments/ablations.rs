@@ -8,8 +8,8 @@ use super::experiments::{TrainTestSplit, Worlds, conditions};
 use crate::clock::process_cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;
-use crate::model::train::LossWeights;
-use crate::model::{Artifact, FitOptions, Trial, fit_trial};
+use crate::model::network::LossWeights;
+use crate::model::{Artifact, FitOptions, FitOverrides, fit_with};
 use crate::simulation::{Options, Route, Scene};
 
 /// wX : wZ of the recipe `paper` (raw pixels and standardised degrees), and of `hybrid` (both scaled).
@@ -42,9 +42,11 @@ fn loss_balance(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> a
             let weights = LossWeights { reconstruction: ratio, regression: 1.0 };
             let mut cells = String::new();
             for &scene in Scene::ALL {
-                let trial =
-                    Trial { candidate: Some(recipe.as_str()), balance: Some(in_units(recipe, weights)) };
-                let (_, error_m) = mean_over(&Options::new(scene), worlds, recipe, trial)?;
+                let overrides = FitOverrides {
+                    candidate: Some(recipe.as_str()),
+                    loss_weights: Some(in_units(recipe, weights)),
+                };
+                let (_, error_m) = mean_over(&Options::new(scene), worlds, recipe, overrides)?;
                 let _ = write!(cells, " {error_m:.3} |");
             }
             let _ = writeln!(page, "| `{recipe}` | 1 : {} |{cells}", (1e6 / ratio).round() / 1e6);
@@ -79,8 +81,8 @@ fn label_smoothing(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -
             for pair in SMOOTHED {
                 let mut columns = [String::new(), String::new()];
                 for candidate in pair {
-                    let trial = Trial { candidate: Some(candidate), balance: None };
-                    let (held_out_m, error_m) = mean_over(&options, worlds, Recipe::Auto, trial)?;
+                    let overrides = FitOverrides { candidate: Some(candidate), loss_weights: None };
+                    let (held_out_m, error_m) = mean_over(&options, worlds, Recipe::Auto, overrides)?;
                     let _ = write!(columns[0], " {held_out_m:.3} |");
                     let _ = write!(columns[1], " {error_m:.3} |");
                 }
@@ -107,7 +109,7 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
             let base = Options::new(scene);
             let world = TrainTestSplit::of_world(&base, seed, 1, Route::Lines);
             let started_s = process_cpu_s();
-            let artifact = train(&world, &base, Recipe::Auto, Trial::default())?;
+            let artifact = train(&world, &base, Recipe::Auto, FitOverrides::default())?;
             most_s = most_s.max(process_cpu_s() - started_s);
             most_bytes = most_bytes.max(artifact.weights.len());
         }
@@ -117,12 +119,17 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Mean held-out distance to the fixes and mean true error (m) of a trial over the worlds.
-fn mean_over(base: &Options, worlds: Worlds, recipe: Recipe, trial: Trial<'_>) -> anyhow::Result<(f64, f64)> {
+/// Mean held-out distance to the fixes and mean true error (m) of a fit over the worlds.
+fn mean_over(
+    base: &Options,
+    worlds: Worlds,
+    recipe: Recipe,
+    overrides: FitOverrides<'_>,
+) -> anyhow::Result<(f64, f64)> {
     let (mut held_out_m, mut error_m) = (0.0, 0.0);
     for seed in worlds.seeds() {
         let world = TrainTestSplit::of_world(base, seed, 1_000, Route::Lines);
-        let artifact = train(&world, base, recipe, trial)?;
+        let artifact = train(&world, base, recipe, overrides)?;
         held_out_m += artifact.metadata.held_out.as_ref().map_or(f64::NAN, |found| found.mean_to_fix_m);
         let regressor = artifact.load()?;
         let (mut sum_m, mut count) = (0.0, 0.0);
@@ -141,7 +148,7 @@ fn train(
     world: &TrainTestSplit,
     base: &Options,
     recipe: Recipe,
-    trial: Trial<'_>,
+    overrides: FitOverrides<'_>,
 ) -> anyhow::Result<Artifact> {
     let options = FitOptions {
         recipe,
@@ -150,6 +157,6 @@ fn train(
         image_size: world.image_size,
         gnss_error: GnssError::Known(SigmaM::new(base.gnss_sigma_m)?),
     };
-    fit_trial(&world.train, &options, trial, &mut |_| ControlFlow::Continue(()))
+    fit_with(&world.train, &options, overrides, &mut |_| ControlFlow::Continue(()))
         .map_err(|error| anyhow::anyhow!("{error}"))
 }

@@ -7,7 +7,7 @@ use super::{Ended, Job, JobIdentity, Work, load_samples};
 use crate::app::{App, JobQueue};
 use crate::clock::thread_cpu_s;
 use crate::domain::{Error, EvaluationJob, EvaluationProgress, JobState, Observation, Result, Sample};
-use crate::evaluation::{Doing, EvaluateOptions, Report, TestRow, evaluate};
+use crate::evaluation::{self, EvaluateOptions, Report, TestRow, evaluate};
 use crate::store::{Claim, Heartbeat, JobEnd, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
 
@@ -64,18 +64,19 @@ impl Job for EvaluationJob {
         };
         Ok(Box::new(move |sink| {
             let mut cancelled = false;
-            let evaluated = evaluate(&train, &test, &truth, &options, &mut |doing: &Doing<'_>| {
-                let flow = sink.update(|progress| {
-                    *progress = EvaluationProgress {
-                        phase: doing.words.to_owned(),
-                        steps_done: doing.done,
-                        steps: doing.planned,
-                        remaining_s: sink.remaining_s(doing.done, doing.planned),
-                    };
+            let evaluated =
+                evaluate(&train, &test, &truth, &options, &mut |step: &evaluation::Progress<'_>| {
+                    let flow = sink.update(|progress| {
+                        *progress = EvaluationProgress {
+                            phase: step.phase.to_owned(),
+                            steps_done: step.done,
+                            steps: step.planned,
+                            remaining_s: sink.remaining_s(step.done, step.planned),
+                        };
+                    });
+                    cancelled |= flow.is_break();
+                    flow
                 });
-                cancelled |= flow.is_break();
-                flow
-            });
             if cancelled { Evaluated::Cancelled } else { Evaluated::Completed(evaluated.map(|it| it.report)) }
         }))
     }

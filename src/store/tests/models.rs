@@ -1,5 +1,5 @@
 use super::*;
-use crate::domain::{HeldOutSampleError, ModelVersion};
+use crate::domain::{Durability, HeldOutSampleError, ModelVersion};
 use crate::store::{NewModel, RunEnd, RunOutput};
 
 async fn active(store: &Store, camera: &CameraId) -> Option<u32> {
@@ -92,7 +92,7 @@ async fn a_changed_row_does_not_match_its_checksum() {
 #[tokio::test]
 async fn held_out_errors_come_back_with_their_samples_while_those_are_stored() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    store.insert_samples(&camera, vec![sample(1, "a")]).await.expect("stored");
+    store.insert_samples(&camera, vec![sample(1, "a")], Durability::default()).await.expect("stored");
     let error = |second: i64, distance_m: f64| HeldOutSampleError {
         time: at(second),
         target_id: target("a"),

@@ -221,8 +221,8 @@ async fn a_lease_that_ends_further_ahead_than_its_length_counts_as_expired() {
     // The clock was set right: the lease ends in 400 days.
     let now = fixture.claim(2).await;
     assert_eq!((now.job.attempt, now.fence), (2, ahead.fence + 1));
-    assert_eq!(fixture.beat(ahead.fence, 400 * DAY_S + 1).await, Heartbeat::Lost);
-    assert_eq!(fixture.beat(now.fence, 3).await, Heartbeat::Continue);
+    assert_eq!(fixture.heartbeat(ahead.fence, 400 * DAY_S + 1).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(now.fence, 3).await, Heartbeat::Continue);
     assert!(fixture.store.claim_run(LEASE, at(4)).await.expect("works").is_none(), "a sound lease holds");
 }
 

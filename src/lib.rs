@@ -1,6 +1,7 @@
 //! sightfix tells where a target is on the earth from what a fixed camera that nobody calibrated
 //! sees and what a GNSS receiver says. `docs/architecture.md` is the map of this crate.
 
+pub mod admission;
 pub mod app;
 pub mod cli;
 pub mod clock;

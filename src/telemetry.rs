@@ -45,6 +45,8 @@ pub struct Metrics {
     /// Evaluations.
     pub evaluations: JobMetrics,
     connections: Gauge,
+    connections_refused: Counter,
+    connections_closed: [(CloseReason, Counter); CloseReason::ALL.len()],
     http_requests: [Counter; 5],
     http_duration_s: Histogram,
     requests_refused: Counter,
@@ -55,6 +57,35 @@ pub struct Metrics {
     live_item_errors: Counter,
     live_answers_lost: Counter,
     cameras_moved: Counter,
+}
+
+/// Why the server closes a connection by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CloseReason {
+    /// No request for the idle time.
+    Idle,
+    /// The client took a response too slowly.
+    Stalled,
+    /// Too many HTTP/2 control frames per second.
+    Flooded,
+    /// It was still open when the time to shut down was over.
+    Shutdown,
+}
+
+impl CloseReason {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Idle, Self::Stalled, Self::Flooded, Self::Shutdown];
+
+    /// The label in the metrics.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Idle => "idle",
+            Self::Stalled => "stalled",
+            Self::Flooded => "flooded",
+            Self::Shutdown => "shutdown",
+        }
+    }
 }
 
 const NIS: &str = "sightfix_track_nis";
@@ -134,6 +165,10 @@ impl Metrics {
             let help = "Measured positions that tracks did not take up, by reason";
             (reason, labelled("sightfix_track_rejections_total", help, "reason", reason.as_str()))
         };
+        let closed = |reason: CloseReason| {
+            let help = "Connections that the server closed by itself, by reason";
+            (reason, labelled("sightfix_connections_closed_total", help, "reason", reason.as_str()))
+        };
         Self {
             fusions: plain("sightfix_fusions_total", "Observations answered"),
             fusions_denied: plain("sightfix_fusions_denied_total", "Observations answered without a fix"),
@@ -156,12 +191,17 @@ impl Metrics {
                 "sightfix_evaluation_duration_seconds",
                 "Time of an evaluation",
             ),
+            connections_refused: plain(
+                "sightfix_connections_refused_total",
+                "Connections beyond the limit, in all or of one client address",
+            ),
+            connections_closed: CloseReason::ALL.map(closed),
             connections: recorder.register_gauge(&Key::from_name("sightfix_connections"), &METADATA),
             http_requests: [http("1xx"), http("2xx"), http("3xx"), http("4xx"), http("5xx")],
             http_duration_s: histogram("sightfix_http_request_duration_seconds", "Time to an answer's head"),
             requests_refused: plain(
                 "sightfix_requests_refused_total",
-                "Requests refused because too many were in flight",
+                "Requests refused because a limit on requests or bytes under way was reached",
             ),
             track_nis: histogram(
                 NIS,
@@ -252,9 +292,21 @@ impl Metrics {
         self.http_duration_s.record(time.as_secs_f64());
     }
 
-    /// A request was refused for too many in flight.
+    /// A request was refused because a limit on requests or bytes under way was reached.
     pub fn refused(&self) {
         self.requests_refused.increment(1);
+    }
+
+    /// A connection beyond a limit was refused.
+    pub fn connection_refused(&self) {
+        self.connections_refused.increment(1);
+    }
+
+    /// The server closed a connection by itself.
+    pub fn connection_closed(&self, reason: CloseReason) {
+        for (known, counter) in &self.connections_closed {
+            counter.increment(u64::from(*known == reason));
+        }
     }
 
     /// A connection was opened; it counts until the value is dropped.

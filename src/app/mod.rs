@@ -17,6 +17,7 @@ use std::sync::Arc;
 
 use tokio::sync::{Notify, Semaphore};
 
+use crate::admission::Quotas;
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
 use crate::store::Store;
@@ -49,6 +50,8 @@ pub struct Parts {
     pub randomness: Randomness,
     /// What an outside client may make large.
     pub limits: Limits,
+    /// How much of each bounded resource clients may hold at a time.
+    pub quotas: Quotas,
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
@@ -76,6 +79,7 @@ impl App {
         let (run_queued, pairings) = (Notify::new(), Semaphore::new(limits.pairings));
         let live = live::Live::default();
         let evaluation_queued = Notify::new();
+        let quotas = Quotas::new(&limits);
         let parts = Parts {
             store,
             registry,
@@ -83,6 +87,7 @@ impl App {
             clock,
             randomness,
             limits,
+            quotas,
             metrics,
             pairings,
             run_queued,

@@ -61,6 +61,10 @@ pub enum ErrorKind {
     Timeout,
     /// The server is ending.
     ShuttingDown,
+    /// The request names a host that this server does not answer for.
+    HostNotAllowed,
+    /// A web page of another origin asks for a change.
+    OriginNotAllowed,
     /// A fault of the server.
     Internal,
 }

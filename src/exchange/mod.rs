@@ -13,6 +13,7 @@ mod cursor;
 mod elements;
 mod fixes;
 mod format;
+mod formula_guard;
 mod gpsd;
 mod gpx;
 mod lines;

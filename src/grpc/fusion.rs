@@ -6,7 +6,7 @@ use super::convert::{camera_id, observation, timestamp};
 use super::outbox::Responses;
 use super::proto;
 use super::proto::fusion_service_server::FusionService;
-use super::statuses::{Reply, answer, request_id};
+use super::statuses::{Reply, answer, client_address, request_id};
 use super::stream;
 use crate::app::App;
 use crate::domain::{Flag, FusedFix, TargetId};
@@ -32,7 +32,8 @@ impl FusionService for Fusion {
         request: tonic::Request<Streaming<proto::StreamRequest>>,
     ) -> Reply<Self::StreamStream> {
         let id = request_id(request.extensions());
-        let responses = stream::serve(&self.app, &self.shutdown, id, request.into_inner());
+        let client = client_address(request.extensions());
+        let responses = stream::serve(&self.app, &self.shutdown, id, client, request.into_inner());
         Ok(tonic::Response::new(responses))
     }
 

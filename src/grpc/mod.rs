@@ -23,6 +23,7 @@ use tonic::service::Routes;
 use tonic_health::ServingStatus;
 use tonic_health::server::{HealthReporter, HealthService};
 
+use crate::admission::RequestClass;
 use crate::app::App;
 use crate::domain::Error;
 use crate::shutdown::Shutdown;
@@ -73,8 +74,17 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .prepare()
 }
 
-/// The path of the live stream, which has an idle limit of its own.
-pub const LIVE_STREAM: &str = "/sightfix.v1.FusionService/Stream";
+/// What a request is for, by its path.
+#[must_use]
+pub fn class(path: &str) -> RequestClass {
+    match path {
+        "/grpc.health.v1.Health/Check" => RequestClass::Probe,
+        "/sightfix.v1.FusionService/Fuse" => RequestClass::Fusion,
+        "/sightfix.v1.SampleService/ImportSamples" => RequestClass::ImportStream,
+        "/sightfix.v1.FusionService/Stream" => RequestClass::LiveStream,
+        _ => RequestClass::Other,
+    }
+}
 
 /// A refusal before any service was asked, as a whole answer.
 #[must_use]

@@ -8,6 +8,7 @@ use hyper::http::HeaderValue;
 use tonic::{Code, Request, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
 
+use crate::admission::ClientAddress;
 use crate::domain::{Error, ErrorKind, Refusal, Result, Violation};
 use crate::status;
 use crate::telemetry::RequestId;
@@ -38,6 +39,11 @@ where
 pub(super) fn request_id(extensions: &Extensions) -> RequestId {
     let unknown = || RequestId::new(HeaderValue::from_static("unknown"));
     extensions.get().cloned().unwrap_or_else(unknown)
+}
+
+/// Who sends the request.
+pub(super) fn client_address(extensions: &Extensions) -> ClientAddress {
+    extensions.get().copied().unwrap_or(ClientAddress::UNKNOWN)
 }
 
 /// An error with its code and details: `ErrorInfo` with the problem's slug as reason, `RequestInfo`,

@@ -12,6 +12,7 @@ use super::proto;
 use super::proto::stream_answer::Outcome;
 use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
+use crate::admission::ClientAddress;
 use crate::app::{App, LiveStream, TrackPoint};
 use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Flag, Result};
 use crate::fusion::track::{Rejection, RejectionReason, Source};
@@ -31,10 +32,12 @@ pub(super) fn serve(
     app: &App,
     shutdown: &Shutdown,
     id: RequestId,
+    client_address: ClientAddress,
     requests: Streaming<proto::StreamRequest>,
 ) -> Responses {
     let (outbox, responses) = outbox(app.limits.live_answers);
-    let conversation = Conversation { app: app.clone(), shutdown: shutdown.clone(), requests, outbox };
+    let conversation =
+        Conversation { app: app.clone(), shutdown: shutdown.clone(), client_address, requests, outbox };
     shutdown.spawn(async move {
         let mut conversation = conversation;
         let ended = conversation.hold().await;
@@ -47,6 +50,7 @@ pub(super) fn serve(
 struct Conversation {
     app: App,
     shutdown: Shutdown,
+    client_address: ClientAddress,
     requests: Streaming<proto::StreamRequest>,
     outbox: Outbox,
 }
@@ -107,7 +111,13 @@ impl Conversation {
         let camera = camera_id(&opening.camera_id)?;
         let stream = self
             .app
-            .open_stream(&camera, &opening.client_name, opening.resume_after_seq, opening.store_samples)
+            .open_stream(
+                &camera,
+                &opening.client_name,
+                self.client_address,
+                opening.resume_after_seq,
+                opening.store_samples,
+            )
             .await?;
         Ok((camera, stream))
     }

@@ -11,12 +11,24 @@ use serde::de::DeserializeOwned;
 
 use super::body;
 use super::problem::{Answer, Refused, no_route};
+use crate::admission::ClientAddress;
 use crate::app::App;
 use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time};
 use crate::exchange::wire;
 
 /// Items on a page whose length the client leaves open.
 const PAGE_ITEMS: u32 = 100;
+
+/// Who sends the request.
+pub(super) struct Client(pub(super) ClientAddress);
+
+impl<S: Send + Sync> FromRequestParts<S> for Client {
+    type Rejection = Refused;
+
+    async fn from_request_parts(parts: &mut Parts, _state: &S) -> Answer<Self> {
+        Ok(Self(body::client_address(parts)))
+    }
+}
 
 /// A camera of the path. What is no slug names no camera.
 pub(super) struct CameraPath(pub(super) CameraId);

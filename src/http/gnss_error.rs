@@ -79,8 +79,7 @@ async fn estimate_gnss_error(
         given => {
             let format = given.and_then(FixFormat::from_media_type);
             let format = format.ok_or_else(|| not_read(&["text/csv", "text/plain", "application/json"]))?;
-            let limit = (limits.import_bytes, limits.import_memory_bytes);
-            Source::File(body::spooled(&parts.headers, content, limit.0, limit.1).await?, format)
+            Source::File(body::spooled(&app, &parts, content).await?, format)
         }
     };
     let tell_at_most = limits.rejected_rows;

@@ -168,7 +168,7 @@ async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, reques
     params.end()?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let names = [Part::Detections, Part::Fixes].map(Part::as_str);
-    let [detections, fixes] = parts(&head.headers, content, &app.limits, names).await?;
+    let [detections, fixes] = parts(&app, &head, content, names).await?;
     let readable = |format: &Format| *format != Format::GeoJson;
     let detections_format = detections.format(
         names[0],

@@ -118,9 +118,8 @@ async fn import_samples(State(app): State<App>, CameraPath(id): CameraPath, requ
     let (parts, content) = request.into_parts();
     let format = import_format(&parts.headers)?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
-    let limits = &app.limits;
-    let spooled = body::spooled(&parts.headers, content, limits.import_bytes, limits.import_memory_bytes);
-    let report = app.import_file(&id, spooled.await?, format).await?;
+    let spooled = body::spooled(&app, &parts, content).await?;
+    let report = app.import_file(&id, spooled, format).await?;
     Ok(json(&Imported::from(report))?)
 }
 

@@ -1,5 +1,7 @@
 //! What watches the server: `/livez`, `/readyz`, `/metrics`.
 
+use std::time::Duration;
+
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use hyper::header::CONTENT_TYPE;
@@ -10,6 +12,9 @@ use super::Rest;
 use super::problem::{Answer, Problem};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind};
+
+/// Time for the store's answer; whoever asks whether the server is ready does not wait much longer.
+const PING_TIME: Duration = Duration::from_secs(1);
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz)).routes(routes!(metrics))
@@ -36,8 +41,16 @@ async fn readyz(State(rest): State<Rest>) -> Answer<&'static str> {
     if rest.shutdown.has_begun() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }
-    rest.app.store.ping().await?;
+    match tokio::time::timeout(PING_TIME, rest.app.store.ping()).await {
+        Ok(answered) => answered?,
+        Err(_) => return Err(slow_store().into()),
+    }
     Ok("ready\n")
+}
+
+fn slow_store() -> Error {
+    let seconds = PING_TIME.as_secs();
+    Error::refused(ErrorKind::Overloaded, format!("the store did not answer within {seconds} s"))
 }
 
 /// Counters and times, in the text format of Prometheus

@@ -19,12 +19,12 @@ use utoipa_axum::routes;
 
 use super::Rest;
 use super::cameras::CameraMoved;
-use super::extract::{CameraPath, JsonBody, TargetPath};
+use super::extract::{CameraPath, Client, JsonBody, TargetPath};
 use super::fusions::{FusionRequest, observations};
 use super::problem::{Answer, Problem};
 use super::wire::{json, json_of_about};
 use crate::app::{App, CameraEvent, Followed, TrackPoint};
-use crate::domain::{Error, ErrorKind, Result};
+use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
 
@@ -276,10 +276,12 @@ async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBo
     params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "Events", body = TrackFeature, content_type = "text/event-stream"))
 )]
-async fn watch_camera(State(rest): State<Rest>, CameraPath(id): CameraPath) -> Answer {
-    let place = rest.event_streams.clone().try_acquire_owned().map_err(|_| {
-        Error::refused(ErrorKind::Overloaded, "too many event streams are open; poll the tracks instead")
-    })?;
+async fn watch_camera(
+    State(rest): State<Rest>,
+    CameraPath(id): CameraPath,
+    Client(client): Client,
+) -> Answer {
+    let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
     let events = rest.app.camera_events(&id).await?;
     let shutdown = rest.shutdown.clone();
     let told = stream::unfold(events, |mut events| async move {
@@ -292,7 +294,7 @@ async fn watch_camera(State(rest): State<Rest>, CameraPath(id): CameraPath) -> A
         Some((event, events))
     });
     let told = told.take_until(async move { shutdown.begun().await }).map(move |event| {
-        let _held = &place; // until the stream is dropped
+        let _held = &lease; // until the stream is dropped
         Ok::<_, Infallible>(event)
     });
     Ok(Sse::new(told).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())

@@ -15,11 +15,11 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
-use super::extract::{CameraPath, JsonBody, Params, RunPath};
+use super::extract::{CameraPath, Client, JsonBody, Params, RunPath};
 use super::problem::{Answer, Problem};
 use super::wire::{JobState, Recipe, empty, instant, json, made};
 use crate::app::{App, RunRequest};
-use crate::domain::{self, EpochReport, Error, ErrorKind, Result, RunProgress};
+use crate::domain::{self, EpochReport, Error, Result, RunProgress};
 use crate::exchange::{foreign_cursor, read_cursor, write_cursor};
 
 /// How often a silent event stream says that it is still there.
@@ -228,18 +228,17 @@ async fn cancel_training_run(State(app): State<App>, RunPath(id, run): RunPath) 
 async fn watch_training_run(
     State(rest): State<Rest>,
     RunPath(id, run): RunPath,
+    Client(client): Client,
     headers: HeaderMap,
 ) -> Answer {
     if headers.get("last-event-id").is_some_and(|last| last == ENDED) {
         return Ok(empty());
     }
-    let place = rest.event_streams.clone().try_acquire_owned().map_err(|_| {
-        Error::refused(ErrorKind::Overloaded, "too many event streams are open; poll the run instead")
-    })?;
+    let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
     let changes = rest.app.watch_run(&id, run).await?;
     let shutdown = rest.shutdown.clone();
     let events = changes.take_until(async move { shutdown.begun().await }).map(move |change| {
-        let _held = &place; // until the stream is dropped
+        let _held = &lease; // until the stream is dropped
         Ok(event_of(change))
     });
     Ok(event_stream(events))

@@ -27,6 +27,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use sqlx::SqlitePool;
+use sqlx::sqlite::SqlitePoolOptions;
 
 use crate::domain::{Error, ErrorKind, Result};
 
@@ -52,6 +53,8 @@ pub struct Store {
 struct Inner {
     writer: Arc<Writer>,
     readers: SqlitePool,
+    /// One reader for [`Store::ping`] alone, which slow reads do not keep waiting.
+    probe: SqlitePool,
     samples: GroupCommit,
 }
 
@@ -66,7 +69,9 @@ impl Store {
         let (writer, readers) = connection::open(folder).await?;
         let writer = Arc::new(writer);
         let samples = GroupCommit::start(Arc::clone(&writer));
-        Ok(Self { inner: Arc::new(Inner { writer, readers, samples }) })
+        let options = readers.connect_options().as_ref().clone();
+        let probe = SqlitePoolOptions::new().max_connections(1).connect_lazy_with(options);
+        Ok(Self { inner: Arc::new(Inner { writer, readers, probe, samples }) })
     }
 
     /// Commits what was handed in, writes the log back into the file and lets go of it. Later calls
@@ -74,6 +79,7 @@ impl Store {
     pub async fn close(&self) {
         self.inner.samples.close().await;
         self.inner.readers.close().await;
+        self.inner.probe.close().await;
         self.inner.writer.close().await;
     }
 
@@ -86,7 +92,7 @@ impl Store {
             return Err(Error::refused(ErrorKind::ShuttingDown, "the store is closed"));
         }
         sqlx::query_scalar::<_, i64>("SELECT count(*) FROM cameras WHERE key = 0")
-            .fetch_one(self.readers())
+            .fetch_one(&self.inner.probe)
             .await
             .map_err(failed)?;
         Ok(())

@@ -15,6 +15,7 @@ const FLOORS: &[(&str, u32)] = &[
     ("store", 2),
     ("filters", 2),
     ("model", 3),
+    ("admission", 3),
     ("telemetry", 5),
     ("fusion", 4),
     ("simulation", 4),

@@ -2,11 +2,13 @@
 
 mod bad_input;
 mod connections;
+mod cross_site;
 mod evaluations;
 mod grpc;
 mod harness;
 mod layering;
 mod openapi;
+mod overload;
 mod pairing;
 mod replay;
 mod story;

@@ -7,6 +7,7 @@ use tokio::sync::watch;
 
 use super::keeping::{Half, Keeping, Ledger};
 use super::{CameraLive, Followed, lock};
+use crate::admission::{ClientAddress, Lease};
 use crate::app::App;
 use crate::domain::{
     CameraId, CameraMoved, Detection, Error, ErrorKind, LiveItem, Observation, Result, Sample, Score,
@@ -65,6 +66,7 @@ pub struct LiveStream {
     kept: Option<Kept>,
     last_seq: u64,
     _place: Place,
+    _address_lease: Lease,
 }
 
 struct Kept {
@@ -83,12 +85,15 @@ impl App {
         &self,
         id: &CameraId,
         client_name: &str,
+        client_address: ClientAddress,
         resume_after_seq: u64,
         store_samples: bool,
     ) -> Result<LiveStream> {
         check_text("client_name", client_name, LONGEST_CLIENT_NAME)?;
         self.serving(id).await?;
         let limits = &self.limits;
+        // Names are the client's choice; its address is not.
+        let address_lease = self.quotas.live_streams.try_acquire(client_address, 1)?;
         let place =
             self.live.places.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
         let live = self.live.of(id);
@@ -104,6 +109,7 @@ impl App {
             kept,
             last_seq: resume_after_seq,
             _place: place,
+            _address_lease: address_lease,
         })
     }
 }

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// Folder of the database, made at the first start.
+    /// Folder of the database, created at the first start.
     pub data: PathBuf,
     /// Address of the one port for REST and gRPC.
     pub listen: SocketAddr,
@@ -22,9 +22,9 @@ pub struct Config {
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
     pub log_filter: String,
-    /// Who fits training runs.
+    /// Workers of training runs.
     pub training: Workers,
-    /// Who carries out evaluations.
+    /// Workers of evaluations.
     pub evaluation: Workers,
     /// What an outside client may make large.
     pub limits: Limits,
@@ -46,7 +46,7 @@ pub enum LogFormat {
 pub struct Workers {
     /// Jobs carried out at the same time, each on a thread of its own at the lowest priority.
     pub workers: usize,
-    /// Seconds after which the job of a silent worker is taken up by another.
+    /// Seconds after which another worker claims the job of a silent one.
     pub lease_s: u32,
 }
 
@@ -78,7 +78,7 @@ pub struct Limits {
     pub pairing_rows: usize,
     /// Imports in two parts that are paired at the same time; more wait.
     pub pairings: usize,
-    /// Rejected rows of an import that are told one by one.
+    /// Rejected rows of an import that are reported one by one.
     pub rejected_rows: usize,
     /// Bytes of a request's headers.
     pub header_bytes: u32,
@@ -116,7 +116,7 @@ pub struct Limits {
     pub live_streams: usize,
     /// Live streams open at a time under one client name.
     pub live_streams_per_client: usize,
-    /// Answers of a live stream that wait for a slow reader; beyond, the oldest are lost.
+    /// Answers of a live stream that wait for a slow reader; beyond that the oldest are dropped.
     pub live_answers: usize,
     /// Seconds after which a live stream without an item is ended.
     pub live_idle_s: u64,

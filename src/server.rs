@@ -59,7 +59,7 @@ impl Server {
     /// The address that was taken; with port 0 in the settings, the system's choice.
     ///
     /// # Errors
-    /// The system does not tell.
+    /// The system does not report it.
     pub fn address(&self) -> std::io::Result<SocketAddr> {
         self.listener.local_addr()
     }
@@ -70,22 +70,22 @@ impl Server {
         &self.app
     }
 
-    /// Ends the server when told to.
+    /// Shuts the server down when it is asked to.
     #[must_use]
     pub fn shutdown(&self) -> Shutdown {
         self.shutdown.clone()
     }
 
-    /// Answers until the shutdown begins, then ends in order: no new connections, streams ended,
-    /// runs put back, requests finished, store closed.
+    /// Answers until it is asked to shut down, then drains: no new connections, streams ended, runs put
+    /// back, requests finished, store closed.
     ///
     /// # Errors
-    /// The system does not tell the address.
+    /// The system does not report the address.
     pub async fn run(self) -> anyhow::Result<()> {
         let Self { config, app, listener, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
-        shutdown.spawn(keep_up(app.clone(), shutdown.clone()));
+        shutdown.spawn(maintenance_loop(app.clone(), shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
         let pipeline = Arc::new(RequestPipeline::new(app.clone(), hosts, &shutdown));
         connection::accept(listener, pipeline, &config.limits, &shutdown).await;
@@ -99,7 +99,7 @@ impl Server {
     }
 }
 
-async fn keep_up(app: App, shutdown: Shutdown) {
+async fn maintenance_loop(app: App, shutdown: Shutdown) {
     loop {
         tokio::select! {
             () = shutdown.begun() => return,
@@ -110,7 +110,7 @@ async fn keep_up(app: App, shutdown: Shutdown) {
             tracing::error!(%error, "cannot look for changed cameras");
         }
         if let Err(error) = app.retrain_moved().await {
-            tracing::error!(%error, "cannot train moved cameras anew");
+            tracing::error!(%error, "cannot retrain moved cameras");
         }
     }
 }

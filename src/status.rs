@@ -1,8 +1,8 @@
-//! The one table from an error's kind to what each transport says.
+//! The one table from an error's kind to the status on each transport.
 
 use crate::domain::ErrorKind;
 
-/// How an error kind is told to a client.
+/// How an error kind is reported to a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Status {
     /// Status of the HTTP answer.

@@ -21,7 +21,7 @@ mod training;
 
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
-pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
+pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};

@@ -24,7 +24,7 @@ mod tests;
 pub mod wire;
 mod write;
 
-pub use cursor::{foreign_cursor, read_cursor, write_cursor};
+pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use fixes::{FixFormat, TimedFix, read_fixes, read_received_fixes};
 pub use format::Format;
 pub use rows::{ObservedRow, RowError, RowRules, read_detections, read_observations, read_samples};

@@ -9,7 +9,7 @@ use super::proto::fusion_service_server::FusionService;
 use super::statuses::{Reply, answer, client_address, request_id};
 use super::stream;
 use crate::app::App;
-use crate::domain::{Flag, FusedFix, TargetId};
+use crate::domain::{Flag, FusedFix, TargetId, convert_all};
 use crate::shutdown::Shutdown;
 
 pub(super) struct Fusion {
@@ -40,15 +40,10 @@ impl FusionService for Fusion {
     async fn fuse(&self, request: tonic::Request<proto::FuseRequest>) -> Reply<proto::FuseResponse> {
         answer(request, |asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            self.app.check_batch(asked.observations.len())?;
             let rules = self.app.row_rules(&camera).await?;
-            let mut observations = Vec::with_capacity(asked.observations.len());
-            for (index, message) in asked.observations.into_iter().enumerate() {
-                observations.push(
-                    observation(message, &rules)
-                        .map_err(|error| error.under(&format!("observations[{index}]")))?,
-                );
-            }
+            self.app.check_batch(asked.observations.len())?;
+            let convert = |message| observation(message, &rules);
+            let observations = convert_all("observations", asked.observations, convert)?;
             let fused = self.app.fuse(&camera, &observations).await?;
             Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
         })

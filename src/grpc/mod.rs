@@ -92,7 +92,7 @@ pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
     statuses::to_status(error, id).into_http()
 }
 
-/// The names under which health is told; the empty one is the server as a whole.
+/// The services whose health is reported; the empty name is the server as a whole.
 const HEALTHY: [&str; 6] = [
     "",
     CameraServiceServer::<()>::NAME,
@@ -102,7 +102,7 @@ const HEALTHY: [&str; 6] = [
     FusionServiceServer::<()>::NAME,
 ];
 
-/// Serving until the end begins; then watchers are told, and their streams end.
+/// Serving until the end begins; then watchers get a last status, and their streams end.
 fn health(shutdown: &Shutdown) -> tonic_health::pb::health_server::HealthServer<HealthService> {
     let mut reporter = HealthReporter::new();
     for name in HEALTHY {

@@ -130,7 +130,7 @@ impl TrainingService for Training {
 pub(super) type Changes =
     Pin<Box<dyn Stream<Item = std::result::Result<proto::WatchTrainingRunResponse, Status>> + Send>>;
 
-/// Ends with the run, with the first fault, or with the server, which is told as an error so that
+/// Ends with the run, with the first fault, or with the server, which is reported as an error so that
 /// nobody takes the run for ended.
 fn changes(
     runs: impl Stream<Item = Result<TrainingRun>> + Send + 'static,

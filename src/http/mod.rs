@@ -70,8 +70,8 @@ pub fn router(app: App, shutdown: Shutdown) -> Router {
     routes
         .merge(page)
         .with_state(rest)
-        // As one layer: axum boxes every request anew for each.
-        .layer((from_fn(problem::tell), CatchPanicLayer::custom(problem::panicked)))
+        // As one layer: axum boxes every request again for each.
+        .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
 }
 
 /// What the page of the description may do: run its own scripts and ask its own server, nothing else.

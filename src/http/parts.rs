@@ -23,7 +23,7 @@ use super::extract::{media_type, not_read};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind, Result};
 
-/// Read at once while parts are told apart.
+/// Read at once while the body is split into its parts.
 const CHUNK_BYTES: usize = 32 * 1024;
 /// What may come between two parts: a boundary and a few headers.
 const LONGEST_HEAD_BYTES: usize = 8 * CHUNK_BYTES;
@@ -93,7 +93,7 @@ pub(super) async fn parts<const N: usize>(
             return Err(Error::invalid(shown, format!("is not a part of this body; they are {known}")));
         };
         if place.is_some() {
-            return Err(Error::invalid(name, "the part stands twice"));
+            return Err(Error::invalid(name, "the part appears twice"));
         }
         *place = Some(spooled(field, Spool::new(app, client_address(head))?, &since).await?);
     }

@@ -9,7 +9,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind};
 
@@ -37,7 +37,7 @@ async fn livez() -> &'static str {
         (status = 503, description = "It is ending, or its store does not answer", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn readyz(State(rest): State<Rest>) -> Answer<&'static str> {
+async fn readyz(State(rest): State<Rest>) -> ApiResult<&'static str> {
     if rest.shutdown.has_begun() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }

@@ -21,7 +21,7 @@ use super::Rest;
 use super::cameras::CameraMoved;
 use super::extract::{CameraPath, Client, JsonBody, TargetPath};
 use super::fusions::{FusionRequest, observations};
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use super::wire::{json, json_of_about};
 use crate::app::{App, CameraEvent, Followed, TrackPoint};
 use crate::domain::Result;
@@ -199,7 +199,7 @@ fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "Positions, by target", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
     Ok(geojson(&app.tracks(&id).await?)?)
 }
 
@@ -211,7 +211,7 @@ async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> Answ
     params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id")),
     responses((status = 200, description = "Positions, oldest first", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> Answer {
+async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> ApiResult {
     Ok(geojson(&app.track_history(&id, &target).await?)?)
 }
 
@@ -254,7 +254,7 @@ struct FollowedObservations<'a> {
         (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
+async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
     let rules = app.row_rules(&id).await?;
     let observations = observations(&app, &body.read()?, &rules)?;
     app.check_batch(observations.len())?;
@@ -280,7 +280,7 @@ async fn watch_camera(
     State(rest): State<Rest>,
     CameraPath(id): CameraPath,
     Client(client): Client,
-) -> Answer {
+) -> ApiResult {
     let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
     let events = rest.app.camera_events(&id).await?;
     let shutdown = rest.shutdown.clone();

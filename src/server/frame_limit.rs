@@ -20,7 +20,7 @@ pub(super) struct FrameLimit {
     refilled_at: Instant,
 }
 
-/// Where in the client's bytes the next one stands.
+/// Where among frames the client's next byte belongs.
 enum Position {
     /// So many bytes of the preface were there.
     Preface(usize),

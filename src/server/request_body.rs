@@ -18,7 +18,7 @@ use crate::admission::{BodyRefusal, ClientAddress, Lease, RequestClass};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind, Result};
 
-/// What is read and thrown away of a refused request, so that its client reads the refusal and not a
+/// What is read and discarded of a refused request, so that its client reads the refusal and not a
 /// broken connection.
 const DISCARD_BYTES: u64 = 64 << 20;
 
@@ -119,7 +119,7 @@ pub(super) struct AdmittedBody {
 #[derive(PartialEq, Eq)]
 enum State {
     Open,
-    /// Refused; so many bytes are still thrown away before that is told.
+    /// Refused; so many bytes are still discarded before the reader is told so.
     Discarding(u64),
     Ended,
 }
@@ -129,7 +129,7 @@ impl AdmittedBody {
         Self { body, ticket, pace, state: State::Open }
     }
 
-    /// What to do with a frame: hand it on, or begin to throw the body away.
+    /// What to do with a frame: pass it on, or begin to discard the body.
     fn receive(&mut self, frame: Frame<Bytes>) -> Option<Frame<Bytes>> {
         let bytes = frame.data_ref().map_or(0, Bytes::len) as u64;
         if let Some(pace) = &mut self.pace {

@@ -10,6 +10,7 @@ mod layering;
 mod openapi;
 mod overload;
 mod pairing;
+mod parity;
 mod replay;
 mod story;
 mod stream;

@@ -235,7 +235,11 @@ async fn under_overload_probes_and_fusions_are_answered_and_others_read_why_not(
 
 #[tokio::test]
 async fn a_refused_upload_is_read_so_that_its_client_sees_the_refusal() {
-    let (_folder, server) = with_camera(&[("SIGHTFIX_LIMITS__REQUEST_MEMORY_BYTES", "40000")]).await;
+    let (_folder, server) = with_camera(&[
+        ("SIGHTFIX_LIMITS__REQUEST_MEMORY_BYTES", "40000"),
+        ("SIGHTFIX_LIMITS__CLIENT_SHARE", "1"),
+    ])
+    .await;
     // Three requests of 16 KiB each are more than 40 kB.
     let held = slow_uploads(server.address, 2).await;
     let mut stream = connect_from([127, 0, 0, 1], server.address).await;

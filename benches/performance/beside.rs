@@ -1,7 +1,7 @@
 //! Fusion while training runs use every core.
 
 use sightfix::app::RunRequest;
-use sightfix::domain::{CameraId, NewCamera, Recipe};
+use sightfix::domain::{CameraId, Durability, NewCamera, Recipe};
 use sightfix::simulation::{Options, Scene, simulate};
 
 use crate::load;
@@ -23,7 +23,12 @@ pub(crate) fn run() {
         for number in 0..cores {
             let id = CameraId::new(&format!("busy-{number}")).expect("a slug");
             served.app.create_camera(NewCamera::named(id.clone())).await.expect("a new camera");
-            served.app.store.insert_samples(&id, samples.clone()).await.expect("samples are stored");
+            served
+                .app
+                .store
+                .insert_samples(&id, samples.clone(), Durability::Synced)
+                .await
+                .expect("samples are stored");
             cameras.push(id);
         }
         let path = format!("/v1/cameras/{}/fusions", served.camera);
@@ -50,10 +55,10 @@ pub(crate) fn run() {
             rates.push(busy / quiet);
             late.push(percentile(&mut busy_times, 0.99) / percentile(&mut quiet_times, 0.99));
         }
-        println!("\n### Fusion while a run trains on each of {cores} cores\n");
+        println!("\n### Fusion while a training run uses each of {cores} cores\n");
         println!("| measure | busy / quiet |\n|---|---:|");
         println!("| requests per second | {:.2} |", median(&mut rates));
-        println!("| 99th percentile of the answer's time | {:.2} |", median(&mut late));
+        println!("| 99th percentile of the latency | {:.2} |", median(&mut late));
         served.end();
     });
 }

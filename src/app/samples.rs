@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use tokio::sync::mpsc;
 
 use super::{App, Page, page_of};
-use crate::domain::{CameraId, Error, ImageSize, Result, Sample, TargetId, TimeBounds};
+use crate::domain::{CameraId, Durability, Error, ImageSize, Result, Sample, TargetId, TimeBounds};
 use crate::exchange::{self, Cursor, Format, RowError, RowRules};
 use crate::store::{SampleFilter, SampleKey};
 
@@ -50,13 +50,14 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, before anything is read; `MalformedBody` for a file that cannot be read as
-    /// its format: batches before the place where it broke are stored, and the message tells how
-    /// many rows.
+    /// its format, `InsufficientStorage`: batches before that place are stored, and the message tells
+    /// how many rows.
     pub async fn import_file(
         &self,
         id: &CameraId,
         file: impl Read + Send + 'static,
         format: Format,
+        durability: Durability,
     ) -> Result<ImportReport> {
         let rules = self.row_rules(id).await?;
         let (sender, mut batches) = mpsc::channel(BATCHES_AHEAD);
@@ -67,7 +68,8 @@ impl App {
             while let Ok(more) = batches.try_recv() {
                 batch.extend(more);
             }
-            self.store_batch(id, batch, &mut report).await?;
+            let stored = self.store_batch(id, batch, durability, &mut report).await;
+            stored.map_err(|error| told_what_is_stored(error, &report))?;
         }
         let read = reading.await.map_err(Error::fault)?;
         self.metrics.imported(report.accepted, report.duplicate, report.rejected);
@@ -84,6 +86,7 @@ impl App {
         &self,
         id: &CameraId,
         rows: impl Stream<Item = Result<Result<Sample, RowError>>> + Send,
+        durability: Durability,
     ) -> Result<ImportReport> {
         self.serving(id).await?;
         let mut report = ImportReport::default();
@@ -100,7 +103,8 @@ impl App {
                     }
                 }
             }
-            self.store_batch(id, batch, &mut report).await?;
+            let stored = self.store_batch(id, batch, durability, &mut report).await;
+            stored.map_err(|error| told_what_is_stored(error, &report))?;
             if let Some(error) = broken {
                 self.metrics.imported(report.accepted, report.duplicate, report.rejected);
                 return Err(told_what_is_stored(error, &report));
@@ -157,6 +161,7 @@ impl App {
         &self,
         id: &CameraId,
         batch: Vec<Result<Sample, RowError>>,
+        durability: Durability,
         report: &mut ImportReport,
     ) -> Result<()> {
         let mut samples = Vec::with_capacity(batch.len());
@@ -167,7 +172,7 @@ impl App {
             }
         }
         if !samples.is_empty() {
-            let inserted = self.store.insert_samples(id, samples).await?;
+            let inserted = self.store.insert_samples(id, samples, durability).await?;
             report.accepted += inserted.accepted;
             report.duplicate += inserted.duplicate;
         }

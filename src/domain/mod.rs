@@ -1,11 +1,13 @@
-//! The values sightfix speaks of, valid by construction.
+//! Domain values, valid by construction.
 //!
-//! Every check on a number lives in a constructor here or in [`crate::geo`]; the floors above take
-//! these values as they are and check nothing again. What never happens here: I/O, clocks,
+//! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
+//! it and do not check again. What never happens here: I/O, clocks,
 //! randomness, wire formats, status codes.
 
 mod bounding_box;
 mod camera;
+mod checksum;
+mod durability;
 mod error;
 mod evaluation;
 mod gnss_error;
@@ -21,6 +23,8 @@ mod training;
 
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
+pub use checksum::model_sha256;
+pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
@@ -33,6 +37,6 @@ pub use recipe::Recipe;
 pub use sample::{Sample, Score};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
-    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, ModelMetadata, ModelVersion,
-    OriginDeg, RunProgress, TrainingOptions, TrainingRun,
+    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, HeldOutSampleError,
+    ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingRun,
 };

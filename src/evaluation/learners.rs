@@ -4,8 +4,7 @@ use std::ops::ControlFlow;
 
 use super::runner::EvaluateOptions;
 use crate::domain::{EpochReport, GnssError, Method, Recipe, Sample};
-use crate::filters::{ImmUkf, ImmUkfOptions};
-use crate::fusion::track::Pass;
+use crate::filters::{ImmUkf, ImmUkfOptions, Traverse};
 use crate::model::{FitEvent, FitOptions, Regressor, fit};
 
 /// Accelerations that the IMM-UKF is tuned over, m/s2.
@@ -35,7 +34,8 @@ pub(super) struct RecipeModel {
 /// The recipes that some methods need, each once.
 pub(super) fn recipes_of(methods: &[Method], default: Recipe) -> Vec<Recipe> {
     Recipe::ALL
-        .into_iter()
+        .iter()
+        .copied()
         .filter(|recipe| methods.iter().any(|method| method.recipe(default) == Some(*recipe)))
         .collect()
 }
@@ -65,7 +65,7 @@ pub(super) fn learn_recipe(
                 curve.push(*epoch);
                 ControlFlow::Continue(())
             }
-            FitEvent::Note(_) => ControlFlow::Continue(()),
+            FitEvent::HeldOut(_) | FitEvent::Note(_) => ControlFlow::Continue(()),
         });
         let regressor =
             artifact.map_err(|error| error.to_string())?.load().map_err(|error| error.to_string())?;
@@ -77,11 +77,11 @@ pub(super) fn learn_recipe(
 ///
 /// Coloured errors look like motion, so the likelihood alone would follow every fix; the track's own
 /// split into white and coloured is not this baseline's to know.
-pub(super) fn tune_imm_ukf(passes: &[Pass], variance_m2: f64) -> ImmUkfOptions {
+pub(super) fn tune_imm_ukf(traverses: &[Traverse], variance_m2: f64) -> ImmUkfOptions {
     let likelihood = |acceleration_mps2: f64| -> f64 {
-        let mut filter = ImmUkf::new(ImmUkfOptions::of_acceleration(acceleration_mps2));
+        let mut filter = ImmUkf::new(ImmUkfOptions::from_acceleration(acceleration_mps2));
         let mut sum = 0.0;
-        for (times_s, fixes) in passes {
+        for (times_s, fixes) in traverses {
             filter.step(1e9, None);
             for (index, fix) in fixes.iter().enumerate() {
                 let seconds = if index == 0 { 0.0 } else { times_s[index] - times_s[index - 1] };
@@ -93,5 +93,5 @@ pub(super) fn tune_imm_ukf(passes: &[Pass], variance_m2: f64) -> ImmUkfOptions {
     };
     let scored = ACCELERATIONS_MPS2.map(|candidate| (likelihood(candidate), candidate));
     let best = scored.into_iter().max_by(|one, other| one.0.total_cmp(&other.0));
-    ImmUkfOptions::of_acceleration(best.map_or(0.4, |(_, candidate)| candidate))
+    ImmUkfOptions::from_acceleration(best.map_or(0.4, |(_, candidate)| candidate))
 }

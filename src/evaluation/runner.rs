@@ -11,7 +11,7 @@ use crate::domain::{
     BoundingBox, EpochReport, ImageSize, Method, Observation, Recipe, Result, Sample, SigmaM, Step, Truth,
 };
 use crate::filters::ImmUkf;
-use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, passes};
+use crate::fusion::track::{MeasuredPosition, Measurement, Track, TrackSettings, traverses};
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, dnn, homography};
@@ -374,7 +374,7 @@ impl<'a> Run<'a> {
     where
         'a: 'b,
     {
-        let tuned = tune_imm_ukf(&passes(self.train, &self.plane), variance_m2);
+        let tuned = tune_imm_ukf(&traverses(self.train, &self.plane), variance_m2);
         let (plane, test) = (self.plane, self.test);
         Box::new(move |target| {
             let mut filter = ImmUkf::new(tuned);
@@ -418,7 +418,7 @@ impl<'a> Run<'a> {
                 })
             }),
             Method::Track | Method::TrackDenied => {
-                let settings = TrackSettings::learn(self.train, regressor);
+                let settings = TrackSettings::estimate(self.train, regressor);
                 let test = self.test;
                 let denied = method == Method::TrackDenied;
                 Box::new(move |target| {
@@ -448,11 +448,11 @@ fn measurement(
 ) -> Measurement {
     let fix = observation.fix.map(|fix| {
         let variance_m2 = fix.sigma_m.map_or(e_gnss_m2, SigmaM::variance_m2);
-        Measured::isotropic(plane.to_plane(fix.position), variance_m2)
+        MeasuredPosition::isotropic(plane.to_plane(fix.position), variance_m2)
     });
     let regressed = observation.bounding_box.as_ref().map(|drawn| {
         let regression = regress(drawn, fix.map(|fix| fix.position));
-        Measured::isotropic(regression.regressed, regression.variance_m2())
+        MeasuredPosition::isotropic(regression.regressed, regression.variance_m2())
     });
     Measurement { time: observation.time, fix, regressed }
 }
@@ -464,7 +464,7 @@ fn step_track(
     measurement: &Measurement,
     plane: &LocalPlane,
 ) -> Option<Told> {
-    if track.as_ref().is_some_and(|track| track.is_gone(measurement.time)) {
+    if track.as_ref().is_some_and(|track| track.is_expired(measurement.time)) {
         *track = None;
     }
     let state = match track {

@@ -1,7 +1,7 @@
 //! Rows of a CSV file.
 //!
-//! Read line by line on purpose: no column has reason to hold a line break, and so an unclosed
-//! quote costs its own row and not the rest of the file, and memory stays bounded.
+//! Read line by line, unlike the csv crate: no column contains line breaks, so an unclosed quote
+//! invalidates its own row and not the rest of the file, and memory is bounded.
 
 use std::io::Read;
 
@@ -19,27 +19,27 @@ use crate::domain::{Error, ErrorKind, Result};
 pub(super) struct CsvRows<R> {
     lines: Lines<R>,
     header: Box<Header>,
-    fields: Fields,
+    fields: FieldSplitter,
 }
 
 impl<R: Read> CsvRows<R> {
     /// # Errors
-    /// A file without a header, or with columns missing, doubled or unknown.
+    /// Refuses a file without a header, or with missing, duplicated or unknown columns.
     pub(super) fn new(reader: R, required: &[usize]) -> Result<Self> {
-        Self::knowing(reader, required, OF_SAMPLES)
+        Self::with_columns(reader, required, OF_SAMPLES)
     }
 
-    /// The same for a file of fixes, which may name receivers.
+    /// Rows of a file of fixes, which may have a receiver column.
     ///
     /// # Errors
     /// As [`CsvRows::new`].
     pub(super) fn of_fixes(reader: R, required: &[usize]) -> Result<Self> {
-        Self::knowing(reader, required, COUNT)
+        Self::with_columns(reader, required, COUNT)
     }
 
-    fn knowing(reader: R, required: &[usize], known: usize) -> Result<Self> {
+    fn with_columns(reader: R, required: &[usize], known: usize) -> Result<Self> {
         let mut lines = Lines::new(reader);
-        let mut fields = Fields::default();
+        let mut fields = FieldSplitter::default();
         let header = loop {
             match lines.next_line().map_err(Error::fault)? {
                 Some((_, Line::Text(text))) if text.trim().is_empty() => {}
@@ -49,13 +49,13 @@ impl<R: Read> CsvRows<R> {
                 }
                 Some((_, Line::NotUtf8)) => return Err(malformed("the header is not UTF-8")),
                 Some((_, Line::TooLong)) => return Err(malformed("the header is longer than 64 KiB")),
-                None => return Err(malformed("the file is empty; its first line must name its columns")),
+                None => return Err(malformed("the file is empty; the first line must name the columns")),
             }
         };
         Ok(Self { lines, header, fields })
     }
 
-    /// Number of the line that was read last, from 1.
+    /// Number of the latest line, from 1.
     pub(super) const fn line(&self) -> u64 {
         self.lines.number()
     }
@@ -67,7 +67,7 @@ impl<R: Read> CsvRows<R> {
     ) -> Option<Result<Result<T, RowError>>> {
         loop {
             let (line, text) = match self.lines.next_line() {
-                Err(broken) => return Some(Err(Error::fault(broken))),
+                Err(error) => return Some(Err(Error::fault(error))),
                 Ok(None) => return None,
                 Ok(Some((_, Line::Text(text)))) if text.trim().is_empty() => continue,
                 Ok(Some((line, Line::Text(text)))) => (line, text),
@@ -79,31 +79,34 @@ impl<R: Read> CsvRows<R> {
                 }
             };
             let header = &self.header;
-            let row = self.fields.split(text).map_err(Fault::Whole).and_then(|fields| {
-                let cells = Cells::of(header, fields)?;
-                let row = cells.row().map_err(|(index, reason)| Fault::Column(index, reason))?;
-                convert(row).map_err(Fault::Domain)
+            let row = self.fields.split(text).map_err(CsvRowError::Row).and_then(|fields| {
+                let cells = CsvCells::of(header, fields)?;
+                let row = cells.row().map_err(|(index, reason)| CsvRowError::Column(index, reason))?;
+                convert(row).map_err(CsvRowError::Value)
             });
             return Some(match row {
                 Ok(value) => Ok(Ok(value)),
-                Err(Fault::Whole(reason)) => Ok(Err(RowError::whole(line, &reason))),
-                Err(Fault::Column(index, reason)) => {
+                Err(CsvRowError::Row(reason)) => Ok(Err(RowError::whole(line, &reason))),
+                Err(CsvRowError::Column(index, reason)) => {
                     Ok(Err(RowError { line, field: header.name(index).to_owned(), reason }))
                 }
-                Err(Fault::Domain(error)) => RowError::of(line, error).map(|mut fault| {
-                    fault.field = header.name_of_path(&fault.field).to_owned();
-                    Err(fault)
+                Err(CsvRowError::Value(error)) => RowError::of(line, error).map(|mut row_error| {
+                    row_error.field = header.name_of_path(&row_error.field).to_owned();
+                    Err(row_error)
                 }),
             });
         }
     }
 }
 
-/// Why a row is none.
-enum Fault {
-    Whole(String),
+/// Why a row is invalid.
+enum CsvRowError {
+    /// The row as a whole.
+    Row(String),
+    /// One column, by its index in [`super::columns::COLUMNS`].
     Column(usize, String),
-    Domain(Error),
+    /// A value that a domain constructor refuses.
+    Value(Error),
 }
 
 fn malformed(reason: &str) -> Error {
@@ -111,14 +114,14 @@ fn malformed(reason: &str) -> Error {
 }
 
 /// The cells of one line in the order of the known columns.
-struct Cells<'a> {
+struct CsvCells<'a> {
     cells: [&'a str; COUNT],
 }
 
-type Cell<T> = std::result::Result<T, (usize, String)>;
+type CellResult<T> = std::result::Result<T, (usize, String)>;
 
-impl<'a> Cells<'a> {
-    fn of(header: &Header, fields: impl Iterator<Item = &'a str>) -> Result<Self, Fault> {
+impl<'a> CsvCells<'a> {
+    fn of(header: &Header, fields: impl Iterator<Item = &'a str>) -> Result<Self, CsvRowError> {
         let mut in_file = [""; COUNT];
         let mut count = 0;
         for field in fields {
@@ -129,13 +132,14 @@ impl<'a> Cells<'a> {
         }
         if count != header.width() {
             let width = header.width();
-            return Err(Fault::Whole(format!("has {count} fields where the header names {width}")));
+            return Err(CsvRowError::Row(format!("has {count} fields where the header names {width}")));
         }
-        let cells = std::array::from_fn(|index| header.place(index).map_or("", |place| in_file[place]));
+        let cells =
+            std::array::from_fn(|index| header.position(index).map_or("", |position| in_file[position]));
         Ok(Self { cells })
     }
 
-    fn row(&self) -> Cell<Row<'a>> {
+    fn row(&self) -> CellResult<Row<'a>> {
         Ok(Row {
             time: self.text(TIME),
             target_id: self.name(TARGET_ID),
@@ -157,7 +161,7 @@ impl<'a> Cells<'a> {
         })
     }
 
-    fn fix(&self) -> Cell<Option<wire::Fix>> {
+    fn fix(&self) -> CellResult<Option<wire::Fix>> {
         let sigma_m = self.number(SIGMA)?;
         let degrees = self.numbers([LONGITUDE, LATITUDE])?;
         Ok(degrees.map(|[longitude_deg, latitude_deg]| wire::Fix { longitude_deg, latitude_deg, sigma_m }))
@@ -174,7 +178,7 @@ impl<'a> Cells<'a> {
         (!cell.is_empty()).then(|| Text::from(cell))
     }
 
-    fn number(&self, index: usize) -> Cell<Option<f64>> {
+    fn number(&self, index: usize) -> CellResult<Option<f64>> {
         let cell = self.cells[index];
         if cell.is_empty() {
             return Ok(None);
@@ -185,8 +189,8 @@ impl<'a> Cells<'a> {
         })
     }
 
-    /// Numbers that belong together: `None` if all cells are empty, an error if some are.
-    fn numbers<const N: usize>(&self, indexes: [usize; N]) -> Cell<Option<[f64; N]>> {
+    /// The numbers of a group: `None` if all cells are empty, an error if some are.
+    fn numbers<const N: usize>(&self, indexes: [usize; N]) -> CellResult<Option<[f64; N]>> {
         let mut numbers = [0.0; N];
         let mut missing = None;
         let mut given = 0;
@@ -202,27 +206,27 @@ impl<'a> Cells<'a> {
         match missing {
             None => Ok(Some(numbers)),
             Some(_) if given == 0 => Ok(None),
-            Some(index) => Err((index, "is empty where the values it belongs to are given".to_owned())),
+            Some(index) => Err((index, "is empty, but other values of its group are given".to_owned())),
         }
     }
 }
 
-/// The fields of one line; RFC 4180 but for line breaks within quotes.
+/// The fields of one line, as in RFC 4180 but without line breaks within quotes.
 #[derive(Default)]
-struct Fields {
-    /// Fields that had quotes, without them.
+struct FieldSplitter {
+    /// Text of the fields without quotes.
     unquoted: String,
-    /// Begin and end of every field in `unquoted`.
+    /// Range of every field in `unquoted`.
     spans: Vec<(usize, usize)>,
 }
 
-/// Fields that stand in the line as they are, or those freed of their quotes.
-enum Split<'a> {
+/// FieldSplitter borrowed from the line, or from the unquoted text.
+enum SplitFields<'a> {
     Plain(std::str::Split<'a, char>),
     Quoted(&'a str, std::slice::Iter<'a, (usize, usize)>),
 }
 
-impl<'a> Iterator for Split<'a> {
+impl<'a> Iterator for SplitFields<'a> {
     type Item = &'a str;
 
     fn next(&mut self) -> Option<&'a str> {
@@ -233,10 +237,10 @@ impl<'a> Iterator for Split<'a> {
     }
 }
 
-impl Fields {
-    fn split<'a>(&'a mut self, line: &'a str) -> Result<Split<'a>, String> {
+impl FieldSplitter {
+    fn split<'a>(&'a mut self, line: &'a str) -> Result<SplitFields<'a>, String> {
         if !line.contains('"') {
-            return Ok(Split::Plain(line.split(',')));
+            return Ok(SplitFields::Plain(line.split(',')));
         }
         self.unquoted.clear();
         self.spans.clear();
@@ -246,10 +250,10 @@ impl Fields {
             rest = self.take_field(text)?;
             self.spans.push((begin, self.unquoted.len()));
         }
-        Ok(Split::Quoted(&self.unquoted, self.spans.iter()))
+        Ok(SplitFields::Quoted(&self.unquoted, self.spans.iter()))
     }
 
-    /// Appends the first field of the text; what follows its comma is left.
+    /// Appends the first field of the text; returns the rest after the comma.
     fn take_field<'a>(&mut self, text: &'a str) -> Result<Option<&'a str>, String> {
         let Some(mut quoted) = text.strip_prefix('"') else {
             let (field, rest) =
@@ -260,7 +264,7 @@ impl Fields {
         loop {
             let (part, after) = quoted
                 .split_once('"')
-                .ok_or("has a quote that is not closed; a field cannot go on in the next line")?;
+                .ok_or("has an unclosed quote; a field cannot continue on the next line")?;
             self.unquoted.push_str(part);
             if let Some(after) = after.strip_prefix('"') {
                 self.unquoted.push('"');
@@ -283,13 +287,13 @@ mod tests {
 
     proptest! {
         #[test]
-        fn fields_come_back_as_the_csv_crate_wrote_them(
+        fn fields_written_by_the_csv_crate_are_read(
             fields in prop::collection::vec("[a-z0-9 \",;'é]{0,8}", 2..8)
         ) {
             let mut writer = csv::Writer::from_writer(Vec::new());
             writer.write_record(&fields).expect("memory");
             let line = String::from_utf8(writer.into_inner().expect("memory")).expect("UTF-8");
-            let mut splitter = Fields::default();
+            let mut splitter = FieldSplitter::default();
             let split: Vec<&str> = splitter.split(line.trim_end_matches('\n')).expect("well formed").collect();
             prop_assert_eq!(split, fields);
         }

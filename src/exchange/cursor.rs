@@ -1,12 +1,12 @@
-//! Where the next page of a list begins, as text that a client hands back and need not understand.
+//! Opaque pagination cursors.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
 use crate::domain::{CameraId, Error, EvaluationId, Result, RunId};
 
-/// Longest cursor that is read, in bytes.
-const LONGEST_BYTES: usize = 512;
+/// Largest accepted cursor, bytes.
+const MAX_BYTES: usize = 512;
 
 /// The key of the last item of a page, behind which the next page begins.
 pub trait Cursor: Sized {
@@ -31,7 +31,7 @@ pub fn write_cursor<C: Cursor>(cursor: &C) -> String {
 /// # Errors
 /// `InvalidArgument`, naming the field, for text that no page of this list gave.
 pub fn read_cursor<C: Cursor>(field: &str, text: &str) -> Result<C> {
-    let cursor = (text.len() <= LONGEST_BYTES)
+    let cursor = (text.len() <= MAX_BYTES)
         .then(|| URL_SAFE_NO_PAD.decode(text).ok())
         .flatten()
         .and_then(|bytes| String::from_utf8(bytes).ok())

@@ -1,22 +1,22 @@
-//! What kind of file it is, from its name or its media type.
+//! File formats, by file name or media type.
 
 use std::path::Path;
 
 /// A format of sample, observation or fused rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Format {
-    /// Comma-separated, one header line.
+    /// Comma-separated values with a header line.
     Csv,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Ndjson,
     /// One JSON document.
     Json,
-    /// RFC 7946, written only.
+    /// GeoJSON (RFC 7946), written only.
     GeoJson,
 }
 
 impl Format {
-    /// All of them.
+    /// All formats.
     pub const ALL: [Self; 4] = [Self::Csv, Self::Ndjson, Self::Json, Self::GeoJson];
 
     /// The format of a media type such as `text/csv; charset=utf-8`.
@@ -34,7 +34,7 @@ impl Format {
         known.into_iter().find(|(name, _)| essence.eq_ignore_ascii_case(name)).map(|(_, format)| format)
     }
 
-    /// The format that a file's extension announces.
+    /// The format of a file's extension.
     #[must_use]
     pub fn from_path(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
@@ -47,7 +47,7 @@ impl Format {
         }
     }
 
-    /// What to announce it as.
+    /// The media type in responses.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {

@@ -1,7 +1,7 @@
-//! Fixes of a gpsd log: a JSON report a line, as `gpspipe -w` writes them.
+//! Fixes of a gpsd log: one JSON report per line, as written by `gpspipe -w`.
 //!
-//! Reports of class TPV hold the fixes; others are passed over. What gpsd says of its errors (`eph`,
-//! `epx`, `epy`) is not taken: it leaves open which share of errors they bound.
+//! Reports of class TPV contain the fixes; others are skipped. gpsd's error estimates (`eph`, `epx`,
+//! `epy`) are not used: their confidence level is not defined.
 
 use std::io::Read;
 
@@ -20,9 +20,9 @@ pub(super) struct GpsdFixes<R> {
     time_bounds: TimeBounds,
 }
 
-/// The fields of a report that are looked at.
+/// The fields of a report that are used.
 #[derive(Deserialize)]
-struct Report<'a> {
+struct GpsdReport<'a> {
     #[serde(borrow)]
     class: Text<'a>,
     #[serde(borrow)]
@@ -43,7 +43,7 @@ impl<R: Read> GpsdFixes<R> {
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
         loop {
             let (line, text) = match self.lines.next_line() {
-                Err(broken) => return Some(Err(Error::fault(broken))),
+                Err(error) => return Some(Err(Error::fault(error))),
                 Ok(None) => return None,
                 Ok(Some(read)) => read,
             };
@@ -66,7 +66,7 @@ impl<R: Read> GpsdFixes<R> {
 
 /// The fix of a report; `None` for a report of another class.
 fn report(line: u64, text: &str, time_bounds: &TimeBounds) -> Result<Option<Result<FixRow, RowError>>> {
-    let report: Report<'_> = wire::parse_json(text.as_bytes())?;
+    let report: GpsdReport<'_> = wire::parse_json(text.as_bytes())?;
     if report.class.as_str() != "TPV" {
         return Ok(None);
     }
@@ -77,14 +77,14 @@ fn report(line: u64, text: &str, time_bounds: &TimeBounds) -> Result<Option<Resu
         let reason = "the position is dead reckoning, surveyed or simulated (status 5, 7, 8), not received";
         return Err(Error::invalid("status", reason));
     }
-    let needed = |number: Option<f64>, field| number.ok_or_else(|| Error::invalid(field, "is required"));
-    let place = wire::Fix {
-        longitude_deg: needed(report.lon, "lon")?,
-        latitude_deg: needed(report.lat, "lat")?,
+    let required = |number: Option<f64>, field| number.ok_or_else(|| Error::invalid(field, "is required"));
+    let fix = wire::Fix {
+        longitude_deg: required(report.lon, "lon")?,
+        latitude_deg: required(report.lat, "lat")?,
         sigma_m: None,
     };
     let receiver_id = report.device.map(|device| ReceiverId::new(device.as_str())).transpose();
     let receiver_id = receiver_id.map_err(|_| Error::invalid("device", "is too long or not printable"))?;
     let time: Option<Timestamp> = report.time.map(|text| parse_time(text.as_str())).transpose()?;
-    Ok(Some(FixRow::checked(line, time, receiver_id, place.to_domain()?, time_bounds)))
+    Ok(Some(FixRow::checked(line, time, receiver_id, fix.to_domain()?, time_bounds)))
 }

@@ -163,8 +163,8 @@ impl Spool {
     }
 
     /// # Errors
-    /// `Overloaded` if all imports together hold as much as they may; a fault if the temporary file
-    /// cannot be written.
+    /// `Overloaded` if all imports together hold as much as they may; `InsufficientStorage`, or a
+    /// fault, if the temporary file cannot be written.
     pub(super) async fn push(&mut self, part: Bytes) -> Result<()> {
         if part.is_empty() {
             return Ok(());
@@ -183,7 +183,7 @@ impl Spool {
             None => self.file.insert(temporary_file().await?),
         };
         for part in self.parts.drain(..) {
-            file.write_all(&part).await.map_err(Error::fault)?;
+            file.write_all(&part).await.map_err(unspoolable)?;
         }
         self.leases.memory.clear();
         Ok(())
@@ -195,13 +195,24 @@ impl Spool {
         let content = match self.file {
             None => Content::Memory(self.parts),
             Some(mut file) => {
-                file.flush().await.map_err(Error::fault)?;
+                file.flush().await.map_err(unspoolable)?;
                 let mut file = file.into_std().await;
                 file.rewind().map_err(Error::fault)?;
                 Content::File(file)
             }
         };
         Ok(Spooled { content, leases: self.leases })
+    }
+}
+
+/// A temporary file that cannot be written.
+fn unspoolable(error: io::Error) -> Error {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Error::refused(
+            ErrorKind::InsufficientStorage,
+            "the disk that holds the server's temporary files is full; send less at once, or give it more space",
+        ),
+        _ => Error::fault(error),
     }
 }
 

@@ -29,7 +29,14 @@ async fn livez() -> &'static str {
     "alive\n"
 }
 
+/// Cameras that `/readyz` names one by one.
+const NAMED_CAMERAS: usize = 100;
+
 /// Whether the server can take work
+///
+/// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
+/// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
+/// a line `degraded: insufficient-storage: ...`.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -37,7 +44,7 @@ async fn livez() -> &'static str {
         (status = 503, description = "It is ending, or its store does not answer", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn readyz(State(rest): State<Rest>) -> ApiResult<&'static str> {
+async fn readyz(State(rest): State<Rest>) -> ApiResult<String> {
     if rest.shutdown.has_begun() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }
@@ -45,7 +52,18 @@ async fn readyz(State(rest): State<Rest>) -> ApiResult<&'static str> {
         Ok(answered) => answered?,
         Err(_) => return Err(slow_store().into()),
     }
-    Ok("ready\n")
+    let faults = rest.app.registry.model_faults();
+    let mut text = "ready\n".to_owned();
+    if rest.app.store.is_full() {
+        text.push_str("degraded: insufficient-storage: imports are refused until space is freed\n");
+    }
+    for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {
+        text.push_str(&format!("degraded: camera {camera}: {}\n", fault.reason));
+    }
+    if faults.len() > NAMED_CAMERAS {
+        text.push_str(&format!("degraded: {} more cameras\n", faults.len() - NAMED_CAMERAS));
+    }
+    Ok(text)
 }
 
 fn slow_store() -> Error {

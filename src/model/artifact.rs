@@ -1,7 +1,8 @@
 //! What a fit yields and a server stores: metadata beside a safetensors file.
 //!
-//! What never happens here: trust. An artifact may come from another server, so [`Artifact::load`]
-//! checks every name, shape and number before anything is computed from them.
+//! An artifact may come from another server or from a damaged disk, so [`Artifact::load`] checks every
+//! name, shape and number before anything is computed from them, then runs the model on boxes of its whole
+//! domain ([`super::probe`]).
 
 use std::collections::BTreeMap;
 
@@ -10,10 +11,11 @@ use bytes::Bytes;
 use super::cells::{Cells, NUMBERS};
 use super::coverage::{Coverage, DIMENSIONS, MOST_CENTRES};
 use super::net::{Net, NetShape};
+use super::probe;
 use super::projective::Doubt;
 use super::regressor::Regressor;
-use super::tensors::Tensors;
-use crate::domain::{Error, FeatureScale, ModelMetadata, Recipe, Result};
+use super::tensors::{LARGEST_MAGNITUDE, Tensors, is_usable};
+use crate::domain::{BoundingBox, Error, FeatureScale, ModelMetadata, Recipe, Result};
 use crate::geo::{LocalPlane, Position};
 
 /// Version of the metadata document.
@@ -33,7 +35,7 @@ impl Artifact {
     ///
     /// # Errors
     /// Names `metadata.x` or `weights` where something is unknown, missing, of another shape, not
-    /// finite, or too large.
+    /// finite, or too large, and the check that the model's answers do not pass.
     pub fn load(&self) -> Result<Regressor> {
         let metadata = &self.metadata;
         if metadata.format != FORMAT {
@@ -52,15 +54,21 @@ impl Artifact {
             tensors: Tensors::from_bytes(&self.weights)?,
             doubt: None,
         };
-        Regressor::build(parts)
+        let training_boxes: Vec<BoundingBox> = parts.clone().take_coverage()?.boxes().flatten().collect();
+        let regressor = Regressor::build(parts)?;
+        probe::check(&regressor, &training_boxes)?;
+        Ok(regressor)
     }
 }
 
+/// A number by which others are divided or multiplied.
 fn positive(field: &str, value: f64) -> Result<f64> {
-    if value.is_finite() && value > 0.0 {
+    if value >= LARGEST_MAGNITUDE.recip() && is_usable(value) {
         Ok(value)
     } else {
-        Err(Error::invalid(format!("metadata.{field}"), "must be a finite number above 0"))
+        let least = LARGEST_MAGNITUDE.recip();
+        let message = format!("must be a finite number from {least:e} to {LARGEST_MAGNITUDE:e}");
+        Err(Error::invalid(format!("metadata.{field}"), message))
     }
 }
 
@@ -82,11 +90,14 @@ impl Parts {
     /// A scalar of the recipe.
     ///
     /// # Errors
-    /// Names the parameter that is missing or not finite.
+    /// Names the parameter that is missing, not finite or too large.
     pub(super) fn parameter(&self, name: &str) -> Result<f64> {
         match self.parameters.get(name) {
-            Some(value) if value.is_finite() => Ok(*value),
-            _ => Err(Error::invalid(format!("metadata.parameters.{name}"), "must be there and finite")),
+            Some(value) if is_usable(*value) => Ok(*value),
+            _ => {
+                let message = format!("must be there, finite and within {LARGEST_MAGNITUDE:e}");
+                Err(Error::invalid(format!("metadata.parameters.{name}"), message))
+            }
         }
     }
 
@@ -101,14 +112,18 @@ impl Parts {
     /// The scalings of exactly these features.
     ///
     /// # Errors
-    /// Names `metadata.features` where they are others, or a scale is not finite or 0.
+    /// Names `metadata.features` where they are others, or a scale is not finite, 0 or too large.
     pub(super) fn scales<const N: usize>(&self, names: [&str; N]) -> Result<[Scale; N]> {
         let same = self.features.iter().map(|feature| feature.feature.as_str()).eq(names);
-        let finite = |feature: &FeatureScale| {
-            feature.offset.is_finite() && feature.factor.is_finite() && feature.factor != 0.0
+        let usable = |feature: &FeatureScale| {
+            let size = feature.factor.abs();
+            is_usable(feature.offset) && is_usable(size) && size >= LARGEST_MAGNITUDE.recip()
         };
-        if !same || !self.features.iter().all(finite) {
-            let message = format!("must be {} in that order, with finite scales", names.join(", "));
+        if !same || !self.features.iter().all(usable) {
+            let message = format!(
+                "must be {} in that order, with finite scales within {LARGEST_MAGNITUDE:e}",
+                names.join(", ")
+            );
             return Err(Error::invalid("metadata.features", message));
         }
         Ok(std::array::from_fn(|at| Scale {

@@ -1,6 +1,7 @@
-//! One file for one model version: safetensors, with the metadata document in the header.
+//! One file for one model version: safetensors, with the metadata document and a checksum in the header.
 //!
-//! What one server gives another takes, and so does `sightfix fuse --model`.
+//! A file that one server gives can be imported by another, and read by `sightfix fuse --model`. Files of
+//! earlier releases have no checksum.
 
 use std::collections::HashMap;
 
@@ -8,10 +9,12 @@ use bytes::Bytes;
 use safetensors::{SafeTensorError, SafeTensors};
 
 use super::Artifact;
-use crate::domain::{Error, Result};
+use crate::domain::{Error, Result, model_sha256};
 
 /// Key of the metadata document in the header.
-const KEY: &str = "sightfix";
+const DOCUMENT_KEY: &str = "sightfix";
+/// Key of the checksum in the header, see [`model_sha256`].
+const CHECKSUM_KEY: &str = "sightfix.sha256";
 /// No model is larger; the header adds some kB to the 64 kB of weights.
 const LARGEST_FILE_BYTES: usize = 1 << 20;
 
@@ -24,11 +27,17 @@ impl Artifact {
         let tensors = SafeTensors::deserialize(&self.weights)?;
         let document =
             serde_json::to_string(&self.metadata).map_err(SafeTensorError::InvalidHeaderDeserialization)?;
-        let header = HashMap::from([(KEY.to_owned(), document)]);
+        let checksum = model_sha256(document.as_bytes(), &self.weights);
+        let header =
+            HashMap::from([(DOCUMENT_KEY.to_owned(), document), (CHECKSUM_KEY.to_owned(), checksum)]);
         safetensors::serialize(tensors.tensors(), Some(header)).map(Bytes::from)
     }
 
     /// The artifact of a file that [`Artifact::to_file`] made.
+    ///
+    /// The checksum is taken over the canonical form of the tensors, so that it covers their names, types
+    /// and shapes as well. Entries of the header that are not known are refused: one of them may be the
+    /// checksum under a damaged name.
     ///
     /// # Errors
     /// `InvalidArgument` naming `file`, or the place in its `metadata`.
@@ -38,16 +47,29 @@ impl Artifact {
         }
         let not_safetensors = |error| Error::invalid("file", format!("is not safetensors: {error}"));
         let (_, header) = SafeTensors::read_metadata(file).map_err(not_safetensors)?;
-        let document = header.metadata().as_ref().and_then(|entries| entries.get(KEY)).ok_or_else(|| {
+        let entries = header.metadata().clone().unwrap_or_default();
+        let document = entries.get(DOCUMENT_KEY).ok_or_else(|| {
             Error::invalid(
                 "file",
-                format!("has no metadata under `{KEY}`; download it from a sightfix server"),
+                format!("has no metadata under `{DOCUMENT_KEY}`; download it from a sightfix server"),
             )
         })?;
+        if let Some(unknown) =
+            entries.keys().find(|key| ![DOCUMENT_KEY, CHECKSUM_KEY].contains(&key.as_str()))
+        {
+            return Err(Error::invalid("file", format!("has an unknown entry {unknown:?} in its header")));
+        }
+        let tensors = SafeTensors::deserialize(file).map_err(not_safetensors)?;
+        let weights = safetensors::serialize(tensors.tensors(), None).map_err(not_safetensors)?;
+        if entries
+            .get(CHECKSUM_KEY)
+            .is_some_and(|sha256| *sha256 != model_sha256(document.as_bytes(), &weights))
+        {
+            let message = "does not match its checksum, so it was damaged on its way; download it again";
+            return Err(Error::invalid("file", message));
+        }
         let metadata = serde_json::from_str(document)
             .map_err(|error| Error::invalid("metadata", format!("cannot be read: {error}")))?;
-        let tensors = SafeTensors::deserialize(file).map_err(not_safetensors)?;
-        let weights = safetensors::serialize(tensors.tensors(), None).map_err(not_safetensors)?.into();
-        Ok(Self { metadata, weights })
+        Ok(Self { metadata, weights: weights.into() })
     }
 }

@@ -45,6 +45,9 @@ pub enum FitEvent<'a> {
     Progress(&'a RunProgress),
     /// One epoch of the final fit.
     Epoch(&'a EpochReport),
+    /// Distance in m from the held-out position to the fix, of each sample in the order of target and time,
+    /// with the recipe that was chosen.
+    HeldOut(&'a [f64]),
     /// A line for the log.
     Note(&'a str),
 }
@@ -141,6 +144,8 @@ pub fn fit_trial(
     }
     let (kept, scores) = select::choose(&rows, &residuals);
     tell_choice(&candidates, kept, &scores, &mut run)?;
+    let distances_m: Vec<f64> = residuals[kept].iter().map(|[east, north]| east.hypot(*north)).collect();
+    run.tell(|observer, _| observer(FitEvent::HeldOut(&distances_m)))?;
 
     let candidate = *candidates[kept];
     // The final fit may be shorter than the longest candidate's.

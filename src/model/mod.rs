@@ -15,6 +15,7 @@ mod hybrid;
 mod kernel;
 pub mod net;
 mod paper;
+mod probe;
 mod projection;
 mod projective;
 mod regressor;

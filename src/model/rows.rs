@@ -3,13 +3,15 @@
 //!
 //! What never happens here: learning; a look at a sample's truth.
 
+use std::collections::HashMap;
+
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
 use super::FitError;
 use super::whitening::FixNoise;
 use crate::domain::{BoundingBox, Error, ErrorKind, Sample};
-use crate::filters::{FixError, smooth_pass, tune_acceleration};
+use crate::filters::{FixError, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 /// Fewer samples cannot tell a camera from its noise.
@@ -50,7 +52,8 @@ impl Rows {
     /// Sorts, projects and cuts the samples.
     ///
     /// # Errors
-    /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], or all at one spot.
+    /// Refuses sets that are empty, smaller than [`FEWEST_SAMPLES`], mostly one repeated row, or all at one
+    /// spot.
     pub(super) fn new(samples: &[Sample]) -> Result<Self, FitError> {
         if samples.is_empty() {
             return Err(unusable("there are none; import samples that have a box and a fix first".into()));
@@ -82,8 +85,31 @@ impl Rows {
         }
         let passes = number_passes(&mut rows);
         let all = Self { plane, rows, targets: target + 1, passes };
+        all.refuse_repeated()?;
         all.refuse_one_spot()?;
         Ok(all)
+    }
+
+    /// Refuses sets of which more than half is one and the same box and fix: a stuck detector or receiver.
+    /// Such rows would outweigh all others, and a model that only repeats them would have the least error.
+    fn refuse_repeated(&self) -> Result<(), FitError> {
+        let mut counts: HashMap<[u64; 6], usize> = HashMap::new();
+        for row in &self.rows {
+            let [left, top, width, height] = row.bounding_box.sides_px();
+            let values =
+                [left, top, width, height, row.position.longitude_deg(), row.position.latitude_deg()];
+            *counts.entry(values.map(f64::to_bits)).or_default() += 1;
+        }
+        let most = counts.into_values().max().unwrap_or(0);
+        if 2 * most > self.rows.len() {
+            return Err(unusable(format!(
+                "{most} of {} repeat one and the same box and fix, so detector or receiver were stuck; \
+                 delete those (DELETE /v1/cameras/{{camera}}/samples?from=...&until=...), or train on a \
+                 range of time without them",
+                self.rows.len()
+            )));
+        }
+        Ok(())
     }
 
     fn refuse_one_spot(&self) -> Result<(), FitError> {
@@ -167,8 +193,9 @@ impl Rows {
             .map(|pass| pass.iter().map(|row| (row.time_s, row.label)).unzip())
             .collect();
         let acceleration_mps2 = tune_acceleration(&passes, &error);
-        let labels =
-            passes.iter().flat_map(|(times_s, fixes)| smooth_pass(times_s, fixes, &error, acceleration_mps2));
+        let labels = passes
+            .iter()
+            .flat_map(|(times_s, fixes)| smooth_traverse(times_s, fixes, &error, acceleration_mps2));
         let mut smoothed = self.clone();
         for (row, label) in smoothed.rows.iter_mut().zip(labels) {
             row.label = label.position;

@@ -23,7 +23,7 @@ impl Run<'_> {
         self.tell(|observer, _| observer(FitEvent::Note(line)))
     }
 
-    fn tell(
+    pub(super) fn tell(
         &mut self,
         event: impl FnOnce(&mut Observer<'_>, &RunProgress) -> ControlFlow<()>,
     ) -> Result<(), FitError> {

@@ -13,6 +13,15 @@ use crate::domain::{Error, Result};
 /// Largest weight file, in bytes.
 pub const LARGEST_WEIGHTS_BYTES: usize = 64 * 1024;
 
+/// No number of a model is larger in size, and no divisor smaller than its inverse: what lies beyond is
+/// damaged or made up, and would overflow on the way to a position.
+pub(super) const LARGEST_MAGNITUDE: f64 = 1e12;
+
+/// Whether a number is finite and within [`LARGEST_MAGNITUDE`].
+pub(super) fn is_usable(value: f64) -> bool {
+    value.abs() <= LARGEST_MAGNITUDE
+}
+
 #[derive(Debug, Clone, PartialEq)]
 enum Values {
     F32(Vec<f32>),
@@ -112,7 +121,7 @@ impl Tensors {
 
     /// # Errors
     /// Refuses files that are too large, not safetensors, of other types than f32 and f64, or hold
-    /// numbers that are not finite; the field is named `weights`.
+    /// numbers that are not finite or beyond [`LARGEST_MAGNITUDE`]; the field is named `weights`.
     pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self> {
         if bytes.len() > LARGEST_WEIGHTS_BYTES {
             return Err(invalid(format!(
@@ -133,12 +142,14 @@ impl Tensors {
                 ),
                 other => return Err(invalid(format!("tensor {name} must be of f32 or f64, not {other:?}"))),
             };
-            let finite = match &values {
-                Values::F32(values) => values.iter().all(|value| value.is_finite()),
-                Values::F64(values) => values.iter().all(|value| value.is_finite()),
+            let usable = match &values {
+                Values::F32(values) => values.iter().all(|value| is_usable(f64::from(*value))),
+                Values::F64(values) => values.iter().all(|value| is_usable(*value)),
             };
-            if !finite {
-                return Err(invalid(format!("tensor {name} holds numbers that are not finite")));
+            if !usable {
+                return Err(invalid(format!(
+                    "tensor {name} holds numbers that are not finite or beyond {LARGEST_MAGNITUDE:e}"
+                )));
             }
             tensors.0.insert(name, Tensor { shape: view.shape().to_vec(), values });
         }

@@ -204,7 +204,7 @@ pub(super) fn silent(_: FitEvent<'_>) -> ControlFlow<()> {
 #[test]
 fn the_same_seed_gives_the_same_bits() {
     let samples = walk(6, 40, 2.0, 1);
-    for recipe in Recipe::ALL {
+    for &recipe in Recipe::ALL {
         let first = fit(&samples, &options(recipe), &mut silent).expect("fits");
         let second = fit(&samples, &options(recipe), &mut silent).expect("fits");
         assert_eq!(first.weights, second.weights, "{recipe}");
@@ -219,7 +219,7 @@ fn the_same_seed_gives_the_same_bits() {
 #[test]
 fn the_metadata_survive_json_and_the_model_answers_the_same() {
     let samples = walk(6, 40, 2.0, 2);
-    for recipe in Recipe::ALL {
+    for &recipe in Recipe::ALL {
         let artifact = fit(&samples, &options(recipe), &mut silent).expect("fits");
         let text = serde_json::to_string(&artifact.metadata).expect("json");
         let metadata = serde_json::from_str(&text).expect("metadata");

@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
-use sqlx::{Sqlite, SqliteExecutor};
+use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 
 use super::Store;
-use super::faults::{failed, no_camera};
-use super::fields::Fields;
+use super::errors::{failed, no_camera};
+use super::row_decoder::RowDecoder;
 use crate::domain::{
     Camera, CameraId, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver, ReceiverId,
     Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
@@ -28,10 +28,10 @@ impl Store {
     /// Stores a new camera with revision 1.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraExists`].
+    /// [`ErrorKind::CameraExists`]; [`ErrorKind::InsufficientStorage`] beyond the limit of cameras.
     pub async fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let insert = sqlx::query(concat!(
             "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, \
              target_classes, labels, receivers, retrain_when_moved, updated_at_us, id, created_at_us, revision) \
@@ -49,6 +49,7 @@ impl Store {
             return Err(Error::field(ErrorKind::CameraExists, "id", taken));
         };
         let camera = read_camera(&row)?;
+        check_limit(&mut transaction, self.limits().cameras).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
     }
@@ -80,16 +81,16 @@ impl Store {
     ///
     /// # Errors
     /// Faults only.
-    pub async fn camera_heads(&self) -> Result<Vec<(CameraId, Revision, Option<u32>)>> {
+    pub async fn camera_versions(&self) -> Result<Vec<(CameraId, Revision, Option<u32>)>> {
         let rows = sqlx::query("SELECT id, revision, active_model FROM cameras")
             .fetch_all(self.readers())
             .await
             .map_err(failed)?;
         let read = |row| {
-            let mut fields = Fields::of("cameras", row);
-            let id = fields.make(CameraId::new)?;
-            let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
-            Ok((id, revision, fields.some_count()?))
+            let mut fields = RowDecoder::new("cameras", row);
+            let id = fields.parse(CameraId::new)?;
+            let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
+            Ok((id, revision, fields.optional_count()?))
         };
         rows.iter().map(read).collect()
     }
@@ -105,8 +106,8 @@ impl Store {
         expected: Option<Revision>,
         now: Timestamp,
     ) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
@@ -131,8 +132,8 @@ impl Store {
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::RunLive`] while a
     /// training run has not ended.
     pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut deletion = self.deletion().await?;
+        let mut transaction = deletion.begin().await?;
         check_revision(&find_camera(&mut *transaction, id).await?, expected)?;
         let live: i64 = sqlx::query_scalar(
             "SELECT count(*) FROM training_runs JOIN cameras ON cameras.key = camera_key \
@@ -153,8 +154,25 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
-        transaction.commit().await.map_err(failed)
+        transaction.commit().await.map_err(failed)?;
+        deletion.reclaim().await;
+        Ok(())
     }
+}
+
+/// Refuses the camera that was just inserted if it is one too many.
+async fn check_limit(connection: &mut SqliteConnection, limit: u32) -> Result<()> {
+    let cameras: i64 =
+        sqlx::query_scalar("SELECT count(*) FROM cameras").fetch_one(connection).await.map_err(failed)?;
+    if cameras > i64::from(limit) {
+        return Err(Error::refused(
+            ErrorKind::InsufficientStorage,
+            format!(
+                "limits.cameras is {limit}; delete a camera that is no longer needed, or raise the limit"
+            ),
+        ));
+    }
+    Ok(())
 }
 
 /// One camera, inside or outside of a transaction.
@@ -211,22 +229,22 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
 }
 
 fn read_camera(row: &SqliteRow) -> Result<Camera> {
-    let mut fields = Fields::of("cameras", row).skip(1);
-    let id = fields.make(CameraId::new)?;
-    let display_name = fields.take()?;
-    let width_px = fields.some_count()?;
-    let height_px = fields.some_count()?;
+    let mut fields = RowDecoder::new("cameras", row).skip(1);
+    let id = fields.parse(CameraId::new)?;
+    let display_name = fields.get()?;
+    let width_px = fields.optional_count()?;
+    let height_px = fields.optional_count()?;
     let image_size = width_px.zip(height_px).map(|(width, height)| ImageSize::new(width, height)).transpose();
-    let image_size = fields.made(image_size)?;
-    let gnss_error = fields.make_some(SigmaM::new)?.map_or(GnssError::Unknown, GnssError::Known);
-    let recipe = fields.make(|name: &str| name.parse())?;
-    let target_classes = fields.make(read_classes)?;
-    let labels = fields.make(serde_json::from_str::<BTreeMap<String, String>>)?;
-    let receivers = fields.make(read_receivers)?;
-    let retrain_when_moved = fields.take()?;
-    let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
-    let (created_at, updated_at) = (fields.time()?, fields.time()?);
-    let active_model = fields.some_count()?;
+    let image_size = fields.checked(image_size)?;
+    let gnss_error = fields.parse_optional(SigmaM::new)?.map_or(GnssError::Unknown, GnssError::Known);
+    let recipe = fields.parse(|name: &str| name.parse())?;
+    let target_classes = fields.parse(read_classes)?;
+    let labels = fields.parse(serde_json::from_str::<BTreeMap<String, String>>)?;
+    let receivers = fields.parse(read_receivers)?;
+    let retrain_when_moved = fields.get()?;
+    let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
+    let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
+    let active_model = fields.optional_count()?;
     let profile = NewCamera {
         id,
         display_name,

@@ -1,4 +1,4 @@
-//! Evaluations: jobs that yield a report, a document that the store does not read.
+//! Evaluations: jobs whose output is a report, a document that the store does not read.
 
 use std::time::Duration;
 
@@ -9,9 +9,10 @@ use uuid::Uuid;
 
 use super::Store;
 use super::cameras::camera_key;
-use super::faults::{failed, no_evaluation};
-use super::fields::Fields;
+use super::errors::{failed, no_evaluation};
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
+use super::retention::prune_evaluations;
+use super::row_decoder::RowDecoder;
 use crate::domain::{
     CameraId, Error, ErrorKind, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, Method,
     Result, SigmaM, TimeRange, Truth,
@@ -19,7 +20,7 @@ use crate::domain::{
 use crate::geo::Position;
 
 const EVALUATIONS: Jobs =
-    Jobs { table: "evaluations", plural: "evaluations", fresh: "steps_done = 0, steps_planned = 0" };
+    Jobs { table: "evaluations", plural: "evaluations", reset_progress: "steps_done = 0, steps_planned = 0" };
 
 macro_rules! select {
     ($rest:literal) => {
@@ -49,10 +50,11 @@ impl Store {
         max_live: u32,
         now: Timestamp,
     ) -> Result<EvaluationJob> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
-        EVALUATIONS.check_room(&mut transaction, max_live).await?;
+        prune_evaluations(&mut transaction, self.limits().ended_evaluations).await?;
+        EVALUATIONS.check_capacity(&mut transaction, max_live).await?;
         let (point, lines) = written_truth(&plan.truth)?;
         let methods: Vec<String> = plan.methods.iter().map(Method::to_string).collect();
         sqlx::query(
@@ -92,7 +94,7 @@ impl Store {
         find_evaluation(self.readers(), id).await
     }
 
-    /// The report of an evaluation as it was handed in, `None` unless it has succeeded.
+    /// The report of an evaluation as it was stored, `None` unless it has succeeded.
     ///
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`].
@@ -132,8 +134,8 @@ impl Store {
         rows.iter().map(read_evaluation).collect()
     }
 
-    /// Takes up the oldest evaluation that is queued or whose worker has stopped beating. Its attempt
-    /// and fence go up by one; its progress begins anew.
+    /// Claims the oldest evaluation that is queued or whose lease has expired. Its attempt and fence go
+    /// up by one; its progress is reset.
     ///
     /// # Errors
     /// Faults only.
@@ -142,19 +144,19 @@ impl Store {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Option<Claim<EvaluationJob>>> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let Some(claim) = EVALUATIONS.claim(&mut transaction, lease, now).await? else { return Ok(None) };
         let job = find_evaluation(&mut *transaction, EvaluationId(claim.job)).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
     }
 
-    /// Prolongs the lease and shows how far the evaluation has come.
+    /// Renews the lease and stores the evaluation's progress.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn beat_evaluation(
+    pub async fn heartbeat_evaluation(
         &self,
         id: EvaluationId,
         fence: i64,
@@ -162,9 +164,9 @@ impl Store {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Heartbeat> {
-        let mut turn = self.relaxed().await?;
-        let mut transaction = turn.begin().await?;
-        let heartbeat = EVALUATIONS.beat(&mut transaction, (id.0, fence), lease, now).await?;
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
+        let heartbeat = EVALUATIONS.heartbeat(&mut transaction, (id.0, fence), lease, now).await?;
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }
@@ -183,28 +185,28 @@ impl Store {
         Ok(heartbeat)
     }
 
-    /// Asks for the end of an evaluation: a queued one ends at once, a running one at its worker's next
-    /// heartbeat. Once this has returned, it yields no report any more.
+    /// Cancels an evaluation: at once where no worker holds a live lease on it, otherwise at its worker's
+    /// next heartbeat. Once this has returned, it produces no report any more.
     ///
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`], [`ErrorKind::EvaluationEnded`].
     pub async fn cancel_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<EvaluationJob> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let stored = find_evaluation(&mut *transaction, id).await?;
         if stored.state.has_ended() {
             let ended = format!("the evaluation has ended already: {}", stored.state.as_str());
             return Err(Error::refused(ErrorKind::EvaluationEnded, ended));
         }
-        EVALUATIONS.cancel(&mut transaction, id.0, stored.state, now).await?;
+        EVALUATIONS.cancel(&mut transaction, id.0, now).await?;
         let stored = find_evaluation(&mut *transaction, id).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(stored)
     }
 
-    /// Ends an evaluation with its report, or otherwise, if the worker still holds it; `None` if it
-    /// lost it, and then nothing was changed. One whose end the operator has asked for is cancelled
-    /// even if it succeeded or was given back.
+    /// Ends an evaluation, or returns it to the queue, if the worker still owns its lease; `None` if it
+    /// lost it, and then nothing was changed. One whose cancellation was requested is cancelled even if it
+    /// succeeded or was returned.
     ///
     /// # Errors
     /// Faults only.
@@ -215,12 +217,12 @@ impl Store {
         end: JobEnd<String>,
         now: Timestamp,
     ) -> Result<Option<EvaluationJob>> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
-        let Some(left) = EVALUATIONS.leave(&mut transaction, (id.0, fence), end, now).await? else {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let Some(finished) = EVALUATIONS.finish(&mut transaction, (id.0, fence), end, now).await? else {
             return Ok(None);
         };
-        if let Some(report) = left.yielded {
+        if let Some(report) = finished.output {
             sqlx::query("UPDATE evaluations SET report = ? WHERE id = ?")
                 .bind(report)
                 .bind(id.to_string())
@@ -238,14 +240,15 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`].
     pub async fn delete_evaluation(&self, id: EvaluationId) -> Result<()> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut deletion = self.deletion().await?;
+        let mut transaction = deletion.begin().await?;
         let done = sqlx::query("DELETE FROM evaluations WHERE id = ?")
             .bind(id.to_string())
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
         transaction.commit().await.map_err(failed)?;
+        deletion.reclaim().await;
         if done.rows_affected() == 0 { Err(no_evaluation(id)) } else { Ok(()) }
     }
 }
@@ -260,38 +263,38 @@ async fn find_evaluation(executor: impl SqliteExecutor<'_>, id: EvaluationId) ->
 }
 
 fn read_evaluation(row: &SqliteRow) -> Result<EvaluationJob> {
-    let mut fields = Fields::of("evaluations", row);
+    let mut fields = RowDecoder::new("evaluations", row);
     Ok(EvaluationJob {
-        id: EvaluationId(fields.make(Uuid::parse_str)?),
-        camera_id: fields.make(CameraId::new)?,
+        id: EvaluationId(fields.parse(Uuid::parse_str)?),
+        camera_id: fields.parse(CameraId::new)?,
         plan: EvaluationPlan {
             train: read_range(&mut fields)?,
             test: read_range(&mut fields)?,
             truth: read_truth(&mut fields)?,
-            methods: fields.make(read_methods)?,
-            recipe: fields.make(|name: &str| name.parse())?,
+            methods: fields.parse(read_methods)?,
+            recipe: fields.parse(|name: &str| name.parse())?,
             seeds: fields.count()?,
-            box_shift_px: fields.take()?,
-            gnss_sigma: fields.make_some(SigmaM::new)?,
+            box_shift_px: fields.get()?,
+            gnss_sigma: fields.parse_optional(SigmaM::new)?,
         },
-        state: fields.make(read_state)?,
+        state: fields.parse(read_state)?,
         attempt: fields.count()?,
         progress: EvaluationProgress {
-            phase: fields.take()?,
+            phase: fields.get()?,
             steps_done: fields.count()?,
             steps: fields.count()?,
-            remaining_s: fields.take()?,
+            remaining_s: fields.get()?,
         },
-        outcome: fields.take()?,
-        created_at: fields.time()?,
-        started_at: fields.some_time()?,
-        ended_at: fields.some_time()?,
+        outcome: fields.get()?,
+        created_at: fields.timestamp()?,
+        started_at: fields.optional_timestamp()?,
+        ended_at: fields.optional_timestamp()?,
     })
 }
 
-fn read_range(fields: &mut Fields<'_>) -> Result<TimeRange> {
-    let (from, until) = (fields.some_time()?, fields.some_time()?);
-    fields.made(TimeRange::new(from, until))
+fn read_range(fields: &mut RowDecoder<'_>) -> Result<TimeRange> {
+    let (from, until) = (fields.optional_timestamp()?, fields.optional_timestamp()?);
+    fields.checked(TimeRange::new(from, until))
 }
 
 fn read_methods(json: &str) -> Result<Vec<Method>> {
@@ -313,12 +316,12 @@ fn written_truth(truth: &Truth) -> Result<(Option<Position>, Option<String>)> {
     }
 }
 
-fn read_truth(fields: &mut Fields<'_>) -> Result<Truth> {
-    let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.take()?, fields.take()?);
+fn read_truth(fields: &mut RowDecoder<'_>) -> Result<Truth> {
+    let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
     let point =
         longitude_deg.zip(latitude_deg).map(|(longitude, latitude)| Position::new(longitude, latitude));
-    let point = fields.made(point.transpose())?;
-    let lines = fields.make_some(read_lines)?;
+    let point = fields.checked(point.transpose())?;
+    let lines = fields.parse_optional(read_lines)?;
     Ok(match (point, lines) {
         (Some(point), _) => Truth::Point(point),
         (None, Some(lines)) => Truth::Lines(lines),

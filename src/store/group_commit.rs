@@ -1,9 +1,9 @@
-//! Storing samples: one task takes what many callers hand in and commits it together.
+//! Group commit of samples: one task commits what many callers have queued in one transaction.
 //!
-//! A commit costs much more than a row, so whoever waits when a transaction begins is taken along.
-//! Nothing is acknowledged before its commit, and a caller's samples are stored wholly or not at all.
+//! A commit costs much more than a row, so every batch that is queued when a transaction begins joins
+//! it. Nothing is acknowledged before its commit, and a caller's batch is stored atomically.
 //! What never happens here: a caller waits for more callers to come, the queue grows without bound, a
-//! caller who went away disturbs the others.
+//! cancelled caller disturbs the others.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -13,17 +13,18 @@ use sqlx::sqlite::SqliteArguments;
 use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
-use super::connection::{Durability, Turn, Writer};
-use super::faults::{closed, failed, no_camera, same};
-use crate::domain::{CameraId, Error, Result, Sample};
+use super::errors::{closed, copy_of, failed, no_camera};
+use super::space::Space;
+use super::writer::{Growth, Writer, WriterGuard};
+use crate::domain::{CameraId, Durability, Error, Result, Sample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
 
-/// Rows that wait or are being committed; callers beyond wait to hand theirs in.
+/// Rows that wait or are being committed; further callers wait to queue theirs.
 const ROWS_IN_FLIGHT: u32 = 65_536;
 
-/// Callers that wait; each hands in at least one row, so more never wait.
+/// Callers that wait; each has at least one row, so more never wait.
 const QUEUE: usize = 16_384;
 
 /// What became of the samples of one call.
@@ -35,7 +36,7 @@ pub struct Inserted {
     pub duplicate: u64,
 }
 
-/// The way into the task.
+/// Queues batches for the task.
 pub(super) struct GroupCommit {
     queue: mpsc::Sender<Request>,
     rows: Arc<Semaphore>,
@@ -43,32 +44,38 @@ pub(super) struct GroupCommit {
 
 enum Request {
     Insert(Batch),
-    /// All before it is committed, then the task ends.
+    /// Everything queued before is committed, then the task ends.
     End(oneshot::Sender<()>),
 }
 
 struct Batch {
     camera: CameraId,
     samples: Vec<Sample>,
+    durability: Durability,
     reply: oneshot::Sender<Result<Inserted>>,
-    /// Makes room for other rows when the batch is done.
-    _room: OwnedSemaphorePermit,
+    /// Limits the rows in flight; released when the batch is done.
+    _permit: OwnedSemaphorePermit,
 }
 
 impl GroupCommit {
-    pub(super) fn start(writer: Arc<Writer>) -> Self {
+    pub(super) fn start(writer: Arc<Writer>, space: Arc<Space>) -> Self {
         let (queue, requests) = mpsc::channel(QUEUE);
-        tokio::spawn(run(writer, requests));
+        tokio::spawn(run(writer, space, requests));
         Self { queue, rows: Arc::new(Semaphore::new(ROWS_IN_FLIGHT as usize)) }
     }
 
-    pub(super) async fn insert(&self, camera: CameraId, samples: Vec<Sample>) -> Result<Inserted> {
+    pub(super) async fn insert(
+        &self,
+        camera: CameraId,
+        samples: Vec<Sample>,
+        durability: Durability,
+    ) -> Result<Inserted> {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
-        let room = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
+        let permit = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = Batch { camera, samples, reply, _room: room };
-        self.queue.send(Request::Insert(batch)).await.map_err(|_| self.gone())?;
-        answer.await.map_err(|_| self.gone())?
+        let batch = Batch { camera, samples, durability, reply, _permit: permit };
+        self.queue.send(Request::Insert(batch)).await.map_err(|_| self.task_ended())?;
+        answer.await.map_err(|_| self.task_ended())?
     }
 
     pub(super) async fn close(&self) {
@@ -84,33 +91,41 @@ impl GroupCommit {
         self.queue.is_closed()
     }
 
-    /// Callers whose samples have not been taken up.
+    /// Callers whose batches are still queued.
     #[cfg(test)]
     pub(super) fn waiting(&self) -> usize {
         self.queue.max_capacity() - self.queue.capacity()
     }
 
-    /// The task has ended, in order or not.
-    fn gone(&self) -> Error {
+    /// Why the task has ended: closed, or failed.
+    fn task_ended(&self) -> Error {
         if self.rows.is_closed() { closed() } else { Error::fault("the task that stores samples has ended") }
     }
 }
 
-async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
+async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<Request>) {
     while let Some(first) = requests.recv().await {
-        // The turn first: whoever hands in samples while another change is written is taken along.
-        let turn = writer.turn(Durability::Relaxed).await;
+        // The writer first: batches that are queued while it is locked for another change join the group.
+        let guard = writer.lock(Durability::default(), Growth::Limited).await;
         let (group, end) = gather(first, &mut requests);
-        match turn {
-            Ok(mut turn) => answer_all(&mut turn, group).await,
+        match guard {
+            Ok(mut guard) => {
+                guard.set_durability(durability_of(&group));
+                answer_all(&mut guard, &space, group).await;
+            }
             Err(error) => refuse_all(group, &error),
         }
         if let Some(ended) = end {
-            // Whoever asked may have gone; nothing is left to tell.
+            // The caller may have been cancelled.
             let _ = ended.send(());
             return;
         }
     }
+}
+
+/// The strongest that a caller of the group asks for: one flush is enough for all of them.
+fn durability_of(group: &[Batch]) -> Durability {
+    group.iter().map(|batch| batch.durability).max().unwrap_or_default()
 }
 
 /// What is in the queue now, up to the rows of one transaction.
@@ -136,17 +151,17 @@ fn gather(
 
 /// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
 /// alone, so that one bad row fails nobody but its caller.
-async fn answer_all(turn: &mut Turn<'_>, group: Vec<Batch>) {
-    match commit(turn, &group).await {
+async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch>) {
+    match commit(guard, space, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
-                // A caller who went away needs no answer.
+                // A cancelled caller needs no answer.
                 let _ = batch.reply.send(outcome);
             }
         }
         Err(Failure::Statement(_)) if group.len() > 1 => {
             for batch in group {
-                let alone = commit(turn, std::slice::from_ref(&batch)).await;
+                let alone = commit(guard, space, std::slice::from_ref(&batch)).await;
                 let outcome = match alone {
                     Ok(mut outcomes) => outcomes.swap_remove(0),
                     Err(Failure::Statement(error) | Failure::Transaction(error)) => Err(error),
@@ -160,7 +175,7 @@ async fn answer_all(turn: &mut Turn<'_>, group: Vec<Batch>) {
 
 fn refuse_all(group: Vec<Batch>, error: &Error) {
     for batch in group {
-        let _ = batch.reply.send(Err(same(error)));
+        let _ = batch.reply.send(Err(copy_of(error)));
     }
 }
 
@@ -172,10 +187,27 @@ enum Failure {
 }
 
 /// One transaction for all batches, with an outcome for each, in their order.
-async fn commit(turn: &mut Turn<'_>, group: &[Batch]) -> Result<Vec<Result<Inserted>>, Failure> {
+async fn commit(
+    guard: &mut WriterGuard<'_>,
+    space: &Space,
+    group: &[Batch],
+) -> Result<Vec<Result<Inserted>>, Failure> {
+    let committed = try_commit(guard, space, group).await;
+    match &committed {
+        Ok(outcomes) => space.stored(outcomes.iter().flatten().map(|inserted| inserted.accepted).sum()),
+        Err(Failure::Statement(error) | Failure::Transaction(error)) => space.failed(error),
+    }
+    committed
+}
+
+async fn try_commit(
+    guard: &mut WriterGuard<'_>,
+    space: &Space,
+    group: &[Batch],
+) -> Result<Vec<Result<Inserted>>, Failure> {
     for counting in [Counting::Together, Counting::Apart] {
-        let mut transaction = turn.begin().await.map_err(Failure::Transaction)?;
-        let outcomes = store(&mut transaction, group, counting).await.map_err(Failure::Statement)?;
+        let mut transaction = guard.begin().await.map_err(Failure::Transaction)?;
+        let outcomes = store(&mut transaction, space, group, counting).await.map_err(Failure::Statement)?;
         if let Some(outcomes) = outcomes {
             transaction.commit().await.map_err(|error| Failure::Transaction(failed(error)))?;
             return Ok(outcomes);
@@ -201,22 +233,29 @@ struct Row<'a> {
     sample: &'a Sample,
 }
 
-/// `None` if a statement over several batches met duplicates, so that nobody can tell whose.
+/// `None` if a statement over several batches met duplicates, so that they cannot be attributed.
 async fn store(
     connection: &mut SqliteConnection,
+    space: &Space,
     group: &[Batch],
     counting: Counting,
 ) -> Result<Option<Vec<Result<Inserted>>>> {
-    let keys = camera_keys(connection, group).await?;
+    let mut cameras = cameras_of(connection, group).await?;
+    let mut quota = space.quota();
     let mut outcomes: Vec<Result<Inserted>> = Vec::with_capacity(group.len());
     let mut rows = Vec::with_capacity(group.iter().map(|batch| batch.samples.len()).sum());
     let mut borders = Vec::new();
     for (index, batch) in group.iter().enumerate() {
-        let key = keys.get(batch.camera.as_str());
-        outcomes.push(key.map_or_else(|| Err(no_camera(&batch.camera)), |_| Ok(Inserted::default())));
-        if let Some(&camera_key) = key {
+        let admitted = match cameras.get_mut(batch.camera.as_str()) {
+            Some(camera) => quota.admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64),
+            None => Err(no_camera(&batch.camera)),
+        };
+        if let (Ok(()), Some(&Known { key: camera_key, .. })) =
+            (&admitted, cameras.get(batch.camera.as_str()))
+        {
             rows.extend(batch.samples.iter().map(|sample| Row { batch: index, camera_key, sample }));
         }
+        outcomes.push(admitted.map(|()| Inserted::default()));
         if counting == Counting::Apart {
             borders.push(rows.len());
         }
@@ -226,7 +265,7 @@ async fn store(
     let mut next = statements.first().map(|range| Insert::of(&rows[range.clone()])).transpose()?;
     for (index, range) in statements.iter().enumerate() {
         let Some(insert) = next.take() else { break };
-        // The next statement's values are laid out while the database works on this one.
+        // The next statement's values are bound while the database executes this one.
         let following = async { statements.get(index + 1).map(|range| Insert::of(&rows[range.clone()])) };
         let (accepted, following) = tokio::join!(insert.execute(connection), following);
         if !count(&mut outcomes, &rows[range.clone()], accepted?) {
@@ -234,10 +273,11 @@ async fn store(
         }
         next = following.transpose()?;
     }
+    count_stored(connection, &cameras, group, &outcomes).await?;
     Ok(Some(outcomes))
 }
 
-/// Adds a statement's count to its batches; false if it cannot be told whose rows were duplicates.
+/// Adds a statement's count to its batches; false if its duplicates cannot be attributed to one.
 fn count(outcomes: &mut [Result<Inserted>], rows: &[Row<'_>], accepted: u64) -> bool {
     let all = rows.len() as u64;
     if accepted == all || accepted == 0 {
@@ -262,20 +302,60 @@ fn add(outcomes: &mut [Result<Inserted>], row: &Row<'_>, accepted: u64, duplicat
     }
 }
 
-/// The keys of the cameras of a group, read in its own transaction, so that none can vanish before
+/// A camera of a group.
+struct Known {
+    key: i64,
+    /// Samples stored, and those of the group that are admitted.
+    samples: u64,
+}
+
+/// The cameras of a group by their ids, read in its own transaction, so that none can vanish before
 /// the commit. One statement for all, since a round trip costs as much as several rows.
-async fn camera_keys(connection: &mut SqliteConnection, group: &[Batch]) -> Result<HashMap<String, i64>> {
+async fn cameras_of(connection: &mut SqliteConnection, group: &[Batch]) -> Result<HashMap<String, Known>> {
     let mut ids: Vec<&str> = group.iter().map(|batch| batch.camera.as_str()).collect();
     ids.sort_unstable();
     ids.dedup();
     let ids = serde_json::to_string(&ids).map_err(Error::fault)?;
-    let keys: Vec<(String, i64)> =
-        sqlx::query_as("SELECT id, key FROM cameras WHERE id IN (SELECT value FROM json_each(?))")
-            .bind(ids)
-            .fetch_all(connection)
-            .await
-            .map_err(failed)?;
-    Ok(keys.into_iter().collect())
+    let cameras: Vec<(String, i64, i64)> = sqlx::query_as(
+        "SELECT id, key, coalesce(samples, 0) FROM cameras LEFT JOIN sample_counts ON camera_key = key \
+         WHERE id IN (SELECT value FROM json_each(?))",
+    )
+    .bind(ids)
+    .fetch_all(connection)
+    .await
+    .map_err(failed)?;
+    let known = |(id, key, samples)| (id, Known { key, samples: u64::try_from(samples).unwrap_or_default() });
+    Ok(cameras.into_iter().map(known).collect())
+}
+
+/// Adds what a group has stored to the counts of its cameras, in one statement.
+async fn count_stored(
+    connection: &mut SqliteConnection,
+    cameras: &HashMap<String, Known>,
+    group: &[Batch],
+    outcomes: &[Result<Inserted>],
+) -> Result<()> {
+    let mut accepted: HashMap<i64, u64> = HashMap::new();
+    for (batch, outcome) in group.iter().zip(outcomes) {
+        if let (Ok(inserted), Some(camera)) = (outcome, cameras.get(batch.camera.as_str()))
+            && inserted.accepted > 0
+        {
+            *accepted.entry(camera.key).or_default() += inserted.accepted;
+        }
+    }
+    if accepted.is_empty() {
+        return Ok(());
+    }
+    // WHERE true: without it the grammar takes ON CONFLICT for the condition of a join.
+    sqlx::query(
+        "INSERT INTO sample_counts (camera_key, samples) SELECT CAST(key AS INTEGER), value FROM json_each(?) \
+         WHERE true ON CONFLICT (camera_key) DO UPDATE SET samples = samples + excluded.samples",
+    )
+    .bind(serde_json::to_string(&accepted).map_err(Error::fault)?)
+    .execute(connection)
+    .await
+    .map_err(failed)?;
+    Ok(())
 }
 
 /// Columns bound per row.
@@ -297,7 +377,7 @@ static INSERTS: LazyLock<[Arc<str>; SIZES.len()]> = LazyLock::new(|| {
     })
 });
 
-/// Cuts the stretches between borders into statements of the sizes there are.
+/// Splits the ranges between borders into statements of the available sizes.
 fn statements(borders: &[usize]) -> Vec<Range<usize>> {
     let mut ranges = Vec::new();
     let mut start = 0;

@@ -21,6 +21,7 @@ const FLOORS: &[(&str, u32)] = &[
     ("simulation", 4),
     ("evaluation", 5),
     ("app", 6),
+    ("paper_experiments", 6),
     ("worker", 7),
     ("status", 7),
     ("http", 8),

@@ -31,7 +31,7 @@ fn full(name: &str) -> NewCamera {
 }
 
 #[tokio::test]
-async fn a_profile_comes_back_as_it_was_given() {
+async fn a_profile_is_read_as_it_was_stored() {
     let Fixture { store, folder: _folder, .. } = Fixture::new().await;
     let made = store.insert_camera(&full("gate"), at(5)).await.expect("new");
     let expected = Camera {
@@ -83,7 +83,7 @@ async fn a_change_needs_the_revision_it_was_made_from() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn of_changes_at_once_from_one_revision_one_wins() {
+async fn one_of_several_concurrent_changes_of_one_revision_succeeds() {
     let Fixture { store, folder: _folder, .. } = Fixture::new().await;
     let attempts: Vec<_> = (0..8)
         .map(|_| {
@@ -102,18 +102,24 @@ async fn of_changes_at_once_from_one_revision_one_wins() {
 }
 
 #[tokio::test]
-async fn a_deleted_camera_takes_all_along_and_its_name_starts_anew() {
+async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    store.insert_samples(&camera, vec![sample(1, "a"), sample(2, "a")]).await.expect("stored");
+    store
+        .insert_samples(&camera, vec![sample(1, "a"), sample(2, "a")], Durability::Synced)
+        .await
+        .expect("stored");
     store.insert_model(&camera, &metadata(), b"w", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
     store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
     assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::RunLive);
-    store.request_cancel(&camera, run_id(1), at(4)).await.expect("cancelled");
+    store.cancel_run(&camera, run_id(1), at(4)).await.expect("cancelled");
 
     store.delete_camera(&camera, Some(Revision(1))).await.expect("deleted");
     assert_eq!(kind(store.camera(&camera).await), ErrorKind::CameraNotFound);
-    assert_eq!(kind(store.insert_samples(&camera, vec![sample(1, "a")]).await), ErrorKind::CameraNotFound);
+    assert_eq!(
+        kind(store.insert_samples(&camera, vec![sample(1, "a")], Durability::Synced).await),
+        ErrorKind::CameraNotFound
+    );
     assert_eq!(kind(store.log(run_id(1)).await), ErrorKind::RunNotFound);
     assert_eq!(store.active_models().await.expect("none"), []);
     assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::CameraNotFound);

@@ -14,12 +14,12 @@ use uuid::Uuid;
 
 use super::Store;
 use crate::domain::{
-    BoundingBox, CameraId, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg, Recipe,
-    Result, RunId, Sample, TargetId, TrainingOptions,
+    BoundingBox, CameraId, Durability, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg,
+    Recipe, Result, RunId, Sample, TargetId, TrainingOptions,
 };
 use crate::geo::Position;
 
-/// A store in a folder that vanishes with it, holding the camera `square`.
+/// A store with the camera `square`, in a folder that is deleted with it.
 struct Fixture {
     folder: TempDir,
     store: Store,
@@ -35,10 +35,10 @@ impl Fixture {
         Self { folder, store, camera }
     }
 
-    /// Runs statements past the store's rules.
+    /// Executes statements without the checks of the store.
     async fn tamper(&self, sql: &'static str) {
-        let mut turn = self.store.relaxed().await.expect("a turn");
-        let mut transaction = turn.begin().await.expect("begins");
+        let mut writer = self.store.relaxed().await.expect("the writer");
+        let mut transaction = writer.begin().await.expect("begins");
         sqlx::raw_sql(sql).execute(&mut *transaction).await.expect("runs");
         transaction.commit().await.expect("commits");
     }
@@ -122,12 +122,12 @@ async fn futures_can_move_between_threads() {
     movable(store.ping());
     movable(store.cameras(Some(&camera), 1));
     movable(store.delete_camera(&camera, None));
-    movable(store.insert_samples(&camera, Vec::new()));
+    movable(store.insert_samples(&camera, Vec::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));
     movable(store.delete_samples(&camera, &filter));
     movable(store.insert_run(run, &camera, &options(), 1, at(0)));
     movable(store.claim_run(lease, at(0)));
-    movable(store.heartbeat(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
+    movable(store.heartbeat_run(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
     movable(store.append_epochs(run, 1, &[]));
     movable(store.finish_run(run, 1, super::RunEnd::Cancelled, at(0)));
     movable(store.claim_evaluation(lease, at(0)));

@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use super::*;
 use crate::domain::{EpochReport, JobState, RunProgress, TrainingRun};
-use crate::store::{Claim, Heartbeat, NewModel, RunEnd};
+use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput};
 
 const LEASE: Duration = Duration::from_secs(30);
 
@@ -15,8 +15,8 @@ impl Fixture {
         self.store.claim_run(LEASE, at(second)).await.expect("works").expect("a run")
     }
 
-    async fn beat(&self, fence: i64, second: i64) -> Heartbeat {
-        self.store.heartbeat(run_id(1), fence, &progress(), LEASE, at(second)).await.expect("works")
+    async fn heartbeat(&self, fence: i64, second: i64) -> Heartbeat {
+        self.store.heartbeat_run(run_id(1), fence, &progress(), LEASE, at(second)).await.expect("works")
     }
 
     async fn finish(&self, fence: i64, end: RunEnd<'_>) -> Option<TrainingRun> {
@@ -37,8 +37,8 @@ fn progress() -> RunProgress {
 }
 
 fn success<'a>(metadata: &'a ModelMetadata, activate: bool) -> RunEnd<'a> {
-    let yielded = NewModel { metadata, weights: b"weights", activate };
-    RunEnd::Succeeded { yielded, outcome: Some("better".to_owned()) }
+    let model = NewModel { metadata, weights: b"weights", held_out: &[] };
+    RunEnd::Succeeded { output: RunOutput { model, activate }, outcome: Some("better".to_owned()) }
 }
 
 fn report(epoch: u32, loss: f64) -> EpochReport {
@@ -54,7 +54,7 @@ async fn a_run_goes_from_queue_to_active_model() {
     assert_eq!((run.state, run.attempt, run.started_at), (JobState::Running, 1, Some(at(2))));
     assert!(!cancel_requested);
     assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
-    assert_eq!(fixture.beat(fence, 4).await, Heartbeat::Continue);
+    assert_eq!(fixture.heartbeat(fence, 4).await, Heartbeat::Continue);
     let seen = fixture.store.run(&fixture.camera, run_id(1)).await.expect("known");
     assert_eq!(seen.progress, progress());
     let ended = fixture.finish(fence, success(&metadata(), true)).await.expect("still mine");
@@ -65,12 +65,12 @@ async fn a_run_goes_from_queue_to_active_model() {
     assert_eq!(ended.outcome.as_deref(), Some("better"));
     assert_eq!(fixture.store.model(&fixture.camera, 1).await.expect("stored").run_id, Some(run_id(1)));
     assert_eq!(fixture.store.active_models().await.expect("known"), [(fixture.camera.clone(), 1)]);
-    assert_eq!(fixture.beat(fence, 51).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(fence, 51).await, Heartbeat::Lost);
     assert!(fixture.finish(fence, RunEnd::Requeue).await.is_none(), "a run ends once");
 }
 
 #[tokio::test]
-async fn a_worker_that_stopped_beating_can_write_nothing_more() {
+async fn a_worker_that_lost_its_lease_can_write_nothing_more() {
     let fixture = Fixture::new().await;
     fixture.queue(1).await;
     let old = fixture.claim(2).await;
@@ -80,7 +80,7 @@ async fn a_worker_that_stopped_beating_can_write_nothing_more() {
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert_eq!(fixture.store.epochs(run_id(1)).await.expect("known"), [], "a new attempt, a new curve");
 
-    assert_eq!(fixture.beat(old.fence, 33).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(old.fence, 33).await, Heartbeat::Lost);
     fixture.store.append_epochs(run_id(1), old.fence, &[report(2, 9.0)]).await.expect("ignored");
     fixture.store.append_log(run_id(1), old.fence, at(33), "old").await.expect("ignored");
     assert!(fixture.finish(old.fence, success(&metadata(), true)).await.is_none());
@@ -136,31 +136,31 @@ async fn of_claims_at_once_one_gets_the_run() {
 }
 
 #[tokio::test]
-async fn a_cancelled_run_yields_nothing() {
+async fn a_cancelled_run_stores_no_model() {
     let fixture = Fixture::new().await;
     let store = &fixture.store;
     fixture.queue(1).await;
-    let cancelled = store.request_cancel(&fixture.camera, run_id(1), at(5)).await.expect("cancelled");
+    let cancelled = store.cancel_run(&fixture.camera, run_id(1), at(5)).await.expect("cancelled");
     assert_eq!((cancelled.state, cancelled.ended_at), (JobState::Cancelled, Some(at(5))));
-    assert_eq!(kind(store.request_cancel(&fixture.camera, run_id(1), at(6)).await), ErrorKind::RunEnded);
-    assert_eq!(kind(store.request_cancel(&fixture.camera, run_id(9), at(6)).await), ErrorKind::RunNotFound);
+    assert_eq!(kind(store.cancel_run(&fixture.camera, run_id(1), at(6)).await), ErrorKind::RunEnded);
+    assert_eq!(kind(store.cancel_run(&fixture.camera, run_id(9), at(6)).await), ErrorKind::RunNotFound);
     assert!(store.claim_run(LEASE, at(7)).await.expect("works").is_none());
 
     fixture.queue(2).await;
     let claim = fixture.claim(8).await;
-    let flagged = store.request_cancel(&fixture.camera, run_id(2), at(9)).await.expect("flagged");
+    let flagged = store.cancel_run(&fixture.camera, run_id(2), at(9)).await.expect("flagged");
     assert_eq!(flagged.state, JobState::Running);
-    let beat = store.heartbeat(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
+    let beat = store.heartbeat_run(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
     assert_eq!(beat.expect("works"), Heartbeat::CancelRequested);
     let taken_over = fixture.claim(100).await;
-    assert!(taken_over.cancel_requested, "the wish outlives the worker");
+    assert!(taken_over.cancel_requested, "the request outlives the worker");
     let ended = store.finish_run(run_id(2), taken_over.fence, success(&metadata(), true), at(101)).await;
     assert_eq!(ended.expect("works").expect("mine").state, JobState::Cancelled);
     assert_eq!(store.models(&fixture.camera, None, 9).await.expect("a page"), []);
 }
 
 #[tokio::test]
-async fn a_run_given_back_is_taken_up_at_once() {
+async fn a_run_returned_to_the_queue_is_claimed_at_once_and_the_attempt_does_not_count() {
     let fixture = Fixture::new().await;
     fixture.queue(1).await;
     let first = fixture.claim(2).await;
@@ -168,12 +168,12 @@ async fn a_run_given_back_is_taken_up_at_once() {
     let back = fixture.finish(first.fence, RunEnd::Requeue).await.expect("mine");
     assert_eq!((back.state, back.ended_at), (JobState::Queued, None));
     let second = fixture.claim(4).await;
-    assert_eq!((second.job.attempt, second.job.progress), (2, RunProgress::default()));
+    assert_eq!((second.job.attempt, second.job.progress), (1, RunProgress::default()));
     assert_eq!(fixture.store.log(run_id(1)).await.expect("known"), [(at(3), "before".to_owned())]);
 }
 
 #[tokio::test]
-async fn curve_and_log_keep_what_they_were_told_within_limits() {
+async fn curve_and_log_are_stored_within_limits() {
     let fixture = Fixture::new().await;
     let store = &fixture.store;
     fixture.queue(1).await;
@@ -202,7 +202,7 @@ async fn pages_show_the_newest_runs_first() {
     let fixture = Fixture::new().await;
     for n in 1..=5 {
         fixture.queue(n).await;
-        fixture.store.request_cancel(&fixture.camera, run_id(n), at(2)).await.expect("cancelled");
+        fixture.store.cancel_run(&fixture.camera, run_id(n), at(2)).await.expect("cancelled");
     }
     let page = fixture.store.runs(&fixture.camera, None, 3).await.expect("a page");
     assert_eq!(page.iter().map(|run| run.id).collect::<Vec<_>>(), [5, 4, 3].map(run_id));

@@ -1,0 +1,110 @@
+//! Detected changes of camera poses.
+
+use sqlx::sqlite::SqliteRow;
+
+use super::Store;
+use super::cameras::camera_key;
+use super::errors::failed;
+use super::row_decoder::RowDecoder;
+use crate::domain::{CameraId, CameraMoved, Result, RunId};
+
+impl Store {
+    /// Stores a pose change, unless one was stored for that model version before; returns whether it is new.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`].
+    pub async fn insert_move(&self, camera: &CameraId, moved: &CameraMoved) -> Result<bool> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        let stored = sqlx::query(
+            "INSERT INTO camera_moves (camera_key, model_number, began_at_us, raised_at_us, shift_east_m, \
+             shift_north_m, statistic, targets) VALUES (?, ?, ?, ?, ?, ?, ?, ?) \
+             ON CONFLICT (camera_key, model_number) DO NOTHING",
+        )
+        .bind(key)
+        .bind(moved.model_version)
+        .bind(moved.began_at.as_microsecond())
+        .bind(moved.raised_at.as_microsecond())
+        .bind(moved.shift_east_m)
+        .bind(moved.shift_north_m)
+        .bind(moved.statistic)
+        .bind(moved.targets)
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(stored.rows_affected() > 0)
+    }
+
+    /// The pose change that was detected with a model version.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn camera_move(&self, camera: &CameraId, model_version: u32) -> Result<Option<CameraMoved>> {
+        let row = sqlx::query(
+            "SELECT cameras.id, model_number, began_at_us, raised_at_us, shift_east_m, shift_north_m, statistic, \
+             targets FROM camera_moves JOIN cameras ON cameras.key = camera_key \
+             WHERE cameras.id = ? AND model_number = ?",
+        )
+        .bind(camera.as_str())
+        .bind(model_version)
+        .fetch_optional(self.readers())
+        .await
+        .map_err(failed)?;
+        row.as_ref().map(read_move).transpose()
+    }
+
+    /// Cameras whose pose has changed since their active model was trained and that are to be retrained
+    /// but were not yet, each with the change.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn moves_to_retrain(&self) -> Result<Vec<(CameraId, CameraMoved)>> {
+        let rows = sqlx::query(
+            "SELECT cameras.id, model_number, began_at_us, raised_at_us, shift_east_m, shift_north_m, statistic, \
+             targets FROM camera_moves JOIN cameras ON cameras.key = camera_key \
+             AND cameras.active_model = model_number \
+             WHERE retrain_when_moved AND retraining_run IS NULL ORDER BY cameras.id",
+        )
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        let read = |row: &SqliteRow| {
+            let id = RowDecoder::new("camera_moves", row).parse(CameraId::new)?;
+            Ok((id, read_move(row)?))
+        };
+        rows.iter().map(read).collect()
+    }
+
+    /// Stores which run was started because of a pose change.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`].
+    pub async fn note_retraining(&self, camera: &CameraId, model_version: u32, run: RunId) -> Result<()> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        sqlx::query("UPDATE camera_moves SET retraining_run = ? WHERE camera_key = ? AND model_number = ?")
+            .bind(run.to_string())
+            .bind(key)
+            .bind(model_version)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        transaction.commit().await.map_err(failed)
+    }
+}
+
+fn read_move(row: &SqliteRow) -> Result<CameraMoved> {
+    let mut fields = RowDecoder::new("camera_moves", row).skip(1);
+    Ok(CameraMoved {
+        model_version: fields.count()?,
+        began_at: fields.timestamp()?,
+        raised_at: fields.timestamp()?,
+        shift_east_m: fields.get()?,
+        shift_north_m: fields.get()?,
+        statistic: fields.get()?,
+        targets: fields.count()?,
+    })
+}

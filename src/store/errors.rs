@@ -1,0 +1,80 @@
+//! Conversion of database errors into errors of the domain.
+
+use sqlx::error::DatabaseError;
+
+use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, RunId};
+
+/// A row that does not hold what was written: another program or the disk has changed it.
+#[derive(Debug, thiserror::Error)]
+#[error("the store is corrupt: table {table}, column {column}, row {row}: {cause}")]
+pub(super) struct Corrupt {
+    pub(super) table: &'static str,
+    pub(super) column: String,
+    pub(super) row: String,
+    pub(super) cause: String,
+}
+
+/// SQLite's primary result code, if the error is SQLite's own.
+pub(super) fn primary_code(error: &sqlx::Error) -> Option<u32> {
+    let extended: u32 = error.as_database_error()?.code()?.parse().ok()?;
+    Some(extended & 0xff)
+}
+
+/// SQLITE_BUSY and SQLITE_LOCKED: another connection holds the file.
+pub(super) fn is_busy(error: &sqlx::Error) -> bool {
+    matches!(primary_code(error), Some(5 | 6))
+}
+
+/// SQLITE_FULL, and SQLITE_IOERR_SHMSIZE: the index of the log cannot grow.
+fn is_full(error: &sqlx::Error) -> bool {
+    const IOERR_SHMSIZE: &str = "4874";
+    let is_shm = |error: &dyn DatabaseError| error.code().is_some_and(|code| code == IOERR_SHMSIZE);
+    primary_code(error) == Some(13) || error.as_database_error().is_some_and(is_shm)
+}
+
+/// A failed statement: refused where the caller can do something about it, else a fault.
+pub(super) fn failed(error: sqlx::Error) -> Error {
+    match error {
+        sqlx::Error::PoolClosed => closed(),
+        sqlx::Error::PoolTimedOut => {
+            Error::refused(ErrorKind::Overloaded, "too many reads are waiting for the store; try again")
+        }
+        busy if is_busy(&busy) => {
+            Error::refused(ErrorKind::Overloaded, "another process holds the store; try again")
+        }
+        full if is_full(&full) => Error::refused(
+            ErrorKind::InsufficientStorage,
+            "the disk is full, or the database has reached limits.database_bytes; delete samples, models or \
+             training runs, or give it more space",
+        ),
+        other => Error::fault(other),
+    }
+}
+
+/// A copy of an error, for another caller of the same transaction.
+pub(super) fn copy_of(error: &Error) -> Error {
+    match error {
+        Error::Refused(refusal) => Error::Refused(refusal.clone()),
+        Error::Fault(fault) => Error::fault(fault.to_string()),
+    }
+}
+
+pub(super) fn closed() -> Error {
+    Error::refused(ErrorKind::ShuttingDown, "the server is ending; try again soon")
+}
+
+pub(super) fn no_camera(id: &CameraId) -> Error {
+    Error::refused(ErrorKind::CameraNotFound, format!("no camera has the id {id}"))
+}
+
+pub(super) fn no_run(id: RunId) -> Error {
+    Error::refused(ErrorKind::RunNotFound, format!("no training run has the id {id}"))
+}
+
+pub(super) fn no_evaluation(id: EvaluationId) -> Error {
+    Error::refused(ErrorKind::EvaluationNotFound, format!("no evaluation has the id {id}"))
+}
+
+pub(super) fn no_model(camera: &CameraId, number: u32) -> Error {
+    Error::refused(ErrorKind::ModelNotFound, format!("camera {camera} has no model version {number}"))
+}

@@ -19,6 +19,7 @@ use std::time::Duration;
 use tokio::sync::{Notify, Semaphore};
 use tokio_util::task::TaskTracker;
 
+use crate::admission::Quotas;
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
 use crate::store::{Store, StoreLimits};
@@ -52,6 +53,8 @@ pub struct Parts {
     pub randomness: Randomness,
     /// What an outside client may make large.
     pub limits: Limits,
+    /// How much of each bounded resource clients may hold at a time.
+    pub quotas: Quotas,
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
@@ -93,12 +96,14 @@ impl App {
         registry.refresh(&store).await?;
         let pairings = Semaphore::new(limits.pairings);
         let (residuals, waiting) = live::residual_queue();
+        let quotas = Quotas::new(&limits);
         let parts = Parts {
             store,
             registry,
             clock,
             randomness,
             limits,
+            quotas,
             metrics,
             pairings,
             training_queue: JobQueue::default(),

@@ -38,6 +38,8 @@ impl Serve {
             let address = server.address().context("cannot determine the address")?;
             let (app, shutdown) = (server.app().clone(), server.shutdown());
             tokio::spawn(shut_down_on_signal(shutdown.clone()));
+            #[cfg(unix)]
+            log_hangups();
             tracing::info!(%address, folder = %settings.data.display(), "serving REST and gRPC");
             let serving = tokio::spawn(server.run());
             let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
@@ -76,4 +78,20 @@ async fn wait_for_signal() {
 #[cfg(not(unix))]
 async fn wait_for_signal() {
     let _ = tokio::signal::ctrl_c().await;
+}
+
+/// Logs each SIGHUP, which would else end the process: a closed terminal must not stop a server.
+#[cfg(unix)]
+fn log_hangups() {
+    use tokio::signal::unix::{SignalKind, signal};
+    match signal(SignalKind::hangup()) {
+        Ok(mut hangups) => {
+            tokio::spawn(async move {
+                while hangups.recv().await.is_some() {
+                    tracing::info!("SIGHUP received; settings are read at the start only");
+                }
+            });
+        }
+        Err(error) => tracing::warn!(%error, "cannot listen for SIGHUP, which will end the server"),
+    }
 }

@@ -1,7 +1,6 @@
 //! `sightfix train`
 
 use std::path::Path;
-use std::time::Duration;
 
 use clap::Args;
 use futures_util::StreamExt as _;
@@ -76,6 +75,6 @@ pub(super) async fn train(
         progress.set((*epoch).into(), (*epochs).into(), &format!("{phase}, Es {error_scale:.3}{remaining}"));
     }
     progress.finish();
-    shutdown.finish(Duration::from_secs(settings.limits.drain_s)).await;
+    shutdown.finish(settings.limits.drain_time()).await;
     Ok(latest)
 }

@@ -27,7 +27,7 @@ pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, NewCamera, Revision};
 pub use checksum::model_sha256;
 pub use durability::Durability;
-pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
+pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};

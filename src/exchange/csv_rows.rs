@@ -10,6 +10,7 @@ use super::columns::{
     TARGET_ID, TIME, TRUTH_LATITUDE, TRUTH_LONGITUDE,
 };
 use super::file_row::{FileRow, RowError};
+use super::formula_guard::unguarded;
 use super::lines::{Line, Lines};
 use super::wire::{self, Text};
 use crate::domain::{Error, ErrorKind, Result};
@@ -141,7 +142,7 @@ impl<'a> CsvCells<'a> {
     fn row(&self) -> CellResult<FileRow<'a>> {
         Ok(FileRow {
             time: self.text(TIME),
-            target_id: self.text(TARGET_ID),
+            target_id: self.name(TARGET_ID),
             bounding_box: self.numbers([LEFT, LEFT + 1, LEFT + 2, HEIGHT])?.map(
                 |[left_px, top_px, width_px, height_px]| wire::BoundingBox {
                     left_px,
@@ -151,12 +152,12 @@ impl<'a> CsvCells<'a> {
                 },
             ),
             fix: self.fix()?,
-            class: self.text(CLASS),
+            class: self.name(CLASS),
             score: self.number(SCORE)?,
             truth: self
                 .numbers([TRUTH_LONGITUDE, TRUTH_LATITUDE])?
                 .map(|[longitude_deg, latitude_deg]| wire::Position { longitude_deg, latitude_deg }),
-            receiver_id: self.text(RECEIVER_ID),
+            receiver_id: self.name(RECEIVER_ID),
         })
     }
 
@@ -168,6 +169,12 @@ impl<'a> CsvCells<'a> {
 
     fn text(&self, index: usize) -> Option<Text<'a>> {
         let cell = self.cells[index];
+        (!cell.is_empty()).then(|| Text::from(cell))
+    }
+
+    /// A name, without the guard that keeps spreadsheets from running it as a formula.
+    fn name(&self, index: usize) -> Option<Text<'a>> {
+        let cell = unguarded(self.cells[index]);
         (!cell.is_empty()).then(|| Text::from(cell))
     }
 

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use super::proto;
 use crate::domain::{
     self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Sample,
-    Score, TargetClass, TargetId,
+    Score, TargetClass, TargetId, TimeRange,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -179,11 +179,9 @@ pub(super) fn live_item(item: proto::StreamItem, rules: &RowRules) -> Result<Liv
 pub(super) fn sample_filter(filter: Option<proto::SampleFilter>) -> Result<SampleFilter> {
     let Some(filter) = filter else { return Ok(SampleFilter::default()) };
     let read = || {
-        Ok(SampleFilter {
-            from: instant(filter.from, "from")?,
-            until: instant(filter.until, "until")?,
-            target_id: target_id(filter.target_id.as_deref())?,
-        })
+        let range = TimeRange::new(instant(filter.from, "from")?, instant(filter.until, "until")?)?;
+        let target_id = target_id(filter.target_id.as_deref())?;
+        Ok(SampleFilter { target_id, ..SampleFilter::within(range) })
     };
     read().map_err(|error: Error| error.under("filter"))
 }

@@ -12,6 +12,7 @@ use super::proto;
 use super::proto::stream_answer::Outcome;
 use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
+use crate::admission::ClientAddress;
 use crate::app::{Acknowledgement, App, ItemResult, LiveStream, NotStored, NotStoredReason, TrackPoint};
 use crate::domain::{CameraMoved, Error, ErrorKind, Flag, Result};
 use crate::fusion::track::{MeasurementSource, Rejection, RejectionReason};
@@ -31,10 +32,12 @@ pub(super) fn serve(
     app: &App,
     shutdown: &Shutdown,
     id: RequestId,
+    client_address: ClientAddress,
     requests: Streaming<proto::StreamRequest>,
 ) -> Responses {
     let (outbox, responses) = outbox(app.limits.live_answers);
-    let mut session = StreamSession { app: app.clone(), shutdown: shutdown.clone(), requests, outbox };
+    let mut session =
+        StreamSession { app: app.clone(), shutdown: shutdown.clone(), client_address, requests, outbox };
     shutdown.spawn(async move {
         let ended = session.run().await;
         let status = ended.err().map(|error| to_status(&error, &id));
@@ -46,6 +49,7 @@ pub(super) fn serve(
 struct StreamSession {
     app: App,
     shutdown: Shutdown,
+    client_address: ClientAddress,
     requests: Streaming<proto::StreamRequest>,
     outbox: Outbox,
 }
@@ -122,7 +126,15 @@ impl StreamSession {
         let camera = camera_id(&opening.camera_id)?;
         let durability = durability(opening.durability)?;
         let store_samples = opening.store_samples.then_some(durability);
-        self.app.open_stream(&camera, &opening.client_name, opening.resume_after_seq, store_samples).await
+        self.app
+            .open_stream(
+                &camera,
+                &opening.client_name,
+                self.client_address,
+                opening.resume_after_seq,
+                store_samples,
+            )
+            .await
     }
 
     /// Reads and answers items. Whatever may end the stream is looked at before each batch, so a client

@@ -18,12 +18,12 @@ use utoipa_axum::routes;
 
 use super::Rest;
 use super::cameras::CameraMoved;
-use super::extract::{CameraPath, JsonBody, TargetPath};
+use super::extract::{CameraPath, Client, JsonBody, TargetPath};
 use super::fusions::{FusionRequest, observations};
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use super::wire::{json, json_of_about};
 use crate::app::{App, CameraEvent, ItemResult, LostEvents, TrackPoint};
-use crate::domain::{Error, ErrorKind, Result};
+use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
 
@@ -201,7 +201,7 @@ fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "Positions, by target", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
     Ok(geojson(&app.tracks(&id).await?)?)
 }
 
@@ -213,7 +213,7 @@ async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> Answ
     params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id")),
     responses((status = 200, description = "Positions, oldest first", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> Answer {
+async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> ApiResult {
     Ok(geojson(&app.track_history(&id, &target).await?)?)
 }
 
@@ -256,7 +256,7 @@ struct FollowedObservations<'a> {
         (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
+async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
     let camera = app.active_camera(&id).await?;
     // Times ahead of the clock are refused before any track has changed.
     let observations = observations(&app, &body.read()?, &app.live_rules(&camera))?;
@@ -279,10 +279,12 @@ async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBo
     params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "Events", body = TrackFeature, content_type = "text/event-stream"))
 )]
-async fn watch_camera(State(rest): State<Rest>, CameraPath(id): CameraPath) -> Answer {
-    let place = rest.event_streams.clone().try_acquire_owned().map_err(|_| {
-        Error::refused(ErrorKind::Overloaded, "too many event streams are open; poll the tracks instead")
-    })?;
+async fn watch_camera(
+    State(rest): State<Rest>,
+    CameraPath(id): CameraPath,
+    Client(client): Client,
+) -> ApiResult {
+    let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
     let events = rest.app.camera_events(&id).await?;
     let shutdown = rest.shutdown.clone();
     let sent = stream::unfold(events, |mut events| async move {
@@ -294,7 +296,7 @@ async fn watch_camera(State(rest): State<Rest>, CameraPath(id): CameraPath) -> A
         Some((event, events))
     });
     let sent = sent.take_until(async move { shutdown.begun().await }).map(move |event| {
-        let _held = &place; // until the stream is dropped
+        let _held = &lease; // until the stream is dropped
         Ok::<_, Infallible>(event)
     });
     Ok(Sse::new(sent).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())

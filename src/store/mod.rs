@@ -35,6 +35,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use sqlx::SqlitePool;
+use sqlx::sqlite::SqlitePoolOptions;
 
 use crate::domain::{Durability, Error, ErrorKind, Result};
 
@@ -67,6 +68,8 @@ pub struct Store {
 struct Inner {
     writer: Arc<Writer>,
     readers: SqlitePool,
+    /// One reader for [`Store::ping`] alone, which slow reads do not keep waiting.
+    probe: SqlitePool,
     samples: GroupCommit,
     space: Arc<Space>,
     /// `None` where the process could not announce itself, and after closing.
@@ -115,7 +118,11 @@ impl Store {
             )
             .ok();
         let presence = Mutex::new(presence);
-        let store = Self { inner: Arc::new(Inner { writer, readers, samples, space, presence }) };
+        let probe = SqlitePoolOptions::new()
+            .max_connections(1)
+            .connect_lazy_with(readers.connect_options().as_ref().clone());
+        let inner = Inner { writer, readers, probe, samples, space, presence };
+        let store = Self { inner: Arc::new(inner) };
         store.reserve_space().await;
         store.count_all_samples().await?;
         Ok(store)
@@ -126,6 +133,7 @@ impl Store {
     pub async fn close(&self) {
         self.inner.samples.close().await;
         self.inner.readers.close().await;
+        self.inner.probe.close().await;
         self.inner.writer.close().await;
         self.presence().take();
     }
@@ -162,7 +170,7 @@ impl Store {
             return Err(Error::refused(ErrorKind::ShuttingDown, "the store is closed"));
         }
         sqlx::query_scalar::<_, i64>("SELECT count(*) FROM cameras WHERE key = 0")
-            .fetch_one(self.readers())
+            .fetch_one(&self.inner.probe)
             .await
             .map_err(failed)?;
         Ok(())

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod connections;
+mod cross_site;
 mod evaluations;
 mod grpc;
 mod harness;
@@ -11,7 +12,9 @@ mod live_client;
 mod live_faults;
 mod model_integrity;
 mod openapi;
+mod overload;
 mod pairing;
+mod parity;
 mod power_cut;
 mod promotion;
 mod replay;

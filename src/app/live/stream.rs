@@ -10,6 +10,7 @@ use super::acknowledgements::{AckTracker, Acknowledgement, NotStoredReason};
 use super::sample_committer::{self, SampleSink};
 use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
+use crate::admission::{ClientAddress, Lease};
 use crate::app::App;
 use crate::app::registry::ActiveCamera;
 use crate::domain::{
@@ -69,6 +70,7 @@ pub struct LiveStream {
     recording: Option<Recording>,
     last_seq: u64,
     _slot: SlotGuard,
+    _address_lease: Lease,
 }
 
 struct Recording {
@@ -87,12 +89,15 @@ impl App {
         &self,
         id: &CameraId,
         client_name: &str,
+        client_address: ClientAddress,
         resume_after_seq: u64,
         store_samples: Option<Durability>,
     ) -> Result<LiveStream> {
         check_text("client_name", client_name, LONGEST_CLIENT_NAME)?;
         let camera = self.active_camera(id).await?;
         let limits = &self.limits;
+        // Names are the client's choice; its address is not.
+        let address_lease = self.quotas.live_streams.try_acquire(client_address, 1)?;
         let slot =
             self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
         let recording = store_samples.map(|durability| Recording {
@@ -100,7 +105,14 @@ impl App {
             tracker: AckTracker::beginning_after(resume_after_seq, durability),
         });
         self.metrics.stream_opened();
-        Ok(LiveStream { app: self.clone(), camera, recording, last_seq: resume_after_seq, _slot: slot })
+        Ok(LiveStream {
+            app: self.clone(),
+            camera,
+            recording,
+            last_seq: resume_after_seq,
+            _slot: slot,
+            _address_lease: address_lease,
+        })
     }
 
     /// The pairing that all storing streams of the camera share.

@@ -89,6 +89,8 @@ pub struct Limits {
     pub tracks_per_camera: usize,
     /// Points of a target's track that are kept, half a second or more apart.
     pub track_points: usize,
+    /// Seconds that the time of a live item may be ahead of the server's clock; beyond, it is refused.
+    pub live_ahead_s: u32,
     /// Live streams open at a time.
     pub live_streams: usize,
     /// Live streams open at a time under one client name.
@@ -103,6 +105,9 @@ pub struct Limits {
     pub live_runs: u32,
     /// Passes of one training run.
     pub epochs: u32,
+    /// Seconds until a retraining after a camera was moved is tried again, if it could not start, failed or
+    /// was not promoted; doubled with each attempt, up to 64 times as long.
+    pub retrain_pause_s: u32,
     /// Samples of one training run; the latest are taken.
     pub samples_per_run: u32,
     /// Evaluations that have not ended, over all cameras.
@@ -175,6 +180,7 @@ impl Default for Limits {
             event_streams: 256,
             tracks_per_camera: 256,
             track_points: 240,
+            live_ahead_s: 5,
             live_streams: 2_048,
             live_streams_per_client: 64,
             live_answers: 256,
@@ -182,6 +188,7 @@ impl Default for Limits {
             live_age_s: 3_600,
             live_runs: 256,
             epochs: 10_000,
+            retrain_pause_s: 15,
             samples_per_run: 100_000,
             live_evaluations: 64,
             evaluation_seeds: 20,

@@ -86,7 +86,7 @@ impl Server {
         connection::accept(listener, entrance, &config.limits, &shutdown).await;
         tracing::info!("ending");
         let in_order = shutdown.finish(Duration::from_secs(config.limits.drain_s)).await;
-        app.store.close().await;
+        app.close().await;
         anyhow::ensure!(in_order, "some requests did not end in time and were dropped");
         tracing::info!("ended");
         Ok(())

@@ -69,7 +69,7 @@ impl App {
         import: PairedImport<impl Read + Send + 'static, impl Read + Send + 'static>,
     ) -> Result<PairedReport> {
         let rules = self.row_rules(id).await?;
-        let receivers = self.serving(id).await?.receivers.clone();
+        let receivers = self.active_camera(id).await?.receivers.clone();
         let limits =
             RecordingLimits { rows: self.limits.pairing_rows, rejected_rows: self.limits.rejected_rows };
         let durability = import.durability;

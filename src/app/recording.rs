@@ -245,16 +245,16 @@ pub struct PairingCounts {
 impl PairingCounts {
     fn of((detections, fixes): (u64, u64), paired: &Paired) -> Self {
         let unpaired = paired.unpaired;
-        let far = unpaired.detections - unpaired.outbid - paired.detections_without_fixes;
+        let far = unpaired.detections - unpaired.fix_claimed_by_nearer_box - paired.detections_without_fixes;
         Self {
             detections,
             fixes,
             paired: paired.samples.len() as u64,
             detections_without_fixes: paired.detections_without_fixes,
             detections_far_from_fixes: far,
-            detections_outbid: unpaired.outbid,
+            detections_outbid: unpaired.fix_claimed_by_nearer_box,
             detections_duplicate: unpaired.duplicates - unpaired.duplicate_fixes,
-            fixes_unbound: unpaired.unbound,
+            fixes_unbound: unpaired.receiver_missing,
             fixes_without_detections: paired.fixes_without_detections,
             fixes_unused: unpaired.fixes - paired.fixes_without_detections,
             fixes_duplicate: unpaired.duplicate_fixes,

@@ -6,7 +6,7 @@ use futures_util::{Stream, StreamExt as _};
 use tokio::sync::mpsc;
 
 use super::{App, Page, page_of};
-use crate::domain::{CameraId, Durability, Error, ImageSize, Result, Sample, TimeBounds};
+use crate::domain::{CameraId, Durability, Error, Result, Sample};
 use crate::exchange::{self, Format, RowError, RowRules};
 use crate::store::{SampleFilter, SampleKey};
 
@@ -87,7 +87,7 @@ impl App {
         rows: impl Stream<Item = Result<Result<Sample, RowError>>> + Send,
         durability: Durability,
     ) -> Result<ImportReport> {
-        self.serving(id).await?;
+        self.active_camera(id).await?;
         let mut report = ImportReport::default();
         let mut batches = std::pin::pin!(rows.ready_chunks(BATCH_ROWS));
         while let Some(chunk) = batches.next().await {
@@ -118,8 +118,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`.
     pub async fn row_rules(&self, id: &CameraId) -> Result<RowRules> {
-        let image_size: Option<ImageSize> = self.serving(id).await?.image_size;
-        Ok(RowRules { time_bounds: TimeBounds::at(self.clock.now()), image_size })
+        Ok(self.active_camera(id).await?.row_rules(self.clock.now()))
     }
 
     /// Samples by time and target, from behind a cursor on.

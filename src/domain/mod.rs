@@ -24,7 +24,7 @@ mod time;
 mod training;
 
 pub use bounding_box::{BoundingBox, ImageSize};
-pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
+pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, NewCamera, Revision};
 pub use checksum::model_sha256;
 pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};

@@ -65,10 +65,11 @@ impl hyper::body::Body for Until {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        match Pin::new(&mut self.body).poll_frame(context) {
-            Poll::Pending if self.ending.as_mut().poll(context).is_ready() => Poll::Ready(None),
-            polled => polled,
+        // First, so that a client whose backlog never ends cannot hold the server up.
+        if self.ending.as_mut().poll(context).is_ready() {
+            return Poll::Ready(None);
         }
+        Pin::new(&mut self.body).poll_frame(context)
     }
 
     fn is_end_stream(&self) -> bool {

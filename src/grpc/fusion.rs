@@ -40,7 +40,8 @@ impl FusionService for Fusion {
         answer(request, |asked| async move {
             let camera = camera_id(&asked.camera_id)?;
             self.app.check_batch(asked.observations.len())?;
-            let rules = self.app.row_rules(&camera).await?;
+            let camera = self.app.active_camera(&camera).await?;
+            let rules = camera.row_rules(self.app.clock.now());
             let mut observations = Vec::with_capacity(asked.observations.len());
             for (index, message) in asked.observations.into_iter().enumerate() {
                 observations.push(
@@ -48,7 +49,7 @@ impl FusionService for Fusion {
                         .map_err(|error| error.under(&format!("observations[{index}]")))?,
                 );
             }
-            let fused = self.app.fuse(&camera, &observations).await?;
+            let fused = self.app.fuse(camera, &observations).await?;
             Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
         })
         .await
@@ -84,6 +85,10 @@ impl From<Flag> for proto::Flag {
             Flag::OutsideTraining => Self::OutsideTraining,
             Flag::NoModel => Self::NoModel,
             Flag::CameraMoved => Self::CameraMoved,
+            Flag::SourcesDisagree => Self::SourcesDisagree,
+            Flag::FixRejected => Self::FixRejected,
+            Flag::BoxRejected => Self::BoxRejected,
+            Flag::FixOutOfRange => Self::FixOutOfRange,
         }
     }
 }

@@ -108,12 +108,13 @@ struct Batches {
 impl Batches {
     async fn next(&mut self) -> Result<Option<proto::ImportSamplesRequest>> {
         tokio::select! {
+            // First, so that a client whose backlog never ends cannot hold the server up.
             biased;
-            message = self.messages.message() => message.map_err(|status| broken(&status)),
             () = self.shutdown.begun() => Err(Error::refused(
                 ErrorKind::ShuttingDown,
                 "the server is ending; send the samples again, those that are stored count as duplicates",
             )),
+            message = self.messages.message() => message.map_err(|status| broken(&status)),
         }
     }
 

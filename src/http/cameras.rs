@@ -231,7 +231,7 @@ impl Camera {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
         let warnings = camera.profile.warnings();
-        let domain::Camera { profile, revision, created_at, updated_at, active_model } = camera;
+        let domain::Camera { profile, revision, created_at, updated_at, active_model, key: _ } = camera;
         Self {
             id: profile.id.as_str().to_owned(),
             display_name: profile.display_name,

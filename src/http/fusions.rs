@@ -78,9 +78,10 @@ struct Fusions<'a> {
     )
 )]
 async fn fuse(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer<Response> {
-    let rules = app.row_rules(&id).await?;
+    let camera = app.active_camera(&id).await?;
+    let rules = camera.row_rules(app.clock.now());
     let observations = observations(&app, &body.read()?, &rules)?;
-    let fused = app.fuse(&id, &observations).await?;
+    let fused = app.fuse(camera, &observations).await?;
     let items = fused.iter().map(wire::FusedFix::from).collect();
     Ok(json_of_about(&Fusions { items }, 64 + ITEM_BYTES * fused.len())?)
 }

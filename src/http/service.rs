@@ -31,7 +31,7 @@ const NAMED_CAMERAS: usize = 100;
 ///
 /// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
 /// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
-/// a line `warning: insufficient-storage: ...`.
+/// a line `degraded: insufficient-storage: ...`.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -47,7 +47,7 @@ async fn readyz(State(rest): State<Rest>) -> Answer<String> {
     let faults = rest.app.registry.model_faults();
     let mut text = "ready\n".to_owned();
     if rest.app.store.is_full() {
-        text.push_str("warning: insufficient-storage: imports are refused until space is freed\n");
+        text.push_str("degraded: insufficient-storage: imports are refused until space is freed\n");
     }
     for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {
         text.push_str(&format!("degraded: camera {camera}: {}\n", fault.reason));

@@ -12,7 +12,6 @@ use hyper::header::CONTENT_TYPE;
 use hyper::http::HeaderValue;
 use jiff::Timestamp;
 use serde::Serialize;
-use tokio::sync::broadcast::error::RecvError;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -23,7 +22,7 @@ use super::extract::{CameraPath, JsonBody, TargetPath};
 use super::fusions::{FusionRequest, observations};
 use super::problem::{Answer, Problem};
 use super::wire::{json, json_of_about};
-use crate::app::{App, CameraEvent, Followed, TrackPoint};
+use crate::app::{App, CameraEvent, ItemResult, LostEvents, TrackPoint};
 use crate::domain::{Error, ErrorKind, Result};
 use crate::exchange::wire;
 use crate::fusion::track;
@@ -52,6 +51,8 @@ enum RejectionReason {
     Duplicate,
     /// Its error variance is not positive.
     UnusableVariance,
+    /// Farther than 20 km from the origin of the track's plane.
+    OutOfRange,
 }
 
 impl From<track::RejectionReason> for RejectionReason {
@@ -61,6 +62,7 @@ impl From<track::RejectionReason> for RejectionReason {
             track::RejectionReason::TooLate => Self::TooLate,
             track::RejectionReason::Duplicate => Self::Duplicate,
             track::RejectionReason::UnusableVariance => Self::UnusableVariance,
+            track::RejectionReason::OutOfRange => Self::OutOfRange,
         }
     }
 }
@@ -226,8 +228,8 @@ struct FollowedObservation<'a> {
     track: Option<TrackFeature>,
 }
 
-impl<'a> From<&'a Followed> for FollowedObservation<'a> {
-    fn from(followed: &'a Followed) -> Self {
+impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
+    fn from(followed: &'a ItemResult) -> Self {
         Self {
             fused: followed.fused.as_ref().map(Into::into),
             track: followed.track.as_ref().map(|point| point.as_ref().into()),
@@ -255,13 +257,14 @@ struct FollowedObservations<'a> {
     )
 )]
 async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
-    let rules = app.row_rules(&id).await?;
-    let observations = observations(&app, &body.read()?, &rules)?;
+    let camera = app.active_camera(&id).await?;
+    // Times ahead of the clock are refused before any track has changed.
+    let observations = observations(&app, &body.read()?, &app.live_rules(&camera))?;
     app.check_batch(observations.len())?;
-    let mut followed = Vec::with_capacity(observations.len());
-    for observation in &observations {
-        followed.push(app.follow(&id, observation).await?);
-    }
+    let followed = observations
+        .iter()
+        .map(|observation| app.follow(&camera, observation))
+        .collect::<Result<Vec<_>>>()?;
     let items = followed.iter().map(Into::into).collect();
     Ok(json_of_about(&FollowedObservations { items }, 64 + ITEM_BYTES * followed.len())?)
 }
@@ -269,8 +272,8 @@ async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBo
 /// Watch a camera
 ///
 /// Server-sent events from now on: `track` with a position as GeoJSON whenever a target was
-/// measured, `camera_moved` when the camera is found to look elsewhere than it did, and `lost` with
-/// the number of events that were lost because the client read too slowly.
+/// measured, `camera_moved` when the camera's pose is found to have changed, and `lost` with the number
+/// of events that were lost because the client read too slowly. They end when the camera is deleted.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/events", tag = "tracks",
     params(("camera" = String, Path, description = "The camera's id")),
@@ -282,20 +285,19 @@ async fn watch_camera(State(rest): State<Rest>, CameraPath(id): CameraPath) -> A
     })?;
     let events = rest.app.camera_events(&id).await?;
     let shutdown = rest.shutdown.clone();
-    let told = stream::unfold(events, |mut events| async move {
-        let event = match events.recv().await {
+    let sent = stream::unfold(events, |mut events| async move {
+        let event = match events.next().await? {
             Ok(CameraEvent::Track(point)) => event_of("track", &TrackFeature::from(&*point)),
             Ok(CameraEvent::Moved(moved)) => event_of("camera_moved", &CameraMoved::from(&*moved)),
-            Err(RecvError::Lagged(lost)) => event_of("lost", &lost),
-            Err(RecvError::Closed) => return None,
+            Err(LostEvents(lost)) => event_of("lost", &lost),
         };
         Some((event, events))
     });
-    let told = told.take_until(async move { shutdown.begun().await }).map(move |event| {
+    let sent = sent.take_until(async move { shutdown.begun().await }).map(move |event| {
         let _held = &place; // until the stream is dropped
         Ok::<_, Infallible>(event)
     });
-    Ok(Sse::new(told).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
+    Ok(Sse::new(sent).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
 }
 
 fn event_of(name: &str, value: &impl Serialize) -> Event {

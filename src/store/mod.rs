@@ -1,4 +1,4 @@
-//! Everything that lasts, behind one type: [`Store`]; the only floor that knows SQL.
+//! Persistent storage behind one type, [`Store`]; the only module with SQL.
 //!
 //! A file `sightfix.db` (SQLite, write-ahead log) with one writer connection and a few readers.
 //! Samples of many callers share transactions (`group_commit`). A change is flushed to the disk before
@@ -6,22 +6,23 @@
 //! sender asks for less.
 //!
 //! What never happens here: clocks are read, numbers are checked (they are valid by construction),
-//! a transaction is held across anything but statements, a type of the database library gets out.
+//! a transaction is held across anything but statements, a type of the database library becomes public.
 //! Rows that the constructors of `domain` refuse are faults that name table, column and row.
 
+mod camera_moves;
 mod cameras;
 mod connection;
+mod errors;
 mod evaluations;
-mod faults;
-mod fields;
+
 mod folder;
 mod group_commit;
 mod jobs;
 mod models;
-mod moves;
 mod occupants;
 mod reserve;
 mod retention;
+mod row_decoder;
 mod runs;
 mod samples;
 mod space;
@@ -45,14 +46,14 @@ pub use runs::{RunEnd, RunOutput};
 pub use samples::{SampleFilter, SampleKey};
 pub use space::{StorageStatus, StoreLimits};
 
-use faults::failed;
+use errors::failed;
 use group_commit::GroupCommit;
 use occupants::Presence;
 use reserve::Reserve;
 use space::Space;
 use writer::{Growth, Writer, WriterGuard};
 
-/// All that lasts. Clones share one store; it lives until the last clone is dropped or it is closed.
+/// The storage of one data folder. Clones share one store; it lives until the last clone is dropped or it is closed.
 ///
 /// Every method may fail with a fault of the server (disk, file), with
 /// [`ErrorKind::Overloaded`] when another process holds the file for seconds, with
@@ -120,7 +121,7 @@ impl Store {
         Ok(store)
     }
 
-    /// Commits what was handed in, copies the log back into the file and closes it. Later calls
+    /// Commits what is queued, copies the log back into the file and closes it. Later calls
     /// are refused with [`ErrorKind::ShuttingDown`]. Closing twice does nothing.
     pub async fn close(&self) {
         self.inner.samples.close().await;

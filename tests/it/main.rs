@@ -7,6 +7,8 @@ mod grpc;
 mod harness;
 mod job_leases;
 mod layering;
+mod live_client;
+mod live_faults;
 mod model_integrity;
 mod openapi;
 mod pairing;

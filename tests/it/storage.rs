@@ -151,7 +151,7 @@ async fn check_full_storage(server: &TestServer, refused: &Answer) {
     assert_eq!(details.error_info().expect("ErrorInfo").reason, "insufficient-storage");
 
     let ready = server.get("/readyz").await.expect(200).text();
-    assert!(ready.starts_with("ready\n") && ready.contains("warning: insufficient-storage"), "{ready}");
+    assert!(ready.starts_with("ready\n") && ready.contains("degraded: insufficient-storage"), "{ready}");
     metric(server, "sightfix_storage_full 1").await;
     let observation = json!({"observations": [{
         "time": "2026-01-01T00:00:00Z",
@@ -202,8 +202,9 @@ async fn a_full_disk_refuses_imports_fuses_on_and_recovers_by_deleting() {
     }
 
     let folder = data_folder();
-    let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
-    assert!(mounted.status().expect("mount runs").success(), "needs the superuser");
+    let mut mount = Command::new("mount");
+    mount.args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
+    assert!(mount.status().expect("mount runs").success(), "needs the superuser");
     let _mounted = Mounted(folder.path());
     let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__RESERVE_BYTES", "20971520")]);
     create_camera(&server, "c").await.expect(201);

@@ -31,7 +31,7 @@ fn simulate(walk: &Walk, seed: u64, seconds: u32) -> Vec<(EastNorth, Measurement
 
 /// Means over the steps of some runs; counts of rejections and steps.
 #[derive(Default, Debug)]
-struct Summary {
+struct RunSummary {
     error_m: f64,
     gnss_error_m: f64,
     two_step_error_m: f64,
@@ -42,8 +42,8 @@ struct Summary {
     steps: f64,
 }
 
-fn run(settings: TrackSettings, walk: &Walk, seeds: std::ops::Range<u64>, seconds: u32) -> Summary {
-    let mut summary = Summary::default();
+fn run(settings: TrackSettings, walk: &Walk, seeds: std::ops::Range<u64>, seconds: u32) -> RunSummary {
+    let mut summary = RunSummary::default();
     for seed in seeds {
         let measurements = simulate(walk, seed, seconds);
         let mut track = Track::start(settings, &measurements[0].1).expect("has both");

@@ -7,6 +7,7 @@
 //! bounded memory. Neither opens files nor reads clocks.
 
 mod buffer;
+mod outcome;
 mod stream;
 
 use std::str::FromStr;
@@ -15,7 +16,8 @@ use jiff::SignedDuration;
 
 use crate::domain::{Detection, Error, Receivers, Result, Sample};
 
-pub use self::stream::{ItemOutcome, PairedItems, Pairer, Released};
+pub use self::outcome::{ItemOutcome, Released};
+pub use self::stream::{PairedItems, Pairer};
 pub use crate::domain::ReceivedFix;
 
 /// How a box finds its fix.

@@ -111,7 +111,7 @@ impl Regressor {
         self.white_share
     }
 
-    /// Whether the regressed position depends on the fix: the network of `paper` has it among its inputs.
+    /// Whether the regressed position depends on the fix: a network of `paper` has it among its inputs.
     #[must_use]
     pub const fn uses_fix(&self) -> bool {
         matches!(self.encoder, Encoder::Paper(_))

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::stream::{ItemOutcome, Released};
+use super::outcome::{ItemOutcome, Released};
 use super::{PairingRule, PairingSettings, Unpaired};
 use crate::domain::{Detection, Fix, Sample};
 use crate::geo::{EastNorth, LocalPlane};

@@ -134,7 +134,11 @@ async fn an_import_stream_that_stalls_reports_what_is_stored() {
         fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
         ..proto::Sample::default()
     };
-    let first = proto::ImportSamplesRequest { camera_id: "c".to_owned(), samples: vec![sample] };
+    let first = proto::ImportSamplesRequest {
+        camera_id: "c".to_owned(),
+        samples: vec![sample],
+        ..proto::ImportSamplesRequest::default()
+    };
     let messages = stream::iter([first]).chain(stream::pending());
     let status = SampleServiceClient::new(channel).import_samples(messages).await.expect_err("it stalls");
     assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");

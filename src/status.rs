@@ -98,7 +98,7 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::Cancelled => (499, code::CANCELLED, "cancelled", "The request was cancelled"),
         ErrorKind::Overloaded => (503, code::UNAVAILABLE, "overloaded", "The server has too much to do"),
         ErrorKind::Timeout => (408, code::DEADLINE_EXCEEDED, "timeout", "The request took too long"),
-        ErrorKind::ShuttingDown => (503, code::UNAVAILABLE, "shutting-down", "The server is ending"),
+        ErrorKind::ShuttingDown => (503, code::UNAVAILABLE, "shutting-down", "The server is shutting down"),
         ErrorKind::HostNotAllowed => {
             (421, code::PERMISSION_DENIED, "host-not-allowed", "The server does not answer for this host")
         }

@@ -102,7 +102,7 @@ pub(super) fn timestamp(time: Timestamp) -> prost_types::Timestamp {
 }
 
 /// A time that a row or an observation may have.
-fn believable(time: Option<prost_types::Timestamp>, rules: &RowRules) -> Result<Timestamp> {
+fn checked_time(time: Option<prost_types::Timestamp>, rules: &RowRules) -> Result<Timestamp> {
     rules.time_bounds.check(required(instant(time, "time")?, "time")?)
 }
 
@@ -142,7 +142,7 @@ fn target_id(id: Option<&str>) -> Result<Option<TargetId>> {
 /// A sample that keeps the rules of its camera.
 pub(super) fn sample(sample: proto::Sample, rules: &RowRules) -> Result<Sample> {
     Ok(Sample {
-        time: believable(sample.time, rules)?,
+        time: checked_time(sample.time, rules)?,
         target_id: TargetId::new(required_text(&sample.target_id, "target_id")?)?,
         bounding_box: bounding_box(required(sample.bounding_box, "bounding_box")?, rules)?,
         fix: fix(required(sample.fix, "fix")?).map_err(|error| error.under("fix"))?,
@@ -155,7 +155,7 @@ pub(super) fn sample(sample: proto::Sample, rules: &RowRules) -> Result<Sample> 
 /// An observation that keeps the rules of its camera.
 pub(super) fn observation(observation: proto::Observation, rules: &RowRules) -> Result<Observation> {
     Observation::new(
-        believable(observation.time, rules)?,
+        checked_time(observation.time, rules)?,
         target_id(observation.target_id.as_deref())?,
         observation.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,
         observation.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,
@@ -165,7 +165,7 @@ pub(super) fn observation(observation: proto::Observation, rules: &RowRules) -> 
 /// An item of a live stream that keeps the rules of its camera.
 pub(super) fn live_item(item: proto::StreamItem, rules: &RowRules) -> Result<LiveItem> {
     Ok(LiveItem {
-        time: believable(item.time, rules)?,
+        time: checked_time(item.time, rules)?,
         target_id: target_id(item.target_id.as_deref())?,
         receiver_id: item.receiver_id.as_deref().map(ReceiverId::new).transpose()?,
         bounding_box: item.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,

@@ -13,7 +13,7 @@ use super::problem::{ApiResult, Problem};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind};
 
-/// Time for the store's answer; whoever asks whether the server is ready does not wait much longer.
+/// Time for the store's response, below the timeouts that probes of readiness have.
 const PING_TIME: Duration = Duration::from_secs(1);
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -41,7 +41,7 @@ const NAMED_CAMERAS: usize = 100;
     get, path = "/readyz", tag = "service",
     responses(
         (status = 200, description = "It can", body = String, content_type = "text/plain"),
-        (status = 503, description = "It is ending, or its store does not answer", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "It is shutting down, or its store does not respond", body = Problem, content_type = "application/problem+json"),
     )
 )]
 async fn readyz(State(rest): State<Rest>) -> ApiResult<String> {

@@ -137,7 +137,7 @@ async fn an_import_stream_that_stalls_reports_what_is_stored() {
     let first = proto::ImportSamplesRequest {
         camera_id: "c".to_owned(),
         samples: vec![sample],
-        ..Default::default()
+        ..proto::ImportSamplesRequest::default()
     };
     let messages = stream::iter([first]).chain(stream::pending());
     let status = SampleServiceClient::new(channel).import_samples(messages).await.expect_err("it stalls");

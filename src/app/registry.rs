@@ -50,7 +50,7 @@ impl ActiveCamera {
         self.model.as_ref().map(|(regressor, version)| (&**regressor, *version))
     }
 
-    /// What rows of the camera must keep.
+    /// What rows of the camera must satisfy.
     #[must_use]
     pub fn row_rules(&self, now: Timestamp) -> RowRules {
         RowRules { time_bounds: TimeBounds::at(now), image_size: self.image_size }
@@ -97,7 +97,7 @@ impl Registry {
     /// Brings all cameras up to date, including changes of another process on the same file.
     ///
     /// A model that cannot be loaded leaves its camera unserved, with a line in the log, so that one bad
-    /// row does not keep the others from being served.
+    /// row does not stop the others from being served.
     ///
     /// # Errors
     /// A fault if the store cannot be read.
@@ -206,4 +206,32 @@ pub(super) async fn load_regressor(store: &Store, id: &CameraId, number: u32) ->
     let metadata = store.model(id, number).await?.metadata;
     let weights = store.weights(id, number).await?.into();
     Artifact { metadata, weights }.load().map_err(Error::fault)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::NewCamera;
+
+    #[tokio::test]
+    async fn a_refresh_under_way_does_not_bring_back_a_deleted_camera() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Store::open(folder.path()).await.expect("a new store");
+        let (registry, id) = (Registry::default(), CameraId::new("yard").expect("a slug"));
+        for _ in 0..50 {
+            store.insert_camera(&NewCamera::named(id.clone()), Timestamp::UNIX_EPOCH).await.expect("new");
+            let camera = registry.refresh_camera(&store, &id).await.expect("known");
+            // Changed, so that the refresh has something to do.
+            let changed = NewCamera { display_name: "gate".to_owned(), ..NewCamera::named(id.clone()) };
+            store.replace_camera(&changed, None, Timestamp::UNIX_EPOCH).await.expect("changed");
+            let delete = async {
+                store.delete_camera(&id, None).await.expect("deleted");
+                registry.forget(&id).await;
+            };
+            let (refreshed, ()) = tokio::join!(registry.refresh(&store), delete);
+            refreshed.expect("refreshed");
+            assert!(registry.get(&id).is_none());
+            assert!(camera.live.is_deleted(), "what listens to the camera ends");
+        }
+    }
 }

@@ -11,13 +11,12 @@ use crate::domain::{
     BoundingBox, EpochReport, ImageSize, Method, Observation, Recipe, Result, Sample, SigmaM, Step, Truth,
 };
 use crate::filters::ImmUkf;
-use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, passes};
+use crate::fusion::observed::{ObservedPositions, UNKNOWN_RECEIVER_M2};
+use crate::fusion::target_track::TargetTrack;
+use crate::fusion::track::{TrackSettings, passes};
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, dnn, homography};
-
-/// Standard deviation per axis taken for a receiver of which nothing is known, m.
-const UNKNOWN_RECEIVER_M: f64 = 5.0;
+use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, dnn, homography};
 
 /// One row to be told and judged.
 #[derive(Debug, Clone, PartialEq)]
@@ -304,7 +303,7 @@ impl<'a> Run<'a> {
     /// The receiver's variance per axis for fixes that do not state their own, m2.
     fn gnss_variance_m2(&self, learnt_m2: Option<f64>) -> f64 {
         let known = self.options.gnss_sigma.map(SigmaM::variance_m2);
-        known.or(learnt_m2).unwrap_or(UNKNOWN_RECEIVER_M * UNKNOWN_RECEIVER_M)
+        known.or(learnt_m2).unwrap_or(UNKNOWN_RECEIVER_M2)
     }
 
     fn baseline<'b>(&self, method: Method, seed: u64) -> Result<Answerer<'b>, String>
@@ -422,14 +421,18 @@ impl<'a> Run<'a> {
                 let test = self.test;
                 let denied = method == Method::TrackDenied;
                 Box::new(move |target| {
-                    let mut track: Option<Track> = None;
+                    let mut track = TargetTrack::default();
                     let tell = |&row: &usize| {
                         let mut observation = test[row].observation.clone();
                         observation.fix = observation.fix.filter(|_| !denied);
-                        let measurement = measurement(&observation, &plane, e_gnss_m2, |drawn, fix| {
-                            regressor.regress(drawn, fix)
-                        });
-                        step_track(&mut track, settings, &measurement, &plane)
+                        let e_gnss_m2 = Some(e_gnss_m2);
+                        let observed =
+                            ObservedPositions::of(&observation, Some(regressor), image_size, e_gnss_m2);
+                        let estimate = match observed.is_empty() {
+                            true => track.at(observation.time),
+                            false => track.update(&observed, || settings),
+                        }?;
+                        Some(Told { position: estimate.position, r95_m: Some(estimate.state.r95_m) })
                     };
                     target.iter().map(tell).collect()
                 })
@@ -437,47 +440,6 @@ impl<'a> Run<'a> {
             _ => return Err("needs no model".to_owned()),
         })
     }
-}
-
-/// What a track is told of one row: the regression's variance brought to its calibrated size.
-fn measurement(
-    observation: &Observation,
-    plane: &LocalPlane,
-    e_gnss_m2: f64,
-    regress: impl Fn(&BoundingBox, Option<EastNorth>) -> Regression,
-) -> Measurement {
-    let fix = observation.fix.map(|fix| {
-        let variance_m2 = fix.sigma_m.map_or(e_gnss_m2, SigmaM::variance_m2);
-        Measured::isotropic(plane.to_plane(fix.position), variance_m2)
-    });
-    let regressed = observation.bounding_box.as_ref().map(|drawn| {
-        let regression = regress(drawn, fix.map(|fix| fix.position));
-        Measured::isotropic(regression.regressed, regression.variance_m2())
-    });
-    Measurement { time: observation.time, fix, regressed }
-}
-
-/// Goes on with a track, or begins one; a row without any measurement is told from what came before.
-fn step_track(
-    track: &mut Option<Track>,
-    settings: TrackSettings,
-    measurement: &Measurement,
-    plane: &LocalPlane,
-) -> Option<Told> {
-    if track.as_ref().is_some_and(|track| track.is_gone(measurement.time)) {
-        *track = None;
-    }
-    let state = match track {
-        Some(track) if measurement.fix.is_none() && measurement.regressed.is_none() => {
-            track.state_at(measurement.time)
-        }
-        Some(track) => track.update(measurement),
-        None => {
-            *track = Track::start(settings, measurement);
-            track.as_ref()?.state_at(measurement.time)
-        }
-    };
-    Some(Told { position: plane.to_position(state.position), r95_m: Some(state.r95_m) })
 }
 
 #[cfg(test)]

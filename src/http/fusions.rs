@@ -15,9 +15,9 @@ use crate::app::App;
 use crate::domain::{Error, ErrorKind, Observation, Refusal, Result, Violation};
 use crate::exchange::{RowRules, wire};
 
-/// Most fields at fault that one answer names.
+/// Fields at fault that one answer names at most.
 const VIOLATIONS: usize = 100;
-/// A fused position as JSON is seldom longer.
+/// Typical size of a fused position as JSON, to reserve memory.
 const ITEM_BYTES: usize = 640;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -110,21 +110,21 @@ pub(super) fn observations(app: &App, request: &Request<'_>, rules: &RowRules) -
         return Err(Error::invalid("observations", "must hold at least one"));
     }
     app.check_batch(batch.len())?;
-    let mut taken = Vec::with_capacity(batch.len());
+    let mut accepted = Vec::with_capacity(batch.len());
     let mut violations = Vec::new();
     for (index, observation) in batch.iter().enumerate() {
         match observation.to_domain(time_bounds, *image_size) {
-            Ok(observation) => taken.push(observation),
-            Err(error) => violations.extend(told(error.under(&format!("observations[{index}]")))?),
+            Ok(observation) => accepted.push(observation),
+            Err(error) => violations.extend(violations_of(error.under(&format!("observations[{index}]")))?),
         }
         if violations.len() >= VIOLATIONS {
             break;
         }
     }
-    if violations.is_empty() { Ok(taken) } else { Err(refused(violations)) }
+    if violations.is_empty() { Ok(accepted) } else { Err(refused(violations)) }
 }
 
-fn told(error: Error) -> Result<Vec<Violation>> {
+fn violations_of(error: Error) -> Result<Vec<Violation>> {
     match error {
         Error::Refused(refusal) => Ok(refusal.violations),
         fault @ Error::Fault(_) => Err(fault),

@@ -125,10 +125,6 @@ impl TestServer {
         Self { process, address: address.expect("the server tells its address"), client }
     }
 
-    pub(crate) fn pid(&self) -> u32 {
-        self.process.id()
-    }
-
     /// `kill -9`.
     pub(crate) fn kill(mut self) {
         self.process.kill().expect("the server can be killed");

@@ -8,6 +8,7 @@ mod harness;
 mod layering;
 mod live_client;
 mod live_faults;
+mod live_saturation;
 mod openapi;
 mod pairing;
 mod replay;

@@ -28,7 +28,7 @@ pub struct PairedImport<D, F> {
     pub receiver_id: Option<ReceiverId>,
     /// When the samples are acknowledged.
     pub durability: Durability,
-    /// Whether the clock offsets are estimated, too. They are told, never applied.
+    /// Whether the clock offsets are estimated, too. They are reported, never applied.
     pub estimates_offsets: bool,
 }
 
@@ -43,7 +43,7 @@ pub struct PairedReport {
     pub rejected: RejectedParts,
     /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
     pub unnamed_fixes_of: Option<Receiver>,
-    /// Clock offsets by receiver, if they were asked for; `None` where the files do not tell them.
+    /// Clock offsets by receiver, if they were asked for; `None` where the files do not show them.
     pub clock_offsets: Vec<(Receiver, Option<OffsetEstimate>)>,
 }
 

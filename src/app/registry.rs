@@ -61,7 +61,7 @@ impl ActiveCamera {
         self.model.as_ref().map(|(regressor, version)| (&**regressor, *version))
     }
 
-    /// What rows of the camera must keep.
+    /// What rows of the camera must satisfy.
     #[must_use]
     pub fn row_rules(&self, now: Timestamp) -> RowRules {
         RowRules { time_bounds: TimeBounds::at(now), image_size: self.image_size }
@@ -263,4 +263,32 @@ pub(super) async fn load_regressor(store: &Store, id: &CameraId, number: u32) ->
         ),
         fault @ Error::Fault(_) => fault,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::NewCamera;
+
+    #[tokio::test]
+    async fn a_refresh_under_way_does_not_bring_back_a_deleted_camera() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Store::open(folder.path()).await.expect("a new store");
+        let (registry, id) = (Registry::default(), CameraId::new("yard").expect("a slug"));
+        for _ in 0..50 {
+            store.insert_camera(&NewCamera::named(id.clone()), Timestamp::UNIX_EPOCH).await.expect("new");
+            let camera = registry.refresh_camera(&store, &id).await.expect("known");
+            // Changed, so that the refresh has something to do.
+            let changed = NewCamera { display_name: "gate".to_owned(), ..NewCamera::named(id.clone()) };
+            store.replace_camera(&changed, None, Timestamp::UNIX_EPOCH).await.expect("changed");
+            let delete = async {
+                store.delete_camera(&id, None).await.expect("deleted");
+                registry.forget(&id).await;
+            };
+            let (refreshed, ()) = tokio::join!(registry.refresh(&store), delete);
+            refreshed.expect("refreshed");
+            assert!(registry.get(&id).is_none());
+            assert!(camera.live.is_deleted(), "what listens to the camera ends");
+        }
+    }
 }

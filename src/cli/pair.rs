@@ -186,12 +186,15 @@ fn print_counts(counts: &PairingCounts) {
          another box {}, duplicate {}",
         counts.detections_without_fixes,
         counts.detections_far_from_fixes,
-        counts.detections_outbid,
+        counts.detections_with_fix_claimed,
         counts.detections_duplicate,
     );
     println!(
         "unused fixes: no receiver named {}, no box of the target {}, no box to take it {}, duplicate {}",
-        counts.fixes_unbound, counts.fixes_without_detections, counts.fixes_unused, counts.fixes_duplicate,
+        counts.fixes_without_receiver,
+        counts.fixes_without_detections,
+        counts.fixes_unused,
+        counts.fixes_duplicate,
     );
 }
 

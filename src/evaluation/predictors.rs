@@ -201,12 +201,11 @@ impl<'a> Predictors<'a> {
             let predict = |&row: &usize| {
                 let mut observation = test[row].observation.clone();
                 observation.fix = observation.fix.filter(|_| with_fix);
-                let is_empty = observation.bounding_box.is_none() && observation.fix.is_none();
-                let estimate = if is_empty {
+                let observed =
+                    ObservedPositions::of(&observation, Some(regressor), image_size, Some(e_gnss_m2));
+                let estimate = if observed.is_empty() {
                     track.at(observation.time)
                 } else {
-                    let observed =
-                        ObservedPositions::of(&observation, Some(regressor), image_size, Some(e_gnss_m2));
                     track.update(&observed, || settings)
                 }?;
                 Some(Prediction { position: estimate.position, r95_m: Some(estimate.state.r95_m) })

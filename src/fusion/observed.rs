@@ -113,7 +113,7 @@ fn is_usable(regression: &Regression) -> bool {
     regression.regressed.is_within_range() && regression.e_regression_m2.is_finite()
 }
 
-/// Stands for a regression without a usable position: the origin, with the plane's range as `r95_m`.
+/// Replaces a regression without a usable position: the origin, with the plane's range as `r95_m`.
 fn anywhere_in_range(regression: &Regression) -> Regression {
     Regression {
         regressed: EastNorth::default(),
@@ -144,6 +144,12 @@ impl<'a> ObservedPositions<'a> {
                 ObservedBox::of(bounding_box, regressor, in_plane, image_size)
             }),
         }
+    }
+
+    /// Whether neither the box nor the fix gives a position.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.fix.is_none() && self.usable_box().is_none()
     }
 
     /// The box, if it gives a position.

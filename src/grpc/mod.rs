@@ -4,9 +4,9 @@
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
 mod cameras;
+mod cancel_on_shutdown;
 pub mod client;
 mod convert;
-mod ending;
 mod fusion;
 mod models;
 mod outbox;
@@ -28,7 +28,7 @@ use crate::app::App;
 use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
-use ending::EndsWithServer;
+use cancel_on_shutdown::CancelOnShutdown;
 use proto::camera_service_server::CameraServiceServer;
 use proto::fusion_service_server::FusionServiceServer;
 use proto::model_service_server::ModelServiceServer;
@@ -65,7 +65,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .expect("the build wrote the descriptors");
     Routes::default()
         .add_service(health(shutdown))
-        .add_service(EndsWithServer::new(reflection, shutdown))
+        .add_service(CancelOnShutdown::new(reflection, shutdown))
         .add_service(cameras)
         .add_service(samples)
         .add_service(training)

@@ -1,4 +1,4 @@
-//! What a live stream has to tell a client who may read slowly.
+//! Messages of a live stream for a client that may read slowly.
 //!
 //! Answers beyond the limit push out the oldest, counted; what must not be lost (acknowledgements,
 //! alarms, the end) takes a place each, whatever the client does.

@@ -151,7 +151,7 @@ impl StreamSession {
                 biased;
                 error = stream.deleted() => return Err(error),
                 () = self.shutdown.begun(), if clock.reconnect_sent_at.is_none() => {
-                    self.outbox.reconnect("the server is ending; its successor will take up the stream");
+                    self.outbox.reconnect("the server is ending; reconnect to continue the stream");
                     clock.reconnect_sent_at = Some(Instant::now());
                 }
                 _ = tick.tick() => {
@@ -295,15 +295,15 @@ fn answer_of(seq: u64, item: ItemResult) -> proto::StreamAnswer {
 }
 
 fn refused(seq: u64, error: &Error) -> proto::StreamAnswer {
-    let told = status::of(error.kind());
+    let status = status::of(error.kind());
     let (field, message) = match error {
         Error::Refused(refusal) => match refusal.violations.first() {
             Some(violation) => (violation.field.clone(), violation.message.clone()),
             None => (String::new(), refusal.message.clone()),
         },
-        Error::Fault(_) => (String::new(), told.title.to_owned()),
+        Error::Fault(_) => (String::new(), status.title.to_owned()),
     };
-    let error = proto::StreamItemError { reason: told.slug.to_owned(), field, message };
+    let error = proto::StreamItemError { reason: status.slug.to_owned(), field, message };
     proto::StreamAnswer { seq, outcome: Some(Outcome::Error(error)), ..proto::StreamAnswer::default() }
 }
 

@@ -15,7 +15,7 @@ use crate::app::App;
 use crate::domain::{Error, Observation, Result, convert_all};
 use crate::exchange::{RowRules, wire};
 
-/// A fused position as JSON is seldom longer.
+/// Typical size of a fused position as JSON, to reserve memory.
 const ITEM_BYTES: usize = 640;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {

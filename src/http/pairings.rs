@@ -257,11 +257,11 @@ impl From<PairingCounts> for Pairing {
             unpaired_detections: UnpairedDetections {
                 no_fix_of_target: counts.detections_without_fixes,
                 no_fix_near: counts.detections_far_from_fixes,
-                fix_nearer_to_another: counts.detections_outbid,
+                fix_nearer_to_another: counts.detections_with_fix_claimed,
                 duplicate: counts.detections_duplicate,
             },
             unused_fixes: UnusedFixes {
-                no_receiver: counts.fixes_unbound,
+                no_receiver: counts.fixes_without_receiver,
                 no_box_of_target: counts.fixes_without_detections,
                 no_box_near: counts.fixes_unused,
                 duplicate: counts.fixes_duplicate,

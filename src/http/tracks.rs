@@ -27,9 +27,9 @@ use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
 
-/// How often a silent event stream says that it is still there.
+/// Interval of the keep-alive comments of a silent event stream.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
-/// A followed observation as JSON is seldom longer.
+/// Typical size of a followed observation as JSON, to reserve memory.
 const ITEM_BYTES: usize = 1_024;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -39,7 +39,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(watch_camera))
 }
 
-/// Why a measured position was not taken up.
+/// Why a measured position was not used.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 enum RejectionReason {
@@ -47,7 +47,7 @@ enum RejectionReason {
     OutsideGate,
     /// Older than the window of late items.
     TooLate,
-    /// The same source has spoken for this instant before.
+    /// A measurement of the same source and instant was used before.
     Duplicate,
     /// Its error variance is not positive.
     UnusableVariance,
@@ -77,12 +77,12 @@ enum Source {
     Fix,
 }
 
-/// A measured position that a track did not take up.
+/// A measured position that a track did not use.
 #[derive(Serialize, ToSchema)]
 struct Rejection {
-    /// Which half of the observation.
+    /// Box or fix.
     source: Source,
-    /// Why.
+    /// The cause.
     reason: RejectionReason,
     /// Squared Mahalanobis length of its innovation, where one was computed.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -102,9 +102,9 @@ impl From<&track::Rejection> for Rejection {
 /// What a track says of its target at one instant.
 #[derive(Serialize, ToSchema)]
 struct TrackState {
-    /// Who.
+    /// The target.
     target_id: String,
-    /// When: the latest instant measured.
+    /// The latest instant measured.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
     /// Velocity towards east, m/s.
@@ -113,14 +113,14 @@ struct TrackState {
     velocity_north_m_s: f64,
     /// Radius about the position that holds the true one with 95 % probability, m.
     r95_m: f64,
-    /// Probability that the target stands, 0 to 1.
+    /// Probability that the target is stationary, 0 to 1.
     still: f64,
-    /// Normalised innovation squared of what was taken up; 2 on average for each of box and fix.
+    /// Normalised innovation squared of what was used; 2 on average for each of box and fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     nis: Option<f64>,
-    /// What was not taken up.
+    /// What was not used.
     rejections: Vec<Rejection>,
-    /// Whether the track began anew.
+    /// Whether the track was restarted at this measurement.
     restarted: bool,
 }
 
@@ -157,7 +157,7 @@ struct TrackFeature {
     /// `Feature`.
     #[schema(example = "Feature")]
     r#type: &'static str,
-    /// Where.
+    /// The position.
     geometry: PointGeometry,
     /// Time, error and motion.
     properties: TrackState,
@@ -207,7 +207,7 @@ async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> ApiR
 
 /// Read where a target was
 ///
-/// Oldest first, as far back as is kept.
+/// Oldest first, as far back as the history reaches.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/tracks/{target}", tag = "tracks",
     params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id")),
@@ -246,8 +246,8 @@ struct FollowedObservations<'a> {
 
 /// Follow targets
 ///
-/// Takes what `fusions` takes, box and fix together or apart, and takes each observation up into
-/// the track of its target.
+/// Takes what `fusions` takes, box and fix together or apart, and feeds each observation to the
+/// track of its target.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/tracks", tag = "tracks", params(("camera" = String, Path, description = "The camera's id")),
     request_body = FusionRequest,

@@ -8,7 +8,7 @@ use sightfix::domain::Observation;
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 pub(crate) use sightfix::grpc::proto::stream_request::Kind as Sent;
-pub(crate) use sightfix::grpc::proto::stream_response::Kind as Told;
+pub(crate) use sightfix::grpc::proto::stream_response::Kind as Received;
 use sightfix::simulation::{Options, SimulatedRow, simulate};
 use tokio::sync::mpsc;
 use tonic::transport::Channel;
@@ -21,13 +21,13 @@ const MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.saf
 /// A stream as a client holds it.
 pub(crate) struct Client {
     pub(crate) items: mpsc::Sender<proto::StreamRequest>,
-    pub(crate) told: Streaming<proto::StreamResponse>,
+    pub(crate) responses: Streaming<proto::StreamResponse>,
     pub(crate) seq: u64,
 }
 
 impl Client {
     pub(crate) async fn send(&mut self, kind: Sent) {
-        // A stream that the server has ended takes nothing more; what it told is looked at instead.
+        // A stream that the server has ended takes nothing more; its status is looked at instead.
         let _ = self.items.send(proto::StreamRequest { kind: Some(kind) }).await;
     }
 
@@ -37,17 +37,17 @@ impl Client {
         self.seq
     }
 
-    pub(crate) async fn next(&mut self) -> Result<Option<Told>, Status> {
-        let message = tokio::time::timeout(Duration::from_secs(60), self.told.message());
-        Ok(message.await.expect("the server tells something in time")?.and_then(|message| message.kind))
+    pub(crate) async fn next(&mut self) -> Result<Option<Received>, Status> {
+        let message = tokio::time::timeout(Duration::from_secs(60), self.responses.message());
+        Ok(message.await.expect("a response in time")?.and_then(|message| message.kind))
     }
 
     /// The next answer; acknowledgements on the way are passed over.
     pub(crate) async fn answer(&mut self) -> proto::StreamAnswer {
         loop {
             match self.next().await.expect("no end") {
-                Some(Told::Answer(answer)) => return *answer,
-                Some(Told::Opened(_) | Told::Acknowledgement(_)) => {}
+                Some(Received::Answer(answer)) => return *answer,
+                Some(Received::Opened(_) | Received::Acknowledgement(_)) => {}
                 other => panic!("no answer but {other:?}"),
             }
         }
@@ -63,14 +63,14 @@ impl Client {
     pub(crate) async fn finish_with_counts(
         self,
     ) -> (Option<proto::StreamAcknowledgement>, Vec<proto::StreamAnswer>, Option<Status>) {
-        let Self { items, mut told, .. } = self;
+        let Self { items, mut responses, .. } = self;
         drop(items);
         let (mut acknowledged, mut answers) = (None, Vec::new());
         loop {
-            match told.message().await {
+            match responses.message().await {
                 Ok(Some(message)) => match message.kind.expect("set") {
-                    Told::Acknowledgement(acknowledgement) => acknowledged = Some(acknowledgement),
-                    Told::Answer(answer) => answers.push(*answer),
+                    Received::Acknowledgement(acknowledgement) => acknowledged = Some(acknowledgement),
+                    Received::Answer(answer) => answers.push(*answer),
                     _ => {}
                 },
                 Ok(None) => return (acknowledged, answers, None),
@@ -109,13 +109,13 @@ pub(crate) async fn begin(channel: &Channel, first: Sent) -> Client {
     let first = proto::StreamRequest { kind: Some(first) };
     items.send(first).await.expect("room");
     let mut service = FusionServiceClient::new(channel.clone());
-    let told = service.stream(messages(requests)).await.expect("errors come as the end").into_inner();
-    Client { items, told, seq: 0 }
+    let responses = service.stream(messages(requests)).await.expect("errors come as the end").into_inner();
+    Client { items, responses, seq: 0 }
 }
 
 pub(crate) async fn open(channel: &Channel, client_name: &str, store_samples: bool) -> Client {
     let mut client = begin(channel, opening(client_name, store_samples)).await;
-    let Ok(Some(Told::Opened(_))) = client.next().await else { panic!("the stream is not opened") };
+    let Ok(Some(Received::Opened(_))) = client.next().await else { panic!("the stream is not opened") };
     client
 }
 

@@ -18,7 +18,7 @@ use sightfix::simulation::{Options, SimulatedRow};
 use tonic::Code;
 
 use crate::harness::{TestServer, data_folder};
-use crate::live_client::{Told, boxed, channel, fixed, open, rows, whole, yard};
+use crate::live_client::{Received, boxed, channel, fixed, open, rows, whole, yard};
 
 fn position_of(value: &Value) -> Position {
     let degrees = |name: &str| value[name].as_f64().expect("degrees");
@@ -359,7 +359,7 @@ async fn streams_and_listeners_of_a_deleted_camera_end() {
         let ended = async {
             loop {
                 match client.next().await {
-                    Ok(Some(Told::Answer(_) | Told::Acknowledgement(_))) => {}
+                    Ok(Some(Received::Answer(_) | Received::Acknowledgement(_))) => {}
                     other => break other,
                 }
             }

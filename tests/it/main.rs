@@ -10,6 +10,7 @@ mod job_leases;
 mod layering;
 mod live_client;
 mod live_faults;
+mod live_saturation;
 mod model_integrity;
 mod openapi;
 mod overload;

@@ -41,7 +41,7 @@ pub struct NotStored {
     pub last_seq: u64,
 }
 
-/// What a stream may tell its client.
+/// What a stream may acknowledge.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Acknowledgement {
     /// Every item up to this seq is settled.

@@ -49,6 +49,12 @@ impl CameraLive {
         self.deleted.cancel();
     }
 
+    /// Whether the camera is deleted.
+    #[cfg(test)]
+    pub(in crate::app) fn is_deleted(&self) -> bool {
+        self.deleted.is_cancelled()
+    }
+
     /// Waits until the camera is deleted.
     pub(super) async fn deleted(&self) {
         self.deleted.cancelled().await;

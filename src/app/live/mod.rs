@@ -81,7 +81,7 @@ impl App {
         TimeBounds::live_at(self.clock.now(), self.limits.live_ahead_s)
     }
 
-    /// What live observations of a camera must keep.
+    /// What live observations of a camera must satisfy.
     #[must_use]
     pub fn live_rules(&self, camera: &ActiveCamera) -> RowRules {
         RowRules { time_bounds: self.live_time_bounds(), image_size: camera.image_size }
@@ -121,7 +121,7 @@ impl App {
         Ok(camera.live.tracks.latest(self.clock.monotonic()))
     }
 
-    /// Where a target was, oldest first, as far back as is kept.
+    /// Where a target was, oldest first, as far back as the history reaches.
     ///
     /// # Errors
     /// `CameraNotFound`, `TrackNotFound`.

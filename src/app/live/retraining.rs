@@ -67,7 +67,7 @@ impl App {
     async fn retrain(&self, camera: &ActiveCamera, moved: &CameraMoved) -> Result<()> {
         let id = &camera.id;
         match self.store.retraining_state(id, moved.model_version).await? {
-            // The operator's decision stands.
+            // A run under way, or the operator's decision against one.
             Some(JobState::Queued | JobState::Running | JobState::Cancelled) => return Ok(()),
             // The camera still answers by the version that no longer fits.
             None | Some(JobState::Failed | JobState::Succeeded) => {}

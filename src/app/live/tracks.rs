@@ -73,7 +73,7 @@ impl Tracks {
         seen: &TargetObservation<'_>,
         limits: &Limits,
     ) -> Result<(Option<Arc<TrackPoint>>, Option<ResidualSample>)> {
-        if seen.observed.fix.is_none() && seen.observed.usable_box().is_none() {
+        if seen.observed.is_empty() {
             return Ok((None, None));
         }
         let target = self.target(id, seen, limits.tracks_per_camera)?;
@@ -99,7 +99,7 @@ impl Tracks {
         points
     }
 
-    /// Where a target was, oldest first, as far back as is kept; `None` if it is not tracked.
+    /// Where a target was, oldest first, as far back as the history reaches; `None` if it is not tracked.
     pub(super) fn history(&self, target_id: &TargetId, now: Duration) -> Option<Vec<Arc<TrackPoint>>> {
         let target = {
             let mut targets = lock(&self.targets);

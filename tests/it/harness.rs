@@ -153,6 +153,11 @@ impl TestServer {
         }
     }
 
+    /// Process id of the server.
+    pub(crate) fn pid(&self) -> u32 {
+        self.process.id()
+    }
+
     /// Kills the process with SIGKILL.
     pub(crate) fn kill(mut self) {
         self.process.kill().expect("the server can be killed");

@@ -77,7 +77,10 @@ async fn a_flooded_import_notices_the_end_of_the_server() {
         let sample = proto::Sample { time: Some(prost_types::Timestamp::default()), ..Default::default() };
         let samples = vec![sample; 20];
         let _ = sent.try_send(());
-        Some((proto::ImportSamplesRequest { camera_id: "yard".to_owned(), samples }, sent))
+        Some((
+            proto::ImportSamplesRequest { camera_id: "yard".to_owned(), samples, ..Default::default() },
+            sent,
+        ))
     });
     let importing = tokio::spawn(async move { service.import_samples(requests).await });
     first_is_sent.recv().await.expect("the import has begun");

@@ -51,6 +51,7 @@ impl Server {
         let store = Store::open_with(&config.data, options)
             .await
             .with_context(|| format!("cannot open the data folder {}", config.data.display()))?;
+        store.log_newcomers();
         let app = App::new(store, clock, randomness, config.limits.clone(), Metrics::new()).await?;
         let listener = connection::listen(config.listen)
             .with_context(|| format!("cannot listen on {}", config.listen))?;

@@ -151,7 +151,8 @@ impl Store {
             .unwrap_or_default()
     }
 
-    fn log_newcomers(&self) {
+    /// Logs the processes of [`Store::newcomers`].
+    pub fn log_newcomers(&self) {
         for Occupant { pid, host, role } in self.newcomers() {
             tracing::warn!(pid, host, role, "another process uses the same data folder");
         }

@@ -9,6 +9,7 @@ use std::time::Duration;
 use futures_util::stream;
 use serde_json::{Value, json};
 use sightfix::grpc::proto;
+use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::model_service_client::ModelServiceClient;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
 use sightfix::grpc::proto::training_service_client::TrainingServiceClient;
@@ -105,6 +106,23 @@ async fn imports_say_how_durable_they_are() {
         };
         let report = samples.import_samples(stream::iter([message])).await.expect("taken").into_inner();
         assert_eq!(report.durability(), told);
+    }
+
+    let mut fusion = FusionServiceClient::new(channel(&server).await);
+    for (store_samples, told) in [(true, proto::Durability::Relaxed), (false, proto::Durability::Unspecified)]
+    {
+        let opening = proto::StreamOpening {
+            camera_id: "c".to_owned(),
+            client_name: "edge-1".to_owned(),
+            store_samples,
+            durability: proto::Durability::Relaxed.into(),
+            ..Default::default()
+        };
+        let first = proto::StreamRequest { kind: Some(proto::stream_request::Kind::Opening(opening)) };
+        let mut answers = fusion.stream(stream::iter([first])).await.expect("taken").into_inner();
+        let answer = answers.message().await.expect("no error").expect("an answer");
+        let Some(proto::stream_response::Kind::Opened(opened)) = answer.kind else { panic!("{answer:?}") };
+        assert_eq!(opened.durability(), told);
     }
 }
 
@@ -212,7 +230,6 @@ async fn a_full_disk_refuses_imports_fuses_on_and_recovers_by_deleting() {
     activate(&server, 1).await;
     let refused = fill(&server).await;
     check_full_storage(&server, &refused).await;
-    assert!(server.terminate());
 }
 
 #[tokio::test]

@@ -1,0 +1,78 @@
+//! Which rows are left out together: whole targets where there are enough of them, else spells.
+
+use super::noise::Epoch;
+
+/// Groups at most.
+const GROUPS: usize = 8;
+/// Targets from which whole ones are left out.
+const MIN_TARGETS: usize = 5;
+
+/// Group of each row, and their number.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Grouping {
+    of_row: Vec<usize>,
+    count: usize,
+}
+
+impl Grouping {
+    /// Rows of each group in their order.
+    pub(crate) fn members(&self) -> Vec<Vec<usize>> {
+        let mut members = vec![Vec::new(); self.count];
+        for (row, group) in self.of_row.iter().enumerate() {
+            members[*group].push(row);
+        }
+        members.retain(|rows| !rows.is_empty());
+        members
+    }
+}
+
+/// Groups of rows that stand in the order of target and time.
+pub(crate) fn groups(epochs: &[Epoch]) -> Grouping {
+    let targets: Vec<usize> =
+        epochs.chunk_by(|one, next| one.sequence == next.sequence).map(<[Epoch]>::len).collect();
+    if targets.len() >= MIN_TARGETS { whole_targets(&targets) } else { spells(epochs, &targets) }
+}
+
+/// The largest target first, each into the group that is the smallest so far.
+fn whole_targets(targets: &[usize]) -> Grouping {
+    let count = targets.len().min(GROUPS);
+    let mut order: Vec<usize> = (0..targets.len()).collect();
+    order.sort_by_key(|target| std::cmp::Reverse(targets[*target]));
+    let mut sizes = vec![0; count];
+    let mut group_of = vec![0; targets.len()];
+    for target in order {
+        let smallest = (0..count).min_by_key(|group| sizes[*group]).unwrap_or(0);
+        sizes[smallest] += targets[target];
+        group_of[target] = smallest;
+    }
+    let of_row = targets.iter().zip(&group_of).flat_map(|(rows, group)| vec![*group; *rows]).collect();
+    Grouping { of_row, count }
+}
+
+/// Spells of each target, cut at the largest gaps near equal shares.
+fn spells(epochs: &[Epoch], targets: &[usize]) -> Grouping {
+    let pieces = GROUPS.div_ceil(targets.len().max(1));
+    let mut of_row = Vec::with_capacity(epochs.len());
+    let (mut from, mut group) = (0, 0);
+    for rows in targets {
+        let own = &epochs[from..from + rows];
+        let share = rows / pieces;
+        let cuts: Vec<usize> = (1..pieces)
+            .map(|cut| {
+                let (low, high) = (cut * share - share / 3, cut * share + share / 3);
+                let gap_s = |at: usize| own[at].time_s - own[at - 1].time_s;
+                (low.max(1)..=high.min(rows.saturating_sub(1)))
+                    .max_by(|one, other| {
+                        gap_s(*one)
+                            .total_cmp(&gap_s(*other))
+                            .then_with(|| other.abs_diff(cut * share).cmp(&one.abs_diff(cut * share)))
+                    })
+                    .unwrap_or(cut * share)
+            })
+            .collect();
+        of_row.extend((0..*rows).map(|row| group + cuts.iter().filter(|cut| row >= **cut).count()));
+        group += pieces;
+        from += rows;
+    }
+    Grouping { of_row, count: group }
+}

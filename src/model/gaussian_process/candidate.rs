@@ -1,14 +1,15 @@
 //! One form of the map under given hyper-parameters: posterior of all rows and without each group.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, SVector};
 
 use super::groups::Grouping;
 use super::hyperparameters::{Hyperparameters, LikelihoodRows, Priors, join, kernel_columns};
 use super::kernel::inducing_points;
 use super::noise::{Epoch, Whitener};
-use super::posterior::{Gram, Posterior};
-use super::projective_mean::{Box4, COEFFICIENTS, ProjectiveMean};
+use super::posterior::{Gram, Posterior, TangentPrior};
+use super::projective_mean::{Box4, COEFFICIENTS, FOOT_COEFFICIENTS, ProjectiveMean};
 use super::training_rows::TrainingRows;
+use super::upright_camera::{Parameters, UprightCamera};
 
 /// Rows that hyper-parameters are estimated on at most.
 const MAX_LIKELIHOOD_ROWS: usize = 2_500;
@@ -16,8 +17,6 @@ const MAX_INDUCING: usize = 64;
 const MAX_LIKELIHOOD_INDUCING: usize = 40;
 /// Rows per inducing point, at least.
 const ROWS_PER_INDUCING: usize = 5;
-/// Gauss-Newton rounds about each set of hyper-parameters.
-const RELINEARIZATIONS: usize = 2;
 /// Scale of the sides' coefficients where only the foot counts.
 const NO_SIDES: f64 = 1e-4;
 
@@ -26,6 +25,8 @@ const NO_SIDES: f64 = 1e-4;
 pub(crate) enum Form {
     /// The foot's homography alone.
     Homography,
+    /// The same with the geometry that the boxes' heights tell as prior.
+    Upright,
     /// Homography, sides and Gaussian-process residual.
     Residual,
 }
@@ -34,6 +35,7 @@ impl Form {
     pub(crate) const fn as_str(self) -> &'static str {
         match self {
             Self::Homography => "homography",
+            Self::Upright => "upright_camera",
             Self::Residual => "residual",
         }
     }
@@ -47,6 +49,8 @@ pub(crate) struct Draft<'a> {
     pub(crate) inputs: &'a [[f64; 4]],
     pub(crate) mean: ProjectiveMean,
     pub(crate) inflation_m2: Vec<f64>,
+    /// The camera whose geometry is the foot's prior, and where it is linearised.
+    pub(crate) upright: Option<(&'a UprightCamera, Parameters)>,
 }
 
 /// Columns of the linearised model over all rows.
@@ -72,10 +76,61 @@ pub(crate) struct Candidate {
     pub(crate) without: Vec<Posterior>,
 }
 
-impl Draft<'_> {
+impl Form {
+    /// Gauss-Newton rounds about each set of hyper-parameters.
+    const fn relinearizations(self) -> usize {
+        match self {
+            Self::Homography | Self::Residual => 2,
+            Self::Upright => 8,
+        }
+    }
+}
+
+impl<'a> Draft<'a> {
+    /// The upright camera that boxes, priors and fixes agree on best, of one start per focal length.
+    pub(crate) fn into_upright(self, camera: &'a UprightCamera, parameters: &Hyperparameters) -> Option<Self> {
+        let of_start = |start: &Parameters| {
+            let placed = camera.placed(start, &self.mean, &self.rows.boxes, &self.rows.labels_m);
+            let mut draft = Draft { form: Form::Upright, upright: Some((camera, placed)), ..self.clone() };
+            draft.set_coefficients(&camera.coefficients(&placed, &self.mean)?)?;
+            draft.relinearize(parameters)?;
+            let columns = draft.columns(&[], parameters)?;
+            let all: Vec<usize> = (0..self.inputs.len()).collect();
+            let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.inflation_m2);
+            let at = draft.upright.as_ref()?.1;
+            let score = gram.misfit_at(&DVector::from_column_slice(&draft.mean.coefficients))
+                + 2.0 * camera.evidence(&at)?.misfit;
+            score.is_finite().then_some((score, draft))
+        };
+        camera
+            .starts()
+            .iter()
+            .filter_map(of_start)
+            .min_by(|one, other| one.0.total_cmp(&other.0))
+            .map(|(_, draft)| draft)
+    }
+
+    fn set_coefficients(&mut self, foot: &SVector<f64, FOOT_COEFFICIENTS>) -> Option<()> {
+        self.mean.coefficients = [0.0; COEFFICIENTS];
+        self.mean.coefficients[..FOOT_COEFFICIENTS].copy_from_slice(foot.as_slice());
+        self.mean.coefficients.iter().all(|value| value.is_finite()).then_some(())
+    }
+
+    /// Linearises at a solution: at its coefficients, or at the camera that has them to first order.
+    fn move_to(&mut self, solution: &DVector<f64>) -> Option<()> {
+        let Some((camera, at)) = &mut self.upright else {
+            self.mean.coefficients.copy_from_slice(solution.as_slice());
+            return self.mean.coefficients.iter().all(|value| value.is_finite()).then_some(());
+        };
+        let foot = solution.fixed_rows::<FOOT_COEFFICIENTS>(0).into_owned();
+        *at = camera.moved_to(at, &self.mean, &foot)?;
+        let foot = camera.coefficients(at, &self.mean)?;
+        self.set_coefficients(&foot)
+    }
+
     fn inducing(&self, most: usize) -> Vec<[f64; 4]> {
         match self.form {
-            Form::Homography => Vec::new(),
+            Form::Homography | Form::Upright => Vec::new(),
             Form::Residual => {
                 let count = (self.inputs.len() / ROWS_PER_INDUCING).clamp(4, most);
                 inducing_points(self.inputs, count)
@@ -111,17 +166,18 @@ impl Draft<'_> {
         .maximize(start, priors, noise_frozen)
     }
 
-    fn prior_m2(&self, parameters: &Hyperparameters) -> [f64; COEFFICIENTS] {
-        self.mean.prior_variances(match self.form {
-            Form::Homography => NO_SIDES,
-            Form::Residual => parameters.side_scale,
-        })
+    fn prior(&self, parameters: &Hyperparameters) -> Option<TangentPrior> {
+        let side_scale = if self.form == Form::Residual { parameters.side_scale } else { NO_SIDES };
+        let prior = TangentPrior::independent(&self.mean.prior_variances(side_scale));
+        let Some((camera, at)) = &self.upright else { return Some(prior) };
+        let (mean, precision) = camera.prior_on_coefficients(at, &self.mean)?;
+        Some(prior.with_foot(&mean, &precision))
     }
 
     fn columns(&self, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Columns> {
         let (tangent, labels_m) = linearize(self.rows, &self.mean);
         let (phi, left_out_m2) = match self.form {
-            Form::Homography => (DMatrix::zeros(self.inputs.len(), 0), vec![0.0; self.inputs.len()]),
+            Form::Homography | Form::Upright => (DMatrix::zeros(self.inputs.len(), 0), vec![0.0; self.inputs.len()]),
             Form::Residual => kernel_columns(self.inputs, inducing, parameters)?,
         };
         Some(Columns { tangent, labels_m, phi, left_out_m2 })
@@ -130,13 +186,12 @@ impl Draft<'_> {
     /// Gauss-Newton steps of the mean, with the weights of rows in gross error found again.
     pub(crate) fn relinearize(&mut self, parameters: &Hyperparameters) -> Option<()> {
         let inducing = self.inducing(MAX_INDUCING);
-        for _ in 0..RELINEARIZATIONS {
+        for _ in 0..self.form.relinearizations() {
             let columns = self.columns(&inducing, parameters)?;
             let all: Vec<usize> = (0..self.inputs.len()).collect();
             let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.inflation_m2);
-            let posterior = Posterior::new(&gram, &self.prior_m2(parameters))?;
-            self.mean.coefficients.copy_from_slice(posterior.tangent.as_slice());
-            self.mean.coefficients.iter().all(|value| value.is_finite()).then_some(())?;
+            let posterior = Posterior::new(&gram, &self.prior(parameters)?)?;
+            self.move_to(&posterior.tangent)?;
             let kernel_m = posterior.kernel.each_ref().map(|weights| &columns.phi * weights);
             let residuals_m: Vec<[f64; 2]> = self
                 .rows
@@ -158,14 +213,14 @@ impl Draft<'_> {
     pub(crate) fn solve(self, parameters: &Hyperparameters, grouping: &Grouping) -> Option<Candidate> {
         let inducing = self.inducing(MAX_INDUCING);
         let columns = self.columns(&inducing, parameters)?;
-        let prior_m2 = self.prior_m2(parameters);
+        let prior = self.prior(parameters)?;
         let of = |rows: &[usize]| columns.gram(rows, &self.rows.epochs, parameters, &self.inflation_m2);
         let total = of(&(0..self.inputs.len()).collect::<Vec<_>>());
-        let posterior = Posterior::new(&total, &prior_m2)?;
+        let posterior = Posterior::new(&total, &prior)?;
         let groups: Vec<Gram> = grouping.members().iter().map(|rows| of(rows)).collect();
         let sum = groups.iter().cloned().reduce(|sum, own| sum.plus(&own))?;
         let without =
-            groups.iter().map(|own| Posterior::new(&sum.minus(own), &prior_m2)).collect::<Option<_>>()?;
+            groups.iter().map(|own| Posterior::new(&sum.minus(own), &prior)).collect::<Option<_>>()?;
         let Self { form, mean, .. } = self;
         Some(Candidate { form, mean, parameters: *parameters, inducing, columns, total, posterior, without })
     }

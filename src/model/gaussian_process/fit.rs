@@ -10,7 +10,9 @@ use super::leave_out::{calibrate, weigh};
 use super::noise::{Epoch, ReceiverNoise, Whitener};
 use super::predictor::{Map, Predictor, Stated};
 use super::projective_mean::ProjectiveMean;
+use super::sessions::Sessions;
 use super::training_rows::{TrainingRows, scatter_m2};
+use super::upright_camera::UprightCamera;
 
 /// Rows that a fit uses at most; more are thinned evenly.
 const MAX_ROWS: usize = 20_000;
@@ -29,6 +31,8 @@ pub(crate) struct FitReport {
     pub(crate) candidates: Vec<(&'static str, f64, f64)>,
     /// Factor on the map's variance by left-out targets.
     pub(crate) widening: f64,
+    /// How sessions differ, if there are several.
+    pub(crate) sessions: Option<Sessions>,
     /// Share of the jackknife's variance that is added, per candidate.
     pub(crate) jackknife_shares: Vec<f64>,
     /// Degrees of freedom of the radius.
@@ -39,11 +43,20 @@ pub(crate) struct FitReport {
     pub(crate) held_out_coverage: f64,
 }
 
+/// What is known beside the rows.
+#[derive(Debug, Clone)]
+pub(crate) struct FitSettings {
+    /// Variance per axis of a bias that all receivers share, which no training row can show, m2.
+    pub(crate) shared_bias_m2: f64,
+    /// Of the bootstrap that weighs the candidates.
+    pub(crate) seed: u64,
+    /// Geometry by the heights of boxes, if the image size is known.
+    pub(crate) upright: Option<UprightCamera>,
+}
+
 /// Fits a model; `None` where the rows determine nothing (not finite, or all alike).
-///
-/// `shared_bias_m2` is the variance per axis of a bias that all receivers share, which no training row
-/// can show.
-pub(crate) fn fit(all: &TrainingRows, shared_bias_m2: f64, seed: u64) -> Option<(Predictor, FitReport)> {
+pub(crate) fn fit(all: &TrainingRows, settings: &FitSettings) -> Option<(Predictor, FitReport)> {
+    let FitSettings { shared_bias_m2, seed, .. } = *settings;
     let edge_px2 = edge_covariance_px2(&all.epochs, &all.boxes);
     let thinned = all.thinned(MAX_ROWS);
     let mut mean = ProjectiveMean::of_rows(&thinned.boxes, &thinned.labels_m);
@@ -58,13 +71,16 @@ pub(crate) fn fit(all: &TrainingRows, shared_bias_m2: f64, seed: u64) -> Option<
     let white =
         Whitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
     let mut draft =
-        Draft { form: Form::Residual, rows: &rows, inputs: &inputs, mean, inflation_m2: white.inflation_m2(&residuals_m) };
+        Draft { form: Form::Residual, rows: &rows, inputs: &inputs, mean, inflation_m2: white.inflation_m2(&residuals_m), upright: None };
     let start = draft.clone();
     let parameters = draft.estimate(&Priors::new(scatter_m2.sqrt(), start.mean.spread_m))?;
     let grouping = groups(&rows.epochs);
     let mut homography = Draft { form: Form::Homography, ..start };
     homography.relinearize(&parameters)?;
-    let candidates = [homography.solve(&parameters, &grouping)?, draft.solve(&parameters, &grouping)?];
+    let upright = settings.upright.as_ref().and_then(|camera| homography.clone().into_upright(camera, &parameters));
+    let mut candidates = vec![homography.solve(&parameters, &grouping)?];
+    candidates.extend(upright.and_then(|draft| draft.solve(&parameters, &grouping)));
+    candidates.push(draft.solve(&parameters, &grouping)?);
 
     let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, seed);
     let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise);
@@ -85,6 +101,8 @@ pub(crate) fn fit(all: &TrainingRows, shared_bias_m2: f64, seed: u64) -> Option<
     let extra_m2 = |row: usize| predictor.jackknife_m2(&rows.boxes[row]);
     let calibration = calibrate(&candidates, &kept, &grouping, &rows, &parameters.noise, &extra_m2);
     predictor.widening = calibration.widening;
+    let residuals_m: Vec<[f64; 2]> = (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
+    let sessions = Sessions::new(&rows.epochs, &residuals_m, &parameters.noise);
     let report = FitReport {
         parameters,
         gross_errors: thinned.boxes.len() - rows.boxes.len(),
@@ -95,12 +113,22 @@ pub(crate) fn fit(all: &TrainingRows, shared_bias_m2: f64, seed: u64) -> Option<
             .map(|(candidate, (weight, miss_m2))| (candidate.form.as_str(), *weight, *miss_m2))
             .collect(),
         widening: calibration.widening,
+        sessions,
         jackknife_shares: jackknives.iter().map(|(share, _)| *share).collect(),
         freedom,
         held_out_m2: calibration.miss_m2,
         held_out_coverage: calibration.coverage,
     };
     Some((predictor, report))
+}
+
+fn mixed_residual(candidates: &[Candidate], weights: &[f64], row: usize) -> [f64; 2] {
+    let mut sum_m = [0.0; 2];
+    for (candidate, weight) in candidates.iter().zip(weights).filter(|(_, weight)| **weight > 0.0) {
+        let own_m = candidate.residual(&candidate.posterior, row).0;
+        sum_m = [sum_m[0] + weight * own_m[0], sum_m[1] + weight * own_m[1]];
+    }
+    sum_m
 }
 
 /// Degrees of freedom of the stated variance, by Welch and Satterthwaite: what differs between receivers
@@ -114,8 +142,8 @@ fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
     let within = ReceiverNoise { session_m2: 0.0, ..*noise };
     let (of_all, of_within) = (information(noise), information(&within));
     let between_share = (1.0 - of_all / of_within).clamp(0.0, 1.0);
-    let receivers = epochs.chunk_by(|one, next| one.sequence == next.sequence).count() as f64;
     // One or two receivers say nothing of how receivers differ: the prior does, for four degrees.
+    let receivers = epochs.chunk_by(|one, next| one.sequence == next.sequence).count() as f64;
     let between = (2.0 * (receivers - 1.0)).max(4.0);
     let within = 2.0 * (within.variance_m2() * of_within - 1.0).max(2.0);
     1.0 / (between_share.powi(2) / between + (1.0 - between_share).powi(2) / within)

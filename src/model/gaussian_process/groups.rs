@@ -1,9 +1,14 @@
-//! Which rows are left out together: whole targets where there are enough of them, else spells.
+//! Which rows are left out together: whole targets where there are enough of them, else whole sessions,
+//! else spells.
 
 use super::noise::Epoch;
 
 /// Groups at most.
 const GROUPS: usize = 8;
+/// Half an hour without any row ends a session.
+pub(crate) const SESSION_GAP_S: f64 = 1800.0;
+/// Share of the rows that a session of its own has at least.
+const MIN_SESSION_SHARE: f64 = 0.1;
 /// Targets from which whole ones are left out.
 const MIN_TARGETS: usize = 5;
 
@@ -30,7 +35,30 @@ impl Grouping {
 pub(crate) fn groups(epochs: &[Epoch]) -> Grouping {
     let targets: Vec<usize> =
         epochs.chunk_by(|one, next| one.sequence == next.sequence).map(<[Epoch]>::len).collect();
-    if targets.len() >= MIN_TARGETS { whole_targets(&targets) } else { spells(epochs, &targets) }
+    if targets.len() >= MIN_TARGETS {
+        return whole_targets(&targets);
+    }
+    sessions(epochs).unwrap_or_else(|| spells(epochs, &targets))
+}
+
+/// Whole sessions, where there are at least two: what they contradict each other by is in no spell's
+/// difference from its neighbours.
+fn sessions(epochs: &[Epoch]) -> Option<Grouping> {
+    let mut order: Vec<usize> = (0..epochs.len()).collect();
+    order.sort_by(|one, other| epochs[*one].time_s.total_cmp(&epochs[*other].time_s));
+    let least = (epochs.len() as f64 * MIN_SESSION_SHARE) as usize;
+    let mut of_row = vec![0; epochs.len()];
+    let (mut count, mut in_last) = (0, 0_usize);
+    for session in order.chunk_by(|one, next| epochs[*next].time_s - epochs[*one].time_s <= SESSION_GAP_S) {
+        // A short session joins its neighbour in time.
+        if count == 0 || (in_last >= least && session.len() >= least) {
+            count += 1;
+            in_last = 0;
+        }
+        in_last += session.len();
+        session.iter().for_each(|row| of_row[*row] = count - 1);
+    }
+    (count > 1).then_some(Grouping { of_row, count })
 }
 
 /// The largest target first, each into the group that is the smallest so far.

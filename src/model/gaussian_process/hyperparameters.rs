@@ -5,14 +5,14 @@ use nalgebra::{DMatrix, SMatrix, SVector};
 
 use super::kernel::LengthScales;
 use super::noise::{Epoch, ReceiverNoise, Whitener};
-use super::posterior::{Gram, Posterior};
-use super::projective_mean::{COEFFICIENTS, ProjectiveMean};
+use super::posterior::{Gram, Posterior, TangentPrior};
+use super::projective_mean::ProjectiveMean;
 
-/// Logarithms of: white, short and session standard deviation, short time constant, residual's standard
+/// Logarithms of: white, short and session standard deviation, short and session time constants, residual's standard
 /// deviation, length scales of place and size, scale of the sides' coefficients.
-pub(crate) const COUNT: usize = 8;
+pub(crate) const COUNT: usize = 9;
 /// Noise parameters among them.
-const NOISE: usize = 4;
+const NOISE: usize = 5;
 /// Smallest share of the short and slow variance that the white part keeps once the noise is frozen:
 /// likelihood alone trusts differences between neighbours to centimetres and bends the map after them.
 const MIN_WHITE_SHARE: f64 = 0.3;
@@ -43,10 +43,11 @@ impl Hyperparameters {
                 short_m2: value(1) * value(1),
                 session_m2: value(2) * value(2),
                 short_time_s: value(3),
+                session_time_s: value(4),
             },
-            residual_m: value(4),
-            lengths: LengthScales { place: value(5), size: value(6) },
-            side_scale: value(7),
+            residual_m: value(5),
+            lengths: LengthScales { place: value(6), size: value(7) },
+            side_scale: value(8),
         }
     }
 
@@ -57,6 +58,7 @@ impl Hyperparameters {
             0.5 * noise.short_m2.ln(),
             0.5 * noise.session_m2.ln(),
             noise.short_time_s.ln(),
+            noise.session_time_s.ln(),
             self.residual_m.ln(),
             self.lengths.place.ln(),
             self.lengths.size.ln(),
@@ -84,10 +86,10 @@ impl Priors {
     /// the positions.
     pub(crate) fn new(scatter_m: f64, spread_m: f64) -> Self {
         let medians =
-            [0.3 * scatter_m, 0.7 * scatter_m, SESSION_SHARE * 0.7 * scatter_m, 30.0, 0.02 * spread_m, 1.0, 2.0, 0.05];
+            [0.3 * scatter_m, 0.7 * scatter_m, SESSION_SHARE * 0.7 * scatter_m, 30.0, 3600.0, 0.02 * spread_m, 1.0, 2.0, 0.05];
         Self {
             medians: Logs::from_column_slice(&medians.map(f64::ln)),
-            sigmas: Logs::from_column_slice(&[1.0, 1.0, 0.5, 0.4, 1.2, 0.7, 0.7, 1.2]),
+            sigmas: Logs::from_column_slice(&[1.0, 1.0, 0.5, 0.4, 1.0, 1.2, 0.7, 0.7, 1.2]),
         }
     }
 
@@ -97,8 +99,9 @@ impl Priors {
 
     fn penalty(&self, logs: &Logs) -> f64 {
         let mut centre = self.medians;
-        // The slow part continues the short one's spectrum: its prior is a share of that.
-        centre[2] = logs[1] + SESSION_SHARE.ln();
+        // The slow part continues the short one's spectrum: its prior is a share of the short part as far
+        // as that is low in frequency, and nearly none for a receiver whose error is white.
+        centre[2] = SESSION_SHARE.ln() + logs[1] + 0.5 * (logs[3] - self.medians[3]).min(0.0);
         (logs - centre).component_div(&self.sigmas).norm_squared()
     }
 }
@@ -135,8 +138,8 @@ impl LikelihoodRows<'_> {
     /// Minus twice the logarithm of the marginal likelihood; infinite where it cannot be computed.
     fn misfit(&self, parameters: &Hyperparameters) -> f64 {
         let fitted = self.gram(parameters).and_then(|(gram, log_determinant)| {
-            let prior_m2: [f64; COEFFICIENTS] = self.mean.prior_variances(parameters.side_scale);
-            Some(Posterior::new(&gram, &prior_m2)?.misfit + log_determinant)
+            let prior = TangentPrior::independent(&self.mean.prior_variances(parameters.side_scale));
+            Some(Posterior::new(&gram, &prior)?.misfit + log_determinant)
         });
         fitted.filter(|misfit| misfit.is_finite()).unwrap_or(f64::INFINITY)
     }

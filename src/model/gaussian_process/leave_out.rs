@@ -5,7 +5,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::candidate::Candidate;
 use super::groups::Grouping;
-use super::noise::{Epoch, ReceiverNoise, Whitener};
+use super::noise::{Epoch, ReceiverNoise};
+use super::sessions::weighted_mean;
 use super::training_rows::TrainingRows;
 
 const BOOTSTRAP_DRAWS: usize = 500;
@@ -13,6 +14,8 @@ const BOOTSTRAP_DRAWS: usize = 500;
 const BOUND: f64 = 10.0;
 /// 95 % point of chi-square with two degrees of freedom.
 const CHI_SQUARE_95: f64 = 5.991;
+/// Standard errors by which mean squares may exceed what is stated: chance.
+const ACCEPTED_ERRORS: f64 = 0.7;
 const MAX_WIDENING: f64 = 25.0;
 
 /// A row by maps that had not seen its group, mixed by the candidates' weights.
@@ -109,7 +112,8 @@ pub(crate) fn calibrate(
         }
         let epochs: Vec<Epoch> = members.iter().map(|row| rows.epochs[*row]).collect();
         let residuals_m: Vec<[f64; 2]> = own.iter().map(|left_out| left_out.residual_m).collect();
-        let (square_m2, noise_m2) = mean_square(&epochs, noise, &residuals_m);
+        let (mean_m, noise_m2) = weighted_mean(&epochs, noise, &residuals_m);
+        let square_m2 = 0.5 * (mean_m[0].powi(2) + mean_m[1].powi(2));
         means.push(SequenceMean { square_m2, noise_m2, map_m2 });
     }
     let count = count.max(1.0);
@@ -139,35 +143,20 @@ struct SequenceMean {
     map_m2: f64,
 }
 
-/// Mean square per axis of the generalised least-squares mean of residuals, and its variance, m2. Gross
-/// errors are weighed down as in the fit.
-fn mean_square(epochs: &[Epoch], noise: &ReceiverNoise, residuals_m: &[[f64; 2]]) -> (f64, f64) {
-    let plain = Whitener::new(epochs, noise, &vec![0.0; epochs.len()]);
-    let whitener = Whitener::new(epochs, noise, &plain.inflation_m2(residuals_m));
-    let mut ones = vec![1.0; residuals_m.len()];
-    whitener.apply(&mut ones);
-    let information = ones.iter().map(|one| one * one).sum::<f64>();
-    let square = (0..2).map(|axis| {
-        let mut column: Vec<f64> = residuals_m.iter().map(|residual| residual[axis]).collect();
-        whitener.apply(&mut column);
-        (ones.iter().zip(&column).map(|(one, value)| one * value).sum::<f64>() / information).powi(2)
-    });
-    (0.5 * square.sum::<f64>(), 1.0 / information)
-}
-
 /// The factor, at least 1, at which the sequences' mean squares agree with what is stated.
 fn widening(means: &[SequenceMean]) -> f64 {
     let ratio = |factor: f64| {
         let own = |mean: &SequenceMean| mean.square_m2 / (mean.noise_m2 + factor * mean.map_m2);
         means.iter().map(own).sum::<f64>() / means.len() as f64
     };
-    if means.len() < 2 || ratio(1.0) <= 1.0 {
+    let accepted = 1.0 + ACCEPTED_ERRORS / (means.len() as f64).sqrt();
+    if means.len() < 2 || ratio(1.0) <= accepted {
         return 1.0;
     }
     let (mut low, mut high) = (1.0, MAX_WIDENING);
     for _ in 0..40 {
         let middle = 0.5 * (low + high);
-        if ratio(middle) > 1.0 { low = middle } else { high = middle }
+        if ratio(middle) > accepted { low = middle } else { high = middle }
     }
     0.5 * (low + high)
 }

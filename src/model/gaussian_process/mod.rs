@@ -18,10 +18,13 @@ mod order_statistics;
 mod posterior;
 mod predictor;
 pub(crate) mod projective_mean;
+mod sessions;
 mod training_rows;
+mod upright_camera;
 
 pub(crate) use box_plausibility::RecentBoxes;
-pub(crate) use fit::{FitReport, fit};
+pub(crate) use fit::{FitReport, FitSettings, fit};
 pub(crate) use noise::Epoch;
 pub(crate) use predictor::{Prediction, Predictor};
 pub(crate) use training_rows::TrainingRows;
+pub(crate) use upright_camera::UprightCamera;

@@ -6,8 +6,6 @@
 //! filter's innovations are independent with a known variance, so least squares on them is exact
 //! generalised least squares in linear time (Bar-Shalom, Li and Kirubarajan 2001, sections 5.2 and 8.2).
 
-/// Correlation time of the slow part, s: longer than a recording, shorter than a day.
-pub(crate) const SESSION_TIME_S: f64 = 6.0 * 3600.0;
 /// Squared normalised innovation of both axes from which a row counts less (2 degrees of freedom, 98 %).
 const CREDIBLE_NIS: f64 = 8.0;
 
@@ -22,11 +20,13 @@ pub(crate) struct ReceiverNoise {
     pub(crate) short_time_s: f64,
     /// Variance of the slow process, m2.
     pub(crate) session_m2: f64,
+    /// Correlation time of the slow process, s.
+    pub(crate) session_time_s: f64,
 }
 
 impl ReceiverNoise {
     pub(crate) const fn white(white_m2: f64) -> Self {
-        Self { white_m2, short_m2: 0.0, short_time_s: 1.0, session_m2: 0.0 }
+        Self { white_m2, short_m2: 0.0, short_time_s: 1.0, session_m2: 0.0, session_time_s: 1.0 }
     }
 
     /// Variance of one fix per axis, m2.
@@ -73,7 +73,7 @@ impl Whitener {
             let decay = match index.checked_sub(1).map(|before| epochs[before]) {
                 Some(before) if before.sequence == epoch.sequence => {
                     let elapsed_s = (epoch.time_s - before.time_s).max(0.0);
-                    [(-elapsed_s / noise.short_time_s).exp(), (-elapsed_s / SESSION_TIME_S).exp()]
+                    [(-elapsed_s / noise.short_time_s).exp(), (-elapsed_s / noise.session_time_s).exp()]
                 }
                 _ => [0.0; 2],
             };

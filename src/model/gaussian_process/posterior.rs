@@ -5,10 +5,10 @@
 //! subtraction. East and north share the tangent's coefficients and have kernel weights of their own with
 //! one Gram matrix, so the 14 + 2 m unknowns are solved by one Cholesky factor of size m and one of 14.
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, SVector};
 
 use super::noise::Whitener;
-use super::projective_mean::COEFFICIENTS;
+use super::projective_mean::{COEFFICIENTS, FOOT_COEFFICIENTS};
 
 const PHI: usize = 2 * COEFFICIENTS;
 
@@ -61,10 +61,48 @@ impl Gram {
         DVector::from_fn(count, |row, _| self.0[(from + row, column)])
     }
 
+    /// Whitened squared residuals of the tangent alone, with those coefficients.
+    pub(crate) fn misfit_at(&self, coefficients: &DVector<f64>) -> f64 {
+        let right = self.right(0, COEFFICIENTS, 0) + self.right(COEFFICIENTS, COEFFICIENTS, 1);
+        self.square() - 2.0 * coefficients.dot(&right) + coefficients.dot(&(self.tangent() * coefficients))
+    }
+
     /// y^T y over both axes.
     fn square(&self) -> f64 {
         let from = PHI + self.kernel_columns();
         self.0[(from, from)] + self.0[(from + 1, from + 1)]
+    }
+}
+
+/// Normal prior of the tangent's coefficients.
+#[derive(Debug, Clone)]
+pub(crate) struct TangentPrior {
+    pub(crate) mean: DVector<f64>,
+    pub(crate) precision: DMatrix<f64>,
+    /// Logarithm of the determinant of the covariance.
+    log_determinant: f64,
+}
+
+impl TangentPrior {
+    /// Independent coefficients about 0.
+    pub(crate) fn independent(variances: &[f64; COEFFICIENTS]) -> Self {
+        Self {
+            mean: DVector::zeros(COEFFICIENTS),
+            precision: DMatrix::from_diagonal(&DVector::from_fn(COEFFICIENTS, |at, _| 1.0 / variances[at])),
+            log_determinant: variances.iter().map(|variance| variance.ln()).sum(),
+        }
+    }
+
+    /// The foot's coefficients about a mean with a precision of their own; the determinant is that of the
+    /// independent ones, for no likelihood is compared under this prior.
+    pub(crate) fn with_foot(
+        mut self,
+        mean: &SVector<f64, FOOT_COEFFICIENTS>,
+        precision: &SMatrix<f64, FOOT_COEFFICIENTS, FOOT_COEFFICIENTS>,
+    ) -> Self {
+        self.mean.rows_mut(0, FOOT_COEFFICIENTS).copy_from(mean);
+        self.precision.view_mut((0, 0), (FOOT_COEFFICIENTS, FOOT_COEFFICIENTS)).copy_from(precision);
+        self
     }
 }
 
@@ -86,18 +124,14 @@ pub(crate) struct Posterior {
 }
 
 impl Posterior {
-    /// `prior_m2` are the prior variances of the tangent's coefficients. `None` where the matrices are
-    /// not positive definite, which finite rows do not give.
-    pub(crate) fn new(gram: &Gram, prior_m2: &[f64; COEFFICIENTS]) -> Option<Self> {
+    /// `None` where the matrices are not positive definite, which finite rows do not give.
+    pub(crate) fn new(gram: &Gram, prior: &TangentPrior) -> Option<Self> {
         let count = gram.kernel_columns();
         let kernel_factor = (gram.kernel() + DMatrix::identity(count, count)).cholesky()?;
-        let mut precision = gram.tangent();
-        let mut right = DVector::zeros(COEFFICIENTS);
-        let mut log_determinant = 0.0;
-        for at in 0..COEFFICIENTS {
-            precision[(at, at)] += 1.0 / prior_m2[at];
-            log_determinant += prior_m2[at].ln();
-        }
+        let mut precision = gram.tangent() + &prior.precision;
+        let mut right = &prior.precision * &prior.mean;
+        let prior_square = prior.mean.dot(&right);
+        let mut log_determinant = prior.log_determinant;
         let mut absorbed = [DMatrix::zeros(0, 0), DMatrix::zeros(0, 0)];
         let mut explained = 0.0;
         let mut kernel_right = [DVector::zeros(0), DVector::zeros(0)];
@@ -128,7 +162,7 @@ impl Posterior {
         let kernel = std::array::from_fn(|axis| {
             kernel_factor.solve(&kernel_right[axis]) - &absorbed[axis] * &tangent
         });
-        let misfit = gram.square() - explained + log_determinant;
+        let misfit = gram.square() + prior_square - explained + log_determinant;
         Some(Self { tangent, kernel, kernel_factor, absorbed, tangent_covariance, misfit })
     }
 

@@ -21,6 +21,8 @@ const MIN_DETERMINED: f64 = 0.02;
 pub(crate) const QUANTILES: usize = 5;
 /// Of an implausible box: the answer moves by this share of its weight toward that of the plausible box.
 const SHRINKAGE: f64 = 0.5;
+/// Share of the squared distance between its edges and the plausible ones that each edge may be wrong by.
+const UNEXPLAINED_SHARE: f64 = 0.2;
 
 /// What is stated beside the maps.
 pub(crate) struct Stated {
@@ -282,7 +284,7 @@ impl Predictor {
             let moved_px2 = (edges_px(&plausible) - edges_px(sides)).norm_squared() / 4.0;
             for edge in 0..4 {
                 let by_edge = [mixture.by_edge[0][edge], mixture.by_edge[1][edge]];
-                add_outer(&mut covariance_m2, by_edge, deviation.weight * moved_px2);
+                add_outer(&mut covariance_m2, by_edge, UNEXPLAINED_SHARE * deviation.weight * moved_px2);
             }
             position_m = [position_m[0] + moved_m[0], position_m[1] + moved_m[1]];
         }

@@ -1,15 +1,17 @@
-//! What time it is and what is random: handed in as values, so that tests and runs repeat exactly.
+//! Time and randomness as values that are passed as parameters, so that tests and training runs can be
+//! repeated exactly.
 //!
-//! This is the only module that reads the wall clock, the CPU's time or the operating system's randomness.
+//! This is the only module that reads the wall clock, CPU time or the operating system's randomness.
 
 use std::sync::{Arc, Mutex};
 
 use jiff::Timestamp;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rustix::time::{ClockId, clock_gettime};
 use uuid::Uuid;
 
-/// Tells the time.
+/// A source of the current time.
 #[derive(Clone)]
 pub struct Clock(Arc<dyn Fn() -> Timestamp + Send + Sync>);
 
@@ -22,45 +24,35 @@ impl Clock {
     }
 
     /// A clock that the caller drives.
-    pub fn from_fn(tell: impl Fn() -> Timestamp + Send + Sync + 'static) -> Self {
-        Self(Arc::new(tell))
+    pub fn from_fn(now: impl Fn() -> Timestamp + Send + Sync + 'static) -> Self {
+        Self(Arc::new(now))
     }
 
-    /// The time now.
+    /// The current time.
     #[must_use]
     pub fn now(&self) -> Timestamp {
         (self.0)()
     }
 }
 
-/// CPU seconds of this process, from any start.
+/// CPU time of this process, user and system, s.
 #[must_use]
 pub fn process_cpu_s() -> f64 {
-    cpu_s("/proc/self/stat")
+    cpu_s(ClockId::ProcessCPUTime)
 }
 
-/// CPU seconds of the calling thread, from any start.
+/// CPU time of the calling thread, user and system, s.
 #[must_use]
 pub fn thread_cpu_s() -> f64 {
-    cpu_s("/proc/thread-self/stat")
+    cpu_s(ClockId::ThreadCPUTime)
 }
 
-/// In user and kernel, as the kernel counts them; the clock's own seconds where it tells none.
-fn cpu_s(path: &str) -> f64 {
-    let ticks = || -> Option<f64> {
-        let line = std::fs::read_to_string(path).ok()?;
-        // The name of the program may hold spaces; what follows its bracket does not.
-        let mut fields = line.rsplit_once(')')?.1.split_ascii_whitespace().skip(11);
-        Some(fields.next()?.parse::<f64>().ok()? + fields.next()?.parse::<f64>().ok()?)
-    };
-    ticks().map_or_else(
-        || Clock::system().now().as_microsecond() as f64 * 1e-6,
-        // Linux shows its times to programs in hundredths of a second.
-        |ticks| ticks / 100.0,
-    )
+fn cpu_s(clock: ClockId) -> f64 {
+    let time = clock_gettime(clock);
+    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// Makes ids and seeds.
+/// A generator of ids and seeds.
 #[derive(Clone)]
 pub struct Randomness(Arc<Mutex<ChaCha8Rng>>);
 
@@ -79,7 +71,7 @@ impl Randomness {
         Self(Arc::new(Mutex::new(ChaCha8Rng::seed_from_u64(seed))))
     }
 
-    /// A UUID of version 7: ordered by time, random behind it.
+    /// A UUID of version 7: ordered by time, the remaining bits random.
     #[must_use]
     pub fn uuid_v7(&self, now: Timestamp) -> Uuid {
         let mut random = [0; 10];

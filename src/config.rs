@@ -113,6 +113,22 @@ pub struct Limits {
     pub rows_per_evaluation: u32,
     /// Positions of the line that is an evaluation's truth.
     pub truth_line_positions: usize,
+    /// Cameras; more are refused.
+    pub cameras: u32,
+    /// Samples of one camera; more are refused.
+    pub samples_per_camera: u64,
+    /// Samples of all cameras; more are refused.
+    pub samples: u64,
+    /// Model versions of one camera; beyond, the oldest that is not active is deleted.
+    pub models_per_camera: u32,
+    /// Ended training runs of one camera; beyond, the oldest is deleted.
+    pub ended_runs_per_camera: u32,
+    /// Ended evaluations of all cameras; beyond, the oldest is deleted.
+    pub ended_evaluations: u32,
+    /// Bytes of the database, beyond which nothing is stored; 0 is no limit but the disk's.
+    pub database_bytes: u64,
+    /// Bytes on the disk that are reserved for deletions when it is full; 0 reserves none.
+    pub reserve_bytes: u64,
     /// Seconds that open requests get when the server ends.
     pub drain_s: u64,
 }
@@ -171,6 +187,14 @@ impl Default for Limits {
             evaluation_seeds: 20,
             rows_per_evaluation: 100_000,
             truth_line_positions: 1_000,
+            cameras: 10_000,
+            samples_per_camera: 10_000_000,
+            samples: 100_000_000,
+            models_per_camera: 100,
+            ended_runs_per_camera: 100,
+            ended_evaluations: 1_000,
+            database_bytes: 0,
+            reserve_bytes: 32 << 20,
             drain_s: 10,
         }
     }
@@ -239,6 +263,8 @@ impl Config {
             anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
         }
         anyhow::ensure!(self.limits.page_items >= 1, "limits.page_items must be at least 1");
+        // One active version and the one that a training run adds.
+        anyhow::ensure!(self.limits.models_per_camera >= 2, "limits.models_per_camera must be at least 2");
         Ok(())
     }
 }

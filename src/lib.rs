@@ -1,5 +1,5 @@
-//! sightfix tells where a target is on the earth from what a fixed camera that nobody calibrated
-//! sees and what a GNSS receiver says. `docs/architecture.md` is the map of this crate.
+//! sightfix estimates the positions of targets from the bounding boxes of an uncalibrated fixed camera
+//! and from GNSS fixes. `docs/architecture.md` describes the structure of this crate.
 
 pub mod app;
 pub mod cli;
@@ -14,10 +14,12 @@ pub mod geo;
 pub mod grpc;
 pub mod http;
 pub mod model;
+pub mod paper_experiments;
 pub mod replay;
 pub mod server;
 pub mod shutdown;
 pub mod simulation;
+pub mod statistics;
 pub mod status;
 pub mod store;
 pub mod telemetry;

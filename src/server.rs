@@ -13,11 +13,11 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tokio::net::TcpListener;
 
-use crate::app::App;
+use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
 use crate::shutdown::Shutdown;
-use crate::store::Store;
+use crate::store::{Store, StoreOptions};
 use crate::telemetry::Metrics;
 use crate::worker;
 
@@ -41,7 +41,8 @@ impl Server {
     /// # Errors
     /// Names the folder or the address that cannot be used.
     pub async fn bind(config: Config, clock: Clock, randomness: Randomness) -> anyhow::Result<Self> {
-        let store = Store::open(&config.data)
+        let options = StoreOptions { limits: store_limits(&config.limits), role: "server".to_owned() };
+        let store = Store::open_with(&config.data, options)
             .await
             .with_context(|| format!("cannot open the data folder {}", config.data.display()))?;
         let app = App::new(store, clock, randomness, config.limits.clone(), Metrics::new()).await?;
@@ -99,6 +100,10 @@ async fn keep_up(app: App, shutdown: Shutdown) {
             () = tokio::time::sleep(REFRESH_EVERY) => {}
         }
         app.metrics.upkeep();
+        match app.store.maintain().await {
+            Ok(status) => app.metrics.storage(&status),
+            Err(error) => tracing::error!(%error, "the maintenance of the store failed"),
+        }
         if let Err(error) = app.registry.refresh(&app.store).await {
             tracing::error!(%error, "cannot look for changed cameras");
         }

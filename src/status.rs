@@ -75,12 +75,21 @@ pub const fn of(kind: ErrorKind) -> Status {
             "The change needs the revision it is based on",
         ),
         ErrorKind::NoModel => (409, code::FAILED_PRECONDITION, "no-model", "The camera has no active model"),
+        ErrorKind::ModelUnusable => {
+            (409, code::FAILED_PRECONDITION, "model-unusable", "The stored model version cannot be used")
+        }
         ErrorKind::RunLive => {
             (409, code::FAILED_PRECONDITION, "run-live", "The camera has a training run that has not ended")
         }
         ErrorKind::RunEnded => (409, code::FAILED_PRECONDITION, "run-ended", "The training run has ended"),
         ErrorKind::EvaluationEnded => {
             (409, code::FAILED_PRECONDITION, "evaluation-ended", "The evaluation has ended")
+        }
+        ErrorKind::ModelActive => {
+            (409, code::FAILED_PRECONDITION, "model-active", "The model version is the active one")
+        }
+        ErrorKind::InsufficientStorage => {
+            (507, code::RESOURCE_EXHAUSTED, "insufficient-storage", "There is no space to store it")
         }
         ErrorKind::UnusableSamples => {
             (422, code::FAILED_PRECONDITION, "unusable-samples", "The samples cannot support a fit")

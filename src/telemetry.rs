@@ -12,6 +12,7 @@ use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle, 
 use crate::config::{Config, LogFormat};
 use crate::domain::{Flag, FusedFix, JobState};
 use crate::fusion::track::{Rejection, RejectionReason};
+use crate::store::StorageStatus;
 
 /// Starts the log of the process, on standard error.
 ///
@@ -55,6 +56,11 @@ pub struct Metrics {
     live_item_errors: Counter,
     live_answers_lost: Counter,
     cameras_moved: Counter,
+    storage_full: Gauge,
+    database_bytes: Gauge,
+    database_free_bytes: Gauge,
+    disk_available_bytes: Gauge,
+    samples_stored: Gauge,
 }
 
 const NIS: &str = "sightfix_track_nis";
@@ -128,6 +134,10 @@ impl Metrics {
                 duration_s: histogram(duration_name, duration_help),
             }
         };
+        let gauge = |name: &'static str, help: &'static str| {
+            describe(&recorder, name, help, Recorder::describe_gauge);
+            recorder.register_gauge(&Key::from_name(name), &METADATA)
+        };
         describe(&recorder, "sightfix_connections", "Open connections", Recorder::describe_gauge);
         describe(&recorder, "sightfix_live_streams", "Open live streams", Recorder::describe_gauge);
         let rejections = |reason: RejectionReason| {
@@ -179,6 +189,14 @@ impl Metrics {
                 "Answers of live streams that slow readers lost",
             ),
             cameras_moved: plain("sightfix_cameras_moved_total", "Alarms that a camera was moved"),
+            storage_full: gauge("sightfix_storage_full", "1 while imports are refused for want of space"),
+            database_bytes: gauge("sightfix_database_bytes", "Size of the database file"),
+            database_free_bytes: gauge("sightfix_database_free_bytes", "Of these, free for new rows"),
+            disk_available_bytes: gauge(
+                "sightfix_disk_available_bytes",
+                "Left on the disk of the data folder",
+            ),
+            samples_stored: gauge("sightfix_samples_stored", "Samples of all cameras"),
             handle: recorder.handle(),
         }
     }
@@ -243,6 +261,17 @@ impl Metrics {
     /// A camera was found to have moved.
     pub fn camera_moved(&self) {
         self.cameras_moved.increment(1);
+    }
+
+    /// How much is stored, and whether more can be.
+    pub fn storage(&self, status: &StorageStatus) {
+        self.storage_full.set(f64::from(u8::from(status.is_full)));
+        self.database_bytes.set(status.database_bytes as f64);
+        self.database_free_bytes.set(status.free_bytes as f64);
+        if let Some(bytes) = status.disk_available_bytes {
+            self.disk_available_bytes.set(bytes as f64);
+        }
+        self.samples_stored.set(status.samples as f64);
     }
 
     /// A request was answered.

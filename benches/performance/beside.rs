@@ -1,7 +1,7 @@
 //! Fusion while training runs use every core.
 
 use sightfix::app::RunRequest;
-use sightfix::domain::{CameraId, NewCamera, Recipe};
+use sightfix::domain::{CameraId, Durability, NewCamera, Recipe};
 use sightfix::simulation::{Options, Scene, simulate};
 
 use crate::load;
@@ -23,7 +23,12 @@ pub(crate) fn run() {
         for number in 0..cores {
             let id = CameraId::new(&format!("busy-{number}")).expect("a slug");
             served.app.create_camera(NewCamera::named(id.clone())).await.expect("a new camera");
-            served.app.store.insert_samples(&id, samples.clone()).await.expect("samples are stored");
+            served
+                .app
+                .store
+                .insert_samples(&id, samples.clone(), Durability::Synced)
+                .await
+                .expect("samples are stored");
             cameras.push(id);
         }
         let path = format!("/v1/cameras/{}/fusions", served.camera);

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use sightfix::domain::{CameraId, NewCamera, Sample};
+use sightfix::domain::{CameraId, Durability, NewCamera, Sample};
 use sightfix::exchange::{Format, write_samples};
 use sightfix::simulation::{Options, Scene, simulate};
 
@@ -55,7 +55,10 @@ pub(crate) fn run() {
                 let (app, id, samples) = (app.clone(), id.clone(), samples.clone());
                 clients.spawn(async move {
                     for sample in samples.iter().skip(client * EACH).take(EACH) {
-                        app.store.insert_samples(&id, vec![sample.clone()]).await.expect("stored");
+                        app.store
+                            .insert_samples(&id, vec![sample.clone()], Durability::Synced)
+                            .await
+                            .expect("stored");
                     }
                 });
             }

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use sightfix::app::{App, RunRequest};
 use sightfix::clock::{Clock, Randomness};
 use sightfix::config::Config;
-use sightfix::domain::{CameraId, NewCamera, Observation};
+use sightfix::domain::{CameraId, Durability, NewCamera, Observation};
 use sightfix::server::Server;
 use sightfix::shutdown::Shutdown;
 use sightfix::simulation::{Options, simulate};
@@ -50,7 +50,7 @@ impl Served {
                 fix: Some(sample.fix),
             })
             .collect();
-        app.store.insert_samples(&camera, samples).await.expect("samples are stored");
+        app.store.insert_samples(&camera, samples, Durability::Synced).await.expect("samples are stored");
         let served = Self { app, address, camera, observations, shutdown, _folder: folder };
         // As an operator who says nothing more gets it.
         served.train(RunRequest::default()).await;

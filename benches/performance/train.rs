@@ -9,8 +9,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use sightfix::domain::{GnssError, Recipe, SigmaM};
 use sightfix::model::FitOptions;
-use sightfix::model::net::{Activation, NetShape};
-use sightfix::model::train::{LossWeights, Schedule, TrainingSet, train};
+use sightfix::model::network::{Activation, LossWeights, NetShape, Schedule, TrainingSet, train};
 use sightfix::simulation::{Options, Scene, simulate};
 
 use crate::ratio::{self, in_turn, median};
@@ -41,7 +40,7 @@ pub(crate) fn run() {
 fn whole() {
     println!("\n### The default recipe on 10,000 simulated rows, one thread\n");
     println!("| scene | s (mark 20) | model bytes (mark 65536) |\n|---|---|---|");
-    for scene in Scene::ALL {
+    for &scene in Scene::ALL {
         let options = Options { seed: 1001, camera_seed: 1001, ..Options::new(scene) };
         let world = simulate(&options);
         let samples = world.training_samples();
@@ -69,8 +68,8 @@ fn training_set(rng: &mut ChaCha8Rng) -> TrainingSet {
         straight.iter().zip(bent).map(|(straight, bent)| 0.7 * straight + 0.3 * bent * bent).collect()
     };
     TrainingSet {
-        rebuilt: inputs.clone(),
-        targets: [target(0), target(1)],
+        reconstruction_targets: inputs.clone(),
+        position_targets: [target(0), target(1)],
         inputs,
         weights: vec![1.0; SAMPLES],
     }

@@ -1,23 +1,23 @@
-//! Evaluations over stored samples as an operator sees them; `worker` does the work.
+//! Evaluations over stored samples: start, list, cancel. `worker` runs them.
 
 use jiff::{SignedDuration, Timestamp};
 
 use super::training::check_extent;
 use super::{App, Page, page_of};
 use crate::domain::{
-    Camera, CameraId, Error, EvaluationId, EvaluationJob, EvaluationPlan, GnssError, Method, Result, SigmaM,
-    Step, TimeRange, Truth,
+    Camera, CameraId, Error, EvaluationId, EvaluationJob, EvaluationPlan, GnssError, InferenceMode, Method,
+    Result, SigmaM, TimeRange, Truth,
 };
 use crate::store::SampleFilter;
 
-/// The last share of the samples that is tested on where nothing is said.
+/// Share of the samples, the latest ones, that is tested on by default.
 pub const DEFAULT_TEST_SHARE: f64 = 0.2;
-/// Shares that can be asked for.
+/// Allowed test shares.
 const TEST_SHARES: std::ops::RangeInclusive<f64> = 0.01..=0.9;
 /// Largest shift of the test boxes, px.
 const LARGEST_BOX_SHIFT_PX: f64 = 10_000.0;
 
-/// What an operator asks for; what is left out is chosen as each field says.
+/// A request for an evaluation; what is left out is chosen as each field says.
 #[derive(Debug, Clone, Default)]
 pub struct EvaluationRequest {
     /// The samples to learn from; given together with `test`, or not at all.
@@ -52,7 +52,7 @@ impl App {
         let evaluation = EvaluationId(self.randomness.uuid_v7(now));
         let most = self.limits.live_evaluations;
         let queued = self.store.insert_evaluation(evaluation, id, &plan, most, now).await?;
-        self.evaluation_queued.notify_one();
+        self.evaluation_queue.notify();
         Ok(queued)
     }
 
@@ -66,7 +66,7 @@ impl App {
         Ok((job, report))
     }
 
-    /// Evaluations, of a camera or of all, newest first, from behind a cursor on.
+    /// Evaluations, of a camera or of all, newest first, after a cursor.
     ///
     /// # Errors
     /// `CameraNotFound`.
@@ -80,7 +80,7 @@ impl App {
         Ok(page_of(jobs, limit, |job| job.id))
     }
 
-    /// Cancels an evaluation: at once if it waits, at its next step if it runs.
+    /// Cancels an evaluation: at once if no worker holds it, at its next step if one does.
     ///
     /// # Errors
     /// `EvaluationNotFound`, `EvaluationEnded`.
@@ -96,12 +96,12 @@ impl App {
         self.store.delete_evaluation(id).await
     }
 
-    /// The request with all that was left out filled in, if the stored samples can bear it.
+    /// The request with its defaults filled in, if the stored samples allow it.
     async fn plan(&self, camera: &Camera, request: EvaluationRequest) -> Result<EvaluationPlan> {
         let recipe = camera.profile.recipe;
         let methods = request.methods.unwrap_or_else(|| {
-            let of_recipe =
-                [Step::OneStep, Step::TwoStep, Step::Denied].map(|step| Method::Recipe(recipe, step));
+            let of_recipe = [InferenceMode::OneStep, InferenceMode::TwoStep, InferenceMode::Denied]
+                .map(|step| Method::Recipe(recipe, step));
             let baselines = [Method::Gnss, Method::ImmUkf, Method::HomographyDenied];
             let tracks = [Method::Track, Method::TrackDenied];
             baselines.into_iter().chain(of_recipe).chain(tracks).collect()
@@ -139,7 +139,7 @@ impl App {
         Ok(())
     }
 
-    /// What to learn from and what to judge on.
+    /// The ranges of time to train on and to test on.
     async fn ranges(
         &self,
         id: &CameraId,
@@ -153,7 +153,7 @@ impl App {
             }
             (Some(train), Some(test)) if train.overlaps(test) => Err(Error::invalid(
                 "test",
-                "overlaps train: a method must not be judged on samples that it has learnt from",
+                "overlaps train: a method must not be tested on samples that it was trained on",
             )),
             (Some(train), Some(test)) => Ok((train, test)),
             (Some(_), None) => Err(Error::invalid("test", "is missing: give train and test, or neither")),
@@ -162,7 +162,7 @@ impl App {
         }
     }
 
-    /// All samples, split at an instant so that about that share of them lies behind it.
+    /// All samples, split at an instant so that about that share of them is later.
     async fn split(&self, id: &CameraId, test_share: f64) -> Result<(TimeRange, TimeRange)> {
         if !TEST_SHARES.contains(&test_share) {
             let (least, most) = (TEST_SHARES.start(), TEST_SHARES.end());
@@ -172,13 +172,13 @@ impl App {
         let before = (count as f64 * (1.0 - test_share)).round() as u64;
         let at = self.store.sample_time(id, before.min(count.saturating_sub(1))).await?;
         let last = self.store.sample_time(id, count.saturating_sub(1)).await?;
-        // Closed, so that samples that come while the evaluation waits change nothing.
+        // Closed, so that samples that arrive while the evaluation is queued change nothing.
         let end =
             last.map(|last| last.saturating_add(SignedDuration::from_micros(1)).unwrap_or(Timestamp::MAX));
         Ok((TimeRange::new(None, at)?, TimeRange::new(at, end)?))
     }
 
-    /// Refuses at once what no evaluation could be made of.
+    /// Refuses samples that cannot be evaluated, before the evaluation is queued.
     async fn check_samples(
         &self,
         id: &CameraId,
@@ -186,10 +186,10 @@ impl App {
         test: TimeRange,
         truth: &Truth,
     ) -> Result<()> {
-        let (learnt, tried) = (SampleFilter::within(train), SampleFilter::within(test));
-        let (train_count, extent) = self.store.sample_extent(id, &learnt).await?;
+        let (train_filter, test_filter) = (SampleFilter::within(train), SampleFilter::within(test));
+        let (train_count, extent) = self.store.sample_extent(id, &train_filter).await?;
         check_extent(id, train_count, extent).map_err(|error| error.at("train"))?;
-        let test_count = self.store.count_samples(id, &tried).await?;
+        let test_count = self.store.count_samples(id, &test_filter).await?;
         if test_count == 0 {
             return Err(Error::invalid("test", "holds no sample of the camera"));
         }
@@ -200,11 +200,11 @@ impl App {
             );
             return Err(Error::invalid("train", message));
         }
-        if *truth == Truth::Columns && self.store.count_truths(id, &tried).await? == 0 {
+        if *truth == Truth::Columns && self.store.count_truths(id, &test_filter).await? == 0 {
             return Err(Error::invalid(
                 "truth_point",
-                "is missing, and no test sample states its truth: give truth_point or truth_line, or import \
-                 the samples with truth_longitude and truth_latitude",
+                "is missing, and no test sample has its truth: give truth_point or truth_line, or import the \
+                 samples with truth_longitude and truth_latitude",
             ));
         }
         Ok(())
@@ -217,7 +217,7 @@ fn check_methods(methods: &[Method]) -> Result<()> {
     }
     for (index, method) in methods.iter().enumerate() {
         if methods[..index].contains(method) {
-            return Err(Error::invalid(format!("methods[{index}]"), "stands twice; name each method once"));
+            return Err(Error::invalid(format!("methods[{index}]"), "appears twice; name each method once"));
         }
     }
     Ok(())

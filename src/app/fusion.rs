@@ -17,6 +17,7 @@ impl App {
         self.check_batch(observations.len())?;
         let mut serving = self.serving(id).await?;
         if serving.model.is_none()
+            && serving.model_fault.is_none()
             && observations.iter().any(|observation| observation.bounding_box.is_some())
         {
             // A run may have ended a moment ago, here or in another process.
@@ -24,7 +25,7 @@ impl App {
         }
         let fused = observations
             .iter()
-            .map(|observation| fuse_one(&serving, observation).ok_or_else(|| no_model(id)))
+            .map(|observation| fuse_one(&serving, observation).ok_or_else(|| no_model(id, &serving)))
             .collect::<Result<Vec<_>>>()?;
         self.metrics.fused(&fused);
         self.watch_over(id, &serving, observations).await;
@@ -59,9 +60,17 @@ impl App {
     }
 }
 
-/// The position of one observation; `None` for a box while the camera has no model.
+/// The position of one observation; `None` for a box while the camera has no model. Where the active model
+/// cannot be used, a box beside a fix is left out, and the fix passes through.
 pub(super) fn fuse_one(serving: &Serving, observation: &Observation) -> Option<FusedFix> {
     let model = serving.model.as_ref().map(|(regressor, number)| (&**regressor, *number));
+    let without_box;
+    let observation = if serving.model_fault.is_some() && observation.fix.is_some() {
+        without_box = Observation { bounding_box: None, ..observation.clone() };
+        &without_box
+    } else {
+        observation
+    };
     let mut fused = two_step::fuse(observation, model, serving.image_size, serving.e_gnss_m2)?;
     if serving.moved.is_some() && fused.regressed.is_some() {
         fused.flags.push(Flag::CameraMoved);
@@ -69,7 +78,11 @@ pub(super) fn fuse_one(serving: &Serving, observation: &Observation) -> Option<F
     Some(fused)
 }
 
-fn no_model(id: &CameraId) -> Error {
+fn no_model(id: &CameraId, serving: &Serving) -> Error {
+    if let Some(fault) = &serving.model_fault {
+        let message = format!("camera {id} has no usable model: {}; give fixes meanwhile", fault.reason);
+        return Error::refused(ErrorKind::NoModel, message);
+    }
     Error::refused(
         ErrorKind::NoModel,
         format!(

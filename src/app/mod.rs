@@ -19,7 +19,7 @@ use tokio::sync::{Notify, Semaphore};
 
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
-use crate::store::Store;
+use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
@@ -27,7 +27,7 @@ pub use live::{CameraEvent, Followed, LiveStream, Moves, TrackPoint};
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
-pub use registry::Registry;
+pub use registry::{ModelFault, Registry};
 pub use samples::{ImportReport, RejectedRow};
 pub use training::RunRequest;
 
@@ -53,10 +53,10 @@ pub struct Parts {
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
     pub pairings: Semaphore,
-    /// Rung when a run was queued, so that a worker need not wait for its next look.
-    pub run_queued: Notify,
-    /// The same of evaluations.
-    pub evaluation_queued: Notify,
+    /// Notifies workers of queued training runs.
+    pub training_queue: JobQueue,
+    /// Notifies workers of queued evaluations.
+    pub evaluation_queue: JobQueue,
 }
 
 impl App {
@@ -72,10 +72,13 @@ impl App {
         metrics: Metrics,
     ) -> crate::domain::Result<Self> {
         let registry = Registry::default();
+        let filled = store.fill_in_model_checksums().await?;
+        if filled > 0 {
+            tracing::info!(models = filled, "stored checksums of model versions of an earlier release");
+        }
         registry.refresh(&store).await?;
-        let (run_queued, pairings) = (Notify::new(), Semaphore::new(limits.pairings));
+        let pairings = Semaphore::new(limits.pairings);
         let live = live::Live::default();
-        let evaluation_queued = Notify::new();
         let parts = Parts {
             store,
             registry,
@@ -85,10 +88,26 @@ impl App {
             limits,
             metrics,
             pairings,
-            run_queued,
-            evaluation_queued,
+            training_queue: JobQueue::default(),
+            evaluation_queue: JobQueue::default(),
         };
         Ok(Self(Arc::new(parts)))
+    }
+}
+
+/// Wakes a worker when a job was queued, so that it need not wait until it polls the store.
+#[derive(Default)]
+pub struct JobQueue(Notify);
+
+impl JobQueue {
+    /// Tells that a job was queued.
+    pub fn notify(&self) {
+        self.0.notify_one();
+    }
+
+    /// Waits until a job was queued; one notification is kept until somebody waits.
+    pub async fn queued(&self) {
+        self.0.notified().await;
     }
 }
 
@@ -97,6 +116,24 @@ impl std::ops::Deref for App {
 
     fn deref(&self) -> &Parts {
         &self.0
+    }
+}
+
+/// The part of the limits that the store enforces.
+#[must_use]
+pub const fn store_limits(limits: &Limits) -> StoreLimits {
+    StoreLimits {
+        cameras: limits.cameras,
+        samples_per_camera: limits.samples_per_camera,
+        samples: limits.samples,
+        models_per_camera: limits.models_per_camera,
+        ended_runs_per_camera: limits.ended_runs_per_camera,
+        ended_evaluations: limits.ended_evaluations,
+        database_bytes: match limits.database_bytes {
+            0 => None,
+            bytes => Some(bytes),
+        },
+        reserve_bytes: limits.reserve_bytes,
     }
 }
 

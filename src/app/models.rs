@@ -1,7 +1,8 @@
-//! Model versions: list, activate, roll back, carry to another server; the receiver's error.
+//! Model versions: list, activate, roll back, download, import; the receiver's error.
 
 use bytes::Bytes;
 
+use super::registry::{ModelFault, load_regressor};
 use super::{App, Page, page_of};
 use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelVersion, Result};
 use crate::exchange::{RowError, TimedFix};
@@ -39,7 +40,7 @@ impl GnssErrorEstimate {
     /// cannot be read.
     pub fn from_rows(
         rows: impl Iterator<Item = Result<std::result::Result<TimedFix, RowError>>>,
-        tell_at_most: usize,
+        reported_rows: usize,
     ) -> Result<Self> {
         const FEWEST: u64 = 10;
         let mut plane: Option<LocalPlane> = None;
@@ -50,7 +51,7 @@ impl GnssErrorEstimate {
                 Ok(row) => row.fix.position,
                 Err(row) => {
                     rejected += 1;
-                    if rejected_rows.len() < tell_at_most {
+                    if rejected_rows.len() < reported_rows {
                         rejected_rows.push(row);
                     }
                     continue;
@@ -67,18 +68,18 @@ impl GnssErrorEstimate {
             }
         }
         let Some(plane) = plane.filter(|_| count >= FEWEST) else {
-            let told = rejected_rows.first().map_or_else(String::new, |row: &RowError| {
+            let first = rejected_rows.first().map_or_else(String::new, |row: &RowError| {
                 format!("; {rejected} were rejected, first line {}: {}: {}", row.line, row.field, row.reason)
             });
             return Err(Error::invalid(
                 "fixes",
-                format!("are {count}, at least {FEWEST} from one fixed point are needed{told}"),
+                format!("are {count}, at least {FEWEST} from one fixed point are needed{first}"),
             ));
         };
         let [east_variance_m2, north_variance_m2] = squares.map(|sum| sum / (count - 1) as f64);
         let e_gnss_m2 = 0.5 * (east_variance_m2 + north_variance_m2);
         if e_gnss_m2 <= 0.0 {
-            return Err(Error::invalid("fixes", "are all the same, so they tell nothing of the error"));
+            return Err(Error::invalid("fixes", "are all the same, so they do not show the error"));
         }
         Ok(Self {
             fixes: count,
@@ -104,7 +105,7 @@ impl App {
         self.store.model(id, number).await
     }
 
-    /// A camera's versions, newest first, from behind a cursor on.
+    /// A camera's versions, newest first, after a cursor.
     ///
     /// # Errors
     /// `CameraNotFound`.
@@ -121,18 +122,18 @@ impl App {
     /// One version as a file: safetensors with the metadata in its header.
     ///
     /// # Errors
-    /// `CameraNotFound`, `ModelNotFound`.
+    /// `CameraNotFound`, `ModelNotFound`, `ModelUnusable`.
     pub async fn download_model(&self, id: &CameraId, number: u32) -> Result<Bytes> {
-        let metadata = self.store.model(id, number).await?.metadata;
-        let weights = self.store.weights(id, number).await?.into();
-        Artifact { metadata, weights }.to_file().map_err(Error::fault)
+        let (metadata, weights) = self.store.model_content(id, number).await?;
+        Artifact { metadata, weights: weights.into() }.to_file().map_err(Error::fault)
     }
 
     /// Stores a version from a file that [`App::download_model`] gave, here or on another server.
     /// It does not become active by itself.
     ///
     /// # Errors
-    /// `CameraNotFound`; `InvalidArgument` naming what in the file cannot be used.
+    /// `CameraNotFound`; `InvalidArgument` naming what in the file cannot be used, or the check that its
+    /// answers do not pass.
     pub async fn import_model(&self, id: &CameraId, file: &[u8]) -> Result<ModelVersion> {
         self.serving(id).await?;
         let artifact = Artifact::from_file(file)?;
@@ -140,17 +141,26 @@ impl App {
         self.store.insert_model(id, &artifact.metadata, &artifact.weights, self.clock.now()).await
     }
 
-    /// Lets a version answer from now on.
+    /// Deletes a version that is not the active one. Its number is never assigned again.
     ///
     /// # Errors
-    /// `CameraNotFound`, `ModelNotFound`.
+    /// `CameraNotFound`, `ModelNotFound`, `ModelActive`.
+    pub async fn delete_model(&self, id: &CameraId, number: u32) -> Result<()> {
+        self.store.delete_model(id, number).await
+    }
+
+    /// Makes a version the active one, which answers from now on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `ModelNotFound`; `ModelUnusable` if the stored version cannot be loaded.
     pub async fn activate_model(&self, id: &CameraId, number: u32) -> Result<Camera> {
+        load_regressor(&self.store, id, number).await?;
         let camera = self.store.activate_model(id, number, self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;
         Ok(camera)
     }
 
-    /// Lets the version answer that did before the active one.
+    /// Makes the version active that was before the active one.
     ///
     /// # Errors
     /// `CameraNotFound`; `NoModel` if there is none before it.
@@ -160,7 +170,13 @@ impl App {
         Ok(camera)
     }
 
-    /// The number of the version that answers.
+    /// Why the camera's active version cannot be used, if so; it then answers by its fixes alone.
+    #[must_use]
+    pub fn model_fault(&self, id: &CameraId) -> Option<ModelFault> {
+        self.registry.get(id)?.model_fault.clone()
+    }
+
+    /// The active version.
     ///
     /// # Errors
     /// `CameraNotFound`; `NoModel`.

@@ -5,7 +5,7 @@ use std::io::Read;
 use super::recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use super::samples::{BATCH_ROWS, told_what_is_stored};
 use super::{App, ImportReport};
-use crate::domain::{CameraId, Error, Receiver, ReceiverId, Receivers, Result, Sample, TargetId};
+use crate::domain::{CameraId, Durability, Error, Receiver, ReceiverId, Receivers, Result, Sample, TargetId};
 use crate::exchange::{self, FixFormat, Format, RowRules};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::PairingSettings;
@@ -26,6 +26,8 @@ pub struct PairedImport<D, F> {
     pub target_id: Option<TargetId>,
     /// The receiver of fixes that name none.
     pub receiver_id: Option<ReceiverId>,
+    /// When the samples are acknowledged.
+    pub durability: Durability,
     /// Whether the clock offsets are estimated, too. They are told, never applied.
     pub estimates_offsets: bool,
 }
@@ -70,13 +72,14 @@ impl App {
         let receivers = self.serving(id).await?.receivers.clone();
         let limits =
             RecordingLimits { rows: self.limits.pairing_rows, rejected_rows: self.limits.rejected_rows };
+        let durability = import.durability;
         let _place = self.pairings.acquire().await.map_err(Error::fault)?;
         let pairing = tokio::task::spawn_blocking(move || import.paired(&rules, &receivers, limits));
         let Work { mut samples, mut report } = pairing.await.map_err(Error::fault)??;
         while !samples.is_empty() {
             let rest = samples.split_off(samples.len().min(BATCH_ROWS));
             let batch = std::mem::replace(&mut samples, rest).into_iter().map(Ok).collect();
-            let stored = self.store_batch(id, batch, &mut report.samples).await;
+            let stored = self.store_batch(id, batch, durability, &mut report.samples).await;
             stored.map_err(|error| told_what_is_stored(error, &report.samples))?;
         }
         let ImportReport { accepted, duplicate, .. } = report.samples;

@@ -29,6 +29,17 @@ pub struct Serving {
     pub moved: Option<Arc<CameraMoved>>,
     /// The active model and its version number.
     pub model: Option<(Arc<Regressor>, u32)>,
+    /// Why the active model cannot be used; then `model` is `None`.
+    pub model_fault: Option<ModelFault>,
+}
+
+/// An active model version that cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ModelFault {
+    /// The version.
+    pub version: u32,
+    /// A sentence for the operator.
+    pub reason: String,
 }
 
 /// All cameras, by id.
@@ -49,7 +60,7 @@ impl Registry {
     /// Brings one camera up to date with the store.
     ///
     /// # Errors
-    /// `CameraNotFound`; a fault if the model cannot be loaded.
+    /// `CameraNotFound`; a fault if the store cannot be read.
     pub async fn refresh_camera(&self, store: &Store, id: &CameraId) -> Result<Arc<Serving>> {
         let _change = self.change.lock().await;
         let serving = self.load(store, id).await?;
@@ -61,8 +72,8 @@ impl Registry {
 
     /// Brings all cameras up to date: what another process on the same file has changed, too.
     ///
-    /// A model that cannot be loaded leaves its camera without one, with a line in the log, so that
-    /// one bad row does not keep the others from being served.
+    /// A model that cannot be loaded leaves its camera without one ([`Serving::model_fault`]), so that one
+    /// damaged row does not keep others from being served. It is tried again with every refresh.
     ///
     /// # Errors
     /// A fault if the store cannot be read.
@@ -88,15 +99,24 @@ impl Registry {
                     cameras.insert(id, serving);
                 }
                 Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraNotFound => {}
-                Err(error) => {
-                    tracing::error!(camera.id = %id, %error, "cannot load the camera's active model");
-                }
+                Err(error) => tracing::error!(camera.id = %id, %error, "cannot read the camera"),
             }
         }
         if changed {
             self.cameras.store(Arc::new(cameras));
         }
         Ok(())
+    }
+
+    /// The cameras whose active model cannot be used, by id.
+    #[must_use]
+    pub fn model_faults(&self) -> Vec<(CameraId, ModelFault)> {
+        let cameras = self.cameras.load();
+        let faults =
+            cameras.iter().filter_map(|(id, camera)| Some((id.clone(), camera.model_fault.clone()?)));
+        let mut faults: Vec<_> = faults.collect();
+        faults.sort_by(|one, other| one.0.as_str().cmp(other.0.as_str()));
+        faults
     }
 
     /// Forgets a deleted camera.
@@ -116,18 +136,24 @@ impl Registry {
         };
         let loaded = self.get(id).filter(|serving| serving.moved == moved);
         let loaded = loaded.and_then(|serving| serving.model.clone());
+        let mut model_fault = None;
         let model = match (camera.active_model, loaded) {
             (None, _) => None,
             (Some(number), Some(loaded)) if loaded.1 == number => Some(loaded),
-            (Some(number), _) => {
-                let regressor = load_regressor(store, id, number).await?;
-                // Wrong by about the shift, it must not go on being confident.
-                let regressor = match &moved {
-                    Some(moved) => regressor.with_added_error(moved.added_m2()),
-                    None => regressor,
-                };
-                Some((Arc::new(regressor), number))
-            }
+            (Some(number), _) => match load_regressor(store, id, number).await {
+                Ok(regressor) => {
+                    // Wrong by about the shift, it must not go on being confident.
+                    let regressor = match &moved {
+                        Some(moved) => regressor.with_added_error(moved.change_variance_m2()),
+                        None => regressor,
+                    };
+                    Some((Arc::new(regressor), number))
+                }
+                Err(error) => {
+                    model_fault = Some(self.model_fault(id, number, error)?);
+                    None
+                }
+            },
         };
         Ok(Arc::new(Serving {
             moved,
@@ -139,16 +165,45 @@ impl Registry {
             },
             receivers: camera.profile.receivers,
             model,
+            model_fault,
         }))
+    }
+
+    /// What to say of a model that cannot be loaded; logged when it is found, not with every refresh.
+    ///
+    /// # Errors
+    /// A refusal that says nothing of the model: the camera was deleted, the store is overloaded or closed.
+    fn model_fault(&self, id: &CameraId, version: u32, error: Error) -> Result<ModelFault> {
+        let reason = match &error {
+            Error::Refused(refusal) if refusal.kind == ErrorKind::ModelUnusable => refusal.message.clone(),
+            Error::Fault(_) => {
+                format!("version {version} cannot be read from the database; the server's log says why")
+            }
+            Error::Refused(_) => return Err(error),
+        };
+        let fault = ModelFault { version, reason };
+        let known = self.get(id).and_then(|serving| serving.model_fault.clone());
+        if known.as_ref() != Some(&fault) {
+            tracing::error!(
+                camera.id = %id, model = version, %error,
+                "the camera's active model cannot be used; its fixes pass through without it"
+            );
+        }
+        Ok(fault)
     }
 }
 
 /// A stored model version, ready to answer.
 ///
 /// # Errors
-/// `ModelNotFound`; a fault if what is stored cannot be loaded.
+/// `ModelNotFound`; `ModelUnusable` if what is stored is damaged or does not pass the checks of a model.
 pub(super) async fn load_regressor(store: &Store, id: &CameraId, number: u32) -> Result<Regressor> {
-    let metadata = store.model(id, number).await?.metadata;
-    let weights = store.weights(id, number).await?.into();
-    Artifact { metadata, weights }.load().map_err(Error::fault)
+    let (metadata, weights) = store.model_content(id, number).await?;
+    Artifact { metadata, weights: weights.into() }.load().map_err(|error| match error {
+        Error::Refused(refusal) => Error::refused(
+            ErrorKind::ModelUnusable,
+            format!("version {number} of camera {id} cannot be used: {}", Error::Refused(refusal)),
+        ),
+        fault @ Error::Fault(_) => fault,
+    })
 }

@@ -6,7 +6,7 @@ use futures_util::{Stream, StreamExt as _};
 use tokio::sync::mpsc;
 
 use super::{App, Page, page_of};
-use crate::domain::{CameraId, Error, ImageSize, Result, Sample, TimeBounds};
+use crate::domain::{CameraId, Durability, Error, ImageSize, Result, Sample, TimeBounds};
 use crate::exchange::{self, Format, RowError, RowRules};
 use crate::store::{SampleFilter, SampleKey};
 
@@ -49,13 +49,14 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, before anything is read; `MalformedBody` for a file that cannot be read as
-    /// its format: batches before the place where it broke are stored, and the message tells how
-    /// many rows.
+    /// its format, `InsufficientStorage`: batches before that place are stored, and the message tells
+    /// how many rows.
     pub async fn import_file(
         &self,
         id: &CameraId,
         file: impl Read + Send + 'static,
         format: Format,
+        durability: Durability,
     ) -> Result<ImportReport> {
         let rules = self.row_rules(id).await?;
         let (sender, mut batches) = mpsc::channel(BATCHES_AHEAD);
@@ -66,7 +67,8 @@ impl App {
             while let Ok(more) = batches.try_recv() {
                 batch.extend(more);
             }
-            self.store_batch(id, batch, &mut report).await?;
+            let stored = self.store_batch(id, batch, durability, &mut report).await;
+            stored.map_err(|error| told_what_is_stored(error, &report))?;
         }
         let read = reading.await.map_err(Error::fault)?;
         self.metrics.imported(report.accepted, report.duplicate, report.rejected);
@@ -83,6 +85,7 @@ impl App {
         &self,
         id: &CameraId,
         rows: impl Stream<Item = Result<Result<Sample, RowError>>> + Send,
+        durability: Durability,
     ) -> Result<ImportReport> {
         self.serving(id).await?;
         let mut report = ImportReport::default();
@@ -99,7 +102,8 @@ impl App {
                     }
                 }
             }
-            self.store_batch(id, batch, &mut report).await?;
+            let stored = self.store_batch(id, batch, durability, &mut report).await;
+            stored.map_err(|error| told_what_is_stored(error, &report))?;
             if let Some(error) = broken {
                 self.metrics.imported(report.accepted, report.duplicate, report.rejected);
                 return Err(told_what_is_stored(error, &report));
@@ -156,6 +160,7 @@ impl App {
         &self,
         id: &CameraId,
         batch: Vec<Result<Sample, RowError>>,
+        durability: Durability,
         report: &mut ImportReport,
     ) -> Result<()> {
         let mut samples = Vec::with_capacity(batch.len());
@@ -166,7 +171,7 @@ impl App {
             }
         }
         if !samples.is_empty() {
-            let inserted = self.store.insert_samples(id, samples).await?;
+            let inserted = self.store.insert_samples(id, samples, durability).await?;
             report.accepted += inserted.accepted;
             report.duplicate += inserted.duplicate;
         }

@@ -1,4 +1,4 @@
-//! Training runs as an operator sees them; `worker` does the work.
+//! Training runs: start, list, cancel, watch. `worker` runs them.
 
 use std::time::Duration;
 
@@ -12,10 +12,10 @@ use crate::domain::{
 use crate::geo::{Position, distance_m};
 use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 
-/// How often a watched run is looked at.
-const WATCH_EVERY: Duration = Duration::from_millis(200);
+/// How often a watched run is read from the store.
+const WATCH_INTERVAL: Duration = Duration::from_millis(200);
 
-/// What an operator asks for; what is left out comes from the profile.
+/// A request for a training run; what is left out comes from the profile.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RunRequest {
     /// The profile's recipe, if `None`.
@@ -60,7 +60,7 @@ impl App {
         let now = self.clock.now();
         let run = RunId(self.randomness.uuid_v7(now));
         let run = self.store.insert_run(run, id, &options, self.limits.live_runs, now).await?;
-        self.run_queued.notify_one();
+        self.training_queue.notify();
         Ok(run)
     }
 
@@ -72,7 +72,7 @@ impl App {
         self.store.run(id, run).await
     }
 
-    /// A camera's runs, newest first, from behind a cursor on.
+    /// A camera's runs, newest first, after a cursor.
     ///
     /// # Errors
     /// `CameraNotFound`.
@@ -86,12 +86,20 @@ impl App {
         Ok(page_of(runs, limit, |run| run.id))
     }
 
-    /// Cancels a run: at once if it waits, at its next step if it runs.
+    /// Cancels a run: at once if no worker holds it, at its next step if one does.
     ///
     /// # Errors
     /// `CameraNotFound`, `RunNotFound`, `RunEnded`.
     pub async fn cancel_run(&self, id: &CameraId, run: RunId) -> Result<TrainingRun> {
-        self.store.request_cancel(id, run, self.clock.now()).await
+        self.store.cancel_run(id, run, self.clock.now()).await
+    }
+
+    /// Deletes a run that has ended, with its log and curve. The version that it yielded stays.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `RunNotFound`, `RunLive`.
+    pub async fn delete_run(&self, id: &CameraId, run: RunId) -> Result<()> {
+        self.store.delete_run(id, run).await
     }
 
     /// The run's curve: one report per epoch of the final fit.
@@ -112,8 +120,8 @@ impl App {
         self.store.log(run).await
     }
 
-    /// The run now and at each change, until it has ended. Looks into the store, so it also sees
-    /// runs that another process works on.
+    /// The run now and at each change, until it has ended. Reads the store, so it also sees runs that
+    /// another process works on.
     ///
     /// # Errors
     /// `CameraNotFound`, `RunNotFound` at once; a fault later ends the stream.
@@ -129,7 +137,7 @@ impl App {
             async move {
                 let shown = shown.filter(|run| !run.state.has_ended())?;
                 loop {
-                    tokio::time::sleep(WATCH_EVERY).await;
+                    tokio::time::sleep(WATCH_INTERVAL).await;
                     match app.store.run(&id, run).await {
                         Ok(seen) if seen == shown => {}
                         Ok(seen) => return Some((Ok(seen.clone()), Some(seen))),
@@ -142,7 +150,7 @@ impl App {
     }
 }
 
-/// Refuses at once what no recipe can learn from; the fit looks closer.
+/// Refuses samples that no recipe can be fitted to, before a run is queued; the fit checks more.
 pub(super) fn check_extent(id: &CameraId, count: u64, extent: Option<[Position; 2]>) -> Result<()> {
     let refused = |message| Err(Error::field(ErrorKind::UnusableSamples, "samples", message));
     if count < FEWEST_SAMPLES {

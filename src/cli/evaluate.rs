@@ -1,7 +1,5 @@
 //! `sightfix evaluate`
 
-mod paper;
-
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
@@ -11,73 +9,78 @@ use clap::Args;
 use super::import::image_size;
 use super::progress::Progress;
 use super::{format_of, open_file};
-use crate::clock::{Clock, process_cpu_s as cpu_s};
+use crate::clock::{Clock, process_cpu_s};
 use crate::domain::{ImageSize, Recipe, Sample, SigmaM, TargetId, TimeBounds};
 use crate::evaluation::{EvaluateOptions, Evaluation, Method, TestRow, Truth, evaluate, plots};
 use crate::exchange::{self, ObservedRow, RowRules};
 use crate::geo::Position;
+use crate::paper_experiments::{self, RealRecording, Worlds};
 
-/// Most seeds of one evaluation.
-const MOST_SEEDS: u64 = 100;
+/// Smallest number of simulated worlds per experiment of the paper.
+const MIN_PAPER_WORLDS: u64 = 3;
+/// Invalid rows that are reported individually.
+const MAX_REPORTED_ROWS: u64 = 20;
+/// Largest number of seeds of one evaluation.
+const MAX_SEEDS: u64 = 100;
 
-/// Try methods side by side on a test file, without a server
+/// Compare methods on a test file, without a server
 #[derive(Args)]
 pub(super) struct Evaluate {
-    /// Rows to learn from, as CSV, NDJSON or JSON
+    /// Training rows, as CSV, NDJSON or JSON
     #[arg(long, value_name = "FILE", required_unless_present = "paper")]
     train: Option<PathBuf>,
-    /// Rows to be told and judged; boxes and fixes may be empty
+    /// Test rows; boxes and fixes may be empty
     #[arg(long, value_name = "FILE", required_unless_present = "paper")]
     test: Option<PathBuf>,
-    /// The truth is this point; else the columns truth_longitude and truth_latitude
+    /// The true position of all rows [default: the columns truth_longitude and truth_latitude]
     #[arg(long, value_name = "LON,LAT", value_parser = point, allow_negative_numbers = true)]
     truth_point: Option<Position>,
-    /// The truth is the nearest point of the lines in this GeoJSON file
+    /// The true positions are on the lines of this GeoJSON file
     #[arg(long, value_name = "FILE", conflicts_with = "truth_point")]
     truth_line: Option<PathBuf>,
     /// Size of the image
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size)]
     image_size: Option<ImageSize>,
-    /// Standard deviation per axis of the receiver, m; else estimated
+    /// Standard deviation per axis of the receiver, m [default: estimated]
     #[arg(long, value_name = "S", value_parser = sigma)]
     gnss_sigma_m: Option<SigmaM>,
-    /// Methods with commas between, or all
+    /// Comma-separated methods, or all
     #[arg(long, value_name = "LIST", default_value = "all", value_parser = methods)]
     methods: Methods,
-    /// Seeds from 1 to this, their spread beside the mean; with --paper, simulated worlds of each case
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST_SEEDS))]
+    /// Number of training seeds; with --paper, number of simulated worlds per experiment
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MAX_SEEDS))]
     seeds: u64,
-    /// Test boxes grow to the upper left by this, px
+    /// Enlarge the test boxes to the upper left by this, px
     #[arg(long, value_name = "N", default_value_t = 0.0)]
     box_shift_px: f64,
-    /// Where the figures go, as JSON
+    /// Write the results as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Folder where pictures go, as SVG
+    /// Write plots to this folder, as SVG
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Run the paper's experiments on simulated worlds instead, and print the page of figures
+    /// Run the experiments of the paper on simulated worlds instead, and print the page of results
     #[arg(long, conflicts_with_all = ["train", "test"])]
     paper: bool,
-    /// Seed of the first simulated world, for --paper; 1000 to 1099 were looked at during development
+    /// Seed of the first simulated world, for --paper; 1000 to 1099 were used during development
     #[arg(long, value_name = "N", requires = "paper", default_value_t = 2001)]
     first_world: u64,
     /// Folder of the real recordings, for --paper
     #[arg(long, value_name = "DIR", requires = "paper")]
     shared_data: Option<PathBuf>,
-    /// Where the page goes, for --paper
+    /// Write the page to this file, for --paper
     #[arg(long, value_name = "FILE", requires = "paper", default_value = "docs/accuracy.md")]
     out: PathBuf,
 }
 
-/// A list that clap takes for one value.
+/// A list as a single value of clap.
 #[derive(Clone)]
 struct Methods(Vec<Method>);
 
 impl Evaluate {
     pub(super) fn run(self) -> anyhow::Result<()> {
         if self.paper {
-            return paper::run(self.shared_data.as_deref(), &self.out, self.first_world, self.seeds.max(3));
+            return self.write_paper_page();
         }
         let (Some(train), Some(test)) = (&self.train, &self.test) else {
             anyhow::bail!("give --train and --test")
@@ -98,16 +101,16 @@ impl Evaluate {
             image_size: self.image_size,
             gnss_sigma: self.gnss_sigma_m,
             box_shift_px: self.box_shift_px,
-            cpu_s,
+            cpu_s: process_cpu_s,
         };
-        let evaluation = evaluate_aloud(&train, &test, &truth, &options)?;
+        let evaluation = evaluate_with_progress(&train, &test, &truth, &options)?;
         print!("{}", evaluation.report.table());
         if let Some(path) = &self.json {
             std::fs::write(path, evaluation.report.to_json()?)
                 .with_context(|| format!("cannot write {}", path.display()))?;
         }
         if let Some(folder) = &self.plots {
-            std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+            std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
             for (name, picture) in plots(&evaluation, &test, &truth) {
                 std::fs::write(folder.join(name), picture)?;
             }
@@ -116,49 +119,90 @@ impl Evaluate {
         Ok(())
     }
 
+    /// Runs the experiments of the paper; writes the page and prints it.
+    fn write_paper_page(&self) -> anyhow::Result<()> {
+        let recording = match &self.shared_data {
+            Some(folder) => Some(RealRecording {
+                samples: read_train(&folder.join("square/training.csv"), None)?,
+                truth: truth_line(&folder.join("square/truth_line.geojson"))?,
+            }),
+            None => None,
+        };
+        let worlds = Worlds { first: self.first_world, count: self.seeds.max(MIN_PAPER_WORLDS) };
+        let page = paper_experiments::page(worlds, recording.as_ref(), &mut PaperRunner)?;
+        if let Some(folder) = self.out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+            std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        }
+        std::fs::write(&self.out, &page).with_context(|| format!("cannot write {}", self.out.display()))?;
+        println!("{page}");
+        Ok(())
+    }
+
     fn truth(&self, test: &[TestRow]) -> anyhow::Result<Truth> {
         if let Some(point) = self.truth_point {
             return Ok(Truth::Point(point));
         }
         if let Some(path) = &self.truth_line {
-            let text =
-                std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-            return Ok(Truth::from_geojson(&text)?);
+            return truth_line(path);
         }
         anyhow::ensure!(
             test.iter().any(|row| row.truth.is_some()),
-            "where is the truth? Give columns truth_longitude and truth_latitude, --truth-point or --truth-line"
+            "the truth is missing: give columns truth_longitude and truth_latitude, --truth-point or --truth-line"
         );
         Ok(Truth::Columns)
     }
 }
 
-/// What tracks stand on, and what a camera is learnt by if nothing is said.
+/// Evaluates the experiments of the paper, with progress on standard error.
+struct PaperRunner;
+
+impl paper_experiments::Runner for PaperRunner {
+    fn evaluate(
+        &mut self,
+        train: &[Sample],
+        test: &[TestRow],
+        truth: &Truth,
+        options: &EvaluateOptions,
+    ) -> anyhow::Result<Evaluation> {
+        evaluate_with_progress(train, test, truth, options)
+    }
+
+    fn begin(&mut self, experiment: &str) {
+        eprintln!("{experiment}");
+    }
+}
+
+fn truth_line(path: &Path) -> anyhow::Result<Truth> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    Ok(Truth::from_geojson(&text)?)
+}
+
+/// The recipe of tracks.
 const DEFAULT_RECIPE: Recipe = Recipe::Auto;
 
-/// Evaluates and shows on standard error what is being done.
-fn evaluate_aloud(
+/// Evaluates and shows the progress on standard error.
+fn evaluate_with_progress(
     train: &[Sample],
     test: &[TestRow],
     truth: &Truth,
     options: &EvaluateOptions,
 ) -> anyhow::Result<Evaluation> {
     let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
-    let evaluation = evaluate(train, test, truth, options, &mut |doing| {
-        progress.set(doing.done.into(), doing.planned.into(), doing.words);
+    let evaluation = evaluate(train, test, truth, options, &mut |step| {
+        progress.set(step.done.into(), step.planned.into(), step.phase);
         ControlFlow::Continue(())
     });
     progress.finish();
     Ok(evaluation?)
 }
 
-/// The rows that have box and fix; the others teach nothing and are counted.
+/// The rows with box and fix; the number of others is reported on standard error.
 fn read_train(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<Sample>> {
     let rows = read(path, image_size)?;
     let all = rows.len();
     let samples: Vec<Sample> = rows.into_iter().filter_map(sample).collect();
     if samples.len() < all {
-        eprintln!("{}: {} rows without box or fix are left out", path.display(), all - samples.len());
+        eprintln!("{}: {} rows without box or fix are ignored", path.display(), all - samples.len());
     }
     Ok(samples)
 }
@@ -181,24 +225,24 @@ fn read_test(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<T
     Ok(read(path, image_size)?.into_iter().map(test_row).collect())
 }
 
-/// All rows but those at fault, which are named on standard error.
+/// All valid rows; the others are reported on standard error.
 fn read(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<ObservedRow>> {
     let rules = RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size };
     let mut rows = Vec::new();
-    let mut faults = 0_u64;
+    let mut invalid = 0_u64;
     for row in exchange::read_observations(open_file(path)?, format_of(path)?, &rules)? {
         match row.with_context(|| format!("cannot read {}", path.display()))? {
             Ok(row) => rows.push(row),
-            Err(fault) => {
-                faults += 1;
-                if faults <= 20 {
-                    eprintln!("{}: line {}: {}: {}", path.display(), fault.line, fault.field, fault.reason);
+            Err(error) => {
+                invalid += 1;
+                if invalid <= MAX_REPORTED_ROWS {
+                    eprintln!("{}: line {}: {}: {}", path.display(), error.line, error.field, error.reason);
                 }
             }
         }
     }
-    if faults > 20 {
-        eprintln!("{}: and {} rows more were left out", path.display(), faults - 20);
+    if invalid > MAX_REPORTED_ROWS {
+        eprintln!("{}: and {} more invalid rows", path.display(), invalid - MAX_REPORTED_ROWS);
     }
     Ok(rows)
 }

@@ -82,7 +82,7 @@ impl Fuse {
         let id = self.camera.as_ref().context("give --camera or --model")?;
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
-            let app = open_app(&settings).await?;
+            let app = open_app(&settings, "sightfix fuse").await?;
             let camera = app.camera(id).await?;
             let serving = app.registry.get(id).context("the camera was deleted")?;
             app.store.close().await;

@@ -8,7 +8,7 @@ use clap::Args;
 use super::progress::Progress;
 use super::{DataFolder, camera_id, format_of, open_app, open_file, runtime};
 use crate::app::ImportReport;
-use crate::domain::{CameraId, Error, ErrorKind, ImageSize, NewCamera};
+use crate::domain::{CameraId, Durability, Error, ErrorKind, ImageSize, NewCamera};
 
 /// Import samples from a file into a camera
 #[derive(Args)]
@@ -38,7 +38,7 @@ impl Import {
         let source =
             Watched { source, read: 0, bytes, progress: Progress::new("{bar:40} {bytes}/{total_bytes}") };
         let report = runtime()?.block_on(async {
-            let app = open_app(&settings).await?;
+            let app = open_app(&settings, "sightfix import").await?;
             if self.create {
                 let profile =
                     NewCamera { image_size: self.image_size, ..NewCamera::named(self.camera.clone()) };
@@ -47,7 +47,7 @@ impl Import {
                     created => drop(created?),
                 }
             }
-            let report = app.import_file(&self.camera, source, format).await;
+            let report = app.import_file(&self.camera, source, format, Durability::Synced).await;
             app.store.close().await;
             anyhow::Ok(report?)
         })?;

@@ -23,12 +23,12 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::{Args, Parser, Subcommand};
 
-use crate::app::App;
+use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
 use crate::domain::{CameraId, ReceiverId, TargetId};
 use crate::exchange::Format;
-use crate::store::Store;
+use crate::store::{Store, StoreOptions};
 use crate::telemetry::Metrics;
 
 /// Positions from what an uncalibrated fixed camera sees and what a GNSS receiver says
@@ -114,11 +114,16 @@ impl DataFolder {
     }
 }
 
-/// The application over the data folder, without a server. A server may run beside it.
-async fn open_app(settings: &Config) -> anyhow::Result<App> {
-    let store = Store::open(&settings.data)
+/// The application over the data folder, without a server. A server may run beside it; both are told
+/// of each other, `role` is what the server's log calls this process.
+async fn open_app(settings: &Config, role: &str) -> anyhow::Result<App> {
+    let options = StoreOptions { limits: store_limits(&settings.limits), role: role.to_owned() };
+    let store = Store::open_with(&settings.data, options)
         .await
         .with_context(|| format!("cannot open the data folder {}", settings.data.display()))?;
+    for other in store.newcomers() {
+        eprintln!("note: another process uses the same data folder: {other}");
+    }
     Ok(App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new())
         .await?)
 }

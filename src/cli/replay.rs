@@ -15,111 +15,111 @@ use super::{camera_id, format_of, open_file, receiver_id, runtime, target_id};
 use crate::clock::Clock;
 use crate::domain::{CameraId, ReceiverId, TargetId, TimeBounds};
 use crate::exchange::{self, ObservedRow, RowRules};
-use crate::replay::{FaultShares, FixesOf, Live, Options, Pace, Recording, Report, replay};
+use crate::replay::{Counters, FaultShares, FixOwner, Pace, Recording, ReplayOptions, Report, replay};
 
-/// Between two looks at how far it has come.
-const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// Interval of the progress display.
+const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
 
 /// Stream recorded boxes and fixes to a server, as one or many cameras
 #[derive(Args)]
 pub(super) struct Replay {
-    /// Rows with boxes, fixes or both, as CSV, NDJSON or JSON, told by the ending
+    /// Rows with boxes, fixes or both, as CSV, NDJSON or JSON, by file extension
     #[arg(value_name = "FILE", required_unless_present = "detections")]
     file: Option<PathBuf>,
-    /// Boxes and fixes recorded apart: the boxes
+    /// Boxes that were recorded separately from the fixes
     #[arg(long, value_name = "FILE", requires = "fixes", conflicts_with = "file")]
     detections: Option<PathBuf>,
-    /// ... and the fixes, merged with them by time
+    /// Fixes that were recorded separately, merged with the boxes by time
     #[arg(long, value_name = "FILE", requires = "detections")]
     fixes: Option<PathBuf>,
-    /// Whose the fixes are that name no target; else the only target's
+    /// Target of the fixes that name none [default: the only target]
     #[arg(long, value_name = "ID", value_parser = target_id, requires = "fixes")]
     fix_target: Option<TargetId>,
-    /// The receiver of the fixes that name no target; the camera's profile says whose it is
+    /// Receiver of the fixes that name no target; the camera's profile maps it to a target
     #[arg(long, value_name = "ID", value_parser = receiver_id, requires = "fixes", conflicts_with = "fix_target")]
     receiver: Option<ReceiverId>,
     #[command(flatten)]
-    to: To,
+    destination: Destination,
     #[command(flatten)]
     pacing: Pacing,
     #[command(flatten)]
-    care: Care,
+    delivery: Delivery,
     /// Print the report as JSON
     #[arg(long)]
     json: bool,
 }
 
-/// Where to.
+/// Server and cameras.
 #[derive(Args)]
-struct To {
-    /// The server
+struct Destination {
+    /// Address of the server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
     server: String,
-    /// The server's camera; give it again for more, and simulated ones are dealt to them in turn
+    /// Camera of the server; repeat it for more, simulated cameras are assigned round robin
     #[arg(long = "camera", value_name = "ID", value_parser = camera_id, required_unless_present = "camera_prefix")]
     camera_ids: Vec<CameraId>,
-    /// The server's cameras are PREFIX-1, PREFIX-2 and so on, one for each simulated one
+    /// Cameras PREFIX-1, PREFIX-2 and so on of the server, one for each simulated camera
     #[arg(long, value_name = "PREFIX", conflicts_with = "camera_ids")]
     camera_prefix: Option<String>,
-    /// Simulated cameras, each with a stream of its own
+    /// Number of simulated cameras, each with its own stream
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = value_parser!(u32).range(1..=100_000))]
     cameras: u32,
-    /// What the streams' client names begin with; the camera's number follows
+    /// Prefix of the streams' client names; the simulated camera's number follows
     #[arg(long, value_name = "NAME", default_value = "replay")]
     client_name: String,
 }
 
-/// When items are sent.
+/// Timing.
 #[derive(Args)]
 struct Pacing {
-    /// Times faster than real time, or max: as fast as --in-flight lets it go
+    /// Speed relative to the recorded times, or max: as fast as --in-flight allows
     #[arg(long, value_name = "N", default_value = "1", value_parser = speed)]
     speed: Pace,
-    /// Items per second and camera instead, whatever their times say
+    /// Constant rate in items per second and camera, regardless of the recorded times
     #[arg(long, value_name = "N", value_parser = rate, conflicts_with = "speed")]
     rate: Option<Pace>,
-    /// Passes over the recording, each later in time than the one before
+    /// Repetitions of the recording, each shifted in time after the one before
     #[arg(long, value_name = "N", default_value = "1")]
     repeat: NonZeroU64,
-    /// Send nothing after so many seconds, and repeat the recording until then
+    /// Repeat the recording for that many seconds
     #[arg(long, value_name = "S", value_parser = value_parser!(u64).range(1..), conflicts_with = "repeat")]
     duration_s: Option<u64>,
-    /// Move all times so that the last item's is now
+    /// Shift all times so that the last item is at the current time
     #[arg(long)]
     shift_to_now: bool,
-    /// Items sent and not answered yet, per camera
+    /// Largest number of unanswered items per camera
     #[arg(long, value_name = "N", default_value_t = 64, value_parser = value_parser!(u32).range(1..=100_000))]
     in_flight: u32,
 }
 
-/// What is kept, and what goes wrong.
+/// Delivery, retries and injected faults.
 #[derive(Args)]
-struct Care {
-    /// Have the items kept as training samples, and wait for their acknowledgement
+struct Delivery {
+    /// Store the items as training samples, and wait for their acknowledgement
     #[arg(long)]
     store_samples: bool,
-    /// Items kept to be sent again after a broken line, per camera
+    /// Capacity per camera of the buffer of items to send again after a failure
     #[arg(long, value_name = "N", default_value_t = 8_192, value_parser = value_parser!(u32).range(1..=10_000_000))]
     keep: u32,
-    /// Attempts in a row to open a stream again before giving up
+    /// Consecutive attempts to reconnect before giving up
     #[arg(long, value_name = "N", default_value_t = 12)]
     attempts: u32,
-    /// A server that owes an answer and is silent for so many seconds counts as gone
-    #[arg(long, value_name = "S", default_value_t = 30, value_parser = value_parser!(u64).range(1..=3_600))]
-    patience_s: u64,
-    /// Share of items to lose on purpose
+    /// Seconds without a due response after which the connection counts as broken
+    #[arg(long, alias = "patience-s", value_name = "S", default_value_t = 30, value_parser = value_parser!(u64).range(1..=3_600))]
+    response_timeout_s: u64,
+    /// Share of items to lose
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = share)]
     lose: f64,
-    /// Share of items to send twice on purpose
+    /// Share of items to send twice
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = share)]
     duplicate: f64,
-    /// Share of items to send late on purpose
+    /// Share of items to send late
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = share)]
     reorder: f64,
-    /// Most items by which late and doubled ones come late
-    #[arg(long, value_name = "N", default_value_t = FaultShares::NONE.latest, value_parser = value_parser!(u32).range(1..=1_000))]
+    /// Largest delay of late and duplicated items, in items
+    #[arg(long, value_name = "N", default_value_t = FaultShares::NONE.max_delay, value_parser = value_parser!(u32).range(1..=1_000))]
     reorder_by: u32,
-    /// Seed of all that goes wrong, of waits and of beginnings
+    /// Seed of faults, backoff and initial delays
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
 }
@@ -132,24 +132,24 @@ impl Replay {
             true => recording.shift_to_end_at(now, self.pacing.repeat.get()),
             false => SignedDuration::ZERO,
         };
-        let options = Options {
-            server: self.to.server.clone(),
-            camera_ids: self.to.camera_ids()?,
-            cameras: self.to.cameras as usize,
-            client_name: self.to.client_name.clone(),
+        let options = ReplayOptions {
+            server: self.destination.server.clone(),
+            camera_ids: self.destination.camera_ids()?,
+            cameras: self.destination.cameras as usize,
+            client_name: self.destination.client_name.clone(),
             pace: self.pacing.rate.unwrap_or(self.pacing.speed),
-            passes: self.pacing.repeat,
+            repetitions: self.pacing.repeat,
             duration: self.pacing.duration_s.map(Duration::from_secs),
             shift,
             in_flight: self.pacing.in_flight as usize,
-            kept: self.care.keep.max(self.pacing.in_flight) as usize,
-            store_samples: self.care.store_samples,
-            faults: self.care.faults(),
-            seed: self.care.seed,
-            attempts: self.care.attempts,
-            patience: Duration::from_secs(self.care.patience_s),
+            resend_buffer: self.delivery.keep.max(self.pacing.in_flight) as usize,
+            store_samples: self.delivery.store_samples,
+            faults: self.delivery.faults(),
+            seed: self.delivery.seed,
+            attempts: self.delivery.attempts,
+            response_timeout: Duration::from_secs(self.delivery.response_timeout_s),
         };
-        let report = runtime()?.block_on(watched(recording, options))?;
+        let report = runtime()?.block_on(replay_with_progress(recording, options))?;
         if self.json {
             println!("{}", serde_json::to_string_pretty(&report)?);
         } else {
@@ -162,16 +162,20 @@ impl Replay {
     fn recording(&self, time_bounds: TimeBounds) -> anyhow::Result<Recording> {
         let rules = RowRules { time_bounds, image_size: None };
         if let (Some(detections), Some(fixes)) = (&self.detections, &self.fixes) {
-            let target = self.fix_target.clone().map(FixesOf::Target);
-            let fixes_of = target.or_else(|| self.receiver.clone().map(FixesOf::Receiver));
-            return Ok(Recording::of_both(rows(detections, &rules)?, rows(fixes, &rules)?, fixes_of)?);
+            let target = self.fix_target.clone().map(FixOwner::Target);
+            let fix_owner = target.or_else(|| self.receiver.clone().map(FixOwner::Receiver));
+            return Ok(Recording::from_detections_and_fixes(
+                rows(detections, &rules)?,
+                rows(fixes, &rules)?,
+                fix_owner,
+            )?);
         }
         let file = self.file.as_deref().unwrap_or_else(|| Path::new(""));
-        Ok(Recording::of_rows(rows(file, &rules)?)?)
+        Ok(Recording::from_rows(rows(file, &rules)?)?)
     }
 }
 
-impl To {
+impl Destination {
     fn camera_ids(&self) -> anyhow::Result<Vec<CameraId>> {
         match &self.camera_prefix {
             Some(prefix) => {
@@ -182,32 +186,32 @@ impl To {
     }
 }
 
-impl Care {
+impl Delivery {
     const fn faults(&self) -> FaultShares {
-        let Self { lose, duplicate, reorder, reorder_by: latest, .. } = *self;
-        FaultShares { lose, duplicate, reorder, latest }
+        let Self { lose, duplicate, reorder, reorder_by: max_delay, .. } = *self;
+        FaultShares { lose, duplicate, reorder, max_delay }
     }
 }
 
-/// The rows of a file; those that are none are told and left out.
+/// The valid rows of a file; the others are reported on standard error and skipped.
 fn rows(path: &Path, rules: &RowRules) -> anyhow::Result<Vec<ObservedRow>> {
-    let mut good = Vec::new();
+    let mut valid = Vec::new();
     for row in exchange::read_observations(open_file(path)?, format_of(path)?, rules)? {
         match row? {
-            Ok(row) => good.push(row),
+            Ok(row) => valid.push(row),
             Err(row) => eprintln!("{}: line {}: {}: {}", path.display(), row.line, row.field, row.reason),
         }
     }
-    Ok(good)
+    Ok(valid)
 }
 
-/// Replays and shows how far it has come. An interrupt ends the streams in order, a second one at once.
-async fn watched(recording: Recording, options: Options) -> anyhow::Result<Report> {
-    let items = recording.len() as u64 * options.passes.get() * options.cameras as u64;
-    let (begin, duration) = (Instant::now(), options.duration);
-    let (live, stop) = (Arc::new(Live::default()), CancellationToken::new());
+/// Replays and shows the progress. A first interrupt closes the streams in order, a second one aborts.
+async fn replay_with_progress(recording: Recording, options: ReplayOptions) -> anyhow::Result<Report> {
+    let items = recording.len() as u64 * options.repetitions.get() * options.cameras as u64;
+    let (started, duration) = (Instant::now(), options.duration);
+    let (counters, stop) = (Arc::new(Counters::default()), CancellationToken::new());
     let mut progress = Progress::new("{bar:40} {msg}");
-    let replaying = replay(Arc::new(recording), Arc::new(options), live.clone(), stop.clone());
+    let replaying = replay(Arc::new(recording), Arc::new(options), counters.clone(), stop.clone());
     tokio::pin!(replaying);
     loop {
         tokio::select! {
@@ -220,13 +224,13 @@ async fn watched(recording: Recording, options: Options) -> anyhow::Result<Repor
                 anyhow::ensure!(!stop.is_cancelled(), "interrupted");
                 stop.cancel();
             }
-            () = tokio::time::sleep(LOOK_EVERY) => {
+            () = tokio::time::sleep(PROGRESS_INTERVAL) => {
                 let [sent, answered, streams] =
-                    [&live.items, &live.answered, &live.streams].map(|count| count.load(Ordering::Relaxed));
-                let words = format!("items, {sent} sent, {answered} answered, {streams} streams");
+                    [&counters.items, &counters.answered, &counters.streams].map(|count| count.load(Ordering::Relaxed));
+                let message = format!("items, {sent} sent, {answered} answered, {streams} streams");
                 match duration {
-                    None => progress.set(answered, items, &words),
-                    Some(whole) => progress.set(begin.elapsed().as_secs(), whole.as_secs(), &format!("s, {words}")),
+                    None => progress.set(answered, items, &message),
+                    Some(total) => progress.set(started.elapsed().as_secs(), total.as_secs(), &format!("s, {message}")),
                 }
             }
         }
@@ -235,7 +239,7 @@ async fn watched(recording: Recording, options: Options) -> anyhow::Result<Repor
 
 fn speed(text: &str) -> Result<Pace, String> {
     match text {
-        "max" => Ok(Pace::FastAsItGoes),
+        "max" => Ok(Pace::Unpaced),
         _ => positive(text)
             .map(|speed| Pace::Recorded { speed })
             .ok_or_else(|| "must be a number above 0, or max".to_owned()),
@@ -244,7 +248,7 @@ fn speed(text: &str) -> Result<Pace, String> {
 
 fn rate(text: &str) -> Result<Pace, String> {
     positive(text)
-        .map(|items_per_s| Pace::Even { items_per_s })
+        .map(|items_per_s| Pace::ConstantRate { items_per_s })
         .ok_or_else(|| "must be a number above 0".to_owned())
 }
 

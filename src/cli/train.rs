@@ -37,7 +37,7 @@ impl Train {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
-            let app = open_app(&settings).await?;
+            let app = open_app(&settings, "sightfix train").await?;
             let request = RunRequest {
                 recipe: self.recipe,
                 seed: self.seed,

@@ -1,9 +1,9 @@
-//! What a detector draws around a target.
+//! Bounding boxes and image sizes.
 
 use super::error::{Error, Result};
 
-/// No camera makes larger images; also keeps f32 pixels exact to 1/64.
-const LARGEST_IMAGE_PX: u32 = 131_072;
+/// Larger images are refused; within this f32 resolves pixels to 1/64.
+const MAX_IMAGE_PX: u32 = 131_072;
 
 /// Size of a camera's image in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,20 +17,20 @@ impl ImageSize {
     /// Names the side that is 0 or beyond 131,072 px.
     pub fn new(width_px: u32, height_px: u32) -> Result<Self> {
         for (field, side_px) in [("width_px", width_px), ("height_px", height_px)] {
-            if side_px == 0 || side_px > LARGEST_IMAGE_PX {
-                return Err(Error::invalid(field, format!("must be from 1 to {LARGEST_IMAGE_PX} pixels")));
+            if side_px == 0 || side_px > MAX_IMAGE_PX {
+                return Err(Error::invalid(field, format!("must be from 1 to {MAX_IMAGE_PX} pixels")));
             }
         }
         Ok(Self { width_px, height_px })
     }
 
-    /// Columns.
+    /// Width, px.
     #[must_use]
     pub const fn width_px(self) -> u32 {
         self.width_px
     }
 
-    /// Rows.
+    /// Height, px.
     #[must_use]
     pub const fn height_px(self) -> u32 {
         self.height_px
@@ -39,8 +39,8 @@ impl ImageSize {
 
 /// A rectangle in the image, valid by construction: finite, of positive area, within 131,072 px.
 ///
-/// `left_px` and `top_px` are the corner nearest the image's origin; they may be negative by what a
-/// detector guesses beyond the border.
+/// `left_px` and `top_px` are relative to the image's upper left corner; they may be negative where a
+/// detector extrapolates beyond the border.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoundingBox {
     left_px: f64,
@@ -51,9 +51,9 @@ pub struct BoundingBox {
 
 impl BoundingBox {
     /// # Errors
-    /// Names the side that is not finite, not positive, or absurdly large.
+    /// Names the side that is not finite, not positive, or larger than 131,072 px.
     pub fn new(left_px: f64, top_px: f64, width_px: f64, height_px: f64) -> Result<Self> {
-        let limit = f64::from(LARGEST_IMAGE_PX);
+        let limit = f64::from(MAX_IMAGE_PX);
         for (field, value) in [("left_px", left_px), ("top_px", top_px)] {
             if !(-limit..=limit).contains(&value) {
                 return Err(Error::invalid(
@@ -73,11 +73,11 @@ impl BoundingBox {
         Ok(Self { left_px, top_px, width_px, height_px })
     }
 
-    /// The same box, if it shows anything of an image of that size.
+    /// The same box, if it overlaps an image of that size.
     ///
     /// # Errors
-    /// A box that lies wholly outside of the image, or reaches beyond its border by more than a
-    /// tenth of the image (a box of another image, or swapped sides).
+    /// Refuses a box outside of the image, or beyond its border by more than a tenth of the image: it
+    /// belongs to another image size, or its sides are swapped.
     pub fn within(self, image_size: ImageSize) -> Result<Self> {
         let (width_px, height_px) = (f64::from(image_size.width_px), f64::from(image_size.height_px));
         let sides = [
@@ -90,7 +90,7 @@ impl BoundingBox {
                 return Err(Error::invalid(
                     field,
                     format!(
-                        "the box reaches from {low_px} to {high_px} px, outside of the image of {} x {} px; \
+                        "the box extends from {low_px} to {high_px} px, outside of the image of {} x {} px; \
                          check the order of the sides and the camera's image_size",
                         image_size.width_px, image_size.height_px
                     ),
@@ -130,14 +130,14 @@ impl BoundingBox {
         [self.left_px, self.top_px, self.width_px, self.height_px]
     }
 
-    /// Where the target stands: the middle of the lower edge (x, y) in px.
+    /// The foot point (x, y), px: the centre of the lower edge, where the target touches the ground.
     #[must_use]
     pub fn foot_px(self) -> [f64; 2] {
         [self.left_px + 0.5 * self.width_px, self.top_px + self.height_px]
     }
 
-    /// Whether the image's border cuts the box, to within one pixel. Without an image size only
-    /// the upper and left border are known.
+    /// Whether the image border truncates the box, to within one pixel. Without an image size only the
+    /// upper and left borders are checked.
     #[must_use]
     pub fn touches_border(self, image_size: Option<ImageSize>) -> bool {
         let near_px = 1.0;
@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn boxes_without_area_or_number_are_refused() {
+    fn boxes_without_area_or_not_finite_are_refused() {
         for sides in [
             [0.0, 0.0, 0.0, 5.0],
             [0.0, 0.0, 5.0, -1.0],
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_of_another_image_is_refused() {
+    fn a_box_outside_of_the_image_is_refused() {
         let size = ImageSize::new(640, 480).expect("valid");
         assert!(BoundingBox::new(600.0, 10.0, 60.0, 50.0).expect("valid").within(size).is_ok());
         assert!(BoundingBox::new(900.0, 10.0, 60.0, 50.0).expect("valid").within(size).is_err());
@@ -177,13 +177,13 @@ mod tests {
     }
 
     #[test]
-    fn the_border_cuts_a_box() {
+    fn truncation_by_the_border_is_detected() {
         let size = ImageSize::new(640, 480).expect("valid");
         let inside = BoundingBox::new(10.0, 10.0, 60.0, 50.0).expect("valid");
-        let cut = BoundingBox::new(10.0, 430.0, 60.0, 50.0).expect("valid");
+        let truncated = BoundingBox::new(10.0, 430.0, 60.0, 50.0).expect("valid");
         assert!(!inside.touches_border(Some(size)));
-        assert!(cut.touches_border(Some(size)));
-        assert!(!cut.touches_border(None));
+        assert!(truncated.touches_border(Some(size)));
+        assert!(!truncated.touches_border(None));
         assert!(BoundingBox::new(10.0, 0.0, 60.0, 50.0).expect("valid").touches_border(None));
     }
 }

@@ -1,4 +1,4 @@
-//! A camera that nobody calibrated.
+//! Camera profiles. No calibration is part of them.
 
 use std::collections::BTreeMap;
 
@@ -11,35 +11,35 @@ use super::names::{CameraId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
 use super::recipe::Recipe;
 
-/// Counts the changes of a profile, from 1.
+/// Revision number of a profile, from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Revision(pub u64);
 
-/// What an operator says of a camera. No calibration is ever asked for.
+/// A camera's profile as the operator defines it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewCamera {
-    /// The slug the operator chose.
+    /// The slug chosen by the operator.
     pub id: CameraId,
-    /// The name for people.
+    /// Display name.
     pub display_name: String,
-    /// Without it, boxes cut by the right or lower border cannot be told.
+    /// Without it, truncation by the right or lower border is not detected.
     pub image_size: Option<ImageSize>,
     /// The receiver's error.
     pub gnss_error: GnssError,
-    /// How to learn the camera.
+    /// Recipe of training runs.
     pub recipe: Recipe,
-    /// Classes that the camera is used for; empty means all.
+    /// Classes of targets that the camera is used for; empty for all.
     pub target_classes: Vec<TargetClass>,
     /// Free-form labels.
     pub labels: BTreeMap<String, String>,
-    /// Whose the GNSS receivers are, and how far their clocks are off.
+    /// The targets that carry the GNSS receivers, and the receivers' clock offsets.
     pub receivers: Receivers,
-    /// Whether a training run is started by itself once the camera is found to have moved.
+    /// Whether a training run starts automatically after the camera has moved.
     pub retrain_when_moved: bool,
 }
 
 impl NewCamera {
-    /// A camera of which nothing but its id is said.
+    /// A profile with an id and defaults.
     #[must_use]
     pub fn named(id: CameraId) -> Self {
         Self {
@@ -56,7 +56,7 @@ impl NewCamera {
     }
 
     /// # Errors
-    /// Names the field that is too long, doubled or unprintable.
+    /// Names the field that is too long, duplicated or not printable.
     pub fn check(self) -> Result<Self> {
         check_text("display_name", &self.display_name, 200)?;
         check_labels(&self.labels)?;
@@ -67,29 +67,29 @@ impl NewCamera {
             if self.target_classes[..index].contains(class) {
                 return Err(Error::invalid(
                     format!("target_classes[{index}]"),
-                    "stands twice; name each class once",
+                    "is a duplicate; name each class once",
                 ));
             }
         }
         Ok(self)
     }
 
-    /// What is lost by what the operator left out, in sentences.
+    /// Consequences of missing fields, as sentences.
     #[must_use]
     pub fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
         if self.image_size.is_none() {
             warnings.push(
-                "image_size is not set: boxes cut by the right or lower border cannot be told, so their \
-                 positions are given with the same confidence as others, and boxes outside of the image \
-                 are not refused"
+                "image_size is not set: truncation of boxes by the right or lower border is not detected, so \
+                 their positions have the same confidence as others, and boxes outside of the image are \
+                 not refused"
                     .to_owned(),
             );
         }
         if self.gnss_error == GnssError::Unknown {
             warnings.push(
                 "gnss_error is unknown: it is estimated from the training samples; \
-                 many fixes at one fixed point tell it better (POST .../gnss-error)"
+                 many fixes at one fixed point give a better estimate (POST .../gnss-error)"
                     .to_owned(),
             );
         }
@@ -97,24 +97,24 @@ impl NewCamera {
     }
 }
 
-/// Changes to a profile; `None` leaves a field as it is.
+/// A partial update of a profile; `None` keeps a field.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct CameraChange {
     /// New name.
     pub display_name: Option<String>,
-    /// New image size; `Some(None)` forgets it.
+    /// New image size; `Some(None)` removes it.
     pub image_size: Option<Option<ImageSize>>,
     /// New receiver error.
     pub gnss_error: Option<GnssError>,
-    /// New recipe, for runs to come.
+    /// New recipe, for future runs.
     pub recipe: Option<Recipe>,
     /// New classes.
     pub target_classes: Option<Vec<TargetClass>>,
-    /// New labels, all of them.
+    /// New labels; they replace all.
     pub labels: Option<BTreeMap<String, String>>,
-    /// New receivers, all of them.
+    /// New receivers; they replace all.
     pub receivers: Option<Receivers>,
-    /// Whether to train anew by itself.
+    /// Whether to retrain automatically.
     pub retrain_when_moved: Option<bool>,
 }
 
@@ -142,15 +142,15 @@ impl CameraChange {
 /// A stored camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
-    /// What the operator said.
+    /// The profile.
     pub profile: NewCamera,
-    /// Counts the changes of the profile.
+    /// Revision of the profile.
     pub revision: Revision,
-    /// When it was made.
+    /// Time of creation.
     pub created_at: Timestamp,
-    /// When the profile was changed last.
+    /// Time of the latest change of the profile.
     pub updated_at: Timestamp,
-    /// The model version that answers, if any.
+    /// Number of the active model version, if any.
     pub active_model: Option<u32>,
 }
 
@@ -162,30 +162,30 @@ impl Camera {
     }
 }
 
-/// A camera no longer looks where it looked when its model was trained: its positions have left the
-/// fixes, beyond what the errors of both explain.
+/// An alarm: the camera's pose has changed since its model was trained. Its positions deviate from the
+/// fixes by more than the errors of both explain.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraMoved {
-    /// The model version that no longer fits.
+    /// The model version concerned.
     pub model_version: u32,
-    /// When it began, as well as can be told.
+    /// Estimated onset of the change.
     pub began_at: Timestamp,
-    /// When the evidence was enough.
+    /// When the alarm was raised.
     pub raised_at: Timestamp,
-    /// Mean shift of the regressed positions against the fixes since then, m.
+    /// Mean shift of the regressed positions relative to the fixes since the onset, towards east, m.
     pub shift_east_m: f64,
-    /// The same towards north, m.
+    /// Mean shift towards north, m.
     pub shift_north_m: f64,
-    /// The test's statistic.
+    /// Statistic of the likelihood ratio test.
     pub statistic: f64,
-    /// Targets that bear witness.
+    /// Number of targets compared since the onset.
     pub targets: u32,
 }
 
 impl CameraMoved {
-    /// Error variance per axis, m2, that the move adds to what the model says.
+    /// Error variance per axis that the change adds to that of the model, m2: half the squared shift.
     #[must_use]
-    pub fn added_m2(&self) -> f64 {
+    pub fn change_variance_m2(&self) -> f64 {
         0.5 * (self.shift_east_m.powi(2) + self.shift_north_m.powi(2))
     }
 }

@@ -1,6 +1,6 @@
-//! What can go wrong, in one place and without a transport.
+//! Errors, independent of the transport.
 //!
-//! A [`Refusal`] is the caller's to mend and is written for them; a [`Fault`] is ours, is logged
+//! A [`Refusal`] can be corrected by the caller and is shown to them; a [`Fault`] of the server is logged
 //! once at the boundary and never shown.
 
 use std::error::Error as StdError;
@@ -9,17 +9,17 @@ use std::fmt;
 /// `std::result::Result` with this crate's error.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Every kind of error a caller can meet. `status.rs` gives each its HTTP status, gRPC code and
+/// Every kind of error that a caller can receive. `status.rs` gives each its HTTP status, gRPC code and
 /// problem type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ErrorKind {
     /// A field has a value that cannot be used.
     InvalidArgument,
-    /// The body is not of the announced format.
+    /// The body is not in the declared format.
     MalformedBody,
-    /// The content type is none that the operation reads.
+    /// The operation does not read this content type.
     UnsupportedMediaType,
-    /// None of the accepted content types can be written.
+    /// The operation writes none of the accepted content types.
     NotAcceptable,
     /// Body, batch or message beyond its limit.
     TooLarge,
@@ -31,7 +31,7 @@ pub enum ErrorKind {
     CameraNotFound,
     /// No such training run.
     RunNotFound,
-    /// No such target is followed.
+    /// No track of that target.
     TrackNotFound,
     /// No such evaluation.
     EvaluationNotFound,
@@ -45,12 +45,18 @@ pub enum ErrorKind {
     RevisionRequired,
     /// The camera has no active model yet.
     NoModel,
+    /// The stored model version is damaged or cannot be loaded.
+    ModelUnusable,
     /// The camera has a training run that has not ended.
     RunLive,
     /// The training run has ended already.
     RunEnded,
     /// The evaluation has ended already.
     EvaluationEnded,
+    /// The model version is the active one.
+    ModelActive,
+    /// The disk is full, or as much is stored as the settings allow.
+    InsufficientStorage,
     /// The stored samples cannot support a fit.
     UnusableSamples,
     /// The caller went away or cancelled.
@@ -65,23 +71,23 @@ pub enum ErrorKind {
     Internal,
 }
 
-/// One field at fault: where, and what would be right.
+/// One invalid field.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Violation {
     /// Path of the field, dotted, with indexes in brackets: `observations[3].bounding_box.width_px`.
     pub field: String,
-    /// What is wrong and what would be right.
+    /// What is wrong and what is valid.
     pub message: String,
 }
 
-/// An error that the caller can mend; all of it may be shown.
+/// An error that the caller can correct; all of it may be shown.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refusal {
-    /// The kind, which decides status and type.
+    /// The kind, which determines status and problem type.
     pub kind: ErrorKind,
-    /// A sentence for a person.
+    /// A human-readable sentence.
     pub message: String,
-    /// The fields at fault, if any.
+    /// The invalid fields, if any.
     pub violations: Vec<Violation>,
 }
 
@@ -97,7 +103,7 @@ impl fmt::Display for Refusal {
     }
 }
 
-/// An error of the server; for the log alone.
+/// An error of the server, for the log only.
 #[derive(Debug)]
 pub struct Fault(Box<dyn StdError + Send + Sync>);
 
@@ -116,7 +122,7 @@ impl fmt::Display for Fault {
 /// Refused or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The caller can mend it.
+    /// The caller can correct it.
     #[error("{0}")]
     Refused(Refusal),
     /// The server is at fault.
@@ -130,7 +136,7 @@ impl Error {
         Self::Refused(Refusal { kind, message: message.into(), violations: Vec::new() })
     }
 
-    /// A field whose value cannot be used.
+    /// An invalid field.
     pub fn invalid(field: impl Into<String>, message: impl Into<String>) -> Self {
         Self::field(ErrorKind::InvalidArgument, field, message)
     }
@@ -141,7 +147,7 @@ impl Error {
         Self::Refused(Refusal { kind, message: violation.message.clone(), violations: vec![violation] })
     }
 
-    /// A fault, from what caused it.
+    /// A fault with its cause.
     pub fn fault(cause: impl Into<Box<dyn StdError + Send + Sync>>) -> Self {
         Self::Fault(Fault(cause.into()))
     }
@@ -155,7 +161,7 @@ impl Error {
         }
     }
 
-    /// The same refusal, said of that field.
+    /// The same refusal for another field.
     #[must_use]
     pub fn at(self, field: &str) -> Self {
         match self {

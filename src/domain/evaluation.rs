@@ -1,4 +1,4 @@
-//! Evaluations over stored samples: what is asked for and how far it has come.
+//! Evaluations over stored samples: plan, state and progress.
 
 use jiff::Timestamp;
 use serde::Serialize;
@@ -12,7 +12,7 @@ use super::names::CameraId;
 use super::recipe::Recipe;
 use crate::geo::Position;
 
-/// A stretch of time; an end that is `None` is open.
+/// A half-open range of time; `None` leaves an end open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct TimeRange {
     from: Option<Timestamp>,
@@ -20,7 +20,7 @@ pub struct TimeRange {
 }
 
 impl TimeRange {
-    /// From an instant on, before another.
+    /// The instants from `from` on and before `until`.
     ///
     /// # Errors
     /// Names `until` if it is not later than `from`.
@@ -33,19 +33,25 @@ impl TimeRange {
         }
     }
 
-    /// First instant within.
+    /// First instant within the range.
     #[must_use]
     pub const fn from(self) -> Option<Timestamp> {
         self.from
     }
 
-    /// First instant behind.
+    /// First instant after the range.
     #[must_use]
     pub const fn until(self) -> Option<Timestamp> {
         self.until
     }
 
-    /// Whether an instant lies in both.
+    /// Whether an instant lies within.
+    #[must_use]
+    pub fn contains(self, time: Timestamp) -> bool {
+        self.from.is_none_or(|from| from <= time) && self.until.is_none_or(|until| time < until)
+    }
+
+    /// Whether some instant is in both ranges.
     #[must_use]
     pub fn overlaps(self, other: Self) -> bool {
         let ends_before = |one: Self, next: Self| matches!((one.until, next.from), (Some(until), Some(from)) if until <= from);
@@ -53,73 +59,73 @@ impl TimeRange {
     }
 }
 
-/// Where the target truly was.
+/// Ground truth of an evaluation.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Truth {
-    /// Each row says so; rows that do not are not judged.
+    /// Columns of the rows; rows without truth are not scored.
     Columns,
-    /// It stood there.
+    /// One point.
     Point(Position),
-    /// Somewhere on these lines; the error is the distance to the nearest.
+    /// Polylines; the error is the distance to the nearest.
     Lines(Vec<Vec<Position>>),
 }
 
-/// What an evaluation is asked to do.
+/// The parameters of an evaluation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvaluationPlan {
-    /// The samples to learn from.
+    /// Training samples.
     pub train: TimeRange,
-    /// The samples to be told and judged; none of them is in `train`.
+    /// Test samples; disjoint from `train`.
     pub test: TimeRange,
-    /// What they are held against.
+    /// Ground truth.
     pub truth: Truth,
     /// In the order of the table, each once.
     pub methods: Vec<Method>,
-    /// The recipe that tracks stand on.
+    /// The recipe whose positions tracks use.
     pub recipe: Recipe,
-    /// Every seed from 1 to this.
+    /// Number of seeds, from 1.
     pub seeds: u32,
-    /// Test boxes grow to the upper left by this, px.
+    /// Enlargement of the test boxes to the upper left, px.
     pub box_shift_px: f64,
     /// Standard deviation per axis of the receiver, if known.
     pub gnss_sigma: Option<SigmaM>,
 }
 
-/// How far an evaluation has come.
+/// Progress of an evaluation.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, ToSchema)]
 pub struct EvaluationProgress {
-    /// What is being done: `auto, seed 2, held-out block 2 of 4 12/60`, `track, seed 2`.
+    /// Current phase: `auto, seed 2, held-out block 2 of 4 12/60`, `track, seed 2`.
     pub phase: String,
-    /// Steps done. A step is a recipe's fit, or a method over all test samples, with one seed.
+    /// Completed steps. A step is the fit of a recipe, or a method over all test samples, with one seed.
     pub steps_done: u32,
-    /// Steps to do.
+    /// Total steps.
     pub steps: u32,
-    /// Seconds left by the pace of the steps so far, which differ in length; `None` before there is one.
+    /// Estimated remaining time from the mean duration of the completed steps, s; `None` before the first.
     pub remaining_s: Option<f64>,
 }
 
 /// An evaluation as stored, without its report.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvaluationJob {
-    /// Its id.
+    /// The evaluation's id.
     pub id: EvaluationId,
-    /// Whose samples.
+    /// The camera whose samples are used.
     pub camera_id: CameraId,
-    /// What was asked for.
+    /// The parameters.
     pub plan: EvaluationPlan,
-    /// Where it stands.
+    /// State of the job.
     pub state: JobState,
-    /// How far it has come.
+    /// Progress of the job.
     pub progress: EvaluationProgress,
-    /// How often a worker has taken it up.
+    /// Number of times that a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
-    /// Why it failed.
+    /// The error, if it failed.
     pub outcome: Option<String>,
-    /// When it was asked for.
+    /// Time of creation.
     pub created_at: Timestamp,
-    /// When a worker took it up last.
+    /// Time of the latest claim by a worker.
     pub started_at: Option<Timestamp>,
-    /// When it ended.
+    /// Time of completion.
     pub ended_at: Option<Timestamp>,
 }
 
@@ -135,7 +141,7 @@ mod tests {
     }
 
     proptest! {
-        /// Against the plain meaning: some second lies in both.
+        /// Compared with the definition: some second is in both.
         #[test]
         fn ranges_overlap_if_they_share_an_instant(
             one: (Option<u8>, Option<u8>), other: (Option<u8>, Option<u8>),

@@ -1,4 +1,4 @@
-//! How far a receiver's fixes lie from the truth.
+//! The error of a GNSS receiver.
 
 use super::error::{Error, Result};
 
@@ -17,25 +17,25 @@ impl SigmaM {
         }
     }
 
-    /// Metres.
+    /// The standard deviation, m.
     #[must_use]
     pub const fn metres(self) -> f64 {
         self.0
     }
 
-    /// Variance per axis in m2.
+    /// Variance per axis, m2.
     #[must_use]
     pub fn variance_m2(self) -> f64 {
         self.0 * self.0
     }
 }
 
-/// What the operator knows of a camera's receiver.
+/// The receivers' error in a camera's profile.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum GnssError {
-    /// Standard deviation per axis, from the data sheet or from many fixes at a fixed point.
+    /// Standard deviation per axis, from the data sheet or from many fixes at one fixed point.
     Known(SigmaM),
-    /// To be estimated from the training samples.
+    /// Estimated from the training samples.
     #[default]
     Unknown,
 }

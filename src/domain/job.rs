@@ -1,13 +1,14 @@
-//! Work in the background: training runs and evaluations.
+//! Background jobs: training runs and evaluations.
 
 use std::fmt;
 use std::str::FromStr;
 
+use strum::{IntoStaticStr, VariantArray};
 use uuid::Uuid;
 
 use super::error::{Error, ErrorKind, Result};
 
-/// Id of a job: a UUID of version 7, so that jobs sort by the time they were asked for.
+/// Id of a job: a UUID of version 7, so that jobs sort by their time of creation.
 macro_rules! job_id {
     ($(#[$doc:meta])* $name:ident, $unknown:expr, $refusal:literal) => {
         $(#[$doc])*
@@ -31,50 +32,45 @@ macro_rules! job_id {
 }
 
 job_id!(
-    /// Id of a training run: a UUID of version 7, so that runs sort by the time they were asked for.
+    /// Id of a training run: a UUID of version 7, so that runs sort by their time of creation.
     RunId,
     ErrorKind::RunNotFound,
     "a training run's id is a UUID"
 );
 job_id!(
-    /// Id of an evaluation: a UUID of version 7, so that they sort by the time they were asked for.
+    /// Id of an evaluation: a UUID of version 7, so that evaluations sort by their time of creation.
     EvaluationId,
     ErrorKind::EvaluationNotFound,
     "an evaluation's id is a UUID"
 );
 
-/// Where a job stands. Queued and running jobs are live; the others have ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// State of a job. Queued and running jobs are live; the others have ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case")]
 pub enum JobState {
-    /// Waits for a worker.
+    /// It waits for a worker.
     Queued,
-    /// A worker carries it out.
+    /// Claimed by a worker.
     Running,
-    /// Yielded what it was asked for.
+    /// Completed.
     Succeeded,
-    /// Ended by an error; the outcome says which.
+    /// Ended by an error, which the outcome describes.
     Failed,
-    /// Ended by the operator.
+    /// The operator cancelled it.
     Cancelled,
 }
 
 impl JobState {
-    /// All of them.
-    pub const ALL: [Self; 5] = [Self::Queued, Self::Running, Self::Succeeded, Self::Failed, Self::Cancelled];
+    /// All states.
+    pub const ALL: &'static [Self] = Self::VARIANTS;
 
-    /// The one name used everywhere.
+    /// Name in the database, in wire formats and logs.
     #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Queued => "queued",
-            Self::Running => "running",
-            Self::Succeeded => "succeeded",
-            Self::Failed => "failed",
-            Self::Cancelled => "cancelled",
-        }
+    pub fn as_str(self) -> &'static str {
+        self.into()
     }
 
-    /// Whether the job will change no more.
+    /// Whether the state is final.
     #[must_use]
     pub const fn has_ended(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)

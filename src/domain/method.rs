@@ -1,4 +1,4 @@
-//! The names of the methods that stand side by side.
+//! The estimation methods that an evaluation compares, and their names.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,21 +6,21 @@ use std::str::FromStr;
 use super::error::{Error, Result};
 use super::recipe::Recipe;
 
-/// How a recipe's model is asked.
+/// How a recipe's model is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Step {
+pub enum InferenceMode {
     /// The regressed position.
     OneStep,
     /// The regressed position and the fix, weighted by (6) to (8).
     TwoStep,
-    /// The box alone.
+    /// The regressed position from the box alone (GNSS denied).
     Denied,
 }
 
-/// A way to tell a position.
+/// A method of position estimation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Method {
-    /// The fix as it comes.
+    /// The raw fix.
     Gnss,
     /// The IMM-UKF over fixes.
     ImmUkf,
@@ -31,29 +31,32 @@ pub enum Method {
     /// The robust homography of the foot point.
     HomographyDenied,
     /// A recipe's model.
-    Recipe(Recipe, Step),
+    Recipe(Recipe, InferenceMode),
     /// Sequence fusion over the default recipe.
     Track,
-    /// The same without any fix.
+    /// Sequence fusion without fixes.
     TrackDenied,
 }
 
 impl Method {
-    /// All of them, in the order of the table.
+    /// All methods, in the order of the table.
     #[must_use]
     pub fn all() -> Vec<Self> {
         let mut all = vec![Self::Gnss, Self::ImmUkf, Self::Dnn, Self::DnnDenied, Self::HomographyDenied];
-        for recipe in Recipe::ALL {
-            all.extend([Step::OneStep, Step::TwoStep, Step::Denied].map(|step| Self::Recipe(recipe, step)));
+        for &recipe in Recipe::ALL {
+            all.extend(
+                [InferenceMode::OneStep, InferenceMode::TwoStep, InferenceMode::Denied]
+                    .map(|mode| Self::Recipe(recipe, mode)),
+            );
         }
         all.extend([Self::Track, Self::TrackDenied]);
         all
     }
 
-    /// Methods from names with commas between; `all` is all.
+    /// Methods from a comma-separated list of names, or `all`.
     ///
     /// # Errors
-    /// Names `methods` for a name that is none.
+    /// Names `methods` for an unknown name.
     pub fn list(text: &str) -> Result<Vec<Self>> {
         if text == "all" {
             return Ok(Self::all());
@@ -61,7 +64,7 @@ impl Method {
         text.split(',').map(|name| name.trim().parse()).collect()
     }
 
-    /// The recipe whose model it asks; `default` is that of the tracks.
+    /// The recipe whose model it uses; `default` is that of the tracks.
     #[must_use]
     pub const fn recipe(self, default: Recipe) -> Option<Recipe> {
         match self {
@@ -82,13 +85,13 @@ impl fmt::Display for Method {
             Self::HomographyDenied => out.pad("homography.denied"),
             Self::Track => out.pad("track"),
             Self::TrackDenied => out.pad("track.denied"),
-            Self::Recipe(recipe, step) => {
-                let step = match step {
-                    Step::OneStep => "one_step",
-                    Step::TwoStep => "two_step",
-                    Step::Denied => "denied",
+            Self::Recipe(recipe, mode) => {
+                let mode = match mode {
+                    InferenceMode::OneStep => "one_step",
+                    InferenceMode::TwoStep => "two_step",
+                    InferenceMode::Denied => "denied",
                 };
-                out.pad(&format!("{recipe}.{step}"))
+                out.pad(&format!("{recipe}.{mode}"))
             }
         }
     }
@@ -100,7 +103,7 @@ impl FromStr for Method {
     fn from_str(name: &str) -> Result<Self> {
         Self::all().into_iter().find(|method| method.to_string() == name).ok_or_else(|| {
             let names: Vec<String> = Self::all().iter().map(Self::to_string).collect();
-            Error::invalid("methods", format!("{name:?} is none of all, {}", names.join(", ")))
+            Error::invalid("methods", format!("{name:?} is not one of all, {}", names.join(", ")))
         })
     }
 }
@@ -110,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_name_is_read_back() {
+    fn every_name_is_parsed() {
         let all = Method::all();
         assert_eq!(all.len(), 19);
         for method in &all {
@@ -118,7 +121,7 @@ mod tests {
         }
         assert_eq!(Method::list("all").expect("all"), all);
         let two = Method::list("gnss, auto.denied").expect("two");
-        assert_eq!(two, [Method::Gnss, Method::Recipe(Recipe::Auto, Step::Denied)]);
+        assert_eq!(two, [Method::Gnss, Method::Recipe(Recipe::Auto, InferenceMode::Denied)]);
         assert!(Method::list("gnss,guess").is_err());
     }
 }

@@ -1,38 +1,46 @@
-//! The values sightfix speaks of, valid by construction.
+//! Domain values, valid by construction.
 //!
-//! Every check on a number lives in a constructor here or in [`crate::geo`]; the floors above take
-//! these values as they are and check nothing again. What never happens here: I/O, clocks,
+//! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
+//! it and do not check again. What never happens here: I/O, clocks,
 //! randomness, wire formats, status codes.
 
 mod bounding_box;
 mod camera;
+mod checksum;
+mod durability;
 mod error;
 mod evaluation;
 mod gnss_error;
 mod job;
 mod method;
 mod names;
+mod noise;
 mod observation;
 mod receiver;
 mod recipe;
 mod sample;
+mod score;
 mod time;
 mod training;
 
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraMoved, NewCamera, Revision};
+pub use checksum::model_sha256;
+pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};
-pub use method::{Method, Step};
+pub use method::{InferenceMode, Method};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
+pub use noise::GaussMarkovNoise;
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
-pub use sample::{Sample, Score};
+pub use sample::Sample;
+pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{
-    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, ModelMetadata, ModelVersion,
-    OriginDeg, RunProgress, TrainingOptions, TrainingRun,
+    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, HeldOutSampleError,
+    ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingRun,
 };

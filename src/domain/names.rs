@@ -1,4 +1,4 @@
-//! Names that operators and detectors choose.
+//! Names chosen by operators, detectors and receivers.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use super::error::{Error, Result};
 
-/// Longest id of a target and longest class name, in bytes.
-const LONGEST_NAME: usize = 128;
+/// Largest length of a name, bytes.
+const MAX_NAME_BYTES: usize = 128;
 
 /// Id of a camera: a slug of 1 to 63 of `a-z0-9-`, beginning and ending with a letter or digit.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -36,14 +36,14 @@ impl CameraId {
     }
 }
 
-/// A camera id can be looked up by its text in a map.
+/// Lets maps keyed by camera ids be queried with text.
 impl std::borrow::Borrow<str> for CameraId {
     fn borrow(&self) -> &str {
         &self.0
     }
 }
 
-/// Text that names something: printable, trimmed, of 1 to 128 bytes.
+/// A newtype for printable, trimmed text of 1 to 128 bytes.
 macro_rules! name {
     ($(#[$doc:meta])* $name:ident, $field:literal) => {
         $(#[$doc])*
@@ -52,9 +52,9 @@ macro_rules! name {
 
         impl $name {
             /// # Errors
-            /// Refuses text that is empty, longer than 128 bytes, padded, or holds control characters.
+            /// Refuses text that is empty, longer than 128 bytes, padded, or contains control characters.
             pub fn new(text: &str) -> Result<Self> {
-                check_text($field, text, LONGEST_NAME)?;
+                check_text($field, text, MAX_NAME_BYTES)?;
                 Ok(Self(text.into()))
             }
 
@@ -89,7 +89,7 @@ name!(
     "class"
 );
 
-/// A receiver of which nothing is said carries its own id as target id.
+/// A receiver that is not mapped to a target has its own id as target id.
 impl From<ReceiverId> for TargetId {
     fn from(receiver_id: ReceiverId) -> Self {
         Self(receiver_id.0)
@@ -105,26 +105,26 @@ impl fmt::Display for CameraId {
 /// Checks free text for a field.
 ///
 /// # Errors
-/// Names the field if the text is empty, longer than `longest` bytes, padded with white space, or
-/// holds control characters.
-pub fn check_text(field: &str, text: &str, longest: usize) -> Result<()> {
-    let fits = !text.is_empty() && text.len() <= longest;
+/// Names the field if the text is empty, longer than `max_bytes`, padded with white space, or
+/// contains control characters.
+pub fn check_text(field: &str, text: &str, max_bytes: usize) -> Result<()> {
+    let fits = !text.is_empty() && text.len() <= max_bytes;
     if fits && text.trim() == text && !text.chars().any(char::is_control) {
         Ok(())
     } else {
         Err(Error::invalid(
             field,
             format!(
-                "must be text of 1 to {longest} bytes without control characters or white space around it"
+                "must be text of 1 to {max_bytes} bytes without control characters or white space around it"
             ),
         ))
     }
 }
 
-/// Checks free-form labels: at most 64, keys to 63 bytes, values to 255.
+/// Checks free-form labels: at most 64, keys of at most 63 bytes, values of at most 255.
 ///
 /// # Errors
-/// Names the label at fault under `labels`.
+/// Names the invalid label under `labels`.
 pub fn check_labels(labels: &BTreeMap<String, String>) -> Result<()> {
     if labels.len() > 64 {
         return Err(Error::invalid("labels", "must be at most 64"));

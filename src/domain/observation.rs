@@ -1,73 +1,74 @@
-//! What is seen and received at one instant, and what is made of it.
+//! Detections, fixes, observations and fused positions.
 
 use jiff::Timestamp;
+use strum::IntoStaticStr;
 
 use super::bounding_box::BoundingBox;
 use super::error::{Error, Result};
 use super::gnss_error::SigmaM;
 use super::names::{ReceiverId, TargetClass, TargetId};
-use super::sample::Score;
+use super::score::Score;
 use crate::geo::Position;
 
 /// A GNSS position; its time is that of the [`Observation`] or [`super::Sample`] that holds it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fix {
-    /// Where the receiver says it is.
+    /// Measured position.
     pub position: Position,
-    /// The receiver's own word on its standard deviation per axis, if it gave one.
+    /// Standard deviation per axis as reported by the receiver, if any.
     pub sigma_m: Option<SigmaM>,
 }
 
-/// A box with its time and target.
+/// A bounding box with its time and target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Detection {
-    /// When the frame was taken.
+    /// Time of the frame.
     pub time: Timestamp,
-    /// Who is in the box.
+    /// The detected target.
     pub target_id: TargetId,
-    /// Where in the image.
+    /// The box in the image.
     pub bounding_box: BoundingBox,
-    /// What the detector takes the target for.
+    /// Class reported by the detector.
     pub class: Option<TargetClass>,
-    /// How sure the detector is.
+    /// Confidence score of the detector.
     pub score: Option<Score>,
 }
 
-/// A box, a fix, or both, as a device sent it.
+/// A box, a fix, or both, as sent by a device.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LiveItem {
-    /// When, by the clock of whoever measured.
+    /// Time by the clock of the device.
     pub time: Timestamp,
-    /// Who, if known.
+    /// The target, if known.
     pub target_id: Option<TargetId>,
-    /// Which receiver measured the fix, for a fix that does not name its target.
+    /// The receiver of a fix that does not name its target.
     pub receiver_id: Option<ReceiverId>,
-    /// What the camera saw.
+    /// The detection.
     pub bounding_box: Option<BoundingBox>,
-    /// What the receiver said.
+    /// The fix.
     pub fix: Option<Fix>,
-    /// What the detector takes the target for.
+    /// Class reported by the detector.
     pub class: Option<TargetClass>,
-    /// How sure the detector is.
+    /// Confidence score of the detector.
     pub score: Option<Score>,
 }
 
 /// A box, a fix, or both, of one target at one instant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// When.
+    /// Time of the measurement.
     pub time: Timestamp,
-    /// Who, if known.
+    /// The target, if known.
     pub target_id: Option<TargetId>,
-    /// What the camera saw.
+    /// The detection.
     pub bounding_box: Option<BoundingBox>,
-    /// What the receiver said.
+    /// The fix.
     pub fix: Option<Fix>,
 }
 
 impl Observation {
     /// # Errors
-    /// An observation of neither box nor fix; the field is named `bounding_box`.
+    /// Refuses an observation with neither box nor fix; the field is `bounding_box`.
     pub fn new(
         time: Timestamp,
         target_id: Option<TargetId>,
@@ -81,35 +82,29 @@ impl Observation {
     }
 }
 
-/// What a caller should know about a [`FusedFix`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// A warning about a [`FusedFix`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
 pub enum Flag {
-    /// No fix: the position comes from the box alone.
+    /// No fix: the position is regressed from the box alone.
     GnssDenied,
-    /// No box: the fix passes through.
+    /// No box: the position is the fix.
     BoxMissing,
-    /// The image's border cuts the box, so foot point and height are not the target's.
+    /// The image border truncates the box, so foot point and height are not the target's.
     BoxAtBorder,
-    /// The box is unlike those of the training samples.
+    /// The box is outside of the domain of the training samples.
     OutsideTraining,
-    /// The camera has no model; only fixes can pass.
+    /// The camera has no model; only fixes are passed through.
     NoModel,
-    /// The camera no longer looks where it looked when its model was trained.
+    /// The camera's pose has changed since its model was trained.
     CameraMoved,
 }
 
 impl Flag {
-    /// The one name used everywhere.
+    /// Name in files and wire formats.
     #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::GnssDenied => "gnss_denied",
-            Self::BoxMissing => "box_missing",
-            Self::BoxAtBorder => "box_at_border",
-            Self::OutsideTraining => "outside_training",
-            Self::NoModel => "no_model",
-            Self::CameraMoved => "camera_moved",
-        }
+    pub fn as_str(self) -> &'static str {
+        self.into()
     }
 }
 
@@ -122,31 +117,31 @@ pub struct Confidences {
     pub gnss: f64,
 }
 
-/// The answer for one [`Observation`].
+/// The fused position of one [`Observation`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct FusedFix {
-    /// The observation's time.
+    /// Time of the observation.
     pub time: Timestamp,
-    /// The observation's target.
+    /// Target of the observation.
     pub target_id: Option<TargetId>,
-    /// The two-step position (8); the regressed one without a fix, the fix without a box.
+    /// The two-step position (8); the regressed position without a fix, the fix without a box.
     pub fused: Position,
-    /// The one-step position, if there was a box.
+    /// The one-step position, if there is a box.
     pub regressed: Option<Position>,
-    /// The fix as it came.
+    /// The fix of the observation.
     pub gnss: Option<Fix>,
-    /// Weights of the two.
+    /// Weights of both.
     pub confidences: Confidences,
     /// Error variance per axis of the regressed position, m2.
     pub e_regression_m2: Option<f64>,
     /// Error variance per axis of the fix, m2.
     pub e_gnss_m2: Option<f64>,
-    /// Radius about `fused` that holds the truth with 95 % probability, m.
+    /// Radius about `fused` that contains the true position with 95 % probability, m.
     pub r95_m: f64,
-    /// eX of (1): how badly the auto-encoder rebuilds its input (in the recipe's units).
+    /// eX of (1): the auto-encoder's reconstruction error, in the recipe's units.
     pub reconstruction_error: Option<f64>,
-    /// Number of the model version that spoke.
+    /// Number of the model version used.
     pub model_version: Option<u32>,
-    /// What to know about it.
+    /// Warnings.
     pub flags: Vec<Flag>,
 }

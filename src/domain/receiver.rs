@@ -1,4 +1,4 @@
-//! The GNSS receivers that targets carry: whose each is, and how far its clock is off.
+//! GNSS receivers: the targets that carry them, and their clock offsets.
 
 use std::collections::BTreeMap;
 
@@ -8,49 +8,49 @@ use super::error::{Error, Result};
 use super::names::{ReceiverId, TargetId};
 use super::observation::Fix;
 
-/// What has to be added to a receiver's time to get the camera's: at most a day, to the microsecond.
+/// The offset added to a receiver's time to get the camera's time: at most a day, to the microsecond.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
 pub struct ClockOffset(SignedDuration);
 
 impl ClockOffset {
-    /// A day covers a receiver that writes local time as if it were UTC; more is a wrong date.
-    const LARGEST_US: i64 = 86_400_000_000;
-    /// Clocks agree.
+    /// A day covers a receiver that reports local time as UTC; more is a wrong date.
+    const MAX_US: i64 = 86_400_000_000;
+    /// No offset.
     pub const ZERO: Self = Self(SignedDuration::ZERO);
 
-    /// Rounds to the microsecond, which is what is stored.
+    /// Rounds to the microsecond, the resolution of stored offsets.
     ///
     /// # Errors
     /// Refuses what is not finite or beyond a day; the field is named `clock_offset_s`.
     pub fn from_seconds(seconds: f64) -> Result<Self> {
-        // What is not finite becomes 0 or the largest number, so it is looked at by itself.
+        // The cast would turn NaN into 0.
         if seconds.is_finite() { Self::from_microseconds((seconds * 1e6).round() as i64) } else { refused() }
     }
 
     /// # Errors
     /// Refuses what is beyond a day; the field is named `clock_offset_s`.
     pub fn from_microseconds(microseconds: i64) -> Result<Self> {
-        if (-Self::LARGEST_US..=Self::LARGEST_US).contains(&microseconds) {
+        if (-Self::MAX_US..=Self::MAX_US).contains(&microseconds) {
             Ok(Self(SignedDuration::from_micros(microseconds)))
         } else {
             refused()
         }
     }
 
-    /// Seconds.
+    /// The offset, s.
     #[must_use]
     pub fn seconds(self) -> f64 {
         self.microseconds() as f64 / 1e6
     }
 
-    /// Microseconds.
+    /// The offset, us.
     #[must_use]
     pub fn microseconds(self) -> i64 {
         // Within a day, so it fits.
         self.0.as_micros() as i64
     }
 
-    /// The camera's time of a receiver's.
+    /// The camera's time for a receiver's time.
     #[must_use]
     pub fn applied_to(self, time: Timestamp) -> Timestamp {
         time.saturating_add(self.0).unwrap_or(time)
@@ -61,62 +61,62 @@ fn refused<T>() -> Result<T> {
     Err(Error::invalid("clock_offset_s", "must be a number of seconds from -86400 to 86400"))
 }
 
-/// A fix as a receiver sent it, by the receiver's own clock.
+/// A fix as sent by a receiver, with the receiver's own time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReceivedFix {
-    /// When, by the receiver's clock.
+    /// Time by the receiver's clock.
     pub time: Timestamp,
-    /// Which receiver; a fix that names none belongs to nobody.
+    /// The receiver; a fix without one cannot be assigned to a target.
     pub receiver_id: Option<ReceiverId>,
-    /// Where it says it is.
+    /// The fix.
     pub fix: Fix,
 }
 
-/// Whose a receiver is.
+/// A receiver and the target that carries it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Receiver {
-    /// The receiver.
+    /// Id of the receiver.
     pub receiver_id: ReceiverId,
     /// The target that carries it.
     pub target_id: TargetId,
-    /// Its clock against the camera's.
+    /// Offset of its clock.
     pub clock_offset: ClockOffset,
 }
 
 impl Receiver {
-    /// A receiver of which nothing is said: its id is the target's, and its clock is right.
+    /// A receiver with defaults: its id is also the target id, and its clock has no offset.
     #[must_use]
     pub fn named(receiver_id: ReceiverId) -> Self {
         Self { target_id: TargetId::from(receiver_id.clone()), receiver_id, clock_offset: ClockOffset::ZERO }
     }
 }
 
-/// The receivers of a camera, each named once, in the order of their ids.
+/// The receivers of a camera, each once, ordered by id.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Receivers(BTreeMap<ReceiverId, Receiver>);
 
 impl Receivers {
-    /// Receivers that a camera may have.
-    pub const MOST: usize = 1_024;
+    /// Largest number of receivers of a camera.
+    pub const MAX: usize = 1_024;
 
     /// # Errors
-    /// Refuses more than [`Receivers::MOST`] and a receiver that stands twice; fields are named
-    /// below `receivers`.
+    /// Refuses more than [`Receivers::MAX`] and a duplicate receiver; fields are named below
+    /// `receivers`.
     pub fn new(receivers: impl IntoIterator<Item = Receiver>) -> Result<Self> {
         let mut named = BTreeMap::new();
         for (index, receiver) in receivers.into_iter().enumerate() {
-            if index == Self::MOST {
-                return Err(Error::invalid("receivers", format!("must be at most {}", Self::MOST)));
+            if index == Self::MAX {
+                return Err(Error::invalid("receivers", format!("must be at most {}", Self::MAX)));
             }
             if named.insert(receiver.receiver_id.clone(), receiver).is_some() {
                 let field = format!("receivers[{index}].receiver_id");
-                return Err(Error::invalid(field, "stands twice; name each receiver once"));
+                return Err(Error::invalid(field, "is a duplicate; name each receiver once"));
             }
         }
         Ok(Self(named))
     }
 
-    /// By receiver id.
+    /// In the order of receiver ids.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = &Receiver> {
         self.0.values()
     }
@@ -127,20 +127,20 @@ impl Receivers {
         self.0.is_empty()
     }
 
-    /// What is said of a receiver.
+    /// The receiver with that id.
     #[must_use]
     pub fn get(&self, receiver_id: &ReceiverId) -> Option<&Receiver> {
         self.0.get(receiver_id)
     }
 
-    /// The receiver, if there is but one.
+    /// The receiver, if there is exactly one.
     #[must_use]
     pub fn only(&self) -> Option<&Receiver> {
         self.0.values().next().filter(|_| self.0.len() == 1)
     }
 
-    /// Target and camera time of what a receiver sent at a time of its own clock. A receiver that
-    /// is not named here carries its own id as target id.
+    /// Target and camera time of a fix that a receiver sent at a time of its own clock. An unknown
+    /// receiver has its own id as target id and no offset.
     #[must_use]
     pub fn resolve(&self, receiver_id: &ReceiverId, time: Timestamp) -> (TargetId, Timestamp) {
         match self.0.get(receiver_id) {
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn an_offset_is_bounded_and_comes_back_as_it_was_given() {
+    fn an_offset_is_bounded_and_exact() {
         for seconds in [0.0, -18.0, 0.1, 1.000_001, 86_400.0, -86_400.0, 3.3, -0.7] {
             let offset = ClockOffset::from_seconds(seconds).expect("within a day");
             assert_eq!(offset.seconds().to_bits(), seconds.to_bits(), "{seconds}");
@@ -173,12 +173,12 @@ mod tests {
     }
 
     #[test]
-    fn receivers_are_named_once_and_not_too_many() {
-        let twice = Receivers::new([receiver("b"), receiver("a"), receiver("b")]).expect_err("doubled");
+    fn receivers_are_unique_and_limited() {
+        let twice = Receivers::new([receiver("b"), receiver("a"), receiver("b")]).expect_err("duplicate");
         assert!(twice.to_string().starts_with("receivers[2].receiver_id"), "{twice}");
         let many = |count: usize| Receivers::new((0..count).map(|n| receiver(&n.to_string())));
-        assert!(many(Receivers::MOST).is_ok());
-        assert!(many(Receivers::MOST + 1).expect_err("too many").to_string().starts_with("receivers"));
+        assert!(many(Receivers::MAX).is_ok());
+        assert!(many(Receivers::MAX + 1).expect_err("too many").to_string().starts_with("receivers"));
         let two = Receivers::new([receiver("b"), receiver("a")]).expect("good");
         assert_eq!(two.iter().map(|it| it.receiver_id.as_str()).collect::<Vec<_>>(), ["a", "b"]);
         assert_eq!((two.only(), two.is_empty()), (None, false));
@@ -200,6 +200,6 @@ mod tests {
         let (target_id, at) = resolve("other");
         assert_eq!((target_id.as_str(), at), ("other", time));
         let early = ClockOffset::from_seconds(-60.0).expect("small").applied_to(Timestamp::MIN);
-        assert_eq!(early, Timestamp::MIN, "an instant cannot leave the calendar");
+        assert_eq!(early, Timestamp::MIN, "saturates at the end of the calendar");
     }
 }

@@ -1,12 +1,11 @@
-//! Instants that a sample or observation may have.
+//! Valid times of samples and observations, and their text format.
 
 use jiff::{SignedDuration, Timestamp};
 
 use super::error::{Error, Result};
 
-/// What instants are believable, given what time it is.
-///
-/// From 1980-01-06, the first day of GPS time, to one day ahead of the server's clock.
+/// The range of valid times: from 1980-01-06, the start of GPS time, to one day ahead of the current
+/// time.
 #[derive(Debug, Clone, Copy)]
 pub struct TimeBounds {
     latest: Timestamp,
@@ -16,14 +15,14 @@ impl TimeBounds {
     /// The start of GPS time, 1980-01-06T00:00:00Z, in seconds since 1970.
     const EARLIEST_S: i64 = 315_964_800;
 
-    /// The bounds as seen from now.
+    /// The bounds at a current time.
     #[must_use]
     pub fn at(now: Timestamp) -> Self {
         let latest = now.saturating_add(SignedDuration::from_hours(24)).unwrap_or(Timestamp::MAX);
         Self { latest }
     }
 
-    /// The same instant to the microsecond, which is what is stored, if it is believable.
+    /// The same instant truncated to the microsecond, the resolution of stored times, if it is valid.
     ///
     /// # Errors
     /// Names the field `time` for an instant before GPS time or more than a day ahead.
@@ -38,10 +37,10 @@ impl TimeBounds {
     }
 }
 
-/// An instant from RFC 3339 text with a zone: `2020-12-14T14:41:48+08:00`.
+/// Parses RFC 3339 text with an offset: `2020-12-14T14:41:48+08:00`.
 ///
 /// # Errors
-/// Names the field `time` for text that is not such an instant, or lacks its offset.
+/// Names the field `time` for text that is not such an instant or has no offset.
 pub fn parse_time(text: &str) -> Result<Timestamp> {
     text.parse().map_err(|_| {
         Error::invalid(

@@ -1,36 +1,36 @@
-//! Training runs and the model versions they yield.
+//! Training runs and the model versions they produce.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::job::{JobState, RunId};
-use super::names::CameraId;
+use super::names::{CameraId, TargetId};
 use super::recipe::Recipe;
 
-/// What a run is asked to do.
+/// The parameters of a training run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TrainingOptions {
-    /// How to learn the camera.
+    /// Recipe to train.
     pub recipe: Recipe,
-    /// Everything random in the run comes from it.
+    /// Seed of all randomness in the run.
     pub seed: u64,
-    /// Passes over the samples, from 1; `None` for the recipe's own number.
+    /// Number of epochs, from 1; `None` for the recipe's default.
     pub epochs: Option<u32>,
-    /// Only samples from this instant on.
+    /// Use only samples from this instant on.
     pub from: Option<Timestamp>,
-    /// Only samples before this instant.
+    /// Use only samples before this instant.
     pub until: Option<Timestamp>,
 }
 
-/// How far a fit has come.
+/// Progress of a fit.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct RunProgress {
-    /// What is being done: `held-out block 2 of 4`, `final fit`.
+    /// Current phase: `held-out block 2 of 4`, `final fit`.
     pub phase: String,
-    /// Passes done, over all phases.
+    /// Completed epochs, over all phases.
     pub epoch: u32,
-    /// Passes to do, over all phases.
+    /// Total epochs, over all phases.
     pub epochs: u32,
     /// eX of (2) in the latest epoch.
     pub reconstruction_error: f64,
@@ -38,11 +38,11 @@ pub struct RunProgress {
     pub regression_error: f64,
     /// Es of (4) so far.
     pub error_scale: f64,
-    /// Seconds left by the pace so far; `None` before there is one.
+    /// Estimated remaining time, s; `None` before the first epoch.
     pub remaining_s: Option<f64>,
 }
 
-/// One point of a run's curve: one epoch of the final fit.
+/// One point of a run's learning curve: one epoch of the final fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct EpochReport {
     /// From 1.
@@ -62,102 +62,113 @@ pub struct EpochReport {
 pub struct TrainingRun {
     /// The run's id.
     pub id: RunId,
-    /// Whose model is fitted.
+    /// The camera to train.
     pub camera_id: CameraId,
-    /// What was asked for.
+    /// The parameters.
     pub options: TrainingOptions,
-    /// Where it stands.
+    /// State of the job.
     pub state: JobState,
-    /// How far it has come.
+    /// Progress of the fit.
     pub progress: RunProgress,
-    /// How often a worker has taken it up.
+    /// Number of times that a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
-    /// The version it yielded.
+    /// The model version it produced.
     pub model_version: Option<u32>,
-    /// Whether that version became active, and why or why not, or why the run failed.
+    /// Whether that version was activated and why, or why the run failed.
     pub outcome: Option<String>,
-    /// When it was asked for.
+    /// Time of creation.
     pub created_at: Timestamp,
-    /// When a worker took it up last.
+    /// Time of the latest claim by a worker.
     pub started_at: Option<Timestamp>,
-    /// When it ended.
+    /// Time of completion.
     pub ended_at: Option<Timestamp>,
 }
 
-/// How well a fit foretold blocks of time that it had not seen.
+/// Prediction error on blocks of time that were held out of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct HeldOutError {
-    /// Blocks of time that were held out in turn.
+    /// Number of blocks of time that were held out in turn.
     pub blocks: u32,
-    /// Samples in them.
+    /// Samples in those blocks.
     pub samples: u32,
     /// Mean horizontal distance in m from the regressed position to the (noisy) fix.
     pub mean_to_fix_m: f64,
     /// Mean square per axis of that distance, m2.
     pub error_to_fix_m2: f64,
-    /// The same less the receiver's own variance, floored: the regression's own error, m2.
+    /// That less the receiver's variance, bounded below: the regression's own error variance, m2.
     pub e_regression_m2: f64,
-    /// Share of the fixes inside the radius that regression and receiver together foretell for 95 %.
+    /// Share of the fixes inside the 95 % radius predicted for regression and receiver together.
     pub coverage95_of_fixes: f64,
 }
 
-/// One input of the network: what is subtracted, then what it is multiplied by.
+/// The error of a held-out sample: predicted by a fit that had not seen its block of time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HeldOutSampleError {
+    /// The sample's time.
+    pub time: Timestamp,
+    /// The sample's target.
+    pub target_id: TargetId,
+    /// Distance from the predicted position to the sample's fix, m.
+    pub distance_m: f64,
+}
+
+/// Scaling of one input of the network: `(value - offset) * factor`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FeatureScale {
     /// `left_px`, `top_px`, `width_px`, `height_px`, `east_m`, ...
     pub feature: String,
-    /// Subtracted first.
+    /// Subtracted from the value.
     pub offset: f64,
-    /// Multiplied then.
+    /// Multiplies the difference.
     pub factor: f64,
 }
 
 /// A position in the metadata document.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct OriginDeg {
-    /// Degrees east.
+    /// Longitude, degrees east.
     pub longitude_deg: f64,
-    /// Degrees north.
+    /// Latitude, degrees north.
     pub latitude_deg: f64,
 }
 
-/// Where the receiver's error came from.
+/// Source of the receiver's error variance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum GnssErrorSource {
-    /// The camera's profile, or the fixes themselves.
+    /// The camera's profile, or the sigma of the fixes.
     Profile,
     /// Estimated from the training samples.
     Estimated,
 }
 
-/// A recipe that was tried, and its held-out error.
+/// A candidate of the model selection, and its held-out error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CandidateReport {
-    /// The recipe or its variant.
+    /// Name of the candidate.
     pub candidate: String,
     /// Its error on the held-out blocks.
     pub held_out: HeldOutError,
 }
 
-/// All that a model version says of itself beside its weights. This is a document format: it is
-/// stored, downloaded and imported as JSON.
+/// Metadata of a model version: all but its weights. This is a document format: it is stored,
+/// downloaded and imported as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ModelMetadata {
     /// Version of this document, now 1.
     pub format: u32,
-    /// The recipe that was asked for.
+    /// The requested recipe.
     pub requested_recipe: String,
     /// The recipe that was fitted.
     pub recipe: String,
-    /// Inputs of the encoder in their order, with their scaling.
+    /// Inputs of the encoder in order, with their scaling.
     pub features: Vec<FeatureScale>,
     /// Origin of the local plane, or of the standardised degrees.
     pub origin: OriginDeg,
     /// Seed of the run.
     pub seed: u64,
-    /// Passes of the final fit.
+    /// Epochs of the final fit.
     pub epochs: u32,
     /// SHA-256 of the training rows in their order, hexadecimal.
     pub training_rows_sha256: String,
@@ -165,35 +176,35 @@ pub struct ModelMetadata {
     pub samples: u32,
     /// Targets among them.
     pub targets: u32,
-    /// Passes (stretches of time without a hole) among them.
+    /// Traverses (gap-free sequences of one target) among them.
     pub passes: u32,
     /// Es of (4), or its robust form.
     pub error_scale: f64,
     /// The receiver's error variance per axis, m2.
     pub e_gnss_m2: f64,
-    /// Where that came from.
+    /// Source of that variance.
     pub e_gnss_source: GnssErrorSource,
-    /// Error on held-out blocks of time; `None` where the samples make too few blocks.
+    /// Error on held-out blocks of time; `None` if the samples form too few blocks.
     pub held_out: Option<HeldOutError>,
-    /// What was tried beside it.
+    /// The candidates of the model selection.
     pub candidates: Vec<CandidateReport>,
-    /// Names and values of the recipe's own scalars (noise floors, calibration factors).
+    /// Names and values of the recipe's scalar parameters (noise floors, calibration factors).
     pub parameters: std::collections::BTreeMap<String, f64>,
 }
 
 /// An immutable model of one camera, without its weights.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelVersion {
-    /// Whose.
+    /// The camera.
     pub camera_id: CameraId,
-    /// Counts from 1 per camera.
+    /// Version number, from 1 per camera.
     pub number: u32,
-    /// The run that yielded it; `None` if it was imported.
+    /// The run that produced it; `None` if it was imported.
     pub run_id: Option<RunId>,
-    /// When it was stored.
+    /// Time of storage.
     pub created_at: Timestamp,
-    /// Size of the weights in bytes.
+    /// Size of the weights, bytes.
     pub weights_bytes: u64,
-    /// What it says of itself.
+    /// The metadata.
     pub metadata: ModelMetadata,
 }

@@ -1,22 +1,22 @@
-//! What is said of a method's errors.
+//! Error figures of a method.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 use utoipa::ToSchema;
 
-/// Radii (m) whose share of errors is reported.
+/// Error bounds, m: the report gives the share of errors within each.
 pub const BOUNDS_M: [f64; 8] = [0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0];
-/// Radius that holds half of an isotropic normal plane, in radii that hold 95 %:
+/// Ratio of the 50 % radius to the 95 % radius of an isotropic normal distribution in the plane:
 /// sqrt(ln 0.5 / ln 0.05).
 const R50_PER_R95: f64 = 0.481_015_8;
 
-/// One judged answer.
+/// A prediction's error against the truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Judged {
+pub struct ScoredPrediction {
     /// Horizontal error, m.
     pub error_m: f64,
-    /// The radius that the method states for 95 %, m, if it states one.
+    /// The 95 % radius that the method states, m, if it states one.
     pub r95_m: Option<f64>,
 }
 
@@ -28,7 +28,7 @@ pub struct Metrics {
     pub mean_m: f64,
     /// Median.
     pub median_m: f64,
-    /// 95 % of errors are below.
+    /// 95th percentile.
     pub p95_m: f64,
     /// Largest.
     pub max_m: f64,
@@ -42,16 +42,16 @@ pub struct Metrics {
     pub coverage50: Option<f64>,
     /// The same of the 95 % radius.
     pub coverage95: Option<f64>,
-    /// Judged answers.
+    /// Number of scored predictions.
     pub n: usize,
 }
 
 impl Metrics {
-    /// Figures of these answers; `None` of none.
+    /// Figures of some predictions; `None` if there are none.
     #[must_use]
-    pub fn of(answers: &[Judged]) -> Option<Self> {
-        let n = answers.len();
-        let mut errors_m: Vec<f64> = answers.iter().map(|answer| answer.error_m).collect();
+    pub fn of(predictions: &[ScoredPrediction]) -> Option<Self> {
+        let n = predictions.len();
+        let mut errors_m: Vec<f64> = predictions.iter().map(|prediction| prediction.error_m).collect();
         errors_m.sort_by(f64::total_cmp);
         let max_m = *errors_m.last()?;
         let count = n as f64;
@@ -66,13 +66,14 @@ impl Metrics {
             variance_m2: errors_m.iter().map(|error_m| (error_m - mean_m).powi(2)).sum::<f64>() / count,
             rmse_m: square_m2.sqrt(),
             share_within: BOUNDS_M.iter().map(|&bound_m| (format!("{bound_m}"), within(bound_m))).collect(),
-            coverage50: coverage(answers, R50_PER_R95),
-            coverage95: coverage(answers, 1.0),
+            coverage50: coverage(predictions, R50_PER_R95),
+            coverage95: coverage(predictions, 1.0),
             n,
         })
     }
 
-    /// The mean of each figure over seeds, but the largest error of all; `None` of no seed.
+    /// The mean of each figure over seeds, except for `max_m`, the largest error of all seeds; `None` if
+    /// there is no seed.
     #[must_use]
     pub fn over_seeds(seeds: &[Self]) -> Option<Self> {
         let first = seeds.first()?;
@@ -99,7 +100,7 @@ impl Metrics {
     }
 }
 
-/// Linear between neighbours, of ascending values, at least one.
+/// Quantile of ascending values (at least one), interpolated linearly between order statistics.
 fn quantile(ascending: &[f64], part: f64) -> f64 {
     let place = part * (ascending.len() - 1) as f64;
     let low = place.floor() as usize;
@@ -107,12 +108,12 @@ fn quantile(ascending: &[f64], part: f64) -> f64 {
     ascending[low] + (place - place.floor()) * (ascending[high] - ascending[low])
 }
 
-fn coverage(answers: &[Judged], factor: f64) -> Option<f64> {
-    let inside = answers
-        .iter()
-        .map(|answer| answer.r95_m.map(|r95_m| f64::from(u8::from(answer.error_m <= factor * r95_m))));
+fn coverage(predictions: &[ScoredPrediction], factor: f64) -> Option<f64> {
+    let inside = predictions.iter().map(|prediction| {
+        prediction.r95_m.map(|r95_m| f64::from(u8::from(prediction.error_m <= factor * r95_m)))
+    });
     let sum: Option<f64> = inside.sum();
-    sum.filter(|_| !answers.is_empty()).map(|sum| sum / answers.len() as f64)
+    sum.filter(|_| !predictions.is_empty()).map(|sum| sum / predictions.len() as f64)
 }
 
 #[cfg(test)]
@@ -121,8 +122,8 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    fn judged(errors_m: &[f64]) -> Vec<Judged> {
-        errors_m.iter().map(|&error_m| Judged { error_m, r95_m: None }).collect()
+    fn scored(errors_m: &[f64]) -> Vec<ScoredPrediction> {
+        errors_m.iter().map(|&error_m| ScoredPrediction { error_m, r95_m: None }).collect()
     }
 
     fn near(one: f64, other: f64) -> bool {
@@ -131,7 +132,7 @@ mod tests {
 
     #[test]
     fn figures_of_known_errors() {
-        let metrics = Metrics::of(&judged(&[4.0, 1.0, 3.0, 2.0, 10.0])).expect("some");
+        let metrics = Metrics::of(&scored(&[4.0, 1.0, 3.0, 2.0, 10.0])).expect("some");
         assert!(near(metrics.mean_m, 4.0) && near(metrics.median_m, 3.0) && near(metrics.max_m, 10.0));
         assert!(near(metrics.variance_m2, 10.0) && near(metrics.rmse_m, 26.0f64.sqrt()));
         assert!(near(metrics.p95_m, 8.8), "{}", metrics.p95_m);
@@ -141,16 +142,16 @@ mod tests {
     }
 
     #[test]
-    fn an_honest_radius_covers_its_share() {
+    fn a_correct_radius_contains_its_share() {
         let mut random = ChaCha8Rng::seed_from_u64(5);
         // Rayleigh errors of sigma 1, whose 95 % radius is known.
-        let answers: Vec<Judged> = (0..20_000)
-            .map(|_| Judged {
+        let predictions: Vec<ScoredPrediction> = (0..20_000)
+            .map(|_| ScoredPrediction {
                 error_m: (-2.0 * (1.0 - random.random::<f64>()).ln()).sqrt(),
                 r95_m: Some(2.447_746_8),
             })
             .collect();
-        let metrics = Metrics::of(&answers).expect("some");
+        let metrics = Metrics::of(&predictions).expect("some");
         assert!((metrics.coverage95.expect("stated") - 0.95).abs() < 0.006, "{metrics:?}");
         assert!((metrics.coverage50.expect("stated") - 0.5).abs() < 0.015, "{metrics:?}");
     }
@@ -158,7 +159,7 @@ mod tests {
     #[test]
     fn seeds_are_averaged_and_the_largest_error_kept() {
         let seeds =
-            [&[1.0, 3.0][..], &[2.0, 6.0][..]].map(|errors| Metrics::of(&judged(errors)).expect("some"));
+            [&[1.0, 3.0][..], &[2.0, 6.0][..]].map(|errors| Metrics::of(&scored(errors)).expect("some"));
         let both = Metrics::over_seeds(&seeds).expect("two");
         assert!(near(both.mean_m, 3.0) && near(both.max_m, 6.0));
         assert_eq!(both.n, 2);

@@ -1,18 +1,25 @@
-//! Methods side by side: every way to tell a position, over one test file, against the truth.
+//! Compares methods: every way to estimate a position, on the same test rows, against the truth.
 //!
-//! What never happens here: a choice made on test rows. All that is learnt, and all that is tuned,
-//! comes from the training samples alone.
+//! Whatever is fitted or tuned is fitted on the training samples alone; no choice depends on a test
+//! row.
 
-mod learners;
+pub mod baselines;
 mod metrics;
+mod options;
 mod plots;
+mod predictors;
 mod report;
 mod runner;
+#[cfg(test)]
+mod tests;
+mod traces;
+mod training;
 mod truth;
 
-// What is evaluated by which, in the words of the domain, where jobs keep them.
-pub use crate::domain::{Method, Step, Truth};
-pub use metrics::{BOUNDS_M, Judged, Metrics};
+pub use crate::domain::{Method, Truth};
+pub use metrics::{BOUNDS_M, Metrics, ScoredPrediction};
+pub use options::{EvaluateOptions, Progress, TestRow};
 pub use plots::plots;
 pub use report::{MethodReport, Report};
-pub use runner::{Curve, Doing, EvaluateOptions, Evaluation, TestRow, Trace, TracePoint, evaluate};
+pub use runner::evaluate;
+pub use traces::{Curve, Evaluation, Trace, TracePoint};

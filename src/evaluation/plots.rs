@@ -1,34 +1,34 @@
-//! Pictures of an evaluation as SVG, written by hand: no font, no script, no dependency.
-//!
-//! What never happens here: a figure that is not in the report or the traces.
+//! Plots of an evaluation as self-contained SVG documents, without scripts or embedded fonts.
 
 use std::fmt::Write as _;
 
-use super::runner::{Evaluation, TestRow, Trace, TracePoint};
+use super::options::TestRow;
+use super::traces::{Curve, Evaluation, Trace, TracePoint};
 use crate::domain::Truth;
 use crate::geo::{EastNorth, LocalPlane, Position};
 
-/// The picture, and its frame within: left, top, right, bottom, all px.
+/// Size of a plot: width, height, px.
 const SIZE_PX: [f64; 2] = [900.0, 520.0];
+/// Frame of the axes within the plot: left, top, right, bottom, px.
 const FRAME_PX: [f64; 4] = [70.0, 40.0, 690.0, 465.0];
-/// Colours that differ for most eyes (after Okabe and Ito), then darker ones.
+/// Colours that are distinct under colour blindness (after Okabe and Ito), then darker ones.
 const COLOURS: [&str; 10] = [
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b", "#4b0092",
     "#1a1a1a",
 ];
-/// More points than this are thinned out.
+/// A series with more points than this is thinned.
 const MOST_POINTS: usize = 3_000;
 
-/// The pictures by file name: error over time, cumulative share, the plane, and Es per epoch.
+/// The plots by file name: error over time, cumulative share, the plane, and Es per epoch.
 #[must_use]
 pub fn plots(evaluation: &Evaluation, test: &[TestRow], truth: &Truth) -> Vec<(String, String)> {
-    let mut pictures = vec![
+    let mut documents = vec![
         ("error_over_time.svg".to_owned(), error_over_time(&evaluation.traces, test)),
         ("cumulative_share.svg".to_owned(), cumulative_share(&evaluation.traces)),
         ("plane.svg".to_owned(), plane(&evaluation.traces, test, truth)),
     ];
     if !evaluation.curves.is_empty() {
-        let curve = |curve: &super::runner::Curve| Series {
+        let curve = |curve: &Curve| Series {
             name: curve.recipe.to_string(),
             points: curve
                 .epochs
@@ -38,10 +38,10 @@ pub fn plots(evaluation: &Evaluation, test: &[TestRow], truth: &Truth) -> Vec<(S
             shape: Shape::Line,
         };
         let series: Vec<Series> = evaluation.curves.iter().map(curve).collect();
-        pictures
+        documents
             .push(("error_scale.svg".to_owned(), chart("Es per epoch", "epoch", "log10 Es", &series, false)));
     }
-    pictures
+    documents
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -56,7 +56,7 @@ struct Series {
     shape: Shape,
 }
 
-/// Seconds of test time with its holes closed to 5 s, so that passes stand side by side.
+/// Errors over test time, with gaps shortened to 5 s so that passes are adjacent.
 fn error_over_time(traces: &[Trace], test: &[TestRow]) -> String {
     let mut times_s: Vec<f64> =
         test.iter().map(|row| row.observation.time.as_microsecond() as f64 * 1e-6).collect();
@@ -73,7 +73,7 @@ fn error_over_time(traces: &[Trace], test: &[TestRow]) -> String {
     };
     let points = |point: &TracePoint| Some([place(point.row), point.error_m?]);
     let series = of_traces(traces, Shape::Dots, &points);
-    chart("Error over time", "seconds of test rows, holes closed", "error, m", &series, false)
+    chart("Error over time", "seconds of test rows, gaps shortened", "error, m", &series, false)
 }
 
 fn cumulative_share(traces: &[Trace]) -> String {
@@ -129,7 +129,7 @@ fn thin(points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
     points.into_iter().step_by(step).collect()
 }
 
-/// From values to px, with round ticks.
+/// Maps values to px and places ticks at round values.
 struct Axis {
     low: f64,
     high: f64,
@@ -138,16 +138,16 @@ struct Axis {
 }
 
 impl Axis {
-    /// Spans the values but for the outermost 0.5 % on the upper side, so that one wild answer does
-    /// not hide all others.
+    /// Spans the values except for the uppermost 0.5 %, so that one outlier does not compress all
+    /// others.
     fn over(mut values: Vec<f64>, from_px: f64, to_px: f64) -> Self {
         values.retain(|value| value.is_finite());
         values.sort_by(f64::total_cmp);
         let last = values.len().saturating_sub(1);
         let low = values.first().copied().unwrap_or(0.0);
         let high = values.get(last - last / 200).copied().unwrap_or(1.0);
-        let room = if high > low { 0.03 * (high - low) } else { 0.5 };
-        Self { low: low - room, high: high + room, from_px, to_px }
+        let margin = if high > low { 0.03 * (high - low) } else { 0.5 };
+        Self { low: low - margin, high: high + margin, from_px, to_px }
     }
 
     fn at(&self, value: f64) -> f64 {
@@ -168,21 +168,21 @@ impl Axis {
         (self.high - self.low) / (self.to_px - self.from_px).abs()
     }
 
-    /// Widens the axis about its middle to so much per px.
+    /// Widens the axis about its centre to a given value per px.
     fn widen(&mut self, per_px: f64) {
         let half = 0.5 * per_px * (self.to_px - self.from_px).abs();
-        let middle = 0.5 * (self.low + self.high);
-        (self.low, self.high) = (middle - half, middle + half);
+        let centre = 0.5 * (self.low + self.high);
+        (self.low, self.high) = (centre - half, centre + half);
     }
 }
 
-/// A chart with its legend; `even` gives both axes the same scale.
-fn chart(title: &str, across: &str, upward: &str, series: &[Series], even: bool) -> String {
+/// A chart with its legend; `equal_scale` gives both axes the same scale.
+fn chart(title: &str, across: &str, upward: &str, series: &[Series], equal_scale: bool) -> String {
     let [left, top, right, bottom] = FRAME_PX;
     let values = |axis: usize| series.iter().flat_map(|one| &one.points).map(|point| point[axis]).collect();
     let mut x = Axis::over(values(0), left, right);
     let mut y = Axis::over(values(1), bottom, top);
-    if even {
+    if equal_scale {
         let per_px = x.per_px().max(y.per_px());
         x.widen(per_px);
         y.widen(per_px);
@@ -267,7 +267,7 @@ fn draw(svg: &mut String, series: &Series, colour: &str, x: &Axis, y: &Axis) {
     let _ = writeln!(svg, "<path d=\"{path}\" stroke=\"{colour}\" {style}/>");
 }
 
-/// A tick's text without the dust of binary fractions.
+/// A tick's label, rounded to 6 decimals.
 fn number(tick: f64) -> String {
     format!("{}", (tick * 1e6).round() / 1e6)
 }

@@ -1,4 +1,4 @@
-//! What an evaluation says: a table for people, a JSON document for machines.
+//! The report of an evaluation, as a table and as a JSON document.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -16,14 +16,14 @@ pub struct MethodReport {
     pub metrics: Metrics,
     /// The mean error with each seed.
     pub seed_means_m: Vec<f64>,
-    /// CPU seconds of learning what the method needs, for one seed.
+    /// CPU seconds spent on fitting what the method needs, per seed.
     pub train_cpu_s: f64,
-    /// Microseconds per answer.
+    /// Microseconds per prediction.
     pub fuse_us: f64,
 }
 
 impl MethodReport {
-    /// Standard deviation of the seeds' means; 0 of one seed.
+    /// Standard deviation of the seeds' means, m; 0 for a single seed.
     #[must_use]
     pub fn seed_spread_m(&self) -> f64 {
         let count = self.seed_means_m.len() as f64;
@@ -33,16 +33,16 @@ impl MethodReport {
     }
 }
 
-/// All methods.
+/// Figures of all methods.
 #[derive(Debug, Clone, PartialEq, Serialize, Default, ToSchema)]
 #[schema(as = EvaluationReport)]
 pub struct Report {
-    /// By name.
+    /// Figures by the method's name.
     pub methods: BTreeMap<String, MethodReport>,
-    /// Methods that could not run, and why.
+    /// Methods that could not run, with the reason.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub failed: BTreeMap<String, String>,
-    /// Names in the order in which they were asked for.
+    /// Names of the methods in the order of the request.
     #[serde(skip)]
     pub order: Vec<String>,
 }
@@ -51,12 +51,12 @@ impl Report {
     /// The document of `--json`.
     ///
     /// # Errors
-    /// None that a finite figure could raise; serde's signature has one.
+    /// Never for finite figures.
     pub fn to_json(&self) -> serde_json::Result<String> {
         serde_json::to_string_pretty(self)
     }
 
-    /// The methods in the order in which they were asked for.
+    /// The methods in the order of the request.
     pub fn rows(&self) -> impl Iterator<Item = (&str, &MethodReport)> {
         self.order.iter().filter_map(|name| Some((name.as_str(), self.methods.get(name)?)))
     }
@@ -109,12 +109,12 @@ fn percent(share: Option<f64>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::metrics::Judged;
+    use super::super::metrics::ScoredPrediction;
     use super::*;
 
     #[test]
     fn the_document_has_the_promised_keys() {
-        let metrics = Metrics::of(&[Judged { error_m: 1.5, r95_m: None }]).expect("one");
+        let metrics = Metrics::of(&[ScoredPrediction { error_m: 1.5, r95_m: None }]).expect("one");
         let method = MethodReport { metrics, seed_means_m: vec![1.0, 2.0], train_cpu_s: 0.5, fuse_us: 1.0 };
         assert!((method.seed_spread_m() - 0.5f64.sqrt()).abs() < 1e-12);
         let report = Report {

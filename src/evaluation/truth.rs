@@ -1,7 +1,7 @@
-//! What positions are held against: columns of the test file, a fixed point, or a line.
+//! The error of a position against the truth: a column of the test file, a fixed point, or lines.
 //!
-//! Distances are geodesic: between points by Karney's method, to a line in the plane that touches
-//! the earth at the position itself, where the plane is exact.
+//! Distances between points are geodesic (Karney 2013). The distance to a line is taken in the local
+//! plane whose origin is the position itself, where the projection error vanishes.
 
 use geojson::{GeoJson, Geometry, GeometryValue};
 
@@ -9,22 +9,22 @@ use crate::domain::{Error, Result, Truth};
 use crate::geo::{EastNorth, LocalPlane, Position, distance_m};
 
 impl Truth {
-    /// The lines of a GeoJSON document: every LineString in it, however deep.
+    /// The lines of a GeoJSON document: every LineString in it, at any depth.
     ///
     /// # Errors
-    /// Names `truth_line` for text that is no GeoJSON, or holds no line of two positions.
+    /// Names `truth_line` for text that is not GeoJSON or contains no line of two positions.
     pub fn from_geojson(text: &str) -> Result<Self> {
         let wrong = |message: String| Error::invalid("truth_line", message);
         let document: GeoJson = text.parse().map_err(|error| wrong(format!("is not GeoJSON: {error}")))?;
         let mut lines = Vec::new();
         match &document {
-            GeoJson::Geometry(geometry) => gather(geometry, &mut lines)?,
+            GeoJson::Geometry(geometry) => collect_lines(geometry, &mut lines)?,
             GeoJson::Feature(feature) => {
-                feature.geometry.iter().try_for_each(|one| gather(one, &mut lines))?
+                feature.geometry.iter().try_for_each(|one| collect_lines(one, &mut lines))?
             }
             GeoJson::FeatureCollection(all) => {
                 let geometries = all.features.iter().filter_map(|feature| feature.geometry.as_ref());
-                geometries.into_iter().try_for_each(|one| gather(one, &mut lines))?;
+                geometries.into_iter().try_for_each(|one| collect_lines(one, &mut lines))?;
             }
         }
         if lines.is_empty() {
@@ -33,7 +33,7 @@ impl Truth {
         Ok(Self::Lines(lines))
     }
 
-    /// Error in m of a position, if the truth is known; `row` is the truth that the row states.
+    /// Horizontal error of a position, m, if the truth is known; `row` is the truth that the row states.
     #[must_use]
     pub fn error_m(&self, row: Option<Position>, position: Position) -> Option<f64> {
         match self {
@@ -44,7 +44,7 @@ impl Truth {
     }
 }
 
-fn gather(geometry: &Geometry, lines: &mut Vec<Vec<Position>>) -> Result<()> {
+fn collect_lines(geometry: &Geometry, lines: &mut Vec<Vec<Position>>) -> Result<()> {
     let mut line = |coordinates: &[geojson::Position]| -> Result<()> {
         let position = |pair: &geojson::Position| match pair.as_slice() {
             [longitude_deg, latitude_deg, ..] => Position::new(*longitude_deg, *latitude_deg)
@@ -61,7 +61,7 @@ fn gather(geometry: &Geometry, lines: &mut Vec<Vec<Position>>) -> Result<()> {
         GeometryValue::LineString { coordinates } => line(coordinates),
         GeometryValue::MultiLineString { coordinates } => coordinates.iter().try_for_each(|one| line(one)),
         GeometryValue::GeometryCollection { geometries } => {
-            geometries.iter().try_for_each(|one| gather(one, lines))
+            geometries.iter().try_for_each(|one| collect_lines(one, lines))
         }
         _ => Ok(()),
     }
@@ -79,7 +79,7 @@ fn distance_to_lines_m(lines: &[Vec<Position>], position: Position) -> f64 {
     nearest_m
 }
 
-/// From the plane's origin to a straight stretch, m.
+/// Distance from the plane's origin to a line segment, m.
 fn distance_of_origin_m(from: EastNorth, to: EastNorth) -> f64 {
     let (east_m, north_m) = (to.east_m - from.east_m, to.north_m - from.north_m);
     let length_m2 = east_m * east_m + north_m * north_m;

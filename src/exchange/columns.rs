@@ -1,14 +1,14 @@
-//! The columns that a CSV file may have.
+//! Columns of CSV files.
 
 use crate::domain::{Error, ErrorKind, Result};
 
-/// A column: its two spellings and the path of the same value in a JSON row.
+/// A column: its two names and the path of the same value in a JSON row.
 pub(super) struct Column {
-    /// As in the files of the paper.
+    /// Name without the unit, as in the files of the paper.
     pub plain: &'static str,
-    /// With its unit.
+    /// Name with the unit.
     pub with_unit: &'static str,
-    /// Where the value stands in a JSON row.
+    /// Path of the value in a JSON row.
     pub path: &'static str,
 }
 
@@ -28,12 +28,12 @@ pub(super) const SCORE: usize = 10;
 pub(super) const TRUTH_LONGITUDE: usize = 11;
 pub(super) const TRUTH_LATITUDE: usize = 12;
 pub(super) const RECEIVER_ID: usize = 13;
-/// Columns that a file of fixes may have.
+/// Number of columns of a file of fixes.
 pub(super) const COUNT: usize = 14;
-/// Columns that a file of samples, observations or detections may have, the first of all.
+/// Number of columns of a file of samples, observations or detections: the first of all.
 pub(super) const OF_SAMPLES: usize = 13;
 
-/// All columns, in the order in which they are written.
+/// All columns, in the order of writing.
 pub(super) const COLUMNS: [Column; COUNT] = [
     column("time", "time", "time"),
     column("target_id", "target_id", "target_id"),
@@ -51,22 +51,22 @@ pub(super) const COLUMNS: [Column; COUNT] = [
     column("receiver_id", "receiver_id", "receiver_id"),
 ];
 
-/// Columns that belong together: all of them or none.
+/// Groups of columns that must occur together.
 const GROUPS: [&[usize]; 3] =
     [&[LEFT, LEFT + 1, LEFT + 2, HEIGHT], &[LONGITUDE, LATITUDE], &[TRUTH_LONGITUDE, TRUTH_LATITUDE]];
 
-/// Where each column stands in a file, and how the file spells it.
+/// Position of each column in a file, and the name that the file uses.
 pub(super) struct Header {
-    place: [Option<usize>; COUNT],
-    spelled: [&'static str; COUNT],
+    positions: [Option<usize>; COUNT],
+    names: [&'static str; COUNT],
     width: usize,
 }
 
 impl Header {
-    /// Reads the names of a header line, of which the first `known` columns are known.
+    /// Reads the names of a header line; the first `known` of all columns are accepted.
     ///
     /// # Errors
-    /// Names a column that is unknown, stands twice or is missing.
+    /// Names a column that is unknown, duplicated or missing.
     pub(super) fn read<'a>(
         names: impl Iterator<Item = &'a str>,
         required: &[usize],
@@ -74,19 +74,19 @@ impl Header {
     ) -> Result<Self> {
         let known = COLUMNS.get(..known).unwrap_or(&COLUMNS);
         let mut header =
-            Self { place: [None; COUNT], spelled: COLUMNS.each_ref().map(|column| column.plain), width: 0 };
+            Self { positions: [None; COUNT], names: COLUMNS.each_ref().map(|column| column.plain), width: 0 };
         for name in names {
             let name = name.trim();
             let index = known
                 .iter()
                 .position(|column| column.plain == name || column.with_unit == name)
                 .ok_or_else(|| unknown(name, known))?;
-            if header.place[index].is_some() {
-                return Err(refused(COLUMNS[index].plain, "the column stands twice".to_owned()));
+            if header.positions[index].is_some() {
+                return Err(refused(COLUMNS[index].plain, "the column is a duplicate".to_owned()));
             }
-            header.place[index] = Some(header.width);
+            header.positions[index] = Some(header.width);
             if COLUMNS[index].with_unit == name {
-                header.spelled[index] = COLUMNS[index].with_unit;
+                header.names[index] = COLUMNS[index].with_unit;
             }
             header.width += 1;
         }
@@ -103,7 +103,8 @@ impl Header {
             let missing = group.iter().find(|&&index| !self.has(index));
             if let (true, Some(&index)) = (group.iter().any(|&index| self.has(index)), missing) {
                 let name = COLUMNS[index].plain;
-                let reason = format!("the file has no column `{name}`, which belongs to the others it has");
+                let reason =
+                    format!("the file has no column `{name}`, which must accompany the columns of its group");
                 return Err(refused(name, reason));
             }
         }
@@ -111,11 +112,11 @@ impl Header {
     }
 
     pub(super) const fn has(&self, index: usize) -> bool {
-        self.place[index].is_some()
+        self.positions[index].is_some()
     }
 
-    pub(super) const fn place(&self, index: usize) -> Option<usize> {
-        self.place[index]
+    pub(super) const fn position(&self, index: usize) -> Option<usize> {
+        self.positions[index]
     }
 
     /// Number of columns.
@@ -123,26 +124,26 @@ impl Header {
         self.width
     }
 
-    /// The file's own name of a column.
+    /// The name that the file uses for a column.
     pub(super) const fn name(&self, index: usize) -> &'static str {
-        self.spelled[index]
+        self.names[index]
     }
 
-    /// The file's own name of the value at a path of a JSON row; of its first column if the path is
-    /// that of a group.
+    /// The name that the file uses for the value at a path of a JSON row; that of its first column for
+    /// the path of a group.
     pub(super) fn name_of_path<'a>(&self, path: &'a str) -> &'a str {
         let at_path = |column: &Column| {
             let below = column.path.strip_prefix(path);
             !path.is_empty() && below.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
         };
-        COLUMNS.iter().position(at_path).map_or(path, |index| self.spelled[index])
+        COLUMNS.iter().position(at_path).map_or(path, |index| self.names[index])
     }
 }
 
 fn unknown(name: &str, known: &[Column]) -> Error {
     let known = known.iter().map(|column| column.plain).collect::<Vec<_>>().join(", ");
     let shown: String = name.chars().take(60).collect();
-    refused(&shown, format!("unknown column `{shown}`; columns, parted by commas, may be {known}"))
+    refused(&shown, format!("unknown column `{shown}`; columns, separated by commas, may be {known}"))
 }
 
 fn refused(field: &str, message: String) -> Error {

@@ -1,7 +1,7 @@
 //! Rows of a CSV file.
 //!
-//! Read line by line on purpose: no column has reason to hold a line break, and so an unclosed
-//! quote costs its own row and not the rest of the file, and memory stays bounded.
+//! Read line by line, unlike the csv crate: no column contains line breaks, so an unclosed quote
+//! invalidates its own row and not the rest of the file, and memory is bounded.
 
 use std::io::Read;
 
@@ -9,8 +9,8 @@ use super::columns::{
     CLASS, COUNT, HEIGHT, Header, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA,
     TARGET_ID, TIME, TRUTH_LATITUDE, TRUTH_LONGITUDE,
 };
+use super::file_row::{FileRow, RowError};
 use super::lines::{Line, Lines};
-use super::rows::{Row, RowError};
 use super::wire::{self, Text};
 use crate::domain::{Error, ErrorKind, Result};
 
@@ -23,20 +23,20 @@ pub(super) struct CsvRows<R> {
 
 impl<R: Read> CsvRows<R> {
     /// # Errors
-    /// A file without a header, or with columns missing, doubled or unknown.
+    /// Refuses a file without a header, or with missing, duplicated or unknown columns.
     pub(super) fn new(reader: R, required: &[usize]) -> Result<Self> {
-        Self::knowing(reader, required, OF_SAMPLES)
+        Self::with_columns(reader, required, OF_SAMPLES)
     }
 
-    /// The same for a file of fixes, which may name receivers.
+    /// Rows of a file of fixes, which may have a receiver column.
     ///
     /// # Errors
     /// As [`CsvRows::new`].
     pub(super) fn of_fixes(reader: R, required: &[usize]) -> Result<Self> {
-        Self::knowing(reader, required, COUNT)
+        Self::with_columns(reader, required, COUNT)
     }
 
-    fn knowing(reader: R, required: &[usize], known: usize) -> Result<Self> {
+    fn with_columns(reader: R, required: &[usize], known: usize) -> Result<Self> {
         let mut lines = Lines::new(reader);
         let mut fields = Fields::default();
         let header = loop {
@@ -48,13 +48,13 @@ impl<R: Read> CsvRows<R> {
                 }
                 Some((_, Line::NotUtf8)) => return Err(malformed("the header is not UTF-8")),
                 Some((_, Line::TooLong)) => return Err(malformed("the header is longer than 64 KiB")),
-                None => return Err(malformed("the file is empty; its first line must name its columns")),
+                None => return Err(malformed("the file is empty; the first line must name the columns")),
             }
         };
         Ok(Self { lines, header, fields })
     }
 
-    /// Number of the line that was read last, from 1.
+    /// Number of the latest line, from 1.
     pub(super) const fn line(&self) -> u64 {
         self.lines.number()
     }
@@ -62,11 +62,11 @@ impl<R: Read> CsvRows<R> {
     /// Converts the next row that is not blank.
     pub(super) fn next_row<T>(
         &mut self,
-        convert: impl FnOnce(Row<'_>) -> Result<T>,
+        convert: impl FnOnce(FileRow<'_>) -> Result<T>,
     ) -> Option<Result<Result<T, RowError>>> {
         loop {
             let (line, text) = match self.lines.next_line() {
-                Err(broken) => return Some(Err(Error::fault(broken))),
+                Err(error) => return Some(Err(Error::fault(error))),
                 Ok(None) => return None,
                 Ok(Some((_, Line::Text(text)))) if text.trim().is_empty() => continue,
                 Ok(Some((line, Line::Text(text)))) => (line, text),
@@ -130,12 +130,13 @@ impl<'a> Cells<'a> {
             let width = header.width();
             return Err(Fault::Whole(format!("has {count} fields where the header names {width}")));
         }
-        let cells = std::array::from_fn(|index| header.place(index).map_or("", |place| in_file[place]));
+        let cells =
+            std::array::from_fn(|index| header.position(index).map_or("", |position| in_file[position]));
         Ok(Self { cells })
     }
 
-    fn row(&self) -> Cell<Row<'a>> {
-        Ok(Row {
+    fn row(&self) -> Cell<FileRow<'a>> {
+        Ok(FileRow {
             time: self.text(TIME),
             target_id: self.text(TARGET_ID),
             bounding_box: self.numbers([LEFT, LEFT + 1, LEFT + 2, HEIGHT])?.map(
@@ -178,7 +179,7 @@ impl<'a> Cells<'a> {
         })
     }
 
-    /// Numbers that belong together: `None` if all cells are empty, an error if some are.
+    /// The numbers of a group: `None` if all cells are empty, an error if some are.
     fn numbers<const N: usize>(&self, indexes: [usize; N]) -> Cell<Option<[f64; N]>> {
         let mut numbers = [0.0; N];
         let mut missing = None;
@@ -195,21 +196,21 @@ impl<'a> Cells<'a> {
         match missing {
             None => Ok(Some(numbers)),
             Some(_) if given == 0 => Ok(None),
-            Some(index) => Err((index, "is empty where the values it belongs to are given".to_owned())),
+            Some(index) => Err((index, "is empty, but other values of its group are given".to_owned())),
         }
     }
 }
 
-/// The fields of one line; RFC 4180 but for line breaks within quotes.
+/// The fields of one line, as in RFC 4180 but without line breaks within quotes.
 #[derive(Default)]
 struct Fields {
-    /// Fields that had quotes, without them.
+    /// Text of the fields without quotes.
     unquoted: String,
-    /// Begin and end of every field in `unquoted`.
+    /// Range of every field in `unquoted`.
     spans: Vec<(usize, usize)>,
 }
 
-/// Fields that stand in the line as they are, or those freed of their quotes.
+/// Fields borrowed from the line, or from the unquoted text.
 enum Split<'a> {
     Plain(std::str::Split<'a, char>),
     Quoted(&'a str, std::slice::Iter<'a, (usize, usize)>),
@@ -242,7 +243,7 @@ impl Fields {
         Ok(Split::Quoted(&self.unquoted, self.spans.iter()))
     }
 
-    /// Appends the first field of the text; what follows its comma is left.
+    /// Appends the first field of the text; returns the rest after the comma.
     fn take_field<'a>(&mut self, text: &'a str) -> Result<Option<&'a str>, String> {
         let Some(mut quoted) = text.strip_prefix('"') else {
             let (field, rest) =
@@ -253,7 +254,7 @@ impl Fields {
         loop {
             let (part, after) = quoted
                 .split_once('"')
-                .ok_or("has a quote that is not closed; a field cannot go on in the next line")?;
+                .ok_or("has an unclosed quote; a field cannot continue on the next line")?;
             self.unquoted.push_str(part);
             if let Some(after) = after.strip_prefix('"') {
                 self.unquoted.push('"');
@@ -276,7 +277,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn fields_come_back_as_the_csv_crate_wrote_them(
+        fn fields_written_by_the_csv_crate_are_read(
             fields in prop::collection::vec("[a-z0-9 \",;'é]{0,8}", 2..8)
         ) {
             let mut writer = csv::Writer::from_writer(Vec::new());

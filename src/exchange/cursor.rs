@@ -1,25 +1,25 @@
-//! Where the next page of a list begins, as text that a client hands back and need not understand.
+//! Opaque pagination cursors.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
 use crate::domain::{Error, Result};
 
-/// Longest cursor that is read.
-const LONGEST_BYTES: usize = 512;
+/// Largest accepted cursor, bytes.
+const MAX_BYTES: usize = 512;
 
-/// A cursor of a list, from the key of the last item shown.
+/// The cursor after the item with that key, for a list.
 #[must_use]
 pub fn write_cursor(list: &str, key: &str) -> String {
     URL_SAFE_NO_PAD.encode(format!("{list}:{key}"))
 }
 
-/// The key in a cursor of the same list.
+/// The key in a cursor of that list.
 ///
 /// # Errors
-/// Names the field `cursor` for text that no page of this list gave.
+/// Names the field `cursor` for text that is not a cursor of this list.
 pub fn read_cursor(list: &str, cursor: &str) -> Result<String> {
-    let key = (cursor.len() <= LONGEST_BYTES)
+    let key = (cursor.len() <= MAX_BYTES)
         .then(|| URL_SAFE_NO_PAD.decode(cursor).ok())
         .flatten()
         .and_then(|bytes| String::from_utf8(bytes).ok())
@@ -27,10 +27,10 @@ pub fn read_cursor(list: &str, cursor: &str) -> Result<String> {
     key.ok_or_else(foreign_cursor)
 }
 
-/// The refusal of a cursor that no page of the list gave.
+/// The refusal of text that is not a cursor of the list.
 #[must_use]
 pub fn foreign_cursor() -> Error {
-    Error::invalid("cursor", "must be what a page of this list gave as its next cursor")
+    Error::invalid("cursor", "must be the next cursor returned with a page of this list")
 }
 
 #[cfg(test)]

@@ -1,13 +1,13 @@
-//! Elements of a JSON array, one by one and in bounded memory.
+//! Elements of a JSON array as a pull iterator in bounded memory.
 //!
-//! Only the array's own brackets and commas are read here; what an element says is left to serde.
-//! So an element that is no row, or no JSON, costs itself alone, as long as its brackets and quotes
-//! pair up. (serde's own way through a long array, a `DeserializeSeed`, pushes instead of letting
-//! pull, keeps no limit on an element, and ends at the first fault.)
+//! Only the brackets and commas of the array are parsed here; the elements are parsed by serde. So an
+//! invalid element does not affect the others, as long as its brackets and quotes are balanced.
+//! (serde's streaming, a `DeserializeSeed`, is push-based, does not limit the size of an element, and
+//! stops at the first error.)
 
-use std::io::{BufRead, BufReader, ErrorKind as ErrorKindOfIo, Read};
+use std::io::{BufRead, BufReader, ErrorKind as IoErrorKind, Read};
 
-use super::LONGEST_ROW_BYTES;
+use super::MAX_ROW_BYTES;
 use super::lines::Line;
 use crate::domain::{Error, ErrorKind, Result};
 
@@ -16,20 +16,20 @@ pub(super) struct Elements<R> {
     reader: BufReader<R>,
     element: Vec<u8>,
     count: u64,
-    wrapped: bool,
-    ended: bool,
+    is_wrapped: bool,
+    has_ended: bool,
 }
 
 impl<R: Read> Elements<R> {
     /// # Errors
-    /// `MalformedBody` for a document that does not begin so.
+    /// `MalformedBody` for a document that does not begin like this.
     pub(super) fn new(reader: R, name: &str) -> Result<Self> {
         let mut elements = Self {
             reader: BufReader::with_capacity(64 * 1024, reader),
             element: Vec::with_capacity(512),
             count: 0,
-            wrapped: false,
-            ended: false,
+            is_wrapped: false,
+            has_ended: false,
         };
         elements.begin(name)?;
         Ok(elements)
@@ -46,7 +46,7 @@ impl<R: Read> Elements<R> {
             first = self.next_token()?;
         }
         if first == Some(b'{') {
-            self.wrapped = true;
+            self.is_wrapped = true;
             if self.next_token()? != Some(b'"') {
                 return Err(expected());
             }
@@ -65,21 +65,21 @@ impl<R: Read> Elements<R> {
 
     /// The next element and its number from 1; an error ends the file.
     pub(super) fn next_element(&mut self) -> Option<Result<(u64, Line<'_>)>> {
-        if self.ended {
+        if self.has_ended {
             return None;
         }
-        match self.gather() {
+        match self.read_element() {
             Ok(true) => {}
             Ok(false) => {
-                self.ended = true;
+                self.has_ended = true;
                 return None;
             }
             Err(error) => {
-                self.ended = true;
+                self.has_ended = true;
                 return Some(Err(error));
             }
         }
-        let line = if self.element.len() > LONGEST_ROW_BYTES {
+        let line = if self.element.len() > MAX_ROW_BYTES {
             Line::TooLong
         } else {
             std::str::from_utf8(&self.element).map_or(Line::NotUtf8, Line::Text)
@@ -87,9 +87,9 @@ impl<R: Read> Elements<R> {
         Some(Ok((self.count, line)))
     }
 
-    /// Gathers the next element; `false` at the array's end.
-    fn gather(&mut self) -> Result<bool> {
-        let Some(first) = self.next_token()? else { return Err(self.broken_off()) };
+    /// Reads the next element into the buffer; `false` at the end of the array.
+    fn read_element(&mut self) -> Result<bool> {
+        let Some(first) = self.next_token()? else { return Err(self.truncated()) };
         if first == b']' && self.count == 0 {
             return self.end().map(|()| false);
         }
@@ -100,29 +100,29 @@ impl<R: Read> Elements<R> {
             _ => {
                 nesting.enter(first);
                 self.element.push(first);
-                self.gather_rest(&mut nesting)?
+                self.read_rest(&mut nesting)?
             }
         };
         self.count += 1;
         let is_blank = self.element.iter().all(u8::is_ascii_whitespace);
         match byte {
-            b'}' => Err(malformed(&format!("not JSON: brackets do not pair up in element {}", self.count))),
-            b']' if is_blank => Err(malformed("not JSON: a comma before the array's end")),
+            b'}' => Err(malformed(&format!("not JSON: unbalanced brackets in element {}", self.count))),
+            b']' if is_blank => Err(malformed("not JSON: a comma before the end of the array")),
             b']' => {
                 self.end()?;
-                self.ended = true;
+                self.has_ended = true;
                 Ok(true)
             }
             _ => Ok(true),
         }
     }
 
-    /// Gathers an element up to the comma or bracket that ends it, which is taken and given back.
-    fn gather_rest(&mut self, nesting: &mut Nesting) -> Result<u8> {
+    /// Reads the rest of an element, and the comma or bracket that ends it, which is returned.
+    fn read_rest(&mut self, nesting: &mut Nesting) -> Result<u8> {
         loop {
             let bytes = fill(&mut self.reader)?;
             if bytes.is_empty() {
-                return Err(self.broken_off());
+                return Err(self.truncated());
             }
             let end = bytes.iter().position(|&byte| {
                 let ends = nesting.is_outside() && matches!(byte, b',' | b']' | b'}');
@@ -132,30 +132,30 @@ impl<R: Read> Elements<R> {
                 ends
             });
             let part = &bytes[..end.unwrap_or(bytes.len())];
-            // One byte too many is kept, to tell that the element is too long.
-            let room = (LONGEST_ROW_BYTES + 1).saturating_sub(self.element.len());
-            self.element.extend_from_slice(&part[..part.len().min(room)]);
-            let (taken, ending) = (part.len(), end.map(|at| bytes[at]));
-            self.reader.consume(taken + usize::from(ending.is_some()));
+            // One byte beyond the limit is kept to recognise that the element is too long.
+            let capacity = (MAX_ROW_BYTES + 1).saturating_sub(self.element.len());
+            self.element.extend_from_slice(&part[..part.len().min(capacity)]);
+            let (length, ending) = (part.len(), end.map(|at| bytes[at]));
+            self.reader.consume(length + usize::from(ending.is_some()));
             if let Some(ending) = ending {
                 return Ok(ending);
             }
         }
     }
 
-    /// What may follow the array.
+    /// Checks what follows the array.
     fn end(&mut self) -> Result<()> {
-        if self.wrapped && self.next_token()? != Some(b'}') {
-            return Err(malformed("nothing but the rows may stand in the document"));
+        if self.is_wrapped && self.next_token()? != Some(b'}') {
+            return Err(malformed("the document may contain only the rows"));
         }
         match self.next_token()? {
             None => Ok(()),
-            Some(_) => Err(malformed("not JSON: text after the document's end")),
+            Some(_) => Err(malformed("not JSON: text after the end of the document")),
         }
     }
 
-    fn broken_off(&self) -> Error {
-        malformed(&format!("not JSON: breaks off in element {}", self.count + 1))
+    fn truncated(&self) -> Error {
+        malformed(&format!("not JSON: ends within element {}", self.count + 1))
     }
 
     fn next_token(&mut self) -> Result<Option<u8>> {
@@ -174,19 +174,19 @@ impl<R: Read> Elements<R> {
     }
 }
 
-/// Bytes at hand; none at the end of the file.
+/// Buffered bytes; empty at the end of the file.
 fn fill<R: Read>(reader: &mut BufReader<R>) -> Result<&[u8]> {
     loop {
         match reader.fill_buf() {
             Ok(_) => break,
-            Err(error) if error.kind() == ErrorKindOfIo::Interrupted => {}
+            Err(error) if error.kind() == IoErrorKind::Interrupted => {}
             Err(error) => return Err(Error::fault(error)),
         }
     }
     Ok(reader.buffer())
 }
 
-/// How deep in brackets and quotes a byte stands.
+/// Nesting depth of brackets and quotes.
 #[derive(Default)]
 struct Nesting {
     depth: u32,

@@ -1,22 +1,26 @@
-//! What kind of file it is, from its name or its media type.
+//! File formats, by file name or media type.
 
 use std::path::Path;
+
+use strum::{EnumString, IntoStaticStr, VariantArray};
+
+use crate::domain::Error;
 
 /// A format of sample, observation or fused rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Format {
-    /// Comma-separated, one header line.
+    /// Comma-separated values with a header line.
     Csv,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Ndjson,
     /// One JSON document.
     Json,
-    /// RFC 7946, written only.
+    /// GeoJSON (RFC 7946), written only.
     GeoJson,
 }
 
 impl Format {
-    /// All of them.
+    /// All formats.
     pub const ALL: [Self; 4] = [Self::Csv, Self::Ndjson, Self::Json, Self::GeoJson];
 
     /// The format of a media type such as `text/csv; charset=utf-8`.
@@ -34,7 +38,7 @@ impl Format {
         known.into_iter().find(|(name, _)| essence.eq_ignore_ascii_case(name)).map(|(_, format)| format)
     }
 
-    /// The format that a file's extension announces.
+    /// The format of a file's extension.
     #[must_use]
     pub fn from_path(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
@@ -47,7 +51,7 @@ impl Format {
         }
     }
 
-    /// What to announce it as.
+    /// The media type in responses.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {
@@ -57,4 +61,63 @@ impl Format {
             Self::GeoJson => "application/geo+json",
         }
     }
+}
+
+/// A format of fixes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, EnumString, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_fix_format)]
+pub enum FixFormat {
+    /// Columns `longitude`, `latitude` and optionally `time`, `sigma_m` and `receiver_id`; other columns
+    /// of sample files are accepted. Without a `receiver_id` the `target_id` is used instead.
+    Csv,
+    /// NMEA 0183: positions of GGA, dates of RMC and ZDA; other sentences are skipped.
+    Nmea,
+    /// GPX: track, route and way points.
+    Gpx,
+    /// Reports of gpsd, one per line (`gpspipe -w`): those of class TPV. The receiver is the `device`.
+    Gpsd,
+}
+
+impl FixFormat {
+    /// All formats.
+    pub const ALL: &'static [Self] = Self::VARIANTS;
+
+    /// The format of a file's extension; `nmea`, `log` and `txt` are NMEA; `json`,
+    /// `ndjson` and `jsonl` are gpsd's.
+    #[must_use]
+    pub fn from_path(path: &std::path::Path) -> Option<Self> {
+        let extension = path.extension()?.to_str()?.to_ascii_lowercase();
+        match extension.as_str() {
+            "csv" => Some(Self::Csv),
+            "nmea" | "log" | "txt" => Some(Self::Nmea),
+            "gpx" => Some(Self::Gpx),
+            "json" | "ndjson" | "jsonl" => Some(Self::Gpsd),
+            _ => None,
+        }
+    }
+
+    /// The format of a media type.
+    #[must_use]
+    pub fn from_media_type(media_type: &str) -> Option<Self> {
+        let essence = media_type.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
+        match essence.as_str() {
+            "text/csv" => Some(Self::Csv),
+            "application/nmea" | "application/x-nmea" | "text/x-nmea" | "text/plain" => Some(Self::Nmea),
+            "application/gpx+xml" => Some(Self::Gpx),
+            "application/json" | "application/x-ndjson" | "application/ndjson" | "application/jsonl" => {
+                Some(Self::Gpsd)
+            }
+            _ => None,
+        }
+    }
+
+    /// Name in commands and reports.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
+}
+
+fn unknown_fix_format(_: &str) -> Error {
+    Error::invalid("format", "must be one of csv, nmea, gpx, gpsd")
 }

@@ -1,16 +1,16 @@
-//! Fixes of a gpsd log: a JSON report a line, as `gpspipe -w` writes them.
+//! Fixes of a gpsd log: one JSON report per line, as written by `gpspipe -w`.
 //!
-//! Reports of class TPV hold the fixes; others are passed over. What gpsd says of its errors (`eph`,
-//! `epx`, `epy`) is not taken: it leaves open which share of errors they bound.
+//! Reports of class TPV contain the fixes; others are skipped. gpsd's error estimates (`eph`, `epx`,
+//! `epy`) are not used: their confidence level is not defined.
 
 use std::io::Read;
 
 use jiff::Timestamp;
 use serde::Deserialize;
 
-use super::fixes::FixRow;
+use super::file_row::RowError;
+use super::fix_row::FixRow;
 use super::lines::{Line, Lines};
-use super::rows::RowError;
 use super::wire::{self, Text};
 use crate::domain::{Error, ReceiverId, Result, TimeBounds, parse_time};
 
@@ -20,7 +20,7 @@ pub(super) struct GpsdFixes<R> {
     time_bounds: TimeBounds,
 }
 
-/// The fields of a report that are looked at.
+/// The fields of a report that are used.
 #[derive(Deserialize)]
 struct Report<'a> {
     #[serde(borrow)]
@@ -43,7 +43,7 @@ impl<R: Read> GpsdFixes<R> {
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
         loop {
             let (line, text) = match self.lines.next_line() {
-                Err(broken) => return Some(Err(Error::fault(broken))),
+                Err(error) => return Some(Err(Error::fault(error))),
                 Ok(None) => return None,
                 Ok(Some(read)) => read,
             };
@@ -77,14 +77,14 @@ fn report(line: u64, text: &str, time_bounds: &TimeBounds) -> Result<Option<Resu
         let reason = "the position is dead reckoning, surveyed or simulated (status 5, 7, 8), not received";
         return Err(Error::invalid("status", reason));
     }
-    let needed = |number: Option<f64>, field| number.ok_or_else(|| Error::invalid(field, "is required"));
-    let place = wire::Fix {
-        longitude_deg: needed(report.lon, "lon")?,
-        latitude_deg: needed(report.lat, "lat")?,
+    let required = |number: Option<f64>, field| number.ok_or_else(|| Error::invalid(field, "is required"));
+    let fix = wire::Fix {
+        longitude_deg: required(report.lon, "lon")?,
+        latitude_deg: required(report.lat, "lat")?,
         sigma_m: None,
     };
     let receiver_id = report.device.map(|device| ReceiverId::new(device.as_str())).transpose();
     let receiver_id = receiver_id.map_err(|_| Error::invalid("device", "is too long or not printable"))?;
     let time: Option<Timestamp> = report.time.map(|text| parse_time(text.as_str())).transpose()?;
-    Ok(Some(FixRow::checked(line, time, receiver_id, place.to_domain()?, time_bounds)))
+    Ok(Some(FixRow::checked(line, time, receiver_id, fix.to_domain()?, time_bounds)))
 }

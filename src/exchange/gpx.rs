@@ -1,40 +1,40 @@
-//! Fixes of a GPX file: its track, route and way points.
+//! Fixes of a GPX file: track points, route points and waypoints.
 //!
-//! Read as a stream of XML events in bounded memory: no tag or text is longer than 64 KiB and no
-//! element lies deeper than 64. Entities are not expanded and nothing is fetched.
+//! Read as a stream of XML events in bounded memory: a tag or text has at most 64 KiB, and elements are
+//! nested at most 64 deep. Entities are not expanded and nothing is fetched.
 
 use std::io::{self, BufRead, BufReader, Read};
 
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::LONGEST_ROW_BYTES;
-use super::fixes::FixRow;
-use super::rows::RowError;
+use super::MAX_ROW_BYTES;
+use super::file_row::RowError;
+use super::fix_row::FixRow;
 use super::wire;
 use crate::domain::{Error, ErrorKind, Fix, Result, TimeBounds, parse_time};
 
-/// Elements within elements.
-const DEEPEST: usize = 64;
-/// Longest text of a time.
-const LONGEST_TIME_BYTES: usize = 64;
+/// Largest nesting depth of elements.
+const MAX_DEPTH: usize = 64;
+/// Largest text of a time, bytes.
+const MAX_TIME_BYTES: usize = 64;
 
 /// Reads a GPX file's points.
 pub(super) struct GpxFixes<R> {
-    reader: Reader<Counted<R>>,
+    reader: Reader<BoundedReader<R>>,
     buffer: Vec<u8>,
     time_bounds: TimeBounds,
-    /// Elements that are open.
+    /// Number of open elements.
     depth: usize,
-    /// The point that is open.
-    point: Option<Point>,
-    begun: bool,
-    ended: bool,
+    /// The open point.
+    point: Option<OpenPoint>,
+    has_root: bool,
+    has_ended: bool,
 }
 
-struct Point {
+struct OpenPoint {
     line: u64,
-    /// Elements open around it.
+    /// Depth of its parent.
     depth: usize,
     fix: std::result::Result<Fix, RowError>,
     /// Text of its `time`, if it has one.
@@ -42,9 +42,9 @@ struct Point {
     in_time: bool,
 }
 
-/// What an event means for the points.
-enum Step {
-    Open { point: Option<Point>, is_time: bool, is_gpx: bool, is_empty: bool },
+/// An XML event as far as it concerns points.
+enum PointEvent {
+    Open { point: Option<OpenPoint>, is_time: bool, is_gpx: bool, is_empty: bool },
     Close,
     Text(String),
     Other,
@@ -53,45 +53,44 @@ enum Step {
 
 impl<R: Read> GpxFixes<R> {
     pub(super) fn new(reader: R, time_bounds: TimeBounds) -> Self {
-        let source = Counted { reader: BufReader::new(reader), line: 1, since: 0 };
+        let source = BoundedReader { reader: BufReader::new(reader), line: 1, event_bytes: 0 };
         Self {
             reader: Reader::from_reader(source),
             buffer: Vec::new(),
             time_bounds,
             depth: 0,
             point: None,
-            begun: false,
-            ended: false,
+            has_root: false,
+            has_ended: false,
         }
     }
 
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
-        while !self.ended {
-            match self.step().and_then(|step| self.take(step)) {
+        while !self.has_ended {
+            match self.next_event().and_then(|event| self.handle(event)) {
                 Ok(None) => {}
                 Ok(Some(row)) => return Some(Ok(row)),
-                Err(broken) => {
-                    self.ended = true;
-                    return Some(Err(broken));
+                Err(error) => {
+                    self.has_ended = true;
+                    return Some(Err(error));
                 }
             }
         }
         None
     }
 
-    fn step(&mut self) -> Result<Step> {
+    fn next_event(&mut self) -> Result<PointEvent> {
         self.buffer.clear();
-        self.reader.get_mut().since = 0;
+        self.reader.get_mut().event_bytes = 0;
         let in_time = self.point.as_ref().is_some_and(|point| point.in_time);
         let event = self.reader.read_event_into(&mut self.buffer);
-        // Text and names borrow the buffer, so the line is taken where nothing else is borrowed.
         Ok(match event {
             Ok(Event::Start(tag)) => opened(&tag, self.reader.get_ref().line, self.depth, false),
             Ok(Event::Empty(tag)) => opened(&tag, self.reader.get_ref().line, self.depth, true),
-            Ok(Event::End(_)) => Step::Close,
-            Ok(Event::Text(text)) if in_time => Step::Text(text.to_string()),
-            Ok(Event::Eof) => Step::End,
-            Ok(_) => Step::Other,
+            Ok(Event::End(_)) => PointEvent::Close,
+            Ok(Event::Text(text)) if in_time => PointEvent::Text(text.to_string()),
+            Ok(Event::Eof) => PointEvent::End,
+            Ok(_) => PointEvent::Other,
             Err(quick_xml::Error::Io(error)) if error.kind() != io::ErrorKind::InvalidInput => {
                 return Err(Error::fault(error));
             }
@@ -99,15 +98,15 @@ impl<R: Read> GpxFixes<R> {
         })
     }
 
-    fn take(&mut self, step: Step) -> Result<Option<std::result::Result<FixRow, RowError>>> {
-        match step {
-            Step::Open { point, is_time, is_gpx, is_empty } => {
-                if !self.begun && !is_gpx {
+    fn handle(&mut self, event: PointEvent) -> Result<Option<std::result::Result<FixRow, RowError>>> {
+        match event {
+            PointEvent::Open { point, is_time, is_gpx, is_empty } => {
+                if !self.has_root && !is_gpx {
                     return Err(self.malformed("not GPX: the first element must be `gpx`"));
                 }
-                self.begun = true;
+                self.has_root = true;
                 if let Some(open) = &mut self.point {
-                    // A time that is the point's own, not one of its extensions'.
+                    // The time of the point itself, not of one of its extensions.
                     if is_time && self.depth == open.depth + 1 && !is_empty {
                         open.in_time = true;
                         open.time.get_or_insert_default();
@@ -116,24 +115,26 @@ impl<R: Read> GpxFixes<R> {
                     self.point = point;
                 }
                 self.depth += 1;
-                if self.depth > DEEPEST {
-                    return Err(self.malformed("elements lie more than 64 deep"));
+                if self.depth > MAX_DEPTH {
+                    return Err(self.malformed("elements are nested more than 64 deep"));
                 }
                 if is_empty {
                     return Ok(self.close());
                 }
             }
-            Step::Close => return Ok(self.close()),
-            Step::Text(text) => {
+            PointEvent::Close => return Ok(self.close()),
+            PointEvent::Text(text) => {
                 if let Some(time) = self.point.as_mut().and_then(|point| point.time.as_mut())
-                    && time.len() + text.len() <= LONGEST_TIME_BYTES
+                    && time.len() + text.len() <= MAX_TIME_BYTES
                 {
                     time.push_str(&text);
                 }
             }
-            Step::Other => {}
-            Step::End if self.depth == 0 && self.begun => self.ended = true,
-            Step::End => return Err(self.malformed("the file ends before its elements do")),
+            PointEvent::Other => {}
+            PointEvent::End if self.depth == 0 && self.has_root => self.has_ended = true,
+            PointEvent::End => {
+                return Err(self.malformed("the file ends before its root element is complete"));
+            }
         }
         Ok(None)
     }
@@ -154,70 +155,71 @@ impl<R: Read> GpxFixes<R> {
     }
 }
 
-impl Point {
+impl OpenPoint {
     fn row(self, time_bounds: &TimeBounds) -> std::result::Result<FixRow, RowError> {
         let fix = self.fix?;
         let time = self.time.as_deref().map(|text| parse_time(text.trim())).transpose();
-        let at_fault = |_| RowError {
+        let invalid = |_| RowError {
             line: self.line,
             field: "time".to_owned(),
             reason: "must be RFC 3339 with an offset, such as 2020-12-14T06:41:48Z".to_owned(),
         };
-        FixRow::checked(self.line, time.map_err(at_fault)?, None, fix, time_bounds)
+        FixRow::checked(self.line, time.map_err(invalid)?, None, fix, time_bounds)
     }
 }
 
-fn opened(tag: &BytesStart<'_>, line: u64, depth: usize, is_empty: bool) -> Step {
+fn opened(tag: &BytesStart<'_>, line: u64, depth: usize, is_empty: bool) -> PointEvent {
     let name = tag.local_name().into_inner();
     let is_point = matches!(name, "trkpt" | "rtept" | "wpt");
-    let point = is_point.then(|| Point { line, depth, fix: place(tag, line), time: None, in_time: false });
-    Step::Open { point, is_time: name == "time", is_gpx: name == "gpx", is_empty }
+    let point =
+        is_point.then(|| OpenPoint { line, depth, fix: fix_of(tag, line), time: None, in_time: false });
+    PointEvent::Open { point, is_time: name == "time", is_gpx: name == "gpx", is_empty }
 }
 
-fn place(tag: &BytesStart<'_>, line: u64) -> std::result::Result<Fix, RowError> {
-    let fault =
+fn fix_of(tag: &BytesStart<'_>, line: u64) -> std::result::Result<Fix, RowError> {
+    let error =
         |field: &str, reason: &str| RowError { line, field: field.to_owned(), reason: reason.to_owned() };
     let degrees = |name: &str| {
         let attribute = tag.try_get_attribute(name).ok().flatten();
-        let attribute = attribute.ok_or_else(|| fault(name, "is required"))?;
-        attribute.value.trim().parse().map_err(|_| fault(name, "must be a number of degrees"))
+        let attribute = attribute.ok_or_else(|| error(name, "is required"))?;
+        attribute.value.trim().parse().map_err(|_| error(name, "must be a number of degrees"))
     };
-    let place = wire::Fix { longitude_deg: degrees("lon")?, latitude_deg: degrees("lat")?, sigma_m: None };
-    place.to_domain().map_err(|error| {
-        let is_latitude = error.to_string().starts_with("latitude");
-        fault(if is_latitude { "lat" } else { "lon" }, &error.to_string())
+    let fix = wire::Fix { longitude_deg: degrees("lon")?, latitude_deg: degrees("lat")?, sigma_m: None };
+    fix.to_domain().map_err(|cause| {
+        let is_latitude = cause.to_string().starts_with("latitude");
+        error(if is_latitude { "lat" } else { "lon" }, &cause.to_string())
     })
 }
 
-/// Counts lines, and refuses to go on within one event for longer than a row may be.
-struct Counted<R> {
+/// Counts lines and limits the bytes of one event.
+struct BoundedReader<R> {
     reader: BufReader<R>,
     line: u64,
-    /// Bytes taken since the last event.
-    since: usize,
+    /// Bytes consumed since the latest event.
+    event_bytes: usize,
 }
 
-impl<R: Read> Read for Counted<R> {
+impl<R: Read> Read for BoundedReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let taken = self.fill_buf()?.read(buffer)?;
-        self.consume(taken);
-        Ok(taken)
+        let consumed = self.fill_buf()?.read(buffer)?;
+        self.consume(consumed);
+        Ok(consumed)
     }
 }
 
-impl<R: Read> BufRead for Counted<R> {
+impl<R: Read> BufRead for BoundedReader<R> {
     fn fill_buf(&mut self) -> io::Result<&[u8]> {
-        if self.since > LONGEST_ROW_BYTES {
+        if self.event_bytes > MAX_ROW_BYTES {
             let reason = "a tag or text is longer than 64 KiB";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
         }
         self.reader.fill_buf()
     }
 
-    fn consume(&mut self, taken: usize) {
-        let lines = self.reader.buffer().iter().take(taken).filter(|&&byte| byte == b'\n').count();
+    fn consume(&mut self, consumed: usize) {
+        let lines = self.reader.buffer().iter().take(consumed).filter(|&&byte| byte == b'\n').count();
         self.line += lines as u64;
-        self.since += taken;
-        self.reader.consume(taken);
+        self.event_bytes += consumed;
+        self.reader.consume(consumed);
     }
 }

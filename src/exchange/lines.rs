@@ -1,20 +1,20 @@
-//! Lines of a file in bounded memory: a line too long is skipped and told, not gathered.
+//! Lines of a file in bounded memory: a line beyond the limit is skipped and reported.
 
 use std::io::{self, BufRead, BufReader, Read};
 
-use super::LONGEST_ROW_BYTES;
+use super::MAX_ROW_BYTES;
 
-/// One line without its end.
+/// One line without its line ending.
 pub(super) enum Line<'a> {
-    /// What it says.
+    /// Valid text.
     Text(&'a str),
     /// It is not UTF-8.
     NotUtf8,
-    /// It is longer than [`LONGEST_ROW_BYTES`].
+    /// It is longer than [`MAX_ROW_BYTES`].
     TooLong,
 }
 
-/// Reads lines that end in LF or CRLF; a byte order mark before the first is dropped.
+/// Reads lines that end in LF or CRLF; a byte order mark before the first is removed.
 pub(super) struct Lines<R> {
     reader: BufReader<R>,
     line: Vec<u8>,
@@ -26,7 +26,7 @@ impl<R: Read> Lines<R> {
         Self { reader: BufReader::with_capacity(64 * 1024, reader), line: Vec::with_capacity(256), number: 0 }
     }
 
-    /// Number of the line that was read last; 0 before the first.
+    /// Number of the latest line, from 1; 0 before the first.
     pub(super) const fn number(&self) -> u64 {
         self.number
     }
@@ -34,19 +34,19 @@ impl<R: Read> Lines<R> {
     /// The next line and its number from 1, or `None` at the end of the file.
     pub(super) fn next_line(&mut self) -> io::Result<Option<(u64, Line<'_>)>> {
         self.line.clear();
-        let most = LONGEST_ROW_BYTES as u64 + 2; // the line's end is not counted
-        if (&mut self.reader).take(most).read_until(b'\n', &mut self.line)? == 0 {
+        let limit = MAX_ROW_BYTES as u64 + 2; // plus the line ending
+        if (&mut self.reader).take(limit).read_until(b'\n', &mut self.line)? == 0 {
             return Ok(None);
         }
         self.number += 1;
-        let whole = self.line.ends_with(b"\n");
+        let is_complete = self.line.ends_with(b"\n");
         let mut text = self.line.strip_suffix(b"\n").unwrap_or(&self.line);
         text = text.strip_suffix(b"\r").unwrap_or(text);
         if self.number == 1 {
             text = text.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(text);
         }
-        if text.len() > LONGEST_ROW_BYTES {
-            if !whole {
+        if text.len() > MAX_ROW_BYTES {
+            if !is_complete {
                 self.reader.skip_until(b'\n')?;
             }
             return Ok(Some((self.number, Line::TooLong)));

@@ -1,16 +1,18 @@
 //! Files of samples, observations, fixes and fused positions: CSV, NDJSON, JSON, GeoJSON,
 //! NMEA, GPX and gpsd's log.
 //!
-//! HTTP, the command line and evaluation all read and write through here, so a file means the same
-//! everywhere. Readers and writers stream: memory is bounded by one line or element of at most
-//! 64 KiB, however long the file. One bad row never loses the others: its line, field and reason
-//! come out in its place. What never happens here: transports, storage, clocks; numbers are checked
-//! by the constructors of [`crate::domain`] alone.
+//! REST, the command line and evaluation all use these readers and writers, so a file has the same
+//! meaning everywhere. They stream: memory is bounded by one line or element of at most 64 KiB,
+//! regardless of the length of the file. An invalid row does not affect the others: an error with its
+//! line, field and reason takes its place. Numbers are checked by the constructors of
+//! [`crate::domain`] only. What never happens here: transports, storage, clocks.
 
 mod columns;
 mod csv_rows;
 mod cursor;
 mod elements;
+mod file_row;
+mod fix_row;
 mod fixes;
 mod format;
 mod gpsd;
@@ -24,10 +26,11 @@ pub mod wire;
 mod write;
 
 pub use cursor::{foreign_cursor, read_cursor, write_cursor};
-pub use fixes::{FixFormat, TimedFix, read_fixes, read_received_fixes};
-pub use format::Format;
-pub use rows::{ObservedRow, RowError, RowRules, read_detections, read_observations, read_samples};
+pub use file_row::RowError;
+pub use fixes::{TimedFix, read_fixes, read_received_fixes};
+pub use format::{FixFormat, Format};
+pub use rows::{ObservedRow, RowRules, read_detections, read_observations, read_samples};
 pub use write::{FusedWriter, SampleWriter, write_fused, write_samples};
 
-/// Longest line of a CSV, NDJSON or NMEA file and longest element of a JSON array, in bytes.
-pub const LONGEST_ROW_BYTES: usize = 64 * 1024;
+/// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.
+pub const MAX_ROW_BYTES: usize = 64 * 1024;

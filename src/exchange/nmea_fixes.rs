@@ -1,7 +1,7 @@
 //! Fixes of an NMEA 0183 log.
 //!
-//! Positions come from GGA, which tells their quality but only the time of day; the date comes from
-//! RMC and ZDA. Other sentences are passed over.
+//! Positions are those of GGA, which has their quality but only the time of day; the date is that of
+//! RMC and ZDA. Other sentences are skipped.
 
 use std::collections::VecDeque;
 use std::io::Read;
@@ -13,55 +13,56 @@ use nmea::sentences::rmc::RmcStatusOfFix;
 use nmea::sentences::{FixType, GgaData, RmcData, ZdaData};
 use nmea::{ParseResult, SentenceType};
 
-use super::fixes::FixRow;
+use super::file_row::RowError;
+use super::fix_row::FixRow;
 use super::lines::{Line, Lines};
-use super::rows::RowError;
 use super::wire;
 use crate::domain::{Error, Fix, Result, TimeBounds};
 
-/// Sentences that wait for the first date. Receivers send RMC or ZDA at least every few seconds; in
-/// a file without a date the fixes come out without a time.
-const MOST_WAITING: usize = 256;
+/// Rows buffered until the first date. Receivers send RMC or ZDA at least every few seconds; the fixes
+/// of a file without a date have no time.
+const MAX_PENDING: usize = 256;
 
 /// Reads an NMEA log's fixes.
 pub(super) struct NmeaFixes<R> {
     lines: Lines<R>,
     time_bounds: TimeBounds,
-    /// The latest instant of which the date was told.
-    dated: Option<Timestamp>,
-    /// In the file's order; the first waits for a date.
-    waiting: VecDeque<Waiting>,
+    /// The latest instant with a date.
+    dated_instant: Option<Timestamp>,
+    /// In the order of the file; the first lacks a date.
+    pending: VecDeque<PendingRow>,
 }
 
-enum Waiting {
+enum PendingRow {
     Fix { line: u64, time_of_day: Option<Time>, fix: Fix },
-    Fault(RowError),
+    Invalid(RowError),
 }
 
-/// What a line tells.
-enum Told {
+/// Content of a line.
+enum Content {
     Fix(Option<Time>, Fix),
     Date(Timestamp),
-    Nothing,
+    None,
 }
 
 impl<R: Read> NmeaFixes<R> {
     pub(super) fn new(reader: R, time_bounds: TimeBounds) -> Self {
-        Self { lines: Lines::new(reader), time_bounds, dated: None, waiting: VecDeque::new() }
+        Self { lines: Lines::new(reader), time_bounds, dated_instant: None, pending: VecDeque::new() }
     }
 
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
         loop {
-            let full = self.waiting.len() >= MOST_WAITING;
-            let ready =
-                self.dated.is_some() || full || matches!(self.waiting.front(), Some(Waiting::Fault(_)));
-            if ready && let Some(first) = self.waiting.pop_front() {
-                return Some(Ok(self.released(first)));
+            let is_full = self.pending.len() >= MAX_PENDING;
+            let is_ready = self.dated_instant.is_some()
+                || is_full
+                || matches!(self.pending.front(), Some(PendingRow::Invalid(_)));
+            if is_ready && let Some(first) = self.pending.pop_front() {
+                return Some(Ok(self.resolve(first)));
             }
             match self.read_line() {
-                Err(broken) => return Some(Err(broken)),
+                Err(error) => return Some(Err(error)),
                 Ok(true) => {}
-                Ok(false) => return self.waiting.pop_front().map(|first| Ok(self.released(first))),
+                Ok(false) => return self.pending.pop_front().map(|first| Ok(self.resolve(first))),
             }
         }
     }
@@ -69,36 +70,38 @@ impl<R: Read> NmeaFixes<R> {
     /// Reads one line; `false` at the end of the file.
     fn read_line(&mut self) -> Result<bool> {
         let Some((line, text)) = self.lines.next_line().map_err(Error::fault)? else { return Ok(false) };
-        let told = match text {
-            Line::Text(text) => told(text.trim()),
+        let content = match text {
+            Line::Text(text) => content_of(text.trim()),
             Line::NotUtf8 => Err("is not UTF-8".to_owned()),
             Line::TooLong => Err("is longer than 64 KiB".to_owned()),
         };
-        match told {
-            Ok(Told::Nothing) => {}
-            Ok(Told::Date(dated)) => self.dated = Some(dated),
-            Ok(Told::Fix(time_of_day, fix)) => {
-                self.waiting.push_back(Waiting::Fix { line, time_of_day, fix });
+        match content {
+            Ok(Content::None) => {}
+            Ok(Content::Date(instant)) => self.dated_instant = Some(instant),
+            Ok(Content::Fix(time_of_day, fix)) => {
+                self.pending.push_back(PendingRow::Fix { line, time_of_day, fix });
             }
-            Err(reason) => self.waiting.push_back(Waiting::Fault(RowError::whole(line, &reason))),
+            Err(reason) => self.pending.push_back(PendingRow::Invalid(RowError::whole(line, &reason))),
         }
         Ok(true)
     }
 
-    fn released(&self, waiting: Waiting) -> Result<FixRow, RowError> {
-        match waiting {
-            Waiting::Fault(fault) => Err(fault),
-            Waiting::Fix { line, time_of_day, fix } => {
-                let time = time_of_day.zip(self.dated).and_then(|(time, dated)| nearest(time, dated));
+    fn resolve(&self, row: PendingRow) -> Result<FixRow, RowError> {
+        match row {
+            PendingRow::Invalid(error) => Err(error),
+            PendingRow::Fix { line, time_of_day, fix } => {
+                let time = time_of_day
+                    .zip(self.dated_instant)
+                    .and_then(|(time, dated)| nearest_instant(time, dated));
                 FixRow::checked(line, time, None, fix, &self.time_bounds)
             }
         }
     }
 }
 
-/// The instant of a time of day that is nearest to a dated one: around midnight a fix may come
-/// before the sentence that tells the new date.
-fn nearest(time_of_day: Time, dated: Timestamp) -> Option<Timestamp> {
+/// The instant with that time of day that is nearest to a dated instant: at midnight a fix may precede
+/// the sentence with the new date.
+fn nearest_instant(time_of_day: Time, dated: Timestamp) -> Option<Timestamp> {
     let date = TimeZone::UTC.to_datetime(dated).date();
     let same_day = instant(date, time_of_day)?;
     let day = SignedDuration::from_hours(24);
@@ -110,16 +113,16 @@ fn instant(date: Date, time: Time) -> Option<Timestamp> {
     TimeZone::UTC.to_timestamp(DateTime::from_parts(date, time)).ok()
 }
 
-/// What a line tells; blank lines and other sentences tell nothing.
-fn told(text: &str) -> Result<Told, String> {
-    let Some(sentence) = sentence_of(text) else { return Ok(Told::Nothing) };
+/// Parses a line; blank lines and other sentences have no content.
+fn content_of(text: &str) -> Result<Content, String> {
+    let Some(sentence) = sentence_of(text) else { return Ok(Content::None) };
     match nmea::parse_str(text) {
-        Ok(ParseResult::GGA(gga)) => Ok(Told::Fix(time_of(gga.fix_time), fix_of(&gga)?)),
-        Ok(ParseResult::RMC(rmc)) => Ok(date_of_rmc(&rmc).map_or(Told::Nothing, Told::Date)),
-        Ok(ParseResult::ZDA(zda)) => Ok(date_of_zda(&zda).map_or(Told::Nothing, Told::Date)),
-        Ok(_) => Ok(Told::Nothing),
-        // Where there is no fix to lose, there is nothing to tell.
-        Err(_) if sentence == Sentence::Dated => Ok(Told::Nothing),
+        Ok(ParseResult::GGA(gga)) => Ok(Content::Fix(time_of(gga.fix_time), fix_of(&gga)?)),
+        Ok(ParseResult::RMC(rmc)) => Ok(date_of_rmc(&rmc).map_or(Content::None, Content::Date)),
+        Ok(ParseResult::ZDA(zda)) => Ok(date_of_zda(&zda).map_or(Content::None, Content::Date)),
+        Ok(_) => Ok(Content::None),
+        // An invalid sentence without a position loses no fix.
+        Err(_) if sentence == Sentence::Date => Ok(Content::None),
         Err(nmea::Error::ChecksumMismatch { .. }) => Err("the sentence's checksum is wrong".to_owned()),
         Err(_) => Err("is not an NMEA 0183 sentence".to_owned()),
     }
@@ -127,38 +130,38 @@ fn told(text: &str) -> Result<Told, String> {
 
 #[derive(PartialEq, Eq)]
 enum Sentence {
-    /// GGA, or what is no sentence at all.
-    Positioned,
+    /// GGA, or text that is not a sentence.
+    Position,
     /// RMC or ZDA.
-    Dated,
+    Date,
 }
 
-/// `$` or `!`, two letters of the talker, three of the sentence; `$P...` is a maker's own. `None`
-/// for what need not be parsed.
+/// Kind of a sentence by its address: `$` or `!`, two letters of the talker, three of the sentence;
+/// `$P...` is proprietary. `None` for sentences that need not be parsed.
 fn sentence_of(text: &str) -> Option<Sentence> {
     let address = text.strip_prefix(['$', '!']).and_then(|rest| rest.split(',').next());
     let is_address = |address: &&str| {
         (4..=10).contains(&address.len()) && address.bytes().all(|byte| byte.is_ascii_alphanumeric())
     };
     let Some(address) = address.filter(is_address) else {
-        return (!text.is_empty()).then_some(Sentence::Positioned);
+        return (!text.is_empty()).then_some(Sentence::Position);
     };
     let name = address.get(2..)?;
     if name == SentenceType::GGA.as_str() {
-        return Some(Sentence::Positioned);
+        return Some(Sentence::Position);
     }
     [SentenceType::RMC, SentenceType::ZDA]
         .iter()
         .any(|dated| name == dated.as_str())
-        .then_some(Sentence::Dated)
+        .then_some(Sentence::Date)
 }
 
-/// The library's times and dates are those of another calendar library; their text is ISO 8601.
+/// Converts the parser's times, which are of another calendar library, by their ISO 8601 text.
 fn time_of(time: Option<impl ToString>) -> Option<Time> {
     time?.to_string().parse().ok()
 }
 
-/// A receiver that has no fix may tell any date.
+/// The date of an RMC sentence; it is undefined while the receiver has no fix.
 fn date_of_rmc(rmc: &RmcData) -> Option<Timestamp> {
     let date = rmc.fix_date.filter(|_| rmc.status_of_fix != RmcStatusOfFix::Invalid)?;
     instant(date.to_string().parse().ok()?, time_of(rmc.fix_time)?)
@@ -174,7 +177,8 @@ fn fix_of(gga: &GgaData) -> Result<Fix, String> {
         None | Some(FixType::Invalid) => return Err("the receiver had no fix (quality 0)".to_owned()),
         Some(_) => {
             return Err(
-                "the position is estimated, typed in or simulated (quality 6 to 8), not received".to_owned()
+                "the position is estimated, entered manually or simulated (quality 6 to 8), not measured"
+                    .to_owned(),
             );
         }
     }

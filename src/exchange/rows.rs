@@ -1,82 +1,53 @@
-//! Rows of sample and observation files.
+//! Rows of files of samples, observations and detections.
 
 use std::io::Read;
-
-use serde::Deserialize;
 
 use super::columns::{HEIGHT, LATITUDE, LEFT, LONGITUDE, TARGET_ID, TIME};
 use super::csv_rows::CsvRows;
 use super::elements::Elements;
+use super::file_row::{FileRow, RowError, shared};
 use super::format::Format;
 use super::lines::{Line, Lines};
-use super::wire::{self, Text, box_within};
+use super::wire::{self, box_within};
 use crate::domain::{
     Detection, Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, TargetClass, TargetId,
     TimeBounds, parse_time,
 };
 use crate::geo::Position;
 
-/// Why one row of a file was not taken.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RowError {
-    /// Line of the file from 1 (a CSV file's header is line 1), or element of a JSON array from 1.
-    pub line: u64,
-    /// Column, or path of the field in the row's JSON; empty if the row as a whole is at fault.
-    pub field: String,
-    /// What is wrong and what would be right.
-    pub reason: String,
-}
-
-impl RowError {
-    pub(super) fn whole(line: u64, reason: &str) -> Self {
-        Self { line, field: String::new(), reason: reason.to_owned() }
-    }
-
-    /// A refusal as the row's fault; a fault of the machine stays an error of the file.
-    pub fn of(line: u64, error: Error) -> Result<Self> {
-        match error {
-            Error::Refused(refusal) => Ok(match refusal.violations.into_iter().next() {
-                Some(violation) => Self { line, field: violation.field, reason: violation.message },
-                None => Self { line, field: String::new(), reason: refusal.message },
-            }),
-            Error::Fault(_) => Err(error),
-        }
-    }
-}
-
-/// What a row is held against.
+/// What rows are checked against.
 #[derive(Debug, Clone, Copy)]
 pub struct RowRules {
-    /// Believable instants.
+    /// Valid times.
     pub time_bounds: TimeBounds,
-    /// The camera's image, if it is known: boxes outside of it are refused.
+    /// Size of the camera's image, if known: boxes outside of it are refused.
     pub image_size: Option<ImageSize>,
 }
 
-/// A row of a file to be fused or evaluated.
+/// A row of a file to fuse, evaluate or replay.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ObservedRow {
-    /// What was seen and received.
+    /// The observation.
     pub observation: Observation,
-    /// What the detector takes the target for.
+    /// Class reported by the detector.
     pub class: Option<TargetClass>,
-    /// How sure the detector is.
+    /// Confidence score of the detector.
     pub score: Option<Score>,
-    /// Where the target truly was.
+    /// True position.
     pub truth: Option<Position>,
 }
 
-/// Rows of a sample file, one by one, in the file's order.
+/// Samples of a file, in the order of the file.
 ///
 /// CSV has the columns `time`, `target_id`, `left`, `top`, `width`, `height`, `longitude`,
-/// `latitude` in any order, also with their units (`left_px`, `longitude_deg`), and at will
+/// `latitude` in any order, also with their units (`left_px`, `longitude_deg`), and optionally
 /// `sigma_m`, `class`, `score`, `truth_longitude` and `truth_latitude`. NDJSON has a [`wire::Sample`]
-/// a line; JSON is an array of them, or an object `{"samples": [...]}`.
+/// per line; JSON is an array of them, or an object `{"samples": [...]}`.
 ///
 /// # Errors
-/// Outside: a file that cannot be read at all (no header, a column missing or unknown, not JSON, a
-/// format that is only written). As an item: a file that breaks off, after which nothing follows.
-/// Within an item: the fault of that row alone.
+/// The outer error: the file cannot be read at all (no header, a column missing or unknown, not JSON, a
+/// format that is only written). The error of an item: the file is truncated or cannot be read further;
+/// nothing follows. The inner error of an item: that row is invalid.
 pub fn read_samples<R: Read>(
     reader: R,
     format: Format,
@@ -84,12 +55,12 @@ pub fn read_samples<R: Read>(
 ) -> Result<impl Iterator<Item = Result<Result<Sample, RowError>>> + use<R>> {
     let required = [TIME, TARGET_ID, LEFT, LEFT + 1, LEFT + 2, HEIGHT, LONGITUDE, LATITUDE];
     let mut rows = Rows::new(reader, format, &required)?;
-    let mut reading = Reading::new(*rules);
-    Ok(std::iter::from_fn(move || rows.next_row(|row| reading.sample(&row))))
+    let mut converter = RowConverter::new(*rules);
+    Ok(std::iter::from_fn(move || rows.next_row(|row| converter.sample(&row))))
 }
 
-/// The same with target, box, fix and class all optional: what `sightfix fuse` and evaluation read.
-/// A row may hold a box, a fix, or both.
+/// Observations of a file: rows as those of [`read_samples`] with a box, a fix, or both; target and class
+/// are optional.
 ///
 /// # Errors
 /// As [`read_samples`].
@@ -99,12 +70,12 @@ pub fn read_observations<R: Read>(
     rules: &RowRules,
 ) -> Result<impl Iterator<Item = Result<Result<ObservedRow, RowError>>> + use<R>> {
     let mut rows = Rows::new(reader, format, &[TIME])?;
-    let mut reading = Reading::new(*rules);
-    Ok(std::iter::from_fn(move || rows.next_row(|row| reading.observed(&row))))
+    let mut converter = RowConverter::new(*rules);
+    Ok(std::iter::from_fn(move || rows.next_row(|row| converter.observed(&row))))
 }
 
-/// Detections of a file, one by one: rows as those of [`read_samples`] without a fix. A `target_id`
-/// that is left out is the given one. What else a row holds is passed over.
+/// Detections of a file: rows as those of [`read_samples`] without a fix. `target_id` is the target of
+/// rows that name none. Other values of a row are ignored.
 ///
 /// # Errors
 /// As [`read_samples`].
@@ -116,43 +87,24 @@ pub fn read_detections<R: Read>(
 ) -> Result<impl Iterator<Item = Result<Result<Detection, RowError>>> + use<R>> {
     let required = [TIME, LEFT, LEFT + 1, LEFT + 2, HEIGHT];
     let mut rows = Rows::new(reader, format, &required)?;
-    let mut reading = Reading::new(*rules);
-    Ok(std::iter::from_fn(move || rows.next_row(|row| reading.detection(&row, target_id.as_ref()))))
+    let mut converter = RowConverter::new(*rules);
+    Ok(std::iter::from_fn(move || rows.next_row(|row| converter.detection(&row, target_id.as_ref()))))
 }
 
-/// Any row as it stands in a file; what is required of it depends on who reads.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct Row<'a> {
-    #[serde(borrow)]
-    pub time: Option<Text<'a>>,
-    #[serde(borrow)]
-    pub target_id: Option<Text<'a>>,
-    pub bounding_box: Option<wire::BoundingBox>,
-    pub fix: Option<wire::Fix>,
-    #[serde(borrow)]
-    pub class: Option<Text<'a>>,
-    pub score: Option<f64>,
-    pub truth: Option<wire::Position>,
-    /// Only files of fixes have it, and these are not JSON.
-    #[serde(skip)]
-    pub receiver_id: Option<Text<'a>>,
-}
-
-/// Turns rows into values. Neighbouring rows mostly have the same target and class, so these are
-/// shared and not made anew.
-struct Reading {
+/// Converts rows into domain values. Adjacent rows mostly have the same target and class, whose text is
+/// then shared.
+struct RowConverter {
     rules: RowRules,
     target_id: Option<TargetId>,
     class: Option<TargetClass>,
 }
 
-impl Reading {
+impl RowConverter {
     const fn new(rules: RowRules) -> Self {
         Self { rules, target_id: None, class: None }
     }
 
-    fn sample(&mut self, row: &Row<'_>) -> Result<Sample> {
+    fn sample(&mut self, row: &FileRow<'_>) -> Result<Sample> {
         let ObservedRow { observation, class, score, truth } = self.observed(row)?;
         let Observation { time, target_id, bounding_box, fix } = observation;
         Ok(Sample {
@@ -166,9 +118,9 @@ impl Reading {
         })
     }
 
-    fn detection(&mut self, row: &Row<'_>, unnamed: Option<&TargetId>) -> Result<Detection> {
+    fn detection(&mut self, row: &FileRow<'_>, default_target: Option<&TargetId>) -> Result<Detection> {
         let ObservedRow { observation, class, score, .. } = self.observed(row)?;
-        let target_id = observation.target_id.or_else(|| unnamed.cloned());
+        let target_id = observation.target_id.or_else(|| default_target.cloned());
         Ok(Detection {
             time: observation.time,
             target_id: target_id.ok_or_else(|| missing("target_id"))?,
@@ -178,7 +130,7 @@ impl Reading {
         })
     }
 
-    fn observed(&mut self, row: &Row<'_>) -> Result<ObservedRow> {
+    fn observed(&mut self, row: &FileRow<'_>) -> Result<ObservedRow> {
         let time = parse_time(row.time.as_ref().ok_or_else(|| missing("time"))?.as_str())?;
         let observation = Observation {
             time: self.rules.time_bounds.check(time)?,
@@ -206,21 +158,7 @@ fn missing(path: &str) -> Error {
     Error::invalid(path, "is required")
 }
 
-/// The name, taken from the row before if it is the same.
-pub(super) fn shared<T: Clone>(
-    text: Option<&Text<'_>>,
-    before: &mut Option<T>,
-    as_str: impl Fn(&T) -> &str,
-    make: impl Fn(&str) -> Result<T>,
-) -> Result<Option<T>> {
-    let Some(text) = text else { return Ok(None) };
-    if before.as_ref().is_none_or(|name| as_str(name) != text.as_str()) {
-        *before = Some(make(text.as_str())?);
-    }
-    Ok(before.clone())
-}
-
-/// The rows of any format.
+/// A reader for each format.
 enum Rows<R> {
     Csv(CsvRows<R>),
     Lines(Lines<R>),
@@ -235,27 +173,27 @@ impl<R: Read> Rows<R> {
             Format::Json => Elements::new(reader, "samples").map(Self::Elements),
             Format::GeoJson => Err(Error::refused(
                 ErrorKind::UnsupportedMediaType,
-                "GeoJSON is written, not read; send CSV, NDJSON or JSON",
+                "GeoJSON is not read, only written; send CSV, NDJSON or JSON",
             )),
         }
     }
 
     fn next_row<T>(
         &mut self,
-        convert: impl FnOnce(Row<'_>) -> Result<T>,
+        convert: impl FnOnce(FileRow<'_>) -> Result<T>,
     ) -> Option<Result<Result<T, RowError>>> {
         match self {
             Self::Csv(rows) => rows.next_row(convert),
             Self::Lines(lines) => loop {
                 match lines.next_line() {
-                    Err(broken) => return Some(Err(Error::fault(broken))),
+                    Err(error) => return Some(Err(Error::fault(error))),
                     Ok(None) => return None,
                     Ok(Some((_, Line::Text(text)))) if text.trim().is_empty() => {}
                     Ok(Some((line, text))) => return Some(json_row(line, &text, convert)),
                 }
             },
             Self::Elements(elements) => match elements.next_element()? {
-                Err(broken) => Some(Err(broken)),
+                Err(error) => Some(Err(error)),
                 Ok((line, text)) => Some(json_row(line, &text, convert)),
             },
         }
@@ -265,7 +203,7 @@ impl<R: Read> Rows<R> {
 fn json_row<T>(
     line: u64,
     text: &Line<'_>,
-    convert: impl FnOnce(Row<'_>) -> Result<T>,
+    convert: impl FnOnce(FileRow<'_>) -> Result<T>,
 ) -> Result<Result<T, RowError>> {
     let text = match text {
         Line::Text(text) => text,

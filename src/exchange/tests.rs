@@ -1,4 +1,4 @@
-//! What files must and must not do, through the public readers and writers.
+//! Readers and writers through their public interface.
 
 mod fixes;
 
@@ -30,7 +30,7 @@ fn rows(text: &str, format: Format) -> Rows {
     read(text.as_bytes(), format).expect("a file that can be read")
 }
 
-fn fault(text: &str, format: Format) -> RowError {
+fn row_error(text: &str, format: Format) -> RowError {
     let mut faults = rows(text, format).into_iter().filter_map(Result::err);
     let fault = faults.next().expect("a row at fault");
     assert_eq!(faults.next(), None);
@@ -95,7 +95,7 @@ fn decimal(value: f64) -> f64 {
 
 proptest! {
     #[test]
-    fn what_is_written_is_read(samples in prop::collection::vec(sample(), 0..20)) {
+    fn written_samples_are_read(samples in prop::collection::vec(sample(), 0..20)) {
         for format in [Format::Csv, Format::Ndjson, Format::Json] {
             let file = write_samples(Vec::new(), format, &samples).expect("memory");
             let back = read(&file, format).expect("own writing");
@@ -122,7 +122,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_told_from_a_file(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+    fn arbitrary_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
         for format in Format::ALL {
             for begin in ["", HEADER, "[", "{\"samples\":["] {
                 let text = [begin.as_bytes(), b"\n", &bytes].concat();
@@ -143,7 +143,7 @@ proptest! {
     }
 
     #[test]
-    fn a_bad_row_loses_only_itself(bad in "[^\n\r,]{1,80}", before in 0..4_usize, after in 0..4_usize) {
+    fn an_invalid_row_does_not_affect_the_others(bad in "[^\n\r,]{1,80}", before in 0..4_usize, after in 0..4_usize) {
         // A byte order mark alone is no more than a blank line.
         prop_assume!(!bad.trim_matches(|it: char| it.is_whitespace() || it == '\u{feff}').is_empty());
         let expect = |rows: Rows| {
@@ -163,7 +163,7 @@ proptest! {
 }
 
 #[test]
-fn the_fields_at_fault_are_named() {
+fn invalid_fields_are_named() {
     for (row, line, field) in [
         ("2020-12-14T14:41:48+08:00,person-1,475,11,28,77,181,30.6", 2, "longitude"),
         ("2020-12-14T14:41:48+08:00,person-1,475,11,28,77,103,91", 2, "latitude"),
@@ -181,8 +181,8 @@ fn the_fields_at_fault_are_named() {
         ("2020-12-14T14:41:48Z,person-1,475,11,28,77,103", 2, ""),
         ("2020-12-14T14:41:48Z,person-1,475,11,28,77,103,30,5", 2, ""),
     ] {
-        let fault = fault(&format!("{HEADER}\n{row}\n{GOOD}\n"), Format::Csv);
-        assert_eq!((fault.line, fault.field.as_str()), (line, field), "{row}: {fault:?}");
+        let error = row_error(&format!("{HEADER}\n{row}\n{GOOD}\n"), Format::Csv);
+        assert_eq!((error.line, error.field.as_str()), (line, field), "{row}: {error:?}");
     }
     for (from, to, field) in [
         ("103.98678", "181", "fix.longitude_deg"),
@@ -202,31 +202,31 @@ fn the_fields_at_fault_are_named() {
             (format!("[{GOOD_JSON},\n{bad}]"), Format::Json),
             (format!("{{\"samples\":[{GOOD_JSON},{bad}]}}"), Format::Json),
         ] {
-            let fault = fault(&text, format);
-            assert_eq!((fault.line, fault.field.as_str()), (2, field), "{bad}: {fault:?}");
+            let error = row_error(&text, format);
+            assert_eq!((error.line, error.field.as_str()), (2, field), "{bad}: {error:?}");
         }
     }
 }
 
 #[test]
-fn a_file_that_is_none_is_refused_as_a_whole() {
-    for (text, format, said) in [
+fn an_unreadable_file_is_refused_as_a_whole() {
+    for (text, format, reason) in [
         ("", Format::Csv, "empty"),
         ("time,target_id,left,top,width,height,longitude\n", Format::Csv, "latitude"),
         ("time,target_id,left,top,width,height,longitude,latitude,sigma\n", Format::Csv, "`sigma`"),
         ("time;target_id;left\n", Format::Csv, "commas"),
-        ("time,time,target_id\n", Format::Csv, "twice"),
-        ("left,left_px,target_id\n", Format::Csv, "twice"),
+        ("time,time,target_id\n", Format::Csv, "duplicate"),
+        ("left,left_px,target_id\n", Format::Csv, "duplicate"),
         ("7", Format::Json, "array"),
         ("{\"rows\":[]}", Format::Json, "samples"),
-        ("[", Format::Json, "breaks off"),
+        ("[", Format::Json, "ends within"),
         ("[]]", Format::Json, "after"),
-        ("{\"samples\":[],\"more\":1}", Format::Json, "nothing but"),
+        ("{\"samples\":[],\"more\":1}", Format::Json, "only the rows"),
         ("{}", Format::GeoJson, "GeoJSON"),
     ] {
         let error = read(text.as_bytes(), format).expect_err(text);
         assert!(matches!(error.kind(), ErrorKind::MalformedBody | ErrorKind::UnsupportedMediaType));
-        assert!(error.to_string().contains(said), "{text}: {error}");
+        assert!(error.to_string().contains(reason), "{text}: {error}");
     }
     let utf16: Vec<u8> = format!("\u{feff}{HEADER}").encode_utf16().flat_map(u16::to_le_bytes).collect();
     assert!(read(&utf16, Format::Csv).expect_err("UTF-16").to_string().contains("UTF-8"));
@@ -235,7 +235,7 @@ fn a_file_that_is_none_is_refused_as_a_whole() {
 }
 
 #[test]
-fn columns_come_in_any_order_and_with_units() {
+fn columns_are_accepted_in_any_order_and_with_units() {
     let text = "\u{feff}latitude_deg,longitude_deg,score,class,height_px,width_px,top_px,left_px,target_id,time,\
                 sigma_m,truth_latitude,truth_longitude\r\n\
                 30.6280135,103.98678,0.9,person,77,28,11,475,\"a, \"\"b\"\"\",2020-12-14T14:41:48+08:00,2.5,,\r\n\r\n\
@@ -253,17 +253,17 @@ fn columns_come_in_any_order_and_with_units() {
 }
 
 #[test]
-fn a_row_too_long_is_skipped_and_told() {
-    let long = "x".repeat(3 * LONGEST_ROW_BYTES);
+fn a_row_beyond_the_limit_is_skipped_and_reported() {
+    let long = "x".repeat(3 * MAX_ROW_BYTES);
     let text = format!("{HEADER}\n{GOOD}\n{long}\n{GOOD}\n");
-    let fault_of_line = fault(&text, Format::Csv);
-    assert_eq!((fault_of_line.line, rows(&text, Format::Csv).len()), (3, 3));
+    let too_long = row_error(&text, Format::Csv);
+    assert_eq!((too_long.line, rows(&text, Format::Csv).len()), (3, 3));
     let text = format!("[{GOOD_JSON},\"{long}\",{GOOD_JSON}]");
-    assert_eq!((fault(&text, Format::Json).line, rows(&text, Format::Json).len()), (2, 3));
+    assert_eq!((row_error(&text, Format::Json).line, rows(&text, Format::Json).len()), (2, 3));
 }
 
 #[test]
-fn a_box_of_another_image_is_told() {
+fn a_box_outside_of_the_image_is_reported() {
     let mut rules = rules();
     rules.image_size = Some(ImageSize::new(320, 240).expect("a size"));
     let text = format!("{HEADER}\n{GOOD}\n");
@@ -292,7 +292,7 @@ fn observations_may_lack_box_or_fix_but_not_both() {
 }
 
 #[test]
-fn nmea_gives_its_fixes_and_refuses_the_others() {
+fn nmea_positions_without_a_valid_fix_are_row_errors() {
     let text = "$GPGGA,033745.0,5650.82344,N,03548.9778,E,1,07,1.8,101.2,M,14.7,M,,*60\r\n\
                 $GPGSV,3,1,11,10,63,137,17,07,61,098,15,05,59,290,20,08,54,157,30*70\r\n\
                 \r\n\
@@ -354,21 +354,18 @@ fn fused_positions_are_written_in_every_format() {
     assert_eq!(map["features"][0]["properties"], line);
 }
 
-fn square(name: &str) -> Option<File> {
+fn shared_file(name: &str) -> File {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
-    let file = File::open(&path).ok();
-    if file.is_none() {
-        println!("skipped: {} is not here", path.display());
-    }
-    file
+    File::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
 #[test]
-fn the_real_square_is_read_whole_and_written_back() {
-    let Some(file) = square("training.csv") else { return };
+#[ignore = "needs ../shared/data"]
+fn shared_samples_are_read_and_written() {
+    let file = shared_file("training.csv");
     let samples: Result<Vec<Sample>, RowError> =
         read_samples(file, Format::Csv, &rules()).expect("a file").map(|row| row.expect("a line")).collect();
-    let samples = samples.expect("only good rows");
+    let samples = samples.expect("only valid rows");
     assert_eq!(samples.len(), 10_078);
     for format in [Format::Csv, Format::Ndjson, Format::Json] {
         let written = write_samples(Vec::new(), format, &samples).expect("memory");
@@ -379,8 +376,9 @@ fn the_real_square_is_read_whole_and_written_back() {
 }
 
 #[test]
-fn the_real_fixes_are_read_whole() {
-    let Some(file) = square("gnss.csv") else { return };
+#[ignore = "needs ../shared/data"]
+fn shared_fixes_are_read() {
+    let file = shared_file("gnss.csv");
     let fixes = read_fixes(file, FixFormat::Csv, rules().time_bounds).expect("a file");
     assert_eq!(fixes.filter(|row| row.as_ref().expect("a line").is_ok()).count(), 11_270);
 }

@@ -1,7 +1,7 @@
 //! The JSON shapes of positions, boxes, samples, observations and fused positions.
 //!
-//! One set for files and for REST. Shapes are types without checks: the conversions into
-//! [`crate::domain`] check, and name the field at fault by its path in the JSON.
+//! The same shapes serve files and REST. They are not checked: the conversions into [`crate::domain`]
+//! check them and name an invalid field by its path in the JSON.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -13,7 +13,7 @@ use utoipa::ToSchema;
 use crate::domain::{self, Error, ErrorKind, Result, SigmaM, TimeBounds, parse_time};
 use crate::geo::{self, PositionError};
 
-/// Text borrowed from the JSON it stands in, wherever it has no escapes.
+/// Text borrowed from the JSON document if it has no escapes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Text<'a>(#[serde(borrow)] Cow<'a, str>);
@@ -32,7 +32,7 @@ impl<'a> From<&'a str> for Text<'a> {
     }
 }
 
-/// A place on WGS 84.
+/// A position on WGS 84.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Position {
@@ -64,7 +64,7 @@ impl From<geo::Position> for Position {
     }
 }
 
-/// A GNSS position, with the receiver's own word on its error if it gave one.
+/// A GNSS position, with the error reported by the receiver, if any.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Fix {
@@ -82,7 +82,7 @@ pub struct Fix {
 
 impl Fix {
     /// # Errors
-    /// Names the coordinate or `sigma_m` that cannot be used.
+    /// Names the invalid coordinate or `sigma_m`.
     pub fn to_domain(self) -> Result<domain::Fix> {
         let Self { longitude_deg, latitude_deg, sigma_m } = self;
         Ok(domain::Fix {
@@ -122,7 +122,7 @@ pub struct BoundingBox {
 
 impl BoundingBox {
     /// # Errors
-    /// Names the side that cannot be used.
+    /// Names the invalid side.
     pub fn to_domain(self) -> Result<domain::BoundingBox> {
         domain::BoundingBox::new(self.left_px, self.top_px, self.width_px, self.height_px)
     }
@@ -135,28 +135,28 @@ impl From<domain::BoundingBox> for BoundingBox {
     }
 }
 
-/// A box and a fix of one target at one instant, kept for training. Unique by target and time.
+/// A box and a fix of one target at one instant, stored for training. Unique by target and time.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct Sample<'a> {
     /// RFC 3339 with an offset; stored to the microsecond.
     #[schema(value_type = String, format = DateTime, example = "2020-12-14T14:41:48+08:00")]
     pub time: Timestamp,
-    /// Who.
+    /// The target.
     #[schema(value_type = String, min_length = 1, max_length = 128, example = "person-1")]
     pub target_id: &'a str,
-    /// What the camera saw.
+    /// The detection.
     pub bounding_box: BoundingBox,
-    /// What the receiver said.
+    /// The fix.
     pub fix: Fix,
-    /// What the detector takes the target for.
+    /// Class reported by the detector.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, example = "person")]
     pub class: Option<&'a str>,
-    /// How sure the detector is.
+    /// Confidence score of the detector.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.0, maximum = 1.0)]
     pub score: Option<f64>,
-    /// Where the target truly was; for evaluation alone, never used in training.
+    /// True position; for evaluation only, never used in training.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub truth: Option<Position>,
 }
@@ -183,21 +183,21 @@ pub struct Observation<'a> {
     #[serde(borrow)]
     #[schema(value_type = String, format = DateTime, example = "2020-12-14T14:41:48+08:00")]
     pub time: Text<'a>,
-    /// Who, if known.
+    /// The target, if known.
     #[serde(borrow, default)]
     #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "person-1")]
     pub target_id: Option<Text<'a>>,
-    /// What the camera saw.
+    /// The detection.
     #[serde(default)]
     pub bounding_box: Option<BoundingBox>,
-    /// What the receiver said.
+    /// The fix.
     #[serde(default)]
     pub fix: Option<Fix>,
 }
 
 impl Observation<'_> {
     /// # Errors
-    /// Names the field that cannot be used, or both if neither box nor fix is given.
+    /// Names the invalid field, or `bounding_box` if neither box nor fix is given.
     pub fn to_domain(
         &self,
         bounds: &TimeBounds,
@@ -218,7 +218,7 @@ impl Observation<'_> {
     }
 }
 
-/// A box that belongs to an image of that size; errors are named below `bounding_box`.
+/// A box within an image of that size; fields of errors are below `bounding_box`.
 pub fn box_within(sides: BoundingBox, image_size: Option<domain::ImageSize>) -> Result<domain::BoundingBox> {
     let checked = sides.to_domain().and_then(|bounding_box| match image_size {
         Some(size) => bounding_box.within(size),
@@ -227,7 +227,7 @@ pub fn box_within(sides: BoundingBox, image_size: Option<domain::ImageSize>) -> 
     checked.map_err(|error| error.under("bounding_box"))
 }
 
-/// The answer for one observation.
+/// The fused position of one observation.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct FusedFix<'a> {
     /// The observation's time.
@@ -237,12 +237,13 @@ pub struct FusedFix<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     pub target_id: Option<&'a str>,
-    /// The best position: the two-step one; from the box alone without a fix; the fix without a box.
+    /// The best estimate: the two-step position; the regressed position without a fix; the fix without a
+    /// box.
     pub fused: Position,
-    /// The one-step position, from the box.
+    /// The one-step position, regressed from the box.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub regressed: Option<Position>,
-    /// The fix as it came.
+    /// The fix of the observation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gnss: Option<Fix>,
     /// Weight of the regressed position, 0 to 1; both weights sum to 1.
@@ -255,15 +256,15 @@ pub struct FusedFix<'a> {
     /// Error variance per axis of the fix, m2.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub e_gnss_m2: Option<f64>,
-    /// Radius about `fused` that holds the true position with 95 % probability, m.
+    /// Radius about `fused` that contains the true position with 95 % probability, m.
     pub r95_m: f64,
-    /// How badly the auto-encoder rebuilds its input, in the recipe's units.
+    /// Reconstruction error of the auto-encoder, in the recipe's units.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reconstruction_error: Option<f64>,
-    /// Number of the model version that spoke.
+    /// Number of the model version used.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub model_version: Option<u32>,
-    /// What to know about it.
+    /// Warnings.
     #[schema(value_type = Vec<Flag>)]
     pub flags: Flags<'a>,
 }
@@ -288,21 +289,21 @@ impl<'a> From<&'a domain::FusedFix> for FusedFix<'a> {
     }
 }
 
-/// What a caller should know about a fused position.
+/// A warning about a fused position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ToSchema)]
 #[schema(rename_all = "snake_case")]
 pub enum Flag {
-    /// No fix: the position comes from the box alone.
+    /// No fix: the position is regressed from the box alone.
     GnssDenied,
-    /// No box: the fix passes through.
+    /// No box: the position is the fix.
     BoxMissing,
-    /// The image's border cuts the box.
+    /// The image border truncates the box.
     BoxAtBorder,
-    /// The box is unlike those of the training samples.
+    /// The box is outside of the domain of the training samples.
     OutsideTraining,
-    /// The camera has no model; only fixes can pass.
+    /// The camera has no model; only fixes are passed through.
     NoModel,
-    /// The camera no longer looks where it looked when its model was trained.
+    /// The camera's pose has changed since its model was trained.
     CameraMoved,
 }
 
@@ -328,13 +329,13 @@ impl fmt::Display for Flags<'_> {
     }
 }
 
-/// A value from JSON text.
+/// Parses a value from JSON text.
 ///
 /// # Errors
 /// `MalformedBody` for text that is not JSON, `InvalidArgument` for a value of the wrong shape; both
 /// name the path of the field.
 pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
-    // The path costs time to follow, so it is followed only where there is a fault to tell.
+    // Tracking the path is slow, so it is done only for an error.
     match serde_json::from_slice(json) {
         Ok(value) => Ok(value),
         Err(_) => parse_with_path(json),
@@ -358,14 +359,14 @@ fn refusal_of(path: &str, error: &serde_json::Error) -> Error {
         return Error::invalid(path, "the number is too large for a double");
     }
     if error.is_data() {
-        let (field, reason) = named_in(path, what);
+        let (field, reason) = field_and_reason(path, what);
         return Error::invalid(field, reason);
     }
     Error::field(ErrorKind::MalformedBody, path, format!("not JSON: {what}{place}"))
 }
 
-/// serde tells a missing or an unknown field at its parent; here it gets the field's own path.
-fn named_in(path: &str, what: &str) -> (String, String) {
+/// serde reports a missing or unknown field at its parent; this returns the path of the field itself.
+fn field_and_reason(path: &str, what: &str) -> (String, String) {
     let join = |name: &str| if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
     let quoted = |begin: &str| what.strip_prefix(begin).and_then(|rest| rest.split_once('`'));
     if let Some((name, _)) = quoted("missing field `") {

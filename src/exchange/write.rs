@@ -1,7 +1,7 @@
-//! Writers of samples and fused positions, row by row.
+//! Streaming writers of samples and fused positions.
 //!
-//! Degrees are written with 8 decimals (about 1 mm) where the format is text for people (CSV), and
-//! in full elsewhere. GeoJSON is RFC 7946: WGS 84, `[longitude, latitude]`.
+//! Degrees have 8 decimals (about 1 mm) in CSV and full precision elsewhere. GeoJSON is RFC 7946: WGS 84,
+//! `[longitude, latitude]`.
 
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -14,12 +14,12 @@ use super::format::Format;
 use super::wire;
 use crate::domain::{FusedFix, Sample};
 
-/// Writes samples as they come. Between two of them the target can be emptied (`get_mut`), so an
-/// export of any length needs the memory of a page.
+/// Writes samples one by one. Between two of them the output can be drained (`get_mut`), so an export of
+/// any length needs the memory of one page.
 pub struct SampleWriter<W: Write>(Document<W>);
 
 impl<W: Write> SampleWriter<W> {
-    /// A document in that format; nothing is written yet.
+    /// A writer of that format. Nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
         Self(Document::new(out, format, "samples"))
     }
@@ -27,38 +27,38 @@ impl<W: Write> SampleWriter<W> {
     /// Writes one sample.
     ///
     /// # Errors
-    /// What the target says.
+    /// An I/O error of the output.
     pub fn write(&mut self, sample: &Sample) -> io::Result<()> {
         let row = wire::Sample::from(sample);
         match self.0.format {
             Format::Csv => self.0.csv_row(sample_header, |out| sample_cells(out, &row)),
             Format::Ndjson | Format::Json => self.0.json_row(&row),
             Format::GeoJson => {
-                let place = wire::Position::from(sample.fix.position);
-                self.0.json_row(&Feature::new(place, &row))
+                let position = wire::Position::from(sample.fix.position);
+                self.0.json_row(&Feature::new(position, &row))
             }
         }
     }
 
-    /// The target, for taking away what is written so far.
+    /// The output, to drain it.
     pub const fn get_mut(&mut self) -> &mut W {
         &mut self.0.out
     }
 
-    /// Ends the document and gives back the target.
+    /// Completes the document and returns the output.
     ///
     /// # Errors
-    /// What the target says.
+    /// An I/O error of the output.
     pub fn finish(self) -> io::Result<W> {
         self.0.finish(sample_header)
     }
 }
 
-/// Writes fused positions as they come; as [`SampleWriter`].
+/// Writes fused positions one by one, like [`SampleWriter`].
 pub struct FusedWriter<W: Write>(Document<W>);
 
 impl<W: Write> FusedWriter<W> {
-    /// A document in that format; nothing is written yet.
+    /// A writer of that format. Nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
         Self(Document::new(out, format, "items"))
     }
@@ -66,7 +66,7 @@ impl<W: Write> FusedWriter<W> {
     /// Writes one fused position.
     ///
     /// # Errors
-    /// What the target says.
+    /// An I/O error of the output.
     pub fn write(&mut self, fused: &FusedFix) -> io::Result<()> {
         let row = wire::FusedFix::from(fused);
         match self.0.format {
@@ -76,15 +76,15 @@ impl<W: Write> FusedWriter<W> {
         }
     }
 
-    /// The target, for taking away what is written so far.
+    /// The output, to drain it.
     pub const fn get_mut(&mut self) -> &mut W {
         &mut self.0.out
     }
 
-    /// Ends the document and gives back the target.
+    /// Completes the document and returns the output.
     ///
     /// # Errors
-    /// What the target says.
+    /// An I/O error of the output.
     pub fn finish(self) -> io::Result<W> {
         self.0.finish(fused_header)
     }
@@ -93,7 +93,7 @@ impl<W: Write> FusedWriter<W> {
 /// Writes samples as one document.
 ///
 /// # Errors
-/// What the target says.
+/// An I/O error of the output.
 pub fn write_samples<'a, W: Write>(
     out: W,
     format: Format,
@@ -109,7 +109,7 @@ pub fn write_samples<'a, W: Write>(
 /// Writes fused positions as one document.
 ///
 /// # Errors
-/// What the target says.
+/// An I/O error of the output.
 pub fn write_fused<'a, W: Write>(
     out: W,
     format: Format,
@@ -122,18 +122,18 @@ pub fn write_fused<'a, W: Write>(
     writer.finish()
 }
 
-/// What all documents have in common: how they begin, part their rows, and end.
+/// The framing of a document: beginning, separators and end.
 struct Document<W> {
     out: W,
     format: Format,
-    /// The rows' name in a JSON document.
+    /// Name of the array in a JSON document.
     name: &'static str,
-    begun: bool,
+    has_begun: bool,
 }
 
 impl<W: Write> Document<W> {
     const fn new(out: W, format: Format, name: &'static str) -> Self {
-        Self { out, format, name, begun: false }
+        Self { out, format, name, has_begun: false }
     }
 
     fn csv_row(
@@ -141,8 +141,8 @@ impl<W: Write> Document<W> {
         header: fn(&mut W) -> io::Result<()>,
         cells: impl FnOnce(&mut W) -> io::Result<()>,
     ) -> io::Result<()> {
-        if !self.begun {
-            self.begun = true;
+        if !self.has_begun {
+            self.has_begun = true;
             header(&mut self.out)?;
         }
         cells(&mut self.out)
@@ -150,11 +150,11 @@ impl<W: Write> Document<W> {
 
     fn json_row(&mut self, row: &impl Serialize) -> io::Result<()> {
         match self.format {
-            Format::Json | Format::GeoJson if self.begun => self.out.write_all(b",\n")?,
+            Format::Json | Format::GeoJson if self.has_begun => self.out.write_all(b",\n")?,
             Format::Json | Format::GeoJson => self.begin()?,
             Format::Csv | Format::Ndjson => {}
         }
-        self.begun = true;
+        self.has_begun = true;
         serde_json::to_writer(&mut self.out, row)?;
         if self.format == Format::Ndjson { self.out.write_all(b"\n") } else { Ok(()) }
     }
@@ -169,10 +169,10 @@ impl<W: Write> Document<W> {
 
     fn finish(mut self, header: fn(&mut W) -> io::Result<()>) -> io::Result<W> {
         match self.format {
-            Format::Csv if !self.begun => header(&mut self.out)?,
+            Format::Csv if !self.has_begun => header(&mut self.out)?,
             Format::Csv | Format::Ndjson => {}
             Format::Json | Format::GeoJson => {
-                if !self.begun {
+                if !self.has_begun {
                     self.begin()?;
                 }
                 self.out.write_all(b"\n]}\n")?;
@@ -243,7 +243,7 @@ fn degrees<W: Write>(out: &mut W, position: Option<wire::Position>) -> io::Resul
     }
 }
 
-/// A value and the comma after it; nothing but the comma if there is none.
+/// An optional value, followed by a comma.
 fn cell<W: Write>(out: &mut W, value: Option<impl Display>) -> io::Result<()> {
     match value {
         Some(value) => write!(out, "{value},"),
@@ -251,7 +251,7 @@ fn cell<W: Write>(out: &mut W, value: Option<impl Display>) -> io::Result<()> {
     }
 }
 
-/// Names hold no control characters, so only commas and quotes need quotes around them.
+/// Names contain no control characters, so only commas and quotes require quoting.
 fn quoted(name: &str) -> Cow<'_, str> {
     if name.contains([',', '"']) {
         Cow::Owned(format!("\"{}\"", name.replace('"', "\"\"")))
@@ -260,23 +260,23 @@ fn quoted(name: &str) -> Cow<'_, str> {
     }
 }
 
-/// A GeoJSON feature: a point and what is known of it.
+/// A GeoJSON feature: a point with properties.
 #[derive(Serialize)]
 struct Feature<P> {
     r#type: &'static str,
-    geometry: Point,
+    geometry: PointGeometry,
     properties: P,
 }
 
 #[derive(Serialize)]
-struct Point {
+struct PointGeometry {
     r#type: &'static str,
     coordinates: [f64; 2],
 }
 
 impl<P> Feature<P> {
-    const fn new(place: wire::Position, properties: P) -> Self {
-        let coordinates = [place.longitude_deg, place.latitude_deg];
-        Self { r#type: "Feature", geometry: Point { r#type: "Point", coordinates }, properties }
+    const fn new(position: wire::Position, properties: P) -> Self {
+        let coordinates = [position.longitude_deg, position.latitude_deg];
+        Self { r#type: "Feature", geometry: PointGeometry { r#type: "Point", coordinates }, properties }
     }
 }

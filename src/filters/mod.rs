@@ -1,10 +1,15 @@
-//! Filters and smoothers over fixes alone: the IMM-UKF baseline, and the kinematic smoother that
+//! Filters and smoothers over fixes alone: the IMM-UKF baseline, and the fixed-interval smoother that
 //! prepares training labels.
 //!
-//! What never happens here: boxes, models, degrees. Everything is in metres of a local plane.
+//! What never happens here: boxes, models, degrees. All positions are in metres of a local plane.
 
-mod imm;
+mod imm_ukf;
 mod smoother;
 
-pub use imm::{Estimate, ImmUkf, ImmUkfOptions};
-pub use smoother::{FixError, Smoothed, smooth_pass, tune_acceleration};
+use crate::geo::EastNorth;
+
+pub use imm_ukf::{ImmUkf, ImmUkfEstimate, ImmUkfOptions};
+pub use smoother::{FixError, SmoothedPosition, smooth_traverse, tune_acceleration};
+
+/// One traverse of the scene by one target, without a gap: times in s, ascending, and a fix for each.
+pub type Traverse = (Vec<f64>, Vec<EastNorth>);

@@ -1,12 +1,12 @@
-//! Confidences, two-step fusion, pairing and tracks: pure functions and values.
+//! Confidences, two-step fusion, pairing, tracks and drift detection: pure functions and values.
 //!
 //! What never happens here: I/O, clocks, randomness, allocation that an outside client decides.
 
 pub mod clock_offset;
+pub mod drift_detector;
 pub mod pairing;
 mod plane_covariance;
 pub mod track;
 pub mod two_step;
-pub mod watch;
 
 pub use plane_covariance::PlaneCovariance;

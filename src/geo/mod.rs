@@ -1,8 +1,7 @@
 //! WGS 84 positions, the local east-north plane of a camera, and geodesic distance.
 //!
-//! What never happens here: nothing above this floor is known, no I/O, no f32.
-//! Degrees live in [`Position`], metres in [`EastNorth`]; the only way between them is a
-//! [`LocalPlane`].
+//! Degrees are in [`Position`], metres in [`EastNorth`]; only a [`LocalPlane`] converts between them.
+//! What never happens here: imports from other modules, I/O, f32.
 
 mod plane;
 mod position;

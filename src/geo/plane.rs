@@ -1,4 +1,4 @@
-//! The local east-north plane in which everything is learnt and fused.
+//! The local east-north plane in which models are trained and positions are fused.
 
 use super::position::{Position, wrap_degrees};
 
@@ -17,13 +17,13 @@ pub struct EastNorth {
 }
 
 impl EastNorth {
-    /// Straight distance in metres.
+    /// Euclidean distance, m.
     #[must_use]
     pub fn distance_m(self, other: Self) -> f64 {
         (self.east_m - other.east_m).hypot(self.north_m - other.north_m)
     }
 
-    /// Half the squared distance in m2: the error per axis, the mean over the two axes of (2).
+    /// Half the squared distance, m2: the mean squared error over the two axes, as in (2).
     #[must_use]
     pub fn error_per_axis_m2(self, other: Self) -> f64 {
         let (east, north) = (self.east_m - other.east_m, self.north_m - other.north_m);
@@ -31,26 +31,26 @@ impl EastNorth {
     }
 }
 
-/// The plane that touches the ellipsoid at an origin, axes east and north (metres).
+/// The tangent plane of the ellipsoid at an origin, axes east and north (m) of the topocentric (ENU)
+/// frame.
 ///
-/// East and north are those of the topocentric (ENU) frame; the ground is taken to be the
-/// ellipsoid, so the plane is exact in both directions to better than 1 mm within 20 km. Beyond
-/// that positions still go there and back, but a metre in the plane is shorter than on the ground.
+/// Positions are on the ellipsoid (height 0). The round trip is exact to better than 1 mm within 20 km;
+/// farther away it still works, but distances in the plane are shorter than on the ellipsoid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalPlane {
     origin: Position,
     sin_latitude: f64,
     cos_latitude: f64,
-    /// Distance from the polar axis, and height above the equator, of the origin (metres).
+    /// Distance of the origin from the polar axis and from the equatorial plane, m.
     axis_m: f64,
     equator_m: f64,
-    /// Radii of curvature at the origin, along the prime vertical and the meridian (metres).
+    /// Radii of curvature at the origin, in the prime vertical and in the meridian, m.
     prime_vertical_m: f64,
     meridian_m: f64,
 }
 
 impl LocalPlane {
-    /// The plane about an origin.
+    /// The plane with that origin.
     #[must_use]
     pub fn new(origin: Position) -> Self {
         let (sin_latitude, cos_latitude) = origin.latitude_deg().to_radians().sin_cos();
@@ -67,7 +67,7 @@ impl LocalPlane {
         }
     }
 
-    /// Where the plane touches the earth.
+    /// The point of tangency.
     #[must_use]
     pub const fn origin(&self) -> Position {
         self.origin
@@ -81,22 +81,22 @@ impl LocalPlane {
             EQUATORIAL_RADIUS_M / (1.0 - ECCENTRICITY_SQUARED * sin_latitude * sin_latitude).sqrt();
         let axis_m = prime_vertical_m * cos_latitude;
         let equator_m = prime_vertical_m * (1.0 - ECCENTRICITY_SQUARED) * sin_latitude;
-        let turn = wrap_degrees(position.longitude_deg() - self.origin.longitude_deg()).to_radians();
-        let (sin_turn, cos_turn) = turn.sin_cos();
-        // Earth-centred difference in the frame turned to the origin's meridian, then tilted.
-        let outward_m = axis_m * cos_turn - self.axis_m;
+        let longitude_rad = wrap_degrees(position.longitude_deg() - self.origin.longitude_deg()).to_radians();
+        let (sin_longitude, cos_longitude) = longitude_rad.sin_cos();
+        // Earth-centred difference, rotated about the polar axis to the origin's meridian, then by latitude.
+        let outward_m = axis_m * cos_longitude - self.axis_m;
         let upward_m = equator_m - self.equator_m;
         EastNorth {
-            east_m: axis_m * sin_turn,
+            east_m: axis_m * sin_longitude,
             north_m: self.cos_latitude * upward_m - self.sin_latitude * outward_m,
         }
     }
 
-    /// The position on the ellipsoid that lies over a point of the plane.
+    /// The position on the ellipsoid vertically below a point of the plane.
     #[must_use]
     pub fn to_position(&self, point: EastNorth) -> Position {
-        // The drop of the ellipsoid below the plane closes the third coordinate: a fixed point of
-        // the ellipsoid's equation, two steps of Newton from the osculating paraboloid.
+        // The third coordinate is the distance of the ellipsoid from the plane: two Newton steps on the
+        // ellipsoid's equation, starting from the osculating paraboloid.
         let EastNorth { east_m, north_m } = point;
         let mut up_m = -0.5 * (east_m * east_m / self.prime_vertical_m + north_m * north_m / self.meridian_m);
         let polar_squared = 1.0 - ECCENTRICITY_SQUARED;
@@ -106,8 +106,9 @@ impl LocalPlane {
             upward_m = self.equator_m + self.sin_latitude * up_m + self.cos_latitude * north_m;
             let excess = east_m * east_m + outward_m * outward_m + upward_m * upward_m / polar_squared
                 - EQUATORIAL_RADIUS_M * EQUATORIAL_RADIUS_M;
-            let slope = 2.0 * (outward_m * self.cos_latitude + upward_m * self.sin_latitude / polar_squared);
-            up_m -= excess / slope;
+            let derivative =
+                2.0 * (outward_m * self.cos_latitude + upward_m * self.sin_latitude / polar_squared);
+            up_m -= excess / derivative;
             outward_m = self.axis_m + self.cos_latitude * up_m - self.sin_latitude * north_m;
             upward_m = self.equator_m + self.sin_latitude * up_m + self.cos_latitude * north_m;
         }
@@ -127,7 +128,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn there_and_back_within_a_millimetre(
+        fn the_round_trip_is_exact_to_a_millimetre(
             longitude in -180.0..180.0f64, latitude in -89.0..89.0f64,
             east_m in -20_000.0..20_000.0f64, north_m in -20_000.0..20_000.0f64,
         ) {
@@ -153,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn the_plane_reaches_across_the_antimeridian() {
+    fn the_plane_crosses_the_antimeridian() {
         let plane = LocalPlane::new(Position::new(179.9995, 0.0).expect("valid"));
         let point = plane.to_plane(Position::new(-179.9995, 0.0).expect("valid"));
         assert!((point.east_m - 111.32).abs() < 0.01, "{point:?}");

@@ -1,19 +1,18 @@
-//! A place on the WGS 84 ellipsoid.
+//! Positions on the WGS 84 ellipsoid, and geodesic distance.
 
 use std::sync::LazyLock;
 
 use geographiclib_rs::{Geodesic, InverseGeodesic};
 
-/// A place on the WGS 84 ellipsoid at height zero, valid by construction.
-///
-/// Longitude lies in -180..=180 and latitude in -90..=90, both in degrees and finite.
+/// A position on the WGS 84 ellipsoid at height 0, valid by construction: longitude in -180..=180 and
+/// latitude in -90..=90, both finite, in degrees.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Position {
     longitude_deg: f64,
     latitude_deg: f64,
 }
 
-/// Why two numbers are not a [`Position`].
+/// Why two numbers do not form a [`Position`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum PositionError {
     /// The longitude is not a finite number of degrees within -180..=180.
@@ -28,8 +27,8 @@ impl Position {
     /// A position from degrees.
     ///
     /// # Errors
-    /// [`PositionError`] names the coordinate that is not finite or out of range. Longitude 181 and
-    /// latitude 91, common "no position" codes, are refused here.
+    /// Names the coordinate that is not finite or out of range. Longitude 181 and latitude 91, the codes
+    /// of AIS for "not available", are therefore refused.
     pub fn new(longitude_deg: f64, latitude_deg: f64) -> Result<Self, PositionError> {
         if !(-180.0..=180.0).contains(&longitude_deg) {
             return Err(PositionError::Longitude);
@@ -58,12 +57,12 @@ impl Position {
     }
 }
 
-/// Degrees brought into -180..=180, so that differences are right across the antimeridian.
+/// Wraps degrees into -180..=180, so that differences are correct across the antimeridian.
 pub(super) fn wrap_degrees(degrees: f64) -> f64 {
     if (-180.0..=180.0).contains(&degrees) { degrees } else { (degrees + 180.0).rem_euclid(360.0) - 180.0 }
 }
 
-/// Length in metres of the geodesic between two positions on WGS 84 (Karney 2013).
+/// Length of the geodesic between two positions on WGS 84, m (Karney 2013).
 #[must_use]
 pub fn distance_m(from: Position, to: Position) -> f64 {
     static WGS84: LazyLock<Geodesic> = LazyLock::new(Geodesic::wgs84);
@@ -75,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_for_no_position_are_refused() {
+    fn codes_for_unavailable_positions_are_refused() {
         assert_eq!(Position::new(181.0, 0.0), Err(PositionError::Longitude));
         assert_eq!(Position::new(0.0, 91.0), Err(PositionError::Latitude));
         assert_eq!(Position::new(f64::NAN, 0.0), Err(PositionError::Longitude));
@@ -83,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn distance_crosses_the_antimeridian_the_short_way() {
+    fn distance_across_the_antimeridian_is_the_short_one() {
         let west = Position::new(-179.9995, 10.0).expect("valid");
         let east = Position::new(179.9995, 10.0).expect("valid");
         let metres = distance_m(west, east);

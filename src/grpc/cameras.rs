@@ -218,6 +218,7 @@ impl proto::Camera {
     fn of(app: &App, camera: Camera) -> Self {
         Self {
             moved: app.camera_moved(camera.id()).map(|moved| (*moved).clone().into()),
+            model_fault: app.model_fault(camera.id()).map(|fault| fault.reason),
             id: camera.id().as_str().to_owned(),
             warnings: camera.profile.warnings(),
             profile: Some(camera.profile.into()),

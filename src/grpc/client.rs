@@ -73,7 +73,7 @@ pub struct ClientError {
     /// For people.
     pub message: String,
     /// Whether the same may go well later: the line broke, or the server has too much to do.
-    pub passing: bool,
+    pub retryable: bool,
 }
 
 impl fmt::Display for ClientError {
@@ -88,14 +88,14 @@ impl ClientError {
     /// An error of the line that no status tells of.
     #[must_use]
     pub fn broken_line(message: &str) -> Self {
-        Self { reason: "broken-line".to_owned(), message: message.to_owned(), passing: true }
+        Self { reason: "broken-line".to_owned(), message: message.to_owned(), retryable: true }
     }
 }
 
 impl From<Status> for ClientError {
     fn from(status: Status) -> Self {
         let told = status.get_details_error_info().map(|info| info.reason);
-        let passing = match status.code() {
+        let retryable = match status.code() {
             Code::Unavailable | Code::DeadlineExceeded | Code::Aborted | Code::Internal => true,
             // The line's own faults come under these codes, without any details.
             Code::Unknown | Code::Cancelled | Code::ResourceExhausted => told.is_none(),
@@ -106,7 +106,7 @@ impl From<Status> for ClientError {
             "" => status.code().description().to_owned(),
             message => message.to_owned(),
         };
-        Self { reason, message, passing }
+        Self { reason, message, retryable }
     }
 }
 
@@ -120,8 +120,11 @@ impl Connection {
     /// # Errors
     /// An address that is none, or that asks for TLS, which this client does not speak.
     pub fn to(server: &str) -> Result<Self, ClientError> {
-        let refused =
-            |message: String| ClientError { reason: "invalid-argument".to_owned(), message, passing: false };
+        let refused = |message: String| ClientError {
+            reason: "invalid-argument".to_owned(),
+            message,
+            retryable: false,
+        };
         if !server.starts_with("http://") {
             return Err(refused(format!("`{server}` must begin with http://")));
         }
@@ -154,21 +157,21 @@ impl Connection {
 pub struct ItemSender(mpsc::Sender<proto::StreamRequest>);
 
 impl ItemSender {
-    /// Waits for room for one item. Dropping the wait loses nothing.
+    /// Waits for the capacity to send one item. Cancel safe.
     ///
     /// # Errors
     /// The stream has ended; the [`Events`] say why.
-    pub async fn room(&self) -> Result<Room<'_>, ClientError> {
+    pub async fn reserve(&self) -> Result<SendPermit<'_>, ClientError> {
         let permit = self.0.reserve().await;
-        permit.map(Room).map_err(|_| ClientError::broken_line("the stream takes no more items"))
+        permit.map(SendPermit).map_err(|_| ClientError::broken_line("the stream takes no more items"))
     }
 }
 
-/// Room for one item.
+/// Capacity to send one item.
 #[derive(Debug)]
-pub struct Room<'a>(mpsc::Permit<'a, proto::StreamRequest>);
+pub struct SendPermit<'a>(mpsc::Permit<'a, proto::StreamRequest>);
 
-impl Room<'_> {
+impl SendPermit<'_> {
     /// Sends the item. Seqs must rise.
     pub fn send(self, seq: u64, item: LiveItem) {
         let item = proto::StreamItem {
@@ -222,6 +225,7 @@ impl From<&Opening> for proto::StreamOpening {
             client_name: opening.client_name.clone(),
             resume_after_seq: opening.resume_after_seq,
             store_samples: opening.store_samples,
+            ..Self::default()
         }
     }
 }
@@ -237,15 +241,15 @@ mod tests {
     #[test]
     fn a_broken_line_passes_and_a_refusal_stays() {
         for code in [Code::Unavailable, Code::Unknown, Code::Internal, Code::Cancelled] {
-            assert!(ClientError::from(Status::new(code, "h2 protocol error")).passing, "{code:?}");
+            assert!(ClientError::from(Status::new(code, "h2 protocol error")).retryable, "{code:?}");
         }
         for code in [Code::NotFound, Code::InvalidArgument, Code::Unimplemented] {
-            assert!(!ClientError::from(Status::new(code, "no")).passing, "{code:?}");
+            assert!(!ClientError::from(Status::new(code, "no")).retryable, "{code:?}");
         }
         let details =
             ErrorDetails::with_error_info("too-large", "sightfix", HashMap::<String, String>::new());
         let told = ClientError::from(Status::with_error_details(Code::ResourceExhausted, "no", details));
-        assert_eq!((told.reason.as_str(), told.passing), ("too-large", false));
+        assert_eq!((told.reason.as_str(), told.retryable), ("too-large", false));
         assert_eq!(told.to_string(), "no (too-large)");
     }
 
@@ -253,7 +257,7 @@ mod tests {
     async fn only_plain_addresses_are_taken() {
         for wrong in ["https://127.0.0.1:1", "127.0.0.1:8080", "http://", "http://a b"] {
             let refused = Connection::to(wrong).expect_err(wrong);
-            assert!(!refused.passing, "{wrong}");
+            assert!(!refused.retryable, "{wrong}");
         }
         Connection::to("http://127.0.0.1:8080").expect("an address");
     }
@@ -271,6 +275,6 @@ mod tests {
         };
         let connection = Connection::to(&format!("http://{address}")).expect("an address");
         let refused = connection.open(&opening).await.expect_err("nobody listens");
-        assert!(refused.passing, "{refused}");
+        assert!(refused.retryable, "{refused}");
     }
 }

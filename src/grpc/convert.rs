@@ -47,6 +47,24 @@ pub(super) fn recipe(recipe: i32) -> Result<Option<domain::Recipe>> {
     }
 }
 
+pub(super) fn durability(durability: i32) -> Result<domain::Durability> {
+    match proto::Durability::try_from(durability) {
+        Ok(proto::Durability::Unspecified) => Ok(domain::Durability::default()),
+        Ok(proto::Durability::Synced) => Ok(domain::Durability::Synced),
+        Ok(proto::Durability::Relaxed) => Ok(domain::Durability::Relaxed),
+        Err(_) => Err(Error::invalid("durability", format!("has no value {durability}"))),
+    }
+}
+
+impl From<domain::Durability> for proto::Durability {
+    fn from(durability: domain::Durability) -> Self {
+        match durability {
+            domain::Durability::Synced => Self::Synced,
+            domain::Durability::Relaxed => Self::Relaxed,
+        }
+    }
+}
+
 impl From<domain::Recipe> for proto::Recipe {
     fn from(recipe: domain::Recipe) -> Self {
         match recipe {

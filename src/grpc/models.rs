@@ -100,6 +100,17 @@ impl ModelService for Models {
         .await
     }
 
+    async fn delete_model(
+        &self,
+        request: tonic::Request<proto::DeleteModelRequest>,
+    ) -> Reply<proto::DeleteModelResponse> {
+        answer(request, |asked| async move {
+            self.app.delete_model(&camera_id(&asked.camera_id)?, asked.number).await?;
+            Ok(proto::DeleteModelResponse {})
+        })
+        .await
+    }
+
     async fn estimate_gnss_error(
         &self,
         request: tonic::Request<proto::EstimateGnssErrorRequest>,

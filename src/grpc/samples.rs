@@ -3,13 +3,13 @@
 use futures_util::{Stream, StreamExt as _, TryStreamExt as _, stream};
 use tonic::Streaming;
 
-use super::convert::{camera_id, sample, sample_filter};
+use super::convert::{camera_id, durability, sample, sample_filter};
 use super::pages;
 use super::proto;
 use super::proto::sample_service_server::SampleService;
 use super::statuses::{Reply, answer, broken};
 use crate::app::{App, ImportReport, RejectedRow};
-use crate::domain::{Error, ErrorKind, Result, Sample};
+use crate::domain::{Durability, Error, ErrorKind, Result, Sample};
 use crate::exchange::RowRules;
 use crate::shutdown::Shutdown;
 use crate::store::{SampleFilter, SampleKey};
@@ -37,10 +37,12 @@ impl SampleService for Samples {
                 return Err(Error::invalid("camera_id", "is required in the first message"));
             };
             let camera = camera_id(&first.camera_id)?;
+            let durability = durability(first.durability)?;
             batches.camera = first.camera_id;
             let rules = self.app.row_rules(&camera).await?;
             let rows = rows(first.samples, batches, rules);
-            Ok(self.app.import_rows(&camera, rows).await?.into())
+            let report = self.app.import_rows(&camera, rows, durability).await?;
+            Ok(imported(report, durability))
         })
         .await
     }
@@ -148,13 +150,12 @@ fn rows(
     )
 }
 
-impl From<ImportReport> for proto::ImportSamplesResponse {
-    fn from(report: ImportReport) -> Self {
-        Self {
-            accepted: report.accepted,
-            duplicate: report.duplicate,
-            rejected: report.rejected,
-            rejected_rows: report.rejected_rows.into_iter().map(Into::into).collect(),
-        }
+fn imported(report: ImportReport, durability: Durability) -> proto::ImportSamplesResponse {
+    proto::ImportSamplesResponse {
+        accepted: report.accepted,
+        duplicate: report.duplicate,
+        rejected: report.rejected,
+        rejected_rows: report.rejected_rows.into_iter().map(Into::into).collect(),
+        durability: proto::Durability::from(durability).into(),
     }
 }

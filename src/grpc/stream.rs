@@ -6,7 +6,7 @@ use futures_util::FutureExt as _;
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
 
-use super::convert::{camera_id, live_item, timestamp};
+use super::convert::{camera_id, durability, live_item, timestamp};
 use super::outbox::{Outbox, Responses, outbox};
 use super::proto;
 use super::proto::stream_answer::Outcome;
@@ -14,7 +14,7 @@ use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
 use crate::app::{App, LiveStream, TrackPoint};
 use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Flag, Result};
-use crate::fusion::track::{Rejection, RejectionReason, Source};
+use crate::fusion::track::{MeasurementSource, Rejection, RejectionReason};
 use crate::shutdown::Shutdown;
 use crate::status;
 use crate::telemetry::RequestId;
@@ -69,6 +69,10 @@ impl Conversation {
         let opened = proto::StreamOpened {
             model_version: stream.model_version(),
             idle_limit: prost_types::Duration::try_from(idle_limit).ok(),
+            durability: stream
+                .durability()
+                .map_or(proto::Durability::Unspecified, proto::Durability::from)
+                .into(),
         };
         self.outbox.opened(opened);
         let stop = self.answer_items(&camera, &mut stream, idle_limit).await?;
@@ -105,9 +109,11 @@ impl Conversation {
             return Err(Error::invalid("opening", "must be the first message of a stream"));
         };
         let camera = camera_id(&opening.camera_id)?;
+        let durability = durability(opening.durability)?;
+        let store_samples = opening.store_samples.then_some(durability);
         let stream = self
             .app
-            .open_stream(&camera, &opening.client_name, opening.resume_after_seq, opening.store_samples)
+            .open_stream(&camera, &opening.client_name, opening.resume_after_seq, store_samples)
             .await?;
         Ok((camera, stream))
     }
@@ -296,10 +302,10 @@ impl From<&TrackPoint> for proto::TrackPoint {
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
-            still: state.still,
+            still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
-            restarted: state.restarted,
+            restarted: state.reinitialized,
         }
     }
 }
@@ -308,8 +314,8 @@ impl From<&Rejection> for proto::TrackRejection {
     fn from(rejection: &Rejection) -> Self {
         use proto::track_rejection as wire;
         let source = match rejection.source {
-            Source::Regressed => wire::Source::Regressed,
-            Source::Fix => wire::Source::Fix,
+            MeasurementSource::Regressed => wire::Source::Regressed,
+            MeasurementSource::Fix => wire::Source::Fix,
         };
         let reason = match rejection.reason {
             RejectionReason::OutsideGate => wire::Reason::OutsideGate,

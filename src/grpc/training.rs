@@ -89,6 +89,17 @@ impl TrainingService for Training {
         .await
     }
 
+    async fn delete_training_run(
+        &self,
+        request: tonic::Request<proto::DeleteTrainingRunRequest>,
+    ) -> Reply<proto::DeleteTrainingRunResponse> {
+        answer(request, |asked| async move {
+            self.app.delete_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            Ok(proto::DeleteTrainingRunResponse {})
+        })
+        .await
+    }
+
     type WatchTrainingRunStream = Changes;
 
     async fn watch_training_run(

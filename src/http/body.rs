@@ -132,7 +132,7 @@ impl Spool {
     }
 
     /// # Errors
-    /// A fault if the temporary file cannot be written.
+    /// `InsufficientStorage`, or a fault, if the temporary file cannot be written.
     pub(super) async fn push(&mut self, part: Bytes) -> Result<()> {
         self.length += part.len();
         if !part.is_empty() {
@@ -144,7 +144,7 @@ impl Spool {
                 None => self.file.insert(temporary_file().await?),
             };
             for part in self.parts.drain(..) {
-                file.write_all(&part).await.map_err(Error::fault)?;
+                file.write_all(&part).await.map_err(unspoolable)?;
             }
         }
         Ok(())
@@ -154,10 +154,21 @@ impl Spool {
     /// A fault if the temporary file cannot be written.
     pub(super) async fn finish(self) -> Result<Spooled> {
         let Some(mut file) = self.file else { return Ok(Spooled::Memory(self.parts)) };
-        file.flush().await.map_err(Error::fault)?;
+        file.flush().await.map_err(unspoolable)?;
         let mut file = file.into_std().await;
         file.rewind().map_err(Error::fault)?;
         Ok(Spooled::File(file))
+    }
+}
+
+/// A temporary file that cannot be written.
+fn unspoolable(error: io::Error) -> Error {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Error::refused(
+            ErrorKind::InsufficientStorage,
+            "the disk that holds the server's temporary files is full; send less at once, or give it more space",
+        ),
+        _ => Error::fault(error),
     }
 }
 

@@ -216,6 +216,9 @@ pub(super) struct Camera {
     /// Number of the model version that answers, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     active_model: Option<u32>,
+    /// Why the active model cannot be used, if so. Fixes then pass through without it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model_fault: Option<String>,
     /// Set if the camera no longer looks where it looked when its active model was trained.
     #[serde(skip_serializing_if = "Option::is_none")]
     moved: Option<CameraMoved>,
@@ -226,6 +229,7 @@ pub(super) struct Camera {
 impl Camera {
     fn of(app: &App, camera: domain::Camera) -> Self {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
+        let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
         let warnings = camera.profile.warnings();
         let domain::Camera { profile, revision, created_at, updated_at, active_model } = camera;
         Self {
@@ -244,6 +248,7 @@ impl Camera {
             created_at,
             updated_at,
             active_model,
+            model_fault,
             moved,
             warnings,
         }

@@ -177,7 +177,7 @@ struct Evaluation {
     state: JobState,
     /// How far it has come.
     progress: EvaluationProgress,
-    /// How often a worker has taken it up.
+    /// Times a worker has claimed it without returning it to the queue in order.
     attempt: u32,
     /// Why it failed.
     #[serde(skip_serializing_if = "Option::is_none")]

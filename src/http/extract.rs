@@ -12,7 +12,9 @@ use serde::de::DeserializeOwned;
 use super::body;
 use super::problem::{Answer, Refused, no_route};
 use crate::app::App;
-use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time};
+use crate::domain::{
+    CameraId, Durability, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time,
+};
 use crate::exchange::wire;
 
 /// Items on a page whose length the client leaves open.
@@ -159,6 +161,11 @@ impl Params {
             limit.ok_or_else(|| Error::invalid("limit", format!("must be from 1 to {most}")))
         })?;
         Ok(limit.unwrap_or(PAGE_ITEMS.min(most)))
+    }
+
+    /// `durability`: when stored samples are acknowledged.
+    pub(super) fn durability(&mut self) -> Result<Durability> {
+        Ok(self.take("durability", str::parse)?.unwrap_or_default())
     }
 
     /// Nothing may be left.

@@ -14,7 +14,7 @@ use utoipa_axum::routes;
 
 use super::extract::{CameraPath, JsonBody, ModelPath, Params, media_type, not_read};
 use super::problem::{Answer, Problem};
-use super::wire::{json, made};
+use super::wire::{empty, json, made};
 use super::{Rest, body};
 use crate::app::App;
 use crate::domain::{self, Error, ModelMetadata};
@@ -26,7 +26,7 @@ const SAFETENSORS: &str = "application/vnd.safetensors";
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new()
         .routes(routes!(list_models, import_model))
-        .routes(routes!(get_model))
+        .routes(routes!(get_model, delete_model))
         .routes(routes!(download_model))
         .routes(routes!(get_active_model, activate_model))
         .routes(routes!(roll_back_model))
@@ -115,6 +115,22 @@ async fn list_models(State(app): State<App>, CameraPath(id): CameraPath, uri: Ur
 )]
 async fn get_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> Answer {
     Ok(json(&ModelVersion::from(app.model(&id, number).await?))?)
+}
+
+/// Delete a model version
+///
+/// The active version cannot be deleted. The number of a deleted version is never assigned again.
+#[utoipa::path(
+    delete, path = "/v1/cameras/{camera}/models/{model}", tag = "models",
+    params(("camera" = String, Path, description = "The camera's id"), ("model" = u32, Path, description = "The version's number")),
+    responses(
+        (status = 204, description = "It is deleted"),
+        (status = 409, description = "The version is active", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn delete_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> Answer {
+    app.delete_model(&id, number).await?;
+    Ok(empty())
 }
 
 /// Download a model version

@@ -9,9 +9,9 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::extract::{CameraPath, Params};
 use super::parts::parts;
-use super::problem::Answer;
+use super::problem::{Answer, Problem};
 use super::receivers::Receiver;
-use super::wire::json;
+use super::wire::{Durability, json};
 use crate::app::{App, PairedImport, PairedReport, PairingCounts, Part};
 use crate::domain::{self, Error, ReceiverId, Result, TargetId};
 use crate::exchange::{FixFormat, Format, RowError};
@@ -47,6 +47,8 @@ struct PairedSamples {
     rejected: u64,
     /// The first 100 of these in each part.
     rejected_rows: Vec<RejectedPartRow>,
+    /// What the accepted samples are safe from.
+    durability: Durability,
     /// What became of the other rows.
     pairing: Pairing,
     /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
@@ -153,10 +155,14 @@ struct ClockOffsetEstimate {
         ("longest_gap_s" = Option<f64>, Query, description = "Fixes are joined over at most this long a gap (interpolate), 2.5 if left out"),
         ("target_id" = Option<String>, Query, description = "The target of boxes that name none"),
         ("receiver_id" = Option<String>, Query, description = "The receiver of fixes that name none"),
+        ("durability" = Option<String>, Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
         ("estimate_offset" = Option<bool>, Query, description = "Tell the receivers' clock offsets as the files show them; they are not applied"),
     ),
     request_body(content = PairingParts, content_type = "multipart/form-data"),
-    responses((status = 200, description = "What became of the rows", body = PairedSamples))
+    responses(
+        (status = 200, description = "What became of the rows", body = PairedSamples),
+        (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
+    )
 )]
 async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> Answer {
     let (head, content) = request.into_parts();
@@ -165,6 +171,7 @@ async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, reques
     let target_id = params.take("target_id", TargetId::new)?;
     let receiver_id = params.take("receiver_id", ReceiverId::new)?;
     let estimates_offsets = params.take("estimate_offset", truth)?.unwrap_or(false);
+    let durability = params.durability()?;
     params.end()?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let names = [Part::Detections, Part::Fixes].map(Part::as_str);
@@ -190,10 +197,11 @@ async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, reques
         settings,
         target_id,
         receiver_id,
+        durability,
         estimates_offsets,
     };
     let report = app.import_paired(&id, import).await?;
-    Ok(json(&told(report, estimates_offsets))?)
+    Ok(json(&told(report, durability, estimates_offsets))?)
 }
 
 fn settings(params: &mut Params) -> Result<PairingSettings> {
@@ -210,7 +218,7 @@ fn truth(text: &str) -> Result<bool> {
     text.parse().map_err(|_| Error::invalid("estimate_offset", "must be true or false"))
 }
 
-fn told(report: PairedReport, with_offsets: bool) -> PairedSamples {
+fn told(report: PairedReport, durability: domain::Durability, with_offsets: bool) -> PairedSamples {
     let PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets } = report;
     let estimates = clock_offsets.iter().map(|(receiver, found)| offset(receiver, found.as_ref()));
     PairedSamples {
@@ -218,6 +226,7 @@ fn told(report: PairedReport, with_offsets: bool) -> PairedSamples {
         duplicate: samples.duplicate,
         rejected: rejected.count,
         rejected_rows: rejected.rows.into_iter().map(|(part, row)| rejected_row(part, row)).collect(),
+        durability: durability.into(),
         pairing: counts.into(),
         unnamed_fixes_of: unnamed_fixes_of.as_ref().map(Receiver::from),
         clock_offsets: with_offsets.then(|| estimates.collect()),

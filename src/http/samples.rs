@@ -16,10 +16,10 @@ use utoipa_axum::routes;
 
 use super::extract::{CameraPath, Params, media_type, negotiate, not_read};
 use super::problem::{Answer, Problem};
-use super::wire::json;
+use super::wire::{Durability, json};
 use super::{Rest, body};
 use crate::app::{App, ImportReport};
-use crate::domain::{CameraId, Error, Result, Sample, TargetId};
+use crate::domain::{self, CameraId, Error, Result, Sample, TargetId};
 use crate::exchange::wire;
 use crate::exchange::{Format, SampleWriter, foreign_cursor, read_cursor, write_cursor};
 use crate::store::{SampleFilter, SampleKey};
@@ -44,6 +44,8 @@ pub(super) struct Imported {
     rejected: u64,
     /// The first 100 of these.
     rejected_rows: Vec<RejectedRow>,
+    /// What the accepted rows are safe from.
+    durability: Durability,
 }
 
 /// A row that was not taken, and why.
@@ -64,11 +66,11 @@ impl From<crate::app::RejectedRow> for RejectedRow {
     }
 }
 
-impl From<ImportReport> for Imported {
-    fn from(report: ImportReport) -> Self {
+impl Imported {
+    fn new(report: ImportReport, durability: domain::Durability) -> Self {
         let ImportReport { accepted, duplicate, rejected, rejected_rows } = report;
         let rejected_rows = rejected_rows.into_iter().map(RejectedRow::from).collect();
-        Self { accepted, duplicate, rejected, rejected_rows }
+        Self { accepted, duplicate, rejected, rejected_rows, durability: durability.into() }
     }
 }
 
@@ -106,22 +108,32 @@ struct DeletedSamples {
 /// One bad row never loses the others. Samples that are stored already are counted, not stored
 /// again, so an import that broke off can be sent again as it is.
 #[utoipa::path(
-    post, path = "/v1/cameras/{camera}/samples", tag = "samples", params(("camera" = String, Path, description = "The camera's id")),
+    post, path = "/v1/cameras/{camera}/samples", tag = "samples",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("durability" = Option<String>, Query, description = "When the rows are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
+    ),
     request_body(content(
         (String = "text/csv", example = "time,target_id,left,top,width,height,longitude,latitude\n2020-12-14T14:41:48+08:00,person-1,475,11,28,77,103.98678,30.6280135\n"),
         (wire::Sample<'static> = "application/x-ndjson"),
         (Vec<wire::Sample<'static>> = "application/json"),
     )),
-    responses((status = 200, description = "What became of the rows", body = Imported))
+    responses(
+        (status = 200, description = "What became of the rows", body = Imported),
+        (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
+    )
 )]
 async fn import_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> Answer {
     let (parts, content) = request.into_parts();
+    let mut params = Params::of(&parts.uri)?;
+    let durability = params.durability()?;
+    params.end()?;
     let format = import_format(&parts.headers)?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let limits = &app.limits;
     let spooled = body::spooled(&parts.headers, content, limits.import_bytes, limits.import_memory_bytes);
-    let report = app.import_file(&id, spooled.await?, format).await?;
-    Ok(json(&Imported::from(report))?)
+    let report = app.import_file(&id, spooled.await?, format, durability).await?;
+    Ok(json(&Imported::new(report, durability))?)
 }
 
 fn import_format(headers: &HeaderMap) -> Result<Format> {

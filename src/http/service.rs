@@ -24,7 +24,14 @@ async fn livez() -> &'static str {
     "alive\n"
 }
 
+/// Cameras that `/readyz` names one by one.
+const NAMED_CAMERAS: usize = 100;
+
 /// Whether the server can take work
+///
+/// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
+/// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
+/// a line `warning: insufficient-storage: ...`.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -32,12 +39,23 @@ async fn livez() -> &'static str {
         (status = 503, description = "It is ending, or its store does not answer", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn readyz(State(rest): State<Rest>) -> Answer<&'static str> {
+async fn readyz(State(rest): State<Rest>) -> Answer<String> {
     if rest.shutdown.has_begun() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }
     rest.app.store.ping().await?;
-    Ok("ready\n")
+    let faults = rest.app.registry.model_faults();
+    let mut text = "ready\n".to_owned();
+    if rest.app.store.is_full() {
+        text.push_str("warning: insufficient-storage: imports are refused until space is freed\n");
+    }
+    for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {
+        text.push_str(&format!("degraded: camera {camera}: {}\n", fault.reason));
+    }
+    if faults.len() > NAMED_CAMERAS {
+        text.push_str(&format!("degraded: {} more cameras\n", faults.len() - NAMED_CAMERAS));
+    }
+    Ok(text)
 }
 
 /// Counters and times, in the text format of Prometheus

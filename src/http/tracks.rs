@@ -90,8 +90,8 @@ struct Rejection {
 impl From<&track::Rejection> for Rejection {
     fn from(rejection: &track::Rejection) -> Self {
         let source = match rejection.source {
-            track::Source::Regressed => Source::Regressed,
-            track::Source::Fix => Source::Fix,
+            track::MeasurementSource::Regressed => Source::Regressed,
+            track::MeasurementSource::Fix => Source::Fix,
         };
         Self { source, reason: rejection.reason.into(), nis: rejection.nis }
     }
@@ -131,10 +131,10 @@ impl From<&TrackPoint> for TrackState {
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
-            still: state.still,
+            still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
-            restarted: state.restarted,
+            restarted: state.reinitialized,
         }
     }
 }

@@ -30,7 +30,7 @@ const ENDED: &str = "ended";
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new()
         .routes(routes!(start_training_run, list_training_runs))
-        .routes(routes!(get_training_run))
+        .routes(routes!(get_training_run, delete_training_run))
         .routes(routes!(cancel_training_run))
         .routes(routes!(watch_training_run))
         .routes(routes!(get_training_log))
@@ -95,7 +95,7 @@ struct TrainingRun {
     state: JobState,
     /// How far it has come.
     progress: RunProgress,
-    /// How often a worker has taken it up.
+    /// Times a worker has claimed it without returning it to the queue in order.
     attempt: u32,
     /// The version it yielded.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -196,6 +196,23 @@ async fn list_training_runs(State(app): State<App>, CameraPath(id): CameraPath, 
 )]
 async fn get_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
     Ok(json(&TrainingRun::from(app.run(&id, run).await?))?)
+}
+
+/// Delete a training run
+///
+/// With its log and its curve. The model version that it yielded stays. A run that has not ended must
+/// be cancelled first.
+#[utoipa::path(
+    delete, path = "/v1/cameras/{camera}/training-runs/{run}", tag = "training",
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
+    responses(
+        (status = 204, description = "It is deleted"),
+        (status = 409, description = "The run has not ended", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn delete_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+    app.delete_run(&id, run).await?;
+    Ok(empty())
 }
 
 /// Cancel a training run

@@ -47,6 +47,25 @@ impl From<crate::domain::Recipe> for Recipe {
     }
 }
 
+/// When stored samples are acknowledged.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Durability {
+    /// After they have been flushed to the disk; they survive a power cut.
+    Synced,
+    /// After their commit; they survive a crash of the server, a power cut may undo the latest.
+    Relaxed,
+}
+
+impl From<domain::Durability> for Durability {
+    fn from(durability: domain::Durability) -> Self {
+        match durability {
+            domain::Durability::Synced => Self::Synced,
+            domain::Durability::Relaxed => Self::Relaxed,
+        }
+    }
+}
+
 /// Where a job stands. Queued and running jobs are live; the others have ended.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]

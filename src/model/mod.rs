@@ -1,41 +1,28 @@
-//! Recipes, training loop, fast forward pass and model artifacts; the only floor that knows candle.
+//! Models of a camera: fitting them to samples, storing them, and regressing positions from boxes.
 //!
-//! [`fit`] turns samples into an [`Artifact`]; [`Artifact::load`] turns that into a [`Regressor`],
-//! which answers box by box from flat weights. What never happens here: storage, transport, clocks,
-//! threads of its own.
+//! [`fit`] turns samples into an [`Artifact`]; [`Artifact::load`] turns that into a [`Regressor`], which
+//! regresses box by box from flat weights. The folders in the order of their layers: `artifact`, `network`,
+//! `samples`, `progress`, `encoder`, `uncertainty`, `regressor`, `probe`, `fitting`. This is the only module that
+//! uses candle; it has no I/O, clocks or threads.
 
 mod artifact;
-mod cells;
-mod coverage;
-pub mod dnn;
-mod file;
-mod fit;
-pub mod homography;
-mod hybrid;
-mod kernel;
-pub mod net;
-mod paper;
-mod projection;
-mod projective;
+mod encoder;
+mod fitting;
+pub mod network;
+mod probe;
+mod progress;
 mod regressor;
-mod rows;
-mod run;
-mod select;
-mod tensors;
-mod track_beliefs;
-pub mod train;
+mod samples;
 mod uncertainty;
-mod whitening;
 
-pub use artifact::{Artifact, FORMAT};
-pub use fit::{FitError, FitEvent, FitOptions, Trial, fit, fit_trial};
-pub use regressor::{R95_PER_SIGMA, Regression, Regressor};
-pub use rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
-pub use tensors::LARGEST_WEIGHTS_BYTES;
-pub use track_beliefs::TrackBeliefs;
+pub use crate::statistics::R95_PER_SIGMA;
+pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackNoiseModel};
+pub use encoder::projection::Projection;
+pub use encoder::projection_fit::fit_foot_points;
+pub use fitting::{FitOptions, FitOverrides, fit, fit_with};
+pub use progress::{FitError, FitEvent};
+pub use regressor::{Regression, Regressor};
+pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 
 #[cfg(test)]
 mod tests;
-
-#[cfg(test)]
-mod behaviour_tests;

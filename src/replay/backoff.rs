@@ -1,40 +1,40 @@
-//! How long to wait before the next attempt: longer each time, and never all clients at once.
+//! Exponential backoff with jitter between attempts to open a stream.
 
 use std::time::Duration;
 
 use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 
-const FIRST: Duration = Duration::from_millis(100);
-const LONGEST: Duration = Duration::from_secs(5);
+const INITIAL_DELAY: Duration = Duration::from_millis(100);
+const MAX_DELAY: Duration = Duration::from_secs(5);
 
-/// Waits between attempts.
+/// The delays of one client.
 #[derive(Debug)]
 pub(super) struct Backoff {
-    failed: u32,
-    attempts: u32,
+    failures: u32,
+    max_attempts: u32,
     random: ChaCha8Rng,
 }
 
 impl Backoff {
-    pub(super) const fn new(attempts: u32, random: ChaCha8Rng) -> Self {
-        Self { failed: 0, attempts, random }
+    pub(super) const fn new(max_attempts: u32, random: ChaCha8Rng) -> Self {
+        Self { failures: 0, max_attempts, random }
     }
 
-    /// Something went well: the next wait is a short one.
+    /// Resets the delay and the attempts after a success.
     pub(super) const fn reset(&mut self) {
-        self.failed = 0;
+        self.failures = 0;
     }
 
-    /// How long to wait after one more failure: 0.1 s doubled up to 5 s, of which a random share
-    /// between half and all. `None` once all attempts are spent.
-    pub(super) fn next_wait(&mut self) -> Option<Duration> {
-        if self.failed >= self.attempts {
+    /// The delay after one more failure: 0.1 s, doubled with every failure up to 5 s, times a uniform
+    /// factor from 0.5 to 1. `None` once all attempts are used.
+    pub(super) fn next_delay(&mut self) -> Option<Duration> {
+        if self.failures >= self.max_attempts {
             return None;
         }
-        let doubled = FIRST.saturating_mul(1 << self.failed.min(16)).min(LONGEST);
-        self.failed += 1;
-        Some(doubled.mul_f64(self.random.random_range(0.5..1.0)))
+        let delay = INITIAL_DELAY.saturating_mul(1 << self.failures.min(16)).min(MAX_DELAY);
+        self.failures += 1;
+        Some(delay.mul_f64(self.random.random_range(0.5..1.0)))
     }
 }
 
@@ -45,21 +45,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waits_grow_to_a_limit_and_end() {
+    fn delays_grow_to_a_limit_and_end() {
         let mut backoff = Backoff::new(40, ChaCha8Rng::seed_from_u64(1));
-        let waits: Vec<_> = std::iter::from_fn(|| backoff.next_wait()).collect();
-        assert_eq!(waits.len(), 40);
-        for (attempt, wait) in waits.iter().enumerate() {
-            let whole = FIRST.saturating_mul(1 << attempt.min(16)).min(LONGEST);
-            assert!(*wait >= whole / 2 && *wait <= whole, "{attempt}: {wait:?}");
+        let delays: Vec<_> = std::iter::from_fn(|| backoff.next_delay()).collect();
+        assert_eq!(delays.len(), 40);
+        for (attempt, delay) in delays.iter().enumerate() {
+            let upper = INITIAL_DELAY.saturating_mul(1 << attempt.min(16)).min(MAX_DELAY);
+            assert!(*delay >= upper / 2 && *delay <= upper, "{attempt}: {delay:?}");
         }
         backoff.reset();
-        assert!(backoff.next_wait().expect("anew") <= FIRST);
+        assert!(backoff.next_delay().expect("attempts are reset") <= INITIAL_DELAY);
     }
 
     #[test]
-    fn clients_of_other_seeds_wait_for_other_times() {
-        let first = |seed| Backoff::new(1, ChaCha8Rng::seed_from_u64(seed)).next_wait();
+    fn clients_with_different_seeds_have_different_delays() {
+        let first = |seed| Backoff::new(1, ChaCha8Rng::seed_from_u64(seed)).next_delay();
         assert_eq!(first(1), first(1));
         assert_ne!(first(1), first(2));
     }

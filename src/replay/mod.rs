@@ -1,168 +1,108 @@
-//! Recorded items streamed to a server as one or many cameras would: the load tool, and the example
-//! of a client that loses nothing on a broken line.
+//! Replays recorded items to a server as one or many cameras: a load generator, and a reference client
+//! that loses nothing when a connection breaks.
 //!
-//! Each simulated camera is one task with one stream: it takes [`feed`] items when they are due, keeps
-//! them in its [`buffer`] until the server need not see them again, and after a broken line waits
-//! ([`backoff`]), opens another stream and sends from the last acknowledgement on. What never happens
+//! Each simulated camera is one task with one stream. It takes items from its [`PacedFeed`] when they
+//! are due and holds them in its [`ResendBuffer`] until they are done; after a failure it waits
+//! ([`Backoff`]), opens another stream and resumes after the last acknowledgement. What never happens
 //! here: files, flags, unbounded memory, randomness without a seed.
-//!
-//! [`feed`]: Feed
-//! [`buffer`]: Buffer
-//! [`backoff`]: Backoff
 
 mod backoff;
-mod buffer;
-mod camera;
-mod faults;
-mod feed;
-mod latency;
+mod fault_injection;
+mod latency_histogram;
+mod options;
+mod paced_feed;
+mod progress;
 mod recording;
 mod report;
+mod resend_buffer;
+mod simulated_camera;
 
-use std::num::NonZeroU64;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use futures_util::future::join_all;
-use jiff::SignedDuration;
 use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 use tokio_util::sync::CancellationToken;
 
-use crate::domain::CameraId;
 use crate::grpc::client::{ClientError, Connection};
 use backoff::Backoff;
-use buffer::Buffer;
-use camera::{Line, SimulatedCamera};
-use faults::Faults;
-use feed::{Feed, Turns};
+use fault_injection::FaultInjector;
+use paced_feed::{PacedFeed, Schedule};
+use report::Counts;
+use resend_buffer::ResendBuffer;
+use simulated_camera::{Link, SimulatedCamera};
 
-pub use faults::FaultShares;
-pub use feed::Pace;
-pub use latency::Latencies;
-pub use recording::{FixesOf, Recording};
-pub use report::{Report, Tally};
+pub use fault_injection::FaultShares;
+pub use options::ReplayOptions;
+pub use paced_feed::Pace;
+pub use progress::Counters;
+pub use recording::{FixOwner, Recording};
+pub use report::Report;
 
-/// Streams that share an HTTP/2 connection; servers allow some hundred, 256 by default.
+/// Streams that share an HTTP/2 connection; servers commonly allow 256 or fewer.
 const STREAMS_PER_CONNECTION: usize = 128;
 
-/// What to replay where, and how.
-#[derive(Debug, Clone)]
-pub struct Options {
-    /// Address of the server, such as `http://127.0.0.1:8080`.
-    pub server: String,
-    /// The server's cameras. Simulated ones are dealt to them in turn; where several share one, their
-    /// targets get a number behind their id, so that they are others.
-    pub camera_ids: Vec<CameraId>,
-    /// Simulated cameras, each with a stream of its own.
-    pub cameras: usize,
-    /// The streams' client names begin with it; the camera's number follows.
-    pub client_name: String,
-    /// When items are sent.
-    pub pace: Pace,
-    /// Passes over the recording; each later in time than the one before.
-    pub passes: NonZeroU64,
-    /// No item is sent after this time; then `passes` no longer counts.
-    pub duration: Option<Duration>,
-    /// Added to every item's time.
-    pub shift: SignedDuration,
-    /// Items sent and not answered yet, per camera.
-    pub in_flight: usize,
-    /// Items kept to be sent again, per camera; when it is full nothing new is sent.
-    pub kept: usize,
-    /// Whether the items become training samples and must be acknowledged.
-    pub store_samples: bool,
-    /// What goes wrong on purpose before items are sent.
-    pub faults: FaultShares,
-    /// Of faults, waits and beginnings.
-    pub seed: u64,
-    /// Attempts in a row to open a stream again, without an answer in between, until a camera gives up.
-    pub attempts: u32,
-    /// A server that owes something and is silent for this long counts as gone.
-    pub patience: Duration,
-}
-
-/// How far all cameras have come, for whoever watches.
-#[derive(Debug, Default)]
-pub struct Live {
-    /// Items sent, each counted once.
-    pub items: AtomicU64,
-    /// Items answered for the first time.
-    pub answered: AtomicU64,
-    /// Streams open now.
-    pub streams: AtomicU64,
-}
-
-impl Live {
-    fn add(counter: &AtomicU64, more: u64) {
-        counter.fetch_add(more, Ordering::Relaxed);
-    }
-
-    fn subtract(counter: &AtomicU64, less: u64) {
-        counter.fetch_sub(less, Ordering::Relaxed);
-    }
-}
-
-/// Replays a recording; ends when every camera has ended. After `stop` nothing new is sent and the
-/// streams end in order.
+/// Replays a recording; returns when every camera has finished. After `stop` no new item is sent and
+/// the streams are closed in order.
 ///
 /// # Errors
-/// An address that is none. All else is in the report.
+/// An invalid address. All other errors are in the report.
 pub async fn replay(
     recording: Arc<Recording>,
-    options: Arc<Options>,
-    live: Arc<Live>,
+    options: Arc<ReplayOptions>,
+    counters: Arc<Counters>,
     stop: CancellationToken,
 ) -> Result<Report, ClientError> {
     let connections = options.cameras.div_ceil(STREAMS_PER_CONNECTION).max(1);
     let connections: Vec<_> =
         (0..connections).map(|_| Connection::to(&options.server)).collect::<Result<_, _>>()?;
-    let begin = Instant::now();
+    let started = Instant::now();
     let cameras = (0..options.cameras).map(|number| {
-        let line = Line { connection: connections[number % connections.len()].clone(), live: live.clone() };
-        let camera = camera(number, recording.clone(), &options, line, begin);
+        let connection = connections[number % connections.len()].clone();
+        let link = Link { connection, counters: counters.clone() };
+        let camera = simulated_camera(number, recording.clone(), &options, link, started);
         tokio::spawn(camera.run(stop.clone()))
     });
-    let mut tally = Tally::default();
-    for ended in join_all(cameras.collect::<Vec<_>>()).await {
-        match ended {
-            Ok(camera) => tally.add(camera),
-            Err(panic) => tally.give_up(&ClientError::broken_line(&panic.to_string())),
+    let mut totals = Counts::default();
+    for finished in join_all(cameras.collect::<Vec<_>>()).await {
+        match finished {
+            Ok(counts) => totals.add(counts),
+            Err(panic) => totals.record_give_up(&ClientError::broken_line(&panic.to_string())),
         }
     }
-    Ok(Report::new(tally, options.cameras, begin.elapsed(), options.store_samples))
+    Ok(Report::new(totals, options.cameras, started.elapsed(), options.store_samples))
 }
 
-/// One simulated camera, everything random in it from streams of its own.
-fn camera(
+/// One simulated camera with its own random streams.
+fn simulated_camera(
     number: usize,
     recording: Arc<Recording>,
-    options: &Arc<Options>,
-    line: Line,
-    begin: Instant,
+    options: &Arc<ReplayOptions>,
+    link: Link,
+    started: Instant,
 ) -> SimulatedCamera {
     let random = |purpose: u64| {
         let mut random = ChaCha8Rng::seed_from_u64(options.seed);
         random.set_stream(number as u64 * 4 + purpose);
         random
     };
-    let passes = if options.duration.is_some() { u64::MAX } else { options.passes.get() };
-    let turns = Faults::new(Turns::new(recording.len(), passes), options.faults, random(0));
-    // Cameras that begin together would send every item at the same instant, as no real ones do.
-    let wait = match options.cameras {
+    let repetitions = if options.duration.is_some() { u64::MAX } else { options.repetitions.get() };
+    let items = FaultInjector::new(Schedule::new(recording.len(), repetitions), options.faults, random(0));
+    // Without an initial delay all cameras would send every item at the same instant.
+    let delay = match options.cameras {
         1 => Duration::ZERO,
-        _ => options.pace.first_wait(&recording, &mut random(1)),
+        _ => options.pace.initial_delay(&recording, &mut random(1)),
     };
-    let until = options.duration.map(|duration| begin + duration);
-    let feed = Feed::new(recording, turns, options.pace, begin + wait, until);
-    let buffer = Buffer::new(options.kept, options.store_samples);
+    let until = options.duration.map(|duration| started + duration);
+    let feed = PacedFeed::new(recording, items, options.pace, started + delay, until);
+    let buffer = ResendBuffer::new(options.resend_buffer, options.store_samples);
     SimulatedCamera::new(
         number,
         options.clone(),
         feed,
         buffer,
         Backoff::new(options.attempts, random(2)),
-        line,
+        link,
     )
 }

@@ -1,20 +1,20 @@
-//! What was recorded: items in the order in which they came.
+//! Recorded items in their order of arrival.
 
 use jiff::{SignedDuration, Timestamp};
 
 use crate::domain::{Error, LiveItem, ReceiverId, Result, TargetId};
 use crate::exchange::ObservedRow;
 
-/// Whose the fixes of a file without targets are.
+/// The owner of fixes that name no target.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum FixesOf {
-    /// This target's.
+pub enum FixOwner {
+    /// A target.
     Target(TargetId),
-    /// This receiver's; the server knows whose it is.
+    /// A receiver; the server knows its target.
     Receiver(ReceiverId),
 }
 
-/// Items to be replayed, at least one.
+/// Items to replay, at least one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recording {
     items: Vec<LiveItem>,
@@ -27,48 +27,48 @@ impl Recording {
     /// Rows in the order of their file.
     ///
     /// # Errors
-    /// No rows at all.
-    pub fn of_rows(rows: impl IntoIterator<Item = ObservedRow>) -> Result<Self> {
-        Self::of_items(rows.into_iter().map(item).collect())
+    /// Refuses an empty recording.
+    pub fn from_rows(rows: impl IntoIterator<Item = ObservedRow>) -> Result<Self> {
+        Self::from_items(rows.into_iter().map(item).collect())
     }
 
-    /// Boxes and fixes that were recorded apart, in the order of their times. Fixes that name no
-    /// target are `fixes_of` somebody, or of the only target that was seen.
+    /// Boxes and fixes that were recorded separately, merged by time. Fixes that name no target belong
+    /// to `fix_owner`, or to the only target among the boxes.
     ///
     /// # Errors
-    /// No rows at all, or fixes that may be of several targets; the field is `target_id`.
-    pub fn of_both(
+    /// Refuses an empty recording, and fixes that may belong to several targets; the field is `target_id`.
+    pub fn from_detections_and_fixes(
         detections: impl IntoIterator<Item = ObservedRow>,
         fixes: impl IntoIterator<Item = ObservedRow>,
-        fixes_of: Option<FixesOf>,
+        fix_owner: Option<FixOwner>,
     ) -> Result<Self> {
         let mut items: Vec<_> = detections.into_iter().map(item).collect();
         let mut targets: Vec<_> = items.iter().filter_map(|item| item.target_id.clone()).collect();
         targets.sort_unstable();
         targets.dedup();
-        let fixes_of = fixes_of.or_else(|| match targets.as_slice() {
-            [only] => Some(FixesOf::Target(only.clone())),
+        let fix_owner = fix_owner.or_else(|| match targets.as_slice() {
+            [only] => Some(FixOwner::Target(only.clone())),
             _ => None,
         });
         for fix in fixes {
             let mut item = item(fix);
-            match (&item.target_id, &fixes_of) {
+            match (&item.target_id, &fix_owner) {
                 (Some(_), _) => {}
-                (None, Some(FixesOf::Target(id))) => item.target_id = Some(id.clone()),
-                (None, Some(FixesOf::Receiver(id))) => item.receiver_id = Some(id.clone()),
+                (None, Some(FixOwner::Target(id))) => item.target_id = Some(id.clone()),
+                (None, Some(FixOwner::Receiver(id))) => item.receiver_id = Some(id.clone()),
                 (None, None) => {
-                    let message = "the fixes name no target and there is more than one: say whose they are";
+                    let message = "the fixes name no target and there are several: name the target or the receiver of the fixes";
                     return Err(Error::invalid("target_id", message));
                 }
             }
             items.push(item);
         }
-        // Stable: a box and a fix of one instant stay in this order.
+        // A stable sort: the box stays before the fix of the same instant.
         items.sort_by_key(|item| item.time);
-        Self::of_items(items)
+        Self::from_items(items)
     }
 
-    fn of_items(items: Vec<LiveItem>) -> Result<Self> {
+    fn from_items(items: Vec<LiveItem>) -> Result<Self> {
         let mut times: Vec<_> = items.iter().map(|item| item.time).collect();
         times.sort_unstable();
         times.dedup();
@@ -79,7 +79,7 @@ impl Recording {
             Ok(gaps @ 1..) => last.duration_since(first) / gaps,
             _ => SignedDuration::from_secs(1),
         };
-        // Stored times are exact to the microsecond, and passes must not meet.
+        // Times are stored in microseconds, and repetitions must not overlap.
         let interval = interval.max(SignedDuration::from_micros(1));
         Ok(Self { items, first, last, interval })
     }
@@ -90,40 +90,40 @@ impl Recording {
         self.items.len()
     }
 
-    /// Never: a recording has an item.
+    /// Always false: a recording has at least one item.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.items.is_empty()
     }
 
-    /// The mean interval between instants; a second if there is only one.
+    /// Mean interval between instants; one second if there is only one instant.
     #[must_use]
     pub const fn interval(&self) -> SignedDuration {
         self.interval
     }
 
-    /// What to add to every time so that the last item of the last of so many passes is at `end`.
+    /// The shift of all times that moves the last item of the last repetition to `end`.
     #[must_use]
-    pub fn shift_to_end_at(&self, end: Timestamp, passes: u64) -> SignedDuration {
-        end.duration_since(self.last) - self.later(passes.saturating_sub(1))
+    pub fn shift_to_end_at(&self, end: Timestamp, repetitions: u64) -> SignedDuration {
+        end.duration_since(self.last) - self.repetition_offset(repetitions.saturating_sub(1))
     }
 
-    /// From the first instant of the first pass to this item's.
-    pub(super) fn since_begin(&self, row: usize, pass: u64) -> SignedDuration {
-        self.items[row].time.duration_since(self.first) + self.later(pass)
+    /// Time from the first instant of the first repetition to this item.
+    pub(super) fn since_begin(&self, row: usize, repetition: u64) -> SignedDuration {
+        self.items[row].time.duration_since(self.first) + self.repetition_offset(repetition)
     }
 
-    /// The item as it is in that pass, its time shifted.
-    pub(super) fn item(&self, row: usize, pass: u64, shift: SignedDuration) -> LiveItem {
+    /// The item in that repetition, with its time shifted.
+    pub(super) fn item(&self, row: usize, repetition: u64, shift: SignedDuration) -> LiveItem {
         let mut item = self.items[row].clone();
-        item.time = item.time.saturating_add(shift + self.later(pass)).unwrap_or(item.time);
+        item.time = item.time.saturating_add(shift + self.repetition_offset(repetition)).unwrap_or(item.time);
         item
     }
 
-    /// How much later a pass is than the first.
-    fn later(&self, pass: u64) -> SignedDuration {
+    /// Time between the first repetition and another.
+    fn repetition_offset(&self, repetition: u64) -> SignedDuration {
         let period = self.last.duration_since(self.first) + self.interval;
-        let times = i32::try_from(pass).unwrap_or(i32::MAX);
+        let times = i32::try_from(repetition).unwrap_or(i32::MAX);
         period.checked_mul(times).unwrap_or(SignedDuration::ZERO)
     }
 }
@@ -166,11 +166,11 @@ pub(super) mod tests {
         for second in seconds {
             csv.push_str(&format!("{},a,1,2,3,4\n", time(*second)));
         }
-        Recording::of_rows(rows(&csv)).expect("rows")
+        Recording::from_rows(rows(&csv)).expect("rows")
     }
 
     #[test]
-    fn passes_follow_each_other_in_time() {
+    fn repetitions_follow_each_other_in_time() {
         let recording = recording(&[0.0, 1.0, 3.0]);
         let at = |row, pass| recording.item(row, pass, SignedDuration::ZERO).time;
         assert_eq!([at(0, 0), at(2, 0), at(0, 1), at(2, 2)], [0.0, 3.0, 4.5, 12.0].map(time));
@@ -192,24 +192,25 @@ pub(super) mod tests {
             time(0.0)
         );
         let fixes = format!("time,longitude,latitude\n{},3,4\n{},3,4\n", time(1.0), time(2.0));
-        let merged = Recording::of_both(rows(&boxes), rows(&fixes), None).expect("rows");
-        let told: Vec<_> = merged.items.iter().map(|item| (item.time, item.fix.is_some())).collect();
+        let merged = Recording::from_detections_and_fixes(rows(&boxes), rows(&fixes), None).expect("rows");
+        let order: Vec<_> = merged.items.iter().map(|item| (item.time, item.fix.is_some())).collect();
         let expected = [(0.0, false), (1.0, true), (2.0, false), (2.0, true)];
-        assert_eq!(told, expected.map(|(second, is_fix)| (time(second), is_fix)));
+        assert_eq!(order, expected.map(|(second, is_fix)| (time(second), is_fix)));
         assert!(merged.items.iter().all(|item| item.target_id.as_ref().is_some_and(|id| id.as_str() == "a")));
 
-        let receiver = FixesOf::Receiver(ReceiverId::new("phone").expect("a name"));
-        let merged = Recording::of_both(rows(&boxes), rows(&fixes), Some(receiver)).expect("rows");
+        let receiver = FixOwner::Receiver(ReceiverId::new("phone").expect("a name"));
+        let merged =
+            Recording::from_detections_and_fixes(rows(&boxes), rows(&fixes), Some(receiver)).expect("rows");
         let receivers =
             merged.items.iter().filter(|item| item.receiver_id.is_some() && item.target_id.is_none());
         assert_eq!(receivers.count(), 2);
     }
 
     #[test]
-    fn fixes_of_nobody_are_refused() {
+    fn fix_owner_nobody_are_refused() {
         let two = format!("time,target_id,left,top,width,height\n{0},a,1,2,3,4\n{0},b,1,2,3,4\n", time(0.0));
         let fixes = format!("time,longitude,latitude\n{},3,4\n", time(1.0));
-        Recording::of_both(rows(&two), rows(&fixes), None).expect_err("whose?");
-        Recording::of_rows(Vec::new()).expect_err("no rows");
+        Recording::from_detections_and_fixes(rows(&two), rows(&fixes), None).expect_err("no owner");
+        Recording::from_rows(Vec::new()).expect_err("no rows");
     }
 }

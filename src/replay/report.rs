@@ -1,4 +1,4 @@
-//! What came of a replay, in numbers that add up.
+//! The result of a replay: counts and latencies.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -6,16 +6,16 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::faults::FaultCounts;
-use super::latency::Latencies;
+use super::fault_injection::FaultCounts;
+use super::latency_histogram::LatencyHistogram;
 use crate::grpc::client::ClientError;
 
-/// Reasons of cameras that gave up, told in full.
-const MOST_REASONS: usize = 5;
+/// Largest number of reported reasons of cameras that gave up.
+const MAX_REASONS: usize = 5;
 
-/// What was counted, by one camera or by all.
+/// Counts of one simulated camera, or sums over several.
 #[derive(Debug, Clone, Default)]
-pub struct Tally {
+pub(super) struct Counts {
     pub(super) items: u64,
     pub(super) resent: u64,
     pub(super) answered: u64,
@@ -26,19 +26,19 @@ pub struct Tally {
     pub(super) unacknowledged: u64,
     pub(super) streams: u64,
     pub(super) reconnects: u64,
-    pub(super) invitations: u64,
+    pub(super) reconnect_requests: u64,
     pub(super) broken: BTreeMap<String, u64>,
     pub(super) cameras_moved: u64,
     pub(super) model_versions: BTreeSet<u32>,
-    pub(super) furthest_behind: Duration,
-    pub(super) latencies: Latencies,
+    pub(super) max_lag: Duration,
+    pub(super) latencies: LatencyHistogram,
     pub(super) faults: FaultCounts,
     pub(super) given_up: u64,
     pub(super) reasons: Vec<String>,
 }
 
-impl Tally {
-    /// Takes in another's counts.
+impl Counts {
+    /// Adds the counts of another camera.
     pub(super) fn add(&mut self, other: Self) {
         self.items += other.items;
         self.resent += other.resent;
@@ -50,97 +50,97 @@ impl Tally {
         self.unacknowledged += other.unacknowledged;
         self.streams += other.streams;
         self.reconnects += other.reconnects;
-        self.invitations += other.invitations;
+        self.reconnect_requests += other.reconnect_requests;
         add_each(&mut self.broken, other.broken);
         self.cameras_moved += other.cameras_moved;
         self.model_versions.extend(other.model_versions);
-        self.furthest_behind = self.furthest_behind.max(other.furthest_behind);
+        self.max_lag = self.max_lag.max(other.max_lag);
         self.latencies.add(&other.latencies);
         self.faults.lost += other.faults.lost;
         self.faults.duplicated += other.faults.duplicated;
         self.faults.reordered += other.faults.reordered;
         self.given_up += other.given_up;
         self.reasons.extend(other.reasons);
-        self.reasons.truncate(MOST_REASONS);
+        self.reasons.truncate(MAX_REASONS);
     }
 
-    /// A camera gives up.
-    pub(super) fn give_up(&mut self, why: &ClientError) {
+    /// Counts a camera that gave up.
+    pub(super) fn record_give_up(&mut self, error: &ClientError) {
         self.given_up += 1;
-        self.reasons.push(why.to_string());
+        self.reasons.push(error.to_string());
     }
 }
 
-fn add_each(counts: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
+fn add_each(totals: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
     for (reason, count) in more {
-        *counts.entry(reason).or_default() += count;
+        *totals.entry(reason).or_default() += count;
     }
 }
 
-/// What came of a replay. `items` = `answered` + `refused` + `lost_answers` + `unanswered`, and with
+/// Result of a replay. `items` = `answered` + `refused` + `lost_answers` + `unanswered`, and with
 /// acknowledgements `items` = `acknowledged` + `unacknowledged`.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     /// Simulated cameras.
     pub cameras: usize,
-    /// From the first to the last, seconds.
+    /// Duration of the replay, s.
     pub elapsed_s: f64,
     /// Items sent, each counted once.
     pub items: u64,
-    /// Items sent again after a broken line.
+    /// Items sent again after a broken connection.
     pub resent: u64,
     /// Items answered, refused ones included, per second.
     pub answers_per_s: f64,
-    /// Items taken by the server.
+    /// Items accepted by the server.
     pub answered: u64,
-    /// Items not taken, by reason.
+    /// Items refused, by reason.
     pub refused: BTreeMap<String, u64>,
-    /// Items whose answer the server dropped because this reader was too slow.
+    /// Items whose answer the server dropped because this client read too slowly.
     pub lost_answers: u64,
-    /// Items that were never answered.
+    /// Items without an answer.
     pub unanswered: u64,
-    /// Items acknowledged; `None` if nothing was to be kept.
+    /// Items acknowledged; `None` if samples are not stored.
     pub acknowledged: Option<u64>,
-    /// Items not acknowledged; `None` if nothing was to be kept.
+    /// Items not acknowledged; `None` if samples are not stored.
     pub unacknowledged: Option<u64>,
-    /// From sending an item to its answer.
+    /// Latency from sending an item to its answer.
     pub latency_ms: LatencyMs,
-    /// Farthest that sending fell behind the pace, milliseconds.
+    /// Largest lag of sending behind the pace, ms.
     pub furthest_behind_ms: f64,
     /// Streams opened.
     pub streams: u64,
     /// Streams opened after a camera's first.
     pub reconnects: u64,
-    /// Invitations of the server to open another stream.
+    /// Requests of the server to reconnect.
     pub invitations: u64,
-    /// Streams that broke or were not opened, by reason.
+    /// Streams that failed or could not be opened, by reason.
     pub broken: BTreeMap<String, u64>,
-    /// Alarms that a camera was moved.
+    /// Alarms that a camera has moved.
     pub cameras_moved: u64,
     /// Model versions that answered.
     pub model_versions: BTreeSet<u32>,
-    /// Faults that were made on purpose.
+    /// Injected faults.
     pub injected: Injected,
-    /// Cameras that gave up before all was sent.
+    /// Cameras that gave up before everything was sent.
     pub given_up: u64,
-    /// Why the first of them did.
+    /// Errors of the first of them.
     pub reasons: Vec<String>,
 }
 
-/// Times from sending to answer, milliseconds; at most 1/32 above the true percentile.
+/// Quantiles of the latency in ms, at most 1 % above the true ones.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct LatencyMs {
-    /// Half of all are shorter.
+    /// Median.
     pub p50: f64,
-    /// One in ten is longer.
+    /// 90 % quantile.
     pub p90: f64,
-    /// One in a hundred is longer.
+    /// 99 % quantile.
     pub p99: f64,
-    /// The longest.
+    /// Maximum; exact.
     pub max: f64,
 }
 
-/// Faults that were made on purpose.
+/// Number of injected faults.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Injected {
     /// Items not sent.
@@ -152,47 +152,47 @@ pub struct Injected {
 }
 
 impl Report {
-    pub(super) fn new(tally: Tally, cameras: usize, elapsed: Duration, must_acknowledge: bool) -> Self {
+    pub(super) fn new(counts: Counts, cameras: usize, elapsed: Duration, must_acknowledge: bool) -> Self {
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
-        let percentile = |share| ms(tally.latencies.percentile(share));
-        let refused: u64 = tally.refused.values().sum();
+        let quantile = |share| ms(counts.latencies.quantile(share));
+        let refused: u64 = counts.refused.values().sum();
         let elapsed_s = elapsed.as_secs_f64();
         Self {
             cameras,
             elapsed_s,
-            items: tally.items,
-            resent: tally.resent,
-            answers_per_s: (tally.answered + refused) as f64 / elapsed_s.max(1e-9),
-            answered: tally.answered,
-            lost_answers: tally.lost_answers,
-            unanswered: tally.unanswered,
-            acknowledged: must_acknowledge.then_some(tally.acknowledged),
-            unacknowledged: must_acknowledge.then_some(tally.unacknowledged),
+            items: counts.items,
+            resent: counts.resent,
+            answers_per_s: (counts.answered + refused) as f64 / elapsed_s.max(1e-9),
+            answered: counts.answered,
+            lost_answers: counts.lost_answers,
+            unanswered: counts.unanswered,
+            acknowledged: must_acknowledge.then_some(counts.acknowledged),
+            unacknowledged: must_acknowledge.then_some(counts.unacknowledged),
             latency_ms: LatencyMs {
-                p50: percentile(0.5),
-                p90: percentile(0.9),
-                p99: percentile(0.99),
-                max: ms(tally.latencies.longest()),
+                p50: quantile(0.5),
+                p90: quantile(0.9),
+                p99: quantile(0.99),
+                max: ms(counts.latencies.max()),
             },
-            furthest_behind_ms: ms(tally.furthest_behind),
-            streams: tally.streams,
-            reconnects: tally.reconnects,
-            invitations: tally.invitations,
-            cameras_moved: tally.cameras_moved,
+            furthest_behind_ms: ms(counts.max_lag),
+            streams: counts.streams,
+            reconnects: counts.reconnects,
+            invitations: counts.reconnect_requests,
+            cameras_moved: counts.cameras_moved,
             injected: Injected {
-                lost: tally.faults.lost,
-                duplicated: tally.faults.duplicated,
-                reordered: tally.faults.reordered,
+                lost: counts.faults.lost,
+                duplicated: counts.faults.duplicated,
+                reordered: counts.faults.reordered,
             },
-            given_up: tally.given_up,
-            refused: tally.refused,
-            broken: tally.broken,
-            model_versions: tally.model_versions,
-            reasons: tally.reasons,
+            given_up: counts.given_up,
+            refused: counts.refused,
+            broken: counts.broken,
+            model_versions: counts.model_versions,
+            reasons: counts.reasons,
         }
     }
 
-    /// Whether every item was answered (or its answer lost by this reader) and acknowledged.
+    /// Whether every item was answered (or its answer was dropped) and acknowledged.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.unanswered == 0 && self.unacknowledged.unwrap_or(0) == 0 && self.given_up == 0
@@ -223,16 +223,16 @@ impl fmt::Display for Report {
         }
         writeln!(
             out,
-            "streams {}, reconnects {}, by invitation {}, items sent again {resent}",
+            "streams {}, reconnects {}, requested by the server {}, items sent again {resent}",
             self.streams, self.reconnects, self.invitations
         )?;
         each(out, "broken", &self.broken)?;
         let Injected { lost, duplicated, reordered } = self.injected;
         if lost + duplicated + reordered > 0 {
-            writeln!(out, "on purpose: lost {lost}, duplicated {duplicated}, reordered {reordered}")?;
+            writeln!(out, "injected faults: lost {lost}, duplicated {duplicated}, reordered {reordered}")?;
         }
         if self.cameras_moved > 0 {
-            writeln!(out, "alarms of a moved camera: {}", self.cameras_moved)?;
+            writeln!(out, "camera-moved alarms: {}", self.cameras_moved)?;
         }
         if self.given_up > 0 {
             writeln!(out, "cameras that gave up: {}", self.given_up)?;

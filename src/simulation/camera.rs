@@ -1,11 +1,11 @@
-//! A full camera: pinhole, radial distortion, height, pan and tilt. No method ever sees it.
+//! A calibrated pinhole camera with radial distortion. No estimation method uses it.
 //!
 //! What never happens here: noise.
 
 use crate::domain::ImageSize;
 use crate::geo::EastNorth;
 
-/// A point of the world: metres east, north and up of the foot of the camera's mast.
+/// A point in space: m east, north and up of the foot of the camera's mast.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Point {
     pub(super) ground: EastNorth,
@@ -18,17 +18,17 @@ pub(super) struct Camera {
     pub(super) image_size: ImageSize,
     pub(super) height_m: f64,
     pub(super) focal_px: f64,
-    /// Where the optical axis points: clockwise from north.
+    /// Azimuth of the optical axis, clockwise from north.
     pub(super) pan_deg: f64,
-    /// Below the horizon.
+    /// Depression of the optical axis below the horizon.
     pub(super) tilt_deg: f64,
-    /// Radial displacement at the image's corner as a share of its distance from the centre;
-    /// negative is a barrel.
+    /// Radial displacement at the image's corner divided by its distance from the centre; negative for
+    /// barrel distortion.
     pub(super) lens_distortion: f64,
 }
 
 impl Camera {
-    /// Column and row of a point, px; `None` for what lies behind the camera.
+    /// Column and row of a point, px; `None` behind the camera.
     pub(super) fn project(&self, point: Point) -> Option<[f64; 2]> {
         let (sin_pan, cos_pan) = self.pan_deg.to_radians().sin_cos();
         let (sin_tilt, cos_tilt) = self.tilt_deg.to_radians().sin_cos();
@@ -43,16 +43,16 @@ impl Camera {
         let below_m = cos_tilt * down_m - sin_tilt * ahead_m;
         let (column, row) = (self.focal_px * right_m / depth_m, self.focal_px * below_m / depth_m);
         let (width_px, height_px) = self.size_px();
-        let bend = self.distortion(column.hypot(row) / (0.5 * width_px.hypot(height_px)));
-        Some([0.5 * width_px + bend * column, 0.5 * height_px + bend * row])
+        let factor = self.distortion(column.hypot(row) / (0.5 * width_px.hypot(height_px)));
+        Some([0.5 * width_px + factor * column, 0.5 * height_px + factor * row])
     }
 
-    /// Factor on the distance from the centre, at that distance in half diagonals. A strong barrel
-    /// would fold the outermost points back into the image; there the factor stays as it is.
+    /// Factor `1 + k r^2` on the distance from the centre, with r in half diagonals. Beyond the radius
+    /// where strong barrel distortion would fold points back into the image it stays constant.
     fn distortion(&self, radius: f64) -> f64 {
-        let turning =
+        let max_radius =
             if self.lens_distortion < 0.0 { (-1.0 / (3.0 * self.lens_distortion)).sqrt() } else { 2.0 };
-        let inner = radius.min(turning);
+        let inner = radius.min(max_radius);
         1.0 + self.lens_distortion * inner * inner
     }
 
@@ -61,8 +61,8 @@ impl Camera {
         (f64::from(self.image_size.width_px()), f64::from(self.image_size.height_px()))
     }
 
-    /// (left, top, right, bottom) of the smallest rectangle about some points, px, uncut; `None` if
-    /// any of them lies behind the camera.
+    /// (left, top, right, bottom) of the bounding rectangle of some points, px, not truncated by the
+    /// border; `None` if any point is behind the camera.
     pub(super) fn extents(&self, body: &[Point]) -> Option<[f64; 4]> {
         let mut extents = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
         for &point in body {
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn the_axis_hits_the_middle_of_the_image_and_up_is_up() {
+    fn the_optical_axis_meets_the_centre_and_up_is_up() {
         let [column, row] = camera(0.0).project(at(10.0, 0.0, 0.0)).expect("in front");
         assert!((column - 640.0).abs() < 1e-9 && (row - 360.0).abs() < 1e-9, "{column} {row}");
         let [_, higher] = camera(0.0).project(at(10.0, 0.0, 1.0)).expect("in front");
@@ -106,10 +106,10 @@ mod tests {
     }
 
     #[test]
-    fn a_barrel_draws_points_to_the_middle() {
+    fn barrel_distortion_moves_points_towards_the_centre() {
         let point = at(10.0, -5.0, 0.0);
         let [straight, _] = camera(0.0).project(point).expect("in front");
-        let [bent, _] = camera(-0.1).project(point).expect("in front");
-        assert!(bent < straight && bent > 640.0, "{bent} {straight}");
+        let [distorted, _] = camera(-0.1).project(point).expect("in front");
+        assert!(distorted < straight && distorted > 640.0, "{distorted} {straight}");
     }
 }

@@ -1,14 +1,28 @@
-//! Synthetic cameras, targets and receivers, with the truth: worlds to prove the methods on.
+//! Synthetic cameras, targets and receivers with ground truth, for tests and evaluation.
 //!
-//! A world comes from its [`Options`] alone, bit for bit. The camera is drawn from `camera_seed`,
-//! everything that happens before it from `seed`; so two worlds may share one camera.
+//! A world is a function of its [`Options`] alone, bit for bit. The camera is drawn from
+//! `camera_seed`, everything else from `seed`, so two worlds may share one camera.
 //! What never happens here: any clock or randomness but the seeds, any knowledge of the methods.
 
 mod camera;
 mod noise;
+mod options;
 mod path;
+#[cfg(test)]
+mod positions;
+mod row;
 mod scene;
+mod target;
 mod world;
 
+pub use options::{Options, Route};
+pub use row::SimulatedRow;
 pub use scene::Scene;
-pub use world::{Options, Route, SimulatedRow, World, simulate, simulate_split};
+pub use world::{World, simulate, simulate_split};
+
+#[cfg(test)]
+pub(crate) use noise::{standard_normal, stream};
+#[cfg(test)]
+pub(crate) use positions::{
+    PositionNoise, SimulatedPositions, SiteVisits, VISIT_GNSS_SIGMA_M, VISIT_MODEL_SIGMA_M, Walk, at_s,
+};

@@ -1,27 +1,26 @@
-//! The noises of detectors and receivers, each from its own seeded stream.
+//! Noise of detectors and receivers, each kind from its own seeded stream.
 //!
-//! What never happens here: any source of randomness that was not handed in.
+//! What never happens here: any source of randomness that is not a parameter.
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::geo::EastNorth;
 
-/// One independent stream of a seed, so that switching one noise on or off leaves the others as
-/// they were.
-pub(super) fn stream(seed: u64, number: u64) -> ChaCha8Rng {
+/// An independent stream of a seed: enabling one kind of noise does not change the draws of another.
+pub(crate) fn stream(seed: u64, number: u64) -> ChaCha8Rng {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(number);
     random
 }
 
-/// A draw from the standard normal distribution (Box and Muller).
-pub(super) fn normal(random: &mut impl Rng) -> f64 {
+/// A draw from the standard normal distribution (Box and Muller 1958).
+pub(crate) fn standard_normal(random: &mut impl Rng) -> f64 {
     let radius = (-2.0 * (1.0 - random.random::<f64>()).ln()).sqrt();
     radius * (std::f64::consts::TAU * random.random::<f64>()).cos()
 }
 
-/// A stationary Gauss-Markov value of standard deviation 1, times whatever its user says.
+/// A stationary first-order Gauss-Markov process of standard deviation 1.
 #[derive(Debug, Clone)]
 pub(super) struct GaussMarkov {
     value: f64,
@@ -30,18 +29,19 @@ pub(super) struct GaussMarkov {
 
 impl GaussMarkov {
     pub(super) fn new(time_constant_s: f64, random: &mut impl Rng) -> Self {
-        Self { value: normal(random), time_constant_s }
+        Self { value: standard_normal(random), time_constant_s }
     }
 
-    /// The value after some seconds, standard deviation 1.
-    pub(super) fn after(&mut self, seconds: f64, random: &mut impl Rng) -> f64 {
-        let keep = (-seconds / self.time_constant_s).exp();
-        self.value = keep * self.value + (1.0 - keep * keep).sqrt() * normal(random);
+    /// The value that many seconds later: `x' = phi x + sqrt(1 - phi^2) n`, `phi = exp(-t / tau)`.
+    pub(super) fn advance(&mut self, seconds: f64, random: &mut impl Rng) -> f64 {
+        let decay = (-seconds / self.time_constant_s).exp();
+        self.value = decay * self.value + (1.0 - decay * decay).sqrt() * standard_normal(random);
         self.value
     }
 }
 
-/// Standard deviations per axis (m) of a receiver, and the time constant of its coloured part (s).
+/// Error of a receiver: standard deviations per axis (m) of the white part and of the Gauss-Markov
+/// part, and the time constant (s) of the latter.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ReceiverError {
     pub(super) white_m: f64,
@@ -49,56 +49,57 @@ pub(super) struct ReceiverError {
     pub(super) time_constant_s: f64,
 }
 
-/// One receiver: a white and a coloured error per axis.
+/// One receiver with independent errors on both axes.
 #[derive(Debug)]
-pub(super) struct Receiver {
+pub(super) struct SimulatedReceiver {
     error: ReceiverError,
     east: GaussMarkov,
     north: GaussMarkov,
     random: ChaCha8Rng,
 }
 
-impl Receiver {
+impl SimulatedReceiver {
     pub(super) fn new(error: ReceiverError, mut random: ChaCha8Rng) -> Self {
         let east = GaussMarkov::new(error.time_constant_s, &mut random);
         let north = GaussMarkov::new(error.time_constant_s, &mut random);
         Self { error, east, north, random }
     }
 
-    /// Where the receiver says it is, some seconds after it was asked last.
-    pub(super) fn fix(&mut self, truth: EastNorth, seconds: f64) -> EastNorth {
+    /// The measured position, that many seconds after the previous one.
+    pub(super) fn measure(&mut self, truth: EastNorth, seconds: f64) -> EastNorth {
         let ReceiverError { white_m, coloured_m, .. } = self.error;
-        let east_m = coloured_m * self.east.after(seconds, &mut self.random);
-        let north_m = coloured_m * self.north.after(seconds, &mut self.random);
+        let east_m = coloured_m * self.east.advance(seconds, &mut self.random);
+        let north_m = coloured_m * self.north.advance(seconds, &mut self.random);
         EastNorth {
-            east_m: truth.east_m + east_m + white_m * normal(&mut self.random),
-            north_m: truth.north_m + north_m + white_m * normal(&mut self.random),
+            east_m: truth.east_m + east_m + white_m * standard_normal(&mut self.random),
+            north_m: truth.north_m + north_m + white_m * standard_normal(&mut self.random),
         }
     }
 }
 
-/// Comes and goes: holds for a given share of the rows, in episodes of a mean length.
+/// A two-state Markov chain: on for a given share of the rows, in episodes of a given mean length.
 #[derive(Debug)]
 pub(super) struct Episodes {
-    begin: f64,
-    end: f64,
-    on: bool,
+    begin_probability: f64,
+    end_probability: f64,
+    is_on: bool,
     random: ChaCha8Rng,
 }
 
 impl Episodes {
-    /// A share of 0 never begins; shares are kept below 0.95.
+    /// `share` is clamped to 0..=0.95; 0 never begins an episode.
     pub(super) fn new(share: f64, mean_rows: f64, random: ChaCha8Rng) -> Self {
         let share = share.clamp(0.0, 0.95);
-        let end = 1.0 / mean_rows;
-        Self { begin: end * share / (1.0 - share), end, on: false, random }
+        let end_probability = 1.0 / mean_rows;
+        let begin_probability = end_probability * share / (1.0 - share);
+        Self { begin_probability, end_probability, is_on: false, random }
     }
 
-    /// Whether it holds in the next row, and a number in 0..1 that is the row's own.
+    /// Whether the next row is in an episode, and a uniform number in 0..1 for the use of that row.
     pub(super) fn next_row(&mut self) -> (bool, f64) {
         let draw = self.random.random::<f64>();
-        self.on = if self.on { draw >= self.end } else { draw < self.begin };
-        (self.on, self.random.random::<f64>())
+        self.is_on = if self.is_on { draw >= self.end_probability } else { draw < self.begin_probability };
+        (self.is_on, self.random.random::<f64>())
     }
 }
 
@@ -107,10 +108,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_receiver_has_the_variance_and_the_colour_it_was_given() {
+    fn a_receiver_has_its_variance_and_autocorrelation() {
         let error = ReceiverError { white_m: 0.13, coloured_m: 2.2, time_constant_s: 45.0 };
-        let mut receiver = Receiver::new(error, stream(3, 1));
-        let easts: Vec<f64> = (0..40_000).map(|_| receiver.fix(EastNorth::default(), 1.0).east_m).collect();
+        let mut receiver = SimulatedReceiver::new(error, stream(3, 1));
+        let easts: Vec<f64> =
+            (0..40_000).map(|_| receiver.measure(EastNorth::default(), 1.0).east_m).collect();
         let mean = |values: &mut dyn Iterator<Item = f64>| {
             let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
             sum / count
@@ -123,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn episodes_hold_for_their_share() {
+    fn episodes_cover_their_share() {
         let mut episodes = Episodes::new(0.2, 5.0, stream(4, 0));
         let rows = (0..20_000).filter(|_| episodes.next_row().0).count();
         assert!((3_400..4_600).contains(&rows), "{rows}");

@@ -1,44 +1,41 @@
-//! The two scenes: what stands where, what moves in them, and how large it is.
+//! The two scenes: camera, paths, bodies and motion of the targets, receivers.
 
 use std::f64::consts::TAU;
-use std::fmt;
-use std::str::FromStr;
 
 use rand::{Rng, RngExt};
+use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::camera::{Camera, Point};
 use super::noise::ReceiverError;
-use super::path::{Gait, Path, Pose};
-use crate::domain::{Error, ImageSize, Result};
+use super::path::{MotionProfile, Path, Pose};
+use crate::domain::{Error, ImageSize};
 use crate::geo::{EastNorth, Position};
 
-/// White part of a phone's error per axis, m; the rest is coloured (METHOD.md 2.5, measured).
+/// White part of a phone's error per axis, m, as measured; the rest is a Gauss-Markov bias.
 const PHONE_WHITE_M: f64 = 0.13;
 
-/// A kind of place with its targets and receiver.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// A kind of site with its targets and receivers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display, EnumString, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_scene)]
 pub enum Scene {
     /// The paper's scenario 1: an aircraft of 35 m taxiing along a straight and a curve, white
     /// GNSS noise.
     Airport,
-    /// A walker on a square, with a halt and a corner, and a phone's coloured GNSS error.
+    /// A pedestrian on a square, with a halt and a corner, and a phone's time-correlated GNSS error.
     Square,
 }
 
 impl Scene {
-    /// Both.
-    pub const ALL: [Self; 2] = [Self::Airport, Self::Square];
+    /// All scenes.
+    pub const ALL: &'static [Self] = Self::VARIANTS;
 
-    /// The one name used everywhere.
+    /// Name in commands and reports.
     #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Airport => "airport",
-            Self::Square => "square",
-        }
+    pub fn as_str(self) -> &'static str {
+        self.into()
     }
 
-    /// Class and stem of the ids of its targets.
+    /// Class of its targets, and prefix of their ids.
     pub(super) const fn class(self) -> &'static str {
         match self {
             Self::Airport => "aircraft",
@@ -46,7 +43,7 @@ impl Scene {
         }
     }
 
-    /// Where the camera's mast stands.
+    /// Position of the camera's mast: the origin of the plane.
     pub(super) fn origin(self) -> Position {
         let (longitude_deg, latitude_deg) = match self {
             Self::Airport => (11.786_1, 48.353_8),
@@ -55,8 +52,8 @@ impl Scene {
         Position::new(longitude_deg, latitude_deg).expect("constants within range")
     }
 
-    /// The camera of that draw. A longer lens lets the border cut boxes on the square; at the
-    /// airport the aircraft enters and leaves by the border anyway.
+    /// Draws a camera. On the square a longer focal length makes the border truncate boxes; at the
+    /// airport the aircraft enters and leaves across the border in any case.
     pub(super) fn camera(self, border_cuts: bool, lens_distortion: f64, random: &mut impl Rng) -> Camera {
         let (size, height_m, focal_px, tilt_deg) = match self {
             Self::Airport => ((1920, 1080), 30.0, 1660.0, 4.0),
@@ -72,9 +69,9 @@ impl Scene {
         }
     }
 
-    /// The lines that targets follow in turn, about the camera's axis.
+    /// The lines that targets follow in turn, about the camera's optical axis.
     pub(super) fn paths(self, pan_deg: f64) -> Vec<Path> {
-        let at = |right_m: f64, ahead_m: f64| turned(right_m, ahead_m, pan_deg);
+        let at = |right_m: f64, ahead_m: f64| rotated(right_m, ahead_m, pan_deg);
         match self {
             Self::Airport => {
                 let (from, to) = (at(-250.0, 260.0), at(250.0, 330.0));
@@ -85,26 +82,34 @@ impl Scene {
         }
     }
 
-    /// How far aside the line lies that no training pass has followed, m.
-    pub(super) const fn new_line_aside_m(self) -> f64 {
+    /// Offset of [`super::Route::NewLine`] from the training lines, m.
+    pub(super) const fn new_line_offset_m(self) -> f64 {
         match self {
             Self::Airport => 20.0,
             Self::Square => 2.0,
         }
     }
 
-    pub(super) const fn gait(self) -> Gait {
+    pub(super) const fn motion(self) -> MotionProfile {
         match self {
-            Self::Airport => {
-                Gait { speed_mps: 9.0, speed_spread_mps: 1.5, wander_m: 1.0, halt_s: 0.0, both_ways: false }
-            }
-            Self::Square => {
-                Gait { speed_mps: 1.25, speed_spread_mps: 0.12, wander_m: 0.3, halt_s: 40.0, both_ways: true }
-            }
+            Self::Airport => MotionProfile {
+                speed_m_s: 9.0,
+                speed_sigma_m_s: 1.5,
+                lateral_deviation_m: 1.0,
+                halt_s: 0.0,
+                both_ways: false,
+            },
+            Self::Square => MotionProfile {
+                speed_m_s: 1.25,
+                speed_sigma_m_s: 0.12,
+                lateral_deviation_m: 0.3,
+                halt_s: 40.0,
+                both_ways: true,
+            },
         }
     }
 
-    /// Seconds between two passes of a target.
+    /// Pause between two traverses of a target, s.
     pub(super) fn pause_s(self, random: &mut impl Rng) -> i64 {
         match self {
             Self::Airport => random.random_range(60..180),
@@ -112,7 +117,7 @@ impl Scene {
         }
     }
 
-    /// A receiver of that standard deviation per axis.
+    /// The error model of a receiver with that standard deviation per axis.
     pub(super) fn receiver_error(self, sigma_m: f64, random: &mut impl Rng) -> ReceiverError {
         match self {
             Self::Airport => ReceiverError { white_m: sigma_m, coloured_m: 0.0, time_constant_s: 1.0 },
@@ -127,24 +132,24 @@ impl Scene {
         }
     }
 
-    /// The corners of a target's body; `scale` 1 is the scene's usual size.
+    /// Points of a target's outline; `scale` 1 is the nominal size.
     pub(super) fn body(self, pose: Pose, scale: f64, random: &mut impl Rng) -> Vec<Point> {
         let [east, north] = pose.heading;
         let corner = |ahead_m: f64, left_m: f64, up_m: f64| Point {
             ground: EastNorth {
-                east_m: pose.place.east_m + scale * (ahead_m * east - left_m * north),
-                north_m: pose.place.north_m + scale * (ahead_m * north + left_m * east),
+                east_m: pose.position.east_m + scale * (ahead_m * east - left_m * north),
+                north_m: pose.position.north_m + scale * (ahead_m * north + left_m * east),
             },
             up_m: scale * up_m,
         };
         match self {
             Self::Airport => aircraft(&corner),
-            Self::Square => walker(&corner, random),
+            Self::Square => pedestrian(&corner, random),
         }
     }
 }
 
-/// An airliner of 35 m; its antenna is on the roof, 3 m ahead of the middle.
+/// An airliner of 35 m; its antenna is on the roof, 3 m ahead of the centre.
 fn aircraft(corner: &dyn Fn(f64, f64, f64) -> Point) -> Vec<Point> {
     let mut body = vec![
         corner(14.5, 0.0, 3.0),
@@ -166,8 +171,8 @@ fn aircraft(corner: &dyn Fn(f64, f64, f64) -> Point) -> Vec<Point> {
     body
 }
 
-/// A person of 1.72 m; arms and legs change the box's width with every step.
-fn walker(corner: &dyn Fn(f64, f64, f64) -> Point, random: &mut impl Rng) -> Vec<Point> {
+/// A person of 1.72 m; arms and legs vary the box's width with every step.
+fn pedestrian(corner: &dyn Fn(f64, f64, f64) -> Point, random: &mut impl Rng) -> Vec<Point> {
     let stride_m = 0.28 * (TAU * random.random::<f64>()).sin().abs();
     let mut body = vec![corner(0.0, 0.0, 1.72)];
     for side in [-1.0, 1.0] {
@@ -181,8 +186,9 @@ fn walker(corner: &dyn Fn(f64, f64, f64) -> Point, random: &mut impl Rng) -> Vec
     body
 }
 
-/// A place given from the camera's foot to the right of and along its axis.
-fn turned(right_m: f64, ahead_m: f64, pan_deg: f64) -> EastNorth {
+/// A point given relative to the camera's foot, to the right of and along its optical axis, in the
+/// east-north plane.
+fn rotated(right_m: f64, ahead_m: f64, pan_deg: f64) -> EastNorth {
     let (sin_pan, cos_pan) = pan_deg.to_radians().sin_cos();
     EastNorth {
         east_m: cos_pan * right_m + sin_pan * ahead_m,
@@ -190,19 +196,6 @@ fn turned(right_m: f64, ahead_m: f64, pan_deg: f64) -> EastNorth {
     }
 }
 
-impl fmt::Display for Scene {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(self.as_str())
-    }
-}
-
-impl FromStr for Scene {
-    type Err = Error;
-
-    fn from_str(name: &str) -> Result<Self> {
-        Self::ALL
-            .into_iter()
-            .find(|scene| scene.as_str() == name)
-            .ok_or_else(|| Error::invalid("scene", "must be one of airport, square"))
-    }
+fn unknown_scene(_: &str) -> Error {
+    Error::invalid("scene", "must be one of airport, square")
 }

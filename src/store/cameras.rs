@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
-use sqlx::{Sqlite, SqliteExecutor};
+use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 
 use super::Store;
 use super::faults::{failed, no_camera};
@@ -28,10 +28,10 @@ impl Store {
     /// Stores a new camera with revision 1.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraExists`].
+    /// [`ErrorKind::CameraExists`]; [`ErrorKind::InsufficientStorage`] beyond the limit of cameras.
     pub async fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let insert = sqlx::query(concat!(
             "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, \
              target_classes, labels, receivers, retrain_when_moved, updated_at_us, id, created_at_us, revision) \
@@ -49,6 +49,7 @@ impl Store {
             return Err(Error::field(ErrorKind::CameraExists, "id", taken));
         };
         let camera = read_camera(&row)?;
+        check_limit(&mut transaction, self.limits().cameras).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
     }
@@ -131,8 +132,8 @@ impl Store {
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::RunLive`] while a
     /// training run has not ended.
     pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut deletion = self.deletion().await?;
+        let mut transaction = deletion.begin().await?;
         check_revision(&find_camera(&mut *transaction, id).await?, expected)?;
         let live: i64 = sqlx::query_scalar(
             "SELECT count(*) FROM training_runs JOIN cameras ON cameras.key = camera_key \
@@ -153,8 +154,25 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
-        transaction.commit().await.map_err(failed)
+        transaction.commit().await.map_err(failed)?;
+        deletion.reclaim().await;
+        Ok(())
     }
+}
+
+/// Refuses the camera that was just inserted if it is one too many.
+async fn check_limit(connection: &mut SqliteConnection, limit: u32) -> Result<()> {
+    let cameras: i64 =
+        sqlx::query_scalar("SELECT count(*) FROM cameras").fetch_one(connection).await.map_err(failed)?;
+    if cameras > i64::from(limit) {
+        return Err(Error::refused(
+            ErrorKind::InsufficientStorage,
+            format!(
+                "limits.cameras is {limit}; delete a camera that is no longer needed, or raise the limit"
+            ),
+        ));
+    }
+    Ok(())
 }
 
 /// One camera, inside or outside of a transaction.

@@ -1,22 +1,23 @@
-//! The file: opening it, its schema, its one writer and its readers.
+//! Opening the database: its settings, its schema, its writer and its readers.
 
 use std::path::Path;
 use std::time::Duration;
 
 use sqlx::migrate::{MigrateError, Migrator};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{ConnectOptions, Connection, Sqlite, SqliteConnection, SqlitePool, Transaction};
-use tokio::sync::{Mutex, MutexGuard};
+use sqlx::sqlite::{
+    SqliteAutoVacuum, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
+};
+use sqlx::{ConnectOptions, Connection, SqliteConnection, SqlitePool};
 
-use super::faults::{closed, failed, is_busy, primary_code};
+use super::faults::{is_busy, primary_code};
+use super::folder;
+use super::writer::Writer;
 use crate::domain::{Error, Result};
-
-const FILE_NAME: &str = "sightfix.db";
 
 /// How long to wait for another process that writes.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Turning on the write-ahead log does not wait for others by itself, so opening is tried again.
+/// Turning on the write-ahead log does not wait for other processes by itself, so it is tried again.
 const OPEN_ATTEMPTS: u32 = 20;
 const OPEN_PAUSE: Duration = Duration::from_millis(50);
 
@@ -26,118 +27,9 @@ const READER_WAIT: Duration = Duration::from_secs(10);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
 
-/// What has happened when a change is acknowledged.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Durability {
-    /// It survives a crash of the process; a power cut may undo the latest.
-    Relaxed,
-    /// It is on the disk.
-    Synced,
-}
-
-/// The one connection that writes. Whoever writes takes a turn.
-pub(super) struct Writer {
-    options: SqliteConnectOptions,
-    open: Mutex<Option<Open>>,
-}
-
-struct Open {
-    connection: SqliteConnection,
-    /// `None` while a change of it is under way, so that a caller who goes away leaves no wrong belief.
-    durability: Option<Durability>,
-    /// A transaction could not begin, and nobody else held the file.
-    broken: bool,
-}
-
-impl Open {
-    const fn new(connection: SqliteConnection) -> Self {
-        Self { connection, durability: None, broken: false }
-    }
-
-    /// Whether the library believes in a transaction that is not there. That happens when the database
-    /// ends one by itself (a full disk, an I/O error): the library's own end of it then fails.
-    async fn is_stuck(&mut self) -> Result<bool, sqlx::Error> {
-        if self.connection.is_in_transaction() {
-            // Commands are worked off in order, so this waits for a roll back that is under way.
-            self.connection.ping().await?;
-        }
-        Ok(self.connection.is_in_transaction())
-    }
-
-    async fn set(&mut self, durability: Durability) -> Result<(), sqlx::Error> {
-        if self.durability == Some(durability) {
-            return Ok(());
-        }
-        self.durability = None;
-        let pragma = match durability {
-            Durability::Relaxed => "PRAGMA synchronous = NORMAL",
-            Durability::Synced => "PRAGMA synchronous = FULL",
-        };
-        sqlx::query(pragma).execute(&mut self.connection).await?;
-        self.durability = Some(durability);
-        Ok(())
-    }
-}
-
-/// The writer, held.
-pub(super) struct Turn<'w> {
-    options: &'w SqliteConnectOptions,
-    open: MutexGuard<'w, Option<Open>>,
-    durability: Durability,
-}
-
-impl Writer {
-    /// Waits for the writer; `durability` is that of the transactions of this turn.
-    pub(super) async fn turn(&self, durability: Durability) -> Result<Turn<'_>> {
-        let open = self.open.lock().await;
-        if open.is_none() {
-            return Err(closed());
-        }
-        Ok(Turn { options: &self.options, open, durability })
-    }
-
-    /// Writes the log back into the file and closes it.
-    pub(super) async fn close(&self) {
-        let Some(mut open) = self.open.lock().await.take() else { return };
-        // Another process may be reading; then the log stays, which loses nothing.
-        if let Err(error) = sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(&mut open.connection).await
-        {
-            tracing::debug!(%error, "the write-ahead log stays");
-        }
-        if let Err(error) = open.connection.close().await {
-            tracing::warn!(%error, "closing the store");
-        }
-    }
-}
-
-impl Turn<'_> {
-    /// A transaction that holds the file's write lock from its first moment; rolled back if dropped.
-    pub(super) async fn begin(&mut self) -> Result<Transaction<'_, Sqlite>> {
-        let open = self.open.as_mut().ok_or_else(closed)?;
-        // An error here means a connection that is of no more use.
-        if open.broken || open.is_stuck().await.unwrap_or(true) {
-            *open = Open::new(self.options.connect().await.map_err(failed)?);
-        }
-        if let Err(error) = open.set(self.durability).await {
-            open.broken = true;
-            return Err(failed(error));
-        }
-        match open.connection.begin_with("BEGIN IMMEDIATE").await {
-            Ok(transaction) => Ok(transaction),
-            Err(error) => {
-                open.broken = !is_busy(&error);
-                Err(failed(error))
-            }
-        }
-    }
-}
-
-/// Opens the file of a folder with its schema brought up to date.
-pub(super) async fn open(folder: &Path) -> Result<(Writer, SqlitePool)> {
-    tokio::fs::create_dir_all(folder)
-        .await
-        .map_err(|error| Error::fault(format!("cannot make the folder {}: {error}", folder.display())))?;
-    let path = folder.join(FILE_NAME);
+/// Opens the database of a folder with its schema brought up to date. `max_pages` limits its size.
+pub(super) async fn open(folder: &Path, max_pages: Option<u32>) -> Result<(Writer, SqlitePool)> {
+    let path = folder::prepare(folder).await?;
     let options = options(&path);
     let writer = writer_options(options.clone());
     let connection = open_writer(&writer).await.map_err(|cause| unusable(&path, &cause))?;
@@ -148,7 +40,7 @@ pub(super) async fn open(folder: &Path) -> Result<(Writer, SqlitePool)> {
         .idle_timeout(None)
         .max_lifetime(None)
         .connect_lazy_with(options.create_if_missing(false).pragma("query_only", "ON").row_buffer_size(512));
-    Ok((Writer { options: writer, open: Mutex::new(Some(Open::new(connection))) }, readers))
+    Ok((Writer::new(writer, max_pages, connection), readers))
 }
 
 fn options(path: &Path) -> SqliteConnectOptions {
@@ -157,14 +49,16 @@ fn options(path: &Path) -> SqliteConnectOptions {
         .create_if_missing(true)
         .foreign_keys(true)
         .busy_timeout(BUSY_TIMEOUT)
-        .synchronous(SqliteSynchronous::Normal)
+        .synchronous(SqliteSynchronous::Full)
         .pragma("temp_store", "MEMORY")
         .disable_statement_logging()
 }
 
-/// The log is written back every 16 MB, and is cut to that size after a large change.
+/// The log is copied back every 16 MB, and is cut to that size after a large change. Free pages can
+/// be given back to the disk in new files only: the setting is part of the file's format.
 fn writer_options(options: SqliteConnectOptions) -> SqliteConnectOptions {
     options
+        .auto_vacuum(SqliteAutoVacuum::Incremental)
         .journal_mode(SqliteJournalMode::Wal)
         .pragma("cache_size", "-16000")
         .pragma("wal_autocheckpoint", "4000")
@@ -185,8 +79,8 @@ async fn open_writer(options: &SqliteConnectOptions) -> Result<SqliteConnection,
     }
 }
 
-/// All missing steps in one transaction: two processes that start at once do not meet, and a step that
-/// fails leaves the file as it was.
+/// All missing steps in one transaction: two processes that start at once do not interfere, and a step
+/// that fails leaves the file as it was.
 async fn connect_and_migrate(options: &SqliteConnectOptions) -> Result<SqliteConnection, MigrateError> {
     let mut connection = options.connect().await?;
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
@@ -195,7 +89,7 @@ async fn connect_and_migrate(options: &SqliteConnectOptions) -> Result<SqliteCon
     Ok(connection)
 }
 
-/// Why the file cannot be used, for whoever started the program.
+/// Why the file cannot be used, for the person who started the program.
 fn unusable(path: &Path, cause: &MigrateError) -> Error {
     let path = path.display();
     let code = match cause {

@@ -1,4 +1,4 @@
-//! Evaluations: jobs that yield a report, a document that the store does not read.
+//! Evaluations: jobs whose output is a report, a document that the store does not read.
 
 use std::time::Duration;
 
@@ -12,6 +12,7 @@ use super::cameras::camera_key;
 use super::faults::{failed, no_evaluation};
 use super::fields::Fields;
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
+use super::retention::prune_evaluations;
 use crate::domain::{
     CameraId, Error, ErrorKind, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, Method,
     Result, SigmaM, TimeRange, Truth,
@@ -19,7 +20,7 @@ use crate::domain::{
 use crate::geo::Position;
 
 const EVALUATIONS: Jobs =
-    Jobs { table: "evaluations", plural: "evaluations", fresh: "steps_done = 0, steps_planned = 0" };
+    Jobs { table: "evaluations", plural: "evaluations", reset_progress: "steps_done = 0, steps_planned = 0" };
 
 macro_rules! select {
     ($rest:literal) => {
@@ -49,10 +50,11 @@ impl Store {
         max_live: u32,
         now: Timestamp,
     ) -> Result<EvaluationJob> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
-        EVALUATIONS.check_room(&mut transaction, max_live).await?;
+        prune_evaluations(&mut transaction, self.limits().ended_evaluations).await?;
+        EVALUATIONS.check_capacity(&mut transaction, max_live).await?;
         let (point, lines) = written_truth(&plan.truth)?;
         let methods: Vec<String> = plan.methods.iter().map(Method::to_string).collect();
         sqlx::query(
@@ -132,8 +134,8 @@ impl Store {
         rows.iter().map(read_evaluation).collect()
     }
 
-    /// Takes up the oldest evaluation that is queued or whose worker has stopped beating. Its attempt
-    /// and fence go up by one; its progress begins anew.
+    /// Claims the oldest evaluation that is queued or whose lease has expired. Its attempt and fence go
+    /// up by one; its progress is reset.
     ///
     /// # Errors
     /// Faults only.
@@ -150,11 +152,11 @@ impl Store {
         Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
     }
 
-    /// Prolongs the lease and shows how far the evaluation has come.
+    /// Renews the lease and stores the evaluation's progress.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn beat_evaluation(
+    pub async fn heartbeat_evaluation(
         &self,
         id: EvaluationId,
         fence: i64,
@@ -164,7 +166,7 @@ impl Store {
     ) -> Result<Heartbeat> {
         let mut turn = self.relaxed().await?;
         let mut transaction = turn.begin().await?;
-        let heartbeat = EVALUATIONS.beat(&mut transaction, (id.0, fence), lease, now).await?;
+        let heartbeat = EVALUATIONS.heartbeat(&mut transaction, (id.0, fence), lease, now).await?;
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }
@@ -183,8 +185,8 @@ impl Store {
         Ok(heartbeat)
     }
 
-    /// Asks for the end of an evaluation: a queued one ends at once, a running one at its worker's next
-    /// heartbeat. Once this has returned, it yields no report any more.
+    /// Cancels an evaluation: at once where no worker holds a live lease on it, otherwise at its worker's
+    /// next heartbeat. Once this has returned, it produces no report any more.
     ///
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`], [`ErrorKind::EvaluationEnded`].
@@ -196,15 +198,15 @@ impl Store {
             let ended = format!("the evaluation has ended already: {}", stored.state.as_str());
             return Err(Error::refused(ErrorKind::EvaluationEnded, ended));
         }
-        EVALUATIONS.cancel(&mut transaction, id.0, stored.state, now).await?;
+        EVALUATIONS.cancel(&mut transaction, id.0, now).await?;
         let stored = find_evaluation(&mut *transaction, id).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(stored)
     }
 
-    /// Ends an evaluation with its report, or otherwise, if the worker still holds it; `None` if it
-    /// lost it, and then nothing was changed. One whose end the operator has asked for is cancelled
-    /// even if it succeeded or was given back.
+    /// Ends an evaluation, or returns it to the queue, if the worker still owns its lease; `None` if it
+    /// lost it, and then nothing was changed. One whose cancellation was requested is cancelled even if it
+    /// succeeded or was returned.
     ///
     /// # Errors
     /// Faults only.
@@ -217,10 +219,10 @@ impl Store {
     ) -> Result<Option<EvaluationJob>> {
         let mut turn = self.synced().await?;
         let mut transaction = turn.begin().await?;
-        let Some(left) = EVALUATIONS.leave(&mut transaction, (id.0, fence), end, now).await? else {
+        let Some(finished) = EVALUATIONS.finish(&mut transaction, (id.0, fence), end, now).await? else {
             return Ok(None);
         };
-        if let Some(report) = left.yielded {
+        if let Some(report) = finished.output {
             sqlx::query("UPDATE evaluations SET report = ? WHERE id = ?")
                 .bind(report)
                 .bind(id.to_string())
@@ -238,14 +240,15 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`].
     pub async fn delete_evaluation(&self, id: EvaluationId) -> Result<()> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut deletion = self.deletion().await?;
+        let mut transaction = deletion.begin().await?;
         let done = sqlx::query("DELETE FROM evaluations WHERE id = ?")
             .bind(id.to_string())
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
         transaction.commit().await.map_err(failed)?;
+        deletion.reclaim().await;
         if done.rows_affected() == 0 { Err(no_evaluation(id)) } else { Ok(()) }
     }
 }

@@ -1,5 +1,7 @@
 //! Errors of the database as errors of the domain: the one place where they meet.
 
+use sqlx::error::DatabaseError;
+
 use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, RunId};
 
 /// A row that does not hold what was written: another program changed it, or the disk did.
@@ -23,7 +25,14 @@ pub(super) fn is_busy(error: &sqlx::Error) -> bool {
     matches!(primary_code(error), Some(5 | 6))
 }
 
-/// A failed statement: refused where the caller can try again, else a fault.
+/// SQLITE_FULL, and SQLITE_IOERR_SHMSIZE: the index of the log cannot grow.
+fn is_full(error: &sqlx::Error) -> bool {
+    const IOERR_SHMSIZE: &str = "4874";
+    let is_shm = |error: &dyn DatabaseError| error.code().is_some_and(|code| code == IOERR_SHMSIZE);
+    primary_code(error) == Some(13) || error.as_database_error().is_some_and(is_shm)
+}
+
+/// A failed statement: refused where the caller can do something about it, else a fault.
 pub(super) fn failed(error: sqlx::Error) -> Error {
     match error {
         sqlx::Error::PoolClosed => closed(),
@@ -33,6 +42,11 @@ pub(super) fn failed(error: sqlx::Error) -> Error {
         busy if is_busy(&busy) => {
             Error::refused(ErrorKind::Overloaded, "another process holds the store; try again")
         }
+        full if is_full(&full) => Error::refused(
+            ErrorKind::InsufficientStorage,
+            "the disk is full, or the database has reached limits.database_bytes; delete samples, models or \
+             training runs, or give it more space",
+        ),
         other => Error::fault(other),
     }
 }

@@ -13,9 +13,10 @@ use sqlx::sqlite::SqliteArguments;
 use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
-use super::connection::{Durability, Turn, Writer};
 use super::faults::{closed, failed, no_camera, same};
-use crate::domain::{CameraId, Error, Result, Sample};
+use super::space::Space;
+use super::writer::{Growth, Writer, WriterGuard};
+use crate::domain::{CameraId, Durability, Error, Result, Sample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -50,23 +51,29 @@ enum Request {
 struct Batch {
     camera: CameraId,
     samples: Vec<Sample>,
+    durability: Durability,
     reply: oneshot::Sender<Result<Inserted>>,
     /// Makes room for other rows when the batch is done.
     _room: OwnedSemaphorePermit,
 }
 
 impl GroupCommit {
-    pub(super) fn start(writer: Arc<Writer>) -> Self {
+    pub(super) fn start(writer: Arc<Writer>, space: Arc<Space>) -> Self {
         let (queue, requests) = mpsc::channel(QUEUE);
-        tokio::spawn(run(writer, requests));
+        tokio::spawn(run(writer, space, requests));
         Self { queue, rows: Arc::new(Semaphore::new(ROWS_IN_FLIGHT as usize)) }
     }
 
-    pub(super) async fn insert(&self, camera: CameraId, samples: Vec<Sample>) -> Result<Inserted> {
+    pub(super) async fn insert(
+        &self,
+        camera: CameraId,
+        samples: Vec<Sample>,
+        durability: Durability,
+    ) -> Result<Inserted> {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
         let room = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = Batch { camera, samples, reply, _room: room };
+        let batch = Batch { camera, samples, durability, reply, _room: room };
         self.queue.send(Request::Insert(batch)).await.map_err(|_| self.gone())?;
         answer.await.map_err(|_| self.gone())?
     }
@@ -96,13 +103,16 @@ impl GroupCommit {
     }
 }
 
-async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
+async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<Request>) {
     while let Some(first) = requests.recv().await {
-        // The turn first: whoever hands in samples while another change is written is taken along.
-        let turn = writer.turn(Durability::Relaxed).await;
+        // The writer first: samples that are handed in while another change is written join the group.
+        let guard = writer.lock(Durability::default(), Growth::Limited).await;
         let (group, end) = gather(first, &mut requests);
-        match turn {
-            Ok(mut turn) => answer_all(&mut turn, group).await,
+        match guard {
+            Ok(mut guard) => {
+                guard.set_durability(durability_of(&group));
+                answer_all(&mut guard, &space, group).await;
+            }
             Err(error) => refuse_all(group, &error),
         }
         if let Some(ended) = end {
@@ -111,6 +121,11 @@ async fn run(writer: Arc<Writer>, mut requests: mpsc::Receiver<Request>) {
             return;
         }
     }
+}
+
+/// The strongest that a caller of the group asks for: one flush is enough for all of them.
+fn durability_of(group: &[Batch]) -> Durability {
+    group.iter().map(|batch| batch.durability).max().unwrap_or_default()
 }
 
 /// What is in the queue now, up to the rows of one transaction.
@@ -136,8 +151,8 @@ fn gather(
 
 /// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
 /// alone, so that one bad row fails nobody but its caller.
-async fn answer_all(turn: &mut Turn<'_>, group: Vec<Batch>) {
-    match commit(turn, &group).await {
+async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch>) {
+    match commit(guard, space, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
                 // A caller who went away needs no answer.
@@ -146,7 +161,7 @@ async fn answer_all(turn: &mut Turn<'_>, group: Vec<Batch>) {
         }
         Err(Failure::Statement(_)) if group.len() > 1 => {
             for batch in group {
-                let alone = commit(turn, std::slice::from_ref(&batch)).await;
+                let alone = commit(guard, space, std::slice::from_ref(&batch)).await;
                 let outcome = match alone {
                     Ok(mut outcomes) => outcomes.swap_remove(0),
                     Err(Failure::Statement(error) | Failure::Transaction(error)) => Err(error),
@@ -172,10 +187,27 @@ enum Failure {
 }
 
 /// One transaction for all batches, with an outcome for each, in their order.
-async fn commit(turn: &mut Turn<'_>, group: &[Batch]) -> Result<Vec<Result<Inserted>>, Failure> {
+async fn commit(
+    guard: &mut WriterGuard<'_>,
+    space: &Space,
+    group: &[Batch],
+) -> Result<Vec<Result<Inserted>>, Failure> {
+    let committed = try_commit(guard, space, group).await;
+    match &committed {
+        Ok(outcomes) => space.stored(outcomes.iter().flatten().map(|inserted| inserted.accepted).sum()),
+        Err(Failure::Statement(error) | Failure::Transaction(error)) => space.failed(error),
+    }
+    committed
+}
+
+async fn try_commit(
+    guard: &mut WriterGuard<'_>,
+    space: &Space,
+    group: &[Batch],
+) -> Result<Vec<Result<Inserted>>, Failure> {
     for counting in [Counting::Together, Counting::Apart] {
-        let mut transaction = turn.begin().await.map_err(Failure::Transaction)?;
-        let outcomes = store(&mut transaction, group, counting).await.map_err(Failure::Statement)?;
+        let mut transaction = guard.begin().await.map_err(Failure::Transaction)?;
+        let outcomes = store(&mut transaction, space, group, counting).await.map_err(Failure::Statement)?;
         if let Some(outcomes) = outcomes {
             transaction.commit().await.map_err(|error| Failure::Transaction(failed(error)))?;
             return Ok(outcomes);
@@ -204,19 +236,26 @@ struct Row<'a> {
 /// `None` if a statement over several batches met duplicates, so that nobody can tell whose.
 async fn store(
     connection: &mut SqliteConnection,
+    space: &Space,
     group: &[Batch],
     counting: Counting,
 ) -> Result<Option<Vec<Result<Inserted>>>> {
-    let keys = camera_keys(connection, group).await?;
+    let mut cameras = cameras_of(connection, group).await?;
+    let mut quota = space.quota();
     let mut outcomes: Vec<Result<Inserted>> = Vec::with_capacity(group.len());
     let mut rows = Vec::with_capacity(group.iter().map(|batch| batch.samples.len()).sum());
     let mut borders = Vec::new();
     for (index, batch) in group.iter().enumerate() {
-        let key = keys.get(batch.camera.as_str());
-        outcomes.push(key.map_or_else(|| Err(no_camera(&batch.camera)), |_| Ok(Inserted::default())));
-        if let Some(&camera_key) = key {
+        let admitted = match cameras.get_mut(batch.camera.as_str()) {
+            Some(camera) => quota.admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64),
+            None => Err(no_camera(&batch.camera)),
+        };
+        if let (Ok(()), Some(&Known { key: camera_key, .. })) =
+            (&admitted, cameras.get(batch.camera.as_str()))
+        {
             rows.extend(batch.samples.iter().map(|sample| Row { batch: index, camera_key, sample }));
         }
+        outcomes.push(admitted.map(|()| Inserted::default()));
         if counting == Counting::Apart {
             borders.push(rows.len());
         }
@@ -234,6 +273,7 @@ async fn store(
         }
         next = following.transpose()?;
     }
+    count_stored(connection, &cameras, group, &outcomes).await?;
     Ok(Some(outcomes))
 }
 
@@ -262,20 +302,60 @@ fn add(outcomes: &mut [Result<Inserted>], row: &Row<'_>, accepted: u64, duplicat
     }
 }
 
-/// The keys of the cameras of a group, read in its own transaction, so that none can vanish before
+/// A camera of a group.
+struct Known {
+    key: i64,
+    /// Samples stored, and those of the group that are admitted.
+    samples: u64,
+}
+
+/// The cameras of a group by their ids, read in its own transaction, so that none can vanish before
 /// the commit. One statement for all, since a round trip costs as much as several rows.
-async fn camera_keys(connection: &mut SqliteConnection, group: &[Batch]) -> Result<HashMap<String, i64>> {
+async fn cameras_of(connection: &mut SqliteConnection, group: &[Batch]) -> Result<HashMap<String, Known>> {
     let mut ids: Vec<&str> = group.iter().map(|batch| batch.camera.as_str()).collect();
     ids.sort_unstable();
     ids.dedup();
     let ids = serde_json::to_string(&ids).map_err(Error::fault)?;
-    let keys: Vec<(String, i64)> =
-        sqlx::query_as("SELECT id, key FROM cameras WHERE id IN (SELECT value FROM json_each(?))")
-            .bind(ids)
-            .fetch_all(connection)
-            .await
-            .map_err(failed)?;
-    Ok(keys.into_iter().collect())
+    let cameras: Vec<(String, i64, i64)> = sqlx::query_as(
+        "SELECT id, key, coalesce(samples, 0) FROM cameras LEFT JOIN sample_counts ON camera_key = key \
+         WHERE id IN (SELECT value FROM json_each(?))",
+    )
+    .bind(ids)
+    .fetch_all(connection)
+    .await
+    .map_err(failed)?;
+    let known = |(id, key, samples)| (id, Known { key, samples: u64::try_from(samples).unwrap_or_default() });
+    Ok(cameras.into_iter().map(known).collect())
+}
+
+/// Adds what a group has stored to the counts of its cameras, in one statement.
+async fn count_stored(
+    connection: &mut SqliteConnection,
+    cameras: &HashMap<String, Known>,
+    group: &[Batch],
+    outcomes: &[Result<Inserted>],
+) -> Result<()> {
+    let mut accepted: HashMap<i64, u64> = HashMap::new();
+    for (batch, outcome) in group.iter().zip(outcomes) {
+        if let (Ok(inserted), Some(camera)) = (outcome, cameras.get(batch.camera.as_str()))
+            && inserted.accepted > 0
+        {
+            *accepted.entry(camera.key).or_default() += inserted.accepted;
+        }
+    }
+    if accepted.is_empty() {
+        return Ok(());
+    }
+    // WHERE true: without it the grammar takes ON CONFLICT for the condition of a join.
+    sqlx::query(
+        "INSERT INTO sample_counts (camera_key, samples) SELECT CAST(key AS INTEGER), value FROM json_each(?) \
+         WHERE true ON CONFLICT (camera_key) DO UPDATE SET samples = samples + excluded.samples",
+    )
+    .bind(serde_json::to_string(&accepted).map_err(Error::fault)?)
+    .execute(connection)
+    .await
+    .map_err(failed)?;
+    Ok(())
 }
 
 /// Columns bound per row.

@@ -1,112 +1,125 @@
-//! What the tables of background jobs have in common: whoever claims a job holds a lease and a fence.
+//! What the tables of background jobs have in common: claim, lease, heartbeat, fence.
 //!
-//! A worker that stops beating loses its lease; the next claim raises the fence, and whatever the old
-//! worker still writes is left out. So a job ends exactly once, whatever crashes.
+//! A worker that claims a job gets a lease, which it renews by heartbeats, and a fencing token, which goes
+//! up by one with every claim. A worker that stops sending heartbeats loses its lease; the next claim raises
+//! the fence, and whatever the earlier worker still writes is ignored. So a job ends exactly once, whatever
+//! crashes.
+//!
+//! Leases are instants of the wall clock, which may step. A lease that ends further ahead than its own
+//! length was taken under a clock that has been set back since; it counts as expired. A worker that is
+//! alive writes a sound lease again with its next heartbeat.
 
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use sqlx::{AssertSqlSafe, SqliteConnection};
 use uuid::Uuid;
 
 use super::faults::failed;
 use crate::domain::{Error, ErrorKind, JobState, Result};
 
-/// A job that was taken up.
+/// Condition under which no worker holds a live lease on a job; `?1` is the time now in microseconds.
+/// Rows of earlier releases do not have the length of their lease; an hour is longer than any was.
+const LEASE_EXPIRED: &str = "(lease_until_us IS NULL OR lease_until_us <= ?1 \
+                             OR lease_until_us > ?1 + coalesce(lease_us, 3600000000))";
+
+/// A claimed job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Claim<J> {
     /// The job, now running.
     pub job: J,
-    /// What the worker must show to write anything about it.
+    /// Fencing token: every write of the worker must show it.
     pub fence: i64,
-    /// The operator has asked for its end already, while an earlier worker held it.
+    /// The operator asked for its cancellation while an earlier worker held it.
     pub cancel_requested: bool,
 }
 
 /// What a worker learns from its heartbeat.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Heartbeat {
-    /// The lease is prolonged.
+    /// The lease is renewed.
     Continue,
-    /// The lease is prolonged, and the operator wants the job to end.
+    /// The lease is renewed, and the operator wants the job to be cancelled.
     CancelRequested,
-    /// The job belongs to another worker now, has ended, or is gone: stop.
+    /// The lease is lost: another worker has the job, or it has ended or was deleted. Stop.
     Lost,
 }
 
-/// How a worker leaves a job.
+/// How a worker finishes a job.
 #[derive(Debug, Clone, PartialEq)]
-pub enum JobEnd<Y> {
-    /// With what it was asked for.
+pub enum JobEnd<O> {
+    /// It produced its output.
     Succeeded {
-        /// What is kept of it.
-        yielded: Y,
-        /// A sentence for the operator, if there is something to say.
+        /// What is stored with it.
+        output: O,
+        /// A sentence for the operator.
         outcome: Option<String>,
     },
-    /// By an error.
+    /// An error ended it.
     Failed {
-        /// Which.
+        /// The error.
         outcome: String,
     },
-    /// By the operator.
+    /// The operator cancelled it.
     Cancelled,
-    /// Unfinished, because the server ends: the next worker takes it up at once.
+    /// The server shuts down: the job returns to the queue, and this attempt does not count.
     Requeue,
 }
 
-/// A job that its holder has left: whose it is, and what is to be kept of it in the same transaction.
-pub(super) struct Left<Y> {
+/// A finished job: its camera, and the output to be stored in the same transaction.
+pub(super) struct Finished<O> {
     pub(super) camera_key: i64,
-    pub(super) yielded: Option<Y>,
+    pub(super) output: Option<O>,
 }
 
 /// A table of jobs. Only its fixed text goes into statements; values are bound.
 pub(super) struct Jobs {
     pub(super) table: &'static str,
-    /// What the table's jobs are called in a message.
+    /// What messages call the table's jobs.
     pub(super) plural: &'static str,
-    /// Assignments that begin the table's own columns of progress anew.
-    pub(super) fresh: &'static str,
+    /// Assignments that reset the table's own columns of progress.
+    pub(super) reset_progress: &'static str,
 }
 
 impl Jobs {
     /// Refuses one job more than `max_live` that have not ended.
-    pub(super) async fn check_room(&self, connection: &mut SqliteConnection, max_live: u32) -> Result<()> {
+    pub(super) async fn check_capacity(
+        &self,
+        connection: &mut SqliteConnection,
+        max_live: u32,
+    ) -> Result<()> {
         let Self { table, plural, .. } = self;
         let sql = format!("SELECT count(*) FROM {table} WHERE state IN ('queued', 'running')");
         let live: i64 = sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(connection).await.map_err(failed)?;
         if live >= i64::from(max_live) {
             return Err(Error::refused(
                 ErrorKind::Overloaded,
-                format!(
-                    "{live} {plural} are queued or running, and no more than {max_live} may be; try later"
-                ),
+                format!("{live} {plural} are queued or running, at most {max_live} may be; try later"),
             ));
         }
         Ok(())
     }
 
-    /// Takes up the oldest job that is queued or whose worker has stopped beating. Its attempt and
-    /// fence go up by one; its progress begins anew.
+    /// Claims the oldest job that is queued or whose lease has expired. Attempt and fence go up by one;
+    /// the progress is reset.
     pub(super) async fn claim(
         &self,
         connection: &mut SqliteConnection,
         lease: Duration,
         now: Timestamp,
     ) -> Result<Option<Claim<Uuid>>> {
-        let Self { table, fresh, .. } = self;
+        let Self { table, reset_progress, .. } = self;
         let sql = format!(
             "UPDATE {table} SET state = 'running', attempt = attempt + 1, fence = fence + 1, \
-             lease_until_us = ?, started_at_us = ?, phase = '', remaining_s = NULL, {fresh} \
-             WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') \
-             AND (lease_until_us IS NULL OR lease_until_us <= ?) ORDER BY id LIMIT 1) \
+             lease_until_us = ?1 + ?2, lease_us = ?2, started_at_us = ?1, phase = '', remaining_s = NULL, \
+             {reset_progress} \
+             WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') AND {LEASE_EXPIRED} \
+             ORDER BY id LIMIT 1) \
              RETURNING id, fence, cancel_requested"
         );
         let claimed: Option<(String, i64, i64)> = sqlx::query_as(AssertSqlSafe(sql))
-            .bind(lease_end(now, lease))
             .bind(now.as_microsecond())
-            .bind(now.as_microsecond())
+            .bind(lease_us(lease))
             .fetch_optional(connection)
             .await
             .map_err(failed)?;
@@ -115,8 +128,8 @@ impl Jobs {
         Ok(Some(Claim { job, fence, cancel_requested: cancel_requested != 0 }))
     }
 
-    /// Prolongs the lease.
-    pub(super) async fn beat(
+    /// Renews the lease.
+    pub(super) async fn heartbeat(
         &self,
         connection: &mut SqliteConnection,
         (id, fence): (Uuid, i64),
@@ -124,12 +137,13 @@ impl Jobs {
         now: Timestamp,
     ) -> Result<Heartbeat> {
         let sql = format!(
-            "UPDATE {} SET lease_until_us = ? WHERE id = ? AND fence = ? AND state = 'running' \
-             RETURNING cancel_requested",
+            "UPDATE {} SET lease_until_us = ?1 + ?2, lease_us = ?2 \
+             WHERE id = ?3 AND fence = ?4 AND state = 'running' RETURNING cancel_requested",
             self.table
         );
         let cancel_requested: Option<i64> = sqlx::query_scalar(AssertSqlSafe(sql))
-            .bind(lease_end(now, lease))
+            .bind(now.as_microsecond())
+            .bind(lease_us(lease))
             .bind(id.to_string())
             .bind(fence)
             .fetch_optional(connection)
@@ -142,9 +156,9 @@ impl Jobs {
         })
     }
 
-    /// Whose the job is and whether its end was asked for, if the fence is still the newest and the
-    /// job runs.
-    pub(super) async fn held(
+    /// The job's camera and whether its cancellation was requested, if the fence is still the newest and
+    /// the job runs.
+    pub(super) async fn owns_lease(
         &self,
         connection: &mut SqliteConnection,
         (id, fence): (Uuid, i64),
@@ -153,54 +167,63 @@ impl Jobs {
             "SELECT camera_key, cancel_requested FROM {} WHERE id = ? AND fence = ? AND state = 'running'",
             self.table
         );
-        let held: Option<(i64, i64)> = sqlx::query_as(AssertSqlSafe(sql))
+        let owned: Option<(i64, i64)> = sqlx::query_as(AssertSqlSafe(sql))
             .bind(id.to_string())
             .bind(fence)
             .fetch_optional(connection)
             .await
             .map_err(failed)?;
-        Ok(held.map(|(camera_key, cancel_requested)| (camera_key, cancel_requested != 0)))
+        Ok(owned.map(|(camera_key, cancel_requested)| (camera_key, cancel_requested != 0)))
     }
 
-    /// Asks for the end of a live job: a queued one ends at once, a running one at its worker's next
-    /// heartbeat.
+    /// Cancels a job that has not ended: at once where no worker holds a live lease on it, otherwise at
+    /// its worker's next heartbeat.
     pub(super) async fn cancel(
         &self,
         connection: &mut SqliteConnection,
         id: Uuid,
-        state: JobState,
         now: Timestamp,
     ) -> Result<()> {
-        if state == JobState::Queued {
+        let Self { table, .. } = self;
+        let sql = format!(
+            "SELECT 1 FROM {table} WHERE id = ?2 AND (state = 'queued' OR (state = 'running' AND {LEASE_EXPIRED}))"
+        );
+        let unclaimed: Option<i64> = sqlx::query_scalar(AssertSqlSafe(sql))
+            .bind(now.as_microsecond())
+            .bind(id.to_string())
+            .fetch_optional(&mut *connection)
+            .await
+            .map_err(failed)?;
+        if unclaimed.is_some() {
             self.end(connection, id, JobState::Cancelled, None, now).await?;
         }
-        let sql = format!("UPDATE {} SET cancel_requested = 1 WHERE id = ?", self.table);
+        let sql = format!("UPDATE {table} SET cancel_requested = 1 WHERE id = ?");
         sqlx::query(AssertSqlSafe(sql)).bind(id.to_string()).execute(connection).await.map_err(failed)?;
         Ok(())
     }
 
-    /// Ends a job, or gives it back, if the worker still holds it; `None` if it lost it, and then
-    /// nothing was changed. A job whose end the operator has asked for is cancelled even if it
-    /// succeeded or was given back.
-    pub(super) async fn leave<Y>(
+    /// Ends a job, or returns it to the queue, if the worker still owns its lease; `None` if it lost it,
+    /// and then nothing was changed. A job whose cancellation was requested is cancelled even if it
+    /// succeeded or was returned.
+    pub(super) async fn finish<O>(
         &self,
         connection: &mut SqliteConnection,
         (id, fence): (Uuid, i64),
-        end: JobEnd<Y>,
+        end: JobEnd<O>,
         now: Timestamp,
-    ) -> Result<Option<Left<Y>>> {
-        let Some((camera_key, cancel_requested)) = self.held(connection, (id, fence)).await? else {
+    ) -> Result<Option<Finished<O>>> {
+        let Some((camera_key, cancel_requested)) = self.owns_lease(connection, (id, fence)).await? else {
             return Ok(None);
         };
         let end = match end {
             JobEnd::Succeeded { .. } | JobEnd::Requeue if cancel_requested => JobEnd::Cancelled,
             end => end,
         };
-        let mut kept = None;
+        let mut stored = None;
         match end {
-            JobEnd::Succeeded { yielded, outcome } => {
+            JobEnd::Succeeded { output, outcome } => {
                 self.end(connection, id, JobState::Succeeded, outcome, now).await?;
-                kept = Some(yielded);
+                stored = Some(output);
             }
             JobEnd::Failed { outcome } => {
                 self.end(connection, id, JobState::Failed, Some(outcome), now).await?;
@@ -208,7 +231,7 @@ impl Jobs {
             JobEnd::Cancelled => self.end(connection, id, JobState::Cancelled, None, now).await?,
             JobEnd::Requeue => self.requeue(connection, id).await?,
         }
-        Ok(Some(Left { camera_key, yielded: kept }))
+        Ok(Some(Finished { camera_key, output: stored }))
     }
 
     async fn end(
@@ -235,18 +258,24 @@ impl Jobs {
         Ok(())
     }
 
+    /// An orderly return is no failed attempt: otherwise a few restarts would exhaust the attempts of a
+    /// job that never failed.
     async fn requeue(&self, connection: &mut SqliteConnection, id: Uuid) -> Result<()> {
-        let sql = format!("UPDATE {} SET state = 'queued', lease_until_us = NULL WHERE id = ?", self.table);
+        let sql = format!(
+            "UPDATE {} SET state = 'queued', lease_until_us = NULL, attempt = attempt - 1 WHERE id = ?",
+            self.table
+        );
         sqlx::query(AssertSqlSafe(sql)).bind(id.to_string()).execute(connection).await.map_err(failed)?;
         Ok(())
     }
 }
 
 pub(super) fn read_state(name: &str) -> Result<JobState, &'static str> {
-    JobState::ALL.into_iter().find(|state| state.as_str() == name).ok_or("no state of a job")
+    JobState::ALL.iter().copied().find(|state| state.as_str() == name).ok_or("is not the state of a job")
 }
 
-fn lease_end(now: Timestamp, lease: Duration) -> i64 {
-    let lease = SignedDuration::try_from(lease).unwrap_or(SignedDuration::MAX);
-    now.saturating_add(lease).unwrap_or(Timestamp::MAX).as_microsecond()
+/// Microseconds of a lease; at most a century, so that the end of a lease stays in range.
+fn lease_us(lease: Duration) -> i64 {
+    const CENTURY_US: i64 = 100 * 366 * 86_400 * 1_000_000;
+    i64::try_from(lease.as_micros()).map_or(CENTURY_US, |lease_us| lease_us.min(CENTURY_US))
 }

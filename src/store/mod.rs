@@ -1,8 +1,9 @@
 //! Everything that lasts, behind one type: [`Store`]; the only floor that knows SQL.
 //!
 //! A file `sightfix.db` (SQLite, write-ahead log) with one writer connection and a few readers.
-//! Samples of many callers share transactions (`group_commit`); activations, profiles and the state of
-//! background jobs are on the disk before they are acknowledged (`Durability::Synced`).
+//! Samples of many callers share transactions (`group_commit`). A change is flushed to the disk before
+//! it is acknowledged ([`Durability::Synced`]), except for the progress of jobs and for samples whose
+//! sender asks for less.
 //!
 //! What never happens here: clocks are read, numbers are checked (they are valid by construction),
 //! a transaction is held across anything but statements, a type of the database library gets out.
@@ -13,36 +14,49 @@ mod connection;
 mod evaluations;
 mod faults;
 mod fields;
+mod folder;
 mod group_commit;
 mod jobs;
 mod models;
 mod moves;
+mod occupants;
+mod reserve;
+mod retention;
 mod runs;
 mod samples;
+mod space;
 #[cfg(test)]
 mod tests;
 mod training;
+mod writer;
 
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use sqlx::SqlitePool;
 
-use crate::domain::{Error, ErrorKind, Result};
+use crate::domain::{Durability, Error, ErrorKind, Result};
 
 pub use group_commit::Inserted;
 pub use jobs::{Claim, Heartbeat, JobEnd};
-pub use runs::{NewModel, RunEnd};
+pub use models::{NewModel, StoredHeldOutError};
+pub use occupants::Occupant;
+pub use runs::{RunEnd, RunOutput};
 pub use samples::{SampleFilter, SampleKey};
+pub use space::{StorageStatus, StoreLimits};
 
-use connection::{Durability, Writer};
 use faults::failed;
 use group_commit::GroupCommit;
+use occupants::Presence;
+use reserve::Reserve;
+use space::Space;
+use writer::{Growth, Writer, WriterGuard};
 
 /// All that lasts. Clones share one store; it lives until the last clone is dropped or it is closed.
 ///
 /// Every method may fail with a fault of the server (disk, file), with
-/// [`ErrorKind::Overloaded`] when another process holds the file for seconds, and with
+/// [`ErrorKind::Overloaded`] when another process holds the file for seconds, with
+/// [`ErrorKind::InsufficientStorage`] when there is no space for what it writes, and with
 /// [`ErrorKind::ShuttingDown`] after [`Store::close`].
 #[derive(Clone)]
 pub struct Store {
@@ -53,28 +67,89 @@ struct Inner {
     writer: Arc<Writer>,
     readers: SqlitePool,
     samples: GroupCommit,
+    space: Arc<Space>,
+    /// `None` where the process could not announce itself, and after closing.
+    presence: Mutex<Option<Presence>>,
+}
+
+/// How a store is opened.
+#[derive(Debug, Clone)]
+pub struct StoreOptions {
+    /// What it may hold.
+    pub limits: StoreLimits,
+    /// What this process does, for the logs of others that use the same folder.
+    pub role: String,
+}
+
+impl Default for StoreOptions {
+    fn default() -> Self {
+        Self { limits: StoreLimits::default(), role: "sightfix".to_owned() }
+    }
 }
 
 impl Store {
+    /// Opens the store of a folder without limits; see [`Store::open_with`].
+    ///
+    /// # Errors
+    /// As [`Store::open_with`].
+    pub async fn open(folder: &Path) -> Result<Self> {
+        Self::open_with(folder, StoreOptions::default()).await
+    }
+
     /// Opens the store of a folder; makes the folder and the file if missing and brings the schema up
     /// to date. Must be called within a tokio runtime; the group-commit task lives on it.
     ///
     /// # Errors
     /// A fault that says what is wrong with folder or file: not writable, not a database, or written
     /// by a newer version.
-    pub async fn open(folder: &Path) -> Result<Self> {
-        let (writer, readers) = connection::open(folder).await?;
+    pub async fn open_with(folder: &Path, options: StoreOptions) -> Result<Self> {
+        let StoreOptions { limits, role } = options;
+        let (writer, readers) = connection::open(folder, Space::max_pages(&limits)).await?;
         let writer = Arc::new(writer);
-        let samples = GroupCommit::start(Arc::clone(&writer));
-        Ok(Self { inner: Arc::new(Inner { writer, readers, samples }) })
+        let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
+        let samples = GroupCommit::start(Arc::clone(&writer), Arc::clone(&space));
+        let presence = Presence::announce(folder, &role)
+            .inspect_err(
+                |error| tracing::warn!(%error, "others cannot see that this process uses the data folder"),
+            )
+            .ok();
+        let presence = Mutex::new(presence);
+        let store = Self { inner: Arc::new(Inner { writer, readers, samples, space, presence }) };
+        store.reserve_space().await;
+        store.count_all_samples().await?;
+        Ok(store)
     }
 
-    /// Commits what was handed in, writes the log back into the file and lets go of it. Later calls
+    /// Commits what was handed in, copies the log back into the file and closes it. Later calls
     /// are refused with [`ErrorKind::ShuttingDown`]. Closing twice does nothing.
     pub async fn close(&self) {
         self.inner.samples.close().await;
         self.inner.readers.close().await;
         self.inner.writer.close().await;
+        self.presence().take();
+    }
+
+    /// Other processes that have begun to use the data folder since the last call; at the first, all
+    /// that use it.
+    pub fn newcomers(&self) -> Vec<Occupant> {
+        let newcomers = self.presence().as_mut().map(Presence::newcomers).transpose();
+        newcomers
+            .inspect_err(
+                |error| tracing::warn!(%error, "cannot tell which other processes use the data folder"),
+            )
+            .ok()
+            .flatten()
+            .unwrap_or_default()
+    }
+
+    fn log_newcomers(&self) {
+        for Occupant { pid, host, role } in self.newcomers() {
+            tracing::warn!(pid, host, role, "another process uses the same data folder");
+        }
+    }
+
+    fn presence(&self) -> std::sync::MutexGuard<'_, Option<Presence>> {
+        self.inner.presence.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Whether the store answers.
@@ -96,13 +171,17 @@ impl Store {
         &self.inner.readers
     }
 
-    /// The writer's turn, for a change that must be on the disk before it is acknowledged.
-    async fn synced(&self) -> Result<connection::Turn<'_>> {
-        self.inner.writer.turn(Durability::Synced).await
+    fn limits(&self) -> &StoreLimits {
+        &self.inner.space.limits
     }
 
-    /// The writer's turn, for a change that a power cut (not a crash) may undo.
-    async fn relaxed(&self) -> Result<connection::Turn<'_>> {
-        self.inner.writer.turn(Durability::Relaxed).await
+    /// The writer, for a change that must be on the disk before it is acknowledged.
+    async fn synced(&self) -> Result<WriterGuard<'_>> {
+        self.inner.writer.lock(Durability::Synced, Growth::Headroom).await
+    }
+
+    /// The writer, for a change that a power cut (not a crash) may undo.
+    async fn relaxed(&self) -> Result<WriterGuard<'_>> {
+        self.inner.writer.lock(Durability::Relaxed, Growth::Headroom).await
     }
 }

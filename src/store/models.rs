@@ -9,7 +9,12 @@ use super::Store;
 use super::cameras::{camera_key, find_camera};
 use super::faults::{failed, no_model};
 use super::fields::Fields;
-use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelMetadata, ModelVersion, Result, RunId};
+use super::retention::prune_models;
+use crate::domain::{
+    BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata, ModelVersion, Result,
+    RunId, TargetId, model_sha256,
+};
+use crate::geo::Position;
 
 macro_rules! select {
     ($rest:literal) => {
@@ -34,10 +39,12 @@ impl Store {
         weights: &[u8],
         now: Timestamp,
     ) -> Result<ModelVersion> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
-        let number = add_model(&mut transaction, key, None, metadata, weights, now).await?;
+        let model = NewModel { metadata, weights, held_out: &[] };
+        let number = add_model(&mut transaction, key, None, &model, now).await?;
+        prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
         let version = find_model(&mut transaction, camera, number).await?;
         transaction.commit().await.map_err(failed)?;
         version.ok_or_else(|| no_model(camera, number))
@@ -53,19 +60,82 @@ impl Store {
         find_model(&mut reader, camera, number).await?.ok_or_else(|| no_model(camera, number))
     }
 
-    /// The weights of one version, as they were handed in.
+    /// Metadata and weights of one version, as they were handed in.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
-    pub async fn weights(&self, camera: &CameraId, number: u32) -> Result<Vec<u8>> {
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`]; [`ErrorKind::ModelUnusable`] where what
+    /// is stored does not match its checksum or cannot be read.
+    pub async fn model_content(&self, camera: &CameraId, number: u32) -> Result<(ModelMetadata, Vec<u8>)> {
         let key = camera_key(self.readers(), camera).await?;
-        sqlx::query_scalar("SELECT weights FROM models WHERE camera_key = ? AND number = ?")
+        let content: Option<(Vec<u8>, Vec<u8>, Option<String>)> = sqlx::query_as(
+            "SELECT CAST(metadata AS BLOB), weights, sha256 FROM models WHERE camera_key = ? AND number = ?",
+        )
+        .bind(key)
+        .bind(number)
+        .fetch_optional(self.readers())
+        .await
+        .map_err(failed)?;
+        let (document, weights, sha256) = content.ok_or_else(|| no_model(camera, number))?;
+        if sha256.is_some_and(|sha256| sha256 != model_sha256(&document, &weights)) {
+            return Err(unusable(camera, number, "what is stored does not match its checksum"));
+        }
+        let metadata = serde_json::from_slice(&document)
+            .map_err(|error| unusable(camera, number, &format!("its metadata cannot be read: {error}")))?;
+        Ok((metadata, weights))
+    }
+
+    /// Fills in the checksums of versions that an earlier release stored; returns how many there were.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn fill_in_model_checksums(&self) -> Result<u64> {
+        let mut turn = self.synced().await?;
+        let mut transaction = turn.begin().await?;
+        let missing: Vec<(i64, i64)> =
+            sqlx::query_as("SELECT camera_key, number FROM models WHERE sha256 IS NULL")
+                .fetch_all(&mut *transaction)
+                .await
+                .map_err(failed)?;
+        for (key, number) in &missing {
+            let (document, weights): (Vec<u8>, Vec<u8>) = sqlx::query_as(
+                "SELECT CAST(metadata AS BLOB), weights FROM models WHERE camera_key = ? AND number = ?",
+            )
             .bind(key)
             .bind(number)
-            .fetch_optional(self.readers())
+            .fetch_one(&mut *transaction)
             .await
-            .map_err(failed)?
-            .ok_or_else(|| no_model(camera, number))
+            .map_err(failed)?;
+            sqlx::query("UPDATE models SET sha256 = ? WHERE camera_key = ? AND number = ?")
+                .bind(model_sha256(&document, &weights))
+                .bind(key)
+                .bind(number)
+                .execute(&mut *transaction)
+                .await
+                .map_err(failed)?;
+        }
+        transaction.commit().await.map_err(failed)?;
+        Ok(missing.len() as u64)
+    }
+
+    /// The held-out errors that were stored with a version, each with its sample as long as that is
+    /// stored; by time and target.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    pub async fn held_out_errors(&self, camera: &CameraId, number: u32) -> Result<Vec<StoredHeldOutError>> {
+        let key = camera_key(self.readers(), camera).await?;
+        let rows = sqlx::query(
+            "SELECT errors.camera_key, errors.time_us, errors.target_id, errors.distance_m, left_px, top_px, \
+             width_px, height_px, longitude_deg, latitude_deg \
+             FROM held_out_errors AS errors LEFT JOIN samples USING (camera_key, time_us, target_id) \
+             WHERE errors.camera_key = ? AND errors.model_number = ? ORDER BY errors.time_us, errors.target_id",
+        )
+        .bind(key)
+        .bind(number)
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        rows.iter().map(read_held_out_error).collect()
     }
 
     /// A page of versions, newest first, before a number.
@@ -162,33 +232,112 @@ impl Store {
     }
 }
 
-/// Adds the next version of a camera; returns its number.
+/// A model to be stored.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewModel<'a> {
+    /// Its description.
+    pub metadata: &'a ModelMetadata,
+    /// Its weights.
+    pub weights: &'a [u8],
+    /// Errors on held-out samples, for the comparison with later versions.
+    pub held_out: &'a [HeldOutSampleError],
+}
+
+/// Adds the next version of a camera; returns its number, which no version had before.
 pub(super) async fn add_model(
     connection: &mut SqliteConnection,
     camera_key: i64,
     run: Option<RunId>,
-    metadata: &ModelMetadata,
-    weights: &[u8],
+    model: &NewModel<'_>,
     now: Timestamp,
 ) -> Result<u32> {
+    let NewModel { metadata, weights, held_out } = model;
     let metadata = serde_json::to_string(metadata).map_err(Error::fault)?;
     // JSON has no NaN: it would be written as null and could never be read again.
     serde_json::from_str::<ModelMetadata>(&metadata)
         .map_err(|error| Error::fault(format!("the metadata of a model cannot be stored: {error}")))?;
     let number: i64 = sqlx::query_scalar(
-        "INSERT INTO models (camera_key, number, run_id, created_at_us, metadata, weights) \
-         SELECT ?, coalesce(max(number), 0) + 1, ?, ?, ?, ? FROM models WHERE camera_key = ? RETURNING number",
+        "UPDATE cameras SET last_model_number = 1 + max(last_model_number, \
+         (SELECT coalesce(max(number), 0) FROM models WHERE camera_key = ?1)) WHERE key = ?1 \
+         RETURNING last_model_number",
     )
     .bind(camera_key)
-    .bind(run.map(|run| run.to_string()))
-    .bind(now.as_microsecond())
-    .bind(metadata)
-    .bind(weights)
-    .bind(camera_key)
-    .fetch_one(connection)
+    .fetch_one(&mut *connection)
     .await
     .map_err(failed)?;
+    sqlx::query(
+        "INSERT INTO models (camera_key, number, run_id, created_at_us, sha256, metadata, weights) \
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+    )
+    .bind(camera_key)
+    .bind(number)
+    .bind(run.map(|run| run.to_string()))
+    .bind(now.as_microsecond())
+    .bind(model_sha256(metadata.as_bytes(), weights))
+    .bind(metadata)
+    .bind(*weights)
+    .execute(&mut *connection)
+    .await
+    .map_err(failed)?;
+    for error in *held_out {
+        sqlx::query(
+            "INSERT INTO held_out_errors (camera_key, model_number, time_us, target_id, distance_m) \
+             VALUES (?, ?, ?, ?, ?)",
+        )
+        .bind(camera_key)
+        .bind(number)
+        .bind(error.time.as_microsecond())
+        .bind(error.target_id.as_str())
+        .bind(error.distance_m)
+        .execute(&mut *connection)
+        .await
+        .map_err(failed)?;
+    }
     u32::try_from(number).map_err(Error::fault)
+}
+
+fn unusable(camera: &CameraId, number: u32, reason: &str) -> Error {
+    Error::refused(
+        ErrorKind::ModelUnusable,
+        format!(
+            "version {number} of camera {camera} cannot be used: {reason}; activate another version, or \
+             import this one again"
+        ),
+    )
+}
+
+/// A held-out error, with the box and the fix of its sample as long as that is stored.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StoredHeldOutError {
+    /// The error.
+    pub error: HeldOutSampleError,
+    /// The sample's box, and the position of its fix.
+    pub sample: Option<(BoundingBox, Position)>,
+}
+
+fn read_held_out_error(row: &SqliteRow) -> Result<StoredHeldOutError> {
+    let mut fields = Fields::of("held_out_errors", row).skip(1);
+    let time = fields.time()?;
+    let target_id = fields.make(TargetId::new)?;
+    let error = HeldOutSampleError { time, target_id, distance_m: fields.take()? };
+    let mut columns = [None; 6];
+    for column in &mut columns {
+        *column = fields.take::<Option<f64>>()?;
+    }
+    let [
+        Some(left_px),
+        Some(top_px),
+        Some(width_px),
+        Some(height_px),
+        Some(longitude_deg),
+        Some(latitude_deg),
+    ] = columns
+    else {
+        return Ok(StoredHeldOutError { error, sample: None });
+    };
+    let bounding_box = fields.made(BoundingBox::new(left_px, top_px, width_px, height_px))?;
+    let position = fields.made(Position::new(longitude_deg, latitude_deg))?;
+    Ok(StoredHeldOutError { error, sample: Some((bounding_box, position)) })
 }
 
 /// Moves the pointer to a version that exists, and writes it into the history.

@@ -1,4 +1,4 @@
-//! Training runs: jobs that yield models.
+//! Training runs: jobs whose output is a model version.
 
 use std::time::Duration;
 
@@ -12,31 +12,29 @@ use super::cameras::camera_key;
 use super::faults::{failed, no_run};
 use super::fields::Fields;
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
-use super::models::{activate, add_model};
+use super::models::{NewModel, activate, add_model};
+use super::retention::{prune_models, prune_runs};
 use crate::domain::{
-    CameraId, Error, ErrorKind, ModelMetadata, Recipe, Result, RunId, RunProgress, TrainingOptions,
-    TrainingRun,
+    CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
 };
 
 pub(super) const RUNS: Jobs = Jobs {
     table: "training_runs",
     plural: "training runs",
-    fresh: "epoch_done = 0, epochs_planned = 0, reconstruction_error = 0, regression_error = 0, error_scale = 0",
+    reset_progress: "epoch_done = 0, epochs_planned = 0, reconstruction_error = 0, regression_error = 0, error_scale = 0",
 };
 
-/// A model that a run yields.
+/// The output of a run.
 #[derive(Debug, Clone, PartialEq)]
-pub struct NewModel<'a> {
-    /// What the model says of itself.
-    pub metadata: &'a ModelMetadata,
-    /// Its weights.
-    pub weights: &'a [u8],
-    /// Whether it shall answer from now on.
+pub struct RunOutput<'a> {
+    /// The fitted model.
+    pub model: NewModel<'a>,
+    /// Whether it becomes the active version in the same transaction.
     pub activate: bool,
 }
 
-/// How a worker leaves a run.
-pub type RunEnd<'a> = JobEnd<NewModel<'a>>;
+/// How a worker finishes a run.
+pub type RunEnd<'a> = JobEnd<RunOutput<'a>>;
 
 macro_rules! select {
     ($rest:literal) => {
@@ -65,11 +63,12 @@ impl Store {
         max_live: u32,
         now: Timestamp,
     ) -> Result<TrainingRun> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
+        prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
         check_no_live_run(&mut transaction, key).await?;
-        RUNS.check_room(&mut transaction, max_live).await?;
+        RUNS.check_capacity(&mut transaction, max_live).await?;
         sqlx::query(
             "INSERT INTO training_runs (id, camera_key, recipe, seed, epochs, from_us, until_us, state, \
              created_at_us) VALUES (?, ?, ?, ?, ?, ?, ?, 'queued', ?)",
@@ -123,8 +122,8 @@ impl Store {
         rows.iter().map(read_run).collect()
     }
 
-    /// Takes up the oldest run that is queued or whose worker has stopped beating. Its attempt and
-    /// fence go up by one; its curve and progress begin anew.
+    /// Claims the oldest run that is queued or whose lease has expired. Its attempt and fence go up by
+    /// one; its curve and progress are reset.
     ///
     /// # Errors
     /// Faults only.
@@ -143,11 +142,11 @@ impl Store {
         Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
     }
 
-    /// Prolongs the lease and shows how far the run has come.
+    /// Renews the lease and stores the run's progress.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn heartbeat(
+    pub async fn heartbeat_run(
         &self,
         run: RunId,
         fence: i64,
@@ -157,7 +156,7 @@ impl Store {
     ) -> Result<Heartbeat> {
         let mut turn = self.relaxed().await?;
         let mut transaction = turn.begin().await?;
-        let heartbeat = RUNS.beat(&mut transaction, (run.0, fence), lease, now).await?;
+        let heartbeat = RUNS.heartbeat(&mut transaction, (run.0, fence), lease, now).await?;
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }
@@ -180,12 +179,12 @@ impl Store {
         Ok(heartbeat)
     }
 
-    /// Asks for the end of a run: a queued one ends at once, a running one at its worker's next
-    /// heartbeat. Once this has returned, the run yields no model any more.
+    /// Cancels a run: at once where no worker holds a live lease on it, otherwise at its worker's next
+    /// heartbeat. Once this has returned, the run produces no model any more.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunEnded`].
-    pub async fn request_cancel(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<TrainingRun> {
+    pub async fn cancel_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<TrainingRun> {
         let mut turn = self.synced().await?;
         let mut transaction = turn.begin().await?;
         camera_key(&mut *transaction, camera).await?;
@@ -194,15 +193,15 @@ impl Store {
             let ended = format!("the training run has ended already: {}", stored.state.as_str());
             return Err(Error::refused(ErrorKind::RunEnded, ended));
         }
-        RUNS.cancel(&mut transaction, run.0, stored.state, now).await?;
+        RUNS.cancel(&mut transaction, run.0, now).await?;
         let stored = find_run(&mut *transaction, run).await?;
         transaction.commit().await.map_err(failed)?;
         stored.ok_or_else(|| no_run(run))
     }
 
-    /// Ends a run, or gives it back, if the worker still holds it; `None` if it lost it, and then
-    /// nothing was changed. The model, its activation and the run's state are one transaction. A run
-    /// whose end the operator has asked for is cancelled even if it succeeded or was given back.
+    /// Ends a run, or returns it to the queue, if the worker still owns its lease; `None` if it lost it,
+    /// and then nothing was changed. The model, its activation and the run's state are one transaction. A
+    /// run whose cancellation was requested is cancelled even if it succeeded or was returned.
     ///
     /// # Errors
     /// Faults only.
@@ -215,15 +214,16 @@ impl Store {
     ) -> Result<Option<TrainingRun>> {
         let mut turn = self.synced().await?;
         let mut transaction = turn.begin().await?;
-        let Some(left) = RUNS.leave(&mut transaction, (run.0, fence), end, now).await? else {
+        let Some(finished) = RUNS.finish(&mut transaction, (run.0, fence), end, now).await? else {
             return Ok(None);
         };
-        if let Some(NewModel { metadata, weights, activate: wanted }) = left.yielded {
-            let key = left.camera_key;
-            let number = add_model(&mut transaction, key, Some(run), metadata, weights, now).await?;
+        if let Some(RunOutput { model, activate: wanted }) = finished.output {
+            let key = finished.camera_key;
+            let number = add_model(&mut transaction, key, Some(run), &model, now).await?;
             if wanted {
                 activate(&mut transaction, key, number, now).await?;
             }
+            prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
             sqlx::query("UPDATE training_runs SET model_version = ? WHERE id = ?")
                 .bind(number)
                 .bind(run.to_string())

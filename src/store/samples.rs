@@ -10,7 +10,7 @@ use super::faults::failed;
 use super::fields::Fields;
 use super::group_commit::Inserted;
 use crate::domain::{
-    BoundingBox, CameraId, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId, TimeRange,
+    BoundingBox, CameraId, Durability, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId, TimeRange,
 };
 use crate::geo::Position;
 
@@ -51,14 +51,20 @@ impl SampleKey {
 }
 
 impl Store {
-    /// Stores samples of a camera and returns after their commit; all of them are stored, or none. A
+    /// Stores samples of a camera and returns after their commit, and with [`Durability::Synced`] after
+    /// they have been flushed to the disk; all of them are stored, or none. A
     /// sample whose camera, target and time are stored already is left as it is and counted as a
     /// duplicate. Many callers at once share a transaction; a caller who goes away does not stop it.
     ///
     /// # Errors
-    /// [`crate::domain::ErrorKind::CameraNotFound`].
-    pub async fn insert_samples(&self, id: &CameraId, samples: Vec<Sample>) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), samples).await
+    /// [`crate::domain::ErrorKind::CameraNotFound`], [`crate::domain::ErrorKind::InsufficientStorage`].
+    pub async fn insert_samples(
+        &self,
+        id: &CameraId,
+        samples: Vec<Sample>,
+        durability: Durability,
+    ) -> Result<Inserted> {
+        self.inner.samples.insert(id.clone(), samples, durability).await
     }
 
     /// A page of samples ordered by time and target, after a key.
@@ -150,13 +156,21 @@ impl Store {
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
     pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
-        let range = Range::of(camera_key(&mut *transaction, id).await?, filter, None);
+        let mut deletion = self.deletion().await?;
+        let mut transaction = deletion.begin().await?;
+        let key = camera_key(&mut *transaction, id).await?;
+        let range = Range::of(key, filter, None);
         let sql = range.sql("DELETE FROM samples", "");
-        let done = range.bind(&sql).execute(&mut *transaction).await.map_err(failed)?;
+        let deleted = range.bind(&sql).execute(&mut *transaction).await.map_err(failed)?.rows_affected();
+        sqlx::query("UPDATE sample_counts SET samples = max(samples - ?, 0) WHERE camera_key = ?")
+            .bind(i64::try_from(deleted).unwrap_or(i64::MAX))
+            .bind(key)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
         transaction.commit().await.map_err(failed)?;
-        Ok(done.rows_affected())
+        deletion.reclaim().await;
+        Ok(deleted)
     }
 }
 

@@ -1,4 +1,4 @@
-//! What a run leaves behind while it fits: its curve and its log.
+//! Curve and log of training runs.
 
 use jiff::Timestamp;
 
@@ -8,22 +8,22 @@ use super::fields::Fields;
 use super::runs::RUNS;
 use crate::domain::{EpochReport, Result, RunId};
 
-/// Lines of a run's log; older ones are dropped.
+/// Lines kept in a run's log; older ones are deleted.
 const LOG_LINES: i64 = 1_000;
 
-/// Bytes of one line; the rest is cut.
+/// Bytes kept of one line; the rest is cut off.
 const LINE_BYTES: usize = 4_000;
 
 impl Store {
     /// Adds points to the curve of a run. An epoch that is there already is replaced. Does nothing
-    /// once the run was lost to another worker or has ended, which the next heartbeat tells.
+    /// once the lease was lost or the run has ended, which the next heartbeat reports.
     ///
     /// # Errors
     /// Faults only.
     pub async fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()> {
         let mut turn = self.relaxed().await?;
         let mut transaction = turn.begin().await?;
-        if RUNS.held(&mut transaction, (run.0, fence)).await?.is_none() {
+        if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
         for report in epochs {
@@ -48,14 +48,14 @@ impl Store {
     }
 
     /// Adds a line to the log of a run, which keeps its latest 1,000 lines of 4,000 bytes over all
-    /// attempts. Does nothing once the run was lost.
+    /// attempts. Does nothing once the lease was lost.
     ///
     /// # Errors
     /// Faults only.
     pub async fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()> {
         let mut turn = self.relaxed().await?;
         let mut transaction = turn.begin().await?;
-        if RUNS.held(&mut transaction, (run.0, fence)).await?.is_none() {
+        if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
         let number: i64 = sqlx::query_scalar(

@@ -1,56 +1,43 @@
-//! Evaluations as jobs: which samples they need, how far they have come, and the report they yield.
+//! Evaluations as jobs: their samples, the evaluation on a thread, and the report that it gives.
 
 use std::time::Duration;
 
-use tokio::sync::Notify;
-use uuid::Uuid;
-
-use super::aside::Said;
-use super::{Ended, Job, Work, load_samples};
-use crate::app::App;
+use super::job_thread::Progress;
+use super::{Ended, Job, JobIdentity, Work, load_samples};
+use crate::app::{App, JobQueue};
 use crate::clock::thread_cpu_s;
-use crate::domain::{
-    CameraId, Error, EvaluationJob, EvaluationProgress, JobState, Observation, Result, Sample,
-};
-use crate::evaluation::{Doing, EvaluateOptions, Report, TestRow, evaluate};
+use crate::domain::{Error, EvaluationJob, EvaluationProgress, JobState, Observation, Result, Sample};
+use crate::evaluation::{self, EvaluateOptions, Report, TestRow, evaluate};
 use crate::store::{Claim, Heartbeat, JobEnd, SampleFilter};
-use crate::telemetry::Metrics;
+use crate::telemetry::{JobMetrics, Metrics};
 
-impl Said for EvaluationProgress {
+impl Progress for EvaluationProgress {
     fn take(&mut self) -> Self {
         self.clone()
     }
 }
 
-/// How an evaluation's work has ended.
+/// How an evaluation ended.
 pub(super) enum Evaluated {
-    Whole(Result<Report>),
-    BrokenOff,
+    Completed(Result<Report>),
+    Cancelled,
 }
 
 impl Job for EvaluationJob {
     const NAME: &'static str = "evaluation";
-    type Said = EvaluationProgress;
-    type Yield = Evaluated;
+    type Progress = EvaluationProgress;
+    type Output = Evaluated;
 
-    fn id(&self) -> Uuid {
-        self.id.0
+    fn identity(&self) -> JobIdentity<'_> {
+        JobIdentity { id: self.id.0, camera: &self.camera_id, attempt: self.attempt }
     }
 
-    fn camera(&self) -> &CameraId {
-        &self.camera_id
+    fn queue(app: &App) -> &JobQueue {
+        &app.evaluation_queue
     }
 
-    fn attempt(&self) -> u32 {
-        self.attempt
-    }
-
-    fn bell(app: &App) -> &Notify {
-        &app.evaluation_queued
-    }
-
-    fn count(metrics: &Metrics, state: JobState, time: Duration) {
-        metrics.evaluations.ended(state, time);
+    fn metrics(metrics: &Metrics) -> &JobMetrics {
+        &metrics.evaluations
     }
 
     async fn claim(app: &App, lease: Duration) -> Result<Option<Claim<Self>>> {
@@ -75,31 +62,33 @@ impl Job for EvaluationJob {
             box_shift_px: plan.box_shift_px,
             cpu_s: thread_cpu_s,
         };
-        Ok(Box::new(move |voice| {
-            let mut broken_off = false;
-            let evaluated = evaluate(&train, &test, &truth, &options, &mut |doing: &Doing<'_>| {
-                let going_on = voice.say(|progress| {
-                    *progress = EvaluationProgress {
-                        phase: doing.words.to_owned(),
-                        steps_done: doing.done,
-                        steps: doing.planned,
-                        remaining_s: voice.remaining_s(doing.done, doing.planned),
-                    };
+        Ok(Box::new(move |sink| {
+            let mut cancelled = false;
+            let evaluated =
+                evaluate(&train, &test, &truth, &options, &mut |step: &evaluation::Progress<'_>| {
+                    let flow = sink.update(|progress| {
+                        *progress = EvaluationProgress {
+                            phase: step.phase.to_owned(),
+                            steps_done: step.done,
+                            steps: step.planned,
+                            remaining_s: sink.remaining_s(step.done, step.planned),
+                        };
+                    });
+                    cancelled |= flow.is_break();
+                    flow
                 });
-                broken_off |= going_on.is_break();
-                going_on
-            });
-            if broken_off { Evaluated::BrokenOff } else { Evaluated::Whole(evaluated.map(|it| it.report)) }
+            if cancelled { Evaluated::Cancelled } else { Evaluated::Completed(evaluated.map(|it| it.report)) }
         }))
     }
 
     async fn record(
         app: &App,
         claim: &Claim<Self>,
-        said: EvaluationProgress,
+        progress: EvaluationProgress,
         lease: Duration,
     ) -> Result<Heartbeat> {
-        app.store.beat_evaluation(claim.job.id, claim.fence, &said, lease, app.clock.now()).await
+        let now = app.clock.now();
+        app.store.heartbeat_evaluation(claim.job.id, claim.fence, &progress, lease, now).await
     }
 
     async fn end(
@@ -108,34 +97,34 @@ impl Job for EvaluationJob {
         ended: Ended<Self>,
         lease: Duration,
     ) -> Result<Option<JobState>> {
-        let Ended { yielded, mut said, server_is_ending } = ended;
-        let end = match yielded {
-            Evaluated::BrokenOff if server_is_ending => JobEnd::Requeue,
-            Evaluated::BrokenOff => JobEnd::Cancelled,
-            Evaluated::Whole(Ok(report)) if report.methods.is_empty() => {
+        let Ended { output, mut progress, shutting_down } = ended;
+        let end = match output {
+            Evaluated::Cancelled if shutting_down => JobEnd::Requeue,
+            Evaluated::Cancelled => JobEnd::Cancelled,
+            Evaluated::Completed(Ok(report)) if report.methods.is_empty() => {
                 let reasons: Vec<String> =
                     report.failed.iter().map(|(method, reason)| format!("{method}: {reason}")).collect();
                 JobEnd::Failed { outcome: format!("no method could run: {}", reasons.join("; ")) }
             }
-            Evaluated::Whole(Ok(report)) => {
-                said.steps_done = said.steps;
-                let yielded = serde_json::to_string(&report).map_err(Error::fault)?;
-                JobEnd::Succeeded { yielded, outcome: None }
+            Evaluated::Completed(Ok(report)) => {
+                progress.steps_done = progress.steps;
+                let output = serde_json::to_string(&report).map_err(Error::fault)?;
+                JobEnd::Succeeded { output, outcome: None }
             }
-            Evaluated::Whole(Err(error)) => return Err(error),
+            Evaluated::Completed(Err(error)) => return Err(error),
         };
-        if matches!(Self::record(app, claim, said, lease).await?, Heartbeat::Lost) {
+        if matches!(Self::record(app, claim, progress, lease).await?, Heartbeat::Lost) {
             return Ok(None);
         }
-        leave(app, claim, end).await
+        finish(app, claim, end).await
     }
 
     async fn fail(app: &App, claim: &Claim<Self>, outcome: String) -> Result<Option<JobState>> {
-        leave(app, claim, JobEnd::Failed { outcome }).await
+        finish(app, claim, JobEnd::Failed { outcome }).await
     }
 }
 
-async fn leave(app: &App, claim: &Claim<EvaluationJob>, end: JobEnd<String>) -> Result<Option<JobState>> {
+async fn finish(app: &App, claim: &Claim<EvaluationJob>, end: JobEnd<String>) -> Result<Option<JobState>> {
     let ended = app.store.finish_evaluation(claim.job.id, claim.fence, end, app.clock.now()).await?;
     Ok(ended.map(|job| job.state))
 }

@@ -1,86 +1,92 @@
-//! Background jobs, training runs and evaluations: claim, carry out, heartbeat, finish.
+//! Background jobs, training runs and evaluations: claim, lease, heartbeat, finish.
 //!
-//! A job is claimed in a short transaction, carried out on a thread of its own at the lowest
-//! priority, and finished in one transaction that only the holder of the newest fence can make. What
-//! never happens here: a database transaction held across the work, work on a thread of tokio's.
+//! A worker claims a job in a short transaction, runs it on a thread of its own at the lowest priority,
+//! renews the lease by heartbeats while it runs, and finishes it in one transaction that only the holder of
+//! the newest fence can make. No database transaction is held across the work, and no work runs on a thread
+//! of tokio.
 
-mod aside;
 mod evaluation;
+mod job_thread;
 mod promotion;
 mod training;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use tokio::sync::{Notify, Semaphore};
+use tokio::sync::Semaphore;
 use uuid::Uuid;
 
-use crate::app::App;
+use crate::app::{App, JobQueue};
 use crate::config::Workers;
 use crate::domain::{CameraId, Error, EvaluationJob, JobState, Result, Sample, TrainingRun};
 use crate::shutdown::Shutdown;
 use crate::store::{Claim, Heartbeat, SampleFilter};
-use crate::telemetry::Metrics;
+use crate::telemetry::{JobMetrics, Metrics};
 
-use aside::{Aside, Said, Voice};
+use job_thread::{JobThread, Progress, ProgressSink};
 
-/// How often a worker looks for jobs that nobody rang for (another process, an expired lease).
-const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// How often progress is written while a job is carried out, if the lease does not ask for more.
-const REPORT_EVERY: Duration = Duration::from_millis(400);
-/// Takes of a job after which it is given up: it has brought down every worker that tried.
-const MOST_ATTEMPTS: u32 = 5;
+/// How often a worker looks for jobs of which it was not notified (another process, an expired lease).
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
+/// How often a job sends a heartbeat with its progress, unless its lease asks for more.
+const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(400);
+/// Attempts after which a job is given up: every worker that claimed it has crashed.
+const MAX_ATTEMPTS: u32 = 5;
 /// Samples read at a time.
 const PAGE_SAMPLES: u32 = 10_000;
 
-/// Works on queued training runs until the server ends.
+/// Works on queued training runs until the server shuts down.
 pub async fn train(app: App, settings: Workers, shutdown: Shutdown) {
     work::<TrainingRun>(app, settings, shutdown).await;
 }
 
-/// Carries out queued evaluations until the server ends.
+/// Works on queued evaluations until the server shuts down.
 pub async fn evaluate(app: App, settings: Workers, shutdown: Shutdown) {
     work::<EvaluationJob>(app, settings, shutdown).await;
 }
 
 /// What a job does on its thread.
-type Work<J> = Box<dyn FnOnce(&Voice<<J as Job>::Said>) -> <J as Job>::Yield + Send>;
+type Work<J> = Box<dyn FnOnce(&ProgressSink<<J as Job>::Progress>) -> <J as Job>::Output + Send>;
+
+/// What the log and the rules of attempts need of a job.
+struct JobIdentity<'a> {
+    id: Uuid,
+    camera: &'a CameraId,
+    attempt: u32,
+}
 
 /// A kind of job.
 trait Job: Send + Sync + Sized + 'static {
-    /// What one is called in the log; also its thread.
+    /// Name of the kind in the log, and of its thread.
     const NAME: &'static str;
-    /// What the work says while it is under way.
-    type Said: Said;
-    /// What it yields.
-    type Yield: Send + 'static;
+    /// What the work reports while it runs.
+    type Progress: Progress;
+    /// What the work gives.
+    type Output: Send + 'static;
 
-    fn id(&self) -> Uuid;
-    fn camera(&self) -> &CameraId;
-    fn attempt(&self) -> u32;
-    /// Rung when one was queued.
-    fn bell(app: &App) -> &Notify;
-    fn count(metrics: &Metrics, state: JobState, time: Duration);
+    fn identity(&self) -> JobIdentity<'_>;
+    /// Where workers of this kind are notified of queued jobs.
+    fn queue(app: &App) -> &JobQueue;
+    fn metrics(metrics: &Metrics) -> &JobMetrics;
 
-    /// Takes one up.
+    /// Claims the next job.
     fn claim(app: &App, lease: Duration) -> impl Future<Output = Result<Option<Claim<Self>>>> + Send;
-    /// Reads what the work needs; a refusal ends the job with its words.
+    /// Reads what the work needs. A refusal fails the job with its message.
     fn prepare(app: &App, claim: &Claim<Self>) -> impl Future<Output = Result<Work<Self>>> + Send;
-    /// Prolongs the lease and writes down what was said.
+    /// Renews the lease and stores the progress.
     fn record(
         app: &App,
         claim: &Claim<Self>,
-        said: Self::Said,
+        progress: Self::Progress,
         lease: Duration,
     ) -> impl Future<Output = Result<Heartbeat>> + Send;
-    /// Ends the job by what it yielded; `None` if the fence was lost.
+    /// Finishes the job by its output; `None` if the lease was lost.
     fn end(
         app: &App,
         claim: &Claim<Self>,
         ended: Ended<Self>,
         lease: Duration,
     ) -> impl Future<Output = Result<Option<JobState>>> + Send;
-    /// Ends the job with an error; `None` if the fence was lost.
+    /// Finishes the job with an error; `None` if the lease was lost.
     fn fail(
         app: &App,
         claim: &Claim<Self>,
@@ -88,16 +94,16 @@ trait Job: Send + Sync + Sized + 'static {
     ) -> impl Future<Output = Result<Option<JobState>>> + Send;
 }
 
-/// A job whose work has ended.
+/// A job whose thread has ended.
 struct Ended<J: Job> {
-    yielded: J::Yield,
-    /// What was said last.
-    said: J::Said,
-    /// If the work was broken off, the next server shall take it up.
-    server_is_ending: bool,
+    output: J::Output,
+    /// The last report.
+    progress: J::Progress,
+    /// A job that was cancelled by the shutdown returns to the queue.
+    shutting_down: bool,
 }
 
-/// Works on queued jobs of a kind until the server ends.
+/// Claims and runs queued jobs of a kind until the server shuts down.
 async fn work<J: Job>(app: App, settings: Workers, shutdown: Shutdown) {
     let slots = Arc::new(Semaphore::new(settings.workers));
     let lease = Duration::from_secs(settings.lease_s.into());
@@ -110,32 +116,32 @@ async fn work<J: Job>(app: App, settings: Workers, shutdown: Shutdown) {
             Ok(Some(claim)) => {
                 let (app, ending) = (app.clone(), shutdown.clone());
                 shutdown.spawn(async move {
-                    carry_out(&app, claim, lease, &ending).await;
+                    run_to_end(&app, claim, lease, &ending).await;
                     drop(slot);
                 });
                 continue;
             }
             Ok(None) => {}
-            Err(error) => tracing::error!(%error, "cannot look for a {}", J::NAME),
+            Err(error) => tracing::error!(%error, "cannot claim a {}", J::NAME),
         }
         drop(slot);
         tokio::select! {
             () = shutdown.begun() => return,
-            () = J::bell(&app).notified() => {}
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = J::queue(&app).queued() => {}
+            () = tokio::time::sleep(POLL_INTERVAL) => {}
         }
     }
 }
 
-/// Carries out one claimed job to its end, whatever that is.
-async fn carry_out<J: Job>(app: &App, claim: Claim<J>, lease: Duration, shutdown: &Shutdown) {
-    let (id, camera, attempt) = (claim.job.id(), claim.job.camera(), claim.job.attempt());
+/// Runs one claimed job to its end, whatever that is.
+async fn run_to_end<J: Job>(app: &App, claim: Claim<J>, lease: Duration, shutdown: &Shutdown) {
+    let JobIdentity { id, camera, attempt } = claim.job.identity();
     let started = Instant::now();
     tracing::info!(job.id = %id, camera.id = %camera, attempt, "{} begins", J::NAME);
-    let state = match try_once(app, &claim, lease, shutdown).await {
+    let state = match run_attempt(app, &claim, lease, shutdown).await {
         Ok(Some(state)) => state,
         Ok(None) => {
-            tracing::warn!(job.id = %id, "{} was taken over by another worker, or deleted", J::NAME);
+            tracing::warn!(job.id = %id, "{} lost its lease to another worker, or was deleted", J::NAME);
             return;
         }
         Err(error) => {
@@ -145,56 +151,56 @@ async fn carry_out<J: Job>(app: &App, claim: Claim<J>, lease: Duration, shutdown
             };
             tracing::error!(job.id = %id, %error, "{} failed", J::NAME);
             if let Err(error) = J::fail(app, &claim, outcome).await {
-                // The lease runs out and the job is taken up again.
+                // The lease expires and the job is claimed again.
                 tracing::error!(job.id = %id, %error, "cannot record the failed {}", J::NAME);
             }
             JobState::Failed
         }
     };
     let time = started.elapsed();
-    J::count(&app.metrics, state, time);
+    J::metrics(&app.metrics).ended(state, time);
     let duration_s = time.as_secs_f64();
     tracing::info!(job.id = %id, state = state.as_str(), duration_s, "{} ends", J::NAME);
 }
 
-/// `None` if the fence was lost.
-async fn try_once<J: Job>(
+/// `None` if the lease was lost.
+async fn run_attempt<J: Job>(
     app: &App,
     claim: &Claim<J>,
     lease: Duration,
     shutdown: &Shutdown,
 ) -> Result<Option<JobState>> {
-    if claim.job.attempt() > MOST_ATTEMPTS {
-        let outcome = format!("given up: {MOST_ATTEMPTS} workers took it up and none came to its end");
+    if claim.job.identity().attempt > MAX_ATTEMPTS {
+        let outcome = format!("given up: {MAX_ATTEMPTS} workers claimed it and none came to its end");
         return J::fail(app, claim, outcome).await;
     }
-    let mut aside = Aside::begin(J::NAME, J::prepare(app, claim).await?).map_err(Error::fault)?;
+    let mut thread = JobThread::spawn(J::NAME, J::prepare(app, claim).await?).map_err(Error::fault)?;
     if claim.cancel_requested {
-        aside.cancel();
+        thread.cancel();
     }
-    let every = REPORT_EVERY.min(lease / 3);
-    let mut server_is_ending = false;
+    let every = HEARTBEAT_INTERVAL.min(lease / 3);
+    let mut shutting_down = false;
     loop {
         tokio::select! {
-            () = aside.ended() => break,
+            () = thread.ended() => break,
             () = tokio::time::sleep(every) => {}
-            () = shutdown.begun(), if !server_is_ending => {
-                server_is_ending = true;
-                aside.cancel();
+            () = shutdown.begun(), if !shutting_down => {
+                shutting_down = true;
+                thread.cancel();
             }
         }
-        match J::record(app, claim, aside.take_said(), lease).await? {
+        match J::record(app, claim, thread.take_progress(), lease).await? {
             Heartbeat::Continue => {}
-            Heartbeat::CancelRequested => aside.cancel(),
+            Heartbeat::CancelRequested => thread.cancel(),
             Heartbeat::Lost => return Ok(None),
         }
     }
-    let (yielded, said) = aside.finish().await;
-    let yielded = yielded.ok_or_else(|| Error::fault("the work's thread ended without a word"))?;
-    J::end(app, claim, Ended { yielded, said, server_is_ending }, lease).await
+    let (output, progress) = thread.join().await;
+    let output = output.ok_or_else(|| Error::fault("the job's thread panicked"))?;
+    J::end(app, claim, Ended { output, progress, shutting_down }, lease).await
 }
 
-/// Stored samples by time and target, the latest where there are too many.
+/// Stored samples by time and target; where there are too many, the latest.
 async fn load_samples(app: &App, camera: &CameraId, filter: &SampleFilter, most: u32) -> Result<Vec<Sample>> {
     let most = most as usize;
     let mut samples = Vec::new();

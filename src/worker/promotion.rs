@@ -1,71 +1,225 @@
 //! Whether a new model version becomes active by itself.
+//!
+//! Two versions are compared by their mean distance to the fixes of held-out samples, that is, samples
+//! predicted by a fit that had not seen them. With each version a sample of its held-out errors is stored,
+//! so a later version must hold its ground on what the earlier one was good at, whatever its own training
+//! samples are. Both versions of a comparison choose their samples by the same hash of time and target, so
+//! that a sample that both have trained on is in both choices or in none.
+
+use std::collections::{HashMap, HashSet};
+
+use jiff::Timestamp;
+use sha2::{Digest, Sha256};
 
 use crate::app::App;
-use crate::domain::{CameraId, ModelMetadata, Result, Sample};
+use crate::domain::{
+    BoundingBox, CameraId, HeldOutSampleError, ModelMetadata, Result, Sample, TargetId, TimeRange,
+};
+use crate::geo::Position;
 use crate::model::{Artifact, Regressor};
+use crate::store::StoredHeldOutError;
 
-/// The verdict and a sentence for the operator.
-pub(super) struct Verdict {
+/// Held-out errors that are stored with a version.
+const STORED_ERRORS: usize = 2_000;
+/// The mean distance on the active version's own held-out samples may grow by this factor, the scatter
+/// between two fits of the same camera.
+const TOLERANCE: f64 = 1.05;
+
+/// Whether to activate, and a sentence for the operator.
+pub(super) struct PromotionDecision {
     pub(super) activate: bool,
     pub(super) reason: String,
 }
 
-/// Compares a new version with the active one by their mean distance to fixes not trained on.
+/// A fitted model that asks for promotion.
+pub(super) struct Candidate<'a> {
+    pub(super) artifact: &'a Artifact,
+    /// Its training samples.
+    pub(super) samples: &'a [Sample],
+    /// Its held-out error on each of them.
+    pub(super) held_out: &'a [HeldOutSampleError],
+    /// The range of time that the run was asked to learn from.
+    pub(super) range: TimeRange,
+}
+
+/// Identity of a sample within its camera.
+type Key<'a> = (Timestamp, &'a TargetId);
+
+/// Sums of the distances of both versions over the same samples, m.
+#[derive(Default)]
+struct Comparison {
+    samples: f64,
+    new_m: f64,
+    active_m: f64,
+}
+
+impl Comparison {
+    fn add(&mut self, new_m: f64, active_m: f64) {
+        self.samples += 1.0;
+        self.new_m += new_m;
+        self.active_m += active_m;
+    }
+
+    /// Whether the new version is worse, by the means over all samples.
+    fn new_is_worse(&self, tolerance: f64) -> bool {
+        self.new_m > tolerance * self.active_m
+    }
+
+    /// Means in m: of the new version, then of the active one.
+    fn describe(&self, number: u32) -> String {
+        format!(
+            "{:.3} m from {} held-out fixes against {:.3} m of version {number}",
+            self.new_m / self.samples,
+            self.samples,
+            self.active_m / self.samples
+        )
+    }
+}
+
+/// The held-out errors to be stored with a version: those with the least hashes.
+pub(super) fn stored_errors(held_out: &[HeldOutSampleError]) -> Vec<HeldOutSampleError> {
+    let mut hashed: Vec<(u64, &HeldOutSampleError)> =
+        held_out.iter().map(|error| (hash_of((error.time, &error.target_id)), error)).collect();
+    hashed.sort_by_key(|(hash, _)| *hash);
+    hashed.into_iter().take(STORED_ERRORS).map(|(_, error)| error.clone()).collect()
+}
+
+fn hash_of((time, target_id): Key<'_>) -> u64 {
+    let mut hash = Sha256::new();
+    hash.update(time.as_microsecond().to_le_bytes());
+    hash.update(target_id.as_str());
+    let digest = hash.finalize();
+    u64::from_le_bytes(std::array::from_fn(|at| digest[at]))
+}
+
+/// Compares a new version with the active one.
 ///
-/// The active version's error is the larger of what it was held to when it was trained and what it
-/// shows on the new run's samples, so that a model of a camera that has been moved since gives way.
-pub(super) async fn judge(
-    app: &App,
-    id: &CameraId,
-    artifact: &Artifact,
-    samples: &[Sample],
-) -> Result<Verdict> {
+/// The new version must be no worse on the held-out samples of both together, repeated rows counted once,
+/// nor (but for [`TOLERANCE`]) on those of the active version alone. Only samples count that the run was
+/// asked to learn from and that the active version can be held to: after a camera was moved, those since.
+pub(super) async fn decide(app: &App, id: &CameraId, new: &Candidate<'_>) -> Result<PromotionDecision> {
     let camera = app.store.camera(id).await?;
     let Some(number) = camera.active_model else {
-        return Ok(Verdict { activate: true, reason: "became active: the camera had no model".to_owned() });
+        return Ok(activate("the camera had no model".to_owned()));
     };
-    let Some(new_m) = held_out_m(&artifact.metadata) else {
-        return Ok(keep(number, "the new version has no held-out error to compare".to_owned()));
+    let Some((active, _)) = app.registry.refresh_camera(&app.store, id).await?.model.clone() else {
+        return Ok(activate(format!("version {number} cannot be used")));
     };
-    let active = app.registry.refresh_camera(&app.store, id).await?.model.clone();
-    let recorded_m = held_out_m(&app.store.model(id, number).await?.metadata);
-    let seen_m = active.and_then(|(regressor, _)| mean_to_fix_m(&regressor, samples));
-    let Some(active_m) = [recorded_m, seen_m].into_iter().flatten().reduce(f64::max) else {
-        return Ok(Verdict {
-            activate: true,
-            reason: format!("became active: version {number} has no held-out error to compare"),
-        });
-    };
-    let compared = format!("held-out mean {new_m:.3} m against {active_m:.3} m of version {number}");
-    if new_m <= active_m {
-        Ok(Verdict { activate: true, reason: format!("became active: {compared}") })
+    let moved_at = app.store.camera_move(id, number).await?.map(|moved| moved.began_at);
+    let counts =
+        |time: Timestamp| new.range.contains(time) && moved_at.is_none_or(|moved_at| time >= moved_at);
+    let stored = app.store.held_out_errors(id, number).await?;
+    if stored.is_empty() {
+        let recorded = app.store.model(id, number).await?.metadata;
+        return Ok(against_recorded(number, new, &active, &recorded));
+    }
+    let own = on_active_samples(new, &stored, &counts)?;
+    let mut all = on_new_samples(new, &active, &stored, &counts);
+    (all.samples, all.new_m, all.active_m) =
+        (all.samples + own.samples, all.new_m + own.new_m, all.active_m + own.active_m);
+    Ok(if own.new_is_worse(TOLERANCE) {
+        keep(number, &format!("on the samples that it was held to, the new one is {}", own.describe(number)))
+    } else if all.new_is_worse(1.0) {
+        keep(number, &all.describe(number))
+    } else if all.samples == 0.0 {
+        activate(format!("version {number} has no held-out samples that count any more"))
     } else {
-        Ok(keep(number, compared))
+        activate(all.describe(number))
+    })
+}
+
+/// Both versions on the stored held-out samples of the active one. The new version's error there is its own
+/// held-out error where it has trained on the sample.
+fn on_active_samples(
+    new: &Candidate<'_>,
+    stored: &[StoredHeldOutError],
+    counts: &impl Fn(Timestamp) -> bool,
+) -> Result<Comparison> {
+    let regressor = new.artifact.load()?;
+    let held_out: HashMap<Key<'_>, f64> =
+        new.held_out.iter().map(|error| ((error.time, &error.target_id), error.distance_m)).collect();
+    let mut comparison = Comparison::default();
+    for StoredHeldOutError { error, sample } in stored {
+        let Some((bounding_box, position)) = sample else { continue };
+        if counts(error.time) {
+            let own_m = held_out.get(&(error.time, &error.target_id)).copied();
+            let new_m = own_m.unwrap_or_else(|| distance_m(&regressor, bounding_box, *position));
+            comparison.add(new_m, error.distance_m);
+        }
+    }
+    Ok(comparison)
+}
+
+/// Both versions on the new one's held-out samples that the active one has not trained on, repeated rows
+/// counted once.
+fn on_new_samples(
+    new: &Candidate<'_>,
+    active: &Regressor,
+    stored: &[StoredHeldOutError],
+    counts: &impl Fn(Timestamp) -> bool,
+) -> Comparison {
+    let trained_on: HashSet<Key<'_>> =
+        stored.iter().map(|stored| (stored.error.time, &stored.error.target_id)).collect();
+    // Beyond its greatest hash the active version may have trained on samples that were not stored.
+    let greatest = if stored.len() < STORED_ERRORS {
+        u64::MAX
+    } else {
+        trained_on.iter().map(|key| hash_of(*key)).max().unwrap_or(u64::MAX)
+    };
+    let samples: HashMap<Key<'_>, &Sample> =
+        new.samples.iter().map(|sample| ((sample.time, &sample.target_id), sample)).collect();
+    let mut seen = HashSet::new();
+    let mut comparison = Comparison::default();
+    for error in new.held_out {
+        let key = (error.time, &error.target_id);
+        let Some(sample) = samples.get(&key) else { continue };
+        if !counts(error.time) || trained_on.contains(&key) || hash_of(key) > greatest {
+            continue;
+        }
+        let (bounding_box, position) = (&sample.bounding_box, sample.fix.position);
+        if seen.insert(bits_of(bounding_box, position)) {
+            comparison.add(error.distance_m, distance_m(active, bounding_box, position));
+        }
+    }
+    comparison
+}
+
+/// Against a version without stored held-out errors (imported, or of an earlier release): its error is the
+/// larger of what its metadata state and what it shows on the new version's samples.
+fn against_recorded(
+    number: u32,
+    new: &Candidate<'_>,
+    active: &Regressor,
+    recorded: &ModelMetadata,
+) -> PromotionDecision {
+    let everything = on_new_samples(new, active, &[], &|_| true);
+    let recorded_m = recorded.held_out.as_ref().map_or(0.0, |held_out| held_out.mean_to_fix_m);
+    let active_m = everything.active_m.max(recorded_m * everything.samples);
+    let comparison = Comparison { active_m, ..everything };
+    if comparison.new_is_worse(1.0) {
+        keep(number, &comparison.describe(number))
+    } else {
+        activate(comparison.describe(number))
     }
 }
 
-fn keep(number: u32, why: String) -> Verdict {
-    Verdict {
-        activate: false,
-        reason: format!(
-            "version {number} stays active: {why}; activate the new one by hand if you know better"
-        ),
-    }
+fn activate(why: String) -> PromotionDecision {
+    PromotionDecision { activate: true, reason: format!("became active: {why}") }
 }
 
-fn held_out_m(metadata: &ModelMetadata) -> Option<f64> {
-    metadata.held_out.as_ref().map(|held_out| held_out.mean_to_fix_m)
+fn keep(number: u32, why: &str) -> PromotionDecision {
+    let reason =
+        format!("version {number} stays active: {why}; activate the new one by hand if it is the better");
+    PromotionDecision { activate: false, reason }
 }
 
-fn mean_to_fix_m(regressor: &Regressor, samples: &[Sample]) -> Option<f64> {
-    let plane = regressor.plane();
-    let sum: f64 = samples
-        .iter()
-        .map(|sample| {
-            let fix = plane.to_plane(sample.fix.position);
-            // From the box alone, as held-out errors are measured.
-            regressor.regress(&sample.bounding_box, None).regressed.distance_m(fix)
-        })
-        .sum();
-    (!samples.is_empty()).then(|| sum / samples.len() as f64)
+/// From the box alone, as held-out errors are measured.
+fn distance_m(regressor: &Regressor, bounding_box: &BoundingBox, position: Position) -> f64 {
+    let fix = regressor.plane().to_plane(position);
+    regressor.regress(bounding_box, None).regressed.distance_m(fix)
+}
+
+fn bits_of(bounding_box: &BoundingBox, position: Position) -> [u64; 6] {
+    let [left, top, width, height] = bounding_box.sides_px();
+    [left, top, width, height, position.longitude_deg(), position.latitude_deg()].map(f64::to_bits)
 }

@@ -1,20 +1,20 @@
-//! Training runs as jobs: what a fit needs, says and yields.
+//! Training runs as jobs: their samples, the fit on a thread, and the model version that it gives.
 
 use std::time::Duration;
 
-use tokio::sync::Notify;
-use uuid::Uuid;
-
-use super::aside::{Said, Voice};
-use super::{Ended, Job, Work, load_samples, promotion};
-use crate::app::App;
-use crate::domain::{CameraId, EpochReport, Error, JobState, Result, RunProgress, Sample, TrainingRun};
+use super::job_thread::{Progress, ProgressSink};
+use super::promotion::{self, Candidate};
+use super::{Ended, Job, JobIdentity, Work, load_samples};
+use crate::app::{App, JobQueue};
+use crate::domain::{
+    EpochReport, Error, HeldOutSampleError, JobState, Result, RunProgress, Sample, TimeRange, TrainingRun,
+};
 use crate::fusion::track::TrackSettings;
 use crate::model::{self, Artifact, FitError, FitEvent, FitOptions};
-use crate::store::{Claim, Heartbeat, NewModel, RunEnd, SampleFilter};
-use crate::telemetry::Metrics;
+use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput, SampleFilter};
+use crate::telemetry::{JobMetrics, Metrics};
 
-/// What a fit has said since it was asked last.
+/// What a fit has reported since the last look.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Update {
     progress: RunProgress,
@@ -22,42 +22,40 @@ pub(super) struct Update {
     notes: Vec<String>,
 }
 
-impl Said for Update {
+impl Progress for Update {
     fn take(&mut self) -> Self {
         let progress = self.progress.clone();
         std::mem::replace(self, Self { progress, ..Self::default() })
     }
 }
 
-/// What a fit yielded, and from which samples.
+/// How a fit ended, and its samples in the order of target and time.
 pub(super) struct Fitted {
-    outcome: std::result::Result<Artifact, FitError>,
+    outcome: std::result::Result<Model, FitError>,
     samples: Vec<Sample>,
+}
+
+/// A fitted model, and its held-out error on each sample.
+struct Model {
+    artifact: Artifact,
+    held_out: Vec<HeldOutSampleError>,
 }
 
 impl Job for TrainingRun {
     const NAME: &'static str = "training run";
-    type Said = Update;
-    type Yield = Fitted;
+    type Progress = Update;
+    type Output = Fitted;
 
-    fn id(&self) -> Uuid {
-        self.id.0
+    fn identity(&self) -> JobIdentity<'_> {
+        JobIdentity { id: self.id.0, camera: &self.camera_id, attempt: self.attempt }
     }
 
-    fn camera(&self) -> &CameraId {
-        &self.camera_id
+    fn queue(app: &App) -> &JobQueue {
+        &app.training_queue
     }
 
-    fn attempt(&self) -> u32 {
-        self.attempt
-    }
-
-    fn bell(app: &App) -> &Notify {
-        &app.run_queued
-    }
-
-    fn count(metrics: &Metrics, state: JobState, time: Duration) {
-        metrics.training_runs.ended(state, time);
+    fn metrics(metrics: &Metrics) -> &JobMetrics {
+        &metrics.training_runs
     }
 
     async fn claim(app: &App, lease: Duration) -> Result<Option<Claim<Self>>> {
@@ -68,7 +66,7 @@ impl Job for TrainingRun {
         let run = &claim.job;
         let camera = app.store.camera(&run.camera_id).await?;
         let filter = SampleFilter { from: run.options.from, until: run.options.until, target_id: None };
-        let samples = load_samples(app, &run.camera_id, &filter, app.limits.samples_per_run).await?;
+        let mut samples = load_samples(app, &run.camera_id, &filter, app.limits.samples_per_run).await?;
         let options = FitOptions {
             recipe: run.options.recipe,
             seed: run.options.seed,
@@ -78,22 +76,31 @@ impl Job for TrainingRun {
         };
         let line = format!("{} samples, recipe {}, seed {}", samples.len(), options.recipe, options.seed);
         app.store.append_log(run.id, claim.fence, app.clock.now(), &line).await?;
-        Ok(Box::new(move |voice| {
-            let outcome = model::fit(&samples, &options, &mut |event| hear(voice, event));
-            let outcome = outcome.and_then(|artifact| with_track_beliefs(artifact, &samples));
+        Ok(Box::new(move |sink| {
+            let mut distances_m = Vec::new();
+            let fitted = model::fit(&samples, &options, &mut |event| {
+                if let FitEvent::HeldOut(distances) = event {
+                    distances_m = distances.to_vec();
+                }
+                report(sink, event)
+            });
+            let fitted = fitted.and_then(|artifact| with_track_noise(artifact, &samples));
+            samples.sort_by(|one, other| (&one.target_id, one.time).cmp(&(&other.target_id, other.time)));
+            let outcome =
+                fitted.map(|artifact| Model { artifact, held_out: errors_of(&samples, &distances_m) });
             Fitted { outcome, samples }
         }))
     }
 
-    async fn record(app: &App, claim: &Claim<Self>, said: Update, lease: Duration) -> Result<Heartbeat> {
+    async fn record(app: &App, claim: &Claim<Self>, progress: Update, lease: Duration) -> Result<Heartbeat> {
         let (run, now) = (claim.job.id, app.clock.now());
-        if !said.epochs.is_empty() {
-            app.store.append_epochs(run, claim.fence, &said.epochs).await?;
+        if !progress.epochs.is_empty() {
+            app.store.append_epochs(run, claim.fence, &progress.epochs).await?;
         }
-        for note in &said.notes {
+        for note in &progress.notes {
             app.store.append_log(run, claim.fence, now, note).await?;
         }
-        app.store.heartbeat(run, claim.fence, &said.progress, lease, now).await
+        app.store.heartbeat_run(run, claim.fence, &progress.progress, lease, now).await
     }
 
     async fn end(
@@ -102,24 +109,24 @@ impl Job for TrainingRun {
         ended: Ended<Self>,
         lease: Duration,
     ) -> Result<Option<JobState>> {
-        let Ended { yielded: Fitted { outcome, samples }, mut said, server_is_ending } = ended;
+        let Ended { output: Fitted { outcome, samples }, mut progress, shutting_down } = ended;
         if outcome.is_ok() {
-            // A recipe may skip what it had counted on: a kept candidate without a network, say.
-            said.progress.epoch = said.progress.epochs;
-            said.progress.remaining_s = Some(0.0);
+            // A recipe may do less than planned: the chosen candidate has no network, for one.
+            progress.progress.epoch = progress.progress.epochs;
+            progress.progress.remaining_s = Some(0.0);
         }
-        if matches!(Self::record(app, claim, said, lease).await?, Heartbeat::Lost) {
+        if matches!(Self::record(app, claim, progress, lease).await?, Heartbeat::Lost) {
             return Ok(None);
         }
         match outcome {
-            Ok(artifact) => succeed(app, claim, &artifact, &samples).await,
-            Err(FitError::Cancelled) if server_is_ending => {
-                leave(app, claim, "the server ends; the run waits", RunEnd::Requeue).await
+            Ok(model) => succeed(app, claim, &model, &samples).await,
+            Err(FitError::Cancelled) if shutting_down => {
+                finish(app, claim, "returned to the queue: the server shuts down", RunEnd::Requeue).await
             }
-            Err(FitError::Cancelled) => leave(app, claim, "cancelled", RunEnd::Cancelled).await,
+            Err(FitError::Cancelled) => finish(app, claim, "cancelled", RunEnd::Cancelled).await,
             Err(FitError::Unusable(error)) => {
                 let outcome = error.to_string();
-                leave(app, claim, &outcome.clone(), RunEnd::Failed { outcome }).await
+                finish(app, claim, &outcome.clone(), RunEnd::Failed { outcome }).await
             }
             Err(FitError::Fault(error)) => Err(Error::fault(error)),
         }
@@ -132,21 +139,37 @@ impl Job for TrainingRun {
     }
 }
 
-/// The model with what its samples tell of how errors stay, for the tracks that it will serve.
-fn with_track_beliefs(mut artifact: Artifact, samples: &[Sample]) -> std::result::Result<Artifact, FitError> {
-    let regressor = artifact.load().map_err(|error| FitError::Fault(error.into()))?;
-    let settings = TrackSettings::learn(samples, &regressor);
-    settings.beliefs().write(&mut artifact.metadata.parameters);
+/// The model with the noise parameters that its samples show, for the tracks that it will serve.
+///
+/// # Errors
+/// `Unusable` where the fitted model does not pass the checks of every loaded model.
+fn with_track_noise(mut artifact: Artifact, samples: &[Sample]) -> std::result::Result<Artifact, FitError> {
+    let regressor = artifact.load().map_err(FitError::Unusable)?;
+    let settings = TrackSettings::estimate(samples, &regressor);
+    settings.noise_model().write(&mut artifact.metadata.parameters);
     Ok(artifact)
 }
 
-fn hear(voice: &Voice<Update>, event: FitEvent<'_>) -> std::ops::ControlFlow<()> {
-    voice.say(|update| match event {
+/// Pairs samples in the order of target and time with their distances, m.
+fn errors_of(samples: &[Sample], distances_m: &[f64]) -> Vec<HeldOutSampleError> {
+    let pairs = samples.iter().zip(distances_m);
+    pairs
+        .map(|(sample, distance_m)| HeldOutSampleError {
+            time: sample.time,
+            target_id: sample.target_id.clone(),
+            distance_m: *distance_m,
+        })
+        .collect()
+}
+
+fn report(sink: &ProgressSink<Update>, event: FitEvent<'_>) -> std::ops::ControlFlow<()> {
+    sink.update(|update| match event {
         FitEvent::Progress(progress) => {
             update.progress.clone_from(progress);
-            update.progress.remaining_s = voice.remaining_s(progress.epoch, progress.epochs);
+            update.progress.remaining_s = sink.remaining_s(progress.epoch, progress.epochs);
         }
         FitEvent::Epoch(report) => update.epochs.push(*report),
+        FitEvent::HeldOut(_) => {}
         FitEvent::Note(line) => update.notes.push(line.to_owned()),
     })
 }
@@ -154,23 +177,26 @@ fn hear(voice: &Voice<Update>, event: FitEvent<'_>) -> std::ops::ControlFlow<()>
 async fn succeed(
     app: &App,
     claim: &Claim<TrainingRun>,
-    artifact: &Artifact,
+    Model { artifact, held_out }: &Model,
     samples: &[Sample],
 ) -> Result<Option<JobState>> {
-    let camera = &claim.job.camera_id;
-    let verdict = promotion::judge(app, camera, artifact, samples).await?;
-    let yielded =
-        NewModel { metadata: &artifact.metadata, weights: &artifact.weights, activate: verdict.activate };
-    let end = RunEnd::Succeeded { yielded, outcome: Some(verdict.reason.clone()) };
-    let ended = leave(app, claim, &verdict.reason, end).await?;
-    if verdict.activate && ended.is_some() {
-        app.registry.refresh_camera(&app.store, camera).await?;
+    let TrainingRun { camera_id, options, .. } = &claim.job;
+    let range = TimeRange::new(options.from, options.until)?;
+    let candidate = Candidate { artifact, samples, held_out, range };
+    let decision = promotion::decide(app, camera_id, &candidate).await?;
+    let stored = promotion::stored_errors(held_out);
+    let model = NewModel { metadata: &artifact.metadata, weights: &artifact.weights, held_out: &stored };
+    let output = RunOutput { model, activate: decision.activate };
+    let end = RunEnd::Succeeded { output, outcome: Some(decision.reason.clone()) };
+    let ended = finish(app, claim, &decision.reason, end).await?;
+    if decision.activate && ended.is_some() {
+        app.registry.refresh_camera(&app.store, camera_id).await?;
     }
     Ok(ended)
 }
 
 /// Ends the run with a line in its log.
-async fn leave(
+async fn finish(
     app: &App,
     claim: &Claim<TrainingRun>,
     line: &str,

@@ -1,4 +1,4 @@
-//! `/v1/evaluations` through the real binary: the figures of the command line, and `kill -9`.
+//! `/v1/evaluations` through the real binary: the same figures as the command line, and SIGKILL.
 
 use std::time::Duration;
 
@@ -10,10 +10,10 @@ use crate::harness::{TestServer, data_folder, run};
 
 const SIGMA_M: f64 = 2.2;
 
-/// A square with its truth: what to learn from, and a week later what to be judged on.
+/// Training and test world of a square with truth, a week apart.
 fn square(train: usize, test: usize) -> (World, World) {
-    let learnt = Options { samples: train, ..Options::new(Scene::Square) };
-    (simulate(&learnt), simulate(&learnt.test(test)))
+    let options = Options { samples: train, ..Options::new(Scene::Square) };
+    (simulate(&options), simulate(&options.test(test)))
 }
 
 fn csv(world: &World) -> String {
@@ -29,7 +29,7 @@ async fn import(server: &TestServer, csv: String) {
 }
 
 /// The camera `square` with all samples of both worlds.
-async fn teach(server: &TestServer, train: &World, test: &World) {
+async fn create_camera(server: &TestServer, train: &World, test: &World) {
     let size = train.image_size;
     let profile = json!({
         "id": "square",
@@ -41,24 +41,24 @@ async fn teach(server: &TestServer, train: &World, test: &World) {
     import(server, csv(test)).await;
 }
 
-/// Waits until an evaluation is as wished.
-async fn until(server: &TestServer, path: &str, wished: impl Fn(&Value) -> bool) -> Value {
+/// Waits until an evaluation satisfies a condition.
+async fn until(server: &TestServer, path: &str, condition: impl Fn(&Value) -> bool) -> Value {
     for _ in 0..1_200 {
         let seen = server.get(path).await.expect(200).json();
-        if wished(&seen) {
+        if condition(&seen) {
             return seen;
         }
         assert!(!has_ended(&seen), "{seen}");
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
-    panic!("the evaluation does not come on")
+    panic!("the evaluation makes no progress")
 }
 
 fn has_ended(evaluation: &Value) -> bool {
     !matches!(evaluation["state"].as_str(), Some("queued" | "running"))
 }
 
-/// Its worker has told what it does.
+/// Whether its worker has reported a phase.
 fn runs(evaluation: &Value) -> bool {
     evaluation["progress"]["phase"].as_str().is_some_and(|phase| !phase.is_empty())
 }
@@ -76,11 +76,11 @@ async fn rest_and_command_line_give_the_same_figures() {
     let files = ["--train", &train_file, "--test", &test_file, "--json", &json_file];
     let options = ["--image-size", &size, "--gnss-sigma-m", "2.2", "--methods", methods, "--seeds", "2"];
     run(&[&["evaluate"][..], &files, &options, &["--box-shift-px", "3.5"]].concat());
-    let told: Value =
+    let printed_report: Value =
         serde_json::from_str(&std::fs::read_to_string(json_file).expect("was written")).expect("JSON");
 
     let server = TestServer::start(&folder.path().join("data"));
-    teach(&server, &train, &test).await;
+    create_camera(&server, &train, &test).await;
     let begin = test.rows.iter().map(|row| row.time).min().expect("rows").to_string();
     let asked = json!({
         "camera_id": "square",
@@ -96,14 +96,14 @@ async fn rest_and_command_line_give_the_same_figures() {
     assert_eq!(ended["progress"]["steps_done"], 2 * (1 + 7), "one fit and seven methods: {ended}");
 
     let reported = ended["report"]["methods"].as_object().expect("figures");
-    let printed = told["methods"].as_object().expect("figures");
+    let printed = printed_report["methods"].as_object().expect("figures");
     assert_eq!(reported.len(), 7, "{ended}");
     assert_eq!(reported.keys().collect::<Vec<_>>(), printed.keys().collect::<Vec<_>>());
     for (name, method) in printed {
         let tested = test.training_samples().len();
         assert_eq!(method["n"], tested, "{name}: {method}");
         for (figure, value) in method.as_object().expect("an object") {
-            // Only what the clock tells may differ.
+            // Only durations may differ.
             if !matches!(figure.as_str(), "train_cpu_s" | "fuse_us") {
                 assert_eq!(reported[name][figure], *value, "{name}.{figure}");
             }
@@ -120,12 +120,12 @@ async fn rest_and_command_line_give_the_same_figures() {
 }
 
 #[tokio::test]
-async fn an_evaluation_is_taken_up_again_after_a_kill() {
+async fn an_evaluation_is_resumed_after_a_kill() {
     let folder = data_folder();
     let short_lease = [("SIGHTFIX_EVALUATION__LEASE_S", "3")];
     let server = TestServer::start_with(folder.path(), &short_lease);
     let (train, test) = square(400, 60);
-    teach(&server, &train, &test).await;
+    create_camera(&server, &train, &test).await;
     let asked = json!({"camera_id": "square", "methods": ["gnss", "hybrid.denied"], "seeds": 4});
     let queued = server.post("/v1/evaluations", &asked).await.expect(202);
     let path = queued.header("location").to_owned();
@@ -138,16 +138,16 @@ async fn an_evaluation_is_taken_up_again_after_a_kill() {
     let ended = until(&server, &path, has_ended).await;
     assert_eq!((&ended["state"], &ended["attempt"]), (&json!("succeeded"), &json!(2)), "{ended}");
     let means = ended["report"]["methods"]["hybrid.denied"]["seed_means_m"].as_array().expect("means");
-    assert_eq!(means.len(), 4, "all seeds anew: {ended}");
+    assert_eq!(means.len(), 4, "all seeds again: {ended}");
 }
 
 #[tokio::test]
-async fn a_running_evaluation_is_cancelled_put_back_and_deleted() {
+async fn a_running_evaluation_is_cancelled_requeued_and_deleted() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
     let (train, test) = square(600, 60);
-    teach(&server, &train, &test).await;
-    // Long enough to be met while it runs.
+    create_camera(&server, &train, &test).await;
+    // Long enough to be observed while it runs.
     let asked = json!({"camera_id": "square", "methods": ["auto.denied"], "seeds": 20});
     let start = async |server: &TestServer| {
         let queued = server.post("/v1/evaluations", &asked).await.expect(202);
@@ -162,7 +162,7 @@ async fn a_running_evaluation_is_cancelled_put_back_and_deleted() {
 
     let path = start(&server).await;
     until(&server, &path, runs).await;
-    assert!(server.terminate(), "the server ends in order");
+    assert!(server.terminate(), "the server exits successfully");
     let server = TestServer::start(folder.path());
     let again = until(&server, &path, |seen| seen["attempt"] == 2 && runs(seen)).await;
     assert_eq!(again["state"], "running", "{again}");

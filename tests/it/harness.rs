@@ -1,10 +1,11 @@
-//! A real server: the binary, a data folder of its own, a port of the system's choice.
+//! Runs the real binary: a server with its own data folder on a free port, or a command.
 
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicU16, Ordering};
+use std::sync::{Arc, Mutex};
 
 use http_body_util::{BodyExt as _, Full};
 use hyper::body::{Bytes, Incoming};
@@ -15,14 +16,14 @@ use hyper_util::rt::TokioExecutor;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// The binary, ready to be given arguments.
+/// A command of the binary, without arguments.
 pub(crate) fn sightfix() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sightfix"));
     command.env_remove("SIGHTFIX_DATA").env_remove("SIGHTFIX_LISTEN").current_dir(std::env::temp_dir());
     command
 }
 
-/// Runs the binary to its end; gives standard output.
+/// Runs the binary to completion; returns standard output.
 pub(crate) fn run(arguments: &[&str]) -> String {
     let output = sightfix().args(arguments).output().expect("the binary runs");
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -35,9 +36,10 @@ pub(crate) struct TestServer {
     process: Child,
     pub(crate) address: SocketAddr,
     client: Client<HttpConnector, Full<Bytes>>,
+    log: Arc<Mutex<Vec<Value>>>,
 }
 
-/// A whole answer.
+/// A complete response.
 pub(crate) struct Answer {
     pub(crate) status: StatusCode,
     pub(crate) headers: HeaderMap,
@@ -57,7 +59,7 @@ impl Answer {
         self.headers.get(name).unwrap_or_else(|| panic!("no header {name}")).to_str().expect("visible ASCII")
     }
 
-    /// The same answer, if its status is the expected one.
+    /// Asserts the status and returns the response.
     #[track_caller]
     pub(crate) fn expect(self, status: u16) -> Self {
         assert_eq!(self.status.as_u16(), status, "{}", self.text());
@@ -66,12 +68,12 @@ impl Answer {
 }
 
 impl TestServer {
-    /// Starts over a data folder.
+    /// Starts a server on a data folder.
     pub(crate) fn start(folder: &Path) -> Self {
         Self::start_with(folder, &[])
     }
 
-    /// Starts over a data folder with settings from the environment.
+    /// Starts a server with settings from the environment.
     pub(crate) fn start_with(folder: &Path, settings: &[(&str, &str)]) -> Self {
         let mut command = sightfix();
         command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
@@ -79,7 +81,7 @@ impl TestServer {
         Self::run(command)
     }
 
-    /// Starts over a data folder at an address of [`own_address`], so that it can be started there again.
+    /// Starts a server at an address of [`own_address`], so that it can be restarted there.
     pub(crate) fn start_at(folder: &Path, address: SocketAddr) -> Self {
         let mut command = sightfix();
         command.args(["serve", "--listen", &address.to_string(), "--data"]).arg(folder);
@@ -87,62 +89,87 @@ impl TestServer {
         Self::run(command)
     }
 
-    /// Starts the demonstration over an empty folder; gives what it prints once it answers.
+    /// Starts the demonstration on an empty folder; returns what it prints once it is ready.
     pub(crate) fn demonstrate(folder: &Path) -> (Self, String) {
         let mut command = sightfix();
         command.args(["serve", "--demo", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
         command.stdout(Stdio::piped());
         let mut server = Self::run(command);
         let lines = BufReader::new(server.process.stdout.take().expect("piped")).lines();
-        let mut said = String::new();
+        let mut printed = String::new();
         for line in lines.map_while(Result::ok) {
-            said.push_str(&line);
-            said.push('\n');
+            printed.push_str(&line);
+            printed.push('\n');
             if line.trim_end().ends_with("/docs") {
                 break;
             }
         }
-        (server, said)
+        (server, printed)
     }
 
-    fn run(mut command: Command) -> Self {
+    /// Starts a command that ends up as a server, and waits until it listens.
+    pub(crate) fn run(mut command: Command) -> Self {
         let command = command.env("SIGHTFIX_LOG_FORMAT", "json").stderr(Stdio::piped());
         let mut process = command.spawn().expect("the binary starts");
         let mut lines = BufReader::new(process.stderr.take().expect("piped")).lines();
         let mut address = None;
+        let log = Arc::new(Mutex::new(Vec::new()));
         for line in lines.by_ref() {
             let line = line.expect("UTF-8");
             let entry: Value =
-                serde_json::from_str(&line).unwrap_or_else(|_| panic!("the server says: {line}"));
-            if let Some(told) = entry["address"].as_str() {
-                address = Some(told.parse().expect("an address"));
+                serde_json::from_str(&line).unwrap_or_else(|_| panic!("not a JSON log line: {line}"));
+            if let Some(text) = entry["address"].as_str() {
+                address = Some(text.parse().expect("an address"));
                 break;
             }
+            log.lock().expect("no panic").push(entry);
         }
-        // Read on, or the server's log would fill the pipe and halt it.
-        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
+        // Keep reading: a full pipe would block the server.
+        let rest = log.clone();
+        std::thread::spawn(move || {
+            for line in lines.map_while(Result::ok) {
+                rest.lock().expect("no panic").extend(serde_json::from_str::<Value>(&line).ok());
+            }
+        });
         let client = Client::builder(TokioExecutor::new()).build_http();
-        Self { process, address: address.expect("the server tells its address"), client }
+        Self { process, address: address.expect("the server logs its address"), client, log }
+    }
+
+    /// Entries of the server's log, as text, that contain a text.
+    pub(crate) fn log_lines(&self, text: &str) -> Vec<String> {
+        let log = self.log.lock().expect("no panic");
+        log.iter().map(Value::to_string).filter(|line| line.contains(text)).collect()
+    }
+
+    /// Waits until the log has an entry of which this is true, and returns it.
+    pub(crate) async fn logged(&self, is_wanted: impl Fn(&Value) -> bool) -> Value {
+        loop {
+            let found = self.log.lock().expect("no panic").iter().find(|entry| is_wanted(entry)).cloned();
+            match found {
+                Some(entry) => return entry,
+                None => tokio::time::sleep(std::time::Duration::from_millis(50)).await,
+            }
+        }
     }
 
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
     }
 
-    /// `kill -9`.
+    /// Kills the process with SIGKILL.
     pub(crate) fn kill(mut self) {
         self.process.kill().expect("the server can be killed");
         self.process.wait().expect("the server is gone");
     }
 
-    /// Asks the server to end and waits; gives whether it ended well.
+    /// Sends SIGTERM and waits; returns whether the server exited successfully.
     pub(crate) fn terminate(mut self) -> bool {
         let pid = self.process.id().to_string();
         assert!(Command::new("kill").args(["-TERM", &pid]).status().expect("kill runs").success());
         self.process.wait().expect("the server ends").success()
     }
 
-    /// Sends a request; the answer's body is still to come.
+    /// Sends a request; returns the response with an unread body.
     pub(crate) async fn open(
         &self,
         method: &str,
@@ -158,7 +185,7 @@ impl TestServer {
         self.client.request(request).await.expect("an answer")
     }
 
-    /// Sends a request and reads the whole answer.
+    /// Sends a request and reads the complete response.
     pub(crate) async fn send(
         &self,
         method: &str,
@@ -179,7 +206,7 @@ impl TestServer {
         self.send("POST", path, &[("content-type", "application/json")], body.to_string()).await
     }
 
-    /// Starts a training run and waits until it has ended; gives its last state.
+    /// Starts a training run and waits until it has ended; returns its final state.
     pub(crate) async fn train(&self, camera: &str, request: &Value) -> Value {
         let started = self.post(&format!("/v1/cameras/{camera}/training-runs"), request).await.expect(202);
         let path = started.header("location").to_owned();
@@ -200,8 +227,8 @@ impl Drop for TestServer {
     }
 }
 
-/// An address for one server after another. Below the ports that systems give to clients, so that
-/// none of those takes it while no server is there.
+/// An address for a sequence of servers. It is below the range of ephemeral ports, so that no client
+/// socket takes it while no server is running.
 pub(crate) fn own_address() -> SocketAddr {
     static GIVEN: AtomicU16 = AtomicU16::new(0);
     let first = 20_000 + (std::process::id() % 10_000) as u16;
@@ -218,14 +245,12 @@ pub(crate) fn data_folder() -> TempDir {
     tempfile::tempdir().expect("a folder")
 }
 
-/// A file of the real square, or `None` with a printed reason.
-pub(crate) fn shared(name: &str) -> Option<PathBuf> {
+/// Path of a file of the real square. Tests that use it are ignored by default; their names contain
+/// `shared`, so that a filter selects exactly them.
+pub(crate) fn shared(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    println!("skipped: {} is not there", path.display());
-    None
+    assert!(path.exists(), "{} does not exist", path.display());
+    path
 }
 
 /// Samples of a small simulated square, as CSV.

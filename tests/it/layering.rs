@@ -1,12 +1,15 @@
-//! Holds the floors and the library walls that docs/architecture.md draws.
+//! Checks the layers and library boundaries of docs/architecture.md on the source text.
+
+mod imports;
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::path::{Path, PathBuf};
 
-/// A module imports only from modules of a lower number; those of one number do not know each other.
-const FLOORS: &[(&str, u32)] = &[
+use self::imports::{SourceFile, circle, imports_within_modules, source_files};
+
+/// The layer of each module. A module imports only from modules of lower layers.
+const LAYERS: &[(&str, u32)] = &[
     ("geo", 0),
+    ("statistics", 0),
     ("domain", 1),
     ("clock", 2),
     ("config", 2),
@@ -20,6 +23,7 @@ const FLOORS: &[(&str, u32)] = &[
     ("simulation", 4),
     ("evaluation", 5),
     ("app", 6),
+    ("paper_experiments", 6),
     ("worker", 7),
     ("status", 7),
     ("http", 8),
@@ -29,8 +33,8 @@ const FLOORS: &[(&str, u32)] = &[
     ("cli", 10),
 ];
 
-/// A library is named only in these modules.
-const WALLS: &[(&str, &[&str])] = &[
+/// The modules that may use a library.
+const LIBRARIES: &[(&str, &[&str])] = &[
     ("candle_core", &["model"]),
     ("candle_nn", &["model"]),
     ("sqlx", &["store"]),
@@ -50,94 +54,72 @@ const WALLS: &[(&str, &[&str])] = &[
     ("metrics_exporter_prometheus", &["telemetry"]),
 ];
 
-struct Source {
-    path: PathBuf,
-    module: String,
-    text: String,
+/// Whether a text uses a library by the path `library::`.
+fn uses(text: &str, library: &str) -> bool {
+    text.match_indices(&format!("{library}::"))
+        .any(|(at, _)| !text[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == ':'))
 }
 
-fn sources() -> Vec<Source> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    let mut folders = vec![root.clone()];
-    let mut sources = Vec::new();
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).expect("src can be read") {
-            let path = entry.expect("an entry can be read").path();
-            if path.is_dir() {
-                folders.push(path);
-            } else if path.extension().is_some_and(|extension| extension == "rs") {
-                let below = path.strip_prefix(&root).expect("below src");
-                let first = below.components().next().expect("a name").as_os_str().to_string_lossy();
-                let module = first.trim_end_matches(".rs").to_owned();
-                let text = without_tests(&path, fs::read_to_string(&path).expect("source can be read"));
-                sources.push(Source { path, module, text });
-            }
-        }
-    }
-    sources
-}
-
-/// Unit tests may look upwards: a filter is tried on a simulation.
-fn without_tests(path: &Path, text: String) -> String {
-    if path.components().any(|part| matches!(part.as_os_str().to_str(), Some("tests" | "tests.rs"))) {
-        return String::new();
-    }
-    match text.find("\n#[cfg(test)]\nmod tests {") {
-        Some(end) => text[..end].to_owned(),
-        None => text,
-    }
-}
-
-/// Names after `crate::` outside of comments, with their lines.
-fn imports(text: &str) -> impl Iterator<Item = (usize, &str)> {
-    text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with("//")).flat_map(
-        |(number, line)| {
-            line.match_indices("crate::").map(move |(at, found)| {
-                let rest = &line[at + found.len()..];
-                let end = rest.find(|c: char| !c.is_alphanumeric() && c != '_').unwrap_or(rest.len());
-                (number + 1, &rest[..end])
-            })
-        },
-    )
+/// Names after `crate::`, with their lines.
+fn imported_modules(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines().enumerate().flat_map(|(number, line)| {
+        line.match_indices("crate::").map(move |(at, found)| {
+            let rest = &line[at + found.len()..];
+            let end = rest.find(|c: char| !c.is_alphanumeric() && c != '_').unwrap_or(rest.len());
+            (number + 1, &rest[..end])
+        })
+    })
 }
 
 #[test]
-fn every_module_stands_on_a_floor_and_imports_only_from_below() {
-    let floors: BTreeMap<_, _> = FLOORS.iter().copied().collect();
+fn every_module_has_a_layer_and_imports_only_from_lower_ones() {
+    let layers: BTreeMap<_, _> = LAYERS.iter().copied().collect();
     let mut wrong = Vec::new();
-    for source in sources() {
-        if matches!(source.module.as_str(), "lib" | "main") {
+    for SourceFile { path, text, module } in &source_files() {
+        let module = module.first().map_or("", String::as_str);
+        if matches!(module, "lib" | "main") {
             continue;
         }
-        let Some(floor) = floors.get(source.module.as_str()) else {
-            wrong.push(format!("{}: the module stands on no floor", source.path.display()));
+        let path = path.display();
+        let Some(layer) = layers.get(module) else {
+            wrong.push(format!("{path}: the module has no layer"));
             continue;
         };
-        for (line, name) in imports(&source.text) {
-            let Some(below) = floors.get(name) else { continue };
-            if name != source.module && below >= floor {
-                wrong.push(format!("{}:{line}: {} imports {name}", source.path.display(), source.module));
+        for (line, name) in imported_modules(text) {
+            let Some(imported) = layers.get(name) else { continue };
+            if name != module && imported >= layer {
+                wrong.push(format!("{path}:{line}: {module} imports {name}"));
             }
         }
-        if source.text.contains("use crate::{") && source.module != "server" {
-            wrong.push(format!("{}: write one `use crate::module` a line", source.path.display()));
+        if text.contains("use crate::{") && module != "server" {
+            wrong.push(format!("{path}: write one `use crate::module` a line"));
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
 #[test]
-fn each_library_stays_behind_its_wall() {
+fn the_files_of_a_module_import_each_other_without_circles() {
+    let files = source_files();
+    let imports = imports_within_modules(&files);
+    // The parser is of use only if it finds imports at all.
+    let count: usize = imports.iter().map(|imports| imports.len()).sum();
+    assert!(count > files.len(), "{count} imports of {} files", files.len());
+    let circle = circle(&imports).map(|circle| {
+        let names: Vec<String> =
+            circle.iter().map(|index| files[*index].path.display().to_string()).collect();
+        names.join(" -> ")
+    });
+    assert_eq!(circle, None);
+}
+
+#[test]
+fn each_library_is_used_only_by_its_modules() {
     let mut wrong = Vec::new();
-    for source in sources() {
-        for (library, modules) in WALLS {
-            let named = source.text.lines().filter(|line| !line.trim_start().starts_with("//")).any(|line| {
-                line.match_indices(&format!("{library}::")).any(|(at, _)| {
-                    !line[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == ':')
-                })
-            });
-            if named && !modules.contains(&source.module.as_str()) {
-                wrong.push(format!("{}: names {library}", source.path.display()));
+    for file in source_files() {
+        for (library, modules) in LIBRARIES {
+            if uses(&file.text, library) && !modules.contains(&file.top_level()) {
+                wrong.push(format!("{}: uses {library}", file.path.display()));
             }
         }
     }
@@ -145,16 +127,16 @@ fn each_library_stays_behind_its_wall() {
 }
 
 #[test]
-fn statuses_are_written_in_one_place() {
-    let allowed = ["status"];
-    for source in sources() {
-        let named = source.text.lines().filter(|line| !line.trim_start().starts_with("//")).any(|line| {
-            line.contains("StatusCode::BAD_REQUEST")
-                || line.contains("StatusCode::INTERNAL_SERVER_ERROR")
-                || line.contains("Status::internal(")
-                || line.contains("Status::invalid_argument(")
-                || line.contains("Status::not_found(")
-        });
-        assert!(!named || allowed.contains(&source.module.as_str()), "{}", source.path.display());
+fn statuses_are_defined_in_one_place() {
+    const STATUSES: [&str; 5] = [
+        "StatusCode::BAD_REQUEST",
+        "StatusCode::INTERNAL_SERVER_ERROR",
+        "Status::internal(",
+        "Status::invalid_argument(",
+        "Status::not_found(",
+    ];
+    for file in source_files() {
+        let names_status = STATUSES.iter().any(|status| file.text.contains(status));
+        assert!(!names_status || file.top_level() == "status", "{}", file.path.display());
     }
 }

@@ -1,4 +1,4 @@
-//! Detections and fixes that come apart, by the command line and over REST.
+//! Pairing of separate detections and fixes, by the command line and over REST.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ fn rows(csv: &str) -> Vec<Row> {
     reader.records().map(|record| row(record.expect("a row"))).collect()
 }
 
-/// A recording in a folder: samples, and the same taken apart.
+/// A recording in a folder: samples, and the same as separate detections and fixes.
 struct Recording {
     folder: TempDir,
     samples: Vec<Row>,
@@ -42,7 +42,7 @@ struct Recording {
 }
 
 impl Recording {
-    /// What `sightfix simulate` writes, its columns parted into two files.
+    /// The output of `sightfix simulate`, split into two files.
     fn simulated(targets: &str, samples: &str) -> Self {
         let folder = data_folder();
         let path = folder.path().join("simulated.csv");
@@ -66,8 +66,8 @@ impl Recording {
         targets
     }
 
-    /// The fixes of a file that names no receiver, by a clock that is late.
-    fn nameless_fixes(&self, late_s: f64) -> Vec<(jiff::Timestamp, f64, f64)> {
+    /// Fixes without a receiver, by a clock that is late.
+    fn anonymous_fixes(&self, late_s: f64) -> Vec<(jiff::Timestamp, f64, f64)> {
         let late = jiff::SignedDuration::from_secs_f64(late_s);
         self.samples.iter().map(|row| (row.time + late, row.numbers[4], row.numbers[5])).collect()
     }
@@ -78,7 +78,7 @@ impl Recording {
         path
     }
 
-    /// Runs `sightfix pair`; gives what it prints and the rows that it writes.
+    /// Runs `sightfix pair`; returns what it prints and the rows that it writes.
     fn pair(&self, fixes: &Path, flags: &[&str]) -> (String, Vec<Row>) {
         let detections = self.write("detections.csv", &self.detections);
         pair(&detections, fixes, &self.folder.path().join("paired.csv"), flags)
@@ -90,21 +90,18 @@ fn pair(detections: &Path, fixes: &Path, out: &Path, flags: &[&str]) -> (String,
     let files = [text(detections), text(fixes), text(out)];
     let mut arguments = vec!["pair", "--detections", &files[0], "--fixes", &files[1], "--out", &files[2]];
     arguments.extend_from_slice(flags);
-    let said = run(&arguments);
-    (said, rows(&std::fs::read_to_string(out).expect("written")))
+    let printed = run(&arguments);
+    (printed, rows(&std::fs::read_to_string(out).expect("written")))
 }
 
 #[test]
-fn the_square_s_files_are_paired_to_the_paired_file() {
-    let (Some(detections), Some(fixes), Some(paired)) =
-        (shared("detections.csv"), shared("gnss.csv"), shared("training.csv"))
-    else {
-        return;
-    };
+#[ignore = "needs ../shared/data"]
+fn shared_files_are_paired_to_the_paired_file() {
+    let [detections, fixes, paired] = ["detections.csv", "gnss.csv", "training.csv"].map(shared);
     let folder = data_folder();
     let out = folder.path().join("paired.csv");
-    let (said, found) = pair(&detections, &fixes, &out, &["--estimate-offset"]);
-    assert!(found == rows(&std::fs::read_to_string(paired).expect("readable")), "{said}");
+    let (printed, found) = pair(&detections, &fixes, &out, &["--estimate-offset"]);
+    assert!(found == rows(&std::fs::read_to_string(paired).expect("readable")), "{printed}");
     for part in [
         "fixes that name no receiver are those of person-1",
         "clock offset of person-1",
@@ -112,13 +109,13 @@ fn the_square_s_files_are_paired_to_the_paired_file() {
         "no fix near in time 347,",
         "no box to take it 1192,",
     ] {
-        assert!(said.contains(part), "{part} is missing in: {said}");
+        assert!(printed.contains(part), "{part} is missing in: {printed}");
     }
-    // What was paired is what the import takes.
+    // The import accepts the paired samples.
     let data = folder.path().join("data");
     let (data, out) = (data.to_str().expect("UTF-8"), out.to_str().expect("UTF-8"));
-    let said = run(&["import", out, "--camera", "square", "--create", "--data", data]);
-    assert!(said.contains("accepted 10078, duplicate 0, rejected 0"), "{said}");
+    let printed = run(&["import", out, "--camera", "square", "--create", "--data", data]);
+    assert!(printed.contains("accepted 10078, duplicate 0, rejected 0"), "{printed}");
 }
 
 #[test]
@@ -130,10 +127,10 @@ fn simulated_files_are_paired_to_the_file_they_come_from() {
     assert_eq!(bindings.len(), 3);
     let flags: Vec<&str> = bindings.iter().flat_map(|binding| ["--receiver", binding]).collect();
     for method in ["nearest", "interpolate"] {
-        let (said, found) = recording.pair(&fixes, &[&flags[..], &["--method", method]].concat());
-        assert!(found == recording.samples, "{method}: {said}");
+        let (printed, found) = recording.pair(&fixes, &[&flags[..], &["--method", method]].concat());
+        assert!(found == recording.samples, "{method}: {printed}");
     }
-    // Without the bindings nobody carries the receivers.
+    // Without the bindings no target carries the receivers.
     let detections = recording.folder.path().join("detections.csv");
     let out = recording.folder.path().join("none.csv");
     let output = sightfix()
@@ -145,9 +142,9 @@ fn simulated_files_are_paired_to_the_file_they_come_from() {
         .arg(&out)
         .output();
     let output = output.expect("the binary runs");
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(!output.status.success() && !out.exists(), "{said}");
-    assert!(said.contains(&format!("no fix of the target {},", recording.samples.len())), "{said}");
+    let printed = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(!output.status.success() && !out.exists(), "{printed}");
+    assert!(printed.contains(&format!("no fix of the target {},", recording.samples.len())), "{printed}");
 }
 
 /// `ddmm.mmmmmmm` and its hemisphere.
@@ -200,15 +197,15 @@ fn gpsd(fixes: &[(jiff::Timestamp, f64, f64)]) -> String {
 #[test]
 fn every_format_of_fixes_gives_the_same_samples() {
     let recording = Recording::simulated("1", "400");
-    let fixes = recording.nameless_fixes(0.0);
+    let fixes = recording.anonymous_fixes(0.0);
     for (name, text, flags) in [
         ("fixes.nmea", nmea(&fixes), &[][..]),
         ("fixes.gpx", gpx(&fixes), &[]),
         ("fixes.json", gpsd(&fixes), &[]),
         ("fixes.dat", gpsd(&fixes), &["--fixes-format", "gpsd"]),
     ] {
-        let (said, found) = recording.pair(&recording.write(name, &text), flags);
-        assert_eq!(found.len(), recording.samples.len(), "{name}: {said}");
+        let (printed, found) = recording.pair(&recording.write(name, &text), flags);
+        assert_eq!(found.len(), recording.samples.len(), "{name}: {printed}");
         for (found, expected) in found.iter().zip(&recording.samples) {
             assert_eq!((found.time, &found.target_id), (expected.time, &expected.target_id), "{name}");
             for (one, other) in found.numbers.iter().zip(expected.numbers) {
@@ -219,27 +216,27 @@ fn every_format_of_fixes_gives_the_same_samples() {
 }
 
 #[test]
-fn an_estimated_offset_is_told_and_applied_only_when_asked() {
+fn an_estimated_offset_is_printed_and_applied_only_on_request() {
     let recording = Recording::simulated("1", "3000");
-    let fixes = recording.write("fixes.gpx", &gpx(&recording.nameless_fixes(4.0)));
-    let offset_s = |said: &str| -> f64 {
-        let line = said.lines().find(|line| line.starts_with("clock offset of")).expect("an estimate");
-        let told = line.split(": ").nth(1).and_then(|rest| rest.split(" s").next()).expect("a number");
-        told.parse().unwrap_or_else(|_| panic!("{line}"))
+    let fixes = recording.write("fixes.gpx", &gpx(&recording.anonymous_fixes(4.0)));
+    let offset_s = |printed: &str| -> f64 {
+        let line = printed.lines().find(|line| line.starts_with("clock offset of")).expect("an estimate");
+        let seconds = line.split(": ").nth(1).and_then(|rest| rest.split(" s").next()).expect("a number");
+        seconds.parse().unwrap_or_else(|_| panic!("{line}"))
     };
-    let (said, told) = recording.pair(&fixes, &["--estimate-offset"]);
-    assert!((offset_s(&said) + 4.0).abs() < 0.5, "{said}");
-    assert!(told != recording.samples, "told is not applied");
-    let (said, applied) = recording.pair(&fixes, &["--estimate-offset", "--apply-offset"]);
-    assert!(applied == recording.samples, "{said}");
-    // By hand the same: the receiver of nameless fixes is the only target's own.
+    let (printed, unshifted) = recording.pair(&fixes, &["--estimate-offset"]);
+    assert!((offset_s(&printed) + 4.0).abs() < 0.5, "{printed}");
+    assert!(unshifted != recording.samples, "printed, not applied");
+    let (printed, applied) = recording.pair(&fixes, &["--estimate-offset", "--apply-offset"]);
+    assert!(applied == recording.samples, "{printed}");
+    // The same by hand: anonymous fixes are those of the only target.
     let given = format!("{}=-4", recording.targets()[0]);
-    let (said, given) = recording.pair(&fixes, &["--clock-offset", &given]);
-    assert!(given == recording.samples, "{said}");
+    let (printed, given) = recording.pair(&fixes, &["--clock-offset", &given]);
+    assert!(given == recording.samples, "{printed}");
 }
 
 #[test]
-fn bad_flags_and_bad_files_are_told() {
+fn invalid_flags_and_files_are_reported() {
     let recording = Recording::simulated("2", "300");
     let detections = recording.write("detections.csv", &recording.detections);
     let bad = recording.write("bad.csv", "time,longitude\n");
@@ -252,15 +249,15 @@ fn bad_flags_and_bad_files_are_told() {
         (&fixes, &["--method", "best"], "nearest"),
         (&fixes, &["--receiver", "a"], "RECEIVER=TARGET"),
         (&fixes, &["--clock-offset", "a=1e9"], "clock_offset_s"),
-        (&fixes, &["--receiver", "a=b", "--receiver", "a=c"], "stands twice"),
+        (&fixes, &["--receiver", "a=b", "--receiver", "a=c"], "duplicate"),
         (&fixes, &["--apply-offset"], "--estimate-offset"),
     ] {
         let out = recording.folder.path().join("out.csv");
         let mut command = sightfix();
         command.arg("pair").arg("--detections").arg(&detections).arg("--fixes").arg(fixes);
         let output = command.arg("--out").arg(&out).args(flags).output().expect("the binary runs");
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(!output.status.success() && said.contains(reason), "{flags:?}: {said}");
+        let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && printed.contains(reason), "{flags:?}: {printed}");
     }
 }
 
@@ -268,7 +265,7 @@ const BOUNDARY: &str = "a-boundary-of-its-own";
 
 /// Parts of a form: name, file name, content type and content.
 fn form(parts: &[(&str, &str, &str, &str)]) -> String {
-    let mut body = "a preamble that nobody reads\r\n".to_owned();
+    let mut body = "an ignored preamble\r\n".to_owned();
     for (name, file, content_type, content) in parts {
         write!(body, "--{BOUNDARY}\r\ncontent-disposition: form-data; name=\"{name}\"").expect("memory");
         if !file.is_empty() {
@@ -303,7 +300,7 @@ async fn two_parts_are_paired_by_the_receivers_of_the_profile() {
             json!({"receiver_id": format!("receiver-of-{target}"), "target_id": target, "clock_offset_s": -2.25})
         })
         .collect();
-    // By a clock that is late for all; both ways of spooling.
+    // All clocks are late; spooled in memory and on disk.
     let late = jiff::SignedDuration::from_millis(2_250);
     let mut fixes = "time,receiver_id,longitude,latitude\nnever,x,1,2\n".to_owned();
     for row in &recording.samples {
@@ -321,11 +318,15 @@ async fn two_parts_are_paired_by_the_receivers_of_the_profile() {
             ("fixes", "F.csv", octets, &fixes),
             ("detections", "", "text/csv", &recording.detections),
         ]);
-        let told = post(&server, "", body.clone()).await.expect(200).json();
+        let report = post(&server, "", body.clone()).await.expect(200).json();
         let count = recording.samples.len();
-        assert_eq!(told["accepted"], count, "{told}");
-        assert_eq!((&told["pairing"]["paired"], &told["rejected"]), (&json!(count), &json!(1)), "{told}");
-        let row = &told["rejected_rows"][0];
+        assert_eq!(report["accepted"], count, "{report}");
+        assert_eq!(
+            (&report["pairing"]["paired"], &report["rejected"]),
+            (&json!(count), &json!(1)),
+            "{report}"
+        );
+        let row = &report["rejected_rows"][0];
         assert_eq!((&row["part"], &row["line"], &row["field"]), (&json!("fixes"), &json!(2), &json!("time")));
         assert!(stored(&server).await == recording.samples);
         let again = post(&server, "", body).await.expect(200).json();
@@ -334,28 +335,28 @@ async fn two_parts_are_paired_by_the_receivers_of_the_profile() {
 }
 
 #[tokio::test]
-async fn two_parts_that_name_nobody_are_paired_by_what_is_given() {
+async fn two_parts_without_receivers_are_paired_by_the_parameters() {
     let recording = Recording::simulated("1", "3000");
     let target = &recording.targets()[0];
     let folder = data_folder();
     let server = TestServer::start(folder.path());
     server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
-    let fixes = gpx(&recording.nameless_fixes(4.0));
+    let fixes = gpx(&recording.anonymous_fixes(4.0));
     let body = form(&[
         ("detections", "D.csv", "", &recording.detections),
         ("fixes", "F.xml", "application/gpx+xml", &fixes),
     ]);
     let query = "?estimate_offset=true&window_s=0.2&receiver_id=phone";
-    let told = post(&server, query, body.clone()).await.expect(200).json();
-    assert_eq!(told["pairing"]["paired"], 0, "phone is nobody's: {told}");
-    assert_eq!(told["unnamed_fixes_of"]["target_id"], "phone", "{told}");
-    assert_eq!(told["clock_offsets"][0]["clock_offset_s"], Value::Null, "{told}");
-    let nobody = told["pairing"]["unpaired_detections"]["no_fix_of_target"].as_u64();
-    assert_eq!(nobody, Some(recording.samples.len() as u64), "{told}");
+    let report = post(&server, query, body.clone()).await.expect(200).json();
+    assert_eq!(report["pairing"]["paired"], 0, "phone is nobody's: {report}");
+    assert_eq!(report["unnamed_fixes_of"]["target_id"], "phone", "{report}");
+    assert_eq!(report["clock_offsets"][0]["clock_offset_s"], Value::Null, "{report}");
+    let nobody = report["pairing"]["unpaired_detections"]["no_fix_of_target"].as_u64();
+    assert_eq!(nobody, Some(recording.samples.len() as u64), "{report}");
 
-    let told = post(&server, "?estimate_offset=true", body.clone()).await.expect(200).json();
-    let offset_s = told["clock_offsets"][0]["clock_offset_s"].as_f64().expect("an estimate");
-    assert!((offset_s + 4.0).abs() < 0.5, "{told}");
+    let report = post(&server, "?estimate_offset=true", body.clone()).await.expect(200).json();
+    let offset_s = report["clock_offsets"][0]["clock_offset_s"].as_f64().expect("an estimate");
+    assert!((offset_s + 4.0).abs() < 0.5, "{report}");
     server.send("DELETE", &format!("/v1/cameras/c/samples?target_id={target}"), &[], "").await.expect(200);
 
     let receivers =
@@ -363,33 +364,30 @@ async fn two_parts_that_name_nobody_are_paired_by_what_is_given() {
     let change = json!({ "receivers": receivers }).to_string();
     let headers = [("content-type", "application/json"), ("if-match", "*")];
     server.send("PATCH", "/v1/cameras/c", &headers, change).await.expect(200);
-    let told = post(&server, "", body).await.expect(200).json();
-    assert_eq!(told["accepted"], recording.samples.len(), "{told}");
+    let report = post(&server, "", body).await.expect(200).json();
+    assert_eq!(report["accepted"], recording.samples.len(), "{report}");
     assert!(stored(&server).await == recording.samples);
 }
 
 #[tokio::test]
-async fn the_square_s_files_are_paired_over_rest() {
-    let (Some(detections), Some(fixes), Some(paired)) =
-        (shared("detections.csv"), shared("gnss.csv"), shared("training.csv"))
-    else {
-        return;
-    };
+#[ignore = "needs ../shared/data"]
+async fn shared_files_are_paired_over_rest() {
+    let [detections, fixes, paired] = ["detections.csv", "gnss.csv", "training.csv"].map(shared);
     let read = |path: PathBuf| std::fs::read_to_string(path).expect("readable");
     let folder = data_folder();
     let server = TestServer::start(folder.path());
     server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
     let body =
         form(&[("detections", "D.csv", "", &read(detections)), ("fixes", "F.csv", "text/csv", &read(fixes))]);
-    let told = post(&server, "", body).await.expect(200).json();
-    assert_eq!((&told["accepted"], &told["rejected"]), (&json!(10_078), &json!(0)), "{told}");
-    assert_eq!(told["pairing"]["unpaired_detections"]["no_fix_near"], 347, "{told}");
-    assert_eq!(told["pairing"]["unused_fixes"]["no_box_near"], 1_192, "{told}");
+    let report = post(&server, "", body).await.expect(200).json();
+    assert_eq!((&report["accepted"], &report["rejected"]), (&json!(10_078), &json!(0)), "{report}");
+    assert_eq!(report["pairing"]["unpaired_detections"]["no_fix_near"], 347, "{report}");
+    assert_eq!(report["pairing"]["unused_fixes"]["no_box_near"], 1_192, "{report}");
     assert!(stored(&server).await == rows(&read(paired)));
 }
 
 #[tokio::test]
-async fn bad_parts_are_refused_by_name_and_leave_nothing_behind() {
+async fn invalid_parts_are_refused_by_name_and_store_nothing() {
     let folder = data_folder();
     let limits = [("SIGHTFIX_LIMITS__PAIRING_ROWS", "10"), ("SIGHTFIX_LIMITS__IMPORT_BYTES", "2000000")];
     let server = TestServer::start_with(folder.path(), &limits);
@@ -422,13 +420,13 @@ async fn bad_parts_are_refused_by_name_and_leave_nothing_behind() {
         ("?receiver_id=", form(&[d, f]), 422, "invalid-argument", "receiver_id"),
         ("?window=1", form(&[d, f]), 422, "invalid-argument", "window"),
     ] {
-        let told = format!("{query} {body:.400}");
+        let request = format!("{query} {body:.400}");
         let answer = post(&server, query, body).await;
-        assert_eq!(answer.status.as_u16(), status, "{told}: {}", answer.text());
+        assert_eq!(answer.status.as_u16(), status, "{request}: {}", answer.text());
         let problem = answer.json();
-        assert!(problem["type"].as_str().is_some_and(|name| name.ends_with(kind)), "{told}: {problem}");
+        assert!(problem["type"].as_str().is_some_and(|name| name.ends_with(kind)), "{request}: {problem}");
         let named = problem["violations"][0]["field"].as_str().unwrap_or_default();
-        assert_eq!(named, field, "{told}: {problem}");
+        assert_eq!(named, field, "{request}: {problem}");
     }
     let csv = server.send(
         "POST",
@@ -438,12 +436,12 @@ async fn bad_parts_are_refused_by_name_and_leave_nothing_behind() {
     );
     csv.await.expect(415);
     let count = server.get("/v1/cameras/c/samples/count").await.expect(200).json();
-    assert_eq!(count["count"], 0, "what was refused left samples");
-    let told = post(&server, "", form(&[d, f])).await.expect(200).json();
+    assert_eq!(count["count"], 0, "refused parts stored samples");
+    let report = post(&server, "", form(&[d, f])).await.expect(200).json();
     assert_eq!(
-        (&told["accepted"], &told["unnamed_fixes_of"]["target_id"]),
+        (&report["accepted"], &report["unnamed_fixes_of"]["target_id"]),
         (&json!(1), &json!("a")),
-        "{told}"
+        "{report}"
     );
     let body = form(&[d, f]);
     let content_type = format!("multipart/form-data; boundary={BOUNDARY}");

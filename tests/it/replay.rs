@@ -1,4 +1,4 @@
-//! `sightfix replay`: what a client does when things go wrong, and that nothing acknowledged is lost.
+//! `sightfix replay`: faults of connection and server, and that no acknowledged item is lost.
 
 mod fake;
 mod rules;

@@ -1,4 +1,4 @@
-//! The main job, end to end, through the real binary and its real port.
+//! The main use case end to end, through the real binary and its port.
 
 use serde_json::{Value, json};
 use sightfix::grpc::proto;
@@ -6,8 +6,8 @@ use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 
 use crate::harness::{Answer, TestServer, data_folder, run, shared, simulated_csv};
 
-/// A camera is made, taught and used; the server is killed and started again.
-async fn main_job(image_size: Option<Value>, csv: String, rows: u64, epochs: u32) {
+/// Creates a camera, imports samples, trains and fuses; kills and restarts the server.
+async fn main_use_case(image_size: Option<Value>, csv: String, rows: u64, epochs: u32) {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
 
@@ -15,10 +15,10 @@ async fn main_job(image_size: Option<Value>, csv: String, rows: u64, epochs: u32
     if let Some(size) = &image_size {
         profile["image_size"] = size.clone();
     }
-    let made = server.post("/v1/cameras", &profile).await.expect(201);
-    assert_eq!(made.header("location"), "/v1/cameras/square");
-    let warned = made.json()["warnings"].to_string().contains("image_size");
-    assert_eq!(warned, image_size.is_none(), "{}", made.text());
+    let created = server.post("/v1/cameras", &profile).await.expect(201);
+    assert_eq!(created.header("location"), "/v1/cameras/square");
+    let warned = created.json()["warnings"].to_string().contains("image_size");
+    assert_eq!(warned, image_size.is_none(), "{}", created.text());
 
     let imported = import(&server, &csv).await.json();
     assert_eq!(imported["accepted"], rows, "{imported}");
@@ -44,13 +44,13 @@ async fn main_job(image_size: Option<Value>, csv: String, rows: u64, epochs: u32
     let by_grpc = fuse_by_grpc(&server, &observation).await;
     let position =
         |name: &str| [number_of(&item[name]["longitude_deg"]), number_of(&item[name]["latitude_deg"])];
-    let told = |position: Option<proto::Position>| {
+    let degrees = |position: Option<proto::Position>| {
         position
             .and_then(|position| Some([position.longitude_deg?, position.latitude_deg?]))
             .expect("a position")
     };
-    assert_eq!(told(by_grpc.fused).map(f64::to_bits), position("fused").map(f64::to_bits));
-    assert_eq!(told(by_grpc.regressed).map(f64::to_bits), position("regressed").map(f64::to_bits));
+    assert_eq!(degrees(by_grpc.fused).map(f64::to_bits), position("fused").map(f64::to_bits));
+    assert_eq!(degrees(by_grpc.regressed).map(f64::to_bits), position("regressed").map(f64::to_bits));
     for (grpc, rest) in [
         (by_grpc.confidence_regression, "confidence_regression"),
         (by_grpc.confidence_gnss, "confidence_gnss"),
@@ -68,7 +68,7 @@ async fn main_job(image_size: Option<Value>, csv: String, rows: u64, epochs: u32
     assert_eq!(count["count"], rows);
     let after = server.post("/v1/cameras/square/fusions", &observation).await.expect(200).json();
     assert_eq!(after, fused, "the same model gives the same answer after a crash");
-    assert!(server.terminate(), "the server ends in order");
+    assert!(server.terminate(), "the server exits successfully");
 }
 
 fn number_of(value: &Value) -> f64 {
@@ -128,17 +128,17 @@ fn observation_of(csv: &str) -> Value {
 }
 
 #[tokio::test]
-async fn the_main_job_on_a_simulated_square() {
+async fn a_simulated_square_is_imported_trained_and_fused() {
     let csv = simulated_csv();
     let rows = csv.lines().count() as u64 - 1;
-    main_job(Some(json!({"width_px": 1920, "height_px": 1080})), csv, rows, 60).await;
+    main_use_case(Some(json!({"width_px": 1920, "height_px": 1080})), csv, rows, 60).await;
 }
 
 #[tokio::test]
-async fn the_main_job_on_the_real_square() {
-    let Some(path) = shared("training.csv") else { return };
-    let csv = std::fs::read_to_string(path).expect("the file can be read");
-    main_job(None, csv, 10_078, 20).await;
+#[ignore = "needs ../shared/data"]
+async fn shared_square_is_imported_trained_and_fused() {
+    let csv = std::fs::read_to_string(shared("training.csv")).expect("the file can be read");
+    main_use_case(None, csv, 10_078, 20).await;
 }
 
 #[tokio::test]
@@ -147,13 +147,13 @@ async fn the_command_line_does_the_same_without_a_server() {
     let file = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
     std::fs::write(file("samples.csv"), simulated_csv()).expect("the folder can be written");
     let data = file("data");
-    let said = run(&["import", &file("samples.csv"), "--camera", "c", "--create", "--data", &data]);
-    assert!(said.starts_with("accepted "), "{said}");
-    let said = run(&["train", "--camera", "c", "--recipe", "hybrid", "--epochs", "60", "--data", &data]);
-    assert!(said.starts_with("version 1 became active"), "{said}");
+    let printed = run(&["import", &file("samples.csv"), "--camera", "c", "--create", "--data", &data]);
+    assert!(printed.starts_with("accepted "), "{printed}");
+    let printed = run(&["train", "--camera", "c", "--recipe", "hybrid", "--epochs", "60", "--data", &data]);
+    assert!(printed.starts_with("version 1 became active"), "{printed}");
     let (from, to) = (file("samples.csv"), file("fused.geojson"));
-    let said = run(&["fuse", &from, "--out", &to, "--camera", "c", "--data", &data]);
-    assert!(said.contains("rejected 0"), "{said}");
+    let printed = run(&["fuse", &from, "--out", &to, "--camera", "c", "--data", &data]);
+    assert!(printed.contains("rejected 0"), "{printed}");
     let positions: Value =
         serde_json::from_str(&std::fs::read_to_string(to).expect("was written")).expect("GeoJSON");
     assert!(positions["features"].as_array().is_some_and(|features| features.len() > 100));
@@ -164,19 +164,19 @@ async fn the_command_line_does_the_same_without_a_server() {
 }
 
 #[tokio::test]
-async fn the_demonstration_prints_what_works() {
+async fn the_demonstration_prints_requests_that_work() {
     let folder = data_folder();
-    let (server, said) = TestServer::demonstrate(folder.path());
-    let observation = said.split('\'').nth(1).unwrap_or_else(|| panic!("no body for curl: {said}"));
+    let (server, printed) = TestServer::demonstrate(folder.path());
+    let observation = printed.split('\'').nth(1).unwrap_or_else(|| panic!("no body for curl: {printed}"));
     let observation: Value = serde_json::from_str(observation).expect("JSON");
     let fused = server.post("/v1/cameras/demo/fusions", &observation).await.expect(200).json();
     assert!(fused["items"][0]["r95_m"].as_f64().is_some_and(|r95_m| r95_m > 0.0), "{fused}");
-    assert!(said.contains("grpcurl -plaintext") && said.contains("/docs"), "{said}");
+    assert!(printed.contains("grpcurl -plaintext") && printed.contains("/docs"), "{printed}");
 }
 
-/// A model file of an earlier version still answers, and better than the receiver alone.
+/// A model file of an earlier format loads, and is more accurate than the receiver alone.
 #[test]
-fn the_reference_model_answers() {
+fn the_reference_model_loads() {
     use sightfix::geo::distance_m;
 
     let model = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.safetensors");

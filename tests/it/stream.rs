@@ -88,6 +88,7 @@ fn opening(client_name: &str, store_samples: bool) -> Sent {
         client_name: client_name.to_owned(),
         resume_after_seq: 0,
         store_samples,
+        ..Default::default()
     })
 }
 

@@ -14,7 +14,7 @@ use tokio::sync::{Notify, mpsc};
 use tokio::time::Instant;
 
 use super::lock;
-use crate::domain::{CameraId, Detection, Error, ErrorKind, Fix, Result, Sample, TargetId};
+use crate::domain::{CameraId, Detection, Durability, Error, ErrorKind, Fix, Result, Sample, TargetId};
 use crate::fusion::pairing::{Decided, Pairer, PairingSettings};
 use crate::store::Store;
 use crate::telemetry::Metrics;
@@ -31,6 +31,8 @@ const TICK: Duration = Duration::from_secs(1);
 pub(super) struct Ledger {
     entries: Mutex<Entries>,
     changed: Notify,
+    /// When the stream's samples are acknowledged.
+    durability: Durability,
 }
 
 #[derive(Default)]
@@ -41,9 +43,13 @@ struct Entries {
 }
 
 impl Ledger {
-    pub(super) fn beginning_after(seq: u64) -> Arc<Self> {
+    pub(super) fn beginning_after(seq: u64, durability: Durability) -> Arc<Self> {
         let entries = Entries { highest: seq, ..Entries::default() };
-        Arc::new(Self { entries: Mutex::new(entries), changed: Notify::new() })
+        Arc::new(Self { entries: Mutex::new(entries), changed: Notify::new(), durability })
+    }
+
+    pub(super) const fn durability(&self) -> Durability {
+        self.durability
     }
 
     /// An item that is settled as it comes: nothing of it is ever kept.
@@ -93,6 +99,11 @@ impl Ledger {
 fn not_kept(kind: ErrorKind) -> Error {
     match kind {
         ErrorKind::CameraNotFound => Error::refused(kind, "the camera was deleted"),
+        ErrorKind::InsufficientStorage => Error::refused(
+            kind,
+            "there is no space for more samples; open the stream again behind the last acknowledged seq when \
+             some has been freed",
+        ),
         _ => Error::refused(
             ErrorKind::Overloaded,
             "samples could not be stored; open the stream again behind the last acknowledged seq",
@@ -321,7 +332,9 @@ async fn commit_all(
 async fn store_all(store: &Store, id: &CameraId, commit: Commit, metrics: &Metrics) -> Result<()> {
     let Commit { samples, receipts } = commit;
     if !samples.is_empty() {
-        match store.insert_samples(id, samples).await {
+        // Streams share a commit: the strongest of their demands holds for all of it.
+        let durability = receipts.iter().map(|receipt| receipt.ledger.durability).max().unwrap_or_default();
+        match store.insert_samples(id, samples, durability).await {
             Ok(inserted) => metrics.imported(inserted.accepted, inserted.duplicate, 0),
             Err(error) => {
                 receipts.iter().for_each(|receipt| drop(receipt.ledger.fail(error.kind())));
@@ -361,7 +374,10 @@ mod tests {
         let nowhere = CameraId::new("nowhere").expect("a slug");
         let keeping = Keeping::start(nowhere, store, Metrics::new());
         let samples = simulate(&Options { samples: 2, ..Options::demo() }).training_samples();
-        let (first, second) = (Ledger::beginning_after(0), Ledger::beginning_after(7));
+        let (first, second) = (
+            Ledger::beginning_after(0, Durability::default()),
+            Ledger::beginning_after(7, Durability::default()),
+        );
         keeping.whole(&first, 1, samples[0].clone()).await.expect("handed in");
         while first.is_settled().is_ok() {
             first.changed().await;

@@ -9,8 +9,8 @@ use super::keeping::{Half, Keeping, Ledger};
 use super::{CameraLive, Followed, lock};
 use crate::app::App;
 use crate::domain::{
-    CameraId, CameraMoved, Detection, Error, ErrorKind, LiveItem, Observation, Result, Sample, Score,
-    TargetClass, check_text,
+    CameraId, CameraMoved, Detection, Durability, Error, ErrorKind, LiveItem, Observation, Result, Sample,
+    Score, TargetClass, check_text,
 };
 
 /// Longest name of a client, in bytes.
@@ -74,7 +74,7 @@ struct Kept {
 
 impl App {
     /// Opens a live stream of one client for one camera. With `store_samples` boxes and fixes are
-    /// paired and kept, and items acknowledged.
+    /// paired and stored, and items acknowledged, both with that durability.
     ///
     /// # Errors
     /// `CameraNotFound`; `InvalidArgument` naming `client_name`; `Overloaded` beyond the limits of
@@ -84,7 +84,7 @@ impl App {
         id: &CameraId,
         client_name: &str,
         resume_after_seq: u64,
-        store_samples: bool,
+        store_samples: Option<Durability>,
     ) -> Result<LiveStream> {
         check_text("client_name", client_name, LONGEST_CLIENT_NAME)?;
         self.serving(id).await?;
@@ -92,9 +92,9 @@ impl App {
         let place =
             self.live.places.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
         let live = self.live.of(id);
-        let kept = store_samples.then(|| Kept {
+        let kept = store_samples.map(|durability| Kept {
             keeping: live.keeping(self, id),
-            ledger: Ledger::beginning_after(resume_after_seq),
+            ledger: Ledger::beginning_after(resume_after_seq, durability),
         });
         self.metrics.stream_opened();
         Ok(LiveStream {
@@ -128,6 +128,12 @@ impl LiveStream {
     #[must_use]
     pub fn model_version(&self) -> Option<u32> {
         self.app.registry.get(&self.id)?.model.as_ref().map(|(_, version)| *version)
+    }
+
+    /// When items are acknowledged; `None` on a stream that stores nothing.
+    #[must_use]
+    pub fn durability(&self) -> Option<Durability> {
+        self.kept.as_ref().map(|kept| kept.ledger.durability())
     }
 
     /// Checks that seqs rise; an item that cannot be read has one, too.

@@ -11,8 +11,8 @@ use jiff::{SignedDuration, Timestamp};
 use super::lock;
 use crate::config::Limits;
 use crate::domain::{CameraId, Error, ErrorKind, Observation, Result, TargetId};
-use crate::fusion::track::{Measured, Measurement, Track, TrackSettings, TrackState};
-use crate::fusion::watch::{Compared, Meeting, Spot};
+use crate::fusion::drift_detector::{ResidualSample, TimeAligner, TimedEstimate};
+use crate::fusion::track::{MeasuredPosition, Measurement, Track, TrackSettings, TrackState};
 use crate::geo::{LocalPlane, Position};
 use crate::model::Regressor;
 
@@ -48,7 +48,7 @@ struct Followed {
     heard_at: Timestamp,
     /// In order of time; the last is the latest.
     history: VecDeque<Arc<TrackPoint>>,
-    meeting: Meeting,
+    meeting: TimeAligner,
 }
 
 /// One instant of one target, ready to be taken up.
@@ -73,16 +73,16 @@ impl Tracks {
         id: &CameraId,
         seen: &Seen<'_>,
         limits: &Limits,
-    ) -> Result<(Option<Arc<TrackPoint>>, Option<Compared>)> {
+    ) -> Result<(Option<Arc<TrackPoint>>, Option<ResidualSample>)> {
         let Some((plane, measurement)) = self.measurement(seen) else { return Ok((None, None)) };
         let target = self.target(id, seen, limits.tracks_per_camera)?;
         let mut target = lock(&target);
         let state = match &mut target.0 {
-            Some(followed) if !followed.track.is_gone(measurement.time) => {
+            Some(followed) if !followed.track.is_expired(measurement.time) => {
                 followed.track.update(&measurement)
             }
             gone_or_new => {
-                let settings = seen.regressor.map_or_else(TrackSettings::default, TrackSettings::learnt_by);
+                let settings = seen.regressor.map_or_else(TrackSettings::default, TrackSettings::from_model);
                 let Some(track) = Track::start(settings, &measurement) else { return Ok((None, None)) };
                 let state = track.state_at(measurement.time);
                 *gone_or_new = Some(Followed::new(track, seen.now));
@@ -156,7 +156,8 @@ impl Tracks {
         let regressed = regression.map(|(plane, it)| (plane.to_position(it.regressed), it.variance_m2()));
         let anywhere = fix.map(|fix| fix.position).or(regressed.map(|(position, _)| position))?;
         let plane = self.plane(anywhere);
-        let measured = |(position, variance_m2)| Measured::isotropic(plane.to_plane(position), variance_m2);
+        let measured =
+            |(position, variance_m2)| MeasuredPosition::isotropic(plane.to_plane(position), variance_m2);
         let measurement = Measurement {
             time: *time,
             fix: fix.map(|fix| measured((fix.position, seen.e_gnss_m2))),
@@ -175,7 +176,7 @@ fn drop_gone(targets: &mut HashMap<TargetId, Arc<Mutex<Target>>>, now: Timestamp
         let target = lock(target);
         target.0.as_ref().is_some_and(|followed| {
             let silent_s = now.duration_since(followed.heard_at).as_secs_f64();
-            let gone = told.is_some_and(|told| followed.track.is_gone(told));
+            let gone = told.is_some_and(|told| followed.track.is_expired(told));
             !gone && silent_s <= followed.track.settings().time_to_live_s
         })
     });
@@ -183,7 +184,7 @@ fn drop_gone(targets: &mut HashMap<TargetId, Arc<Mutex<Target>>>, now: Timestamp
 
 impl Followed {
     fn new(track: Track, now: Timestamp) -> Self {
-        Self { track, heard_at: now, history: VecDeque::new(), meeting: Meeting::default() }
+        Self { track, heard_at: now, history: VecDeque::new(), meeting: TimeAligner::default() }
     }
 
     /// Keeps the latest point, and before it only points some time apart.
@@ -203,16 +204,20 @@ impl Followed {
     }
 }
 
-fn compare(meeting: &mut Meeting, target_id: &TargetId, measurement: &Measurement) -> Option<Compared> {
-    let spot = |measured: Measured| Spot {
+fn compare(
+    meeting: &mut TimeAligner,
+    target_id: &TargetId,
+    measurement: &Measurement,
+) -> Option<ResidualSample> {
+    let spot = |measured: MeasuredPosition| TimedEstimate {
         time: measurement.time,
         position: measured.position,
         variance_m2: measured.covariance.per_axis_m2(),
     };
-    let by_box = measurement.regressed.and_then(|measured| meeting.regressed(spot(measured)));
-    let by_fix = measurement.fix.and_then(|measured| meeting.fix(spot(measured)));
+    let by_box = measurement.regressed.and_then(|measured| meeting.push_regressed(spot(measured)));
+    let by_fix = measurement.fix.and_then(|measured| meeting.push_fix(spot(measured)));
     let (regressed, fix) = by_box.or(by_fix)?;
-    Some(Compared {
+    Some(ResidualSample {
         time: fix.time,
         target_id: target_id.clone(),
         regressed: regressed.position,

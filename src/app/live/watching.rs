@@ -6,9 +6,9 @@ use super::{CameraLive, lock};
 use crate::app::App;
 use crate::app::registry::Serving;
 use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Observation, Result};
+use crate::fusion::drift_detector::{DriftAlarm, DriftDetector, DriftDetectorSettings, ResidualSample};
 use crate::fusion::track::TrackSettings;
 use crate::fusion::two_step;
-use crate::fusion::watch::{Alarm, CameraWatch, Compared, WatchSettings};
 use crate::model::Regressor;
 
 /// One camera's watch; begun anew with every model version.
@@ -17,9 +17,9 @@ pub(super) struct Watching(Mutex<Option<Watched>>);
 
 struct Watched {
     model_version: u32,
-    watch: CameraWatch,
+    watch: DriftDetector,
     /// Raised, but not yet kept: keeping it has failed.
-    unsaved: Option<Alarm>,
+    unsaved: Option<DriftAlarm>,
 }
 
 impl Watching {
@@ -27,12 +27,13 @@ impl Watching {
     pub(super) fn compare(
         &self,
         (regressor, model_version): (&Regressor, u32),
-        compared: &Compared,
+        compared: &ResidualSample,
     ) -> Option<CameraMoved> {
         let mut watched = lock(&self.0);
         if watched.as_ref().is_none_or(|watched| watched.model_version != model_version) {
-            let gnss = TrackSettings::learnt_by(regressor).gnss;
-            let watch = CameraWatch::new(WatchSettings { gnss, ..WatchSettings::default() });
+            let gnss = TrackSettings::from_model(regressor).gnss;
+            let watch =
+                DriftDetector::new(DriftDetectorSettings { gnss, ..DriftDetectorSettings::default() });
             *watched = Some(Watched { model_version, watch, unsaved: None });
         }
         let watched = watched.as_mut()?;
@@ -49,15 +50,15 @@ impl Watching {
     }
 }
 
-fn moved(model_version: u32, alarm: &Alarm) -> CameraMoved {
+fn moved(model_version: u32, alarm: &DriftAlarm) -> CameraMoved {
     CameraMoved {
         model_version,
-        began_at: alarm.began_at,
-        raised_at: alarm.raised_at,
+        began_at: alarm.onset_at,
+        raised_at: alarm.detected_at,
         shift_east_m: alarm.shift.east_m,
         shift_north_m: alarm.shift.north_m,
-        statistic: alarm.statistic,
-        targets: u32::try_from(alarm.targets).unwrap_or(u32::MAX),
+        statistic: alarm.glr_statistic,
+        targets: u32::try_from(alarm.supporting_targets).unwrap_or(u32::MAX),
     }
 }
 
@@ -80,7 +81,7 @@ impl App {
             };
             let regression = regressor.regress(drawn, None);
             let plane = live.tracks.plane(fix.position);
-            Some(Compared {
+            Some(ResidualSample {
                 time: *time,
                 target_id: target_id.clone(),
                 regressed: plane.to_plane(regressor.plane().to_position(regression.regressed)),
@@ -101,7 +102,7 @@ impl App {
         id: &CameraId,
         live: &CameraLive,
         model: (&Regressor, u32),
-        compared: &Compared,
+        compared: &ResidualSample,
     ) {
         let Some(moved) = live.watching.compare(model, compared) else { return };
         if let Err(error) = self.raise(id, live, moved).await {

@@ -8,7 +8,7 @@ use futures_util::StreamExt as _;
 
 use crate::app::{App, RunRequest};
 use crate::cli::progress::Progress;
-use crate::domain::{CameraId, GnssError, JobState, NewCamera, SigmaM};
+use crate::domain::{CameraId, Durability, GnssError, JobState, NewCamera, SigmaM};
 use crate::simulation::{Options, SimulatedRow, simulate};
 
 const CAMERA: &str = "demo";
@@ -26,7 +26,7 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
             ..NewCamera::named(id.clone())
         })
         .await?;
-        app.store.insert_samples(&id, world.training_samples()).await?;
+        app.store.insert_samples(&id, world.training_samples(), Durability::Synced).await?;
     }
     let camera = app.camera(&id).await.context("the data folder holds other cameras; choose an empty one")?;
     if camera.active_model.is_none() {

@@ -40,7 +40,7 @@ fn rmc(time: &str, status: &str, date: &str) -> String {
 }
 
 #[test]
-fn nmea_takes_its_dates_from_rmc_and_zda_across_midnight() {
+fn nmea_dates_are_those_of_rmc_and_zda_across_midnight() {
     let zda = sentence("GPZDA,000001.00,15,12,2020,00,00");
     // A receiver without a fix tells the date of its firmware.
     let log = [
@@ -66,7 +66,7 @@ fn nmea_takes_its_dates_from_rmc_and_zda_across_midnight() {
 }
 
 #[test]
-fn nmea_without_a_date_has_no_times() {
+fn nmea_fixes_without_a_date_have_no_times() {
     let log = [gga("235958.00"), gga("235959.00"), rmc("235959.00", "A", "311320")].concat();
     let shown = all_shown(&log, FixFormat::Nmea);
     assert_eq!(shown.len(), 2);
@@ -78,7 +78,7 @@ fn nmea_without_a_date_has_no_times() {
 }
 
 #[test]
-fn gpx_gives_its_points() {
+fn gpx_points_are_read() {
     let gpx = r#"<?xml version="1.0" encoding="UTF-8"?>
 <gpx version="1.1" creator="x" xmlns="http://www.topografix.com/GPX/1/1" xmlns:g="urn:g">
  <metadata><time>2001-01-01T00:00:00Z</time></metadata>
@@ -112,7 +112,7 @@ fn gpx_gives_its_points() {
 }
 
 #[test]
-fn what_is_no_gpx_breaks_off_with_its_reason() {
+fn invalid_gpx_ends_with_a_reason() {
     let broken = |text: String| {
         let mut rows =
             read_received_fixes(text.as_bytes(), FixFormat::Gpx, rules().time_bounds).expect("a reader");
@@ -137,7 +137,7 @@ fn what_is_no_gpx_breaks_off_with_its_reason() {
 }
 
 #[test]
-fn gpsd_gives_its_reports_of_position() {
+fn gpsd_reports_of_position_are_read() {
     let log = r#"{"class":"VERSION","release":"3.25","proto_major":3}
 {"class":"DEVICES","devices":[{"class":"DEVICE","path":"/dev/ttyUSB0"}]}
 {"class":"TPV","device":"/dev/ttyUSB0","mode":1}
@@ -167,7 +167,7 @@ not json
 }
 
 #[test]
-fn a_table_of_fixes_may_name_receivers() {
+fn a_csv_file_of_fixes_may_name_receivers() {
     let csv = "longitude,latitude,time,target_id,receiver_id\n\
                103.9,30.6,2020-12-14T06:41:48Z,person-1,phone\n\
                103.9,30.6,2020-12-14T06:41:49Z,person-1,\n\
@@ -213,8 +213,8 @@ fn detections_need_no_fix_and_may_share_a_target() {
 
 proptest! {
     #[test]
-    fn any_bytes_are_told_from_a_file_of_fixes(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
-        for format in FixFormat::ALL {
+    fn arbitrary_bytes_never_panic_as_fixes(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+        for &format in FixFormat::ALL {
             for begin in ["", "<gpx><trkpt lat=\"1\" lon=\"2\">", "{\"class\":\"TPV\",", "$GPRMC,1", "time,longitude,latitude\n"] {
                 let text = [begin.as_bytes(), &bytes].concat();
                 if let Ok(rows) = read_received_fixes(&text[..], format, rules().time_bounds) {

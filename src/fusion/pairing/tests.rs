@@ -3,12 +3,13 @@
 use std::path::PathBuf;
 
 use proptest::prelude::*;
+use rand_chacha::ChaCha8Rng;
 
 use super::*;
 use crate::domain::{BoundingBox, ClockOffset, Receiver, ReceiverId, parse_time};
 use crate::fusion::clock_offset::{OffsetSearch, estimate_clock_offset};
-use crate::fusion::track::simulated::{Normal, World, at_s};
 use crate::geo::Position;
+use crate::simulation::{Walk, at_s, standard_normal, stream};
 
 fn target(name: &str) -> TargetId {
     TargetId::new(name).expect("a name")
@@ -33,14 +34,10 @@ fn received(name: Option<&str>, seconds: f64, longitude_deg: f64) -> ReceivedFix
     ReceivedFix { time: at_s(seconds), receiver_id: name.map(receiver), fix: Fix { position, sigma_m: None } }
 }
 
-fn columns(name: &str) -> Option<Vec<Vec<String>>> {
+fn columns(name: &str) -> Vec<Vec<String>> {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
-    if !path.exists() {
-        println!("skipped: ../shared/data/square/{name} is not there");
-        return None;
-    }
     let mut reader = csv::Reader::from_path(path).expect("readable");
-    Some(reader.records().map(|row| row.expect("a row").iter().map(str::to_owned).collect()).collect())
+    reader.records().map(|row| row.expect("a row").iter().map(str::to_owned).collect()).collect()
 }
 
 fn number(row: &[String], column: usize) -> f64 {
@@ -64,9 +61,9 @@ fn fixed(row: &[String], column: usize) -> Fix {
 }
 
 /// The square's boxes and fixes, unpaired.
-fn square() -> Option<(Vec<Detection>, Vec<ReceivedFix>)> {
-    let detections = columns("detections.csv")?.iter().map(|row| boxed(row)).collect();
-    let fixes = columns("gnss.csv")?
+fn square() -> (Vec<Detection>, Vec<ReceivedFix>) {
+    let detections = columns("detections.csv").iter().map(|row| boxed(row)).collect();
+    let fixes = columns("gnss.csv")
         .iter()
         .map(|row| ReceivedFix {
             time: parse_time(&row[0]).expect("a time"),
@@ -74,7 +71,7 @@ fn square() -> Option<(Vec<Detection>, Vec<ReceivedFix>)> {
             fix: fixed(row, 1),
         })
         .collect();
-    Some((detections, fixes))
+    (detections, fixes)
 }
 
 fn carried_by(name: &str, phone: &str, offset_s: f64) -> Receivers {
@@ -84,8 +81,9 @@ fn carried_by(name: &str, phone: &str, offset_s: f64) -> Receivers {
 }
 
 #[test]
-fn the_paired_file_of_the_square_comes_back_row_by_row() {
-    let (Some((detections, fixes)), Some(paired)) = (square(), columns("training.csv")) else { return };
+#[ignore = "needs ../shared/data"]
+fn shared_files_are_paired_to_the_paired_file() {
+    let ((detections, fixes), paired) = (square(), columns("training.csv"));
     let expected: Vec<(Detection, Fix)> = paired.iter().map(|row| (boxed(row), fixed(row, 6))).collect();
     let (boxes, all_fixes) = (detections.len(), fixes.len());
     let receivers = carried_by("person-1", "phone", 0.0);
@@ -100,8 +98,9 @@ fn the_paired_file_of_the_square_comes_back_row_by_row() {
 }
 
 #[test]
-fn the_squares_clocks_agree_and_a_shifted_one_is_found() {
-    let Some((detections, fixes)) = square() else { return };
+#[ignore = "needs ../shared/data"]
+fn shared_clocks_agree_and_a_shifted_one_is_found() {
+    let (detections, fixes) = square();
     let plain: Vec<(Timestamp, Fix)> = fixes.iter().map(|it| (it.time, it.fix)).collect();
     let own = estimate_clock_offset(&detections, &plain, &OffsetSearch::default()).expect("he walks");
     println!("{own:?}");
@@ -119,15 +118,16 @@ fn the_squares_clocks_agree_and_a_shifted_one_is_found() {
 fn a_known_offset_is_found_in_a_simulated_walk() {
     let plane = LocalPlane::new(Position::new(8.0, 47.0).expect("valid"));
     for (seed, shift_s) in [(1, 0.0), (2, -1.3), (3, 4.2), (4, 0.4)] {
-        let walk = World { turn_s: 12, ..World::phone() }.walk(seed, 900);
-        let mut random = Normal::seeded(seed);
+        let walk = Walk { turn_interval_s: 12, ..Walk::pedestrian() }.simulate(seed, 900);
+        let mut random = stream(seed, 0);
         let (mut detections, mut fixes) = (Vec::new(), Vec::new());
-        for (second, (truth, measurement)) in walk.iter().enumerate() {
+        for (second, positions) in walk.iter().enumerate() {
+            let truth = positions.truth;
             // A camera 12 m above the ground, 150 m south of where the walk begins.
             let range_m = (truth.north_m + 150.0).max(20.0);
             let foot = [
-                900.0 + 1_200.0 * truth.east_m / range_m + random.draw(),
-                300.0 + 14_400.0 / range_m + random.draw(),
+                900.0 + 1_200.0 * truth.east_m / range_m + standard_normal(&mut random),
+                300.0 + 14_400.0 / range_m + standard_normal(&mut random),
             ];
             let height_px = 2_000.0 / range_m;
             detections.push(Detection {
@@ -135,7 +135,7 @@ fn a_known_offset_is_found_in_a_simulated_walk() {
                     .expect("valid"),
                 ..detection("walker", second as f64)
             });
-            let position = plane.to_position(measurement.fix.expect("always").position);
+            let position = plane.to_position(positions.fix);
             fixes.push((at_s(second as f64 - shift_s), Fix { position, sigma_m: None }));
         }
         let found = estimate_clock_offset(&detections, &fixes, &OffsetSearch::default()).expect("walks");
@@ -246,15 +246,15 @@ proptest! {
     fn a_stream_gives_what_the_lists_give(seed in 0..10_000u64, interpolated in any::<bool>()) {
         let rule = if interpolated { PairingRule::Interpolated } else { PairingRule::Nearest };
         let settings = PairingSettings { rule, ..PairingSettings::default() };
-        let mut random = Normal::seeded(seed);
+        let mut random = stream(seed, 0);
         let (mut detections, mut fixes) = (Vec::new(), Vec::new());
         for (name, rate_hz) in [("a", 5.0), ("b", 1.0)] {
             for index in 0..120 {
-                let jitter_s = 0.05 * random.draw().sin();
-                if random.draw() < 1.0 {
+                let jitter_s = 0.05 * standard_normal(&mut random).sin();
+                if standard_normal(&mut random) < 1.0 {
                     detections.push(detection(name, 100.0 + f64::from(index) / rate_hz + jitter_s));
                 }
-                if random.draw() < 1.0 {
+                if standard_normal(&mut random) < 1.0 {
                     fixes.push(received(Some(name), 100.3 + f64::from(index) + jitter_s, 5.0 + 1e-5 * f64::from(index)));
                 }
             }
@@ -262,7 +262,7 @@ proptest! {
         let batch = pair(detections.clone(), fixes.clone(), &Receivers::default(), &settings);
         // Every item arrives up to 2.8 s late.
         enum Item { Box(Detection), Fix(ReceivedFix) }
-        let late = |random: &mut Normal, time: Timestamp| time + SignedDuration::from_secs_f64(1.4 * (1.0 + random.draw().sin()));
+        let late = |random: &mut ChaCha8Rng, time: Timestamp| time + SignedDuration::from_secs_f64(1.4 * (1.0 + standard_normal(random).sin()));
         let mut items: Vec<(Timestamp, Item)> = Vec::new();
         for it in detections { items.push((late(&mut random, it.time), Item::Box(it))); }
         for it in fixes { items.push((late(&mut random, it.time), Item::Fix(it))); }

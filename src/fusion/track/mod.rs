@@ -1,17 +1,21 @@
-//! Sequence fusion: where one target is, from all that was measured of it so far.
+//! Sequence fusion: the state of one target from all measurements of it so far.
 //!
-//! A [`Track`] holds position, velocity, a slowly changing bias of the receiver and one of the
-//! camera's model (METHOD "Sequence fusion"). Fixes and regressed positions come with their error
-//! variances, together or apart, late or never; what lies beyond the gate is rejected with a reason,
-//! which is data and not an error. What never happens here: clocks, I/O, pixels, degrees; and the
-//! same items in another order within the window give the same state to the last bit.
+//! A [`Track`] estimates position, velocity, a slowly varying bias of the receiver and one of the
+//! camera's model (METHOD "Sequence fusion") with an interacting-multiple-model filter. Fixes and
+//! regressed positions arrive with their error covariances, together or apart, late or never.
+//! Measurements beyond the chi-square gate are rejected with a reason; a rejection is part of the
+//! answer, not an error. Out-of-sequence measurements within the window are inserted at their time
+//! and the filter is replayed from the last checkpoint before them, so the order of arrival does
+//! not change the state by a single bit. What never happens here: clocks, I/O, pixels, degrees.
 
-mod bank;
-mod learnt;
-mod noise;
+mod gate;
+mod gnss_noise;
+mod imm_filter;
+mod measurement;
+mod mode_filter;
 mod settings;
-#[cfg(test)]
-pub(in crate::fusion) mod simulated;
+mod settings_estimation;
+mod state;
 #[cfg(test)]
 mod tests;
 
@@ -20,398 +24,245 @@ use std::collections::VecDeque;
 
 use jiff::Timestamp;
 
-pub use learnt::{Pass, passes};
-pub use noise::{GnssNoiseEstimate, ResidualAt, estimate_gnss_noise};
-pub use settings::{GnssNoise, Motion, RegressionNoise, TrackSettings};
+pub use gnss_noise::{GnssNoiseEstimate, TimedResidual, estimate_gnss_noise};
+pub use measurement::{MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason};
+pub use settings::{GnssNoise, MotionModel, RegressionNoise, TrackSettings};
+pub use settings_estimation::traverses;
+pub use state::{Innovation, TrackState, Velocity};
 
-use self::bank::{Bank, Judgement};
-use super::plane_covariance::PlaneCovariance;
-use crate::geo::EastNorth;
+use self::gate::GateOutcome;
+use self::imm_filter::ImmFilter;
 
-/// Items between two stored states: what a late item costs at most, beside those behind it.
-const CHECKPOINT_ITEMS: usize = 8;
+/// Measurements between two checkpoints: an upper bound on what an insertion replays in addition to
+/// the measurements after it.
+const CHECKPOINT_INTERVAL: usize = 8;
 
-/// A position with the covariance of its error.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Measured {
-    /// Where, in the camera's plane.
-    pub position: EastNorth,
-    /// Covariance of the error, bias included, m2.
-    pub covariance: PlaneCovariance,
-}
-
-impl Measured {
-    /// A position whose error has the same variance in every direction: sigma squared of a fix,
-    /// or `e_regression_m2`.
-    #[must_use]
-    pub const fn isotropic(position: EastNorth, variance_m2: f64) -> Self {
-        Self { position, covariance: PlaneCovariance::isotropic(variance_m2) }
-    }
-}
-
-/// What was measured at one instant; either half may be missing.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Measurement {
-    /// When.
-    pub time: Timestamp,
-    /// The receiver's fix.
-    pub fix: Option<Measured>,
-    /// The position regressed from the box.
-    pub regressed: Option<Measured>,
-}
-
-/// Where a measured position came from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Source {
-    /// The box, through the camera's model.
-    Regressed,
-    /// The receiver.
-    Fix,
-}
-
-impl Source {
-    /// The one name used everywhere.
-    #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Regressed => "regressed",
-            Self::Fix => "fix",
-        }
-    }
-}
-
-/// Why a measured position was not taken up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum RejectionReason {
-    /// Too far from where the track expects it, by the chi-square gate.
-    OutsideGate,
-    /// Older than the window of late items.
-    TooLate,
-    /// The same source has spoken for this instant before.
-    Duplicate,
-    /// Its covariance is not positive.
-    UnusableVariance,
-}
-
-impl RejectionReason {
-    /// All of them.
-    pub const ALL: [Self; 4] = [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance];
-
-    /// The one name used everywhere.
-    #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::OutsideGate => "outside_gate",
-            Self::TooLate => "too_late",
-            Self::Duplicate => "duplicate",
-            Self::UnusableVariance => "unusable_variance",
-        }
-    }
-}
-
-/// A measured position that was not taken up.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Rejection {
-    /// Which half of the measurement.
-    pub source: Source,
-    /// Why.
-    pub reason: RejectionReason,
-    /// Squared Mahalanobis length of its innovation, where one was computed.
-    pub nis: Option<f64>,
-}
-
-/// What one update says of the filter's consistency.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Innovation {
-    /// Which half of the measurement.
-    pub source: Source,
-    /// Measured less expected.
-    pub difference: EastNorth,
-    /// Squared Mahalanobis length of the difference: chi-square of 2 degrees, mean 2, for a
-    /// consistent filter.
-    pub nis: f64,
-}
-
-/// A velocity in the camera's plane.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Velocity {
-    /// Towards east, m/s.
-    pub east_m_s: f64,
-    /// Towards north, m/s.
-    pub north_m_s: f64,
-}
-
-impl Velocity {
-    /// m/s along the direction of motion.
-    #[must_use]
-    pub fn speed_m_s(self) -> f64 {
-        self.east_m_s.hypot(self.north_m_s)
-    }
-}
-
-/// What a track says of its target at one instant.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TrackState {
-    /// When.
-    pub time: Timestamp,
-    /// Where.
-    pub position: EastNorth,
-    /// How fast and where to.
-    pub velocity: Velocity,
-    /// Covariance of the position's error, m2.
-    pub covariance: PlaneCovariance,
-    /// Radius about `position` that holds the truth with 95 % probability, m.
-    pub r95_m: f64,
-    /// Probability that the target stands, 0 to 1.
-    pub still: f64,
-    /// NIS of what the latest measurement brought, summed over the halves taken up (2 degrees each).
-    pub nis: Option<f64>,
-    /// The innovations taken up, one per half.
-    pub innovations: Vec<Innovation>,
-    /// The halves not taken up.
-    pub rejected: Vec<Rejection>,
-    /// Whether the track began anew at this measurement, because it had contradicted all it was
-    /// told for a while.
-    pub restarted: bool,
-}
-
-/// One item of the window, with the state after it now and then.
+/// One measurement of the window; every [`CHECKPOINT_INTERVAL`] of them carry the filter after it.
 #[derive(Debug, Clone)]
-struct Entry {
+struct WindowEntry {
     measurement: Measurement,
-    checkpoint: Option<Box<Bank>>,
+    checkpoint: Option<Box<ImmFilter>>,
 }
 
 /// The sequence fusion of one target.
 #[derive(Debug, Clone)]
 pub struct Track {
     settings: TrackSettings,
-    /// The state before the first entry.
-    base: Box<Bank>,
-    entries: VecDeque<Entry>,
-    now: Box<Bank>,
+    /// The filter before the first entry of the window.
+    base: Box<ImmFilter>,
+    /// In the order of [`precedes_or_equals`].
+    window: VecDeque<WindowEntry>,
+    /// The filter after the last entry of the window.
+    current: Box<ImmFilter>,
     first: Measurement,
 }
 
 impl Track {
-    /// A track from the first measurement of its target; `None` if that has neither a usable fix
-    /// nor a usable regressed position.
+    /// Initialises a track from the first measurement of its target; `None` if that has neither a
+    /// usable fix nor a usable regressed position.
     #[must_use]
     pub fn start(settings: TrackSettings, first: &Measurement) -> Option<Self> {
-        let usable = |measured: Option<Measured>| measured.filter(|it| it.covariance.is_positive());
-        let (source, measured, rest) = match (usable(first.regressed), usable(first.fix)) {
-            (Some(regressed), fix) => (Source::Regressed, regressed, fix),
-            (None, Some(fix)) => (Source::Fix, fix, None),
+        let usable = |measured: Option<MeasuredPosition>| measured.filter(|it| it.covariance.is_positive());
+        let (source, measured, remaining_fix) = match (usable(first.regressed), usable(first.fix)) {
+            (Some(regressed), fix) => (MeasurementSource::Regressed, regressed, fix),
+            (None, Some(fix)) => (MeasurementSource::Fix, fix, None),
             (None, None) => return None,
         };
-        let mut bank = Bank::start(&settings, first.time, source, measured);
-        if rest.is_some() {
-            bank.step(&settings, &Measurement { time: first.time, fix: rest, regressed: None });
+        let mut filter = ImmFilter::new(&settings, first.time, source, measured);
+        if remaining_fix.is_some() {
+            let fix_only = Measurement { time: first.time, fix: remaining_fix, regressed: None };
+            filter.step(&settings, &fix_only);
         }
-        let base = Box::new(bank);
-        Some(Self { settings, now: base.clone(), base, entries: VecDeque::new(), first: *first })
+        let base = Box::new(filter);
+        Some(Self { settings, current: base.clone(), base, window: VecDeque::new(), first: *first })
     }
 
-    /// When the target was measured first.
+    /// Time of the first measurement.
     #[must_use]
     pub const fn started_at(&self) -> Timestamp {
         self.first.time
     }
 
-    /// When the target was measured last.
+    /// Time of the latest measurement.
     #[must_use]
     pub fn measured_at(&self) -> Timestamp {
-        self.now.time
+        self.current.time
     }
 
-    /// Whether the target has not been measured for longer than its time to live.
+    /// Whether the target has not been measured for longer than `time_to_live_s`.
     #[must_use]
-    pub fn is_gone(&self, at: Timestamp) -> bool {
-        at.duration_since(self.now.time).as_secs_f64() > self.settings.time_to_live_s
+    pub fn is_expired(&self, at: Timestamp) -> bool {
+        at.duration_since(self.current.time).as_secs_f64() > self.settings.time_to_live_s
     }
 
-    /// The beliefs in force.
+    /// The noise and motion models in use.
     #[must_use]
     pub const fn settings(&self) -> &TrackSettings {
         &self.settings
     }
 
-    /// Takes up a measurement, late ones at their place in time, and says where the target is at
-    /// the latest instant measured.
+    /// Processes a measurement, an out-of-sequence one at its place in time, and returns the state at
+    /// the latest measured instant.
     pub fn update(&mut self, measurement: &Measurement) -> TrackState {
         let (measurement, mut rejected) = self.admit(measurement);
         if measurement.fix.is_none() && measurement.regressed.is_none() {
-            return self.state(&[None, None], rejected);
+            return self.state_after(&[None, None], rejected);
         }
-        let place = self.entries.partition_point(|entry| precedes(&entry.measurement, &measurement));
-        self.entries.insert(place, Entry { measurement, checkpoint: None });
-        let judgements = if place + 1 == self.entries.len() {
-            let judgements = self.now.step(&self.settings, &measurement);
-            self.keep(place);
-            judgements
+        let index = self.window.partition_point(|entry| precedes_or_equals(&entry.measurement, &measurement));
+        self.window.insert(index, WindowEntry { measurement, checkpoint: None });
+        let outcomes = if index + 1 == self.window.len() {
+            let outcomes = self.current.step(&self.settings, &measurement);
+            self.checkpoint(index);
+            outcomes
         } else {
-            self.refilter(place)
+            self.replay_from(index)
         };
-        self.shrink();
-        for judgement in judgements.iter().flatten() {
-            if let Some(reason) = judgement.rejected {
-                let nis = judgement.nis.is_finite().then_some(judgement.nis);
-                rejected.push(Rejection { source: judgement.source, reason, nis });
+        self.prune();
+        for outcome in outcomes.iter().flatten() {
+            if let Some(reason) = outcome.rejected {
+                let nis = outcome.nis.is_finite().then_some(outcome.nis);
+                rejected.push(Rejection { source: outcome.source, reason, nis });
             }
         }
-        self.state(&judgements, rejected)
+        self.state_after(&outcomes, rejected)
     }
 
-    /// What the track says of another instant: foretold beyond the latest measurement, as then
-    /// filtered within the window, and as at the window's beginning before that.
+    /// The state at another instant: predicted beyond the latest measurement, the filtered state of
+    /// that time within the window, and the state at the beginning of the window before that.
     #[must_use]
     pub fn state_at(&self, time: Timestamp) -> TrackState {
-        let mut bank = if time >= self.now.time {
-            (*self.now).clone()
+        let mut filter = if time >= self.current.time {
+            (*self.current).clone()
         } else {
-            let end = self.entries.partition_point(|entry| entry.measurement.time <= time);
-            let (mut bank, begin) = self.resume(end);
-            for entry in self.entries.range(begin..end) {
-                bank.step(&self.settings, &entry.measurement);
+            let end = self.window.partition_point(|entry| entry.measurement.time <= time);
+            let (mut filter, begin) = self.latest_checkpoint(end);
+            for entry in self.window.range(begin..end) {
+                filter.step(&self.settings, &entry.measurement);
             }
-            bank
+            filter
         };
-        bank.predict(&self.settings, time);
-        describe(&bank)
+        filter.predict(&self.settings, time);
+        filter.track_state()
     }
 
-    /// The measurement without what the window refuses, and the refusals.
+    /// The measurement without the positions that cannot be processed, and a rejection for each of
+    /// those.
     fn admit(&self, measurement: &Measurement) -> (Measurement, Vec<Rejection>) {
         let mut rejected = Vec::new();
         let mut admitted = *measurement;
-        let age_s = self.now.time.duration_since(measurement.time).as_secs_f64();
-        let forgotten = match measurement.time.cmp(&self.base.time) {
+        let age_s = self.current.time.duration_since(measurement.time).as_secs_f64();
+        let before_window = match measurement.time.cmp(&self.base.time) {
             Ordering::Less => true,
-            // Whether a source has spoken at that instant is known of the very first one alone.
+            // Duplicates at the base's own instant are recognisable for the first measurement only.
             Ordering::Equal => measurement.time != self.first.time,
             Ordering::Greater => false,
         };
-        let too_late = age_s > self.settings.window_s || forgotten;
-        for source in [Source::Regressed, Source::Fix] {
-            let half = match source {
-                Source::Regressed => &mut admitted.regressed,
-                Source::Fix => &mut admitted.fix,
+        let too_late = age_s > self.settings.window_s || before_window;
+        for source in [MeasurementSource::Regressed, MeasurementSource::Fix] {
+            let position = match source {
+                MeasurementSource::Regressed => &mut admitted.regressed,
+                MeasurementSource::Fix => &mut admitted.fix,
             };
-            let Some(measured) = half else { continue };
+            let Some(measured) = position else { continue };
             let reason = if too_late {
                 RejectionReason::TooLate
             } else if !measured.covariance.is_positive() {
                 RejectionReason::UnusableVariance
-            } else if self.has_heard(measurement.time, source) {
+            } else if self.is_duplicate(measurement.time, source) {
                 RejectionReason::Duplicate
             } else {
                 continue;
             };
-            *half = None;
+            *position = None;
             rejected.push(Rejection { source, reason, nis: None });
         }
         (admitted, rejected)
     }
 
-    fn has_heard(&self, time: Timestamp, source: Source) -> bool {
-        let begin = self.entries.partition_point(|entry| entry.measurement.time < time);
-        self.entries
+    fn is_duplicate(&self, time: Timestamp, source: MeasurementSource) -> bool {
+        let begin = self.window.partition_point(|entry| entry.measurement.time < time);
+        self.window
             .range(begin..)
             .map(|entry| &entry.measurement)
             .take_while(|measurement| measurement.time == time)
             .chain((self.first.time == time).then_some(&self.first))
             .any(|measurement| match source {
-                Source::Regressed => measurement.regressed.is_some(),
-                Source::Fix => measurement.fix.is_some(),
+                MeasurementSource::Regressed => measurement.regressed.is_some(),
+                MeasurementSource::Fix => measurement.fix.is_some(),
             })
     }
 
-    /// The latest stored state before an entry, and the first entry that it has not seen.
-    fn resume(&self, before: usize) -> (Bank, usize) {
+    /// The latest checkpoint before an entry, and the index of the first entry after that checkpoint.
+    fn latest_checkpoint(&self, before: usize) -> (ImmFilter, usize) {
         (0..before)
             .rev()
-            .find_map(|index| Some(((**self.entries[index].checkpoint.as_ref()?).clone(), index + 1)))
+            .find_map(|index| Some(((**self.window[index].checkpoint.as_ref()?).clone(), index + 1)))
             .unwrap_or_else(|| ((*self.base).clone(), 0))
     }
 
-    /// Filters anew from an inserted entry on, and returns what became of that entry.
-    fn refilter(&mut self, place: usize) -> [Option<Judgement>; 2] {
-        let (bank, begin) = self.resume(place);
-        *self.now = bank;
-        let mut judgements = [None, None];
-        for index in begin..self.entries.len() {
-            let stepped = self.now.step(&self.settings, &self.entries[index].measurement);
-            if index == place {
-                judgements = stepped;
+    /// Replays the filter from the checkpoint before an inserted entry, and returns the gate outcomes
+    /// of that entry.
+    fn replay_from(&mut self, inserted: usize) -> [Option<GateOutcome>; 2] {
+        let (filter, begin) = self.latest_checkpoint(inserted);
+        *self.current = filter;
+        let mut outcomes = [None, None];
+        for index in begin..self.window.len() {
+            let stepped = self.current.step(&self.settings, &self.window[index].measurement);
+            if index == inserted {
+                outcomes = stepped;
             }
-            self.entries[index].checkpoint = None;
-            self.keep(index);
+            self.window[index].checkpoint = None;
+            self.checkpoint(index);
         }
-        judgements
+        outcomes
     }
 
-    /// Stores the state after an entry if none was stored for a while.
-    fn keep(&mut self, index: usize) {
-        let begin = (index + 1).saturating_sub(CHECKPOINT_ITEMS);
-        let recent = self.entries.range(begin..index).any(|entry| entry.checkpoint.is_some());
-        if !recent && index + 1 >= CHECKPOINT_ITEMS {
-            self.entries[index].checkpoint = Some(self.now.clone());
+    /// Stores the filter with an entry if none of the preceding entries of an interval has one.
+    fn checkpoint(&mut self, index: usize) {
+        let begin = (index + 1).saturating_sub(CHECKPOINT_INTERVAL);
+        let has_recent = self.window.range(begin..index).any(|entry| entry.checkpoint.is_some());
+        if !has_recent && index + 1 >= CHECKPOINT_INTERVAL {
+            self.window[index].checkpoint = Some(self.current.clone());
         }
     }
 
-    /// Forgets what lies before the window, up to a stored state.
-    fn shrink(&mut self) {
+    /// Drops entries older than the window, up to a checkpoint, which becomes the base.
+    fn prune(&mut self) {
         let window_s = self.settings.window_s;
         loop {
-            let Some(index) = self.entries.iter().position(|entry| entry.checkpoint.is_some()) else {
+            let Some(index) = self.window.iter().position(|entry| entry.checkpoint.is_some()) else {
                 return;
             };
-            let age_s = self.now.time.duration_since(self.entries[index].measurement.time).as_secs_f64();
-            let crowded = self.entries.len() > self.settings.window_items.max(2 * CHECKPOINT_ITEMS);
-            if age_s <= window_s && !crowded {
+            let age_s = self.current.time.duration_since(self.window[index].measurement.time).as_secs_f64();
+            let is_full = self.window.len() > self.settings.window_items.max(2 * CHECKPOINT_INTERVAL);
+            if age_s <= window_s && !is_full {
                 return;
             }
-            if let Some(checkpoint) = self.entries[index].checkpoint.take() {
+            if let Some(checkpoint) = self.window[index].checkpoint.take() {
                 self.base = checkpoint;
             }
-            self.entries.drain(..=index);
+            self.window.drain(..=index);
         }
     }
 
-    fn state(&self, judgements: &[Option<Judgement>; 2], rejected: Vec<Rejection>) -> TrackState {
-        let mut state = describe(&self.now);
-        let taken = judgements.iter().flatten().filter(|it| it.rejected.is_none());
-        state.innovations = taken
+    fn state_after(&self, outcomes: &[Option<GateOutcome>; 2], rejected: Vec<Rejection>) -> TrackState {
+        let mut state = self.current.track_state();
+        let accepted = outcomes.iter().flatten().filter(|it| it.rejected.is_none());
+        state.innovations = accepted
             .clone()
-            .filter(|it| !it.restarted)
+            .filter(|it| !it.reinitialized)
             .map(|it| Innovation { source: it.source, difference: it.innovation, nis: it.nis })
             .collect();
-        state.restarted = taken.clone().any(|it| it.restarted);
+        state.reinitialized = accepted.clone().any(|it| it.reinitialized);
         state.nis = (!state.innovations.is_empty()).then(|| state.innovations.iter().map(|it| it.nis).sum());
         state.rejected = rejected;
         state
     }
 }
 
-/// The order of the window: by time, and at one instant the box before the fix, so that the order
-/// of arrival leaves no trace.
-fn precedes(earlier: &Measurement, later: &Measurement) -> bool {
+/// The processing order: by time, and at one instant the regressed position before the fix, so that
+/// the result does not depend on the order of arrival.
+fn precedes_or_equals(earlier: &Measurement, later: &Measurement) -> bool {
     let rank = |measurement: &Measurement| u8::from(measurement.regressed.is_none());
     (earlier.time, rank(earlier)) <= (later.time, rank(later))
-}
-
-fn describe(bank: &Bank) -> TrackState {
-    let belief = bank.belief();
-    TrackState {
-        time: bank.time,
-        position: belief.position,
-        velocity: Velocity { east_m_s: belief.velocity[0], north_m_s: belief.velocity[1] },
-        covariance: belief.covariance,
-        r95_m: belief.covariance.r95_m(),
-        still: belief.still,
-        nis: None,
-        innovations: Vec::new(),
-        rejected: Vec::new(),
-        restarted: false,
-    }
 }

@@ -1,14 +1,32 @@
-//! Seeded simulations with bounds: consistency, growth, gates, order.
+//! Seeded simulations with bounds: consistency, growth of the error, gates, order of arrival.
 
 use jiff::SignedDuration;
 use proptest::prelude::*;
 
-use super::simulated::{Normal, World, at_s};
 use super::*;
+use crate::geo::EastNorth;
+use crate::simulation::{PositionNoise, SimulatedPositions, Walk, at_s, standard_normal, stream};
 
-/// What a run over a simulated walk came to.
+/// Both positions of an instant, with the covariances that the simulation has.
+fn measurement(walk: &Walk, positions: &SimulatedPositions) -> Measurement {
+    let measured =
+        |position, noise: PositionNoise| MeasuredPosition::isotropic(position, noise.sigma_m * noise.sigma_m);
+    Measurement {
+        time: positions.time,
+        fix: Some(measured(positions.fix, walk.gnss)),
+        regressed: Some(measured(positions.regressed, walk.regression)),
+    }
+}
+
+/// True positions with their measurements.
+fn simulate(walk: &Walk, seed: u64, seconds: u32) -> Vec<(EastNorth, Measurement)> {
+    let positions = walk.simulate(seed, seconds);
+    positions.iter().map(|it| (it.truth, measurement(walk, it))).collect()
+}
+
+/// Means over the steps of some runs; counts of rejections and steps.
 #[derive(Default, Debug)]
-struct Tally {
+struct Summary {
     error_m: f64,
     gnss_error_m: f64,
     two_step_error_m: f64,
@@ -19,12 +37,12 @@ struct Tally {
     steps: f64,
 }
 
-fn run(settings: TrackSettings, world: &World, seeds: std::ops::Range<u64>, seconds: u32) -> Tally {
-    let mut tally = Tally::default();
+fn run(settings: TrackSettings, walk: &Walk, seeds: std::ops::Range<u64>, seconds: u32) -> Summary {
+    let mut summary = Summary::default();
     for seed in seeds {
-        let walk = world.walk(seed, seconds);
-        let mut track = Track::start(settings, &walk[0].1).expect("has both");
-        for (truth, measurement) in &walk[1..] {
+        let measurements = simulate(walk, seed, seconds);
+        let mut track = Track::start(settings, &measurements[0].1).expect("has both");
+        for (truth, measurement) in &measurements[1..] {
             let state = track.update(measurement);
             let fix = measurement.fix.expect("always there");
             let regressed = measurement.regressed.expect("always there");
@@ -33,26 +51,26 @@ fn run(settings: TrackSettings, world: &World, seeds: std::ops::Range<u64>, seco
                 east_m: weight * regressed.position.east_m + (1.0 - weight) * fix.position.east_m,
                 north_m: weight * regressed.position.north_m + (1.0 - weight) * fix.position.north_m,
             };
-            tally.steps += 1.0;
-            tally.error_m += state.position.distance_m(*truth);
-            tally.gnss_error_m += fix.position.distance_m(*truth);
-            tally.two_step_error_m += two_step.distance_m(*truth);
-            tally.nees += state.covariance.squared_length(minus(state.position, *truth));
-            tally.inside += f64::from(u8::from(state.position.distance_m(*truth) <= state.r95_m));
-            tally.rejected += state.rejected.len();
+            summary.steps += 1.0;
+            summary.error_m += state.position.distance_m(*truth);
+            summary.gnss_error_m += fix.position.distance_m(*truth);
+            summary.two_step_error_m += two_step.distance_m(*truth);
+            summary.nees += state.covariance.mahalanobis_squared(minus(state.position, *truth));
+            summary.inside += f64::from(u8::from(state.position.distance_m(*truth) <= state.r95_m));
+            summary.rejected += state.rejected.len();
             for innovation in &state.innovations {
-                tally.nis[innovation.source as usize] += innovation.nis;
+                summary.nis[innovation.source as usize] += innovation.nis;
             }
         }
     }
-    let steps = tally.steps;
-    tally.error_m /= steps;
-    tally.gnss_error_m /= steps;
-    tally.two_step_error_m /= steps;
-    tally.nees /= steps;
-    tally.inside /= steps;
-    tally.nis = tally.nis.map(|sum| sum / steps);
-    tally
+    let steps = summary.steps;
+    summary.error_m /= steps;
+    summary.gnss_error_m /= steps;
+    summary.two_step_error_m /= steps;
+    summary.nees /= steps;
+    summary.inside /= steps;
+    summary.nis = summary.nis.map(|sum| sum / steps);
+    summary
 }
 
 fn minus(a: EastNorth, b: EastNorth) -> EastNorth {
@@ -61,106 +79,106 @@ fn minus(a: EastNorth, b: EastNorth) -> EastNorth {
 
 /// A fix alone, with the square of its sigma.
 fn fix_at(seconds: f64, east_m: f64, variance_m2: f64) -> Measurement {
-    let fix = Measured::isotropic(EastNorth { east_m, north_m: 0.0 }, variance_m2);
+    let fix = MeasuredPosition::isotropic(EastNorth { east_m, north_m: 0.0 }, variance_m2);
     Measurement { time: at_s(seconds), fix: Some(fix), regressed: None }
 }
 
-fn moved(measured: Option<Measured>, east_m: f64) -> Option<Measured> {
-    measured.map(|it| Measured {
+fn moved(measured: Option<MeasuredPosition>, east_m: f64) -> Option<MeasuredPosition> {
+    measured.map(|it| MeasuredPosition {
         position: EastNorth { east_m: it.position.east_m + east_m, ..it.position },
         ..it
     })
 }
 
 #[test]
-fn a_walker_is_followed_consistently_and_better_than_by_two_steps() {
-    let tally = run(TrackSettings::default(), &World::phone(), 0..20, 600);
-    println!("{tally:?}");
-    assert!(tally.error_m < 0.95 * tally.two_step_error_m, "{tally:?}");
-    assert!(tally.error_m < 0.45 * tally.gnss_error_m, "{tally:?}");
-    // Chi-square of 2 degrees has mean 2. The walker turns on the spot where the filter expects
-    // accelerations, so the bounds are wider than sampling alone would ask for.
-    assert!((1.5..2.5).contains(&tally.nees), "{tally:?}");
-    assert!(tally.nis.iter().all(|nis| (1.4..2.5).contains(nis)), "{tally:?}");
-    assert!((0.92..0.98).contains(&tally.inside), "{tally:?}");
-    assert!((tally.rejected as f64) < 0.01 * tally.steps, "{tally:?}");
+fn a_pedestrian_is_tracked_consistently_and_better_than_by_two_step_fusion() {
+    let summary = run(TrackSettings::default(), &Walk::pedestrian(), 0..20, 600);
+    println!("{summary:?}");
+    assert!(summary.error_m < 0.95 * summary.two_step_error_m, "{summary:?}");
+    assert!(summary.error_m < 0.45 * summary.gnss_error_m, "{summary:?}");
+    // Chi-square with 2 degrees of freedom has mean 2. The simulated heading changes abruptly where the
+    // filter models accelerations, so the bounds are wider than sampling alone would require.
+    assert!((1.5..2.5).contains(&summary.nees), "{summary:?}");
+    assert!(summary.nis.iter().all(|nis| (1.4..2.5).contains(nis)), "{summary:?}");
+    assert!((0.92..0.98).contains(&summary.inside), "{summary:?}");
+    assert!((summary.rejected as f64) < 0.01 * summary.steps, "{summary:?}");
 }
 
 #[test]
-fn a_standing_target_is_averaged() {
-    let world = World { speed_m_s: 0.0, camera_sigma_m: 1.5, ..World::phone() };
-    let tally = run(TrackSettings::default(), &world, 100..160, 450);
-    println!("{tally:?}");
-    assert!(tally.gnss_error_m > 2.5 && tally.gnss_error_m < 3.0, "{tally:?}");
-    assert!(tally.error_m < 1.3, "{tally:?}");
-    assert!(tally.error_m < 0.9 * tally.two_step_error_m, "{tally:?}");
-    assert!((0.90..0.99).contains(&tally.inside), "{tally:?}");
+fn the_positions_of_a_stationary_target_are_averaged() {
+    let pedestrian = Walk::pedestrian();
+    let regression = PositionNoise { sigma_m: 1.5, ..pedestrian.regression };
+    let standing = Walk { speed_m_s: 0.0, regression, ..pedestrian };
+    let summary = run(TrackSettings::default(), &standing, 100..160, 450);
+    println!("{summary:?}");
+    assert!(summary.gnss_error_m > 2.5 && summary.gnss_error_m < 3.0, "{summary:?}");
+    assert!(summary.error_m < 1.3, "{summary:?}");
+    assert!(summary.error_m < 0.9 * summary.two_step_error_m, "{summary:?}");
+    assert!((0.90..0.99).contains(&summary.inside), "{summary:?}");
 }
 
 #[test]
-fn white_and_coloured_receivers_both_pay_with_the_estimated_split() {
-    let white = World {
-        gnss_sigma_m: 29.5,
-        gnss: GnssNoise { white_share: 1.0, time_constant_s: 40.0 },
-        camera_sigma_m: 4.0,
+fn the_estimated_noise_improves_tracks_of_white_and_of_correlated_receivers() {
+    let pedestrian = Walk::pedestrian();
+    let white = Walk {
+        gnss: PositionNoise { sigma_m: 29.5, white_share: 1.0, time_constant_s: 40.0 },
+        regression: PositionNoise { sigma_m: 4.0, ..pedestrian.regression },
         speed_m_s: 8.0,
-        ..World::phone()
+        ..pedestrian
     };
-    for world in [white, World::phone()] {
-        let passes: Vec<Vec<ResidualAt>> = (500..520)
-            .map(|seed| {
-                let walk = world.walk(seed, 300);
-                walk.iter().map(|(_, it)| residual(it)).collect()
-            })
+    for walk in [white, pedestrian] {
+        let traverses: Vec<Vec<TimedResidual>> = (500..520)
+            .map(|seed| simulate(&walk, seed, 300).iter().map(|(_, it)| residual(it)).collect())
             .collect();
-        let e_regression_m2 = world.camera_sigma_m.powi(2);
-        let estimate = estimate_gnss_noise(&passes, e_regression_m2, &world.regression).expect("enough");
+        let e_regression_m2 = walk.regression.sigma_m.powi(2);
+        let estimate =
+            estimate_gnss_noise(&traverses, e_regression_m2, &RegressionNoise::default()).expect("enough");
         println!("{estimate:?}");
-        assert!((estimate.noise.white_share - world.gnss.white_share).abs() < 0.1, "{estimate:?}");
-        assert!((estimate.variance_m2.sqrt() / world.gnss_sigma_m - 1.0).abs() < 0.15, "{estimate:?}");
+        assert!((estimate.noise.white_share - walk.gnss.white_share).abs() < 0.1, "{estimate:?}");
+        assert!((estimate.variance_m2.sqrt() / walk.gnss.sigma_m - 1.0).abs() < 0.15, "{estimate:?}");
         let informed = TrackSettings { gnss: estimate.noise, ..TrackSettings::default() };
-        let wrong_share = 1.0 - world.gnss.white_share;
+        let wrong_share = 1.0 - walk.gnss.white_share;
         let misled = TrackSettings {
             gnss: GnssNoise { white_share: wrong_share, time_constant_s: 40.0 },
             ..TrackSettings::default()
         };
-        let (right, wrong) = (run(informed, &world, 0..10, 400), run(misled, &world, 0..10, 400));
+        let (right, wrong) = (run(informed, &walk, 0..10, 400), run(misled, &walk, 0..10, 400));
         println!("{right:?}\n{wrong:?}");
         assert!(right.error_m < wrong.error_m, "{right:?} {wrong:?}");
         assert!((0.88..0.99).contains(&right.inside), "{right:?}");
     }
 }
 
-fn residual(measurement: &Measurement) -> ResidualAt {
+fn residual(measurement: &Measurement) -> TimedResidual {
     let (fix, regressed) = (measurement.fix.expect("there"), measurement.regressed.expect("there"));
-    ResidualAt { time: measurement.time, difference: minus(fix.position, regressed.position) }
+    TimedResidual { time: measurement.time, difference: minus(fix.position, regressed.position) }
 }
 
 #[test]
-fn too_few_residuals_tell_nothing() {
-    let walk = World::phone().walk(1, 20);
-    let pass: Vec<ResidualAt> = walk.iter().map(|(_, it)| residual(it)).collect();
-    assert!(estimate_gnss_noise(&[pass], 0.5, &RegressionNoise::default()).is_none());
+fn too_few_residuals_give_no_estimate() {
+    let walk = simulate(&Walk::pedestrian(), 1, 20);
+    let traverse: Vec<TimedResidual> = walk.iter().map(|(_, it)| residual(it)).collect();
+    assert!(estimate_gnss_noise(&[traverse], 0.5, &RegressionNoise::default()).is_none());
     assert!(estimate_gnss_noise(&[], 0.5, &RegressionNoise::default()).is_none());
 }
 
 #[test]
-fn the_stated_error_grows_while_nothing_is_measured_and_holds_the_truth() {
+fn the_stated_error_grows_without_measurements_and_contains_the_truth() {
     let gaps = [2.0, 5.0, 10.0, 20.0, 40.0];
     let (mut inside, mut radii_m) = ([0; 5], [0.0; 5]);
     let runs = 60;
     for seed in 0..runs {
-        let walk = World { turn_s: 40, ..World::phone() }.walk(1_000 + seed, 200);
+        let walk = simulate(&Walk { turn_interval_s: 40, ..Walk::pedestrian() }, 1_000 + seed, 200);
         let mut track = Track::start(TrackSettings::default(), &walk[0].1).expect("has both");
         for (_, measurement) in &walk[1..150] {
             track.update(measurement);
         }
-        let mut last_m = track.state_at(track.measured_at()).r95_m;
+        let mut previous_m = track.state_at(track.measured_at()).r95_m;
         for (index, gap_s) in gaps.into_iter().enumerate() {
             let state = track.state_at(at_s(149.0 + gap_s));
-            assert!(state.r95_m > last_m, "{gap_s}: {} after {last_m}", state.r95_m);
-            last_m = state.r95_m;
-            radii_m[index] = last_m;
+            assert!(state.r95_m > previous_m, "{gap_s}: {} after {previous_m}", state.r95_m);
+            previous_m = state.r95_m;
+            radii_m[index] = previous_m;
             let truth = walk[149 + gap_s as usize].0;
             inside[index] += u32::from(state.position.distance_m(truth) <= state.r95_m);
         }
@@ -170,17 +188,17 @@ fn the_stated_error_grows_while_nothing_is_measured_and_holds_the_truth() {
 }
 
 #[test]
-fn each_source_alone_carries_the_track() {
-    let walk = World::phone().walk(7, 400);
-    for lost in [Source::Fix, Source::Regressed] {
+fn each_source_alone_sustains_the_track() {
+    let walk = simulate(&Walk::pedestrian(), 7, 400);
+    for lost in [MeasurementSource::Fix, MeasurementSource::Regressed] {
         let mut track = Track::start(TrackSettings::default(), &walk[0].1).expect("has both");
         let mut radius_with_both_m = 0.0;
         for (index, (truth, measurement)) in walk.iter().enumerate().skip(1) {
             let mut measurement = *measurement;
             if index >= 200 {
                 match lost {
-                    Source::Fix => measurement.fix = None,
-                    Source::Regressed => measurement.regressed = None,
+                    MeasurementSource::Fix => measurement.fix = None,
+                    MeasurementSource::Regressed => measurement.regressed = None,
                 }
             }
             let state = track.update(&measurement);
@@ -196,16 +214,19 @@ fn each_source_alone_carries_the_track() {
 }
 
 #[test]
-fn outliers_are_rejected_by_name_and_leave_the_track_alone() {
-    let walk = World::phone().walk(11, 300);
+fn outliers_are_rejected_with_a_reason_and_do_not_change_the_state() {
+    let walk = simulate(&Walk::pedestrian(), 11, 300);
     let mut track = Track::start(TrackSettings::default(), &walk[0].1).expect("has both");
     let mut untouched = track.clone();
     for (index, (_, measurement)) in walk.iter().enumerate().skip(1) {
         if index % 37 == 0 {
             let outlier = Measurement { fix: moved(measurement.fix, 60.0), ..*measurement };
             let state = track.update(&outlier);
-            let rejection = state.rejected.first().expect("60 m are no phone's error");
-            assert_eq!((rejection.source, rejection.reason), (Source::Fix, RejectionReason::OutsideGate));
+            let rejection = state.rejected.first().expect("60 m are beyond the gate");
+            assert_eq!(
+                (rejection.source, rejection.reason),
+                (MeasurementSource::Fix, RejectionReason::OutsideGate)
+            );
             assert!(rejection.nis.is_some_and(|nis| nis > track.settings().gate));
             untouched.update(&Measurement { fix: None, ..*measurement });
         } else {
@@ -218,26 +239,28 @@ fn outliers_are_rejected_by_name_and_leave_the_track_alone() {
 }
 
 #[test]
-fn a_bias_that_jumped_is_believed_again_without_a_jump_of_the_position() {
-    for (lost, seed) in [(Source::Fix, 21), (Source::Regressed, 22)] {
-        let shift_m = if lost == Source::Fix { 12.0 } else { 5.0 };
-        let walk = World::phone().walk(seed, 260);
+fn a_source_whose_bias_jumped_is_reacquired_without_a_jump_of_the_position() {
+    for (lost, seed) in [(MeasurementSource::Fix, 21), (MeasurementSource::Regressed, 22)] {
+        let shift_m = if lost == MeasurementSource::Fix { 12.0 } else { 5.0 };
+        let walk = simulate(&Walk::pedestrian(), seed, 260);
         let mut track = Track::start(TrackSettings::default(), &walk[0].1).expect("has both");
         let mut rejected_late = 0;
         for (index, (truth, measurement)) in walk.iter().enumerate().skip(1) {
             let mut measurement = *measurement;
             if index >= 200 {
                 match lost {
-                    Source::Fix => measurement.fix = moved(measurement.fix, shift_m),
-                    Source::Regressed => measurement.regressed = moved(measurement.regressed, shift_m),
+                    MeasurementSource::Fix => measurement.fix = moved(measurement.fix, shift_m),
+                    MeasurementSource::Regressed => {
+                        measurement.regressed = moved(measurement.regressed, shift_m)
+                    }
                 }
             }
             let state = track.update(&measurement);
-            assert!(!state.restarted);
+            assert!(!state.reinitialized);
             if index >= 212 {
                 rejected_late += state.rejected.len();
             }
-            if lost == Source::Fix && index >= 200 {
+            if lost == MeasurementSource::Fix && index >= 200 {
                 assert!(state.position.distance_m(*truth) < 4.0, "{index}: {state:?}");
             }
         }
@@ -246,11 +269,11 @@ fn a_bias_that_jumped_is_believed_again_without_a_jump_of_the_position() {
 }
 
 #[test]
-fn whoever_stood_and_sets_out_is_believed_at_once() {
+fn the_first_steps_of_a_stationary_target_are_accepted() {
     let regressed_at = |second: u32, east_m: f64| Measurement {
         time: at_s(f64::from(second)),
         fix: None,
-        regressed: Some(Measured::isotropic(EastNorth { east_m, north_m: 0.0 }, 0.1)),
+        regressed: Some(MeasuredPosition::isotropic(EastNorth { east_m, north_m: 0.0 }, 0.1)),
     };
     let regression = RegressionNoise { white_share: 0.1, ..RegressionNoise::default() };
     let settings = TrackSettings { regression, ..TrackSettings::default() };
@@ -267,7 +290,7 @@ fn whoever_stood_and_sets_out_is_believed_at_once() {
 }
 
 #[test]
-fn a_lone_source_that_contradicts_the_track_restarts_it() {
+fn a_single_source_that_contradicts_the_track_reinitialises_it() {
     let mut track = Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 4.0)).expect("a fix");
     for second in 1..30 {
         track.update(&fix_at(f64::from(second), 0.0, 4.0));
@@ -275,13 +298,13 @@ fn a_lone_source_that_contradicts_the_track_restarts_it() {
     let states: Vec<TrackState> =
         (30..45).map(|second| track.update(&fix_at(f64::from(second), 500.0, 4.0))).collect();
     assert_eq!(states[0].rejected.len(), 1);
-    assert_eq!(states.iter().filter(|state| state.restarted).count(), 1);
+    assert_eq!(states.iter().filter(|state| state.reinitialized).count(), 1);
     let last = states.last().expect("not empty");
     assert!((last.position.east_m - 500.0).abs() < 1.0 && last.rejected.is_empty(), "{last:?}");
 }
 
 #[test]
-fn what_the_window_refuses_is_named() {
+fn late_duplicate_and_unusable_measurements_are_rejected_with_a_reason() {
     let mut track = Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 4.0)).expect("a fix");
     for second in 1..40 {
         track.update(&fix_at(f64::from(second), 0.0, 4.0));
@@ -298,19 +321,19 @@ fn what_the_window_refuses_is_named() {
         assert_eq!(state.rejected.iter().map(|it| it.reason).collect::<Vec<_>>(), [reason]);
         assert_eq!(state.position, before.position);
     }
-    assert!(!track.is_gone(at_s(60.0)) && track.is_gone(at_s(140.0)));
+    assert!(!track.is_expired(at_s(60.0)) && track.is_expired(at_s(140.0)));
     assert!(Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 0.0)).is_none());
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     #[test]
-    fn order_of_arrival_leaves_no_trace(seed in 0..1_000u64, rate_hz in 1..26u32) {
-        // Halves apart, each delayed by up to 1.4 s of the window of 3 s.
-        let mut random = Normal::seeded(seed);
+    fn the_order_of_arrival_does_not_change_the_state(seed in 0..1_000u64, rate_hz in 1..26u32) {
+        // Boxes and fixes separately, each delayed by up to 1.4 s; the window is 3 s.
+        let mut random = stream(seed, 0);
         let period_s = 1.0 / f64::from(rate_hz);
         let mut items = Vec::new();
-        for (index, (_, measurement)) in World::phone().walk(seed, 150).into_iter().enumerate().skip(1) {
+        for (index, (_, measurement)) in simulate(&Walk::pedestrian(), seed, 150).into_iter().enumerate().skip(1) {
             let time = at_s(1.0 + index as f64 * period_s);
             items.push(Measurement { time, fix: None, ..measurement });
             if (index as u32).is_multiple_of(rate_hz) {
@@ -324,7 +347,7 @@ proptest! {
         }
         let mut arrivals: Vec<(Timestamp, Measurement)> = items
             .iter()
-            .map(|item| (item.time + SignedDuration::from_secs_f64(0.7 * (1.0 + random.draw().sin())), *item))
+            .map(|item| (item.time + SignedDuration::from_secs_f64(0.7 * (1.0 + standard_normal(&mut random).sin())), *item))
             .collect();
         arrivals.sort_by_key(|(arrival, _)| *arrival);
         let mut shuffled = Track::start(TrackSettings::default(), &first).expect("a fix");
@@ -339,14 +362,14 @@ proptest! {
 }
 
 #[test]
-fn the_past_within_the_window_is_told_as_it_was() {
-    let walk = World::phone().walk(5, 60);
+fn past_states_within_the_window_are_reproduced() {
+    let walk = simulate(&Walk::pedestrian(), 5, 60);
     let mut track = Track::start(TrackSettings::default(), &walk[0].1).expect("has both");
-    let mut told = Vec::new();
+    let mut states = Vec::new();
     for (_, measurement) in &walk[1..] {
-        told.push(track.update(measurement));
+        states.push(track.update(measurement));
     }
-    for state in &told[told.len() - 3..] {
+    for state in &states[states.len() - 3..] {
         let again = track.state_at(state.time);
         assert_eq!(again.position, state.position);
         assert_eq!(again.covariance, state.covariance);

@@ -104,16 +104,22 @@ async fn of_changes_at_once_from_one_revision_one_wins() {
 #[tokio::test]
 async fn a_deleted_camera_takes_all_along_and_its_name_starts_anew() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    store.insert_samples(&camera, vec![sample(1, "a"), sample(2, "a")]).await.expect("stored");
+    store
+        .insert_samples(&camera, vec![sample(1, "a"), sample(2, "a")], Durability::Synced)
+        .await
+        .expect("stored");
     store.insert_model(&camera, &metadata(), b"w", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
     store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
     assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::RunLive);
-    store.request_cancel(&camera, run_id(1), at(4)).await.expect("cancelled");
+    store.cancel_run(&camera, run_id(1), at(4)).await.expect("cancelled");
 
     store.delete_camera(&camera, Some(Revision(1))).await.expect("deleted");
     assert_eq!(kind(store.camera(&camera).await), ErrorKind::CameraNotFound);
-    assert_eq!(kind(store.insert_samples(&camera, vec![sample(1, "a")]).await), ErrorKind::CameraNotFound);
+    assert_eq!(
+        kind(store.insert_samples(&camera, vec![sample(1, "a")], Durability::Synced).await),
+        ErrorKind::CameraNotFound
+    );
     assert_eq!(kind(store.log(run_id(1)).await), ErrorKind::RunNotFound);
     assert_eq!(store.active_models().await.expect("none"), []);
     assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::CameraNotFound);

@@ -41,9 +41,9 @@ impl Fixture {
         self.store.claim_evaluation(LEASE, at(second)).await.expect("works").expect("an evaluation")
     }
 
-    async fn beat_evaluation(&self, fence: i64, second: i64) -> Heartbeat {
+    async fn heartbeat_evaluation(&self, fence: i64, second: i64) -> Heartbeat {
         let progress = progress();
-        self.store.beat_evaluation(nth(1), fence, &progress, LEASE, at(second)).await.expect("works")
+        self.store.heartbeat_evaluation(nth(1), fence, &progress, LEASE, at(second)).await.expect("works")
     }
 
     async fn finish_evaluation(&self, fence: i64, end: JobEnd<String>) -> Option<EvaluationJob> {
@@ -60,7 +60,7 @@ fn progress() -> EvaluationProgress {
 }
 
 fn success() -> JobEnd<String> {
-    JobEnd::Succeeded { yielded: "{\"methods\":{}}".to_owned(), outcome: None }
+    JobEnd::Succeeded { output: "{\"methods\":{}}".to_owned(), outcome: None }
 }
 
 #[tokio::test]
@@ -89,14 +89,14 @@ async fn an_evaluation_goes_from_queue_to_report() {
     assert!(!cancel_requested);
     assert!(fixture.store.claim_evaluation(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
     assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is no training run");
-    assert_eq!(fixture.beat_evaluation(fence, 4).await, Heartbeat::Continue);
+    assert_eq!(fixture.heartbeat_evaluation(fence, 4).await, Heartbeat::Continue);
     assert_eq!(fixture.store.evaluation(nth(1)).await.expect("known").progress, progress());
     assert_eq!(fixture.report().await, None);
     let ended = fixture.finish_evaluation(fence, success()).await.expect("still mine");
     assert_eq!((ended.state, ended.ended_at), (JobState::Succeeded, Some(at(50))));
     assert_eq!(ended.progress.remaining_s, None, "nothing is left");
     assert_eq!(fixture.report().await.as_deref(), Some("{\"methods\":{}}"));
-    assert_eq!(fixture.beat_evaluation(fence, 51).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat_evaluation(fence, 51).await, Heartbeat::Lost);
     assert!(fixture.finish_evaluation(fence, JobEnd::Requeue).await.is_none(), "it ends once");
 }
 
@@ -105,12 +105,12 @@ async fn a_worker_that_stopped_beating_can_report_nothing_more() {
     let fixture = Fixture::new().await;
     fixture.queue_evaluation(1).await;
     let old = fixture.claim_evaluation(2).await;
-    assert_eq!(fixture.beat_evaluation(old.fence, 3).await, Heartbeat::Continue);
+    assert_eq!(fixture.heartbeat_evaluation(old.fence, 3).await, Heartbeat::Continue);
     assert!(fixture.store.claim_evaluation(LEASE, at(32)).await.expect("works").is_none(), "the lease holds");
     let new = fixture.claim_evaluation(33).await;
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert_eq!(new.job.progress, EvaluationProgress::default(), "its progress begins anew");
-    assert_eq!(fixture.beat_evaluation(old.fence, 34).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat_evaluation(old.fence, 34).await, Heartbeat::Lost);
     assert_eq!(fixture.store.evaluation(nth(1)).await.expect("known").progress, new.job.progress);
     assert!(fixture.finish_evaluation(old.fence, success()).await.is_none());
     assert_eq!(fixture.report().await, None);
@@ -131,7 +131,7 @@ async fn what_was_cancelled_has_no_report() {
     fixture.queue_evaluation(2).await;
     let claim = fixture.claim_evaluation(8).await;
     assert_eq!(store.cancel_evaluation(nth(2), at(9)).await.expect("flagged").state, JobState::Running);
-    let beat = store.beat_evaluation(nth(2), claim.fence, &progress(), LEASE, at(10)).await;
+    let beat = store.heartbeat_evaluation(nth(2), claim.fence, &progress(), LEASE, at(10)).await;
     assert_eq!(beat.expect("works"), Heartbeat::CancelRequested);
     let ended = store.finish_evaluation(nth(2), claim.fence, success(), at(11)).await.expect("works");
     assert_eq!(ended.expect("mine").state, JobState::Cancelled);
@@ -139,16 +139,16 @@ async fn what_was_cancelled_has_no_report() {
 }
 
 #[tokio::test]
-async fn one_given_back_is_taken_up_at_once_and_one_deleted_never() {
+async fn one_returned_to_the_queue_is_claimed_at_once_and_one_deleted_never() {
     let fixture = Fixture::new().await;
     fixture.queue_evaluation(1).await;
     let first = fixture.claim_evaluation(2).await;
     let back = fixture.finish_evaluation(first.fence, JobEnd::Requeue).await.expect("mine");
     assert_eq!((back.state, back.ended_at), (JobState::Queued, None));
     let second = fixture.claim_evaluation(4).await;
-    assert_eq!(second.job.attempt, 2);
+    assert_eq!(second.job.attempt, 1);
     fixture.store.delete_evaluation(nth(1)).await.expect("known");
-    assert_eq!(fixture.beat_evaluation(second.fence, 5).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat_evaluation(second.fence, 5).await, Heartbeat::Lost);
     assert!(fixture.finish_evaluation(second.fence, success()).await.is_none());
     for gone in [
         kind(fixture.store.delete_evaluation(nth(1)).await),
@@ -197,7 +197,7 @@ async fn samples_are_found_by_their_place_and_truths_counted() {
         let truth = (n % 3 == 0).then(|| place(120.0));
         Sample { truth, ..sample(n / 2, if n % 2 == 0 { "a" } else { "b" }) }
     });
-    store.insert_samples(&fixture.camera, samples.collect()).await.expect("stored");
+    store.insert_samples(&fixture.camera, samples.collect(), Durability::Synced).await.expect("stored");
     let time = async |before| store.sample_time(&fixture.camera, before).await.expect("works");
     assert_eq!(time(0).await, Some(at(0)));
     assert_eq!((time(3).await, time(4).await), (Some(at(1)), Some(at(2))));

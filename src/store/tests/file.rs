@@ -22,7 +22,10 @@ async fn refusal(folder: &Path) -> String {
 #[tokio::test]
 async fn a_crash_keeps_all_that_was_acknowledged() {
     let Fixture { store, camera, folder } = Fixture::new().await;
-    store.insert_samples(&camera, (0..3_000).map(|n| sample(n, "a")).collect()).await.expect("stored");
+    store
+        .insert_samples(&camera, (0..3_000).map(|n| sample(n, "a")).collect(), Durability::Synced)
+        .await
+        .expect("stored");
     store.insert_model(&camera, &metadata(), b"weights", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
     store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
@@ -32,7 +35,7 @@ async fn a_crash_keeps_all_that_was_acknowledged() {
         let store = Store::open(folder).await.expect("opens");
         assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 3_000);
         assert_eq!(store.camera(&camera).await.expect("known").active_model, Some(1));
-        assert_eq!(store.weights(&camera, 1).await.expect("known"), b"weights");
+        assert_eq!(store.model_content(&camera, 1).await.expect("known").1, b"weights");
         assert!(store.run(&camera, run_id(1)).await.is_ok());
     }
 }
@@ -92,7 +95,7 @@ async fn several_may_open_one_file_at_once_and_write_side_by_side() {
             tokio::spawn(async move {
                 for n in 0..20 {
                     let one = sample(n, &format!("target-{index}"));
-                    store.insert_samples(&id("square"), vec![one]).await.expect("stored");
+                    store.insert_samples(&id("square"), vec![one], Durability::Synced).await.expect("stored");
                 }
             })
         })

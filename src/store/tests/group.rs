@@ -3,7 +3,7 @@ use std::collections::HashSet;
 use proptest::prelude::*;
 
 use super::*;
-use crate::store::connection::Turn;
+use crate::store::writer::WriterGuard;
 use crate::store::{Inserted, SampleFilter};
 use tokio::task::JoinHandle;
 
@@ -11,12 +11,12 @@ type Call = JoinHandle<Result<Inserted>>;
 
 fn call(store: &Store, camera: &CameraId, samples: Vec<Sample>) -> Call {
     let (store, camera) = (store.clone(), camera.clone());
-    tokio::spawn(async move { store.insert_samples(&camera, samples).await })
+    tokio::spawn(async move { store.insert_samples(&camera, samples, Durability::Synced).await })
 }
 
 /// Lets the writer go once all but the first of so many calls wait in the queue: they share the
 /// next transaction with it.
-async fn release(store: &Store, turn: Turn<'_>, calls: usize) {
+async fn release(store: &Store, turn: WriterGuard<'_>, calls: usize) {
     while store.inner.samples.waiting() + 1 < calls {
         tokio::task::yield_now().await;
     }
@@ -30,7 +30,7 @@ async fn count(store: &Store, camera: &CameraId) -> u64 {
 #[tokio::test]
 async fn callers_of_one_transaction_are_each_counted_right() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    store.insert_samples(&camera, vec![sample(0, "old")]).await.expect("stored");
+    store.insert_samples(&camera, vec![sample(0, "old")], Durability::Synced).await.expect("stored");
     let turn = store.relaxed().await.expect("a turn");
     let calls = vec![
         call(&store, &camera, vec![sample(1, "a")]),
@@ -95,7 +95,14 @@ async fn callers_who_go_away_do_not_disturb_the_others() {
     gone.abort();
     drop(turn);
     assert_eq!(stays.await.expect("no panic").expect("stored").accepted, 1);
-    assert_eq!(store.insert_samples(&camera, vec![sample(3, "a")]).await.expect("stored").accepted, 1);
+    assert_eq!(
+        store
+            .insert_samples(&camera, vec![sample(3, "a")], Durability::Synced)
+            .await
+            .expect("stored")
+            .accepted,
+        1
+    );
 }
 
 #[tokio::test]
@@ -106,7 +113,14 @@ async fn a_change_dropped_half_way_leaves_nothing_and_holds_nobody_up() {
         let mut transaction = turn.begin().await.expect("begins");
         sqlx::query("DELETE FROM cameras").execute(&mut *transaction).await.expect("deletes");
     }
-    assert_eq!(store.insert_samples(&camera, vec![sample(3, "a")]).await.expect("stored").accepted, 1);
+    assert_eq!(
+        store
+            .insert_samples(&camera, vec![sample(3, "a")], Durability::Synced)
+            .await
+            .expect("stored")
+            .accepted,
+        1
+    );
     assert_eq!(store.cameras(None, 9).await.expect("a page").len(), 1);
 }
 
@@ -146,7 +160,10 @@ async fn closing_commits_what_was_handed_in_and_refuses_what_comes_later() {
     for call in calls {
         assert_eq!(call.await.expect("no panic").expect("stored").accepted, 1);
     }
-    assert_eq!(kind(store.insert_samples(&camera, vec![sample(99, "a")]).await), ErrorKind::ShuttingDown);
+    assert_eq!(
+        kind(store.insert_samples(&camera, vec![sample(99, "a")], Durability::Synced).await),
+        ErrorKind::ShuttingDown
+    );
     assert_eq!(kind(store.camera(&camera).await), ErrorKind::ShuttingDown);
     assert_eq!(kind(store.roll_back(&camera, at(1)).await), ErrorKind::ShuttingDown);
     assert_eq!(kind(store.ping().await), ErrorKind::ShuttingDown);
@@ -190,10 +207,10 @@ async fn the_writer_survives_a_transaction_that_ended_under_it() {
 }
 
 #[tokio::test]
-async fn a_full_disk_is_a_fault_and_leaves_nothing_half_done() {
+async fn a_full_disk_is_said_and_leaves_nothing_half_done() {
     let fixture = Fixture::new().await;
     let (store, camera) = (&fixture.store, &fixture.camera);
-    store.insert_samples(camera, vec![sample(0, "a")]).await.expect("stored");
+    store.insert_samples(camera, vec![sample(0, "a")], Durability::Synced).await.expect("stored");
     {
         // The limit is the connection's own, so it must be the one that stores the samples.
         let mut turn = store.relaxed().await.expect("a turn");
@@ -202,9 +219,15 @@ async fn a_full_disk_is_a_fault_and_leaves_nothing_half_done() {
         transaction.commit().await.expect("commits");
     }
     let many: Vec<Sample> = (1..20_000).map(|n| sample(n, "a")).collect();
-    assert_eq!(kind(store.insert_samples(camera, many).await), ErrorKind::Internal);
+    assert_eq!(
+        kind(store.insert_samples(camera, many, Durability::Synced).await),
+        ErrorKind::InsufficientStorage
+    );
     assert_eq!(count(store, camera).await, 1);
-    assert_eq!(store.insert_samples(camera, vec![sample(1, "a")]).await.expect("fits").accepted, 1);
+    assert_eq!(
+        store.insert_samples(camera, vec![sample(1, "a")], Durability::Synced).await.expect("fits").accepted,
+        1
+    );
 }
 
 proptest! {
@@ -220,7 +243,7 @@ proptest! {
         runtime.block_on(async {
             let Fixture { store, camera, folder: _folder } = Fixture::new().await;
             let rows = |keys: &[(i64, String)]| keys.iter().map(|(n, who)| sample(*n, who)).collect::<Vec<_>>();
-            store.insert_samples(&camera, rows(&before)).await.expect("stored");
+            store.insert_samples(&camera, rows(&before), Durability::Synced).await.expect("stored");
             let turn = store.relaxed().await.expect("a turn");
             let tasks: Vec<Call> = calls.iter().map(|keys| call(&store, &camera, rows(keys))).collect();
             release(&store, turn, tasks.len()).await;

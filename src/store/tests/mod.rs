@@ -14,8 +14,8 @@ use uuid::Uuid;
 
 use super::Store;
 use crate::domain::{
-    BoundingBox, CameraId, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg, Recipe,
-    Result, RunId, Sample, TargetId, TrainingOptions,
+    BoundingBox, CameraId, Durability, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg,
+    Recipe, Result, RunId, Sample, TargetId, TrainingOptions,
 };
 use crate::geo::Position;
 
@@ -122,12 +122,12 @@ async fn futures_can_move_between_threads() {
     movable(store.ping());
     movable(store.cameras(Some(&camera), 1));
     movable(store.delete_camera(&camera, None));
-    movable(store.insert_samples(&camera, Vec::new()));
+    movable(store.insert_samples(&camera, Vec::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));
     movable(store.delete_samples(&camera, &filter));
     movable(store.insert_run(run, &camera, &options(), 1, at(0)));
     movable(store.claim_run(lease, at(0)));
-    movable(store.heartbeat(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
+    movable(store.heartbeat_run(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
     movable(store.append_epochs(run, 1, &[]));
     movable(store.finish_run(run, 1, super::RunEnd::Cancelled, at(0)));
     movable(store.claim_evaluation(lease, at(0)));

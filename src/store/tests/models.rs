@@ -22,13 +22,13 @@ async fn versions_count_up_and_come_back_whole() {
         assert_eq!(made, expected);
         assert_eq!(store.model(&camera, made.number).await.expect("known"), expected);
     }
-    assert_eq!(store.weights(&camera, 3).await.expect("known"), weights);
+    assert_eq!(store.model_content(&camera, 3).await.expect("known"), (metadata(), weights.clone()));
     let numbers = |page: Vec<ModelVersion>| page.iter().map(|model| model.number).collect::<Vec<_>>();
     assert_eq!(numbers(store.models(&camera, None, 3).await.expect("a page")), [5, 4, 3]);
     assert_eq!(numbers(store.models(&camera, Some(3), 3).await.expect("a page")), [2, 1]);
     assert_eq!(active(&store, &camera).await, None, "an import does not answer by itself");
     assert_eq!(kind(store.model(&camera, 6).await), ErrorKind::ModelNotFound);
-    assert_eq!(kind(store.weights(&camera, 6).await), ErrorKind::ModelNotFound);
+    assert_eq!(kind(store.model_content(&camera, 6).await), ErrorKind::ModelNotFound);
     assert_eq!(kind(store.model(&id("none"), 1).await), ErrorKind::CameraNotFound);
     assert_eq!(
         kind(store.insert_model(&id("none"), &metadata(), b"", at(1)).await),

@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use super::*;
 use crate::domain::{EpochReport, JobState, RunProgress, TrainingRun};
-use crate::store::{Claim, Heartbeat, NewModel, RunEnd};
+use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput};
 
 const LEASE: Duration = Duration::from_secs(30);
 
@@ -16,7 +16,7 @@ impl Fixture {
     }
 
     async fn beat(&self, fence: i64, second: i64) -> Heartbeat {
-        self.store.heartbeat(run_id(1), fence, &progress(), LEASE, at(second)).await.expect("works")
+        self.store.heartbeat_run(run_id(1), fence, &progress(), LEASE, at(second)).await.expect("works")
     }
 
     async fn finish(&self, fence: i64, end: RunEnd<'_>) -> Option<TrainingRun> {
@@ -37,8 +37,8 @@ fn progress() -> RunProgress {
 }
 
 fn success<'a>(metadata: &'a ModelMetadata, activate: bool) -> RunEnd<'a> {
-    let yielded = NewModel { metadata, weights: b"weights", activate };
-    RunEnd::Succeeded { yielded, outcome: Some("better".to_owned()) }
+    let model = NewModel { metadata, weights: b"weights", held_out: &[] };
+    RunEnd::Succeeded { output: RunOutput { model, activate }, outcome: Some("better".to_owned()) }
 }
 
 fn report(epoch: u32, loss: f64) -> EpochReport {
@@ -70,7 +70,7 @@ async fn a_run_goes_from_queue_to_active_model() {
 }
 
 #[tokio::test]
-async fn a_worker_that_stopped_beating_can_write_nothing_more() {
+async fn a_worker_that_lost_its_lease_can_write_nothing_more() {
     let fixture = Fixture::new().await;
     fixture.queue(1).await;
     let old = fixture.claim(2).await;
@@ -140,27 +140,27 @@ async fn a_cancelled_run_yields_nothing() {
     let fixture = Fixture::new().await;
     let store = &fixture.store;
     fixture.queue(1).await;
-    let cancelled = store.request_cancel(&fixture.camera, run_id(1), at(5)).await.expect("cancelled");
+    let cancelled = store.cancel_run(&fixture.camera, run_id(1), at(5)).await.expect("cancelled");
     assert_eq!((cancelled.state, cancelled.ended_at), (JobState::Cancelled, Some(at(5))));
-    assert_eq!(kind(store.request_cancel(&fixture.camera, run_id(1), at(6)).await), ErrorKind::RunEnded);
-    assert_eq!(kind(store.request_cancel(&fixture.camera, run_id(9), at(6)).await), ErrorKind::RunNotFound);
+    assert_eq!(kind(store.cancel_run(&fixture.camera, run_id(1), at(6)).await), ErrorKind::RunEnded);
+    assert_eq!(kind(store.cancel_run(&fixture.camera, run_id(9), at(6)).await), ErrorKind::RunNotFound);
     assert!(store.claim_run(LEASE, at(7)).await.expect("works").is_none());
 
     fixture.queue(2).await;
     let claim = fixture.claim(8).await;
-    let flagged = store.request_cancel(&fixture.camera, run_id(2), at(9)).await.expect("flagged");
+    let flagged = store.cancel_run(&fixture.camera, run_id(2), at(9)).await.expect("flagged");
     assert_eq!(flagged.state, JobState::Running);
-    let beat = store.heartbeat(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
+    let beat = store.heartbeat_run(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
     assert_eq!(beat.expect("works"), Heartbeat::CancelRequested);
     let taken_over = fixture.claim(100).await;
-    assert!(taken_over.cancel_requested, "the wish outlives the worker");
+    assert!(taken_over.cancel_requested, "the request outlives the worker");
     let ended = store.finish_run(run_id(2), taken_over.fence, success(&metadata(), true), at(101)).await;
     assert_eq!(ended.expect("works").expect("mine").state, JobState::Cancelled);
     assert_eq!(store.models(&fixture.camera, None, 9).await.expect("a page"), []);
 }
 
 #[tokio::test]
-async fn a_run_given_back_is_taken_up_at_once() {
+async fn a_run_returned_to_the_queue_is_claimed_at_once_and_the_attempt_does_not_count() {
     let fixture = Fixture::new().await;
     fixture.queue(1).await;
     let first = fixture.claim(2).await;
@@ -168,7 +168,7 @@ async fn a_run_given_back_is_taken_up_at_once() {
     let back = fixture.finish(first.fence, RunEnd::Requeue).await.expect("mine");
     assert_eq!((back.state, back.ended_at), (JobState::Queued, None));
     let second = fixture.claim(4).await;
-    assert_eq!((second.job.attempt, second.job.progress), (2, RunProgress::default()));
+    assert_eq!((second.job.attempt, second.job.progress), (1, RunProgress::default()));
     assert_eq!(fixture.store.log(run_id(1)).await.expect("known"), [(at(3), "before".to_owned())]);
 }
 
@@ -202,7 +202,7 @@ async fn pages_show_the_newest_runs_first() {
     let fixture = Fixture::new().await;
     for n in 1..=5 {
         fixture.queue(n).await;
-        fixture.store.request_cancel(&fixture.camera, run_id(n), at(2)).await.expect("cancelled");
+        fixture.store.cancel_run(&fixture.camera, run_id(n), at(2)).await.expect("cancelled");
     }
     let page = fixture.store.runs(&fixture.camera, None, 3).await.expect("a page");
     assert_eq!(page.iter().map(|run| run.id).collect::<Vec<_>>(), [5, 4, 3].map(run_id));

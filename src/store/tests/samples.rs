@@ -16,7 +16,7 @@ async fn samples_come_back_bit_for_bit_and_in_order() {
     let mut shuffled = ordered.clone();
     shuffled.reverse();
     shuffled.swap(1, 4);
-    store.insert_samples(&camera, shuffled).await.expect("stored");
+    store.insert_samples(&camera, shuffled, Durability::Synced).await.expect("stored");
     let read = store.samples(&camera, &SampleFilter::default(), None, 100).await.expect("read");
     assert_eq!(read, ordered);
 }
@@ -28,13 +28,18 @@ async fn a_key_is_stored_once_and_the_first_stays() {
     store.insert_camera(&NewCamera::named(other.clone()), at(0)).await.expect("new");
     let mut twin = sample(1, "a");
     twin.score = Some(Score::new(0.5).expect("a score"));
-    let first = store.insert_samples(&camera, vec![sample(1, "a"), twin.clone(), sample(1, "b")]).await;
+    let first = store
+        .insert_samples(&camera, vec![sample(1, "a"), twin.clone(), sample(1, "b")], Durability::Synced)
+        .await;
     assert_eq!(first.expect("stored"), Inserted { accepted: 2, duplicate: 1 });
-    let again = store.insert_samples(&camera, vec![twin.clone(), sample(2, "a")]).await;
+    let again = store.insert_samples(&camera, vec![twin.clone(), sample(2, "a")], Durability::Synced).await;
     assert_eq!(again.expect("stored"), Inserted { accepted: 1, duplicate: 1 });
-    let elsewhere = store.insert_samples(&other, vec![twin]).await;
+    let elsewhere = store.insert_samples(&other, vec![twin], Durability::Synced).await;
     assert_eq!(elsewhere.expect("stored"), Inserted { accepted: 1, duplicate: 0 });
-    assert_eq!(store.insert_samples(&camera, Vec::new()).await.expect("empty"), Inserted::default());
+    assert_eq!(
+        store.insert_samples(&camera, Vec::new(), Durability::Synced).await.expect("empty"),
+        Inserted::default()
+    );
     let kept = store.samples(&camera, &SampleFilter::default(), None, 9).await.expect("read");
     assert_eq!(kept, [sample(1, "a"), sample(1, "b"), sample(2, "a")]);
 }
@@ -45,7 +50,8 @@ async fn many_rows_of_any_number_are_counted_right() {
     let rows = |range: std::ops::Range<i64>| range.map(|second| sample(second, "a")).collect::<Vec<_>>();
     let mut stored = 0;
     for count in [1, 3, 5, 17, 1023, 1025, 4097, 10_000] {
-        let inserted = store.insert_samples(&camera, rows(0..count)).await.expect("stored");
+        let inserted =
+            store.insert_samples(&camera, rows(0..count), Durability::Synced).await.expect("stored");
         assert_eq!(inserted, Inserted { accepted: (count - stored) as u64, duplicate: stored as u64 });
         stored = count;
     }
@@ -55,7 +61,10 @@ async fn many_rows_of_any_number_are_counted_right() {
 #[tokio::test]
 async fn a_cursor_from_before_the_filter_does_not_widen_it() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    store.insert_samples(&camera, (0..6).map(|second| sample(second, "a")).collect()).await.expect("stored");
+    store
+        .insert_samples(&camera, (0..6).map(|second| sample(second, "a")).collect(), Durability::Synced)
+        .await
+        .expect("stored");
     let filter = SampleFilter { from: Some(at(3)), ..SampleFilter::default() };
     let page =
         store.samples(&camera, &filter, Some(SampleKey::of(&sample(1, "a"))), 2).await.expect("a page");
@@ -66,7 +75,7 @@ async fn a_cursor_from_before_the_filter_does_not_widen_it() {
 async fn deleting_takes_what_the_filter_selects() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     let all = (0..10).flat_map(|second| [sample(second, "a"), sample(second, "b")]).collect();
-    store.insert_samples(&camera, all).await.expect("stored");
+    store.insert_samples(&camera, all, Durability::Synced).await.expect("stored");
     let filter = SampleFilter { from: Some(at(3)), until: Some(at(5)), target_id: Some(target("b")) };
     assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 2);
     let filter = SampleFilter { from: Some(at(8)), ..SampleFilter::default() };
@@ -80,7 +89,11 @@ async fn deleting_takes_what_the_filter_selects() {
 #[tokio::test]
 async fn a_corrupt_sample_names_its_row() {
     let fixture = Fixture::new().await;
-    fixture.store.insert_samples(&fixture.camera, vec![sample(1, "a")]).await.expect("stored");
+    fixture
+        .store
+        .insert_samples(&fixture.camera, vec![sample(1, "a")], Durability::Synced)
+        .await
+        .expect("stored");
     fixture.tamper("UPDATE samples SET latitude_deg = 91").await;
     let error =
         fixture.store.samples(&fixture.camera, &SampleFilter::default(), None, 9).await.expect_err("corrupt");
@@ -107,7 +120,7 @@ proptest! {
         runtime.block_on(async {
             let Fixture { store, camera, folder: _folder } = Fixture::new().await;
             let all: Vec<Sample> = keys.iter().map(|(second, target)| sample(*second, target)).collect();
-            store.insert_samples(&camera, all.clone()).await.expect("stored");
+            store.insert_samples(&camera, all.clone(), Durability::Synced).await.expect("stored");
             let filter = SampleFilter { from: from.map(at), until: until.map(at), target_id: only.as_deref().map(target) };
             let expected: Vec<Sample> = all
                 .into_iter()

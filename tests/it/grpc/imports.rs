@@ -38,7 +38,7 @@ pub(super) fn samples(seconds: Range<i64>) -> Vec<proto::Sample> {
 }
 
 fn batch(samples: Vec<proto::Sample>) -> proto::ImportSamplesRequest {
-    proto::ImportSamplesRequest { camera_id: "yard".to_owned(), samples }
+    proto::ImportSamplesRequest { camera_id: "yard".to_owned(), samples, ..Default::default() }
 }
 
 fn client(server: &Server) -> SampleServiceClient<tonic::transport::Channel> {
@@ -78,7 +78,7 @@ async fn one_bad_sample_never_loses_the_others() {
     second[253] = sample(3);
     let messages = vec![
         batch(samples(0..1_500)),
-        proto::ImportSamplesRequest { camera_id: String::new(), samples: second },
+        proto::ImportSamplesRequest { samples: second, ..Default::default() },
         batch(Vec::new()),
         batch(samples(2_990..3_010)),
     ];
@@ -102,12 +102,16 @@ async fn one_bad_sample_never_loses_the_others() {
 #[tokio::test]
 async fn a_stream_names_one_camera_that_exists() {
     let server = Server::with_camera(proto::CameraProfile::default()).await;
-    let nameless = proto::ImportSamplesRequest { camera_id: String::new(), samples: samples(0..2) };
+    let nameless = proto::ImportSamplesRequest { samples: samples(0..2), ..Default::default() };
     for messages in [Vec::new(), vec![nameless]] {
         let status = send(&server, messages).await.expect_err("no camera");
         assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["camera_id"]);
     }
-    let elsewhere = proto::ImportSamplesRequest { camera_id: "nowhere".to_owned(), samples: samples(2..4) };
+    let elsewhere = proto::ImportSamplesRequest {
+        camera_id: "nowhere".to_owned(),
+        samples: samples(2..4),
+        ..Default::default()
+    };
     let status = send(&server, vec![elsewhere.clone()]).await.expect_err("no such camera");
     told(&status, Code::NotFound, "camera-not-found");
     let status = send(&server, vec![batch(samples(0..2)), elsewhere]).await.expect_err("another camera");

@@ -1,4 +1,4 @@
-//! A server that does as its script says: the faults of a line and of a server, at will.
+//! A scripted server, to inject faults of connection and server.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
@@ -7,96 +7,104 @@ use std::sync::{Arc, Mutex};
 use futures_util::stream::{self, BoxStream, StreamExt as _};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_server::{FusionService, FusionServiceServer};
-use sightfix::grpc::proto::stream_request::Kind as Asked;
-use sightfix::grpc::proto::stream_response::Kind as Told;
+use sightfix::grpc::proto::stream_request::Kind as RequestKind;
+use sightfix::grpc::proto::stream_response::Kind as ResponseKind;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tonic::{Request, Response, Status, Streaming};
 
-/// What one stream will meet.
+/// The behaviour of one stream.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Script {
-    /// The stream breaks after so many items; what was not acknowledged by then is forgotten.
+    /// The stream fails after that many items; unacknowledged ones are discarded.
     pub(super) break_after: Option<u64>,
-    /// After so many items the client is invited to open another stream.
-    pub(super) invite_after: Option<u64>,
-    /// Items to an acknowledgement.
+    /// The server requests a reconnect after that many items.
+    pub(super) request_reconnect_after: Option<u64>,
+    /// Number of items per acknowledgement.
     pub(super) acknowledge_every: u64,
-    /// Every so many answers one is lost.
+    /// One of that many answers is dropped.
     pub(super) lose_every: Option<u64>,
-    /// Every so many items one is refused.
+    /// One of that many items is refused.
     pub(super) refuse_every: Option<u64>,
-    /// Nothing is answered at all.
+    /// No item is answered.
     pub(super) silent: bool,
     /// The stream is refused with this.
     pub(super) refuse: Option<Status>,
 }
 
-/// What the server has seen.
+/// What the server has received.
 #[derive(Debug, Default)]
-pub(super) struct Seen {
+pub(super) struct Received {
     pub(super) openings: Vec<proto::StreamOpening>,
     /// Seq, target, and nanoseconds of every item committed.
     pub(super) committed: Vec<(u64, String, i64)>,
-    /// Times an item came, whether it was committed or not.
+    /// Number of items received, committed or not.
     pub(super) items: u64,
-    /// What broke the rules of a client.
-    pub(super) broken_rules: BTreeSet<String>,
+    /// Violations of the protocol by the client.
+    pub(super) violations: BTreeSet<String>,
 }
 
 #[derive(Clone)]
 pub(super) struct Fake {
     pub(super) address: SocketAddr,
     scripts: Arc<Mutex<VecDeque<Script>>>,
-    seen: Arc<Mutex<Seen>>,
+    received: Arc<Mutex<Received>>,
 }
 
 impl Fake {
-    /// Streams get the scripts in turn; those beyond them meet no fault.
+    /// Streams get the scripts in order; further streams have no faults.
     pub(super) async fn start(scripts: impl IntoIterator<Item = Script>) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let fake = Self {
             address: listener.local_addr().expect("its address"),
             scripts: Arc::new(Mutex::new(scripts.into_iter().collect())),
-            seen: Arc::default(),
+            received: Arc::default(),
         };
         let service = FusionServiceServer::new(fake.clone());
         let incoming = stream::unfold(listener, |listener| async {
-            Some((listener.accept().await.map(|(line, _)| line), listener))
+            Some((listener.accept().await.map(|(stream, _)| stream), listener))
         });
         tokio::spawn(tonic::transport::Server::builder().add_service(service).serve_with_incoming(incoming));
         fake
     }
 
-    pub(super) fn seen(&self) -> std::sync::MutexGuard<'_, Seen> {
-        self.seen.lock().expect("no panic holds it")
+    pub(super) fn received(&self) -> std::sync::MutexGuard<'_, Received> {
+        self.received.lock().expect("no panic holds it")
     }
 
-    fn break_rule(&self, rule: &str) {
-        self.seen().broken_rules.insert(rule.to_owned());
+    fn record_violation(&self, rule: &str) {
+        self.received().violations.insert(rule.to_owned());
     }
 
-    async fn serve(self, script: Script, mut asked: Streaming<proto::StreamRequest>, told: Sender) {
-        let opening = match asked.message().await {
-            Ok(Some(proto::StreamRequest { kind: Some(Asked::Opening(opening)) })) => opening,
-            _ => return self.break_rule("the first message opens"),
+    async fn serve(self, script: Script, mut requests: Streaming<proto::StreamRequest>, responses: Sender) {
+        let opening = match requests.message().await {
+            Ok(Some(proto::StreamRequest { kind: Some(RequestKind::Opening(opening)) })) => opening,
+            _ => return self.record_violation("the first message opens"),
         };
-        let mut stream = Served { fake: self, script, opening, told, items: 0, lost: 0, kept: Vec::new() };
-        stream.fake.seen().openings.push(stream.opening.clone());
-        stream.tell(Told::Opened(proto::StreamOpened::default())).await;
+        let mut stream = ServedStream {
+            fake: self,
+            script,
+            opening,
+            responses,
+            items: 0,
+            lost: 0,
+            uncommitted: Vec::new(),
+        };
+        stream.fake.received().openings.push(stream.opening.clone());
+        stream.respond(ResponseKind::Opened(proto::StreamOpened::default())).await;
         let mut last = stream.opening.resume_after_seq;
         loop {
-            let item = match asked.message().await {
-                Ok(Some(proto::StreamRequest { kind: Some(Asked::Item(item)) })) => item,
-                Ok(Some(_)) => return stream.fake.break_rule("only items follow"),
+            let item = match requests.message().await {
+                Ok(Some(proto::StreamRequest { kind: Some(RequestKind::Item(item)) })) => item,
+                Ok(Some(_)) => return stream.fake.record_violation("only items follow"),
                 Ok(None) => return stream.acknowledge().await,
                 Err(_) => return,
             };
             if item.seq <= last {
-                stream.fake.break_rule("seqs rise, and begin above the one to resume after");
+                stream.fake.record_violation("seqs rise, and begin above the one to resume after");
             }
             last = item.seq;
-            if !stream.take(item).await {
+            if !stream.handle(item).await {
                 return;
             }
         }
@@ -105,38 +113,38 @@ impl Fake {
 
 type Sender = mpsc::Sender<Result<proto::StreamResponse, Status>>;
 
-/// A stream being served.
-struct Served {
+/// The server's side of one stream.
+struct ServedStream {
     fake: Fake,
     script: Script,
     opening: proto::StreamOpening,
-    told: Sender,
+    responses: Sender,
     items: u64,
     lost: u64,
-    kept: Vec<proto::StreamItem>,
+    uncommitted: Vec<proto::StreamItem>,
 }
 
-impl Served {
-    async fn tell(&self, kind: Told) {
-        let _ = self.told.send(Ok(proto::StreamResponse { kind: Some(kind) })).await;
+impl ServedStream {
+    async fn respond(&self, kind: ResponseKind) {
+        let _ = self.responses.send(Ok(proto::StreamResponse { kind: Some(kind) })).await;
     }
 
-    /// Says whether the stream goes on.
-    async fn take(&mut self, item: proto::StreamItem) -> bool {
+    /// Handles an item; returns whether the stream continues.
+    async fn handle(&mut self, item: proto::StreamItem) -> bool {
         self.items += 1;
-        self.fake.seen().items += 1;
+        self.fake.received().items += 1;
         let every = |number: Option<u64>| number.is_some_and(|number| self.items.is_multiple_of(number));
         let (seq, refused) = (item.seq, every(self.script.refuse_every));
         let lost = every(self.script.lose_every);
         if !refused {
-            self.kept.push(item);
+            self.uncommitted.push(item);
         }
         self.lost += u64::from(lost);
         if !lost && !self.script.silent {
             let error =
                 proto::StreamItemError { reason: "invalid-argument".to_owned(), ..Default::default() };
             let outcome = refused.then_some(proto::stream_answer::Outcome::Error(error));
-            self.tell(Told::Answer(Box::new(proto::StreamAnswer {
+            self.respond(ResponseKind::Answer(Box::new(proto::StreamAnswer {
                 seq,
                 outcome,
                 lost_answers: self.lost,
@@ -145,29 +153,29 @@ impl Served {
             .await;
         }
         if self.script.break_after == Some(self.items) {
-            let _ = self.told.send(Err(Status::unavailable("the line broke"))).await;
+            let _ = self.responses.send(Err(Status::unavailable("the connection broke"))).await;
             return false;
         }
-        if self.script.invite_after == Some(self.items) {
-            self.tell(Told::Reconnect(proto::StreamReconnect { reason: "old".to_owned() })).await;
+        if self.script.request_reconnect_after == Some(self.items) {
+            self.respond(ResponseKind::Reconnect(proto::StreamReconnect { reason: "old".to_owned() })).await;
         }
         if every_nth(self.items, self.script.acknowledge_every) {
-            self.acknowledge_upto(seq).await;
+            self.acknowledge_up_to(seq).await;
         }
         true
     }
 
     async fn acknowledge(&mut self) {
-        if let Some(last) = self.kept.last() {
-            self.acknowledge_upto(last.seq).await;
+        if let Some(last) = self.uncommitted.last() {
+            self.acknowledge_up_to(last.seq).await;
         }
     }
 
-    async fn acknowledge_upto(&mut self, seq: u64) {
+    async fn acknowledge_up_to(&mut self, seq: u64) {
         if !self.opening.store_samples {
             return;
         }
-        let committed = self.kept.drain(..).map(|item| {
+        let committed = self.uncommitted.drain(..).map(|item| {
             let time = item.time.expect("an item has a time");
             (
                 item.seq,
@@ -175,8 +183,8 @@ impl Served {
                 time.seconds * 1_000_000_000 + i64::from(time.nanos),
             )
         });
-        self.fake.seen().committed.extend(committed);
-        self.tell(Told::Acknowledgement(proto::StreamAcknowledgement { seq })).await;
+        self.fake.received().committed.extend(committed);
+        self.respond(ResponseKind::Acknowledgement(proto::StreamAcknowledgement { seq })).await;
     }
 }
 
@@ -200,8 +208,8 @@ impl FusionService for Fake {
         if let Some(status) = script.refuse {
             return Err(status);
         }
-        let (told, mut answers) = mpsc::channel(64);
-        tokio::spawn(self.clone().serve(script, request.into_inner(), told));
+        let (responses, mut answers) = mpsc::channel(64);
+        tokio::spawn(self.clone().serve(script, request.into_inner(), responses));
         Ok(Response::new(stream::poll_fn(move |context| answers.poll_recv(context)).boxed()))
     }
 }

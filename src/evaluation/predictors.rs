@@ -1,0 +1,254 @@
+//! The predictor of every method: from the rows of one target to positions.
+
+use super::baselines::{dnn, homography, imm_ukf};
+use super::options::{EvaluateOptions, TestRow};
+use super::training::RecipeModel;
+use crate::domain::{BoundingBox, InferenceMode, Method, Observation, Sample, SigmaM};
+use crate::filters::ImmUkf;
+use crate::fusion::track::{MeasuredPosition, Measurement, Track, TrackSettings, traverses};
+use crate::fusion::two_step::fuse;
+use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, Regressor};
+
+/// Standard deviation per axis assumed for a receiver whose error is unknown, m.
+const UNKNOWN_RECEIVER_SIGMA_M: f64 = 5.0;
+
+/// A predicted position with its stated 95 % radius.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Prediction {
+    pub(super) position: Position,
+    /// Radius that contains the true position with 95 % probability, m; `None` where the method states
+    /// none.
+    pub(super) r95_m: Option<f64>,
+}
+
+/// Indexes of the test rows of one target, in order of time.
+pub(super) type TargetRows = Vec<usize>;
+
+/// Predicts a position for each of one target's rows, in their order; `None` where the method cannot.
+pub(super) type Predictor<'a> = Box<dyn FnMut(&TargetRows) -> Vec<Option<Prediction>> + 'a>;
+
+/// What the predictors of one evaluation have in common.
+#[derive(Clone, Copy)]
+pub(super) struct Predictors<'a> {
+    pub(super) train: &'a [Sample],
+    pub(super) test: &'a [TestRow],
+    pub(super) options: &'a EvaluateOptions,
+    /// The plane in which the baselines work.
+    pub(super) plane: LocalPlane,
+}
+
+impl<'a> Predictors<'a> {
+    /// A predictor that looks at each row on its own.
+    fn per_row<'b>(&self, predict: impl Fn(&Observation) -> Option<Prediction> + 'b) -> Predictor<'b>
+    where
+        'a: 'b,
+    {
+        let test = self.test;
+        Box::new(move |target| target.iter().map(|&row| predict(&test[row].observation)).collect())
+    }
+
+    /// Error variance per axis of fixes that do not state their own, m2.
+    fn gnss_variance_m2(&self, of_model_m2: Option<f64>) -> f64 {
+        let known_m2 = self.options.gnss_sigma.map(SigmaM::variance_m2);
+        known_m2.or(of_model_m2).unwrap_or(UNKNOWN_RECEIVER_SIGMA_M * UNKNOWN_RECEIVER_SIGMA_M)
+    }
+
+    /// The predictor of a method that uses no recipe's model.
+    ///
+    /// # Errors
+    /// The reason why the method cannot be fitted to the training samples.
+    pub(super) fn baseline<'b>(&self, method: Method, seed: u64) -> Result<Predictor<'b>, String>
+    where
+        'a: 'b,
+    {
+        match method {
+            Method::Gnss => Ok(self.gnss()),
+            Method::ImmUkf => Ok(self.imm_ukf()),
+            Method::Dnn | Method::DnnDenied => self.dnn(method == Method::Dnn, seed),
+            Method::HomographyDenied => self.homography(seed),
+            Method::Recipe(..) | Method::Track | Method::TrackDenied => Err("needs a model".to_owned()),
+        }
+    }
+
+    /// The fix itself; it states a radius where its error is known.
+    fn gnss<'b>(&self) -> Predictor<'b>
+    where
+        'a: 'b,
+    {
+        let known_sigma_m = self.options.gnss_sigma.map(SigmaM::metres);
+        self.per_row(move |observation| {
+            let fix = observation.fix?;
+            let sigma_m = fix.sigma_m.map(SigmaM::metres).or(known_sigma_m);
+            Some(Prediction { position: fix.position, r95_m: sigma_m.map(|sigma_m| R95_PER_SIGMA * sigma_m) })
+        })
+    }
+
+    /// The supervised network; in its 6D form it predicts only for rows that have a fix.
+    fn dnn<'b>(&self, with_fix: bool, seed: u64) -> Result<Predictor<'b>, String>
+    where
+        'a: 'b,
+    {
+        // The recipes check the number of samples themselves; the network does not.
+        if (self.train.len() as u64) < FEWEST_SAMPLES {
+            let count = self.train.len();
+            return Err(format!("needs at least {FEWEST_SAMPLES} training samples, has {count}"));
+        }
+        let plane = self.plane;
+        let network = dnn::fit(self.train, &plane, with_fix, seed);
+        Ok(self.per_row(move |observation| {
+            let bounding_box = observation.bounding_box.as_ref()?;
+            let fix = observation.fix.filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
+            let point = (fix.is_some() == with_fix).then(|| network.regress(bounding_box, fix))?;
+            Some(Prediction { position: plane.to_position(point), r95_m: None })
+        }))
+    }
+
+    fn homography<'b>(&self, seed: u64) -> Result<Predictor<'b>, String>
+    where
+        'a: 'b,
+    {
+        let plane = self.plane;
+        let pairs: Vec<(BoundingBox, EastNorth)> = self
+            .train
+            .iter()
+            .map(|sample| (sample.bounding_box, plane.to_plane(sample.fix.position)))
+            .collect();
+        let homography = homography::fit(&pairs, seed)
+            .ok_or("fewer than 8 training samples, or all of them at one position")?;
+        Ok(self.per_row(move |observation| {
+            let point = homography.project(observation.bounding_box.as_ref()?)?;
+            Some(Prediction { position: plane.to_position(point), r95_m: None })
+        }))
+    }
+
+    fn imm_ukf<'b>(&self) -> Predictor<'b>
+    where
+        'a: 'b,
+    {
+        let variance_m2 = self.gnss_variance_m2(None);
+        let tuned = imm_ukf::tune(&traverses(self.train, &self.plane), variance_m2);
+        let (plane, test) = (self.plane, self.test);
+        Box::new(move |target| {
+            let mut filter = ImmUkf::new(tuned);
+            let mut last = target.first().map(|&row| test[row].observation.time);
+            let predict = |&row: &usize| {
+                let Observation { time, fix, .. } = &test[row].observation;
+                let seconds = last.replace(*time).map_or(0.0, |last| time.duration_since(last).as_secs_f64());
+                let fix = fix.map(|fix| {
+                    let stated_m2 = fix.sigma_m.map_or(variance_m2, SigmaM::variance_m2);
+                    (plane.to_plane(fix.position), stated_m2)
+                });
+                let estimate = filter.step(seconds, fix)?;
+                Some(Prediction {
+                    position: plane.to_position(estimate.position),
+                    r95_m: Some(R95_PER_SIGMA * estimate.variance_m2.sqrt()),
+                })
+            };
+            target.iter().map(predict).collect()
+        })
+    }
+
+    /// The predictor of a method that uses a recipe's model.
+    ///
+    /// # Errors
+    /// A method that uses none.
+    pub(super) fn of_model<'b>(&self, method: Method, model: &'b RecipeModel) -> Result<Predictor<'b>, String>
+    where
+        'a: 'b,
+    {
+        let regressor = &model.regressor;
+        let e_gnss_m2 = self.gnss_variance_m2(Some(regressor.e_gnss_m2()));
+        match method {
+            Method::Recipe(_, InferenceMode::TwoStep) => {
+                let image_size = self.options.image_size;
+                Ok(self.per_row(move |observation| {
+                    let fused = fuse(observation, Some((regressor, 0)), image_size, Some(e_gnss_m2))?;
+                    Some(Prediction { position: fused.fused, r95_m: Some(fused.r95_m) })
+                }))
+            }
+            Method::Recipe(_, mode) => Ok(self.regressed(mode == InferenceMode::OneStep, regressor)),
+            Method::Track => Ok(self.track(regressor, e_gnss_m2, true)),
+            Method::TrackDenied => Ok(self.track(regressor, e_gnss_m2, false)),
+            _ => Err("needs no model".to_owned()),
+        }
+    }
+
+    /// The regressed position alone.
+    fn regressed<'b>(&self, with_fix: bool, regressor: &'b Regressor) -> Predictor<'b>
+    where
+        'a: 'b,
+    {
+        let plane = *regressor.plane();
+        self.per_row(move |observation| {
+            let fix = observation.fix.filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
+            let regression = regressor.regress(observation.bounding_box.as_ref()?, fix);
+            Some(Prediction {
+                position: plane.to_position(regression.regressed),
+                r95_m: Some(regression.r95_scale * regression.e_regression_m2.sqrt()),
+            })
+        })
+    }
+
+    /// The sequence fusion of each target, with the fixes or without.
+    fn track<'b>(&self, regressor: &'b Regressor, e_gnss_m2: f64, with_fix: bool) -> Predictor<'b>
+    where
+        'a: 'b,
+    {
+        let settings = TrackSettings::estimate(self.train, regressor);
+        let (plane, test) = (*regressor.plane(), self.test);
+        Box::new(move |target| {
+            let mut track: Option<Track> = None;
+            let predict = |&row: &usize| {
+                let mut observation = test[row].observation.clone();
+                observation.fix = observation.fix.filter(|_| with_fix);
+                let measurement = measurement(&observation, &plane, e_gnss_m2, |bounding_box, fix| {
+                    regressor.regress(bounding_box, fix)
+                });
+                step_track(&mut track, settings, &measurement, &plane)
+            };
+            target.iter().map(predict).collect()
+        })
+    }
+}
+
+/// The measurement of one row, with the regression's variance at its calibrated size.
+fn measurement(
+    observation: &Observation,
+    plane: &LocalPlane,
+    e_gnss_m2: f64,
+    regress: impl Fn(&BoundingBox, Option<EastNorth>) -> Regression,
+) -> Measurement {
+    let fix = observation.fix.map(|fix| {
+        let variance_m2 = fix.sigma_m.map_or(e_gnss_m2, SigmaM::variance_m2);
+        MeasuredPosition::isotropic(plane.to_plane(fix.position), variance_m2)
+    });
+    let regressed = observation.bounding_box.as_ref().map(|bounding_box| {
+        let regression = regress(bounding_box, fix.map(|fix| fix.position));
+        MeasuredPosition::isotropic(regression.regressed, regression.variance_m2())
+    });
+    Measurement { time: observation.time, fix, regressed }
+}
+
+/// Updates a track or starts one; a row without any measurement gets the track's prediction.
+fn step_track(
+    track: &mut Option<Track>,
+    settings: TrackSettings,
+    measurement: &Measurement,
+    plane: &LocalPlane,
+) -> Option<Prediction> {
+    if track.as_ref().is_some_and(|track| track.is_expired(measurement.time)) {
+        *track = None;
+    }
+    let state = match track {
+        Some(track) if measurement.fix.is_none() && measurement.regressed.is_none() => {
+            track.state_at(measurement.time)
+        }
+        Some(track) => track.update(measurement),
+        None => {
+            *track = Track::start(settings, measurement);
+            track.as_ref()?.state_at(measurement.time)
+        }
+    };
+    Some(Prediction { position: plane.to_position(state.position), r95_m: Some(state.r95_m) })
+}

@@ -1,0 +1,336 @@
+//! The interacting-multiple-model (IMM) filter of a track (Blom and Bar-Shalom 1988; Bar-Shalom, Li
+//! and Kirubarajan 2001, 11.6.6): one [`ModeFilter`] per motion mode, their mixing, and the gate.
+//!
+//! Motion modes: stationary, steady (slowly varying velocity), agile (turning or starting).
+//! What never happens here: history, time to live, out-of-sequence measurements ([`super::Track`]).
+
+use jiff::Timestamp;
+
+use super::gate::{ACTIVE_S, GateOutcome, Reacquisition, SourceHistory};
+use super::measurement::{MeasuredPosition, Measurement, MeasurementSource, RejectionReason};
+use super::mode_filter::{
+    GNSS_BIAS, ModeFilter, NoiseDecomposition, POSITION, PredictedMeasurement, VELOCITY,
+};
+use super::settings::{MotionModel, TrackSettings};
+use super::state::{TrackState, Velocity};
+use crate::fusion::plane_covariance::PlaneCovariance;
+use crate::geo::EastNorth;
+
+const MODES: usize = 3;
+/// Index of the stationary mode; steady and agile follow.
+const STATIONARY: usize = 0;
+
+/// Floor of a mode probability inside a logarithm or a division.
+const MIN_PROBABILITY: f64 = 1e-12;
+/// Probability that a mode needs before its speed counts as observed.
+const SPEED_MODE_PROBABILITY: f64 = 0.3;
+
+/// The filter at one instant: a plain value, so that checkpoints are copies.
+#[derive(Debug, Clone)]
+pub(super) struct ImmFilter {
+    pub(super) time: Timestamp,
+    modes: [ModeFilter; MODES],
+    /// Sum to 1.
+    mode_probabilities: [f64; MODES],
+    /// By `MeasurementSource as usize`.
+    histories: [SourceHistory; 2],
+    last_regressed_at: Option<Timestamp>,
+    /// Square of the highest speed observed with confidence, decaying, m2/s2.
+    speed_envelope_m2_s2: f64,
+}
+
+impl ImmFilter {
+    /// A filter initialised from one measured position.
+    pub(super) fn new(
+        settings: &TrackSettings,
+        time: Timestamp,
+        source: MeasurementSource,
+        measured: MeasuredPosition,
+    ) -> Self {
+        let motion = &settings.motion;
+        let decomposition = NoiseDecomposition::new(settings, source, measured, 1.0);
+        let moving = ModeFilter::new(&decomposition, measured.covariance, motion.initial_speed_sigma_m_s);
+        let mut stationary = moving.clone();
+        stationary.predict_stationary(0.0, motion.stationary_m2_s);
+        let mut histories = [SourceHistory::default(); 2];
+        histories[source as usize] = SourceHistory::accepted(time);
+        Self {
+            time,
+            modes: [stationary, moving.clone(), moving],
+            mode_probabilities: initial_probabilities(motion),
+            histories,
+            last_regressed_at: (source == MeasurementSource::Regressed).then_some(time),
+            speed_envelope_m2_s2: motion.min_speed_m_s.powi(2),
+        }
+    }
+
+    /// Propagates to a later instant; an earlier one changes nothing.
+    pub(super) fn predict(&mut self, settings: &TrackSettings, time: Timestamp) {
+        let step_s = time.duration_since(self.time).as_secs_f64();
+        if step_s <= 0.0 {
+            return;
+        }
+        let motion = &settings.motion;
+        self.time = time;
+        self.mix(motion, step_s);
+        self.update_speed_envelope(motion, step_s);
+        // Stationary variance of the agile velocity = speed envelope: density = 2 v^2 / tau.
+        let agile_m2_s3 = 2.0 * self.speed_envelope_m2_s2 / motion.agile_time_constant_s;
+        for mode in &mut self.modes {
+            mode.propagate_biases(settings, step_s);
+        }
+        let [stationary, steady, agile] = &mut self.modes;
+        stationary.predict_stationary(step_s, motion.stationary_m2_s);
+        steady.predict_ornstein_uhlenbeck(step_s, motion.steady_m2_s3, motion.steady_time_constant_s);
+        agile.predict_ornstein_uhlenbeck(step_s, agile_m2_s3, motion.agile_time_constant_s);
+    }
+
+    /// The interaction step of the IMM for a step of any length. The chance to stay in a mode is
+    /// `exp(-step / sojourn)`; a mode that is left goes to either of the others alike.
+    fn mix(&mut self, motion: &MotionModel, step_s: f64) {
+        let stay = motion.sojourn_s.map(|sojourn_s| (-step_s / sojourn_s).exp());
+        let transition_probability = |from: usize, to: usize| {
+            if from == to { stay[from] } else { 0.5 * (1.0 - stay[from]) }
+        };
+        let before = self.modes.clone();
+        let mut probabilities = [0.0; MODES];
+        for (to, predicted) in probabilities.iter_mut().enumerate() {
+            let joint: [f64; MODES] =
+                std::array::from_fn(|from| self.mode_probabilities[from] * transition_probability(from, to));
+            let total: f64 = joint.iter().sum();
+            *predicted = total;
+            if total > MIN_PROBABILITY {
+                self.modes[to] = ModeFilter::moment_match(&before, joint.map(|share| share / total));
+            }
+        }
+        let total: f64 = probabilities.iter().sum();
+        self.mode_probabilities = probabilities.map(|probability| probability / total);
+    }
+
+    /// Lets the speed envelope decay, and raises it to the speed of any probable moving mode, its
+    /// variance subtracted.
+    fn update_speed_envelope(&mut self, motion: &MotionModel, step_s: f64) {
+        self.speed_envelope_m2_s2 *= (-step_s * std::f64::consts::LN_2 / motion.speed_half_life_s).exp();
+        self.speed_envelope_m2_s2 = self.speed_envelope_m2_s2.max(motion.min_speed_m_s.powi(2));
+        for (mode, probability) in self.modes.iter().zip(self.mode_probabilities).skip(1) {
+            let speed_m2_s2: f64 = (VELOCITY..GNSS_BIAS)
+                .map(|state| mode.mean[state].powi(2) - mode.covariance[(state, state)])
+                .sum();
+            if probability > SPEED_MODE_PROBABILITY && speed_m2_s2 > self.speed_envelope_m2_s2 {
+                self.speed_envelope_m2_s2 = speed_m2_s2;
+            }
+        }
+    }
+
+    /// Propagates to the measurement's instant and processes its positions, the regressed one first.
+    /// The outcomes are in that order.
+    pub(super) fn step(
+        &mut self,
+        settings: &TrackSettings,
+        measurement: &Measurement,
+    ) -> [Option<GateOutcome>; 2] {
+        self.predict(settings, measurement.time);
+        let regressed = measurement
+            .regressed
+            .map(|measured| self.gate_and_update(settings, MeasurementSource::Regressed, measured));
+        let fix =
+            measurement.fix.map(|measured| self.gate_and_update(settings, MeasurementSource::Fix, measured));
+        [regressed, fix]
+    }
+
+    fn gate_and_update(
+        &mut self,
+        settings: &TrackSettings,
+        source: MeasurementSource,
+        measured: MeasuredPosition,
+    ) -> GateOutcome {
+        let mut outcome = GateOutcome {
+            source,
+            innovation: EastNorth::default(),
+            nis: f64::NAN,
+            rejected: Some(RejectionReason::UnusableVariance),
+            reinitialized: false,
+        };
+        if !measured.covariance.is_positive() {
+            return outcome;
+        }
+        let inflation = self.correlated_noise_inflation(settings, source);
+        let decomposition = NoiseDecomposition::new(settings, source, measured, inflation);
+        let mut predicted = self.predict_measurement(&decomposition);
+        (outcome.innovation, outcome.nis) = self.innovation(&predicted);
+        outcome.rejected = None;
+        if !self.passes_gate(settings, &predicted, outcome.nis) {
+            match self.reacquire(settings, source, measured, &decomposition) {
+                Reacquisition::Rejected => {
+                    outcome.rejected = Some(RejectionReason::OutsideGate);
+                    return outcome;
+                }
+                Reacquisition::Reinitialized => {
+                    outcome.reinitialized = true;
+                    return outcome;
+                }
+                Reacquisition::BiasReset => predicted = self.predict_measurement(&decomposition),
+            }
+        }
+        self.update(&predicted);
+        self.histories[source as usize] = SourceHistory::accepted(self.time);
+        if source == MeasurementSource::Regressed {
+            self.last_regressed_at = Some(self.time);
+        }
+        outcome
+    }
+
+    /// Factor, at least 1, on the white variance of a regressed position: boxes closer in time than
+    /// the detector's correlation time share one error, so n of them carry the information of one.
+    fn correlated_noise_inflation(&self, settings: &TrackSettings, source: MeasurementSource) -> f64 {
+        match (source, self.last_regressed_at) {
+            (MeasurementSource::Regressed, Some(last)) => {
+                let interval_s = self.time.duration_since(last).as_secs_f64().max(1e-3);
+                (settings.regression.detector_correlation_s / interval_s).max(1.0)
+            }
+            _ => 1.0,
+        }
+    }
+
+    /// Deals with a measurement beyond the gate. Once its source was rejected often and for long
+    /// enough: resets the source's bias if the other source is active and the measurement then
+    /// passes the gate; reinitialises the filter if the other source is not active.
+    fn reacquire(
+        &mut self,
+        settings: &TrackSettings,
+        source: MeasurementSource,
+        measured: MeasuredPosition,
+        decomposition: &NoiseDecomposition,
+    ) -> Reacquisition {
+        let now = self.time;
+        let history = &mut self.histories[source as usize];
+        let Some(rejected_s) = history.record_rejection(now, settings.reacquire_after_s) else {
+            return Reacquisition::Rejected;
+        };
+        let other_is_active = self.histories[1 - source as usize].is_active(now);
+        if other_is_active {
+            let mut candidate = self.clone();
+            for mode in &mut candidate.modes {
+                mode.reset_bias(decomposition.bias);
+            }
+            let predicted = candidate.predict_measurement(decomposition);
+            let (_, nis) = candidate.innovation(&predicted);
+            if candidate.passes_gate(settings, &predicted, nis) {
+                *self = candidate;
+                return Reacquisition::BiasReset;
+            }
+        }
+        // A regressed position is confined to the scene, a fix is not: if both stay active and no
+        // bias reconciles them, the camera prevails.
+        let camera_prevails = source == MeasurementSource::Regressed && rejected_s >= ACTIVE_S;
+        if !other_is_active || camera_prevails {
+            *self = Self::new(settings, now, source, measured);
+            return Reacquisition::Reinitialized;
+        }
+        Reacquisition::Rejected
+    }
+
+    fn predict_measurement(&self, decomposition: &NoiseDecomposition) -> [PredictedMeasurement; MODES] {
+        std::array::from_fn(|mode| self.modes[mode].predict_measurement(decomposition))
+    }
+
+    /// The chi-square gate: `nis`, of the mixture, or the penalised NIS of the best mode is within
+    /// `settings.gate`.
+    fn passes_gate(
+        &self,
+        settings: &TrackSettings,
+        predicted: &[PredictedMeasurement; MODES],
+        nis: f64,
+    ) -> bool {
+        let is_outside = nis > settings.gate && self.min_mode_nis(predicted) > settings.gate;
+        !is_outside
+    }
+
+    /// Mean innovation of the mixture, m, and its NIS under the moment-matched covariance.
+    fn innovation(&self, predicted: &[PredictedMeasurement; MODES]) -> (EastNorth, f64) {
+        let mut mean = [0.0; 2];
+        for (PredictedMeasurement { innovation, .. }, probability) in
+            predicted.iter().zip(self.mode_probabilities)
+        {
+            mean[0] += probability * innovation[0];
+            mean[1] += probability * innovation[1];
+        }
+        let mut covariance = PlaneCovariance::default();
+        for (PredictedMeasurement { innovation, innovation_covariance, .. }, probability) in
+            predicted.iter().zip(self.mode_probabilities)
+        {
+            let deviation = PlaneCovariance::outer(innovation[0] - mean[0], innovation[1] - mean[1]);
+            covariance = covariance.plus(innovation_covariance.plus(deviation).scaled(probability));
+        }
+        let innovation = EastNorth { east_m: mean[0], north_m: mean[1] };
+        (innovation, covariance.mahalanobis_squared(innovation))
+    }
+
+    /// The smallest `d' S_j^-1 d - 2 ln mu_j` over the modes j of probability `mu_j`: a stationary
+    /// target that sets out fits the agile mode well, though the mixture hardly predicts it.
+    fn min_mode_nis(&self, predicted: &[PredictedMeasurement; MODES]) -> f64 {
+        let penalised = predicted.iter().zip(self.mode_probabilities).map(
+            |(PredictedMeasurement { innovation, innovation_covariance, .. }, probability)| {
+                let innovation = EastNorth { east_m: innovation[0], north_m: innovation[1] };
+                innovation_covariance.mahalanobis_squared(innovation)
+                    - 2.0 * probability.max(MIN_PROBABILITY).ln()
+            },
+        );
+        penalised.fold(f64::INFINITY, f64::min)
+    }
+
+    /// Kalman update of every mode, then Bayes' rule for the mode probabilities, by log-sum-exp so
+    /// that a distant measurement cannot turn all of them to 0.
+    fn update(&mut self, predicted: &[PredictedMeasurement; MODES]) {
+        let mut log_posterior = [0.0; MODES];
+        for (mode, log) in log_posterior.iter_mut().enumerate() {
+            *log = self.mode_probabilities[mode].max(MIN_PROBABILITY).ln()
+                + self.modes[mode].update(&predicted[mode]);
+        }
+        let highest = log_posterior.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let total: f64 = log_posterior.iter().map(|log| (log - highest).exp()).sum();
+        for (probability, log) in self.mode_probabilities.iter_mut().zip(log_posterior) {
+            *probability = (log - highest).exp() / total;
+        }
+    }
+
+    /// The moment-matched estimate over the modes, without anything about the latest measurement.
+    pub(super) fn track_state(&self) -> TrackState {
+        let mut mean = [0.0; 4];
+        for (mode, probability) in self.modes.iter().zip(self.mode_probabilities) {
+            for (value, component) in mean.iter_mut().zip(mode.mean.iter()) {
+                *value += probability * component;
+            }
+        }
+        let mut covariance = PlaneCovariance::default();
+        for (mode, probability) in self.modes.iter().zip(self.mode_probabilities) {
+            let deviation =
+                PlaneCovariance::outer(mode.mean[POSITION] - mean[0], mode.mean[POSITION + 1] - mean[1]);
+            let position = PlaneCovariance {
+                east_m2: mode.covariance[(POSITION, POSITION)],
+                north_m2: mode.covariance[(POSITION + 1, POSITION + 1)],
+                east_north_m2: mode.covariance[(POSITION, POSITION + 1)],
+            };
+            covariance = covariance.plus(position.plus(deviation).scaled(probability));
+        }
+        TrackState {
+            time: self.time,
+            position: EastNorth { east_m: mean[0], north_m: mean[1] },
+            velocity: Velocity { east_m_s: mean[2], north_m_s: mean[3] },
+            covariance,
+            r95_m: covariance.r95_m(),
+            stationary_probability: self.mode_probabilities[STATIONARY],
+            nis: None,
+            innovations: Vec::new(),
+            rejected: Vec::new(),
+            reinitialized: false,
+        }
+    }
+}
+
+/// The share of time spent in each mode, proportional to its mean sojourn: the stationary
+/// distribution of the mode chain, since every mode is entered equally often.
+fn initial_probabilities(motion: &MotionModel) -> [f64; MODES] {
+    let total: f64 = motion.sojourn_s.iter().sum();
+    motion.sojourn_s.map(|sojourn_s| sojourn_s / total)
+}

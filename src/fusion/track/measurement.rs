@@ -1,0 +1,89 @@
+//! Input of a track: measured positions with their error covariances, and why some are rejected.
+
+use jiff::Timestamp;
+use strum::IntoStaticStr;
+
+use crate::fusion::plane_covariance::PlaneCovariance;
+use crate::geo::EastNorth;
+
+/// A measured position in the camera's local plane, with the covariance of its error.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredPosition {
+    /// East and north of the plane's origin, m.
+    pub position: EastNorth,
+    /// Covariance R of the total error, white part and bias together, m2.
+    pub covariance: PlaneCovariance,
+}
+
+impl MeasuredPosition {
+    /// A position with `R = variance_m2 * I`: the squared sigma of a fix, or `e_regression_m2`.
+    #[must_use]
+    pub const fn isotropic(position: EastNorth, variance_m2: f64) -> Self {
+        Self { position, covariance: PlaneCovariance::isotropic(variance_m2) }
+    }
+}
+
+/// What was measured at one instant: a fix, a regressed position, or both.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measurement {
+    /// Time of measurement, by the camera's clock.
+    pub time: Timestamp,
+    /// The receiver's fix.
+    pub fix: Option<MeasuredPosition>,
+    /// The position regressed from the bounding box.
+    pub regressed: Option<MeasuredPosition>,
+}
+
+/// The sensor that a measured position comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
+pub enum MeasurementSource {
+    /// The bounding box, through the camera's model.
+    Regressed,
+    /// The GNSS receiver.
+    Fix,
+}
+
+impl MeasurementSource {
+    /// Name in logs, metrics and wire formats.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
+}
+
+/// Why a measured position did not update the track.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
+pub enum RejectionReason {
+    /// Its NIS exceeds the chi-square gate.
+    OutsideGate,
+    /// It is older than the window for out-of-sequence measurements.
+    TooLate,
+    /// The track already has a measurement of that source and instant.
+    Duplicate,
+    /// Its covariance is not positive definite.
+    UnusableVariance,
+}
+
+impl RejectionReason {
+    /// All reasons.
+    pub const ALL: [Self; 4] = [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance];
+
+    /// Name in logs, metrics and wire formats.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
+}
+
+/// A measured position that did not update the track.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rejection {
+    /// Its sensor.
+    pub source: MeasurementSource,
+    /// Why it was rejected.
+    pub reason: RejectionReason,
+    /// Normalised innovation squared, where one was computed.
+    pub nis: Option<f64>,
+}

@@ -1,0 +1,275 @@
+//! The Kalman filter of one motion mode.
+//!
+//! State, 8 components: `x = [p_e p_n v_e v_n b_e b_n c_e c_n]`, axes east and north; position p in
+//! m, velocity v in m/s, and the biases of receiver (b) and camera (c) in units of their own standard
+//! deviation, so that one unit-variance Gauss-Markov state serves measurements of any covariance.
+//!
+//! A measured position with error covariance R and white share w is modelled as
+//! `z = p + L b + e`, with `L = sqrtm((1 - w) R)` and `e ~ N(0, w R k)`, where k inflates the white
+//! part for measurements closer in time than its own correlation
+//! (Bar-Shalom, Li and Kirubarajan 2001, 8.2: state augmentation for autocorrelated noise).
+
+use nalgebra::{SMatrix, SVector};
+
+use super::measurement::{MeasuredPosition, MeasurementSource};
+use super::settings::TrackSettings;
+use crate::fusion::plane_covariance::PlaneCovariance;
+use crate::geo::EastNorth;
+
+/// Components of the state.
+pub(super) const STATES: usize = 8;
+/// Index of the first (east) component of each pair; north follows.
+pub(super) const POSITION: usize = 0;
+pub(super) const VELOCITY: usize = 2;
+pub(super) const GNSS_BIAS: usize = 4;
+pub(super) const CAMERA_BIAS: usize = 6;
+
+/// Standard deviation per axis of a stationary target's velocity, m/s: keeps the covariance regular.
+const STATIONARY_SPEED_SIGMA_M_S: f64 = 0.02;
+/// Standard deviation of a bias after its reset, in units of its stationary one.
+const RESET_BIAS_SIGMAS: f64 = 4.0;
+/// Mixing weights below this contribute nothing to a covariance.
+const NEGLIGIBLE_WEIGHT: f64 = 1e-9;
+
+pub(super) type State = SVector<f64, STATES>;
+pub(super) type StateCovariance = SMatrix<f64, STATES, STATES>;
+
+/// Mean and covariance of the state under one motion mode.
+#[derive(Debug, Clone)]
+pub(super) struct ModeFilter {
+    pub(super) mean: State,
+    pub(super) covariance: StateCovariance,
+}
+
+/// A measured position with its error split into a bias and a white part.
+pub(super) struct NoiseDecomposition {
+    pub(super) position: EastNorth,
+    /// Index of the bias state that the measurement observes.
+    pub(super) bias: usize,
+    /// L, the symmetric square root of the bias part of R, m, as (east, north, east-north).
+    pub(super) bias_root_m: [f64; 3],
+    /// Covariance of the white part, m2.
+    pub(super) white: PlaneCovariance,
+}
+
+/// The measurement as one mode predicts it.
+pub(super) struct PredictedMeasurement {
+    /// Measured less predicted position (east, north), m.
+    pub(super) innovation: [f64; 2],
+    /// Innovation covariance S, m2.
+    pub(super) innovation_covariance: PlaneCovariance,
+    /// Cross-covariance `P H'` of the state with the measured position.
+    cross_covariance: SMatrix<f64, STATES, 2>,
+}
+
+impl NoiseDecomposition {
+    /// `white_inflation` (k, at least 1) multiplies the white part.
+    pub(super) fn new(
+        settings: &TrackSettings,
+        source: MeasurementSource,
+        measured: MeasuredPosition,
+        white_inflation: f64,
+    ) -> Self {
+        let (bias, white_share) = match source {
+            MeasurementSource::Fix => (GNSS_BIAS, settings.gnss.white_share),
+            MeasurementSource::Regressed => (CAMERA_BIAS, settings.regression.white_share),
+        };
+        Self {
+            position: measured.position,
+            bias,
+            bias_root_m: measured.covariance.scaled(1.0 - white_share).square_root_m(),
+            white: measured.covariance.scaled(white_share * white_inflation),
+        }
+    }
+}
+
+impl ModeFilter {
+    /// A filter that knows one measured position: `p = z - L b - e`, so position and bias are
+    /// correlated from the start; the velocity has mean 0 and `initial_speed_sigma_m_s` per axis.
+    pub(super) fn new(
+        decomposition: &NoiseDecomposition,
+        covariance_m2: PlaneCovariance,
+        initial_speed_sigma_m_s: f64,
+    ) -> Self {
+        let mut mean = State::zeros();
+        mean[POSITION] = decomposition.position.east_m;
+        mean[POSITION + 1] = decomposition.position.north_m;
+        let mut covariance = StateCovariance::zeros();
+        for bias in GNSS_BIAS..STATES {
+            covariance[(bias, bias)] = 1.0;
+        }
+        for axis in 0..2 {
+            covariance[(VELOCITY + axis, VELOCITY + axis)] = initial_speed_sigma_m_s.powi(2);
+        }
+        let [east, north, east_north] = decomposition.bias_root_m;
+        for (row, column, value) in [(0, 0, east), (1, 1, north), (0, 1, east_north), (1, 0, east_north)] {
+            covariance[(POSITION + row, decomposition.bias + column)] = -value;
+            covariance[(decomposition.bias + column, POSITION + row)] = -value;
+        }
+        for (row, values) in covariance_m2.rows_m2().iter().enumerate() {
+            for (column, value) in values.iter().enumerate() {
+                covariance[(POSITION + row, POSITION + column)] = *value;
+            }
+        }
+        Self { mean, covariance }
+    }
+
+    /// Mean and covariance of a mixture with the given weights, which sum to 1 (moment matching).
+    pub(super) fn moment_match<const N: usize>(components: &[Self; N], weights: [f64; N]) -> Self {
+        let mut mean = State::zeros();
+        for (component, weight) in components.iter().zip(weights) {
+            mean += component.mean * weight;
+        }
+        let mut covariance = StateCovariance::zeros();
+        for (component, weight) in components.iter().zip(weights) {
+            if weight > NEGLIGIBLE_WEIGHT {
+                let deviation = component.mean - mean;
+                covariance += (component.covariance + deviation * deviation.transpose()) * weight;
+            }
+        }
+        Self { mean, covariance }
+    }
+
+    /// Multiplies one state component by a factor, its covariances with it.
+    fn scale(&mut self, state: usize, factor: f64) {
+        self.mean[state] *= factor;
+        for other in 0..STATES {
+            self.covariance[(state, other)] *= factor;
+            self.covariance[(other, state)] *= factor;
+        }
+    }
+
+    /// Propagates both biases as first-order Gauss-Markov processes of unit variance,
+    /// `phi = exp(-rate)`; the camera's also decorrelates with the distance travelled.
+    pub(super) fn propagate_biases(&mut self, settings: &TrackSettings, step_s: f64) {
+        let speed_m_s = self.mean[VELOCITY].hypot(self.mean[VELOCITY + 1]);
+        let regression = &settings.regression;
+        let rates = [
+            (GNSS_BIAS, step_s / settings.gnss.time_constant_s),
+            (
+                CAMERA_BIAS,
+                step_s / regression.time_constant_s + step_s * speed_m_s / regression.correlation_length_m,
+            ),
+        ];
+        for (bias, rate) in rates {
+            let decay = (-rate).exp();
+            for state in [bias, bias + 1] {
+                self.scale(state, decay);
+                self.covariance[(state, state)] += 1.0 - decay * decay;
+            }
+        }
+    }
+
+    /// Stationary mode: the velocity is zero and uncorrelated with everything; the position performs
+    /// a random walk of `density_m2_s`. With `step_s = 0` only the velocity is reset.
+    pub(super) fn predict_stationary(&mut self, step_s: f64, density_m2_s: f64) {
+        for state in [VELOCITY, VELOCITY + 1] {
+            self.scale(state, 0.0);
+            self.covariance[(state, state)] = STATIONARY_SPEED_SIGMA_M_S * STATIONARY_SPEED_SIGMA_M_S;
+        }
+        for state in [POSITION, POSITION + 1] {
+            self.covariance[(state, state)] += density_m2_s * step_s;
+        }
+    }
+
+    /// Moving modes: the velocity is an Ornstein-Uhlenbeck process driven by white acceleration of
+    /// `density_m2_s3`, the position its integral, discretised exactly (Särkkä and Solin 2019, 6.2).
+    pub(super) fn predict_ornstein_uhlenbeck(
+        &mut self,
+        step_s: f64,
+        density_m2_s3: f64,
+        time_constant_s: f64,
+    ) {
+        let rate = 1.0 / time_constant_s;
+        let exponent = rate * step_s;
+        let decay = (-exponent).exp();
+        let integrated_decay_s = (1.0 - decay) / rate;
+        for axis in 0..2 {
+            let (position, velocity) = (POSITION + axis, VELOCITY + axis);
+            self.mean[position] += integrated_decay_s * self.mean[velocity];
+            for other in 0..STATES {
+                self.covariance[(position, other)] += integrated_decay_s * self.covariance[(velocity, other)];
+            }
+            for other in 0..STATES {
+                self.covariance[(other, position)] += integrated_decay_s * self.covariance[(other, velocity)];
+            }
+            self.scale(velocity, decay);
+            let cross = density_m2_s3 * 0.5 * integrated_decay_s * integrated_decay_s;
+            let position_m2 = if exponent < 0.01 {
+                // Series to second order: the closed form loses all digits for short steps.
+                density_m2_s3 * step_s.powi(3) / 3.0 * (1.0 - 0.75 * exponent)
+            } else {
+                density_m2_s3 / rate.powi(3) * (exponent - 2.0 * (1.0 - decay) + 0.5 * (1.0 - decay * decay))
+            };
+            self.covariance[(position, position)] += position_m2;
+            self.covariance[(velocity, velocity)] += density_m2_s3 * (1.0 - decay * decay) / (2.0 * rate);
+            self.covariance[(position, velocity)] += cross;
+            self.covariance[(velocity, position)] += cross;
+        }
+    }
+
+    /// Sets a bias to 0 with a wide variance, uncorrelated with everything else.
+    pub(super) fn reset_bias(&mut self, bias: usize) {
+        for state in [bias, bias + 1] {
+            self.scale(state, 0.0);
+            self.covariance[(state, state)] = RESET_BIAS_SIGMAS * RESET_BIAS_SIGMAS;
+        }
+    }
+
+    /// Innovation, its covariance `S = H P H' + white` and `P H'`, with `H = [I 0 .. L ..]`.
+    pub(super) fn predict_measurement(&self, decomposition: &NoiseDecomposition) -> PredictedMeasurement {
+        let [east, north, east_north] = decomposition.bias_root_m;
+        let bias = decomposition.bias;
+        let innovation = [
+            decomposition.position.east_m
+                - self.mean[POSITION]
+                - east * self.mean[bias]
+                - east_north * self.mean[bias + 1],
+            decomposition.position.north_m
+                - self.mean[POSITION + 1]
+                - east_north * self.mean[bias]
+                - north * self.mean[bias + 1],
+        ];
+        let mut cross = SMatrix::<f64, STATES, 2>::zeros();
+        for state in 0..STATES {
+            let row = |column: usize| self.covariance[(state, column)];
+            cross[(state, 0)] = row(POSITION) + east * row(bias) + east_north * row(bias + 1);
+            cross[(state, 1)] = row(POSITION + 1) + east_north * row(bias) + north * row(bias + 1);
+        }
+        let predicted = PlaneCovariance {
+            east_m2: cross[(POSITION, 0)] + east * cross[(bias, 0)] + east_north * cross[(bias + 1, 0)],
+            north_m2: cross[(POSITION + 1, 1)] + east_north * cross[(bias, 1)] + north * cross[(bias + 1, 1)],
+            east_north_m2: cross[(POSITION, 1)] + east * cross[(bias, 1)] + east_north * cross[(bias + 1, 1)],
+        };
+        PredictedMeasurement {
+            innovation,
+            innovation_covariance: predicted.plus(decomposition.white),
+            cross_covariance: cross,
+        }
+    }
+
+    /// The Kalman update `K = P H' S^-1`. Returns the log-likelihood of the measurement without its
+    /// constant, `-(d' S^-1 d + ln det S) / 2`.
+    pub(super) fn update(&mut self, predicted: &PredictedMeasurement) -> f64 {
+        let PredictedMeasurement { innovation, innovation_covariance, cross_covariance: cross } = predicted;
+        let determinant = innovation_covariance.determinant();
+        let inverse = [
+            innovation_covariance.north_m2 / determinant,
+            innovation_covariance.east_m2 / determinant,
+            -innovation_covariance.east_north_m2 / determinant,
+        ];
+        for state in 0..STATES {
+            let (east, north) = (cross[(state, 0)], cross[(state, 1)]);
+            let gain = [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
+            self.mean[state] += gain[0] * innovation[0] + gain[1] * innovation[1];
+            for other in 0..=state {
+                let reduction = gain[0] * cross[(other, 0)] + gain[1] * cross[(other, 1)];
+                let value = self.covariance[(state, other)] - reduction;
+                self.covariance[(state, other)] = value;
+                self.covariance[(other, state)] = value;
+            }
+        }
+        let innovation = EastNorth { east_m: innovation[0], north_m: innovation[1] };
+        -0.5 * (innovation_covariance.mahalanobis_squared(innovation) + determinant.ln())
+    }
+}

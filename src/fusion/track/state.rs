@@ -1,0 +1,62 @@
+//! Output of a track: the estimated state with the figures of its consistency.
+
+use jiff::Timestamp;
+
+use super::measurement::{MeasurementSource, Rejection};
+use crate::fusion::plane_covariance::PlaneCovariance;
+use crate::geo::EastNorth;
+
+/// The innovation of one accepted measurement.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Innovation {
+    /// The sensor of the measurement.
+    pub source: MeasurementSource,
+    /// Measured less predicted position, m.
+    pub difference: EastNorth,
+    /// Normalised innovation squared, `d' S^-1 d`: chi-square with 2 degrees of freedom, mean 2, for
+    /// a consistent filter.
+    pub nis: f64,
+}
+
+/// A velocity in the camera's local plane.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Velocity {
+    /// Component towards east, m/s.
+    pub east_m_s: f64,
+    /// Component towards north, m/s.
+    pub north_m_s: f64,
+}
+
+impl Velocity {
+    /// Magnitude, m/s.
+    #[must_use]
+    pub fn speed_m_s(self) -> f64 {
+        self.east_m_s.hypot(self.north_m_s)
+    }
+}
+
+/// The estimated state of a target at one instant.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrackState {
+    /// The instant of the estimate.
+    pub time: Timestamp,
+    /// Estimated position.
+    pub position: EastNorth,
+    /// Estimated velocity.
+    pub velocity: Velocity,
+    /// Covariance of the position's error, m2.
+    pub covariance: PlaneCovariance,
+    /// Radius about `position` that contains the true position with 95 % probability, m.
+    pub r95_m: f64,
+    /// Probability of the stationary motion mode, 0 to 1.
+    pub stationary_probability: f64,
+    /// Sum of the NIS of the accepted positions of the latest measurement (2 degrees of freedom each).
+    pub nis: Option<f64>,
+    /// Innovations of the accepted positions, one per sensor.
+    pub innovations: Vec<Innovation>,
+    /// Rejected positions.
+    pub rejected: Vec<Rejection>,
+    /// Whether this measurement reinitialised the track, after a series of rejections that no bias
+    /// explains.
+    pub reinitialized: bool,
+}

@@ -1,0 +1,65 @@
+//! The encoders of the recipes: from a box to a position, and back to the box that belongs to it.
+
+pub(crate) mod features;
+pub(crate) mod hybrid;
+mod initial_projection;
+mod inverse_camera;
+pub(crate) mod paper;
+pub(crate) mod projection;
+pub(crate) mod projection_fit;
+pub(crate) mod projective;
+mod stored_network;
+
+use self::features::{Encoded, features_of};
+use self::hybrid::HybridEncoder;
+use self::paper::PaperEncoder;
+use self::projective::{GeometricCovariance, ProjectiveEncoder};
+use super::artifact::ModelParts;
+use crate::domain::{BoundingBox, Error, Recipe, Result};
+use crate::geo::LocalPlane;
+
+/// The encoder of a loaded model, by recipe.
+#[derive(Debug, Clone)]
+pub(crate) enum Encoder {
+    Paper(Box<PaperEncoder>),
+    Hybrid(Box<HybridEncoder>),
+    Projective(Box<ProjectiveEncoder>),
+}
+
+impl Encoder {
+    /// Takes the encoder's tensors out of the parts of a model.
+    ///
+    /// # Errors
+    /// Names the tensor or metadata field that is missing or cannot be used.
+    pub(crate) fn build(parts: &mut ModelParts) -> Result<Self> {
+        Ok(match parts.recipe {
+            Recipe::Paper => Self::Paper(Box::new(PaperEncoder::build(parts)?)),
+            Recipe::Hybrid => Self::Hybrid(Box::new(HybridEncoder::build(parts)?)),
+            Recipe::Projective => Self::Projective(Box::new(ProjectiveEncoder::build(parts)?)),
+            Recipe::Auto => {
+                let message = "must be the recipe that auto has chosen: paper, hybrid or projective";
+                return Err(Error::invalid("metadata.recipe", message));
+            }
+        })
+    }
+
+    /// Position and reconstruction of a box alone.
+    pub(crate) fn encode(&self, plane: &LocalPlane, bounding_box: &BoundingBox) -> Encoded {
+        match self {
+            Self::Paper(paper) => Encoded {
+                position: paper.estimate(plane, bounding_box, None).position,
+                reconstruction_px: features_of(bounding_box),
+            },
+            Self::Hybrid(hybrid) => hybrid.encode(bounding_box),
+            Self::Projective(projective) => projective.encode(bounding_box),
+        }
+    }
+}
+
+/// A recipe's fit: the encoder's part of a model, and the covariance of its parameters where the recipe
+/// has one.
+#[derive(Debug, Clone)]
+pub(crate) struct FittedEncoder {
+    pub(crate) parts: ModelParts,
+    pub(crate) covariance: Option<GeometricCovariance>,
+}

@@ -1,0 +1,120 @@
+//! The candidates of each recipe.
+
+use crate::domain::{GaussMarkovNoise, Recipe};
+use crate::model::encoder::projective::Variant;
+use crate::model::encoder::{FittedEncoder, hybrid, paper, projective};
+use crate::model::network::LossWeights;
+use crate::model::progress::{FitError, Phase};
+use crate::model::samples::rows::TrainingRows;
+use crate::model::uncertainty::coverage::Coverage;
+use crate::model::uncertainty::error_model::set_uncalibrated;
+
+/// One way to fit a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Candidate {
+    /// Name in the model's report.
+    pub(super) name: &'static str,
+    pub(super) estimator: Estimator,
+    /// Whether the labels are smoothed by a kinematic smoother.
+    smoothed: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Estimator {
+    Paper,
+    Hybrid,
+    Projective(Variant),
+}
+
+const HOMOGRAPHY: Candidate =
+    candidate("projective/foot", Estimator::Projective(variant(false, false)), false);
+const SIZE: Candidate = candidate("projective/sides", Estimator::Projective(variant(true, false)), false);
+const RESIDUAL: Candidate =
+    candidate("projective/residual", Estimator::Projective(variant(true, true)), false);
+const SIZE_SMOOTHED: Candidate =
+    candidate("projective/sides+smoothed", Estimator::Projective(variant(true, false)), true);
+const HYBRID: Candidate = candidate("hybrid", Estimator::Hybrid, false);
+const HYBRID_SMOOTHED: Candidate = candidate("hybrid+smoothed", Estimator::Hybrid, true);
+const PAPER: Candidate = candidate("paper", Estimator::Paper, false);
+
+const fn candidate(name: &'static str, estimator: Estimator, smoothed: bool) -> Candidate {
+    Candidate { name, estimator, smoothed }
+}
+
+const fn variant(uses_size: bool, residual: bool) -> Variant {
+    Variant { uses_size, residual }
+}
+
+/// The candidates of a recipe, the simplest first.
+pub(super) const fn of_recipe(recipe: Recipe) -> &'static [Candidate] {
+    match recipe {
+        Recipe::Paper => &[PAPER],
+        Recipe::Hybrid => &[HYBRID, HYBRID_SMOOTHED],
+        Recipe::Projective => &[HOMOGRAPHY, SIZE, SIZE_SMOOTHED, RESIDUAL],
+        Recipe::Auto => &[HOMOGRAPHY, SIZE, SIZE_SMOOTHED, RESIDUAL, HYBRID, HYBRID_SMOOTHED],
+    }
+}
+
+/// What all fits of a run have in common.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct FitContext {
+    /// Error variance per axis of the receiver, m2.
+    pub(super) e_gnss_m2: f64,
+    /// Noise of the fixes about the geometric map.
+    pub(super) noise: GaussMarkovNoise,
+    /// Number of epochs that replaces the recipe's own.
+    pub(super) epochs: Option<u32>,
+    pub(super) seed: u64,
+    /// Loss weights that replace the recipe's own.
+    pub(super) loss_weights: Option<LossWeights>,
+}
+
+impl Candidate {
+    /// Whether the labels are smoothed.
+    pub(super) const fn is_smoothed(&self) -> bool {
+        self.smoothed
+    }
+
+    /// Epochs of the training of one network.
+    pub(super) fn epochs(&self, context: &FitContext) -> u32 {
+        let default = match self.estimator {
+            Estimator::Paper => paper::EPOCHS,
+            Estimator::Hybrid => hybrid::EPOCHS,
+            Estimator::Projective(_) => projective::EPOCHS,
+        };
+        context.epochs.unwrap_or(default).max(1)
+    }
+
+    /// Epochs of one fit, over all of its networks.
+    pub(super) fn total_epochs(&self, context: &FitContext) -> u32 {
+        let networks = match self.estimator {
+            Estimator::Paper => 2,
+            Estimator::Hybrid => 1,
+            Estimator::Projective(variant) => u32::from(variant.residual),
+        };
+        networks.saturating_mul(self.epochs(context))
+    }
+
+    /// Fits the encoder to rows; its error is not calibrated.
+    pub(super) fn fit(
+        &self,
+        rows: &TrainingRows,
+        context: &FitContext,
+        phase: &mut Phase<'_, '_>,
+    ) -> Result<FittedEncoder, FitError> {
+        let smoothed = self.smoothed.then(|| rows.smoothed(&context.noise));
+        let rows = smoothed.as_ref().unwrap_or(rows);
+        let (e_gnss_m2, epochs) = (context.e_gnss_m2, self.epochs(context));
+        let mut fitted = match self.estimator {
+            Estimator::Paper => paper::fit(rows, e_gnss_m2, epochs, phase),
+            Estimator::Hybrid => hybrid::fit(rows, e_gnss_m2, epochs, phase),
+            Estimator::Projective(variant) => projective::fit(rows, variant, e_gnss_m2, epochs, phase),
+        }?;
+        let coverage = Coverage::new(rows.rows.iter().map(|row| row.bounding_box));
+        match self.estimator {
+            Estimator::Paper => coverage.put(&mut fitted.parts.tensors),
+            _ => set_uncalibrated(&mut fitted.parts, &coverage),
+        }
+        Ok(fitted)
+    }
+}

@@ -1,0 +1,243 @@
+//! The fit of a model: checks, receiver error, cross-validation, final fit, calibration.
+//!
+//! It runs on the calling thread and starts no other.
+
+use std::ops::ControlFlow;
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::candidates::{self, Candidate, Estimator, FitContext};
+use super::held_out::{choose, cross_validate};
+use super::report::{coverage_of_fixes, held_out_error, note_choice, note_errors, note_samples};
+use crate::domain::{
+    CandidateReport, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError, ImageSize,
+    ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
+};
+use crate::model::artifact::{Artifact, FORMAT, ModelParts};
+use crate::model::encoder::projection_fit::ParameterCovariance;
+use crate::model::encoder::projective::{GeometricCovariance, fit_geometry};
+use crate::model::network::LossWeights;
+use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
+use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRows, sha256_of};
+use crate::model::uncertainty::calibration::{HeldOut, calibrate};
+use crate::model::uncertainty::error_model::set_image_size;
+
+/// Least error variance of a receiver that is estimated, m2.
+const LEAST_GNSS_VARIANCE_M2: f64 = 1e-4;
+
+/// What a fit is asked to do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FitOptions {
+    /// The recipe.
+    pub recipe: Recipe,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Training epochs; `None` for the recipe's own number.
+    pub epochs: Option<u32>,
+    /// Size of the camera's image, if known.
+    pub image_size: Option<ImageSize>,
+    /// The receiver's error, if known.
+    pub gnss_error: GnssError,
+}
+
+/// Changes to a fit for an evaluation; operators have no access to them.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct FitOverrides<'a> {
+    /// The only candidate, by its name in the report.
+    pub candidate: Option<&'a str>,
+    /// Loss weights that replace the recipe's own.
+    pub loss_weights: Option<LossWeights>,
+}
+
+/// Fits a model on the calling thread.
+///
+/// The same samples, options and seed give the same artifact bit for bit on one machine.
+///
+/// # Errors
+/// [`FitError::Cancelled`] when the observer breaks, [`FitError::Unusable`] where the samples cannot
+/// support a fit.
+pub fn fit(
+    samples: &[Sample],
+    options: &FitOptions,
+    observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
+) -> Result<Artifact, FitError> {
+    fit_with(samples, options, FitOverrides::default(), observer)
+}
+
+/// Fits a model with some overrides.
+///
+/// # Errors
+/// As [`fit`], and [`FitError::Fault`] where the recipe has no such candidate.
+pub fn fit_with(
+    samples: &[Sample],
+    options: &FitOptions,
+    overrides: FitOverrides<'_>,
+    observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
+) -> Result<Artifact, FitError> {
+    let rows = TrainingRows::new(samples).map_err(FitError::Unusable)?;
+    let geometry = fit_geometry(&rows);
+    let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &geometry.noise);
+    let context = FitContext {
+        e_gnss_m2,
+        noise: geometry.noise,
+        epochs: options.epochs,
+        seed: options.seed,
+        loss_weights: overrides.loss_weights,
+    };
+    let mut run = FitRun { observer, progress: RunProgress::default() };
+    let chosen = select(&rows, &context, &selected(options.recipe, overrides.candidate)?, &mut run)?;
+    let fit = FinalFit { rows: &rows, context: &context, options, e_gnss_source };
+    let (parts, held_out) = fit.run(&chosen, geometry.covariance, &mut run)?;
+    note_errors(&held_out, &parts, &mut run)?;
+    artifact_of(parts, samples, &fit, chosen, held_out)
+}
+
+/// The candidates of a recipe, or the one of that name.
+fn selected(recipe: Recipe, name: Option<&str>) -> Result<Vec<&'static Candidate>, FitError> {
+    let candidates: Vec<&Candidate> = candidates::of_recipe(recipe)
+        .iter()
+        .filter(|candidate| name.is_none_or(|only| only == candidate.name))
+        .collect();
+    if candidates.is_empty() {
+        let message = format!("must be one of the candidates of {recipe}");
+        return Err(FitError::fault(Error::invalid("candidate", message)));
+    }
+    Ok(candidates)
+}
+
+/// The receiver's error variance per axis (m2): as stated, else the variance of the fixes about the
+/// geometric map.
+fn receiver_variance(
+    rows: &TrainingRows,
+    known: GnssError,
+    noise: &GaussMarkovNoise,
+) -> (f64, GnssErrorSource) {
+    match (known, rows.stated_variance_m2()) {
+        (GnssError::Known(sigma), _) => (sigma.variance_m2(), GnssErrorSource::Profile),
+        (GnssError::Unknown, Some(variance_m2)) => (variance_m2, GnssErrorSource::Profile),
+        (GnssError::Unknown, None) => {
+            (noise.variance_m2.max(LEAST_GNSS_VARIANCE_M2), GnssErrorSource::Estimated)
+        }
+    }
+}
+
+/// The chosen candidate with its held-out residuals, and the reports of all candidates.
+struct Chosen {
+    candidate: Candidate,
+    residuals: Vec<[f64; 2]>,
+    held_out: HeldOutError,
+    reports: Vec<CandidateReport>,
+}
+
+/// Cross-validates the candidates and chooses one.
+fn select(
+    rows: &TrainingRows,
+    context: &FitContext,
+    candidates: &[&Candidate],
+    run: &mut FitRun<'_>,
+) -> Result<Chosen, FitError> {
+    let longest = candidates.iter().map(|candidate| candidate.total_epochs(context)).max().unwrap_or(1);
+    let in_blocks: u32 =
+        candidates.iter().map(|candidate| HELD_OUT_BLOCKS * candidate.total_epochs(context)).sum();
+    run.progress.epochs = in_blocks + longest;
+    note_samples(rows, context, run)?;
+    let blocks = rows.blocks(HELD_OUT_BLOCKS);
+    let mut validated = Vec::with_capacity(candidates.len());
+    let mut reports = Vec::with_capacity(candidates.len());
+    for candidate in candidates {
+        let held_out = cross_validate(candidate, rows, &blocks, context, run)?;
+        let report = held_out_error(&held_out, context.e_gnss_m2);
+        run.note(&format!("{}: {:.3} m from the held-out fixes", candidate.name, report.mean_to_fix_m))?;
+        reports.push(CandidateReport { candidate: candidate.name.to_owned(), held_out: report });
+        validated.push(held_out);
+    }
+    let residuals: Vec<&[[f64; 2]]> = validated.iter().map(|it| it.residuals.as_slice()).collect();
+    let (chosen, scores) = choose(rows, &residuals);
+    note_choice(candidates, chosen, &scores, run)?;
+    let distances_m: Vec<f64> = residuals[chosen].iter().map(|[east, north]| east.hypot(*north)).collect();
+    run.notify(FitEvent::HeldOut(&distances_m))?;
+    // The final fit may be shorter than the longest candidate's.
+    run.progress.epochs = in_blocks + candidates[chosen].total_epochs(context);
+    Ok(Chosen {
+        candidate: *candidates[chosen],
+        residuals: validated.swap_remove(chosen).residuals,
+        held_out: reports[chosen].held_out.clone(),
+        reports,
+    })
+}
+
+/// The fit of the chosen candidate to all rows.
+struct FinalFit<'a> {
+    rows: &'a TrainingRows,
+    context: &'a FitContext,
+    options: &'a FitOptions,
+    e_gnss_source: GnssErrorSource,
+}
+
+impl FinalFit<'_> {
+    /// The complete parts of the model, and its error on the held-out rows.
+    fn run(
+        &self,
+        Chosen { candidate, residuals, held_out, .. }: &Chosen,
+        geometry: ParameterCovariance,
+        run: &mut FitRun<'_>,
+    ) -> Result<(ModelParts, HeldOutError), FitError> {
+        let Self { rows, context, options, e_gnss_source } = self;
+        let rng = ChaCha8Rng::seed_from_u64(options.seed);
+        let loss_weights = context.loss_weights;
+        let mut phase = Phase { run, name: "final fit".to_owned(), rng, is_final: true, loss_weights };
+        let mut fitted = candidate.fit(rows, context, &mut phase)?;
+        set_image_size(&mut fitted.parts, options.image_size);
+        let mut held_out = held_out.clone();
+        if candidate.estimator != Estimator::Paper {
+            let geometry = GeometricCovariance::of_geometry(geometry);
+            let validation = HeldOut { rows: &rows.rows, residuals, noise: &context.noise };
+            let calibration = calibrate(&mut fitted, geometry, &validation, options.image_size)?;
+            held_out.e_regression_m2 = calibration.error_m2;
+            if *e_gnss_source == GnssErrorSource::Estimated {
+                fitted.parts.e_gnss_m2 = calibration.receiver_m2.max(LEAST_GNSS_VARIANCE_M2);
+            }
+            held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
+        }
+        let mut parts = fitted.parts;
+        parts.set("fix_scatter_m2", context.noise.variance_m2);
+        parts.set("fix_white_share", context.noise.white_share);
+        parts.set("fix_time_constant_s", context.noise.time_constant_s);
+        parts.set("labels_smoothed", f64::from(u8::from(candidate.is_smoothed())));
+        Ok((parts, held_out))
+    }
+}
+
+fn artifact_of(
+    parts: ModelParts,
+    samples: &[Sample],
+    FinalFit { rows, context, options, e_gnss_source }: &FinalFit<'_>,
+    Chosen { candidate, reports, .. }: Chosen,
+    held_out: HeldOutError,
+) -> Result<Artifact, FitError> {
+    let weights = parts.tensors.to_bytes().map_err(FitError::fault)?;
+    let origin = parts.plane.origin();
+    Ok(Artifact {
+        metadata: ModelMetadata {
+            format: FORMAT,
+            requested_recipe: options.recipe.as_str().to_owned(),
+            recipe: parts.recipe.as_str().to_owned(),
+            features: parts.features,
+            origin: OriginDeg { longitude_deg: origin.longitude_deg(), latitude_deg: origin.latitude_deg() },
+            seed: context.seed,
+            epochs: candidate.epochs(context),
+            training_rows_sha256: sha256_of(samples),
+            samples: rows.rows.len() as u32,
+            targets: rows.targets,
+            passes: rows.traverses,
+            error_scale: parts.error_scale,
+            e_gnss_m2: parts.e_gnss_m2,
+            e_gnss_source: *e_gnss_source,
+            held_out: Some(held_out),
+            candidates: reports,
+            parameters: parts.parameters,
+        },
+        weights,
+    })
+}

@@ -1,0 +1,23 @@
+//! One row of a simulated world.
+
+use jiff::Timestamp;
+
+use crate::domain::{BoundingBox, Fix, TargetClass, TargetId};
+use crate::geo::Position;
+
+/// What camera and receiver measured of one target at one second, with the truth.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimulatedRow {
+    /// The instant.
+    pub time: Timestamp,
+    /// The target.
+    pub target_id: TargetId,
+    /// The target's class.
+    pub class: TargetClass,
+    /// The detection; `None` while the target is occluded.
+    pub bounding_box: Option<BoundingBox>,
+    /// The fix; `None` in a gap.
+    pub fix: Option<Fix>,
+    /// True position of the antenna.
+    pub truth: Position,
+}

@@ -1,0 +1,24 @@
+//! Order statistics and moments of plain numbers.
+
+/// Standard deviation about the mean (divided by the count); 0 for no values.
+#[must_use]
+pub fn std_dev(values: impl Iterator<Item = f64> + Clone) -> f64 {
+    let count = values.clone().count().max(1) as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    (values.map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()
+}
+
+/// The order statistic of rank `n / 2` (from 0), which is the upper median of an even count; 0 for no
+/// values.
+#[must_use]
+pub fn median(mut values: Vec<f64>) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let rank = values.len() / 2;
+    *values.select_nth_unstable_by(rank, f64::total_cmp).1
+}
+
+/// Radius that contains 95 % of an isotropic normal distribution in the plane, in standard deviations per
+/// axis: `sqrt(-2 ln 0.05)`.
+pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;

@@ -1,0 +1,363 @@
+//! What is stored and for how long: durability, full disks, deletions, limits, permissions, and other
+//! processes in the same data folder.
+
+use std::fmt::Write as _;
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+use futures_util::stream;
+use serde_json::{Value, json};
+use sightfix::grpc::proto;
+use sightfix::grpc::proto::model_service_client::ModelServiceClient;
+use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
+use sightfix::grpc::proto::training_service_client::TrainingServiceClient;
+use tonic::Code;
+use tonic_types::StatusExt as _;
+
+use crate::harness::{Answer, TestServer, data_folder, sightfix, simulated_csv};
+
+const MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.safetensors");
+const SAMPLES: &str = "/v1/cameras/c/samples";
+
+async fn create_camera(server: &TestServer, id: &str) -> Answer {
+    let profile = json!({"id": id, "image_size": {"width_px": 1920, "height_px": 1080}});
+    server.post("/v1/cameras", &profile).await
+}
+
+async fn import(server: &TestServer, path: &str, csv: String) -> Answer {
+    server.send("POST", path, &[("content-type", "text/csv")], csv).await
+}
+
+async fn delete(server: &TestServer, path: &str) -> Answer {
+    server.send("DELETE", path, &[], "").await
+}
+
+async fn import_model(server: &TestServer) -> Value {
+    let file = std::fs::read(MODEL).expect("the reference model");
+    let headers = [("content-type", "application/vnd.safetensors")];
+    server.send("POST", "/v1/cameras/c/models", &headers, file).await.expect(201).json()
+}
+
+async fn activate(server: &TestServer, number: u64) {
+    let headers = [("content-type", "application/json")];
+    let body = json!({ "number": number }).to_string();
+    server.send("PUT", "/v1/cameras/c/active-model", &headers, body).await.expect(200);
+}
+
+/// So many samples a second apart, from that second of a day in 2020 on.
+fn csv(seconds: std::ops::Range<i64>) -> String {
+    let mut csv = "time,target_id,left,top,width,height,longitude,latitude\n".to_owned();
+    for second in seconds {
+        let time = jiff::Timestamp::from_second(1_600_000_000 + second).expect("in range");
+        let left = 10 + second % 1_000;
+        writeln!(csv, "{time},person-1,{left},20,30,60,103.9,30.6").expect("memory");
+    }
+    csv
+}
+
+#[track_caller]
+fn problem(answer: &Answer, status: u16, kind: &str) -> Value {
+    assert_eq!(answer.status.as_u16(), status, "{}", answer.text());
+    let problem = answer.json();
+    assert_eq!(problem["type"], format!("urn:sightfix:problem:{kind}"), "{problem}");
+    problem
+}
+
+async fn channel(server: &TestServer) -> tonic::transport::Channel {
+    let endpoint = tonic::transport::Channel::from_shared(format!("http://{}", server.address));
+    endpoint.expect("an address").connect().await.expect("a connection")
+}
+
+/// Waits until the metrics have this line.
+async fn metric(server: &TestServer, line: &str) {
+    while !server.get("/metrics").await.expect(200).text().lines().any(|found| found == line) {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+#[tokio::test]
+async fn imports_say_how_durable_they_are() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_camera(&server, "c").await.expect(201);
+    for (query, durability, rows) in [
+        ("", "synced", 0..2),
+        ("?durability=relaxed", "relaxed", 2..4),
+        ("?durability=synced", "synced", 4..6),
+    ] {
+        let report = import(&server, &format!("{SAMPLES}{query}"), csv(rows)).await.expect(200).json();
+        assert_eq!((&report["accepted"], &report["durability"]), (&json!(2), &json!(durability)), "{report}");
+    }
+    let refused = import(&server, &format!("{SAMPLES}?durability=some"), csv(6..8)).await;
+    assert_eq!(problem(&refused, 422, "invalid-argument")["violations"][0]["field"], "durability");
+
+    let mut samples = SampleServiceClient::new(channel(&server).await);
+    for (asked, told) in [
+        (proto::Durability::Unspecified, proto::Durability::Synced),
+        (proto::Durability::Synced, proto::Durability::Synced),
+        (proto::Durability::Relaxed, proto::Durability::Relaxed),
+    ] {
+        let message = proto::ImportSamplesRequest {
+            camera_id: "c".to_owned(),
+            durability: asked.into(),
+            ..Default::default()
+        };
+        let report = samples.import_samples(stream::iter([message])).await.expect("taken").into_inner();
+        assert_eq!(report.durability(), told);
+    }
+}
+
+/// Fills the storage with imports until one is refused for want of space.
+async fn fill(server: &TestServer) -> Answer {
+    for round in 0..200 {
+        let answer = import(server, SAMPLES, csv(round * 5_000..(round + 1) * 5_000)).await;
+        if answer.status.as_u16() != 200 {
+            return answer;
+        }
+    }
+    panic!("a million samples fit");
+}
+
+/// What must hold on full storage, however it came to be full.
+async fn check_full_storage(server: &TestServer, refused: &Answer) {
+    let said = problem(refused, 507, "insufficient-storage");
+    assert!(said["detail"].as_str().is_some_and(|detail| detail.contains("delete")), "{said}");
+    let mut samples = SampleServiceClient::new(channel(server).await);
+    let mut lines = 0;
+    let batch = (9_000_000..9_005_000).map(|second| {
+        lines += 1;
+        proto::Sample {
+            time: Some(prost_types::Timestamp { seconds: 1_500_000_000 + second, nanos: 0 }),
+            target_id: "person-2".to_owned(),
+            bounding_box: Some(proto::BoundingBox {
+                left_px: Some(10.0),
+                top_px: Some(20.0),
+                width_px: Some(30.0),
+                height_px: Some(60.0),
+            }),
+            fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
+            ..Default::default()
+        }
+    });
+    let message = proto::ImportSamplesRequest {
+        camera_id: "c".to_owned(),
+        samples: batch.collect(),
+        ..Default::default()
+    };
+    let status = samples.import_samples(stream::iter([message])).await.expect_err("refused");
+    assert_eq!(status.code(), Code::ResourceExhausted, "{status:?}");
+    let details = status.get_error_details();
+    assert_eq!(details.error_info().expect("ErrorInfo").reason, "insufficient-storage");
+
+    let ready = server.get("/readyz").await.expect(200).text();
+    assert!(ready.starts_with("ready\n") && ready.contains("warning: insufficient-storage"), "{ready}");
+    metric(server, "sightfix_storage_full 1").await;
+    let observation = json!({"observations": [{
+        "time": "2026-01-01T00:00:00Z",
+        "bounding_box": {"left_px": 900.0, "top_px": 500.0, "width_px": 40.0, "height_px": 90.0},
+        "fix": {"longitude_deg": 103.98678, "latitude_deg": 30.62801},
+    }]});
+    server.post("/v1/cameras/c/fusions", &observation).await.expect(200);
+
+    let deleted = delete(server, &format!("{SAMPLES}?from=2020-01-01T00:00:00Z")).await.expect(200).json();
+    assert!(deleted["deleted"].as_u64().is_some_and(|deleted| deleted >= 5_000), "{deleted}");
+    let report = import(server, SAMPLES, csv(0..5_000)).await.expect(200).json();
+    assert_eq!(report["accepted"], 5_000, "{report}");
+    metric(server, "sightfix_storage_full 0").await;
+    assert_eq!(server.get("/readyz").await.expect(200).text(), "ready\n");
+}
+
+#[tokio::test]
+async fn a_full_database_refuses_imports_fuses_on_and_recovers_by_deleting() {
+    let folder = data_folder();
+    let settings =
+        [("SIGHTFIX_LIMITS__DATABASE_BYTES", "8388608"), ("SIGHTFIX_LIMITS__RESERVE_BYTES", "1048576")];
+    let server = TestServer::start_with(folder.path(), &settings);
+    create_camera(&server, "c").await.expect(201);
+    import_model(&server).await;
+    activate(&server, 1).await;
+    let refused = fill(&server).await;
+    check_full_storage(&server, &refused).await;
+    delete(&server, &format!("{SAMPLES}?from=2020-01-01T00:00:00Z")).await.expect(200);
+    // The file gives back what is free, but for what the next imports will need.
+    let file = folder.path().join("sightfix.db");
+    while std::fs::metadata(&file).expect("the database").len() > 5 << 20 {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    assert!(server.terminate());
+}
+
+/// Needs the rights to mount; `.ci/run` runs it.
+#[tokio::test]
+#[ignore = "mounts a file system, which needs the superuser"]
+async fn a_full_disk_refuses_imports_fuses_on_and_recovers_by_deleting() {
+    /// Unmounts when the test ends, however it ends.
+    struct Mounted<'f>(&'f Path);
+
+    impl Drop for Mounted<'_> {
+        fn drop(&mut self) {
+            let _ = Command::new("umount").arg(self.0).status();
+        }
+    }
+
+    let folder = data_folder();
+    let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
+    assert!(mounted.status().expect("mount runs").success(), "needs the superuser");
+    let _mounted = Mounted(folder.path());
+    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__RESERVE_BYTES", "20971520")]);
+    create_camera(&server, "c").await.expect(201);
+    import_model(&server).await;
+    activate(&server, 1).await;
+    let refused = fill(&server).await;
+    check_full_storage(&server, &refused).await;
+    assert!(server.terminate());
+}
+
+#[tokio::test]
+async fn models_and_runs_can_be_deleted_by_both_transports() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_camera(&server, "c").await.expect(201);
+    for number in 1..=4 {
+        assert_eq!(import_model(&server).await["number"], number);
+    }
+    for number in [1, 2, 1] {
+        activate(&server, number).await;
+    }
+    problem(&delete(&server, "/v1/cameras/c/models/1").await, 409, "model-active");
+    delete(&server, "/v1/cameras/c/models/2").await.expect(204);
+    problem(&delete(&server, "/v1/cameras/c/models/2").await, 404, "model-not-found");
+    let no_other = server.post("/v1/cameras/c/active-model/roll-back", &json!({})).await;
+    problem(&no_other, 409, "no-model");
+
+    let channel = channel(&server).await;
+    let mut models = ModelServiceClient::new(channel.clone());
+    let model = |number| proto::DeleteModelRequest { camera_id: "c".to_owned(), number };
+    models.delete_model(model(4)).await.expect("deleted");
+    assert_eq!(models.delete_model(model(4)).await.expect_err("gone").code(), Code::NotFound);
+    assert_eq!(models.delete_model(model(1)).await.expect_err("active").code(), Code::FailedPrecondition);
+    assert_eq!(import_model(&server).await["number"], 5, "a number is never assigned again");
+
+    import(&server, SAMPLES, simulated_csv()).await.expect(200);
+    let run = server.train("c", &json!({"recipe": "hybrid", "epochs": 2})).await;
+    let live = server.post("/v1/cameras/c/training-runs", &json!({})).await.expect(202).json();
+    let path = |run: &Value| format!("/v1/cameras/c/training-runs/{}", run["id"].as_str().expect("an id"));
+    problem(&delete(&server, &path(&live)).await, 409, "run-live");
+    delete(&server, &path(&run)).await.expect(204);
+    problem(&delete(&server, &path(&run)).await, 404, "run-not-found");
+    server.get(&format!("/v1/cameras/c/models/{}", run["model_version"])).await.expect(200);
+    let mut runs = TrainingServiceClient::new(channel);
+    let request = proto::DeleteTrainingRunRequest {
+        camera_id: "c".to_owned(),
+        run_id: live["id"].as_str().expect("an id").to_owned(),
+    };
+    server.post(&format!("{}/cancel", path(&live)), &json!({})).await;
+    while !matches!(server.get(&path(&live)).await.json()["state"].as_str(), Some("cancelled" | "succeeded"))
+    {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    runs.delete_training_run(request.clone()).await.expect("deleted");
+    assert_eq!(runs.delete_training_run(request).await.expect_err("gone").code(), Code::NotFound);
+}
+
+#[tokio::test]
+async fn limits_refuse_cameras_and_samples_and_drop_old_models() {
+    let folder = data_folder();
+    let settings = [
+        ("SIGHTFIX_LIMITS__CAMERAS", "2"),
+        ("SIGHTFIX_LIMITS__SAMPLES_PER_CAMERA", "100"),
+        ("SIGHTFIX_LIMITS__SAMPLES", "150"),
+        ("SIGHTFIX_LIMITS__MODELS_PER_CAMERA", "3"),
+    ];
+    let server = TestServer::start_with(folder.path(), &settings);
+    create_camera(&server, "c").await.expect(201);
+    create_camera(&server, "d").await.expect(201);
+    problem(&create_camera(&server, "e").await, 507, "insufficient-storage");
+    server.get("/v1/cameras/e").await.expect(404);
+
+    import(&server, SAMPLES, csv(0..90)).await.expect(200);
+    let refused = problem(&import(&server, SAMPLES, csv(90..101)).await, 507, "insufficient-storage");
+    assert!(refused["detail"].as_str().is_some_and(|it| it.contains("samples_per_camera")), "{refused}");
+    import(&server, SAMPLES, csv(90..100)).await.expect(200);
+    import(&server, "/v1/cameras/d/samples", csv(0..50)).await.expect(200);
+    let refused =
+        problem(&import(&server, "/v1/cameras/d/samples", csv(50..51)).await, 507, "insufficient-storage");
+    assert!(refused["detail"].as_str().is_some_and(|it| it.contains("limits.samples is 150")), "{refused}");
+    delete(&server, &format!("{SAMPLES}?from=2020-01-01T00:00:00Z")).await.expect(200);
+    import(&server, "/v1/cameras/d/samples", csv(50..51)).await.expect(200);
+    import(&server, SAMPLES, csv(0..90)).await.expect(200);
+
+    for number in 1..=6 {
+        import_model(&server).await;
+        if number == 1 {
+            activate(&server, 1).await;
+        }
+    }
+    let models = server.get("/v1/cameras/c/models").await.expect(200).json();
+    let numbers: Vec<_> =
+        models["items"].as_array().expect("a list").iter().map(|it| &it["number"]).collect();
+    assert_eq!(numbers, [6, 5, 1], "the oldest go, but for the active one");
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn the_data_folder_is_private_to_its_owner() {
+    use std::fs::{Permissions, metadata, set_permissions};
+    use std::os::unix::fs::PermissionsExt as _;
+
+    let parent = data_folder();
+    let folder = parent.path().join("data");
+    let files = ["", "sightfix.db", "sightfix.db-wal", "sightfix.db-shm"].map(|name| folder.join(name));
+    let modes = || files.clone().map(|path| metadata(path).expect("is there").permissions().mode() & 0o777);
+    let server = TestServer::start(&folder);
+    assert_eq!(modes(), [0o700, 0o600, 0o600, 0o600]);
+    server.kill();
+    for path in &files {
+        let mode = if path == &files[0] { 0o755 } else { 0o644 };
+        set_permissions(path, Permissions::from_mode(mode)).expect("set");
+    }
+    let server = TestServer::start(&folder);
+    assert_eq!(modes(), [0o700, 0o600, 0o600, 0o600]);
+    let logged =
+        server.logged(|entry| entry["message"].as_str().is_some_and(|it| it.contains("restricted"))).await;
+    assert_eq!(logged["path"], folder.to_str().expect("UTF-8"), "{logged}");
+}
+
+#[tokio::test]
+async fn processes_in_one_data_folder_know_of_each_other() {
+    let folder = data_folder();
+    let first = TestServer::start(folder.path());
+    create_camera(&first, "c").await.expect(201);
+    let second = TestServer::start(folder.path());
+    let is_other = |entry: &Value| entry["message"] == "another process uses the same data folder";
+    for (server, other) in [(&second, &first), (&first, &second)] {
+        let logged = server.logged(is_other).await;
+        assert_eq!((&logged["pid"], &logged["role"]), (&json!(other.pid()), &json!("server")), "{logged}");
+        assert!(logged["host"].as_str().is_some_and(|host| !host.is_empty()), "{logged}");
+    }
+    let pid = second.pid();
+    second.kill();
+
+    let file = folder.path().join("samples.csv");
+    std::fs::write(&file, csv(0..20)).expect("written");
+    let mut import = sightfix();
+    import.args(["import", "--camera", "c", "--data"]).arg(folder.path()).arg(&file);
+    let output = import.output().expect("the command runs");
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{errors}");
+    let note = format!("server with process id {}", first.pid());
+    assert!(errors.contains(&note), "{errors}");
+    assert!(!errors.contains(&format!("process id {pid} ")), "a killed server is no longer there: {errors}");
+    let count = first.get("/v1/cameras/c/samples/count").await.expect(200).json();
+    assert_eq!(count["count"], 20);
+    first.kill();
+    let third = TestServer::start(folder.path());
+    assert!(third.terminate());
+    let locks = std::fs::read_dir(folder.path()).expect("listed").filter_map(Result::ok);
+    let locks: Vec<_> = locks
+        .map(|entry| entry.file_name())
+        .filter(|name| name.to_string_lossy().ends_with(".lock"))
+        .collect();
+    assert!(locks.is_empty(), "{locks:?}");
+}

@@ -4,7 +4,7 @@ use super::artifact::{ModelParts, TrackNoiseModel};
 use super::encoder::Encoder;
 use super::encoder::features::Encoded;
 use super::uncertainty::coverage::CoverageLookup;
-use super::uncertainty::error_model::{BoxError, ErrorModel, NOMINAL_RATIO};
+use super::uncertainty::error_model::{BoxError, ErrorModel, NOMINAL_RATIO, reconstruction_error};
 use crate::domain::{BoundingBox, ImageSize, Result};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::statistics::R95_PER_SIGMA;
@@ -116,6 +116,7 @@ impl Regressor {
     #[must_use]
     pub fn regress(&self, bounding_box: &BoundingBox, fix: Option<EastNorth>) -> Regression {
         let lookup = self.error_model.look_up(bounding_box);
+        let mut r95_scale = self.r95_scale;
         let (regressed, error) = match &self.encoder {
             Encoder::Paper(paper) => {
                 let estimate = paper.estimate(&self.plane, bounding_box, fix);
@@ -127,6 +128,14 @@ impl Regressor {
             Encoder::Projective(projective) => {
                 self.with_error(bounding_box, &lookup, projective.encode(bounding_box))
             }
+            Encoder::GaussianProcess(map) => {
+                // Its error comes with every answer, not from the error model.
+                let estimate = map.estimate(bounding_box, None);
+                r95_scale = estimate.r95_scale;
+                let reconstruction_error = reconstruction_error(bounding_box, &estimate.encoded);
+                let error = BoxError { reconstruction_error, variance_m2: estimate.variance_m2 };
+                (estimate.encoded.position, error)
+            }
         };
         Regression {
             regressed,
@@ -134,7 +143,7 @@ impl Regressor {
             e_regression_m2: (error.variance_m2 + self.added_m2)
                 .clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]),
             outside_training: lookup.extrapolation_ratio > NOMINAL_RATIO,
-            r95_scale: self.r95_scale,
+            r95_scale,
         }
     }
 

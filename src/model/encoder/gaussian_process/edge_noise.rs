@@ -3,7 +3,7 @@
 use nalgebra::{Matrix4, Vector4};
 
 use super::noise::Epoch;
-use super::order_statistics::median;
+use crate::statistics::median;
 use super::projective_mean::Box4;
 
 /// Standard deviation of an edge where rows are too far apart in time to tell, px.

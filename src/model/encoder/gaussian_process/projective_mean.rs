@@ -8,7 +8,7 @@ use nalgebra::{SMatrix, SVector};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::order_statistics::median;
+use crate::statistics::median;
 
 /// Coefficients: numerators of east (1, u, v), of north (1, u, v), denominator (u, v), then width and
 /// height of east, of north, of the denominator.

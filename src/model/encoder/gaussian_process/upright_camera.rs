@@ -348,7 +348,7 @@ impl UprightCamera {
                     (east + placed[6] - label[0]).hypot(north + placed[7] - label[1])
                 })
                 .collect();
-            let scale = super::order_statistics::median(misses.clone()).max(1e-3);
+            let scale = crate::statistics::median(misses.clone()).max(1e-3);
             let mut misses = misses.into_iter();
             for (weight, ground) in weights.iter_mut().zip(&ground) {
                 *weight = if ground.is_some() {

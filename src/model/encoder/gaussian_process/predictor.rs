@@ -88,8 +88,9 @@ pub(crate) struct Prediction {
     pub(crate) position_m: [f64; 2],
     /// East, cross, north, m2.
     pub(crate) covariance_m2: [f64; 3],
-    /// Radius that holds the truth with 95 %, m.
-    pub(crate) r95_m: f64,
+    /// Radius that holds the truth with 95 %, in standard deviations per axis (the root of half the
+    /// covariance's trace).
+    pub(crate) r95_scale: f64,
     /// Of it, the part that is new with each box: mean variance per axis, m2.
     pub(crate) box_noise_m2: f64,
     /// How the box deviates from those of training.
@@ -114,6 +115,14 @@ struct Mixture {
     by_edge: [[f64; 4]; 2],
 }
 
+impl Prediction {
+    /// Mean variance per axis, m2.
+    #[inline]
+    pub(crate) fn variance_m2(&self) -> f64 {
+        0.5 * (self.covariance_m2[0] + self.covariance_m2[2])
+    }
+}
+
 impl Map {
     /// `None` for matrices that are not positive definite.
     pub(crate) fn new(
@@ -135,9 +144,8 @@ impl Map {
         let mut mean = candidate.mean.clone();
         // The coefficients of the last solution stand in for those about which it was linearised.
         mean.coefficients.copy_from_slice(posterior.tangent.as_slice());
+        let tangent_factor = tangent_factor.transpose().as_slice().to_vec();
         let mut map = Self {
-            weight,
-            mean,
             lengths: parameters.lengths,
             residual_m2: residual_m * residual_m,
             inducing: inducing.clone(),
@@ -148,12 +156,30 @@ impl Map {
             absorbed: std::array::from_fn(|axis| {
                 (directions.transpose() * &posterior.absorbed[axis]).transpose().as_slice().to_vec()
             }),
-            tangent_factor: tangent_factor.transpose().as_slice().to_vec(),
             deviations: deviations.collect(),
-            point_weights: [Vec::new(), Vec::new()],
+            ..Self::without_kernel(weight, mean, tangent_factor)
         };
         map.derive();
         Some(map)
+    }
+
+    /// A map without a residual.
+    pub(crate) const fn without_kernel(weight: f64, mean: ProjectiveMean, tangent_factor: Vec<f64>) -> Self {
+        Self {
+            weight,
+            mean,
+            lengths: LengthScales { place: 1.0, size: 1.0 },
+            residual_m2: 0.0,
+            inducing: Vec::new(),
+            rank: 0,
+            basis: Vec::new(),
+            determined: Vec::new(),
+            weights: [Vec::new(), Vec::new()],
+            absorbed: [Vec::new(), Vec::new()],
+            tangent_factor,
+            deviations: Vec::new(),
+            point_weights: [Vec::new(), Vec::new()],
+        }
     }
 
     /// Computes what follows from the other numbers.
@@ -291,10 +317,16 @@ impl Predictor {
         Prediction {
             position_m,
             covariance_m2,
-            r95_m: self.r95_m(&covariance_m2),
+            r95_scale: self.r95_scale(&covariance_m2),
             box_noise_m2: 0.5 * (noise_m2[0] + noise_m2[2]),
             deviation,
         }
+    }
+
+    /// The box that training has seen at the place of this one: the decoder.
+    #[inline]
+    pub(crate) fn reconstruct(&self, sides: &Box4, deviation: &Deviation) -> Box4 {
+        self.plausibility.nearest_plausible(sides, deviation)
     }
 
     /// Mean variance per axis of the jackknife at a box, m2.
@@ -336,16 +368,16 @@ impl Predictor {
         Mixture { position_m: [origin_m[0] + mean_m[0], origin_m[1] + mean_m[1]], map_m2: second_m2, by_edge }
     }
 
-    /// Radius of 95 %: trace times the quantile of F at the eigenvalues' own degrees of freedom (Welch and
-    /// Satterthwaite), m.
+    /// Squared radius of 95 %: the trace times the quantile of F at the eigenvalues' own degrees of freedom
+    /// (Welch and Satterthwaite).
     #[inline]
-    fn r95_m(&self, [east_m2, cross_m2, north_m2]: &[f64; 3]) -> f64 {
+    fn r95_scale(&self, [east_m2, cross_m2, north_m2]: &[f64; 3]) -> f64 {
         let trace = east_m2 + north_m2;
         let squares = east_m2 * east_m2 + 2.0 * cross_m2 * cross_m2 + north_m2 * north_m2;
         let at = ((trace * trace / squares.max(1e-300) - 1.0).clamp(0.0, 1.0)) * (QUANTILES - 1) as f64;
         let low = (at as usize).min(QUANTILES - 2);
         let quantile = self.quantiles[low] + (at - low as f64) * (self.quantiles[low + 1] - self.quantiles[low]);
-        (trace * quantile).sqrt()
+        (2.0 * quantile).sqrt()
     }
 }
 

@@ -7,7 +7,7 @@ use super::candidate::Candidate;
 use super::groups::Grouping;
 use super::noise::{Epoch, ReceiverNoise};
 use super::sessions::weighted_mean;
-use super::training_rows::TrainingRows;
+use super::map_rows::MapRows;
 
 const BOOTSTRAP_DRAWS: usize = 500;
 /// A squared miss counts no more than so many variances of the receiver.
@@ -53,7 +53,7 @@ fn sequences(grouping: &Grouping, epochs: &[Epoch]) -> Vec<(usize, Vec<usize>)> 
 pub(crate) fn weigh(
     candidates: &[Candidate],
     grouping: &Grouping,
-    rows: &TrainingRows,
+    rows: &MapRows,
     noise: &ReceiverNoise,
     seed: u64,
 ) -> (Vec<f64>, Vec<f64>) {
@@ -91,7 +91,7 @@ pub(crate) fn calibrate(
     candidates: &[Candidate],
     weights: &[f64],
     grouping: &Grouping,
-    rows: &TrainingRows,
+    rows: &MapRows,
     noise: &ReceiverNoise,
     extra_m2: &dyn Fn(usize) -> f64,
 ) -> Calibration {

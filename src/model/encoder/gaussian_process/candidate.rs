@@ -5,15 +5,15 @@ use nalgebra::{DMatrix, DVector, SVector};
 use super::groups::Grouping;
 use super::hyperparameters::{Hyperparameters, LikelihoodRows, Priors, join, kernel_columns};
 use super::kernel::inducing_points;
-use super::noise::{Epoch, Whitener};
+use super::noise::{Epoch, ReceiverNoise, Whitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
 use super::projective_mean::{Box4, COEFFICIENTS, FOOT_COEFFICIENTS, ProjectiveMean};
-use super::training_rows::TrainingRows;
+use super::map_rows::MapRows;
 use super::upright_camera::{Parameters, UprightCamera};
 
 /// Rows that hyper-parameters are estimated on at most.
 const MAX_LIKELIHOOD_ROWS: usize = 2_500;
-const MAX_INDUCING: usize = 64;
+pub(crate) const MAX_INDUCING: usize = 64;
 const MAX_LIKELIHOOD_INDUCING: usize = 40;
 /// Rows per inducing point, at least.
 const ROWS_PER_INDUCING: usize = 5;
@@ -45,7 +45,7 @@ impl Form {
 #[derive(Debug, Clone)]
 pub(crate) struct Draft<'a> {
     pub(crate) form: Form,
-    pub(crate) rows: &'a TrainingRows,
+    pub(crate) rows: &'a MapRows,
     pub(crate) inputs: &'a [[f64; 4]],
     pub(crate) mean: ProjectiveMean,
     pub(crate) inflation_m2: Vec<f64>,
@@ -138,13 +138,14 @@ impl<'a> Draft<'a> {
         }
     }
 
-    /// Noise and kernel together, then the kernel alone under noise with a sufficient white part.
-    pub(crate) fn estimate(&mut self, priors: &Priors) -> Option<Hyperparameters> {
+    /// Noise and kernel together, then the kernel alone under noise with a sufficient white part; also the
+    /// noise before.
+    pub(crate) fn estimate(&mut self, priors: &Priors) -> Option<(Hyperparameters, ReceiverNoise)> {
         let first = self.maximize(&priors.start(), priors, false);
         self.relinearize(&first)?;
         let second = self.maximize(&first.with_min_white(), priors, true);
         self.relinearize(&second)?;
-        Some(second)
+        Some((second, first.noise))
     }
 
     fn maximize(&self, start: &Hyperparameters, priors: &Priors, noise_frozen: bool) -> Hyperparameters {
@@ -309,7 +310,7 @@ impl Candidate {
 }
 
 /// Tangent columns of both axes, and fixes less what the tangent does not explain, m.
-fn linearize(rows: &TrainingRows, mean: &ProjectiveMean) -> (DMatrix<f64>, DMatrix<f64>) {
+fn linearize(rows: &MapRows, mean: &ProjectiveMean) -> (DMatrix<f64>, DMatrix<f64>) {
     let count = rows.boxes.len();
     let mut tangent = DMatrix::zeros(count, 2 * COEFFICIENTS);
     let mut labels_m = DMatrix::zeros(count, 2);

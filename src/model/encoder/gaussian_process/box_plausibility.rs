@@ -9,10 +9,10 @@ use nalgebra::{Matrix2, Matrix3, Matrix3x2, Vector2, Vector3};
 
 use super::kernel::nearest;
 use super::noise::Epoch;
-use super::order_statistics::quantile;
+
 use super::projective_mean::{Box4, moments};
 
-const MAX_CELLS: usize = 24;
+pub(crate) const MAX_CELLS: usize = 24;
 const ROWS_PER_CELL: usize = 40;
 const LLOYD_ROUNDS: usize = 12;
 /// Rows that the prior of a cell's slopes counts for.
@@ -22,6 +22,8 @@ const CREDIBLE: f64 = 9.21;
 const ROUNDS: usize = 3;
 /// Smallest standard deviation of a logarithmic side.
 const MIN_LOG_SIDE: f64 = 0.01;
+/// Largest logarithm of a side in px: no image is larger.
+const MAX_LOG_SIDE: f64 = 11.8;
 /// A deviation is normal up to the 99 % point, or to this factor on training's own.
 const NORMAL_QUANTILE: f64 = 0.99;
 const NORMAL_FACTOR: f64 = 1.5;
@@ -167,7 +169,7 @@ impl BoxPlausibility {
     #[inline]
     pub(crate) fn nearest_plausible(&self, sides: &Box4, deviation: &Deviation) -> Box4 {
         let cell = &self.cells[deviation.cell];
-        let predicted = cell.predict(&deviation.foot).map(f64::exp);
+        let predicted = cell.predict(&deviation.foot).map(|log_px| log_px.clamp(0.0, MAX_LOG_SIDE).exp());
         let slope = |side: usize, by: usize| predicted[side] * cell.coefficients[side][1 + by] / self.scales_px[by][1];
         let slopes = [[slope(0, 0), slope(0, 1)], [slope(1, 0), slope(1, 1)]];
         let (wider, taller) = (predicted[0] - sides[2], predicted[1] - sides[3]);
@@ -301,6 +303,15 @@ fn whitening(covariance: &Matrix2<f64>) -> [f64; 3] {
     let cross = covariance[(1, 0)] / first;
     let second = (covariance[(1, 1)] - cross * cross).max(1e-12).sqrt();
     [1.0 / first, -cross / (first * second), 1.0 / second]
+}
+
+/// Quantile by rank, without interpolation; 0 for none.
+fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let rank = ((values.len() - 1) as f64 * share).round() as usize;
+    *values.select_nth_unstable_by(rank, f64::total_cmp).1
 }
 
 fn centres(feet: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {

@@ -4,7 +4,7 @@
 use super::noise::Epoch;
 
 /// Groups at most.
-const GROUPS: usize = 8;
+pub(crate) const GROUPS: usize = 8;
 /// Half an hour without any row ends a session.
 pub(crate) const SESSION_GAP_S: f64 = 1800.0;
 /// Share of the rows that a session of its own has at least.

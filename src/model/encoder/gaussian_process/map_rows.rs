@@ -1,7 +1,7 @@
 //! What a fit learns from, and the rows that it leaves out as gross errors.
 
 use super::noise::Epoch;
-use super::order_statistics::median;
+use crate::statistics::median;
 use super::projective_mean::{Box4, ProjectiveMean};
 
 /// Neighbours in time on either side that a row's residual is compared with.
@@ -15,14 +15,14 @@ const GROSS_SIGMAS: f64 = 7.0;
 
 /// Rows in the order of target and time.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct TrainingRows {
+pub(crate) struct MapRows {
     pub(crate) epochs: Vec<Epoch>,
     pub(crate) boxes: Vec<Box4>,
     /// Fixes in the plane, m.
     pub(crate) labels_m: Vec<[f64; 2]>,
 }
 
-impl TrainingRows {
+impl MapRows {
     pub(crate) fn picked(&self, rows: &[usize]) -> Self {
         Self {
             epochs: rows.iter().map(|row| self.epochs[*row]).collect(),

@@ -11,7 +11,7 @@ use super::noise::{Epoch, ReceiverNoise, Whitener};
 use super::predictor::{Map, Predictor, Stated};
 use super::projective_mean::ProjectiveMean;
 use super::sessions::Sessions;
-use super::training_rows::{TrainingRows, scatter_m2};
+use super::map_rows::{MapRows, scatter_m2};
 use super::upright_camera::UprightCamera;
 
 /// Rows that a fit uses at most; more are thinned evenly.
@@ -23,6 +23,8 @@ const MIN_WEIGHT: f64 = 0.02;
 #[derive(Debug, Clone)]
 pub(crate) struct FitReport {
     pub(crate) parameters: Hyperparameters,
+    /// The receivers' noise as estimated, before its white part was raised.
+    pub(crate) receiver: ReceiverNoise,
     /// Rows left out as gross errors.
     pub(crate) gross_errors: usize,
     /// Groups left out in turn.
@@ -55,7 +57,7 @@ pub(crate) struct FitSettings {
 }
 
 /// Fits a model; `None` where the rows determine nothing (not finite, or all alike).
-pub(crate) fn fit(all: &TrainingRows, settings: &FitSettings) -> Option<(Predictor, FitReport)> {
+pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, FitReport)> {
     let FitSettings { shared_bias_m2, seed, .. } = *settings;
     let edge_px2 = edge_covariance_px2(&all.epochs, &all.boxes);
     let thinned = all.thinned(MAX_ROWS);
@@ -73,7 +75,7 @@ pub(crate) fn fit(all: &TrainingRows, settings: &FitSettings) -> Option<(Predict
     let mut draft =
         Draft { form: Form::Residual, rows: &rows, inputs: &inputs, mean, inflation_m2: white.inflation_m2(&residuals_m), upright: None };
     let start = draft.clone();
-    let parameters = draft.estimate(&Priors::new(scatter_m2.sqrt(), start.mean.spread_m))?;
+    let (parameters, receiver) = draft.estimate(&Priors::new(scatter_m2.sqrt(), start.mean.spread_m))?;
     let grouping = groups(&rows.epochs);
     let mut homography = Draft { form: Form::Homography, ..start };
     homography.relinearize(&parameters)?;
@@ -105,6 +107,7 @@ pub(crate) fn fit(all: &TrainingRows, settings: &FitSettings) -> Option<(Predict
     let sessions = Sessions::new(&rows.epochs, &residuals_m, &parameters.noise);
     let report = FitReport {
         parameters,
+        receiver,
         gross_errors: thinned.boxes.len() - rows.boxes.len(),
         groups: grouping.members().len(),
         candidates: candidates

@@ -3,6 +3,7 @@
 mod bad_input;
 mod connections;
 mod evaluations;
+mod gaussian_process;
 mod grpc;
 mod harness;
 mod job_leases;

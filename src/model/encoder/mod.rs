@@ -41,7 +41,8 @@ impl Encoder {
             Recipe::Projective => Self::Projective(Box::new(ProjectiveEncoder::build(parts)?)),
             Recipe::GaussianProcess => Self::GaussianProcess(Box::new(GaussianProcessEncoder::build(parts)?)),
             Recipe::Auto => {
-                let message = "must be the recipe that auto has chosen: paper, hybrid, projective or gaussian_process";
+                let message =
+                    "must be the recipe that auto has chosen: paper, hybrid, projective or gaussian_process";
                 return Err(Error::invalid("metadata.recipe", message));
             }
         })

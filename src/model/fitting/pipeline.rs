@@ -9,7 +9,9 @@ use rand_chacha::ChaCha8Rng;
 
 use super::candidates::{self, Candidate, Estimator, FitContext};
 use super::held_out::{choose, cross_validate};
-use super::report::{coverage_of_fixes, held_out_error, mean_variance_m2, note_choice, note_errors, note_samples};
+use super::report::{
+    coverage_of_fixes, held_out_error, mean_variance_m2, note_choice, note_errors, note_samples,
+};
 use crate::domain::{
     CandidateReport, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError, ImageSize,
     ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
@@ -146,7 +148,7 @@ fn select(
         candidates.iter().map(|candidate| HELD_OUT_BLOCKS * candidate.total_epochs(context)).sum();
     run.progress.epochs = in_blocks + longest;
     note_samples(rows, context, run)?;
-    let blocks = rows.blocks(HELD_OUT_BLOCKS);
+    let blocks = rows.held_out_groups(HELD_OUT_BLOCKS);
     let mut validated = Vec::with_capacity(candidates.len());
     let mut reports = Vec::with_capacity(candidates.len());
     for candidate in candidates {

@@ -2,4 +2,5 @@
 
 pub(crate) mod rows;
 pub(crate) mod second_differences;
+pub(crate) mod target_groups;
 pub(crate) mod whitening;

@@ -64,9 +64,10 @@ pub(crate) struct Deviation {
     pub(crate) weight: f64,
 }
 
-/// The running mean of a target's deviations; one per target, handed in by whoever follows targets.
+/// The running mean of how a target's boxes deviate from those of training: one per target, kept by the
+/// caller between its boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct RecentBoxes {
+pub struct RecentBoxes {
     mean: [f64; 2],
     count: u32,
 }
@@ -155,12 +156,13 @@ impl BoxPlausibility {
         let [log_width, log_height] = log_sides(sides);
         let predicted = cell.predict(&foot);
         let widen = 1.0 / (1.0 + cell.leverage(&foot)).sqrt();
-        let normalized =
-            whiten(&cell.whitening, &[log_width - predicted[0], log_height - predicted[1]]).map(|value| value * widen);
+        let normalized = whiten(&cell.whitening, &[log_width - predicted[0], log_height - predicted[1]])
+            .map(|value| value * widen);
         let beyond = |square: f64, normal: f64| if square > normal { 1.0 - normal / square } else { 0.0 };
         let mut weight = beyond(square(&normalized), self.normal[0]);
         if let Some(recent) = recent.filter(|recent| recent.count as usize == RECENT_BOXES) {
-            weight = weight.max(beyond(square(&whiten(&self.recent_whitening, &recent.mean)), self.normal[1]));
+            weight =
+                weight.max(beyond(square(&whiten(&self.recent_whitening, &recent.mean)), self.normal[1]));
         }
         Deviation { cell: best.1, foot, normalized, weight }
     }
@@ -170,7 +172,9 @@ impl BoxPlausibility {
     pub(crate) fn nearest_plausible(&self, sides: &Box4, deviation: &Deviation) -> Box4 {
         let cell = &self.cells[deviation.cell];
         let predicted = cell.predict(&deviation.foot).map(|log_px| log_px.clamp(0.0, MAX_LOG_SIDE).exp());
-        let slope = |side: usize, by: usize| predicted[side] * cell.coefficients[side][1 + by] / self.scales_px[by][1];
+        let slope = |side: usize, by: usize| {
+            predicted[side] * cell.coefficients[side][1 + by] / self.scales_px[by][1]
+        };
         let slopes = [[slope(0, 0), slope(0, 1)], [slope(1, 0), slope(1, 1)]];
         let (wider, taller) = (predicted[0] - sides[2], predicted[1] - sides[3]);
         // Squares of the edges' moves as functions of the foot's: (coefficients of u and v, constant).
@@ -189,7 +193,8 @@ impl BoxPlausibility {
             right[1] -= by_v * constant;
         }
         let determinant = a * c - b * b;
-        let moved = [(c * right[0] - b * right[1]) / determinant, (a * right[1] - b * right[0]) / determinant];
+        let moved =
+            [(c * right[0] - b * right[1]) / determinant, (a * right[1] - b * right[0]) / determinant];
         let side = |at: usize| (predicted[at] + slopes[at][0] * moved[0] + slopes[at][1] * moved[1]).max(1.0);
         [sides[0] + moved[0], sides[1] + moved[1], side(0), side(1)]
     }
@@ -237,7 +242,8 @@ impl Regression {
             for row in rows {
                 let terms = Vector3::new(1.0, feet[*row][0], feet[*row][1]);
                 let miss = fitted.miss(&terms, &sides[*row]);
-                let weight = (CREDIBLE / square(&whiten(&factor, &[miss[0], miss[1]])).max(CREDIBLE)).min(1.0);
+                let weight =
+                    (CREDIBLE / square(&whiten(&factor, &[miss[0], miss[1]])).max(CREDIBLE)).min(1.0);
                 normal += weight * terms * terms.transpose();
                 right += weight * terms * Vector2::from(sides[*row]).transpose();
                 weights.push(weight);
@@ -245,8 +251,7 @@ impl Regression {
             fitted.inverse = normal.try_inverse().unwrap_or_else(Matrix3::identity);
             fitted.coefficients = fitted.inverse * right;
             let prior_weight = if prior.is_some() { PRIOR_ROWS } else { 0.0 };
-            let mut covariance =
-                prior.map_or_else(Matrix2::zeros, |prior| prior.covariance * PRIOR_ROWS);
+            let mut covariance = prior.map_or_else(Matrix2::zeros, |prior| prior.covariance * PRIOR_ROWS);
             let mut total = prior_weight;
             for (row, weight) in rows.iter().zip(&weights) {
                 let miss = fitted.miss(&Vector3::new(1.0, feet[*row][0], feet[*row][1]), &sides[*row]);
@@ -323,7 +328,9 @@ fn centres(feet: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
             *sum = [sum[0] + foot[0], sum[1] + foot[1]];
             *members += 1.0;
         }
-        for (centre, (sum, members)) in centres.iter_mut().zip(&sums).filter(|(_, (_, members))| *members > 0.0) {
+        for (centre, (sum, members)) in
+            centres.iter_mut().zip(&sums).filter(|(_, (_, members))| *members > 0.0)
+        {
             *centre = sum.map(|sum| sum / members);
         }
     }

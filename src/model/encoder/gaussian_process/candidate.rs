@@ -5,10 +5,10 @@ use nalgebra::{DMatrix, DVector, SVector};
 use super::groups::Grouping;
 use super::hyperparameters::{Hyperparameters, LikelihoodRows, Priors, join, kernel_columns};
 use super::kernel::inducing_points;
+use super::map_rows::MapRows;
 use super::noise::{Epoch, ReceiverNoise, Whitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
 use super::projective_mean::{Box4, COEFFICIENTS, FOOT_COEFFICIENTS, ProjectiveMean};
-use super::map_rows::MapRows;
 use super::upright_camera::{Parameters, UprightCamera};
 
 /// Rows that hyper-parameters are estimated on at most.
@@ -88,7 +88,11 @@ impl Form {
 
 impl<'a> Draft<'a> {
     /// The upright camera that boxes, priors and fixes agree on best, of one start per focal length.
-    pub(crate) fn into_upright(self, camera: &'a UprightCamera, parameters: &Hyperparameters) -> Option<Self> {
+    pub(crate) fn into_upright(
+        self,
+        camera: &'a UprightCamera,
+        parameters: &Hyperparameters,
+    ) -> Option<Self> {
         let of_start = |start: &Parameters| {
             let placed = camera.placed(start, &self.mean, &self.rows.boxes, &self.rows.labels_m);
             let mut draft = Draft { form: Form::Upright, upright: Some((camera, placed)), ..self.clone() };
@@ -178,7 +182,9 @@ impl<'a> Draft<'a> {
     fn columns(&self, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Columns> {
         let (tangent, labels_m) = linearize(self.rows, &self.mean);
         let (phi, left_out_m2) = match self.form {
-            Form::Homography | Form::Upright => (DMatrix::zeros(self.inputs.len(), 0), vec![0.0; self.inputs.len()]),
+            Form::Homography | Form::Upright => {
+                (DMatrix::zeros(self.inputs.len(), 0), vec![0.0; self.inputs.len()])
+            }
             Form::Residual => kernel_columns(self.inputs, inducing, parameters)?,
         };
         Some(Columns { tangent, labels_m, phi, left_out_m2 })
@@ -237,7 +243,8 @@ impl Columns {
         inflation_m2: &[f64],
     ) -> Gram {
         let own: Vec<Epoch> = rows.iter().map(|row| epochs[*row]).collect();
-        let variances: Vec<f64> = rows.iter().map(|row| self.left_out_m2[*row] + inflation_m2[*row]).collect();
+        let variances: Vec<f64> =
+            rows.iter().map(|row| self.left_out_m2[*row] + inflation_m2[*row]).collect();
         let columns = join(&[&self.tangent, &self.phi, &self.labels_m]);
         let columns = if rows.len() == epochs.len() { columns } else { columns.select_rows(rows) };
         Gram::new(columns, &Whitener::new(&own, &parameters.noise, &variances))

@@ -3,8 +3,8 @@
 use nalgebra::{Matrix4, Vector4};
 
 use super::noise::Epoch;
-use crate::statistics::median;
 use super::projective_mean::Box4;
+use crate::statistics::median;
 
 /// Standard deviation of an edge where rows are too far apart in time to tell, px.
 const UNKNOWN_EDGE_PX: f64 = 1.5;

@@ -70,11 +70,18 @@ mod tests {
 
     #[test]
     fn quantiles_are_those_of_the_tables() {
-        for (numerator, denominator, tabulated) in
-            [(2.0, 4.0, 6.944), (1.0, 10.0, 4.965), (2.0, 38.0, 3.245), (2.0, 1e6, 2.9957), (1.0, 1e6, 3.8415)]
-        {
+        for (numerator, denominator, tabulated) in [
+            (2.0, 4.0, 6.944),
+            (1.0, 10.0, 4.965),
+            (2.0, 38.0, 3.245),
+            (2.0, 1e6, 2.9957),
+            (1.0, 1e6, 3.8415),
+        ] {
             let found = f_quantile(0.95, numerator, denominator);
-            assert!((found - tabulated).abs() < 1e-3, "F({numerator}, {denominator}) = {found}, not {tabulated}");
+            assert!(
+                (found - tabulated).abs() < 1e-3,
+                "F({numerator}, {denominator}) = {found}, not {tabulated}"
+            );
         }
     }
 }

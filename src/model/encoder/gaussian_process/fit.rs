@@ -7,11 +7,11 @@ use super::groups::groups;
 use super::hyperparameters::{Hyperparameters, Priors};
 use super::kernel::InputScales;
 use super::leave_out::{calibrate, weigh};
+use super::map_rows::{MapRows, scatter_m2};
 use super::noise::{Epoch, ReceiverNoise, Whitener};
 use super::predictor::{Map, Predictor, Stated};
 use super::projective_mean::ProjectiveMean;
 use super::sessions::Sessions;
-use super::map_rows::{MapRows, scatter_m2};
 use super::upright_camera::UprightCamera;
 
 /// Rows that a fit uses at most; more are thinned evenly.
@@ -70,16 +70,22 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
 
     let residuals_m = rows.misses_m(&mean);
     let scatter_m2 = scatter_m2(&residuals_m).max(1e-6);
-    let white =
-        Whitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
-    let mut draft =
-        Draft { form: Form::Residual, rows: &rows, inputs: &inputs, mean, inflation_m2: white.inflation_m2(&residuals_m), upright: None };
+    let white = Whitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
+    let mut draft = Draft {
+        form: Form::Residual,
+        rows: &rows,
+        inputs: &inputs,
+        mean,
+        inflation_m2: white.inflation_m2(&residuals_m),
+        upright: None,
+    };
     let start = draft.clone();
     let (parameters, receiver) = draft.estimate(&Priors::new(scatter_m2.sqrt(), start.mean.spread_m))?;
     let grouping = groups(&rows.epochs);
     let mut homography = Draft { form: Form::Homography, ..start };
     homography.relinearize(&parameters)?;
-    let upright = settings.upright.as_ref().and_then(|camera| homography.clone().into_upright(camera, &parameters));
+    let upright =
+        settings.upright.as_ref().and_then(|camera| homography.clone().into_upright(camera, &parameters));
     let mut candidates = vec![homography.solve(&parameters, &grouping)?];
     candidates.extend(upright.and_then(|draft| draft.solve(&parameters, &grouping)));
     candidates.push(draft.solve(&parameters, &grouping)?);
@@ -97,13 +103,19 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
         .filter(|(_, weight)| **weight > 0.0)
         .map(|((candidate, (_, deviations)), weight)| Map::new(candidate, deviations, weight / sum))
         .collect::<Option<Vec<Map>>>()?;
-    let stated = Stated { edge_px2, shared_bias_m2, freedom, plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes) };
+    let stated = Stated {
+        edge_px2,
+        shared_bias_m2,
+        freedom,
+        plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes),
+    };
     let mut predictor = Predictor::new(maps, input_scales, stated);
     let kept: Vec<f64> = kept.iter().map(|weight| weight / sum).collect();
     let extra_m2 = |row: usize| predictor.jackknife_m2(&rows.boxes[row]);
     let calibration = calibrate(&candidates, &kept, &grouping, &rows, &parameters.noise, &extra_m2);
     predictor.widening = calibration.widening;
-    let residuals_m: Vec<[f64; 2]> = (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
+    let residuals_m: Vec<[f64; 2]> =
+        (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
     let sessions = Sessions::new(&rows.epochs, &residuals_m, &parameters.noise);
     let report = FitReport {
         parameters,

@@ -2,6 +2,7 @@
 //! else spells.
 
 use super::noise::Epoch;
+use crate::model::samples::target_groups::{MIN_TARGETS, groups_of_targets};
 
 /// Groups at most.
 pub(crate) const GROUPS: usize = 8;
@@ -9,8 +10,6 @@ pub(crate) const GROUPS: usize = 8;
 pub(crate) const SESSION_GAP_S: f64 = 1800.0;
 /// Share of the rows that a session of its own has at least.
 const MIN_SESSION_SHARE: f64 = 0.1;
-/// Targets from which whole ones are left out.
-const MIN_TARGETS: usize = 5;
 
 /// Group of each row, and their number.
 #[derive(Debug, Clone, PartialEq)]
@@ -61,18 +60,9 @@ fn sessions(epochs: &[Epoch]) -> Option<Grouping> {
     (count > 1).then_some(Grouping { of_row, count })
 }
 
-/// The largest target first, each into the group that is the smallest so far.
 fn whole_targets(targets: &[usize]) -> Grouping {
     let count = targets.len().min(GROUPS);
-    let mut order: Vec<usize> = (0..targets.len()).collect();
-    order.sort_by_key(|target| std::cmp::Reverse(targets[*target]));
-    let mut sizes = vec![0; count];
-    let mut group_of = vec![0; targets.len()];
-    for target in order {
-        let smallest = (0..count).min_by_key(|group| sizes[*group]).unwrap_or(0);
-        sizes[smallest] += targets[target];
-        group_of[target] = smallest;
-    }
+    let group_of = groups_of_targets(targets, count);
     let of_row = targets.iter().zip(&group_of).flat_map(|(rows, group)| vec![*group; *rows]).collect();
     Grouping { of_row, count }
 }

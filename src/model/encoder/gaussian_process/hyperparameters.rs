@@ -85,8 +85,17 @@ impl Priors {
     /// `scatter_m` is the robust standard deviation per axis about the geometric map; `spread_m` that of
     /// the positions.
     pub(crate) fn new(scatter_m: f64, spread_m: f64) -> Self {
-        let medians =
-            [0.3 * scatter_m, 0.7 * scatter_m, SESSION_SHARE * 0.7 * scatter_m, 30.0, 3600.0, 0.02 * spread_m, 1.0, 2.0, 0.05];
+        let medians = [
+            0.3 * scatter_m,
+            0.7 * scatter_m,
+            SESSION_SHARE * 0.7 * scatter_m,
+            30.0,
+            3600.0,
+            0.02 * spread_m,
+            1.0,
+            2.0,
+            0.05,
+        ];
         Self {
             medians: Logs::from_column_slice(&medians.map(f64::ln)),
             sigmas: Logs::from_column_slice(&[1.0, 1.0, 0.5, 0.4, 1.0, 1.2, 0.7, 0.7, 1.2]),
@@ -128,8 +137,11 @@ impl LikelihoodRows<'_> {
     /// Gram matrix of all columns, and the noise's log determinant over both axes.
     pub(crate) fn gram(&self, parameters: &Hyperparameters) -> Option<(Gram, f64)> {
         let (phi, left_out_m2) = self.kernel_columns(parameters)?;
-        let variances: Vec<f64> =
-            left_out_m2.iter().zip(self.inflation_m2).map(|(left_out, inflation)| left_out + inflation).collect();
+        let variances: Vec<f64> = left_out_m2
+            .iter()
+            .zip(self.inflation_m2)
+            .map(|(left_out, inflation)| left_out + inflation)
+            .collect();
         let whitener = Whitener::new(self.epochs, &parameters.noise, &variances);
         let columns = join(&[self.tangent, &phi, self.labels_m]);
         Some((Gram::new(columns, &whitener), 2.0 * whitener.log_determinant))
@@ -152,8 +164,7 @@ impl LikelihoodRows<'_> {
         noise_frozen: bool,
     ) -> Hyperparameters {
         let free: Vec<usize> = if noise_frozen { (NOISE..COUNT).collect() } else { (0..COUNT).collect() };
-        let objective =
-            |logs: &Logs| self.misfit(&Hyperparameters::of_logs(logs)) + priors.penalty(logs);
+        let objective = |logs: &Logs| self.misfit(&Hyperparameters::of_logs(logs)) + priors.penalty(logs);
         Hyperparameters::of_logs(&minimize(&objective, start.logs(), &free))
     }
 }
@@ -165,8 +176,7 @@ pub(crate) fn kernel_columns(
     parameters: &Hyperparameters,
 ) -> Option<(DMatrix<f64>, Vec<f64>)> {
     let inverse_factor = parameters.lengths.inverse_factor(inducing)?;
-    let phi =
-        parameters.lengths.cross(inputs, inducing) * inverse_factor.transpose() * parameters.residual_m;
+    let phi = parameters.lengths.cross(inputs, inducing) * inverse_factor.transpose() * parameters.residual_m;
     let mut left_out_m2 = vec![parameters.residual_m * parameters.residual_m; inputs.len()];
     for column in phi.column_iter() {
         for (left, value) in left_out_m2.iter_mut().zip(column.iter()) {

@@ -75,7 +75,9 @@ impl LengthScales {
 
     /// K_xz of unit variance.
     pub(crate) fn cross(&self, inputs: &[[f64; 4]], inducing: &[[f64; 4]]) -> DMatrix<f64> {
-        DMatrix::from_fn(inputs.len(), inducing.len(), |row, column| self.matern(&inputs[row], &inducing[column]).0)
+        DMatrix::from_fn(inputs.len(), inducing.len(), |row, column| {
+            self.matern(&inputs[row], &inducing[column]).0
+        })
     }
 
     /// L^-1 of unit variance; `None` only for numbers that are not finite.
@@ -114,7 +116,8 @@ pub(crate) fn inducing_points(inputs: &[[f64; 4]], count: usize) -> Vec<[f64; 4]
 
 /// Index of the centre nearest to an input.
 pub(crate) fn nearest<const N: usize>(centres: &[[f64; N]], input: &[f64; N]) -> usize {
-    let square = |centre: &[f64; N]| centre.iter().zip(input).map(|(one, other)| (one - other).powi(2)).sum::<f64>();
+    let square =
+        |centre: &[f64; N]| centre.iter().zip(input).map(|(one, other)| (one - other).powi(2)).sum::<f64>();
     let mut best = (f64::INFINITY, 0);
     for (at, centre) in centres.iter().enumerate() {
         let square = square(centre);

@@ -5,9 +5,9 @@ use rand_chacha::ChaCha8Rng;
 
 use super::candidate::Candidate;
 use super::groups::Grouping;
+use super::map_rows::MapRows;
 use super::noise::{Epoch, ReceiverNoise};
 use super::sessions::weighted_mean;
-use super::map_rows::MapRows;
 
 const BOOTSTRAP_DRAWS: usize = 500;
 /// A squared miss counts no more than so many variances of the receiver.
@@ -76,9 +76,11 @@ pub(crate) fn weigh(
     let mut wins = vec![0.0; candidates.len()];
     for _ in 0..BOOTSTRAP_DRAWS {
         let weights: Vec<f64> = sequences.iter().map(|_| -(1.0 - rng.random::<f64>()).ln()).collect();
-        let score = |own: &Vec<f64>| own.iter().zip(&weights).map(|(miss, weight)| miss * weight).sum::<f64>();
+        let score =
+            |own: &Vec<f64>| own.iter().zip(&weights).map(|(miss, weight)| miss * weight).sum::<f64>();
         let scores: Vec<f64> = misses.iter().map(score).collect();
-        let best = (0..scores.len()).min_by(|one, other| scores[*one].total_cmp(&scores[*other])).unwrap_or(0);
+        let best =
+            (0..scores.len()).min_by(|one, other| scores[*one].total_cmp(&scores[*other])).unwrap_or(0);
         wins[best] += 1.0 / BOOTSTRAP_DRAWS as f64;
     }
     let count = rows.boxes.len() as f64;

@@ -1,8 +1,8 @@
 //! What a fit learns from, and the rows that it leaves out as gross errors.
 
 use super::noise::Epoch;
-use crate::statistics::median;
 use super::projective_mean::{Box4, ProjectiveMean};
+use crate::statistics::median;
 
 /// Neighbours in time on either side that a row's residual is compared with.
 const NEIGHBOURS: usize = 3;
@@ -48,8 +48,10 @@ impl MapRows {
     /// The rows without gross errors about a mean.
     pub(crate) fn without_gross_errors(&self, mean: &ProjectiveMean) -> Self {
         let misses_m = self.misses_m(mean);
-        let departures_m: Vec<Option<f64>> = (0..misses_m.len()).map(|row| self.departure_m(&misses_m, row)).collect();
-        let sigma_m = median(departures_m.iter().flatten().copied().collect()) / (2.0 * std::f64::consts::LN_2).sqrt();
+        let departures_m: Vec<Option<f64>> =
+            (0..misses_m.len()).map(|row| self.departure_m(&misses_m, row)).collect();
+        let sigma_m =
+            median(departures_m.iter().flatten().copied().collect()) / (2.0 * std::f64::consts::LN_2).sqrt();
         let kept: Vec<usize> = (0..misses_m.len())
             .filter(|row| departures_m[*row].is_none_or(|departure_m| departure_m <= GROSS_SIGMAS * sigma_m))
             .collect();
@@ -67,7 +69,9 @@ impl MapRows {
                     && (other_epoch.time_s - own.time_s).abs() <= MAX_GAP_S
             })
             .collect();
-        let of = |axis: usize| misses_m[row][axis] - median(near.iter().map(|other| misses_m[*other][axis]).collect());
+        let of = |axis: usize| {
+            misses_m[row][axis] - median(near.iter().map(|other| misses_m[*other][axis]).collect())
+        };
         (near.len() >= NEIGHBOURS).then(|| of(0).hypot(of(1)))
     }
 }

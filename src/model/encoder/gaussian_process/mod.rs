@@ -1,8 +1,10 @@
-//! Recipe `gaussian_process`: a projective mean with a Gaussian-process residual, under coloured noise
-//! per receiver, with an error that counts receivers, not rows.
+//! Recipe `gaussian_process`: a projective mean with a Gaussian-process residual under coloured noise per
+//! receiver, whose stated error counts receivers, not rows.
 //!
-//! What never happens here: I/O, clocks, randomness (the few random starts have a seed of their own), a
-//! look at truth.
+//! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
+//! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
+//! `candidate`, `leave_out`, `sessions`, `fit`; of an answer: `predictor`, `box_plausibility`; `recipe` and
+//! `stored` connect both to the rest of the module. Random starts have a seed of their own.
 
 mod box_plausibility;
 mod candidate;
@@ -13,6 +15,7 @@ mod groups;
 mod hyperparameters;
 mod kernel;
 mod leave_out;
+mod map_rows;
 mod noise;
 mod posterior;
 mod predictor;
@@ -20,8 +23,10 @@ mod projective_mean;
 mod recipe;
 mod sessions;
 mod stored;
-mod map_rows;
 mod upright_camera;
 
-pub(crate) use box_plausibility::RecentBoxes;
-pub(crate) use recipe::{Estimate, GaussianProcessEncoder, Settings, fit, target_height_m};
+pub use box_plausibility::RecentBoxes;
+pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, target_height_m};
+
+#[cfg(test)]
+mod tests;

@@ -153,15 +153,16 @@ impl Posterior {
             precision[(row, column)] * scale[row] * scale[column] + if row == column { 1e-10 } else { 0.0 }
         });
         let factor = scaled.cholesky()?;
-        log_determinant += 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum() - 2.0 * scale.map(f64::ln).sum();
+        log_determinant +=
+            2.0 * factor.l_dirty().diagonal().map(f64::ln).sum() - 2.0 * scale.map(f64::ln).sum();
         let inverse = factor.inverse();
-        let tangent_covariance =
-            DMatrix::from_fn(COEFFICIENTS, COEFFICIENTS, |row, column| inverse[(row, column)] * scale[row] * scale[column]);
+        let tangent_covariance = DMatrix::from_fn(COEFFICIENTS, COEFFICIENTS, |row, column| {
+            inverse[(row, column)] * scale[row] * scale[column]
+        });
         let tangent = &tangent_covariance * &right;
         explained += right.dot(&tangent);
-        let kernel = std::array::from_fn(|axis| {
-            kernel_factor.solve(&kernel_right[axis]) - &absorbed[axis] * &tangent
-        });
+        let kernel =
+            std::array::from_fn(|axis| kernel_factor.solve(&kernel_right[axis]) - &absorbed[axis] * &tangent);
         let misfit = gram.square() + prior_square - explained + log_determinant;
         Some(Self { tangent, kernel, kernel_factor, absorbed, tangent_covariance, misfit })
     }

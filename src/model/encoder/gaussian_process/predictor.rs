@@ -107,12 +107,12 @@ struct MapTerms {
 }
 
 /// What all maps say of one box.
-struct Mixture {
-    position_m: [f64; 2],
+pub(super) struct Mixture {
+    pub(super) position_m: [f64; 2],
     /// Of the maps and of what they differ by, m2.
-    map_m2: [f64; 3],
+    pub(super) map_m2: [f64; 3],
     /// Derivatives by left, top, right, bottom, m per px.
-    by_edge: [[f64; 4]; 2],
+    pub(super) by_edge: [[f64; 4]; 2],
 }
 
 impl Prediction {
@@ -186,7 +186,8 @@ impl Map {
     pub(crate) fn derive(&mut self) {
         let rank = self.rank;
         self.point_weights = std::array::from_fn(|axis| {
-            let dot = |own: &[f64]| own.iter().zip(&self.weights[axis]).map(|(basis, weight)| basis * weight).sum();
+            let dot =
+                |own: &[f64]| own.iter().zip(&self.weights[axis]).map(|(basis, weight)| basis * weight).sum();
             (0..self.inducing.len()).map(|point| dot(&self.basis[point * rank..(point + 1) * rank])).collect()
         });
     }
@@ -266,8 +267,10 @@ impl Map {
         let tangent = terms.evaluation.tangent();
         for deviation in &self.deviations {
             let moved_m = [0, 1].map(|axis| {
-                let by_tangent: f64 = tangent[axis].iter().zip(&deviation.tangent).map(|(one, other)| one * other).sum();
-                let by_kernel: f64 = terms.q.iter().zip(&deviation.kernel[axis]).map(|(one, other)| one * other).sum();
+                let by_tangent: f64 =
+                    tangent[axis].iter().zip(&deviation.tangent).map(|(one, other)| one * other).sum();
+                let by_kernel: f64 =
+                    terms.q.iter().zip(&deviation.kernel[axis]).map(|(one, other)| one * other).sum();
                 by_tangent + by_kernel
             });
             add_outer(&mut sum, moved_m, 1.0);
@@ -304,7 +307,8 @@ impl Predictor {
         if deviation.weight > 0.0 {
             let plausible = self.plausibility.nearest_plausible(sides, &deviation);
             let other_m = self.mix(&plausible, false).position_m;
-            let moved_m = [0, 1].map(|axis| SHRINKAGE * deviation.weight * (other_m[axis] - position_m[axis]));
+            let moved_m =
+                [0, 1].map(|axis| SHRINKAGE * deviation.weight * (other_m[axis] - position_m[axis]));
             add_outer(&mut covariance_m2, moved_m, 1.0);
             // Nothing says which edge is wrong: each may be by the root mean square of all.
             let moved_px2 = (edges_px(&plausible) - edges_px(sides)).norm_squared() / 4.0;
@@ -340,7 +344,7 @@ impl Predictor {
     }
 
     #[inline]
-    fn mix(&self, sides: &Box4, with_error: bool) -> Mixture {
+    pub(super) fn mix(&self, sides: &Box4, with_error: bool) -> Mixture {
         let (input, by_px) = (self.input_scales.input(sides), self.input_scales.slopes(sides));
         let (mut mean_m, mut second_m2) = ([0.0; 2], [0.0; 3]);
         let mut jacobian = [[0.0; 4]; 2];
@@ -364,7 +368,8 @@ impl Predictor {
         }
         add_outer(&mut second_m2, mean_m, -1.0);
         let origin_m = first_m.unwrap_or_default();
-        let by_edge = jacobian.map(|[u, v, width, height]| [0.5 * u - width, -height, 0.5 * u + width, v + height]);
+        let by_edge =
+            jacobian.map(|[u, v, width, height]| [0.5 * u - width, -height, 0.5 * u + width, v + height]);
         Mixture { position_m: [origin_m[0] + mean_m[0], origin_m[1] + mean_m[1]], map_m2: second_m2, by_edge }
     }
 
@@ -376,7 +381,8 @@ impl Predictor {
         let squares = east_m2 * east_m2 + 2.0 * cross_m2 * cross_m2 + north_m2 * north_m2;
         let at = ((trace * trace / squares.max(1e-300) - 1.0).clamp(0.0, 1.0)) * (QUANTILES - 1) as f64;
         let low = (at as usize).min(QUANTILES - 2);
-        let quantile = self.quantiles[low] + (at - low as f64) * (self.quantiles[low + 1] - self.quantiles[low]);
+        let quantile =
+            self.quantiles[low] + (at - low as f64) * (self.quantiles[low + 1] - self.quantiles[low]);
         (2.0 * quantile).sqrt()
     }
 }
@@ -396,7 +402,8 @@ fn determined_directions(candidate: &Candidate) -> (DMatrix<f64>, Vec<f64>) {
     let mut order: Vec<usize> = (0..count).filter(|at| share(*at) >= MIN_DETERMINED).collect();
     order.sort_by(|one, other| share(*other).total_cmp(&share(*one)));
     order.truncate(MAX_RANK);
-    let directions = DMatrix::from_fn(count, order.len(), |row, column| eigen.eigenvectors[(row, order[column])]);
+    let directions =
+        DMatrix::from_fn(count, order.len(), |row, column| eigen.eigenvectors[(row, order[column])]);
     (directions, order.into_iter().map(share).collect())
 }
 

@@ -68,9 +68,8 @@ impl ProjectiveMean {
         (scales_px[0][1], scales_px[1][1]) = (foot_px, foot_px);
         // Medians, so that gross errors of fixes do not set the scale.
         let centre_m = [0, 1].map(|axis| median(labels_m.iter().map(|label| label[axis]).collect()));
-        let distances = labels_m.iter().map(|label| {
-            (label[0] - centre_m[0]).powi(2) + (label[1] - centre_m[1]).powi(2)
-        });
+        let distances =
+            labels_m.iter().map(|label| (label[0] - centre_m[0]).powi(2) + (label[1] - centre_m[1]).powi(2));
         let spread_m = (median(distances.collect()) / (2.0 * std::f64::consts::LN_2)).sqrt().max(0.1);
         Self { scales_px, centre_m, spread_m, coefficients: [0.0; COEFFICIENTS] }
     }
@@ -81,10 +80,14 @@ impl ProjectiveMean {
         let bounded = |at: usize| scaled(at).clamp(-MAX_SIDE, MAX_SIDE);
         let terms = [1.0, scaled(0), scaled(1), bounded(2), bounded(3)];
         let c = &self.coefficients;
-        let denominator =
-            (1.0 + c[6] * terms[1] + c[7] * terms[2] + c[12] * terms[3] + c[13] * terms[4]).max(MIN_DENOMINATOR);
+        let denominator = (1.0 + c[6] * terms[1] + c[7] * terms[2] + c[12] * terms[3] + c[13] * terms[4])
+            .max(MIN_DENOMINATOR);
         let numerator = |foot: usize, side: usize| {
-            c[foot] + c[foot + 1] * terms[1] + c[foot + 2] * terms[2] + c[side] * terms[3] + c[side + 1] * terms[4]
+            c[foot]
+                + c[foot + 1] * terms[1]
+                + c[foot + 2] * terms[2]
+                + c[side] * terms[3]
+                + c[side + 1] * terms[4]
         };
         let offset_m = [numerator(0, 8) / denominator, numerator(3, 10) / denominator];
         Evaluation { terms, denominator, offset_m }
@@ -162,7 +165,8 @@ impl ProjectiveMean {
         let mut normal = SMatrix::<f64, 8, 8>::zeros();
         let mut right = SVector::<f64, 8>::zeros();
         for row in rows {
-            let evaluation = Self { coefficients: [0.0; COEFFICIENTS], ..self.clone() }.evaluate(&boxes[*row]);
+            let evaluation =
+                Self { coefficients: [0.0; COEFFICIENTS], ..self.clone() }.evaluate(&boxes[*row]);
             let [_, u, v, ..] = evaluation.terms;
             for axis in 0..2 {
                 let y = (labels_m[*row][axis] - self.centre_m[axis]) / self.spread_m;

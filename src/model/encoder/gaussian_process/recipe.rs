@@ -120,13 +120,15 @@ fn put_report(report: &FitReport, parts: &mut ModelParts) {
         ("gross_errors", report.gross_errors as f64),
         ("held_out_groups", report.groups as f64),
         ("held_out_coverage", report.held_out_coverage),
+        ("held_out_m2", report.held_out_m2),
         ("radius_degrees_of_freedom", report.freedom),
     ] {
         parts.set(name, value);
     }
-    for (name, weight, miss_m2) in &report.candidates {
+    for ((name, weight, miss_m2), jackknife_share) in report.candidates.iter().zip(&report.jackknife_shares) {
         parts.set(&format!("weight.{name}"), *weight);
         parts.set(&format!("held_out_m2.{name}"), *miss_m2);
+        parts.set(&format!("jackknife_share.{name}"), *jackknife_share);
     }
     if let Some(sessions) = report.sessions {
         parts.set("sessions", sessions.count as f64);
@@ -193,14 +195,15 @@ impl GaussianProcessEncoder {
         Predictor::take(parts).map(Self)
     }
 
-    /// Position and error of a box. `recent` holds the boxes of its target up to now, and takes this one in.
+    /// Position and error of a box. `recent` holds the earlier boxes of its target, and takes this one in.
     #[inline]
     pub(crate) fn estimate(&self, bounding_box: &BoundingBox, recent: Option<&mut RecentBoxes>) -> Estimate {
         let sides = features_of(bounding_box);
-        let prediction = self.0.predict(&sides, recent.as_deref());
-        if let Some(recent) = recent {
-            recent.push(&prediction.deviation);
-        }
+        let recent = recent.map(|recent| {
+            recent.push(&self.0.plausibility.deviation(&sides, None));
+            &*recent
+        });
+        let prediction = self.0.predict(&sides, recent);
         let [east_m, north_m] = prediction.position_m;
         Estimate {
             encoded: Encoded {

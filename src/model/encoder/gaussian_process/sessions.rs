@@ -25,7 +25,8 @@ impl Sessions {
         order.sort_by(|one, other| epochs[*one].time_s.total_cmp(&epochs[*other].time_s));
         let short = ReceiverNoise { session_m2: 0.0, ..*noise };
         let (mut means, mut noise_m2) = (Vec::new(), 0.0);
-        for session in order.chunk_by(|one, next| epochs[*next].time_s - epochs[*one].time_s <= SESSION_GAP_S) {
+        for session in order.chunk_by(|one, next| epochs[*next].time_s - epochs[*one].time_s <= SESSION_GAP_S)
+        {
             if session.len() < MIN_ROWS {
                 continue;
             }

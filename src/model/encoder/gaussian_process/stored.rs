@@ -127,8 +127,7 @@ impl Map {
             spread_m,
             coefficients: std::array::from_fn(|at| mean[MEAN_SCALARS + at]),
         };
-        let tangent_factor =
-            f64s(&tensors.take_f32(&name("tangent_factor"), &[COEFFICIENTS, COEFFICIENTS])?);
+        let tangent_factor = f64s(&tensors.take_f32(&name("tangent_factor"), &[COEFFICIENTS, COEFFICIENTS])?);
         let points = tensors.rows(&name("inducing")).unwrap_or(0);
         let rank = tensors.rows(&name("determined")).unwrap_or(0);
         if points > MAX_INDUCING || rank > MAX_RANK {

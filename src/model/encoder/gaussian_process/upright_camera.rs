@@ -115,11 +115,20 @@ impl UprightCamera {
 
     fn ray(&self, parameters: &Parameters, u: f64, v: f64) -> Ray {
         let focal_px = parameters[0].exp();
-        let (x, y) = ((u - 0.5 * self.width_px) / focal_px, (v - 0.5 * self.height_px) / (focal_px * parameters[8].exp()));
+        let (x, y) = (
+            (u - 0.5 * self.width_px) / focal_px,
+            (v - 0.5 * self.height_px) / (focal_px * parameters[8].exp()),
+        );
         let (sin_roll, cos_roll) = parameters[2].sin_cos();
         let (sin_pitch, cos_pitch) = parameters[1].sin_cos();
         let (right, along) = (x * cos_roll + y * sin_roll, y * cos_roll - x * sin_roll);
-        Ray { right, down: along * cos_pitch + sin_pitch, forward: cos_pitch - along * sin_pitch, x: right, y: along }
+        Ray {
+            right,
+            down: along * cos_pitch + sin_pitch,
+            forward: cos_pitch - along * sin_pitch,
+            x: right,
+            y: along,
+        }
     }
 
     /// Height in pixels of the box of a target of usual height whose foot is there; `None` beyond the
@@ -147,7 +156,11 @@ impl UprightCamera {
         mean: &ProjectiveMean,
     ) -> Option<SVector<f64, FOOT_COEFFICIENTS>> {
         let [[u, u_unit], [v, v_unit], ..] = mean.scales_px;
-        let at = [self.ray(parameters, u, v), self.ray(parameters, u + u_unit, v), self.ray(parameters, u, v + v_unit)];
+        let at = [
+            self.ray(parameters, u, v),
+            self.ray(parameters, u + u_unit, v),
+            self.ray(parameters, u, v + v_unit),
+        ];
         if at[0].down <= 1e-3 {
             return None;
         }
@@ -155,13 +168,16 @@ impl UprightCamera {
             let constant = of(&at[0]);
             [constant, of(&at[1]) - constant, of(&at[2]) - constant]
         };
-        let (right, down, forward) = (linear(|ray| ray.right), linear(|ray| ray.down), linear(|ray| ray.forward));
+        let (right, down, forward) =
+            (linear(|ray| ray.right), linear(|ray| ray.down), linear(|ray| ray.forward));
         let camera_m = parameters[4].exp();
         let (sin_yaw, cos_yaw) = parameters[5].sin_cos();
         let mut coefficients = SVector::zeros();
         for term in 0..3 {
-            let east = parameters[6] * down[term] + camera_m * (cos_yaw * right[term] + sin_yaw * forward[term]);
-            let north = parameters[7] * down[term] + camera_m * (cos_yaw * forward[term] - sin_yaw * right[term]);
+            let east =
+                parameters[6] * down[term] + camera_m * (cos_yaw * right[term] + sin_yaw * forward[term]);
+            let north =
+                parameters[7] * down[term] + camera_m * (cos_yaw * forward[term] - sin_yaw * right[term]);
             coefficients[term] = east / down[0];
             coefficients[3 + term] = north / down[0];
             if term > 0 {
@@ -194,7 +210,8 @@ impl UprightCamera {
         let apart = foot - self.coefficients(parameters, mean)?;
         let own = self.jacobian(parameters, mean)?.lu().solve(&apart)?;
         let mut step = own.insert_row(RATIO, 0.0);
-        let largest = (0..PARAMETERS).filter(|at| *at < 6 || *at == 8).map(|at| step[at].abs()).fold(0.0, f64::max);
+        let largest =
+            (0..PARAMETERS).filter(|at| *at < 6 || *at == 8).map(|at| step[at].abs()).fold(0.0, f64::max);
         if largest > MAX_STEP {
             step *= MAX_STEP / largest;
         }
@@ -267,7 +284,11 @@ impl UprightCamera {
 
     /// Cameras that fit the boxes, one per focal length, without place and direction.
     pub(crate) fn starts(&self) -> Vec<Parameters> {
-        FOCAL_LENGTHS.iter().filter_map(|focal| self.start(focal * self.width_px)).map(|(_, start)| start).collect()
+        FOCAL_LENGTHS
+            .iter()
+            .filter_map(|focal| self.start(focal * self.width_px))
+            .map(|(_, start)| start)
+            .collect()
     }
 
     fn start(&self, focal_px: f64) -> Option<(f64, Parameters)> {
@@ -305,22 +326,33 @@ impl UprightCamera {
     }
 
     /// Place and direction of a camera by robust least squares on fixes: a similarity without scale.
-    pub(crate) fn placed(&self, start: &Parameters, mean: &ProjectiveMean, boxes: &[Box4], labels_m: &[[f64; 2]]) -> Parameters {
+    pub(crate) fn placed(
+        &self,
+        start: &Parameters,
+        mean: &ProjectiveMean,
+        boxes: &[Box4],
+        labels_m: &[[f64; 2]],
+    ) -> Parameters {
         let camera_m = start[4].exp();
         let ground: Vec<Option<[f64; 2]>> = boxes
             .iter()
             .map(|sides| {
                 let ray = self.ray(start, sides[0], sides[1]);
-                (ray.down > 0.01).then(|| [camera_m * ray.right / ray.down, camera_m * ray.forward / ray.down])
+                (ray.down > 0.01)
+                    .then(|| [camera_m * ray.right / ray.down, camera_m * ray.forward / ray.down])
             })
             .collect();
         let mut weights = vec![1.0; boxes.len()];
         let mut placed = *start;
         for _ in 0..20 {
             let (mut total, mut from, mut to) = (0.0, [0.0; 2], [0.0; 2]);
-            let pairs = || ground.iter().zip(labels_m).zip(&weights).filter_map(|((ground, label), weight)| {
-                ground.map(|ground| (ground, [label[0] - mean.centre_m[0], label[1] - mean.centre_m[1]], *weight))
-            });
+            let pairs = || {
+                ground.iter().zip(labels_m).zip(&weights).filter_map(|((ground, label), weight)| {
+                    ground.map(|ground| {
+                        (ground, [label[0] - mean.centre_m[0], label[1] - mean.centre_m[1]], *weight)
+                    })
+                })
+            };
             for (ground, label, weight) in pairs() {
                 total += weight;
                 for axis in 0..2 {
@@ -331,7 +363,8 @@ impl UprightCamera {
             (from, to) = (from.map(|sum| sum / total), to.map(|sum| sum / total));
             let (mut cosine, mut sine) = (0.0, 0.0);
             for (ground, label, weight) in pairs() {
-                let (a, b) = ([ground[0] - from[0], ground[1] - from[1]], [label[0] - to[0], label[1] - to[1]]);
+                let (a, b) =
+                    ([ground[0] - from[0], ground[1] - from[1]], [label[0] - to[0], label[1] - to[1]]);
                 cosine += weight * (a[0] * b[0] + a[1] * b[1]);
                 sine += weight * (a[1] * b[0] - a[0] * b[1]);
             }

@@ -18,7 +18,7 @@ pub(crate) fn run() {
     println!("|---|---:|---:|");
     let world = simulate(&Options::demo());
     let samples = world.training_samples();
-    for recipe in [Recipe::Paper, Recipe::Hybrid, Recipe::Projective] {
+    for recipe in [Recipe::Paper, Recipe::Hybrid, Recipe::Projective, Recipe::GaussianProcess] {
         let options = FitOptions {
             recipe,
             seed: 1,

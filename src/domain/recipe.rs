@@ -16,6 +16,8 @@ pub enum Recipe {
     Hybrid,
     /// A learned homography of the foot point with a small residual network.
     Projective,
+    /// A projective map with a Gaussian-process residual under coloured noise per receiver.
+    GaussianProcess,
     /// Trains the candidates and selects the best on held-out blocks of time.
     #[default]
     Auto,
@@ -33,5 +35,5 @@ impl Recipe {
 }
 
 fn unknown_recipe(_: &str) -> Error {
-    Error::invalid("recipe", "must be one of paper, hybrid, projective, auto")
+    Error::invalid("recipe", "must be one of paper, hybrid, projective, gaussian_process, auto")
 }

@@ -84,10 +84,10 @@ pub struct TrainingRun {
     pub ended_at: Option<Timestamp>,
 }
 
-/// Prediction error on blocks of time that were held out of the fit.
+/// Prediction error on whole targets (from five targets on) or blocks of time that were held out of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct HeldOutError {
-    /// Number of blocks of time that were held out in turn.
+    /// Number of groups of targets, or of blocks of time, that were held out in turn.
     pub blocks: u32,
     /// Samples in those blocks.
     pub samples: u32,

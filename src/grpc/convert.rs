@@ -42,6 +42,7 @@ pub(super) fn recipe(recipe: i32) -> Result<Option<domain::Recipe>> {
         Ok(proto::Recipe::Paper) => Ok(Some(domain::Recipe::Paper)),
         Ok(proto::Recipe::Hybrid) => Ok(Some(domain::Recipe::Hybrid)),
         Ok(proto::Recipe::Projective) => Ok(Some(domain::Recipe::Projective)),
+        Ok(proto::Recipe::GaussianProcess) => Ok(Some(domain::Recipe::GaussianProcess)),
         Ok(proto::Recipe::Auto) => Ok(Some(domain::Recipe::Auto)),
         Err(_) => Err(Error::invalid("recipe", format!("has no value {recipe}"))),
     }
@@ -71,6 +72,7 @@ impl From<domain::Recipe> for proto::Recipe {
             domain::Recipe::Paper => Self::Paper,
             domain::Recipe::Hybrid => Self::Hybrid,
             domain::Recipe::Projective => Self::Projective,
+            domain::Recipe::GaussianProcess => Self::GaussianProcess,
             domain::Recipe::Auto => Self::Auto,
         }
     }

@@ -21,6 +21,8 @@ pub(super) enum Recipe {
     Hybrid,
     /// A learnt homography with a small residual network.
     Projective,
+    /// A projective map with a Gaussian-process residual; its stated error counts receivers, not rows.
+    GaussianProcess,
     /// The best of the candidates on held-out blocks of time.
     Auto,
 }
@@ -31,6 +33,7 @@ impl From<Recipe> for crate::domain::Recipe {
             Recipe::Paper => Self::Paper,
             Recipe::Hybrid => Self::Hybrid,
             Recipe::Projective => Self::Projective,
+            Recipe::GaussianProcess => Self::GaussianProcess,
             Recipe::Auto => Self::Auto,
         }
     }
@@ -42,6 +45,7 @@ impl From<crate::domain::Recipe> for Recipe {
             crate::domain::Recipe::Paper => Self::Paper,
             crate::domain::Recipe::Hybrid => Self::Hybrid,
             crate::domain::Recipe::Projective => Self::Projective,
+            crate::domain::Recipe::GaussianProcess => Self::GaussianProcess,
             crate::domain::Recipe::Auto => Self::Auto,
         }
     }

@@ -17,6 +17,7 @@ mod uncertainty;
 
 pub use crate::statistics::R95_PER_SIGMA;
 pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackNoiseModel};
+pub use encoder::gaussian_process::RecentBoxes;
 pub use encoder::projection::Projection;
 pub use encoder::projection_fit::fit_foot_points;
 pub use fitting::{FitOptions, FitOverrides, TimedResidual, estimate_gnss_noise, fit, fit_with};

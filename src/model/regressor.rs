@@ -3,8 +3,9 @@
 use super::artifact::{ModelParts, TrackNoiseModel};
 use super::encoder::Encoder;
 use super::encoder::features::Encoded;
+use super::encoder::gaussian_process::RecentBoxes;
 use super::uncertainty::coverage::CoverageLookup;
-use super::uncertainty::error_model::{BoxError, ErrorModel, NOMINAL_RATIO};
+use super::uncertainty::error_model::{BoxError, ErrorModel, NOMINAL_RATIO, reconstruction_error};
 use crate::domain::{BoundingBox, ImageSize, Result};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::statistics::R95_PER_SIGMA;
@@ -121,7 +122,31 @@ impl Regressor {
     /// the inputs of one of its networks.
     #[must_use]
     pub fn regress(&self, bounding_box: &BoundingBox, fix: Option<EastNorth>) -> Regression {
+        self.regress_with(bounding_box, fix, None)
+    }
+
+    /// The same for the next box of a target whose earlier boxes are summarised in `recent`, which takes this
+    /// one in. A deviation too small to be noticed in one box is noticed when it lasts; only the recipe
+    /// `gaussian_process` tests for it.
+    #[must_use]
+    pub fn regress_next(
+        &self,
+        bounding_box: &BoundingBox,
+        fix: Option<EastNorth>,
+        recent: &mut RecentBoxes,
+    ) -> Regression {
+        self.regress_with(bounding_box, fix, Some(recent))
+    }
+
+    #[inline]
+    fn regress_with(
+        &self,
+        bounding_box: &BoundingBox,
+        fix: Option<EastNorth>,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Regression {
         let lookup = self.error_model.look_up(bounding_box);
+        let mut r95_scale = self.r95_scale;
         let (regressed, error) = match &self.encoder {
             Encoder::Paper(paper) => {
                 let estimate = paper.estimate(&self.plane, bounding_box, fix);
@@ -133,6 +158,14 @@ impl Regressor {
             Encoder::Projective(projective) => {
                 self.with_error(bounding_box, &lookup, projective.encode(bounding_box))
             }
+            Encoder::GaussianProcess(map) => {
+                // Its error comes with every answer, not from the error model.
+                let estimate = map.estimate(bounding_box, recent);
+                r95_scale = estimate.r95_scale;
+                let reconstruction_error = reconstruction_error(bounding_box, &estimate.encoded);
+                let error = BoxError { reconstruction_error, variance_m2: estimate.variance_m2 };
+                (estimate.encoded.position, error)
+            }
         };
         Regression {
             regressed,
@@ -140,7 +173,7 @@ impl Regressor {
             e_regression_m2: (error.variance_m2 + self.added_m2)
                 .clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]),
             outside_training: lookup.extrapolation_ratio > NOMINAL_RATIO,
-            r95_scale: self.r95_scale,
+            r95_scale,
         }
     }
 

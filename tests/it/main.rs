@@ -4,6 +4,7 @@ mod bad_input;
 mod connections;
 mod cross_site;
 mod evaluations;
+mod gaussian_process;
 mod grpc;
 mod harness;
 mod job_leases;

@@ -1,6 +1,7 @@
 //! The encoders of the recipes: from a box to a position, and back to the box that belongs to it.
 
 pub(crate) mod features;
+pub(crate) mod gaussian_process;
 pub(crate) mod hybrid;
 mod initial_projection;
 mod inverse_camera;
@@ -11,6 +12,7 @@ pub(crate) mod projective;
 mod stored_network;
 
 use self::features::{Encoded, features_of};
+use self::gaussian_process::GaussianProcessEncoder;
 use self::hybrid::HybridEncoder;
 use self::paper::PaperEncoder;
 use self::projective::{GeometricCovariance, ProjectiveEncoder};
@@ -24,6 +26,7 @@ pub(crate) enum Encoder {
     Paper(Box<PaperEncoder>),
     Hybrid(Box<HybridEncoder>),
     Projective(Box<ProjectiveEncoder>),
+    GaussianProcess(Box<GaussianProcessEncoder>),
 }
 
 impl Encoder {
@@ -36,8 +39,10 @@ impl Encoder {
             Recipe::Paper => Self::Paper(Box::new(PaperEncoder::build(parts)?)),
             Recipe::Hybrid => Self::Hybrid(Box::new(HybridEncoder::build(parts)?)),
             Recipe::Projective => Self::Projective(Box::new(ProjectiveEncoder::build(parts)?)),
+            Recipe::GaussianProcess => Self::GaussianProcess(Box::new(GaussianProcessEncoder::build(parts)?)),
             Recipe::Auto => {
-                let message = "must be the recipe that auto has chosen: paper, hybrid or projective";
+                let message =
+                    "must be the recipe that auto has chosen: paper, hybrid, projective or gaussian_process";
                 return Err(Error::invalid("metadata.recipe", message));
             }
         })
@@ -52,6 +57,7 @@ impl Encoder {
             },
             Self::Hybrid(hybrid) => hybrid.encode(bounding_box),
             Self::Projective(projective) => projective.encode(bounding_box),
+            Self::GaussianProcess(map) => map.estimate(bounding_box, None).encoded,
         }
     }
 }

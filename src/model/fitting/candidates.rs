@@ -1,8 +1,8 @@
 //! The candidates of each recipe.
 
-use crate::domain::{GaussMarkovNoise, Recipe};
+use crate::domain::{GaussMarkovNoise, ImageSize, Recipe};
 use crate::model::encoder::projective::Variant;
-use crate::model::encoder::{FittedEncoder, hybrid, paper, projective};
+use crate::model::encoder::{FittedEncoder, gaussian_process, hybrid, paper, projective};
 use crate::model::network::LossWeights;
 use crate::model::progress::{FitError, Phase};
 use crate::model::samples::rows::TrainingRows;
@@ -24,6 +24,7 @@ pub(super) enum Estimator {
     Paper,
     Hybrid,
     Projective(Variant),
+    GaussianProcess,
 }
 
 const HOMOGRAPHY: Candidate =
@@ -35,6 +36,7 @@ const SIZE_SMOOTHED: Candidate =
     candidate("projective/sides+smoothed", Estimator::Projective(variant(true, false)), true);
 const HYBRID: Candidate = candidate("hybrid", Estimator::Hybrid, false);
 const HYBRID_SMOOTHED: Candidate = candidate("hybrid+smoothed", Estimator::Hybrid, true);
+const GAUSSIAN_PROCESS: Candidate = candidate("gaussian_process", Estimator::GaussianProcess, false);
 const PAPER: Candidate = candidate("paper", Estimator::Paper, false);
 
 const fn candidate(name: &'static str, estimator: Estimator, smoothed: bool) -> Candidate {
@@ -45,13 +47,16 @@ const fn variant(uses_size: bool, residual: bool) -> Variant {
     Variant { uses_size, residual }
 }
 
-/// The candidates of a recipe, the simplest first.
+/// The candidates of a recipe, the one to keep unless another is clearly better first.
 pub(super) const fn of_recipe(recipe: Recipe) -> &'static [Candidate] {
     match recipe {
         Recipe::Paper => &[PAPER],
         Recipe::Hybrid => &[HYBRID, HYBRID_SMOOTHED],
         Recipe::Projective => &[HOMOGRAPHY, SIZE, SIZE_SMOOTHED, RESIDUAL],
-        Recipe::Auto => &[HOMOGRAPHY, SIZE, SIZE_SMOOTHED, RESIDUAL, HYBRID, HYBRID_SMOOTHED],
+        Recipe::GaussianProcess => &[GAUSSIAN_PROCESS],
+        Recipe::Auto => {
+            &[GAUSSIAN_PROCESS, HOMOGRAPHY, SIZE, SIZE_SMOOTHED, RESIDUAL, HYBRID, HYBRID_SMOOTHED]
+        }
     }
 }
 
@@ -60,6 +65,10 @@ pub(super) const fn of_recipe(recipe: Recipe) -> &'static [Candidate] {
 pub(super) struct FitContext {
     /// Error variance per axis of the receiver, m2.
     pub(super) e_gnss_m2: f64,
+    pub(super) e_gnss_is_estimated: bool,
+    pub(super) image_size: Option<ImageSize>,
+    /// Median height of the targets, m, and the standard deviation of its logarithm.
+    pub(super) target_height_m: (f64, f64),
     /// Noise of the fixes about the geometric map.
     pub(super) noise: GaussMarkovNoise,
     /// Number of epochs that replaces the recipe's own.
@@ -67,6 +76,13 @@ pub(super) struct FitContext {
     pub(super) seed: u64,
     /// Loss weights that replace the recipe's own.
     pub(super) loss_weights: Option<LossWeights>,
+}
+
+impl FitContext {
+    fn map_settings(&self) -> gaussian_process::Settings {
+        let Self { e_gnss_m2, e_gnss_is_estimated, image_size, target_height_m, seed, .. } = *self;
+        gaussian_process::Settings { e_gnss_m2, e_gnss_is_estimated, image_size, target_height_m, seed }
+    }
 }
 
 impl Candidate {
@@ -81,6 +97,7 @@ impl Candidate {
             Estimator::Paper => paper::EPOCHS,
             Estimator::Hybrid => hybrid::EPOCHS,
             Estimator::Projective(_) => projective::EPOCHS,
+            Estimator::GaussianProcess => 1,
         };
         context.epochs.unwrap_or(default).max(1)
     }
@@ -91,6 +108,7 @@ impl Candidate {
             Estimator::Paper => 2,
             Estimator::Hybrid => 1,
             Estimator::Projective(variant) => u32::from(variant.residual),
+            Estimator::GaussianProcess => 0,
         };
         networks.saturating_mul(self.epochs(context))
     }
@@ -109,6 +127,7 @@ impl Candidate {
             Estimator::Paper => paper::fit(rows, e_gnss_m2, epochs, phase),
             Estimator::Hybrid => hybrid::fit(rows, e_gnss_m2, epochs, phase),
             Estimator::Projective(variant) => projective::fit(rows, variant, e_gnss_m2, epochs, phase),
+            Estimator::GaussianProcess => gaussian_process::fit(rows, &context.map_settings(), phase),
         }?;
         let coverage = Coverage::new(rows.rows.iter().map(|row| row.bounding_box));
         match self.estimator {

@@ -1,6 +1,7 @@
-//! Cross-validation of the candidates on blocks of time, and the choice between them.
+//! Cross-validation of the candidates on held-out targets or blocks of time, and the choice between them.
 //!
-//! The errors of neighbouring rows are correlated, so contiguous blocks are held out, never random rows. A
+//! The errors of neighbouring rows are correlated, so whole targets or contiguous blocks are held out, never
+//! random rows. A
 //! more complex candidate is chosen only where its error is smaller by more than a standard error. Neither
 //! test rows nor true positions are read.
 

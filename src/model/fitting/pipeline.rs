@@ -9,13 +9,16 @@ use rand_chacha::ChaCha8Rng;
 
 use super::candidates::{self, Candidate, Estimator, FitContext};
 use super::held_out::{choose, cross_validate};
-use super::report::{coverage_of_fixes, held_out_error, note_choice, note_errors, note_samples};
+use super::report::{
+    coverage_of_fixes, held_out_error, mean_variance_m2, note_choice, note_errors, note_samples,
+};
 use super::track_noise::estimate_track_noise;
 use crate::domain::{
     CandidateReport, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError, ImageSize,
     ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
 };
 use crate::model::artifact::{Artifact, FORMAT, ModelParts};
+use crate::model::encoder::gaussian_process::target_height_m;
 use crate::model::encoder::projection_fit::ParameterCovariance;
 use crate::model::encoder::projective::{GeometricCovariance, fit_geometry};
 use crate::model::network::LossWeights;
@@ -82,6 +85,9 @@ pub fn fit_with(
     let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &geometry.noise);
     let context = FitContext {
         e_gnss_m2,
+        e_gnss_is_estimated: e_gnss_source == GnssErrorSource::Estimated,
+        image_size: options.image_size,
+        target_height_m: target_height_m(samples.iter().map(|sample| sample.class.as_ref())),
         noise: geometry.noise,
         epochs: options.epochs,
         seed: options.seed,
@@ -147,7 +153,7 @@ fn select(
         candidates.iter().map(|candidate| HELD_OUT_BLOCKS * candidate.total_epochs(context)).sum();
     run.progress.epochs = in_blocks + longest;
     note_samples(rows, context, run)?;
-    let blocks = rows.blocks(HELD_OUT_BLOCKS);
+    let blocks = rows.held_out_groups(HELD_OUT_BLOCKS);
     let mut validated = Vec::with_capacity(candidates.len());
     let mut reports = Vec::with_capacity(candidates.len());
     for candidate in candidates {
@@ -196,7 +202,11 @@ impl FinalFit<'_> {
         let mut fitted = candidate.fit(rows, context, &mut phase)?;
         set_image_size(&mut fitted.parts, options.image_size);
         let mut held_out = held_out.clone();
-        if candidate.estimator != Estimator::Paper {
+        if candidate.estimator == Estimator::GaussianProcess {
+            // It has been calibrated on left-out targets of its own.
+            held_out.e_regression_m2 = mean_variance_m2(&fitted.parts, rows)?;
+            held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
+        } else if candidate.estimator != Estimator::Paper {
             let geometry = GeometricCovariance::of_geometry(geometry);
             let validation = HeldOut { rows: &rows.rows, residuals, noise: &context.noise };
             let calibration = calibrate(&mut fitted, geometry, &validation, options.image_size)?;

@@ -99,6 +99,13 @@ pub(super) fn held_out_error(
     }
 }
 
+/// Mean error variance per axis that a model states at the training boxes, m2.
+pub(super) fn mean_variance_m2(parts: &ModelParts, rows: &TrainingRows) -> Result<f64, FitError> {
+    let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
+    let variances = rows.rows.iter().map(|row| regressor.regress(&row.bounding_box, None).e_regression_m2);
+    Ok(variances.sum::<f64>() / rows.rows.len() as f64)
+}
+
 /// Share of held-out fixes within the 95 % radius of the calibrated error and the receiver's together.
 pub(super) fn coverage_of_fixes(
     parts: &ModelParts,

@@ -9,6 +9,7 @@ use std::collections::HashMap;
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
+use super::target_groups::{MIN_TARGETS, groups_of_targets};
 use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, Result, Sample};
 use crate::filters::{Traverse, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
@@ -128,6 +129,18 @@ impl TrainingRows {
             )));
         }
         Ok(())
+    }
+
+    /// Index of the held-out group of each row, 0 to `count - 1`: whole targets where there are enough of
+    /// them, because the error of a target's receiver outlasts its rows; else blocks of time.
+    pub(crate) fn held_out_groups(&self, count: u32) -> Vec<u32> {
+        if (self.targets as usize) < MIN_TARGETS {
+            return self.blocks(count);
+        }
+        let mut rows_of_target = vec![0; self.targets as usize];
+        self.rows.iter().for_each(|row| rows_of_target[row.target as usize] += 1);
+        let groups = groups_of_targets(&rows_of_target, count as usize);
+        self.rows.iter().map(|row| groups[row.target as usize] as u32).collect()
     }
 
     /// Index of the block of time of each row, 0 to `count - 1`: blocks of about equal size, cut at the

@@ -43,7 +43,7 @@ fn the_default_has_a_smaller_error_than_the_receiver_and_states_it() {
         assert!(regressed_m < 1.2, "{regressed_m}");
         assert!(fused_m < 1.25 * regressed_m, "{fused_m} {regressed_m}");
         assert!(inside > 0.85, "{inside}");
-        assert_eq!(artifact.metadata.candidates.len(), 6);
+        assert_eq!(artifact.metadata.candidates.len(), 7);
     }
 }
 

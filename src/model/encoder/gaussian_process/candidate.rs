@@ -1,0 +1,339 @@
+//! One form of the map under given hyper-parameters: posterior of all rows and without each group.
+
+use nalgebra::{DMatrix, DVector, SVector};
+
+use super::groups::Grouping;
+use super::hyperparameters::{Hyperparameters, LikelihoodRows, Priors, join, kernel_columns};
+use super::kernel::inducing_points;
+use super::map_rows::MapRows;
+use super::noise::{Epoch, ReceiverNoise, Whitener};
+use super::posterior::{Gram, Posterior, TangentPrior};
+use super::projective_mean::{Box4, COEFFICIENTS, FOOT_COEFFICIENTS, ProjectiveMean};
+use super::upright_camera::{Parameters, UprightCamera};
+
+/// Rows that hyper-parameters are estimated on at most.
+const MAX_LIKELIHOOD_ROWS: usize = 2_500;
+pub(crate) const MAX_INDUCING: usize = 64;
+const MAX_LIKELIHOOD_INDUCING: usize = 40;
+/// Rows per inducing point, at least.
+const ROWS_PER_INDUCING: usize = 5;
+/// Scale of the sides' coefficients where only the foot counts.
+const NO_SIDES: f64 = 1e-4;
+
+/// What a map is made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Form {
+    /// The foot's homography alone.
+    Homography,
+    /// The same with the geometry that the boxes' heights tell as prior.
+    Upright,
+    /// Homography, sides and Gaussian-process residual.
+    Residual,
+}
+
+impl Form {
+    pub(crate) const fn as_str(self) -> &'static str {
+        match self {
+            Self::Homography => "homography",
+            Self::Upright => "upright_camera",
+            Self::Residual => "residual",
+        }
+    }
+}
+
+/// A map on its way: rows, where it is linearised, and what gross errors have cost each row.
+#[derive(Debug, Clone)]
+pub(crate) struct Draft<'a> {
+    pub(crate) form: Form,
+    pub(crate) rows: &'a MapRows,
+    pub(crate) inputs: &'a [[f64; 4]],
+    pub(crate) mean: ProjectiveMean,
+    pub(crate) inflation_m2: Vec<f64>,
+    /// The camera whose geometry is the foot's prior, and where it is linearised.
+    pub(crate) upright: Option<(&'a UprightCamera, Parameters)>,
+}
+
+/// Columns of the linearised model over all rows.
+pub(crate) struct Columns {
+    pub(crate) tangent: DMatrix<f64>,
+    /// Fixes less what the tangent does not explain, m.
+    pub(crate) labels_m: DMatrix<f64>,
+    pub(crate) phi: DMatrix<f64>,
+    /// Per row, variance that the inducing points leave out, m2.
+    pub(crate) left_out_m2: Vec<f64>,
+}
+
+/// A solved map with everything that leaving groups out needs.
+pub(crate) struct Candidate {
+    pub(crate) form: Form,
+    pub(crate) mean: ProjectiveMean,
+    pub(crate) parameters: Hyperparameters,
+    pub(crate) inducing: Vec<[f64; 4]>,
+    pub(crate) columns: Columns,
+    pub(crate) total: Gram,
+    pub(crate) posterior: Posterior,
+    /// Without each group.
+    pub(crate) without: Vec<Posterior>,
+}
+
+impl Form {
+    /// Gauss-Newton rounds about each set of hyper-parameters.
+    const fn relinearizations(self) -> usize {
+        match self {
+            Self::Homography | Self::Residual => 2,
+            Self::Upright => 8,
+        }
+    }
+}
+
+impl<'a> Draft<'a> {
+    /// The upright camera that boxes, priors and fixes agree on best, of one start per focal length.
+    pub(crate) fn into_upright(
+        self,
+        camera: &'a UprightCamera,
+        parameters: &Hyperparameters,
+    ) -> Option<Self> {
+        let of_start = |start: &Parameters| {
+            let placed = camera.placed(start, &self.mean, &self.rows.boxes, &self.rows.labels_m);
+            let mut draft = Draft { form: Form::Upright, upright: Some((camera, placed)), ..self.clone() };
+            draft.set_coefficients(&camera.coefficients(&placed, &self.mean)?)?;
+            draft.relinearize(parameters)?;
+            let columns = draft.columns(&[], parameters)?;
+            let all: Vec<usize> = (0..self.inputs.len()).collect();
+            let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.inflation_m2);
+            let at = draft.upright.as_ref()?.1;
+            let score = gram.misfit_at(&DVector::from_column_slice(&draft.mean.coefficients))
+                + 2.0 * camera.evidence(&at)?.misfit;
+            score.is_finite().then_some((score, draft))
+        };
+        camera
+            .starts()
+            .iter()
+            .filter_map(of_start)
+            .min_by(|one, other| one.0.total_cmp(&other.0))
+            .map(|(_, draft)| draft)
+    }
+
+    fn set_coefficients(&mut self, foot: &SVector<f64, FOOT_COEFFICIENTS>) -> Option<()> {
+        self.mean.coefficients = [0.0; COEFFICIENTS];
+        self.mean.coefficients[..FOOT_COEFFICIENTS].copy_from_slice(foot.as_slice());
+        self.mean.coefficients.iter().all(|value| value.is_finite()).then_some(())
+    }
+
+    /// Linearises at a solution: at its coefficients, or at the camera that has them to first order.
+    fn move_to(&mut self, solution: &DVector<f64>) -> Option<()> {
+        let Some((camera, at)) = &mut self.upright else {
+            self.mean.coefficients.copy_from_slice(solution.as_slice());
+            return self.mean.coefficients.iter().all(|value| value.is_finite()).then_some(());
+        };
+        let foot = solution.fixed_rows::<FOOT_COEFFICIENTS>(0).into_owned();
+        *at = camera.moved_to(at, &self.mean, &foot)?;
+        let foot = camera.coefficients(at, &self.mean)?;
+        self.set_coefficients(&foot)
+    }
+
+    fn inducing(&self, most: usize) -> Vec<[f64; 4]> {
+        match self.form {
+            Form::Homography | Form::Upright => Vec::new(),
+            Form::Residual => {
+                let count = (self.inputs.len() / ROWS_PER_INDUCING).clamp(4, most);
+                inducing_points(self.inputs, count)
+            }
+        }
+    }
+
+    /// Noise and kernel together, then the kernel alone under noise with a sufficient white part; also the
+    /// noise before.
+    pub(crate) fn estimate(&mut self, priors: &Priors) -> Option<(Hyperparameters, ReceiverNoise)> {
+        let first = self.maximize(&priors.start(), priors, false);
+        self.relinearize(&first)?;
+        let second = self.maximize(&first.with_min_white(), priors, true);
+        self.relinearize(&second)?;
+        Some((second, first.noise))
+    }
+
+    fn maximize(&self, start: &Hyperparameters, priors: &Priors, noise_frozen: bool) -> Hyperparameters {
+        let stride = self.inputs.len().div_ceil(MAX_LIKELIHOOD_ROWS).max(1);
+        let picked: Vec<usize> = (0..self.inputs.len()).step_by(stride).collect();
+        let rows = self.rows.picked(&picked);
+        let (tangent, labels_m) = linearize(&rows, &self.mean);
+        let inputs: Vec<[f64; 4]> = picked.iter().map(|row| self.inputs[*row]).collect();
+        let inflation_m2: Vec<f64> = picked.iter().map(|row| self.inflation_m2[*row]).collect();
+        LikelihoodRows {
+            epochs: &rows.epochs,
+            inputs: &inputs,
+            inducing: &self.inducing(MAX_LIKELIHOOD_INDUCING),
+            tangent: &tangent,
+            labels_m: &labels_m,
+            inflation_m2: &inflation_m2,
+            mean: &self.mean,
+        }
+        .maximize(start, priors, noise_frozen)
+    }
+
+    fn prior(&self, parameters: &Hyperparameters) -> Option<TangentPrior> {
+        let side_scale = if self.form == Form::Residual { parameters.side_scale } else { NO_SIDES };
+        let prior = TangentPrior::independent(&self.mean.prior_variances(side_scale));
+        let Some((camera, at)) = &self.upright else { return Some(prior) };
+        let (mean, precision) = camera.prior_on_coefficients(at, &self.mean)?;
+        Some(prior.with_foot(&mean, &precision))
+    }
+
+    fn columns(&self, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Columns> {
+        let (tangent, labels_m) = linearize(self.rows, &self.mean);
+        let (phi, left_out_m2) = match self.form {
+            Form::Homography | Form::Upright => {
+                (DMatrix::zeros(self.inputs.len(), 0), vec![0.0; self.inputs.len()])
+            }
+            Form::Residual => kernel_columns(self.inputs, inducing, parameters)?,
+        };
+        Some(Columns { tangent, labels_m, phi, left_out_m2 })
+    }
+
+    /// Gauss-Newton steps of the mean, with the weights of rows in gross error found again.
+    pub(crate) fn relinearize(&mut self, parameters: &Hyperparameters) -> Option<()> {
+        let inducing = self.inducing(MAX_INDUCING);
+        for _ in 0..self.form.relinearizations() {
+            let columns = self.columns(&inducing, parameters)?;
+            let all: Vec<usize> = (0..self.inputs.len()).collect();
+            let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.inflation_m2);
+            let posterior = Posterior::new(&gram, &self.prior(parameters)?)?;
+            self.move_to(&posterior.tangent)?;
+            let kernel_m = posterior.kernel.each_ref().map(|weights| &columns.phi * weights);
+            let residuals_m: Vec<[f64; 2]> = self
+                .rows
+                .misses_m(&self.mean)
+                .iter()
+                .enumerate()
+                .map(|(row, miss_m)| [miss_m[0] - kernel_m[0][row], miss_m[1] - kernel_m[1][row]])
+                .collect();
+            let whitener = Whitener::new(&self.rows.epochs, &parameters.noise, &self.inflation_m2);
+            self.inflation_m2 = whitener.inflation_m2(&residuals_m);
+        }
+        Some(())
+    }
+
+    /// The posterior of all rows and without each group.
+    ///
+    /// Groups' Gram matrices add up, so leaving one out is a subtraction; where a target's spells are
+    /// groups of their own, each is whitened on its own.
+    pub(crate) fn solve(self, parameters: &Hyperparameters, grouping: &Grouping) -> Option<Candidate> {
+        let inducing = self.inducing(MAX_INDUCING);
+        let columns = self.columns(&inducing, parameters)?;
+        let prior = self.prior(parameters)?;
+        let of = |rows: &[usize]| columns.gram(rows, &self.rows.epochs, parameters, &self.inflation_m2);
+        let total = of(&(0..self.inputs.len()).collect::<Vec<_>>());
+        let posterior = Posterior::new(&total, &prior)?;
+        let groups: Vec<Gram> = grouping.members().iter().map(|rows| of(rows)).collect();
+        let sum = groups.iter().cloned().reduce(|sum, own| sum.plus(&own))?;
+        let without =
+            groups.iter().map(|own| Posterior::new(&sum.minus(own), &prior)).collect::<Option<_>>()?;
+        let Self { form, mean, .. } = self;
+        Some(Candidate { form, mean, parameters: *parameters, inducing, columns, total, posterior, without })
+    }
+}
+
+impl Columns {
+    /// Gram matrix of some rows, in their order.
+    fn gram(
+        &self,
+        rows: &[usize],
+        epochs: &[Epoch],
+        parameters: &Hyperparameters,
+        inflation_m2: &[f64],
+    ) -> Gram {
+        let own: Vec<Epoch> = rows.iter().map(|row| epochs[*row]).collect();
+        let variances: Vec<f64> =
+            rows.iter().map(|row| self.left_out_m2[*row] + inflation_m2[*row]).collect();
+        let columns = join(&[&self.tangent, &self.phi, &self.labels_m]);
+        let columns = if rows.len() == epochs.len() { columns } else { columns.select_rows(rows) };
+        Gram::new(columns, &Whitener::new(&own, &parameters.noise, &variances))
+    }
+
+    fn slopes(&self, row: usize) -> [[f64; COEFFICIENTS]; 2] {
+        std::array::from_fn(|axis| std::array::from_fn(|at| self.tangent[(row, axis * COEFFICIENTS + at)]))
+    }
+}
+
+impl Candidate {
+    /// A row's fix less its position by a posterior, m, and that position's covariance, m2.
+    pub(crate) fn residual(&self, posterior: &Posterior, row: usize) -> ([f64; 2], [f64; 3]) {
+        let slopes = self.columns.slopes(row);
+        let phi = self.columns.phi.row(row).transpose();
+        let residual_m = [0, 1].map(|axis| {
+            let by_tangent = DVector::from_column_slice(&slopes[axis]).dot(&posterior.tangent);
+            self.columns.labels_m[(row, axis)] - by_tangent - phi.dot(&posterior.kernel[axis])
+        });
+        let [east_m2, cross_m2, north_m2] = posterior.covariance_m2(&slopes, &phi);
+        let left_out_m2 = self.columns.left_out_m2[row];
+        (residual_m, [east_m2 + left_out_m2, cross_m2, north_m2 + left_out_m2])
+    }
+
+    /// Coefficients without each group less their mean, scaled so that the squares of what they move add
+    /// up to the variance to state: the delete-group jackknife, by the share of it that the posterior
+    /// does not state already.
+    pub(crate) fn jackknife(&self) -> (f64, Vec<(DVector<f64>, [DVector<f64>; 2])>) {
+        let count = self.without.len() as f64;
+        let mean = |of: &dyn Fn(&Posterior) -> DVector<f64>| {
+            self.without.iter().map(of).fold(of(&self.posterior) * 0.0, |sum, own| sum + own) / count
+        };
+        let tangent = mean(&|own| own.tangent.clone());
+        let kernel = [mean(&|own| own.kernel[0].clone()), mean(&|own| own.kernel[1].clone())];
+        let scale = ((count - 1.0) / count).max(0.0).sqrt();
+        let mut deviations: Vec<_> = self
+            .without
+            .iter()
+            .map(|own| {
+                let kernel = std::array::from_fn(|axis| (&own.kernel[axis] - &kernel[axis]) * scale);
+                ((&own.tangent - &tangent) * scale, kernel)
+            })
+            .collect();
+        let share = self.jackknife_share(&deviations);
+        for (tangent, kernel) in &mut deviations {
+            *tangent *= share.sqrt();
+            kernel.iter_mut().for_each(|weights| *weights *= share.sqrt());
+        }
+        deviations.retain(|_| share > 0.0);
+        (share, deviations)
+    }
+
+    fn jackknife_share(&self, deviations: &[(DVector<f64>, [DVector<f64>; 2])]) -> f64 {
+        let rows = self.columns.tangent.nrows();
+        let (mut jackknife_m2, mut posterior_m2) = (0.0, 0.0);
+        for row in (0..rows).step_by(rows.div_ceil(200)) {
+            let slopes = self.columns.slopes(row);
+            let phi = self.columns.phi.row(row).transpose();
+            let [east_m2, _, north_m2] = self.posterior.covariance_m2(&slopes, &phi);
+            posterior_m2 += east_m2 + north_m2;
+            for (of_tangent, of_kernel) in deviations {
+                for axis in 0..2 {
+                    let by_tangent = DVector::from_column_slice(&slopes[axis]).dot(of_tangent);
+                    jackknife_m2 += (by_tangent + phi.dot(&of_kernel[axis])).powi(2);
+                }
+            }
+        }
+        (1.0 - posterior_m2 / f64::max(jackknife_m2, 1e-12)).max(0.0)
+    }
+}
+
+/// Tangent columns of both axes, and fixes less what the tangent does not explain, m.
+fn linearize(rows: &MapRows, mean: &ProjectiveMean) -> (DMatrix<f64>, DMatrix<f64>) {
+    let count = rows.boxes.len();
+    let mut tangent = DMatrix::zeros(count, 2 * COEFFICIENTS);
+    let mut labels_m = DMatrix::zeros(count, 2);
+    for row in 0..count {
+        let sides: &Box4 = &rows.boxes[row];
+        let evaluation = mean.evaluate(sides);
+        let slopes = evaluation.tangent();
+        for axis in 0..2 {
+            let mut linear_m = 0.0;
+            for at in 0..COEFFICIENTS {
+                tangent[(row, axis * COEFFICIENTS + at)] = slopes[axis][at];
+                linear_m += slopes[axis][at] * mean.coefficients[at];
+            }
+            labels_m[(row, axis)] =
+                rows.labels_m[row][axis] - mean.centre_m[axis] - evaluation.offset_m[axis] + linear_m;
+        }
+    }
+    (tangent, labels_m)
+}

@@ -1,0 +1,165 @@
+//! From rows to a model: robust start, hyper-parameters, candidates, weights, calibration.
+
+use super::box_plausibility::BoxPlausibility;
+use super::candidate::{Candidate, Draft, Form};
+use super::edge_noise::edge_covariance_px2;
+use super::groups::groups;
+use super::hyperparameters::{Hyperparameters, Priors};
+use super::kernel::InputScales;
+use super::leave_out::{calibrate, weigh};
+use super::map_rows::{MapRows, scatter_m2};
+use super::noise::{Epoch, ReceiverNoise, Whitener};
+use super::predictor::{Map, Predictor, Stated};
+use super::projective_mean::ProjectiveMean;
+use super::sessions::Sessions;
+use super::upright_camera::UprightCamera;
+
+/// Rows that a fit uses at most; more are thinned evenly.
+const MAX_ROWS: usize = 20_000;
+/// A candidate of less weight is left out of the mixture.
+const MIN_WEIGHT: f64 = 0.02;
+
+/// What a fit found out, for people.
+#[derive(Debug, Clone)]
+pub(crate) struct FitReport {
+    pub(crate) parameters: Hyperparameters,
+    /// The receivers' noise as estimated, before its white part was raised.
+    pub(crate) receiver: ReceiverNoise,
+    /// Rows left out as gross errors.
+    pub(crate) gross_errors: usize,
+    /// Groups left out in turn.
+    pub(crate) groups: usize,
+    /// Per candidate: name, weight, and mean squared miss per axis to left-out fixes, m2.
+    pub(crate) candidates: Vec<(&'static str, f64, f64)>,
+    /// Factor on the map's variance by left-out targets.
+    pub(crate) widening: f64,
+    /// How sessions differ, if there are several.
+    pub(crate) sessions: Option<Sessions>,
+    /// Share of the jackknife's variance that is added, per candidate.
+    pub(crate) jackknife_shares: Vec<f64>,
+    /// Degrees of freedom of the radius.
+    pub(crate) freedom: f64,
+    /// Of the mixture: mean squared miss per axis to left-out fixes, m2, and the share of these inside
+    /// the radius that map and receiver state together.
+    pub(crate) held_out_m2: f64,
+    pub(crate) held_out_coverage: f64,
+}
+
+/// What is known beside the rows.
+#[derive(Debug, Clone)]
+pub(crate) struct FitSettings {
+    /// Variance per axis of a bias that all receivers share, which no training row can show, m2.
+    pub(crate) shared_bias_m2: f64,
+    /// Of the bootstrap that weighs the candidates.
+    pub(crate) seed: u64,
+    /// Geometry by the heights of boxes, if the image size is known.
+    pub(crate) upright: Option<UprightCamera>,
+}
+
+/// Fits a model; `None` where the rows determine nothing (not finite, or all alike).
+pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, FitReport)> {
+    let FitSettings { shared_bias_m2, seed, .. } = *settings;
+    let edge_px2 = edge_covariance_px2(&all.epochs, &all.boxes);
+    let thinned = all.thinned(MAX_ROWS);
+    let mut mean = ProjectiveMean::of_rows(&thinned.boxes, &thinned.labels_m);
+    mean.fit_foot(&thinned.boxes, &thinned.labels_m);
+    mean.coefficients.iter().all(|value| value.is_finite()).then_some(())?;
+    let rows = thinned.without_gross_errors(&mean);
+    let input_scales = InputScales::of_rows(&rows.boxes);
+    let inputs: Vec<[f64; 4]> = rows.boxes.iter().map(|sides| input_scales.input(sides)).collect();
+
+    let residuals_m = rows.misses_m(&mean);
+    let scatter_m2 = scatter_m2(&residuals_m).max(1e-6);
+    let white = Whitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
+    let mut draft = Draft {
+        form: Form::Residual,
+        rows: &rows,
+        inputs: &inputs,
+        mean,
+        inflation_m2: white.inflation_m2(&residuals_m),
+        upright: None,
+    };
+    let start = draft.clone();
+    let (parameters, receiver) = draft.estimate(&Priors::new(scatter_m2.sqrt(), start.mean.spread_m))?;
+    let grouping = groups(&rows.epochs);
+    let mut homography = Draft { form: Form::Homography, ..start };
+    homography.relinearize(&parameters)?;
+    let upright =
+        settings.upright.as_ref().and_then(|camera| homography.clone().into_upright(camera, &parameters));
+    let mut candidates = vec![homography.solve(&parameters, &grouping)?];
+    candidates.extend(upright.and_then(|draft| draft.solve(&parameters, &grouping)));
+    candidates.push(draft.solve(&parameters, &grouping)?);
+
+    let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, seed);
+    let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise);
+    let jackknives: Vec<_> = candidates.iter().map(Candidate::jackknife).collect();
+    let kept = weights.iter().map(|weight| if *weight < MIN_WEIGHT { 0.0 } else { *weight });
+    let kept: Vec<f64> = kept.collect();
+    let sum: f64 = kept.iter().sum();
+    let maps = candidates
+        .iter()
+        .zip(&jackknives)
+        .zip(&kept)
+        .filter(|(_, weight)| **weight > 0.0)
+        .map(|((candidate, (_, deviations)), weight)| Map::new(candidate, deviations, weight / sum))
+        .collect::<Option<Vec<Map>>>()?;
+    let stated = Stated {
+        edge_px2,
+        shared_bias_m2,
+        freedom,
+        plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes),
+    };
+    let mut predictor = Predictor::new(maps, input_scales, stated);
+    let kept: Vec<f64> = kept.iter().map(|weight| weight / sum).collect();
+    let extra_m2 = |row: usize| predictor.jackknife_m2(&rows.boxes[row]);
+    let calibration = calibrate(&candidates, &kept, &grouping, &rows, &parameters.noise, &extra_m2);
+    predictor.widening = calibration.widening;
+    let residuals_m: Vec<[f64; 2]> =
+        (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
+    let sessions = Sessions::new(&rows.epochs, &residuals_m, &parameters.noise);
+    let report = FitReport {
+        parameters,
+        receiver,
+        gross_errors: thinned.boxes.len() - rows.boxes.len(),
+        groups: grouping.members().len(),
+        candidates: candidates
+            .iter()
+            .zip(weights.iter().zip(&misses_m2))
+            .map(|(candidate, (weight, miss_m2))| (candidate.form.as_str(), *weight, *miss_m2))
+            .collect(),
+        widening: calibration.widening,
+        sessions,
+        jackknife_shares: jackknives.iter().map(|(share, _)| *share).collect(),
+        freedom,
+        held_out_m2: calibration.miss_m2,
+        held_out_coverage: calibration.coverage,
+    };
+    Some((predictor, report))
+}
+
+fn mixed_residual(candidates: &[Candidate], weights: &[f64], row: usize) -> [f64; 2] {
+    let mut sum_m = [0.0; 2];
+    for (candidate, weight) in candidates.iter().zip(weights).filter(|(_, weight)| **weight > 0.0) {
+        let own_m = candidate.residual(&candidate.posterior, row).0;
+        sum_m = [sum_m[0] + weight * own_m[0], sum_m[1] + weight * own_m[1]];
+    }
+    sum_m
+}
+
+/// Degrees of freedom of the stated variance, by Welch and Satterthwaite: what differs between receivers
+/// has two per receiver beyond the first, what differs within them two per independent fix.
+fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
+    let information = |noise: &ReceiverNoise| {
+        let mut ones = vec![1.0; epochs.len()];
+        Whitener::new(epochs, noise, &vec![0.0; epochs.len()]).apply(&mut ones);
+        ones.iter().map(|one| one * one).sum::<f64>()
+    };
+    let within = ReceiverNoise { session_m2: 0.0, ..*noise };
+    let (of_all, of_within) = (information(noise), information(&within));
+    let between_share = (1.0 - of_all / of_within).clamp(0.0, 1.0);
+    // One or two receivers say nothing of how receivers differ: the prior does, for four degrees.
+    let receivers = epochs.chunk_by(|one, next| one.sequence == next.sequence).count() as f64;
+    let between = (2.0 * (receivers - 1.0)).max(4.0);
+    let within = 2.0 * (within.variance_m2() * of_within - 1.0).max(2.0);
+    1.0 / (between_share.powi(2) / between + (1.0 - between_share).powi(2) / within)
+}

@@ -1,0 +1,32 @@
+//! Recipe `gaussian_process`: a projective mean with a Gaussian-process residual under coloured noise per
+//! receiver, whose stated error counts receivers, not rows.
+//!
+//! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
+//! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
+//! `candidate`, `leave_out`, `sessions`, `fit`; of an answer: `predictor`, `box_plausibility`; `recipe` and
+//! `stored` connect both to the rest of the module. Random starts have a seed of their own.
+
+mod box_plausibility;
+mod candidate;
+mod edge_noise;
+mod f_distribution;
+mod fit;
+mod groups;
+mod hyperparameters;
+mod kernel;
+mod leave_out;
+mod map_rows;
+mod noise;
+mod posterior;
+mod predictor;
+mod projective_mean;
+mod recipe;
+mod sessions;
+mod stored;
+mod upright_camera;
+
+pub use box_plausibility::RecentBoxes;
+pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, target_height_m};
+
+#[cfg(test)]
+mod tests;

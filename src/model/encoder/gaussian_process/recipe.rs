@@ -1,0 +1,217 @@
+//! The recipe `gaussian_process`: from training samples to the parts of a model.
+
+use super::box_plausibility::RecentBoxes;
+use super::fit::{FitReport, FitSettings, fit as fit_map};
+use super::map_rows::MapRows;
+use super::noise::Epoch;
+use super::predictor::Predictor;
+use super::upright_camera::UprightCamera;
+use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, Recipe, TargetClass};
+use crate::geo::EastNorth;
+use crate::model::artifact::ModelParts;
+use crate::model::encoder::FittedEncoder;
+use crate::model::encoder::features::{Encoded, features_of};
+use crate::model::progress::{FitError, Phase};
+use crate::model::samples::rows::TrainingRows;
+
+/// Standard deviation of a bias that all receivers share, as a share of the receiver's standard deviation:
+/// no training sample can show it, so it is a prior.
+const SHARED_BIAS_SHARE: f64 = 0.1;
+/// Median height of a target in m, and the standard deviation of its logarithm, by class; the last is for
+/// all other classes, whose heights only have to agree with each other.
+const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
+    [(&["person", "pedestrian"], (1.70, 0.05)), (&["car"], (1.50, 0.10)), (&[], (1.70, 1.0))];
+
+/// What the recipe is told beside the samples.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Settings {
+    /// Error variance per axis of the receiver, m2.
+    pub(crate) e_gnss_m2: f64,
+    /// Whether that was estimated, and may be replaced by the estimate of this recipe.
+    pub(crate) e_gnss_is_estimated: bool,
+    pub(crate) image_size: Option<ImageSize>,
+    /// Median height of the targets, m, and the standard deviation of its logarithm.
+    pub(crate) target_height_m: (f64, f64),
+    pub(crate) seed: u64,
+}
+
+/// Height of the targets that most samples show.
+pub(crate) fn target_height_m<'a>(classes: impl Iterator<Item = Option<&'a TargetClass>>) -> (f64, f64) {
+    let [person, car, other] = TARGET_HEIGHTS;
+    let (mut counts, mut all) = ([0_usize; 2], 0);
+    for class in classes {
+        all += 1;
+        let Some(class) = class else { continue };
+        for (count, (names, _)) in counts.iter_mut().zip([person, car]) {
+            *count += usize::from(names.contains(&class.as_str()));
+        }
+    }
+    match counts {
+        [persons, _] if 2 * persons > all => person.1,
+        [_, cars] if 2 * cars > all => car.1,
+        _ => other.1,
+    }
+}
+
+/// Fits the recipe to rows.
+///
+/// # Errors
+/// [`FitError::Unusable`] where the rows determine no map.
+pub(crate) fn fit(
+    rows: &TrainingRows,
+    settings: &Settings,
+    phase: &mut Phase<'_, '_>,
+) -> Result<FittedEncoder, FitError> {
+    let map_rows = MapRows {
+        epochs: rows.rows.iter().map(|row| Epoch { time_s: row.time_s, sequence: row.target }).collect(),
+        boxes: rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect(),
+        labels_m: rows.rows.iter().map(|row| [row.label.east_m, row.label.north_m]).collect(),
+    };
+    let boxes: Vec<(u32, [f64; 4])> =
+        rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides)).collect();
+    let upright = settings.image_size.and_then(|size| {
+        let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
+        UprightCamera::new(&boxes, size_px, settings.target_height_m)
+    });
+    let shared_bias_m2 = SHARED_BIAS_SHARE * SHARED_BIAS_SHARE * settings.e_gnss_m2;
+    let fitted = fit_map(&map_rows, &FitSettings { shared_bias_m2, seed: settings.seed, upright });
+    let Some((predictor, report)) = fitted else {
+        return Err(FitError::Unusable(Error::field(
+            ErrorKind::UnusableSamples,
+            "samples",
+            "they determine no map from boxes to positions; let the target walk through the whole picture",
+        )));
+    };
+    if phase.is_final {
+        note(&report, phase)?;
+    }
+    let receiver_m2 = report.receiver.variance_m2();
+    let e_gnss_m2 = if settings.e_gnss_is_estimated { receiver_m2 } else { settings.e_gnss_m2 };
+    let mut parts = ModelParts::new(Recipe::GaussianProcess, rows.plane, predictor.features(), e_gnss_m2);
+    predictor.put(&mut parts);
+    put_report(&report, &mut parts);
+    parts.set("unrest_share", white_share(&predictor, &map_rows));
+    Ok(FittedEncoder { parts, covariance: None })
+}
+
+/// White share of the error variance: what the detector's noise makes of it, over the training boxes.
+fn white_share(predictor: &Predictor, rows: &MapRows) -> f64 {
+    let (mut white_m2, mut all_m2) = (0.0, 0.0);
+    for sides in rows.boxes.iter().step_by(rows.boxes.len().div_ceil(500)) {
+        let prediction = predictor.predict(sides, None);
+        white_m2 += prediction.box_noise_m2;
+        all_m2 += prediction.variance_m2();
+    }
+    (white_m2 / all_m2).clamp(0.0, 1.0)
+}
+
+/// Scalars of the metadata document: the noise of the receivers, the candidates, the calibration.
+fn put_report(report: &FitReport, parts: &mut ModelParts) {
+    let noise = &report.receiver;
+    for (name, value) in [
+        ("receiver_white_m2", noise.white_m2),
+        ("receiver_short_m2", noise.short_m2),
+        ("receiver_short_time_s", noise.short_time_s),
+        ("receiver_session_m2", noise.session_m2),
+        ("receiver_session_time_s", noise.session_time_s),
+        ("residual_m", report.parameters.residual_m),
+        ("residual_length_place", report.parameters.lengths.place),
+        ("residual_length_size", report.parameters.lengths.size),
+        ("gross_errors", report.gross_errors as f64),
+        ("held_out_groups", report.groups as f64),
+        ("held_out_coverage", report.held_out_coverage),
+        ("held_out_m2", report.held_out_m2),
+        ("radius_degrees_of_freedom", report.freedom),
+    ] {
+        parts.set(name, value);
+    }
+    for ((name, weight, miss_m2), jackknife_share) in report.candidates.iter().zip(&report.jackknife_shares) {
+        parts.set(&format!("weight.{name}"), *weight);
+        parts.set(&format!("held_out_m2.{name}"), *miss_m2);
+        parts.set(&format!("jackknife_share.{name}"), *jackknife_share);
+    }
+    if let Some(sessions) = report.sessions {
+        parts.set("sessions", sessions.count as f64);
+        parts.set("between_sessions_m2", sessions.between_m2);
+    }
+}
+
+/// Log lines of the final fit.
+fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
+    let noise = &report.receiver;
+    phase.run.note(&format!(
+        "receivers: {:.2} m white, {:.2} m over {:.0} s, {:.2} m over {:.0} min; {} rows left out as gross errors",
+        noise.white_m2.sqrt(),
+        noise.short_m2.sqrt(),
+        noise.short_time_s,
+        noise.session_m2.sqrt(),
+        noise.session_time_s / 60.0,
+        report.gross_errors
+    ))?;
+    for (name, weight, miss_m2) in &report.candidates {
+        phase.run.note(&format!(
+            "map {name}: weight {weight:.2}; root mean square to the fixes of left-out groups {:.3} m per axis",
+            miss_m2.sqrt()
+        ))?;
+    }
+    phase.run.note(&format!(
+        "{} groups left out in turn: {:.1} % of their fixes inside the stated radius; map variance widened by {:.2}",
+        report.groups,
+        100.0 * report.held_out_coverage,
+        report.widening
+    ))?;
+    match report.sessions {
+        Some(sessions) if sessions.between_m2 > noise.white_m2 + noise.short_m2 / 4.0 => phase.run.note(&format!(
+            "{} sessions disagree by {:.1} m: one more session on another day would help",
+            sessions.count,
+            (2.0 * sessions.between_m2).sqrt() * std::f64::consts::SQRT_2
+        )),
+        None => phase.run.note(
+            "one session only: a bias that the receivers keep for all of it is a prior; a session on another day \
+             would measure it",
+        ),
+        Some(_) => Ok(()),
+    }
+}
+
+/// The encoder of a loaded model.
+#[derive(Debug, Clone)]
+pub(crate) struct GaussianProcessEncoder(Predictor);
+
+/// Position, error and reconstruction of a box.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Estimate {
+    pub(crate) encoded: Encoded,
+    /// Mean error variance per axis, m2.
+    pub(crate) variance_m2: f64,
+    /// Radius of 95 % in standard deviations.
+    pub(crate) r95_scale: f64,
+}
+
+impl GaussianProcessEncoder {
+    /// # Errors
+    /// Names the tensor or scalar that is missing or cannot be used.
+    pub(crate) fn build(parts: &mut ModelParts) -> crate::domain::Result<Self> {
+        Predictor::take(parts).map(Self)
+    }
+
+    /// Position and error of a box. `recent` holds the earlier boxes of its target, and takes this one in.
+    #[inline]
+    pub(crate) fn estimate(&self, bounding_box: &BoundingBox, recent: Option<&mut RecentBoxes>) -> Estimate {
+        let sides = features_of(bounding_box);
+        let recent = recent.map(|recent| {
+            recent.push(&self.0.plausibility.deviation(&sides, None));
+            &*recent
+        });
+        let prediction = self.0.predict(&sides, recent);
+        let [east_m, north_m] = prediction.position_m;
+        Estimate {
+            encoded: Encoded {
+                position: EastNorth { east_m, north_m },
+                reconstruction_px: self.0.reconstruct(&sides, &prediction.deviation),
+            },
+            variance_m2: prediction.variance_m2(),
+            r95_scale: prediction.r95_scale,
+        }
+    }
+}

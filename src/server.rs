@@ -92,7 +92,7 @@ impl Server {
         let pipeline = Arc::new(RequestPipeline::new(app.clone(), hosts, &shutdown));
         connection::accept(listener, pipeline, &config.limits, &shutdown).await;
         tracing::info!("shutting down");
-        if !shutdown.finish(config.limits.drain_time()).await {
+        if !shutdown.drain_with_timeout(config.limits.drain_time()).await {
             tracing::warn!("requests that did not end within limits.drain_s were dropped");
         }
         app.close().await;
@@ -104,7 +104,7 @@ impl Server {
 async fn maintenance_loop(app: App, shutdown: Shutdown) {
     loop {
         tokio::select! {
-            () = shutdown.begun() => return,
+            () = shutdown.draining() => return,
             () = tokio::time::sleep(REFRESH_EVERY) => {}
         }
         app.metrics.upkeep();

@@ -1,4 +1,4 @@
-//! The end of a server, in two steps: first no new work, then no work at all.
+//! Shutdown in two steps: draining (no new work), then forced (no work at all).
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,62 +9,62 @@ use tokio_util::task::TaskTracker;
 /// Time for tasks to drop what they do, before they are left behind.
 const FORCED_TIME: Duration = Duration::from_secs(1);
 
-/// Handed to everything that runs for long. Clones speak of the same end.
+/// Handed to everything that runs for long. Clones share one state.
 ///
 /// One pointer: handlers clone it with every request, and each clone of a token takes its lock.
 #[derive(Clone, Default)]
-pub struct Shutdown(Arc<Tokens>);
+pub struct Shutdown(Arc<State>);
 
 #[derive(Default)]
-struct Tokens {
-    soft: CancellationToken,
-    hard: CancellationToken,
+struct State {
+    draining: CancellationToken,
+    forced: CancellationToken,
     tasks: TaskTracker,
 }
 
 impl Shutdown {
-    /// Nothing has ended yet.
+    /// A server that runs.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Asks for the end: accept nothing new, end streams and runs in order.
-    pub fn begin(&self) {
-        self.0.soft.cancel();
+    /// Starts to drain: accept nothing new, end streams and runs in order.
+    pub fn drain(&self) {
+        self.0.draining.cancel();
     }
 
-    /// Whether the end was asked for.
+    /// Whether the drain has started.
     #[must_use]
-    pub fn has_begun(&self) -> bool {
-        self.0.soft.is_cancelled()
+    pub fn is_draining(&self) -> bool {
+        self.0.draining.is_cancelled()
     }
 
-    /// Waits until the end is asked for.
-    pub async fn begun(&self) {
-        self.0.soft.cancelled().await;
+    /// Waits until the drain starts.
+    pub async fn draining(&self) {
+        self.0.draining.cancelled().await;
     }
 
-    /// Waits until the time to end in order is over.
-    pub async fn overdue(&self) {
-        self.0.hard.cancelled().await;
+    /// Waits until the time to drain is over.
+    pub async fn forced(&self) {
+        self.0.forced.cancelled().await;
     }
 
-    /// Runs a task that the end waits for.
+    /// Runs a task that the drain waits for.
     pub fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) {
         self.0.tasks.spawn(task);
     }
 
-    /// Waits until every task has ended, `timeout` at most; in the last part of it the tasks are
-    /// asked to drop what they do. Whether all of them ended before that.
-    pub async fn finish(&self, timeout: Duration) -> bool {
-        self.0.soft.cancel();
+    /// Drains, for at most `timeout`: waits until every task has ended; in the last part of the time
+    /// tasks are asked to drop what they do. Whether all of them ended before that.
+    pub async fn drain_with_timeout(&self, timeout: Duration) -> bool {
+        self.drain();
         self.0.tasks.close();
         let forced_time = FORCED_TIME.min(timeout / 2);
         if tokio::time::timeout(timeout - forced_time, self.0.tasks.wait()).await.is_ok() {
             return true;
         }
-        self.0.hard.cancel();
+        self.0.forced.cancel();
         // A task that ignores even this is left behind: the process ends anyway.
         let _ = tokio::time::timeout(forced_time, self.0.tasks.wait()).await;
         false

@@ -71,7 +71,7 @@ impl Served {
     }
 
     pub(crate) fn end(&self) {
-        self.shutdown.begin();
+        self.shutdown.drain();
     }
 }
 

@@ -44,7 +44,7 @@ impl Serve {
             let serving = tokio::spawn(server.run());
             let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
             if shown.is_err() {
-                shutdown.begin();
+                shutdown.drain();
             }
             serving.await.context("the server task panicked")??;
             shown
@@ -55,7 +55,7 @@ impl Serve {
 /// Shuts the server down at the first SIGINT or SIGTERM; a second one exits immediately.
 async fn shut_down_on_signal(shutdown: Shutdown) {
     wait_for_signal().await;
-    shutdown.begin();
+    shutdown.drain();
     wait_for_signal().await;
     std::process::exit(130);
 }

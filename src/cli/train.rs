@@ -75,6 +75,6 @@ pub(super) async fn train(
         progress.set((*epoch).into(), (*epochs).into(), &format!("{phase}, Es {error_scale:.3}{remaining}"));
     }
     progress.finish();
-    shutdown.finish(settings.limits.drain_time()).await;
+    shutdown.drain_with_timeout(settings.limits.drain_time()).await;
     Ok(latest)
 }

@@ -48,7 +48,7 @@ where
 
     fn call(&mut self, request: Request<Body>) -> S::Future {
         let shutdown = self.shutdown.clone();
-        let drained = async move { shutdown.begun().await }.boxed().fuse();
+        let drained = async move { shutdown.draining().await }.boxed().fuse();
         self.service.call(request.map(|body| Body::new(CancellableBody { body, drained })))
     }
 }

@@ -113,7 +113,7 @@ fn health(shutdown: &Shutdown) -> tonic_health::pb::health_server::HealthServer<
     let service = HealthService::from_health_reporter(reporter.clone());
     let ending = shutdown.clone();
     shutdown.spawn(async move {
-        ending.begun().await;
+        ending.draining().await;
         for name in HEALTHY {
             reporter.set_service_status(name, ServingStatus::NotServing).await;
             reporter.clear_service_status(name).await;

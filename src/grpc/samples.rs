@@ -114,7 +114,7 @@ impl Batches {
         tokio::select! {
             // First, so that a client whose backlog never ends cannot hold the server up.
             biased;
-            () = self.shutdown.begun() => Err(Error::refused(
+            () = self.shutdown.draining() => Err(Error::refused(
                 ErrorKind::ShuttingDown,
                 "the server is ending; send the samples again, those that are stored count as duplicates",
             )),

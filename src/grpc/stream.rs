@@ -89,7 +89,7 @@ impl StreamSession {
         // Also while an item waits for the database.
         let stop = tokio::select! {
             stop = self.answer_items(&mut stream, idle_limit) => stop?,
-            () = shutdown.overdue() => return Err(ending()),
+            () = shutdown.forced() => return Err(ending()),
         };
         if matches!(stop, StopReason::ReaderGone) {
             return Ok(());
@@ -97,14 +97,14 @@ impl StreamSession {
         let settled = tokio::select! {
             settled = stream.settle() => settled,
             error = stream.deleted() => Err(error),
-            () = self.shutdown.overdue() => Err(ending()),
+            () = self.shutdown.forced() => Err(ending()),
         };
         // What is settled is acknowledged even where the rest could not be.
         if let Ok(Some(acknowledgement)) = stream.acknowledgement() {
             self.outbox.acknowledge(acknowledgement.into());
         }
         settled?;
-        if self.shutdown.has_begun() { Err(ending()) } else { Ok(()) }
+        if self.shutdown.is_draining() { Err(ending()) } else { Ok(()) }
     }
 
     /// Reads the first message.
@@ -112,7 +112,7 @@ impl StreamSession {
         let patience = self.app.limits.header_time();
         let first = tokio::select! {
             first = tokio::time::timeout(patience, self.requests.message()) => first,
-            () = self.shutdown.begun() => return Err(ending()),
+            () = self.shutdown.draining() => return Err(ending()),
         };
         let first = first.map_err(|_| {
             let message = format!("no opening message came within {} s", patience.as_secs());
@@ -150,7 +150,7 @@ impl StreamSession {
             tokio::select! {
                 biased;
                 error = stream.deleted() => return Err(error),
-                () = self.shutdown.begun(), if clock.reconnect_sent_at.is_none() => {
+                () = self.shutdown.draining(), if clock.reconnect_sent_at.is_none() => {
                     self.outbox.reconnect("the server is ending; reconnect to continue the stream");
                     clock.reconnect_sent_at = Some(Instant::now());
                 }

@@ -157,7 +157,7 @@ fn changes(
             let next = tokio::select! {
                 biased;
                 next = runs.next() => next?,
-                () = shutdown.begun() => Err(ending()),
+                () = shutdown.draining() => Err(ending()),
             };
             Some(match next {
                 Ok(run) => {

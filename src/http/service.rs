@@ -45,7 +45,7 @@ const NAMED_CAMERAS: usize = 100;
     )
 )]
 async fn readyz(State(rest): State<Rest>) -> ApiResult<String> {
-    if rest.shutdown.has_begun() {
+    if rest.shutdown.is_draining() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }
     match tokio::time::timeout(PING_TIME, rest.app.store.ping()).await {

@@ -295,7 +295,7 @@ async fn watch_camera(
         };
         Some((event, events))
     });
-    let sent = sent.take_until(async move { shutdown.begun().await }).map(move |event| {
+    let sent = sent.take_until(async move { shutdown.draining().await }).map(move |event| {
         let _held = &lease; // until the stream is dropped
         Ok::<_, Infallible>(event)
     });

@@ -253,7 +253,7 @@ async fn watch_training_run(
     let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
     let changes = rest.app.watch_run(&id, run).await?;
     let shutdown = rest.shutdown.clone();
-    let events = changes.take_until(async move { shutdown.begun().await }).map(move |change| {
+    let events = changes.take_until(async move { shutdown.draining().await }).map(move |change| {
         let _held = &lease; // until the stream is dropped
         Ok(event_of(change))
     });

@@ -66,7 +66,7 @@ pub(super) async fn accept(
     let excess = Quota::new("connections", EXCESS_CONNECTIONS, limits.client_share);
     loop {
         let (stream, address) = tokio::select! {
-            () = shutdown.begun() => return,
+            () = shutdown.draining() => return,
             accepted = listener.accept() => match accepted {
                 Ok(accepted) => accepted,
                 Err(error) => {
@@ -142,11 +142,11 @@ impl ConnectionServer {
             tokio::select! {
                 // A connection that breaks is the client's affair.
                 _ = connection.as_mut() => break closing.reason,
-                () = self.shutdown.begun(), if !is_draining => {
+                () = self.shutdown.draining(), if !is_draining => {
                     connection.as_mut().graceful_shutdown();
                     is_draining = true;
                 }
-                () = self.shutdown.overdue() => {
+                () = self.shutdown.forced() => {
                     let _ = tokio::time::timeout(LAST_BYTES_TIME, connection.as_mut()).await;
                     break Some(CloseReason::Shutdown);
                 }

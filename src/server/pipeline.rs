@@ -188,7 +188,7 @@ impl RequestPipeline {
         let answer = tokio::select! {
             biased;
             answer = tokio::time::timeout(time, transport.call(request)) => answer.map_err(|_| too_slow(time)),
-            () = self.shutdown.overdue() => Err(shutting_down()),
+            () = self.shutdown.forced() => Err(shutting_down()),
         };
         ticket.end_work();
         let refusal = ticket.refusal().get().filter(|_| !reports_refusal);

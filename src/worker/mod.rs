@@ -109,7 +109,7 @@ async fn work<J: Job>(app: App, settings: Workers, shutdown: Shutdown) {
     let lease = Duration::from_secs(settings.lease_s.into());
     loop {
         let slot = tokio::select! {
-            () = shutdown.begun() => return,
+            () = shutdown.draining() => return,
             slot = slots.clone().acquire_owned() => slot.expect("the semaphore is never closed"),
         };
         match J::claim(&app, lease).await {
@@ -126,7 +126,7 @@ async fn work<J: Job>(app: App, settings: Workers, shutdown: Shutdown) {
         }
         drop(slot);
         tokio::select! {
-            () = shutdown.begun() => return,
+            () = shutdown.draining() => return,
             () = J::queue(&app).queued() => {}
             () = tokio::time::sleep(POLL_INTERVAL) => {}
         }
@@ -184,7 +184,7 @@ async fn run_attempt<J: Job>(
         tokio::select! {
             () = thread.ended() => break,
             () = tokio::time::sleep(every) => {}
-            () = shutdown.begun(), if !shutting_down => {
+            () = shutdown.draining(), if !shutting_down => {
                 shutting_down = true;
                 thread.cancel();
             }

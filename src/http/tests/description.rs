@@ -103,7 +103,7 @@ async fn the_service_tells_how_it_is() {
     rest.get("/readyz").await.expect(200);
     let metrics = rest.get("/metrics").await.expect(200);
     assert!(metrics.text().contains("sightfix_fusions_total"), "{}", metrics.text());
-    rest.shutdown.begin();
+    rest.shutdown.drain();
     rest.get("/readyz").await.problem(503, "shutting-down");
     rest.get("/livez").await.expect(200);
 }

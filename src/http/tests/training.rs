@@ -67,7 +67,7 @@ async fn watching_has_few_places_and_ends_with_the_server() {
     assert_eq!(second.header("retry-after"), "1");
     second.problem(503, "overloaded");
 
-    rest.shutdown.begin();
+    rest.shutdown.drain();
     assert!(first.body_mut().frame().await.is_none(), "the stream ends with the server");
     drop(first);
     rest.get(&events).await.expect(200);

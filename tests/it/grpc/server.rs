@@ -70,7 +70,7 @@ impl Server {
     }
 
     pub(super) fn begin_shutdown(&self) {
-        self.shutdown.begin();
+        self.shutdown.drain();
     }
 
     pub(super) fn cameras(&self) -> CameraServiceClient<Channel> {
@@ -217,7 +217,7 @@ async fn health_is_serving_until_the_end_begins() {
     let mut watched = client.watch(request).await.expect("a stream").into_inner();
     let first = watched.message().await.expect("in order").expect("the state now");
     assert_eq!(first.status(), ServingStatus::Serving);
-    server.shutdown.begin();
+    server.shutdown.drain();
     let last = watched.message().await.expect("in order").expect("a change");
     assert_eq!(last.status(), ServingStatus::NotServing);
     assert!(watched.message().await.expect("in order").is_none());
@@ -230,7 +230,7 @@ async fn open_streams_end_with_the_server() {
     let reflection =
         ServerReflectionClient::new(server.channel.clone()).server_reflection_info(pending()).await;
     let mut reflection = reflection.expect("a stream").into_inner();
-    server.shutdown.begin();
+    server.shutdown.drain();
     let ended = tokio::time::timeout(Duration::from_secs(20), reflection.message()).await;
     assert!(ended.expect("it ends").expect("in order").is_none());
 }
@@ -249,7 +249,7 @@ async fn a_watched_run_is_followed_to_the_end_of_the_run_or_of_the_server() {
     let mut watched = training.watch_training_run(watch.clone()).await.expect("a stream").into_inner();
     let first = watched.message().await.expect("in order").expect("the run now").run;
     assert_eq!(first, Some(run.clone()));
-    server.shutdown.begin();
+    server.shutdown.drain();
     let status = watched.message().await.expect_err("the server ends");
     told(&status, Code::Unavailable, "shutting-down");
 

@@ -1,9 +1,11 @@
 //! Time and randomness as values that are passed as parameters, so that tests and training runs can be
-//! repeated exactly.
+//! repeated exactly. Ages and time-outs are differences of [`Clock::monotonic`], which no correction of the
+//! wall clock changes.
 //!
 //! This is the only module that reads the wall clock, CPU time or the operating system's randomness.
 
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use rand::{Rng, SeedableRng};
@@ -13,25 +15,41 @@ use uuid::Uuid;
 
 /// A source of the current time.
 #[derive(Clone)]
-pub struct Clock(Arc<dyn Fn() -> Timestamp + Send + Sync>);
+pub struct Clock {
+    wall: Arc<dyn Fn() -> Timestamp + Send + Sync>,
+    monotonic: Arc<dyn Fn() -> Duration + Send + Sync>,
+}
 
 impl Clock {
-    /// The operating system's clock.
+    /// The operating system's clocks.
     #[must_use]
     pub fn system() -> Self {
         #[expect(clippy::disallowed_methods, reason = "the one place that reads the wall clock")]
-        Self(Arc::new(Timestamp::now))
+        Self::from_fn(Timestamp::now)
     }
 
-    /// A clock that the caller drives.
-    pub fn from_fn(now: impl Fn() -> Timestamp + Send + Sync + 'static) -> Self {
-        Self(Arc::new(now))
+    /// A wall clock that the caller drives, beside the system's monotonic clock.
+    pub fn from_fn(wall: impl Fn() -> Timestamp + Send + Sync + 'static) -> Self {
+        let started = Instant::now();
+        Self { wall: Arc::new(wall), monotonic: Arc::new(move || started.elapsed()) }
     }
 
-    /// The current time.
+    /// The same wall clock beside a monotonic clock that the caller drives.
+    #[must_use]
+    pub fn with_monotonic(self, monotonic: impl Fn() -> Duration + Send + Sync + 'static) -> Self {
+        Self { monotonic: Arc::new(monotonic), ..self }
+    }
+
+    /// The wall clock's time now. It may jump.
     #[must_use]
     pub fn now(&self) -> Timestamp {
-        (self.0)()
+        (self.wall)()
+    }
+
+    /// Time since the clock was made. It never jumps and never goes back.
+    #[must_use]
+    pub fn monotonic(&self) -> Duration {
+        (self.monotonic)()
     }
 }
 

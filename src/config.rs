@@ -11,17 +11,20 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// Folder of the database, made at the first start.
+    /// Folder of the database, created at the first start.
     pub data: PathBuf,
     /// Address of the one port for REST and gRPC.
     pub listen: SocketAddr,
+    /// Host names under which clients reach the server besides its addresses, each with or without a
+    /// port; `*` accepts every name.
+    pub allowed_hosts: Vec<String>,
     /// `text` or `json` lines in the log.
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
     pub log_filter: String,
-    /// Who fits training runs.
+    /// Workers of training runs.
     pub training: Workers,
-    /// Who carries out evaluations.
+    /// Workers of evaluations.
     pub evaluation: Workers,
     /// What an outside client may make large.
     pub limits: Limits,
@@ -43,7 +46,7 @@ pub enum LogFormat {
 pub struct Workers {
     /// Jobs carried out at the same time, each on a thread of its own at the lowest priority.
     pub workers: usize,
-    /// Seconds after which the job of a silent worker is taken up by another.
+    /// Seconds after which another worker claims the job of a silent one.
     pub lease_s: u32,
 }
 
@@ -57,6 +60,14 @@ pub struct Limits {
     pub import_bytes: usize,
     /// Bytes of an import held in memory before it goes to a temporary file.
     pub import_memory_bytes: usize,
+    /// Bytes of all imports held in memory; beyond, they go to temporary files at once.
+    pub spool_memory_bytes: usize,
+    /// Bytes of all imports in temporary files.
+    pub spool_disk_bytes: usize,
+    /// Client-streamed imports at a time.
+    pub import_streams: usize,
+    /// Bytes of all requests under way: their bodies, and 16 KiB each.
+    pub request_memory_bytes: usize,
     /// Bytes of one gRPC message.
     pub message_bytes: usize,
     /// Observations in one fusion request.
@@ -67,33 +78,47 @@ pub struct Limits {
     pub pairing_rows: usize,
     /// Imports in two parts that are paired at the same time; more wait.
     pub pairings: usize,
-    /// Rejected rows of an import that are told one by one.
+    /// Rejected rows of an import that are reported one by one.
     pub rejected_rows: usize,
     /// Bytes of a request's headers.
     pub header_bytes: u32,
     /// Seconds to send a request's headers.
     pub header_s: u64,
-    /// Seconds between two pieces of a body, or without a ping's answer.
+    /// Seconds after which a connection without a request, or whose client takes nothing of what is
+    /// written, is closed; also the interval of HTTP/2 pings.
     pub idle_s: u64,
+    /// Seconds over which the least rate of a body is measured.
+    pub body_grace_s: u64,
+    /// Least bytes per second of a body, and of a response that the client takes slowly.
+    pub body_bytes_per_s: u64,
+    /// HTTP/2 frames per second and connection that carry neither headers nor data.
+    pub control_frames_per_s: u32,
     /// Seconds that a request may take, its body included, until its answer begins.
     pub request_s: u64,
     /// Open connections.
     pub connections: usize,
     /// Streams per HTTP/2 connection.
     pub streams_per_connection: u32,
-    /// Requests in flight.
+    /// Requests worked on at a time; one counts from the end of its body to the begin of its answer.
     pub requests: usize,
+    /// How many of `requests` are reserved for fusions.
+    pub reserved_requests: usize,
+    /// Share of each limit on connections, requests, streams and bytes that one client address may
+    /// hold, above 0 and up to 1.
+    pub client_share: f64,
     /// Event streams open at a time.
     pub event_streams: usize,
     /// Targets followed at a time, per camera.
     pub tracks_per_camera: usize,
     /// Points of a target's track that are kept, half a second or more apart.
     pub track_points: usize,
+    /// Seconds that the time of a live item may be ahead of the server's clock; beyond, it is refused.
+    pub live_ahead_s: u32,
     /// Live streams open at a time.
     pub live_streams: usize,
     /// Live streams open at a time under one client name.
     pub live_streams_per_client: usize,
-    /// Answers of a live stream that wait for a slow reader; beyond, the oldest are lost.
+    /// Answers of a live stream that wait for a slow reader; beyond that the oldest are dropped.
     pub live_answers: usize,
     /// Seconds after which a live stream without an item is ended.
     pub live_idle_s: u64,
@@ -103,6 +128,9 @@ pub struct Limits {
     pub live_runs: u32,
     /// Passes of one training run.
     pub epochs: u32,
+    /// Seconds until a retraining after a camera was moved is tried again, if it could not start, failed or
+    /// was not promoted; doubled with each attempt, up to 64 times as long.
+    pub retrain_pause_s: u32,
     /// Samples of one training run; the latest are taken.
     pub samples_per_run: u32,
     /// Evaluations that have not ended, over all cameras.
@@ -129,7 +157,7 @@ pub struct Limits {
     pub database_bytes: u64,
     /// Bytes on the disk that are reserved for deletions when it is full; 0 reserves none.
     pub reserve_bytes: u64,
-    /// Seconds that open requests get when the server ends.
+    /// Seconds in which a server that shuts down ends its open requests and streams.
     pub drain_s: u64,
 }
 
@@ -138,6 +166,7 @@ impl Default for Config {
         Self {
             data: PathBuf::from("data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            allowed_hosts: Vec::new(),
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
             training: Workers::default(),
@@ -159,6 +188,10 @@ impl Default for Limits {
             body_bytes: 1 << 20,
             import_bytes: 64 << 20,
             import_memory_bytes: 4 << 20,
+            spool_memory_bytes: 128 << 20,
+            spool_disk_bytes: 1 << 30,
+            import_streams: 64,
+            request_memory_bytes: 256 << 20,
             message_bytes: 4 << 20,
             batch_observations: 1_000,
             page_items: 1_000,
@@ -168,13 +201,19 @@ impl Default for Limits {
             header_bytes: 32 << 10,
             header_s: 10,
             idle_s: 30,
+            body_grace_s: 20,
+            body_bytes_per_s: 500,
+            control_frames_per_s: 10_000,
             request_s: 300,
             connections: 10_000,
             streams_per_connection: 256,
             requests: 1_024,
+            reserved_requests: 256,
+            client_share: 0.5,
             event_streams: 256,
             tracks_per_camera: 256,
             track_points: 240,
+            live_ahead_s: 5,
             live_streams: 2_048,
             live_streams_per_client: 64,
             live_answers: 256,
@@ -182,6 +221,7 @@ impl Default for Limits {
             live_age_s: 3_600,
             live_runs: 256,
             epochs: 10_000,
+            retrain_pause_s: 15,
             samples_per_run: 100_000,
             live_evaluations: 64,
             evaluation_seeds: 20,
@@ -195,7 +235,7 @@ impl Default for Limits {
             ended_evaluations: 1_000,
             database_bytes: 0,
             reserve_bytes: 32 << 20,
-            drain_s: 10,
+            drain_s: 8,
         }
     }
 }
@@ -207,10 +247,22 @@ impl Limits {
         Duration::from_secs(self.header_s)
     }
 
-    /// Time between two pieces of a body.
+    /// Time without a request, or without progress of a write, after which a connection is closed.
     #[must_use]
     pub const fn idle_time(&self) -> Duration {
         Duration::from_secs(self.idle_s)
+    }
+
+    /// Time over which the least rate of a body is measured.
+    #[must_use]
+    pub const fn body_grace(&self) -> Duration {
+        Duration::from_secs(self.body_grace_s)
+    }
+
+    /// Time in which a server that shuts down ends its open requests and streams.
+    #[must_use]
+    pub const fn drain_time(&self) -> Duration {
+        Duration::from_secs(self.drain_s)
     }
 }
 
@@ -239,6 +291,8 @@ impl Config {
         let environment = config::Environment::with_prefix("SIGHTFIX")
             .prefix_separator("_")
             .separator("__")
+            .list_separator(",")
+            .with_list_parse_key("allowed_hosts")
             .try_parsing(true);
         let mut loaded: Self = config::Config::builder()
             .add_source(source)
@@ -257,7 +311,25 @@ impl Config {
     }
 
     fn check(&self) -> anyhow::Result<()> {
-        anyhow::ensure!(self.limits.pairings >= 1, "limits.pairings must be at least 1");
+        let limits = &self.limits;
+        anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
+        anyhow::ensure!(
+            limits.reserved_requests < limits.requests,
+            "limits.reserved_requests must be below limits.requests"
+        );
+        anyhow::ensure!(
+            limits.client_share > 0.0 && limits.client_share <= 1.0,
+            "limits.client_share must be above 0 and at most 1"
+        );
+        for (name, seconds) in [
+            ("header_s", limits.header_s),
+            ("idle_s", limits.idle_s),
+            ("body_grace_s", limits.body_grace_s),
+            ("drain_s", limits.drain_s),
+        ] {
+            anyhow::ensure!(seconds >= 1, "limits.{name} must be at least 1");
+        }
+        anyhow::ensure!(limits.control_frames_per_s >= 1, "limits.control_frames_per_s must be at least 1");
         for (name, workers) in [("training", &self.training), ("evaluation", &self.evaluation)] {
             anyhow::ensure!(workers.workers >= 1, "{name}.workers must be at least 1");
             anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");

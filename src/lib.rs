@@ -1,6 +1,7 @@
 //! sightfix estimates the positions of targets from the bounding boxes of an uncalibrated fixed camera
 //! and from GNSS fixes. `docs/architecture.md` describes the structure of this crate.
 
+pub mod admission;
 pub mod app;
 pub mod cli;
 pub mod clock;

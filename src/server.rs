@@ -1,10 +1,15 @@
 //! The composition root: settings -> store -> app -> one listener for REST and gRPC.
 //!
 //! A request enters here once, whatever its transport: it gets its id, its span, its place among
-//! the requests in flight and its time, then goes to `http` or `grpc` by its content type.
+//! the requests at work and its deadline, then goes to `http` or `grpc` by its content type.
 
+mod activity;
 mod connection;
-mod entrance;
+mod frame_limit;
+mod guarded_stream;
+mod host_check;
+mod pipeline;
+mod request_body;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -21,7 +26,8 @@ use crate::store::{Store, StoreOptions};
 use crate::telemetry::Metrics;
 use crate::worker;
 
-use entrance::Entrance;
+use host_check::HostCheck;
+use pipeline::RequestPipeline;
 
 /// How often metrics are gathered, and the registry looks for what another process on the same file
 /// has changed.
@@ -45,9 +51,9 @@ impl Server {
         let store = Store::open_with(&config.data, options)
             .await
             .with_context(|| format!("cannot open the data folder {}", config.data.display()))?;
+        store.log_newcomers();
         let app = App::new(store, clock, randomness, config.limits.clone(), Metrics::new()).await?;
-        let listener = TcpListener::bind(config.listen)
-            .await
+        let listener = connection::listen(config.listen)
             .with_context(|| format!("cannot listen on {}", config.listen))?;
         Ok(Self { config, app, listener, shutdown: Shutdown::new() })
     }
@@ -55,7 +61,7 @@ impl Server {
     /// The address that was taken; with port 0 in the settings, the system's choice.
     ///
     /// # Errors
-    /// The system does not tell.
+    /// The system does not report it.
     pub fn address(&self) -> std::io::Result<SocketAddr> {
         self.listener.local_addr()
     }
@@ -66,34 +72,36 @@ impl Server {
         &self.app
     }
 
-    /// Ends the server when told to.
+    /// Shuts the server down when it is asked to.
     #[must_use]
     pub fn shutdown(&self) -> Shutdown {
         self.shutdown.clone()
     }
 
-    /// Answers until the shutdown begins, then ends in order: no new connections, streams ended,
-    /// runs put back, requests finished, store closed.
+    /// Answers until it is asked to shut down, then drains: no new connections, streams ended, runs put
+    /// back, requests finished, store closed.
     ///
     /// # Errors
-    /// Requests that did not end within their time.
+    /// The system does not report the address.
     pub async fn run(self) -> anyhow::Result<()> {
         let Self { config, app, listener, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
-        shutdown.spawn(keep_up(app.clone(), shutdown.clone()));
-        let entrance = Arc::new(Entrance::new(app.clone(), &shutdown));
-        connection::accept(listener, entrance, &config.limits, &shutdown).await;
-        tracing::info!("ending");
-        let in_order = shutdown.finish(Duration::from_secs(config.limits.drain_s)).await;
-        app.store.close().await;
-        anyhow::ensure!(in_order, "some requests did not end in time and were dropped");
-        tracing::info!("ended");
+        shutdown.spawn(maintenance_loop(app.clone(), shutdown.clone()));
+        let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
+        let pipeline = Arc::new(RequestPipeline::new(app.clone(), hosts, &shutdown));
+        connection::accept(listener, pipeline, &config.limits, &shutdown).await;
+        tracing::info!("shutting down");
+        if !shutdown.finish(config.limits.drain_time()).await {
+            tracing::warn!("requests that did not end within limits.drain_s were dropped");
+        }
+        app.close().await;
+        tracing::info!("shut down");
         Ok(())
     }
 }
 
-async fn keep_up(app: App, shutdown: Shutdown) {
+async fn maintenance_loop(app: App, shutdown: Shutdown) {
     loop {
         tokio::select! {
             () = shutdown.begun() => return,
@@ -108,7 +116,7 @@ async fn keep_up(app: App, shutdown: Shutdown) {
             tracing::error!(%error, "cannot look for changed cameras");
         }
         if let Err(error) = app.retrain_moved().await {
-            tracing::error!(%error, "cannot train moved cameras anew");
+            tracing::error!(%error, "cannot retrain moved cameras");
         }
     }
 }

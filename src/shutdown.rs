@@ -6,6 +6,9 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+/// Time for tasks to drop what they do, before they are left behind.
+const FORCED_TIME: Duration = Duration::from_secs(1);
+
 /// Handed to everything that runs for long. Clones speak of the same end.
 ///
 /// One pointer: handlers clone it with every request, and each clone of a token takes its lock.
@@ -52,17 +55,18 @@ impl Shutdown {
         self.0.tasks.spawn(task);
     }
 
-    /// Waits until every task has ended; after `patience` they are told to drop what they do.
-    /// Says whether all of them ended in order.
-    pub async fn finish(&self, patience: Duration) -> bool {
+    /// Waits until every task has ended, `timeout` at most; in the last part of it the tasks are
+    /// asked to drop what they do. Whether all of them ended before that.
+    pub async fn finish(&self, timeout: Duration) -> bool {
         self.0.soft.cancel();
         self.0.tasks.close();
-        if tokio::time::timeout(patience, self.0.tasks.wait()).await.is_ok() {
+        let forced_time = FORCED_TIME.min(timeout / 2);
+        if tokio::time::timeout(timeout - forced_time, self.0.tasks.wait()).await.is_ok() {
             return true;
         }
         self.0.hard.cancel();
-        // What does not heed even this is left behind: the process ends anyway.
-        let _ = tokio::time::timeout(Duration::from_secs(2), self.0.tasks.wait()).await;
+        // A task that ignores even this is left behind: the process ends anyway.
+        let _ = tokio::time::timeout(forced_time, self.0.tasks.wait()).await;
         false
     }
 }

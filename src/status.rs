@@ -1,8 +1,8 @@
-//! The one table from an error's kind to what each transport says.
+//! The one table from an error's kind to the status on each transport.
 
 use crate::domain::ErrorKind;
 
-/// How an error kind is told to a client.
+/// How an error kind is reported to a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Status {
     /// Status of the HTTP answer.
@@ -24,6 +24,7 @@ mod code {
     pub(super) const DEADLINE_EXCEEDED: i32 = 4;
     pub(super) const NOT_FOUND: i32 = 5;
     pub(super) const ALREADY_EXISTS: i32 = 6;
+    pub(super) const PERMISSION_DENIED: i32 = 7;
     pub(super) const RESOURCE_EXHAUSTED: i32 = 8;
     pub(super) const FAILED_PRECONDITION: i32 = 9;
     pub(super) const ABORTED: i32 = 10;
@@ -97,7 +98,16 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::Cancelled => (499, code::CANCELLED, "cancelled", "The request was cancelled"),
         ErrorKind::Overloaded => (503, code::UNAVAILABLE, "overloaded", "The server has too much to do"),
         ErrorKind::Timeout => (408, code::DEADLINE_EXCEEDED, "timeout", "The request took too long"),
-        ErrorKind::ShuttingDown => (503, code::UNAVAILABLE, "shutting-down", "The server is ending"),
+        ErrorKind::ShuttingDown => (503, code::UNAVAILABLE, "shutting-down", "The server is shutting down"),
+        ErrorKind::HostNotAllowed => {
+            (421, code::PERMISSION_DENIED, "host-not-allowed", "The server does not answer for this host")
+        }
+        ErrorKind::OriginNotAllowed => (
+            403,
+            code::PERMISSION_DENIED,
+            "origin-not-allowed",
+            "A page of another origin asked for a change",
+        ),
         ErrorKind::Internal => (500, code::INTERNAL, "internal", "The server failed"),
     };
     Status { http, grpc, slug, title }

@@ -55,10 +55,10 @@ pub(crate) fn run() {
             rates.push(busy / quiet);
             late.push(percentile(&mut busy_times, 0.99) / percentile(&mut quiet_times, 0.99));
         }
-        println!("\n### Fusion while a run trains on each of {cores} cores\n");
+        println!("\n### Fusion while a training run uses each of {cores} cores\n");
         println!("| measure | busy / quiet |\n|---|---:|");
         println!("| requests per second | {:.2} |", median(&mut rates));
-        println!("| 99th percentile of the answer's time | {:.2} |", median(&mut late));
+        println!("| 99th percentile of the latency | {:.2} |", median(&mut late));
         served.end();
     });
 }

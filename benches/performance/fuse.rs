@@ -13,8 +13,8 @@ use crate::ratio::median;
 const CALLS: usize = 200_000;
 
 pub(crate) fn run() {
-    println!("\n### One observation in memory: forward pass, decoder, confidences, positions\n");
-    println!("| recipe | with a fix (ns) | from the box alone (ns) |");
+    println!("\n### One observation in memory: forward pass, decoder, weights, positions\n");
+    println!("| recipe | with a fix (ns) | without a fix (ns) |");
     println!("|---|---:|---:|");
     let world = simulate(&Options::demo());
     let samples = world.training_samples();

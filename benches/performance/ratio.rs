@@ -10,8 +10,8 @@ pub(crate) struct Ratio {
     pub(crate) peer: f64,
     /// Median, smallest and largest of ours / peer, round by round.
     pub(crate) median: f64,
-    pub(crate) least: f64,
-    pub(crate) most: f64,
+    pub(crate) min_ratio: f64,
+    pub(crate) max_ratio: f64,
 }
 
 /// Measures ours and the peer in turn, after one round of each that does not count.
@@ -30,8 +30,8 @@ pub(crate) fn in_turn(mut ours: impl FnMut() -> f64, mut peer: impl FnMut() -> f
         ours: median(&mut of_ours),
         peer: median(&mut of_peer),
         median: ratios[ROUNDS / 2],
-        least: ratios[0],
-        most: ratios[ROUNDS - 1],
+        min_ratio: ratios[0],
+        max_ratio: ratios[ROUNDS - 1],
     }
 }
 
@@ -43,12 +43,12 @@ pub(crate) fn median(values: &mut [f64]) -> f64 {
 
 /// Head of a table of ratios.
 pub(crate) fn head(title: &str, unit: &str) {
-    println!("\n### {title}\n\n| case | ours ({unit}) | peer ({unit}) | ratio | least | most |");
+    println!("\n### {title}\n\n| case | ours ({unit}) | peer ({unit}) | ratio | min | max |");
     println!("|---|---:|---:|---:|---:|---:|");
 }
 
 /// A row of it.
 pub(crate) fn row(case: &str, ratio: &Ratio) {
-    let Ratio { ours, peer, median, least, most } = ratio;
-    println!("| {case} | {ours:.4} | {peer:.4} | {median:.2} | {least:.2} | {most:.2} |");
+    let Ratio { ours, peer, median, min_ratio, max_ratio } = ratio;
+    println!("| {case} | {ours:.4} | {peer:.4} | {median:.2} | {min_ratio:.2} | {max_ratio:.2} |");
 }

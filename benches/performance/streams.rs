@@ -218,7 +218,9 @@ pub(crate) fn run() {
     let served = runtime.block_on(Served::start());
     let observations = Arc::new(served.observations.clone());
     ratio::head(
-        &format!("Live streams, {IN_FLIGHT} items in flight each, with the track, against a bare tonic echo"),
+        &format!(
+            "Live streams with tracking, {IN_FLIGHT} items in flight each, compared with a bare tonic echo"
+        ),
         "items/s",
     );
     let answer = runtime.block_on(sample_answer(&served, &observations));
@@ -234,7 +236,7 @@ pub(crate) fn run() {
     let quantile = |share: f64| 1e3 * times_s[((times_s.len() - 1) as f64 * share) as usize];
     println!(
         "\n### {CAMERAS} live streams of {RATE_HZ} items per second for {SECONDS} s, client and server in one process\n\n\
-         | answers | p50 (ms) | p90 (ms) | p99 (ms) | most (ms) |\n|---:|---:|---:|---:|---:|\n\
+         | answers | p50 (ms) | p90 (ms) | p99 (ms) | max (ms) |\n|---:|---:|---:|---:|---:|\n\
          | {} | {:.2} | {:.2} | {:.2} | {:.2} |",
         times_s.len(),
         quantile(0.5),

@@ -26,7 +26,7 @@ pub(crate) fn run() {
     match std::env::var("PEERS_PYTHON") {
         Ok(python) => {
             ratio::head("Training 10,000 samples, 100 epochs, batch 512, net 4-32-2-32-4, one thread", "s");
-            ratio::row("against PyTorch", &in_turn(ours, || by_torch(&python)));
+            ratio::row("compared with PyTorch", &in_turn(ours, || by_torch(&python)));
         }
         Err(_) => {
             println!("\n### Training 10,000 samples, 100 epochs, batch 512, net 4-32-2-32-4, one thread\n");
@@ -39,7 +39,7 @@ pub(crate) fn run() {
 /// A whole default run: every candidate, held-out blocks, the final fit.
 fn whole() {
     println!("\n### The default recipe on 10,000 simulated rows, one thread\n");
-    println!("| scene | s (mark 20) | model bytes (mark 65536) |\n|---|---|---|");
+    println!("| scene | s (target 20) | model bytes (target 65536) |\n|---|---|---|");
     for &scene in Scene::ALL {
         let options = Options { seed: 1001, camera_seed: 1001, ..Options::new(scene) };
         let world = simulate(&options);

@@ -72,7 +72,7 @@ async fn bare_axum(answer: Value) -> SocketAddr {
 pub(crate) fn http() {
     let runtime = runtime();
     let served = runtime.block_on(Served::start());
-    ratio::head("REST: POST .../fusions, against a bare axum handler of the same JSON", "items/s");
+    ratio::head("REST: POST .../fusions, compared with a bare axum handler of the same JSON", "items/s");
     for items in [1, 32] {
         let body = request_body(&served.observations[..items]);
         let request =
@@ -85,7 +85,7 @@ pub(crate) fn http() {
             rate * items as f64
         };
         let ratio = in_turn(|| rate(served.address), || rate(bare));
-        ratio::row(&format!("{items} a request"), &ratio);
+        ratio::row(&format!("{items} per request"), &ratio);
     }
     served.end();
 }
@@ -133,7 +133,7 @@ async fn connect(address: SocketAddr) -> Client {
 pub(crate) fn grpc() {
     let runtime = runtime();
     let served = runtime.block_on(Served::start());
-    ratio::head("gRPC: unary Fuse, against a bare tonic handler of the same messages", "items/s");
+    ratio::head("gRPC: unary Fuse, compared with a bare tonic handler of the same messages", "items/s");
     for items in [1, 32] {
         let request = proto_request(&served, items);
         let answer = runtime.block_on(async {
@@ -142,7 +142,7 @@ pub(crate) fn grpc() {
         let bare = runtime.block_on(bare_tonic(answer));
         let rate = |address| runtime.block_on(calls(address, &request)) * items as f64;
         let ratio = in_turn(|| rate(served.address), || rate(bare));
-        ratio::row(&format!("{items} a request"), &ratio);
+        ratio::row(&format!("{items} per request"), &ratio);
     }
     served.end();
 }

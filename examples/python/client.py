@@ -1,6 +1,6 @@
-"""A client of sightfix: teaches a camera what it sees, then follows targets live.
+"""A client of sightfix: trains a camera, then tracks targets live.
 
-REST for what is asked once (cameras, training runs, tracks), gRPC for what never ends (the stream).
+REST for single requests (cameras, training runs, tracks), gRPC for the stream.
 """
 
 import argparse
@@ -18,12 +18,12 @@ import requests
 from grpc_tools import protoc
 
 PROTO = pathlib.Path(__file__).resolve().parents[2] / "proto"
-IN_FLIGHT = 64  # items sent and not answered yet; the server keeps 256 answers for a slow reader
-ATTEMPTS = 8  # to open a stream again, in a row
+IN_FLIGHT = 64  # unanswered items; the server buffers 256 answers for a slow reader
+ATTEMPTS = 8  # consecutive attempts to reconnect
 
 
 def import_messages(folder):
-    """Compiles proto/ into a folder; gives the modules of the messages and of the service."""
+    """Compiles proto/ into a folder; returns the modules of the messages and of the service."""
     google = importlib.resources.files("grpc_tools") / "_proto"
     files = [str(path.relative_to(PROTO)) for path in sorted(PROTO.rglob("*.proto"))]
     out = [f"--python_out={folder}", f"--grpc_python_out={folder}"]
@@ -47,14 +47,14 @@ class Client:
     # --- REST -----------------------------------------------------------------------------------
 
     def rest(self, method, path, **arguments):
-        """Sends a request; a problem (RFC 9457) becomes an error with its words."""
+        """Sends a request; raises an error with the title and detail of a problem (RFC 9457)."""
         answer = requests.request(method, self.server + path, timeout=30, **arguments)
         if not answer.ok:
             problem = answer.json()
             raise RuntimeError(f"{method} {path}: {problem['title']}: {problem.get('detail', '')}")
         return answer
 
-    def make_camera(self, image_size):
+    def create_camera(self, image_size):
         profile = {"id": self.camera}
         if image_size:
             width, height = image_size.split("x")
@@ -62,7 +62,7 @@ class Client:
         self.rest("POST", "/v1/cameras", json=profile)
 
     def train(self):
-        """Starts a run and waits for its end; gives the run."""
+        """Starts a training run and waits for its end; returns the run."""
         path = self.rest("POST", f"/v1/cameras/{self.camera}/training-runs", json={}).headers["location"]
         while True:
             run = self.rest("GET", path).json()
@@ -71,13 +71,13 @@ class Client:
             time.sleep(0.5)
 
     def tracks(self):
-        """Where the targets are now, as GeoJSON."""
+        """The latest positions of the tracks, as GeoJSON."""
         return self.rest("GET", f"/v1/cameras/{self.camera}/tracks").json()["features"]
 
     # --- gRPC -----------------------------------------------------------------------------------
 
     def item(self, seq, row):
-        """A row of a file as an item of the stream; what is empty is left out."""
+        """A row of a file as an item of the stream; empty fields are omitted."""
         item = self.messages.StreamItem(seq=seq, target_id=row["target_id"])
         item.time.FromJsonString(row["time"])
         if row["left"]:
@@ -89,9 +89,9 @@ class Client:
         return item
 
     def stream_items(self, rows, store_samples):
-        """Streams rows; yields the answers. Returns once all are answered and, if they are to be
-        stored, acknowledged. A row's seq is its number from 1. After a broken line another stream is
-        opened behind what is done: items sent twice do no harm.
+        """Streams rows; yields the answers. Returns once all rows are answered and, with store_samples,
+        acknowledged. The seq of a row is its number from 1. After a broken connection another stream
+        resumes after the last completed item; sending an item twice is harmless.
         """
         done, failed = 0, 0
         while done < len(rows):
@@ -109,11 +109,11 @@ class Client:
                 failed += 1
                 if error.code() != grpc.StatusCode.UNAVAILABLE or failed > ATTEMPTS:
                     raise
-                print(f"the line broke after {done}: {error.details()}", file=sys.stderr)
+                print(f"the connection broke after {done}: {error.details()}", file=sys.stderr)
                 time.sleep(min(0.1 * 2**failed, 5.0))
 
     def one_stream(self, rows, done, store_samples):
-        """One stream from its opening to its end; yields the server's messages."""
+        """One stream from its opening to its end; yields the messages of the server."""
         window = threading.Semaphore(IN_FLIGHT)
         ending = threading.Event()
 
@@ -128,7 +128,7 @@ class Client:
             for seq in range(done + 1, len(rows) + 1):
                 window.acquire()
                 if ending.is_set():
-                    return  # this half-closes: the server acknowledges what it has, then ends
+                    return  # half-close: the server sends its last acknowledgement, then closes
                 yield self.messages.StreamRequest(item=self.item(seq, rows[seq - 1]))
 
         lost = 0
@@ -136,14 +136,14 @@ class Client:
             for event in self.fusion.Stream(requests_of_client()):
                 kind = event.WhichOneof("kind")
                 if kind == "answer":
-                    # An answer that the server dropped makes room as well.
+                    # A dropped answer frees its place in the window, too.
                     window.release(1 + event.answer.lost_answers - lost)
                     lost = event.answer.lost_answers
                 elif kind == "reconnect":
                     ending.set()
                     window.release()
                 elif kind == "camera_moved":
-                    print("the camera was moved: train it anew", file=sys.stderr)
+                    print("the camera has moved: train it again", file=sys.stderr)
                 yield event
         finally:
             ending.set()
@@ -158,15 +158,15 @@ def read_rows(path):
 def main():
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--server", default="http://127.0.0.1:8080")
-    arguments.add_argument("--camera", required=True, help="id of the camera, which is made")
+    arguments.add_argument("--camera", required=True, help="id of the camera to create")
     arguments.add_argument("--image-size", metavar="WIDTHxHEIGHT")
-    arguments.add_argument("training", help="CSV of boxes and fixes to learn from")
-    arguments.add_argument("live", help="CSV of boxes and fixes to follow")
+    arguments.add_argument("training", help="CSV of boxes and fixes for training")
+    arguments.add_argument("live", help="CSV of boxes and fixes to track")
     given = arguments.parse_args()
 
     with tempfile.TemporaryDirectory() as folder:
         client = Client(given.server, given.camera, import_messages(folder))
-        client.make_camera(given.image_size)
+        client.create_camera(given.image_size)
 
         rows = read_rows(given.training)
         refused = [answer for answer in client.stream_items(rows, True) if answer.HasField("error")]
@@ -184,8 +184,8 @@ def main():
             if answer.HasField("track"):
                 tracked += 1
                 track, position = answer.track, answer.track.position
-                place = f"{position.longitude_deg:.7f} {position.latitude_deg:.7f}"
-                print(f"{track.time.ToJsonString()} {track.target_id} {place} within {track.r95_m:.1f} m")
+                degrees = f"{position.longitude_deg:.7f} {position.latitude_deg:.7f}"
+                print(f"{track.time.ToJsonString()} {track.target_id} {degrees} within {track.r95_m:.1f} m")
         if tracked == 0:
             sys.exit("no target was tracked")
 
@@ -194,7 +194,7 @@ def main():
             about, (longitude, latitude) = feature["properties"], feature["geometry"]["coordinates"]
             print(f"last seen: {about['target_id']} at {longitude} {latitude}, {about['time']}")
         if not features:
-            sys.exit("the server knows no tracks")
+            sys.exit("the server has no tracks")
 
 
 if __name__ == "__main__":

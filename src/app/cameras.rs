@@ -57,8 +57,7 @@ impl App {
     /// `CameraNotFound`, `RevisionMismatch`, `RunLive`.
     pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
         self.store.delete_camera(id, expected).await?;
-        self.registry.forget(id);
-        self.live.forget(id);
+        self.registry.forget(id).await;
         Ok(())
     }
 }

@@ -3,32 +3,48 @@
 use std::sync::Arc;
 
 use super::App;
-use super::registry::Serving;
+use super::registry::ActiveCamera;
 use crate::domain::{CameraId, Error, ErrorKind, Flag, FusedFix, Observation, Result};
+use crate::fusion::observed::ObservedPositions;
 use crate::fusion::two_step;
 
 impl App {
-    /// Answers observations of one camera, all by the same model version.
+    /// Answers observations of one camera, all by the same model version. Takes no lock and never waits
+    /// for the database, but to look for a model where there is none.
     ///
     /// # Errors
     /// `CameraNotFound`; `NoModel` if there is a box and no active model; `TooLarge` beyond the
     /// limit of observations.
-    pub async fn fuse(&self, id: &CameraId, observations: &[Observation]) -> Result<Vec<FusedFix>> {
+    pub async fn fuse(
+        &self,
+        camera: Arc<ActiveCamera>,
+        observations: &[Observation],
+    ) -> Result<Vec<FusedFix>> {
         self.check_batch(observations.len())?;
-        let mut serving = self.serving(id).await?;
-        if serving.model.is_none()
-            && serving.model_fault.is_none()
+        let mut camera = camera;
+        if camera.model.is_none()
+            && camera.model_fault.is_none()
             && observations.iter().any(|observation| observation.bounding_box.is_some())
         {
             // A run may have ended a moment ago, here or in another process.
-            serving = self.registry.refresh_camera(&self.store, id).await?;
+            camera = self.registry.refresh_camera(&self.store, &camera.id).await?;
         }
-        let fused = observations
+        let regressor = camera.model().map(|(regressor, _)| regressor);
+        let observed: Vec<_> = observations
             .iter()
-            .map(|observation| fuse_one(&serving, observation).ok_or_else(|| no_model(id, &serving)))
+            .map(|observation| {
+                let (image_size, e_gnss_m2) = (camera.image_size, camera.e_gnss_m2);
+                (observation, ObservedPositions::of(observation, regressor, image_size, e_gnss_m2))
+            })
+            .collect();
+        let fused = observed
+            .iter()
+            .map(|(observation, observed)| {
+                fuse_observed(&camera, observation, observed).ok_or_else(|| no_model(&camera))
+            })
             .collect::<Result<Vec<_>>>()?;
         self.metrics.fused(&fused);
-        self.watch_over(id, &serving, observations).await;
+        self.hand_over_last(&camera, &observed);
         Ok(fused)
     }
 
@@ -52,9 +68,12 @@ impl App {
     }
 
     /// What answers for a camera; looks into the store for one that another process has made.
-    pub(super) async fn serving(&self, id: &CameraId) -> Result<Arc<Serving>> {
+    ///
+    /// # Errors
+    /// `CameraNotFound`; a fault of the store.
+    pub async fn active_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
         match self.registry.get(id) {
-            Some(serving) => Ok(serving),
+            Some(camera) => Ok(camera),
             None => self.registry.refresh_camera(&self.store, id).await,
         }
     }
@@ -62,24 +81,28 @@ impl App {
 
 /// The position of one observation; `None` for a box while the camera has no model. Where the active model
 /// cannot be used, a box beside a fix is left out, and the fix passes through.
-pub(super) fn fuse_one(serving: &Serving, observation: &Observation) -> Option<FusedFix> {
-    let model = serving.model.as_ref().map(|(regressor, number)| (&**regressor, *number));
+pub(super) fn fuse_observed(
+    camera: &ActiveCamera,
+    observation: &Observation,
+    observed: &ObservedPositions<'_>,
+) -> Option<FusedFix> {
     let without_box;
-    let observation = if serving.model_fault.is_some() && observation.fix.is_some() {
+    let observation = if camera.model_fault.is_some() && observation.fix.is_some() {
         without_box = Observation { bounding_box: None, ..observation.clone() };
         &without_box
     } else {
         observation
     };
-    let mut fused = two_step::fuse(observation, model, serving.image_size, serving.e_gnss_m2)?;
-    if serving.moved.is_some() && fused.regressed.is_some() {
+    let mut fused = two_step::fuse_observed(observation, observed, camera.model(), camera.image_size)?;
+    if camera.moved.is_some() && fused.regressed.is_some() {
         fused.flags.push(Flag::CameraMoved);
     }
     Some(fused)
 }
 
-fn no_model(id: &CameraId, serving: &Serving) -> Error {
-    if let Some(fault) = &serving.model_fault {
+fn no_model(camera: &ActiveCamera) -> Error {
+    let id = &camera.id;
+    if let Some(fault) = &camera.model_fault {
         let message = format!("camera {id} has no usable model: {}; give fixes meanwhile", fault.reason);
         return Error::refused(ErrorKind::NoModel, message);
     }

@@ -14,20 +14,26 @@ mod samples;
 mod training;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore};
+use tokio_util::task::TaskTracker;
 
+use crate::admission::Quotas;
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
 use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
-pub use live::{CameraEvent, Followed, LiveStream, Moves, TrackPoint};
+pub use live::{
+    Acknowledgement, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream, LostEvents, NotStored,
+    NotStoredReason, TrackPoint,
+};
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
-pub use registry::{ModelFault, Registry};
+pub use registry::{ActiveCamera, ModelFault, Registry};
 pub use samples::{ImportReport, RejectedRow};
 pub use training::RunRequest;
 
@@ -41,14 +47,14 @@ pub struct Parts {
     pub store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
-    /// Tracks, streams and the watch on the cameras.
-    pub live: live::Live,
     /// What time it is.
     pub clock: Clock,
     /// Ids and seeds.
     pub randomness: Randomness,
     /// What an outside client may make large.
     pub limits: Limits,
+    /// How much of each bounded resource clients may hold at a time.
+    pub quotas: Quotas,
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
@@ -57,7 +63,18 @@ pub struct Parts {
     pub training_queue: JobQueue,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
+    /// Open live streams.
+    stream_slots: live::StreamSlots,
+    /// The way to the drift detectors.
+    residuals: live::ResidualQueue,
+    /// When moved cameras are trained again.
+    retraining: live::RetrainSchedule,
+    /// Tasks that answers hand work to; [`App::close`] waits for them.
+    tasks: TaskTracker,
 }
+
+/// Time that handed-over work gets when the application is closed.
+const CLOSE_TIME: Duration = Duration::from_secs(2);
 
 impl App {
     /// An application over an opened store, its registry filled.
@@ -78,20 +95,37 @@ impl App {
         }
         registry.refresh(&store).await?;
         let pairings = Semaphore::new(limits.pairings);
-        let live = live::Live::default();
+        let (residuals, waiting) = live::residual_queue();
+        let quotas = Quotas::new(&limits);
         let parts = Parts {
             store,
             registry,
-            live,
             clock,
             randomness,
             limits,
+            quotas,
             metrics,
             pairings,
             training_queue: JobQueue::default(),
             evaluation_queue: JobQueue::default(),
+            stream_slots: live::StreamSlots::default(),
+            residuals,
+            retraining: live::RetrainSchedule::default(),
+            tasks: TaskTracker::new(),
         };
-        Ok(Self(Arc::new(parts)))
+        let app = Self(Arc::new(parts));
+        app.tasks.spawn(waiting.run(Arc::downgrade(&app.0)));
+        Ok(app)
+    }
+
+    /// Waits for the work that answers have handed over, then closes the store. Streams must have ended.
+    pub async fn close(&self) {
+        self.residuals.close();
+        self.tasks.close();
+        if tokio::time::timeout(CLOSE_TIME, self.tasks.wait()).await.is_err() {
+            tracing::warn!("samples or residuals of live streams were still under way at the end");
+        }
+        self.store.close().await;
     }
 }
 

@@ -135,7 +135,7 @@ impl App {
     /// `CameraNotFound`; `InvalidArgument` naming what in the file cannot be used, or the check that its
     /// answers do not pass.
     pub async fn import_model(&self, id: &CameraId, file: &[u8]) -> Result<ModelVersion> {
-        self.serving(id).await?;
+        self.active_camera(id).await?;
         let artifact = Artifact::from_file(file)?;
         artifact.load()?;
         self.store.insert_model(id, &artifact.metadata, &artifact.weights, self.clock.now()).await

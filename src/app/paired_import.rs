@@ -28,7 +28,7 @@ pub struct PairedImport<D, F> {
     pub receiver_id: Option<ReceiverId>,
     /// When the samples are acknowledged.
     pub durability: Durability,
-    /// Whether the clock offsets are estimated, too. They are told, never applied.
+    /// Whether the clock offsets are estimated, too. They are reported, never applied.
     pub estimates_offsets: bool,
 }
 
@@ -43,7 +43,7 @@ pub struct PairedReport {
     pub rejected: RejectedParts,
     /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
     pub unnamed_fixes_of: Option<Receiver>,
-    /// Clock offsets by receiver, if they were asked for; `None` where the files do not tell them.
+    /// Clock offsets by receiver, if they were asked for; `None` where the files do not show them.
     pub clock_offsets: Vec<(Receiver, Option<OffsetEstimate>)>,
 }
 
@@ -69,7 +69,7 @@ impl App {
         import: PairedImport<impl Read + Send + 'static, impl Read + Send + 'static>,
     ) -> Result<PairedReport> {
         let rules = self.row_rules(id).await?;
-        let receivers = self.serving(id).await?.receivers.clone();
+        let receivers = self.active_camera(id).await?.receivers.clone();
         let limits =
             RecordingLimits { rows: self.limits.pairing_rows, rejected_rows: self.limits.rejected_rows };
         let durability = import.durability;

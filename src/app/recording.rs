@@ -53,12 +53,12 @@ pub struct Recording {
     pub rejected: RejectedParts,
 }
 
-/// How much of a recording is read and told.
+/// How much of a recording is read, and of its rejected rows reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecordingLimits {
     /// Good rows of each file.
     pub rows: usize,
-    /// Rejected rows told one by one, of each file.
+    /// Rejected rows reported one by one, of each file.
     pub rejected_rows: usize,
 }
 
@@ -134,7 +134,7 @@ impl Recording {
     }
 
     /// The clock offset of every receiver that the fixes name, by its id; `None` where the files
-    /// do not tell it.
+    /// do not show it.
     #[must_use]
     pub fn clock_offsets(&self, receivers: &Receivers) -> Vec<(Receiver, Option<OffsetEstimate>)> {
         let named: BTreeSet<&ReceiverId> =
@@ -183,7 +183,7 @@ fn gather<T>(
     limits: RecordingLimits,
     rejected: &mut RejectedParts,
 ) -> Result<Vec<T>> {
-    let (mut good, mut told) = (Vec::new(), 0);
+    let (mut good, mut reported) = (Vec::new(), 0);
     for row in rows {
         match row.map_err(|error| of_part(part, error))? {
             Ok(_) if good.len() == limits.rows => {
@@ -193,9 +193,9 @@ fn gather<T>(
             Ok(row) => good.push(row),
             Err(fault) => {
                 rejected.count += 1;
-                if told < limits.rejected_rows {
+                if reported < limits.rejected_rows {
                     rejected.rows.push((part, fault));
-                    told += 1;
+                    reported += 1;
                 }
             }
         }
@@ -229,11 +229,11 @@ pub struct PairingCounts {
     /// Boxes without a fix near in time, though others of their target have one.
     pub detections_far_from_fixes: u64,
     /// Boxes whose nearest fix is nearer to another box.
-    pub detections_outbid: u64,
+    pub detections_with_fix_claimed: u64,
     /// Boxes of a target and instant that was there already.
     pub detections_duplicate: u64,
     /// Fixes that name no receiver.
-    pub fixes_unbound: u64,
+    pub fixes_without_receiver: u64,
     /// Fixes of targets that no box shows.
     pub fixes_without_detections: u64,
     /// Other fixes that no box took.
@@ -245,16 +245,16 @@ pub struct PairingCounts {
 impl PairingCounts {
     fn of((detections, fixes): (u64, u64), paired: &Paired) -> Self {
         let unpaired = paired.unpaired;
-        let far = unpaired.detections - unpaired.outbid - paired.detections_without_fixes;
+        let far = unpaired.detections - unpaired.fix_claimed_by_nearer_box - paired.detections_without_fixes;
         Self {
             detections,
             fixes,
             paired: paired.samples.len() as u64,
             detections_without_fixes: paired.detections_without_fixes,
             detections_far_from_fixes: far,
-            detections_outbid: unpaired.outbid,
+            detections_with_fix_claimed: unpaired.fix_claimed_by_nearer_box,
             detections_duplicate: unpaired.duplicates - unpaired.duplicate_fixes,
-            fixes_unbound: unpaired.unbound,
+            fixes_without_receiver: unpaired.receiver_missing,
             fixes_without_detections: paired.fixes_without_detections,
             fixes_unused: unpaired.fixes - paired.fixes_without_detections,
             fixes_duplicate: unpaired.duplicate_fixes,

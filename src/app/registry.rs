@@ -1,36 +1,48 @@
 //! Profiles and active models, loaded and ready, read without a lock.
 //!
-//! A fusion takes the pointer that stands at that moment; an activation swaps it. Nothing here
-//! waits for the database while a request is answered.
+//! A request reads the map that is current at that moment; a change replaces it. Reading never waits for
+//! the database.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
+use jiff::Timestamp;
 use tokio::sync::Mutex;
 
+use super::live::camera::CameraLive;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, GnssError, ImageSize, Receivers, Result, Revision,
+    Camera, CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, ImageSize, Receivers, Result,
+    Revision, TimeBounds,
 };
+use crate::exchange::RowRules;
 use crate::model::{Artifact, Regressor};
 use crate::store::Store;
 
-/// What answers for one camera.
-pub struct Serving {
+/// Everything that answers for one camera.
+pub struct ActiveCamera {
+    /// The camera's id.
+    pub id: CameraId,
+    /// Which one of those that had this id.
+    pub key: CameraKey,
     /// Revision of the profile that this was made from.
     pub revision: Revision,
-    /// Size of the image, if told.
+    /// Size of the image, if the profile states it.
     pub image_size: Option<ImageSize>,
-    /// The receiver's variance per axis in m2, if the profile tells it.
+    /// The receiver's variance per axis in m2, if the profile states it.
     pub e_gnss_m2: Option<f64>,
-    /// Whose the receivers are, for pairing.
+    /// Which target carries which receiver, for pairing.
     pub receivers: Receivers,
-    /// What the watch found with that model.
+    /// Whether to train again by itself after the camera was moved.
+    pub retrain_when_moved: bool,
+    /// What the drift detector found with that model.
     pub moved: Option<Arc<CameraMoved>>,
     /// The active model and its version number.
     pub model: Option<(Arc<Regressor>, u32)>,
     /// Why the active model cannot be used; then `model` is `None`.
     pub model_fault: Option<ModelFault>,
+    /// Tracks, drift detection and listeners; the same as long as the camera exists.
+    pub(super) live: Arc<CameraLive>,
 }
 
 /// An active model version that cannot be used.
@@ -42,68 +54,92 @@ pub struct ModelFault {
     pub reason: String,
 }
 
+impl ActiveCamera {
+    /// The active model and its version number.
+    #[must_use]
+    pub fn model(&self) -> Option<(&Regressor, u32)> {
+        self.model.as_ref().map(|(regressor, version)| (&**regressor, *version))
+    }
+
+    /// What rows of the camera must satisfy.
+    #[must_use]
+    pub fn row_rules(&self, now: Timestamp) -> RowRules {
+        RowRules { time_bounds: TimeBounds::at(now), image_size: self.image_size }
+    }
+}
+
 /// All cameras, by id.
 #[derive(Default)]
 pub struct Registry {
-    cameras: ArcSwap<HashMap<CameraId, Arc<Serving>>>,
-    /// Held while the map is replaced, so that two changes at once cannot undo each other.
+    cameras: ArcSwap<HashMap<CameraId, Arc<ActiveCamera>>>,
+    /// Held from reading the store to replacing the map, so that no change undoes a later one.
     change: Mutex<()>,
 }
 
 impl Registry {
     /// What answers for a camera.
     #[must_use]
-    pub fn get(&self, id: &CameraId) -> Option<Arc<Serving>> {
+    pub fn get(&self, id: &CameraId) -> Option<Arc<ActiveCamera>> {
         self.cameras.load().get(id).cloned()
+    }
+
+    /// The cameras that a rule selects.
+    pub(super) fn select(&self, rule: impl Fn(&ActiveCamera) -> bool) -> Vec<Arc<ActiveCamera>> {
+        self.cameras.load().values().filter(|camera| rule(camera)).cloned().collect()
     }
 
     /// Brings one camera up to date with the store.
     ///
     /// # Errors
     /// `CameraNotFound`; a fault if the store cannot be read.
-    pub async fn refresh_camera(&self, store: &Store, id: &CameraId) -> Result<Arc<Serving>> {
+    pub async fn refresh_camera(&self, store: &Store, id: &CameraId) -> Result<Arc<ActiveCamera>> {
         let _change = self.change.lock().await;
-        let serving = self.load(store, id).await?;
-        let mut cameras = HashMap::clone(&self.cameras.load());
-        cameras.insert(id.clone(), serving.clone());
-        self.cameras.store(Arc::new(cameras));
-        Ok(serving)
+        let camera = match store.camera(id).await {
+            Err(error) if error.kind() == ErrorKind::CameraNotFound => {
+                self.remove(id);
+                return Err(error);
+            }
+            camera => self.load(store, camera?).await?,
+        };
+        self.replace(|cameras| cameras.insert(id.clone(), camera.clone()));
+        Ok(camera)
     }
 
-    /// Brings all cameras up to date: what another process on the same file has changed, too.
+    /// Brings all cameras up to date, including changes of another process on the same file.
     ///
-    /// A model that cannot be loaded leaves its camera without one ([`Serving::model_fault`]), so that one
+    /// A model that cannot be loaded leaves its camera without one ([`ActiveCamera::model_fault`]), so that one
     /// damaged row does not keep others from being served. It is tried again with every refresh.
     ///
     /// # Errors
     /// A fault if the store cannot be read.
     pub async fn refresh(&self, store: &Store) -> Result<()> {
         let _change = self.change.lock().await;
-        let heads = store.camera_heads().await?;
+        let versions = store.camera_versions().await?;
         let known = self.cameras.load_full();
-        let unchanged = |id: &CameraId, revision: Revision, active: Option<u32>| {
-            known.get(id).filter(|serving| {
-                serving.revision == revision && serving.model.as_ref().map(|(_, number)| *number) == active
-            })
-        };
-        let mut cameras = HashMap::with_capacity(heads.len());
-        let mut changed = heads.len() != known.len();
-        for (id, revision, active) in heads {
-            if let Some(serving) = unchanged(&id, revision, active) {
-                cameras.insert(id, serving.clone());
+        let keys: HashMap<_, _> = versions.iter().map(|(id, key, ..)| (id, *key)).collect();
+        for deleted in known.values().filter(|camera| keys.get(&camera.id) != Some(&camera.key)) {
+            self.remove(&deleted.id);
+        }
+        for (id, key, revision, active) in &versions {
+            let is_current = known.get(id).is_some_and(|camera| {
+                let version = camera.model.as_ref().map(|(_, version)| *version);
+                (camera.key, camera.revision, version) == (*key, *revision, *active)
+            });
+            if is_current {
                 continue;
             }
-            changed = true;
-            match self.load(store, &id).await {
-                Ok(serving) => {
-                    cameras.insert(id, serving);
+            let loaded = match store.camera(id).await {
+                Ok(camera) => self.load(store, camera).await,
+                Err(error) => Err(error),
+            };
+            match loaded {
+                Ok(camera) => self.replace(|cameras| cameras.insert(id.clone(), camera.clone())),
+                Err(error) if error.kind() == ErrorKind::CameraNotFound => self.remove(id),
+                Err(error) => {
+                    tracing::error!(camera.id = %id, %error, "cannot read the camera");
+                    self.replace(|cameras| cameras.remove(id));
                 }
-                Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraNotFound => {}
-                Err(error) => tracing::error!(camera.id = %id, %error, "cannot read the camera"),
             }
-        }
-        if changed {
-            self.cameras.store(Arc::new(cameras));
         }
         Ok(())
     }
@@ -119,30 +155,47 @@ impl Registry {
         faults
     }
 
-    /// Forgets a deleted camera.
-    pub fn forget(&self, id: &CameraId) {
+    /// Removes a deleted camera and ends what listens to it. Waits for a refresh under way, which may
+    /// have read the camera before it was deleted.
+    pub async fn forget(&self, id: &CameraId) {
+        let _change = self.change.lock().await;
+        self.remove(id);
+    }
+
+    fn remove(&self, id: &CameraId) {
+        if let Some(camera) = self.get(id) {
+            camera.live.end();
+        }
+        self.replace(|cameras| cameras.remove(id));
+    }
+
+    fn replace<T>(&self, change: impl Fn(&mut HashMap<CameraId, Arc<ActiveCamera>>) -> T) {
         self.cameras.rcu(|cameras| {
             let mut cameras = HashMap::clone(cameras);
-            cameras.remove(id);
+            change(&mut cameras);
             cameras
         });
     }
 
-    async fn load(&self, store: &Store, id: &CameraId) -> Result<Arc<Serving>> {
-        let camera = store.camera(id).await?;
+    async fn load(&self, store: &Store, camera: Camera) -> Result<Arc<ActiveCamera>> {
+        let id = camera.id();
+        let known = self.get(id);
+        let same = known.as_ref().filter(|known| known.key == camera.key);
+        if let (Some(replaced), None) = (&known, same) {
+            replaced.live.end();
+        }
         let moved = match camera.active_model {
             Some(number) => store.camera_move(id, number).await?.map(Arc::new),
             None => None,
         };
-        let loaded = self.get(id).filter(|serving| serving.moved == moved);
-        let loaded = loaded.and_then(|serving| serving.model.clone());
+        let loaded = same.filter(|known| known.moved == moved).and_then(|known| known.model.clone());
         let mut model_fault = None;
         let model = match (camera.active_model, loaded) {
             (None, _) => None,
             (Some(number), Some(loaded)) if loaded.1 == number => Some(loaded),
             (Some(number), _) => match load_regressor(store, id, number).await {
                 Ok(regressor) => {
-                    // Wrong by about the shift, it must not go on being confident.
+                    // The error that the model states must contain the shift that was found.
                     let regressor = match &moved {
                         Some(moved) => regressor.with_added_error(moved.change_variance_m2()),
                         None => regressor,
@@ -155,7 +208,9 @@ impl Registry {
                 }
             },
         };
-        Ok(Arc::new(Serving {
+        Ok(Arc::new(ActiveCamera {
+            id: id.clone(),
+            key: camera.key,
             moved,
             revision: camera.revision,
             image_size: camera.profile.image_size,
@@ -163,6 +218,8 @@ impl Registry {
                 GnssError::Known(sigma) => Some(sigma.variance_m2()),
                 GnssError::Unknown => None,
             },
+            live: same.map_or_else(CameraLive::new, |known| known.live.clone()),
+            retrain_when_moved: camera.profile.retrain_when_moved,
             receivers: camera.profile.receivers,
             model,
             model_fault,
@@ -206,4 +263,32 @@ pub(super) async fn load_regressor(store: &Store, id: &CameraId, number: u32) ->
         ),
         fault @ Error::Fault(_) => fault,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::NewCamera;
+
+    #[tokio::test]
+    async fn a_refresh_under_way_does_not_bring_back_a_deleted_camera() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Store::open(folder.path()).await.expect("a new store");
+        let (registry, id) = (Registry::default(), CameraId::new("yard").expect("a slug"));
+        for _ in 0..50 {
+            store.insert_camera(&NewCamera::named(id.clone()), Timestamp::UNIX_EPOCH).await.expect("new");
+            let camera = registry.refresh_camera(&store, &id).await.expect("known");
+            // Changed, so that the refresh has something to do.
+            let changed = NewCamera { display_name: "gate".to_owned(), ..NewCamera::named(id.clone()) };
+            store.replace_camera(&changed, None, Timestamp::UNIX_EPOCH).await.expect("changed");
+            let delete = async {
+                store.delete_camera(&id, None).await.expect("deleted");
+                registry.forget(&id).await;
+            };
+            let (refreshed, ()) = tokio::join!(registry.refresh(&store), delete);
+            refreshed.expect("refreshed");
+            assert!(registry.get(&id).is_none());
+            assert!(camera.live.is_deleted(), "what listens to the camera ends");
+        }
+    }
 }

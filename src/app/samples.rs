@@ -3,11 +3,12 @@
 use std::io::Read;
 
 use futures_util::{Stream, StreamExt as _};
+use jiff::Timestamp;
 use tokio::sync::mpsc;
 
 use super::{App, Page, page_of};
-use crate::domain::{CameraId, Durability, Error, ImageSize, Result, Sample, TimeBounds};
-use crate::exchange::{self, Format, RowError, RowRules};
+use crate::domain::{CameraId, Durability, Error, Result, Sample, TargetId};
+use crate::exchange::{self, Cursor, Format, RowError, RowRules};
 use crate::store::{SampleFilter, SampleKey};
 
 /// Rows that go to the store at once.
@@ -87,7 +88,7 @@ impl App {
         rows: impl Stream<Item = Result<Result<Sample, RowError>>> + Send,
         durability: Durability,
     ) -> Result<ImportReport> {
-        self.serving(id).await?;
+        self.active_camera(id).await?;
         let mut report = ImportReport::default();
         let mut batches = std::pin::pin!(rows.ready_chunks(BATCH_ROWS));
         while let Some(chunk) = batches.next().await {
@@ -118,8 +119,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`.
     pub async fn row_rules(&self, id: &CameraId) -> Result<RowRules> {
-        let image_size: Option<ImageSize> = self.serving(id).await?.image_size;
-        Ok(RowRules { time_bounds: TimeBounds::at(self.clock.now()), image_size })
+        Ok(self.active_camera(id).await?.row_rules(self.clock.now()))
     }
 
     /// Samples by time and target, from behind a cursor on.
@@ -179,6 +179,23 @@ impl App {
     }
 }
 
+/// A sample's place in the list by time and target.
+impl Cursor for SampleKey {
+    const LIST: &'static str = "samples";
+
+    fn to_key(&self) -> String {
+        format!("{}:{}", self.time.as_microsecond(), self.target_id)
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        let (time_us, target_id) = key.split_once(':')?;
+        Some(Self {
+            time: Timestamp::from_microsecond(time_us.parse().ok()?).ok()?,
+            target_id: TargetId::new(target_id).ok()?,
+        })
+    }
+}
+
 type Batch = Vec<Result<Sample, RowError>>;
 
 fn read_batches(
@@ -218,5 +235,29 @@ pub(super) fn told_what_is_stored(error: Error, report: &ImportReport) -> Error 
             Error::Refused(refusal)
         }
         error => error,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::exchange::{read_cursor, write_cursor};
+
+    proptest! {
+        #[test]
+        fn a_sample_is_found_again(time_us in -1_000_000_000_i64..4_000_000_000_000_000, name in "[a-z ./:é-]{0,20}[a-z]") {
+            let Ok(target_id) = TargetId::new(&name) else { return Ok(()) };
+            let key = SampleKey { time: Timestamp::from_microsecond(time_us).expect("in range"), target_id };
+            prop_assert_eq!(read_cursor::<SampleKey>("cursor", &write_cursor(&key)).expect("its own"), key);
+        }
+
+        #[test]
+        fn what_is_no_cursor_is_refused_or_read(text in ".{1,40}") {
+            if let Err(error) = read_cursor::<SampleKey>("cursor", &text) {
+                prop_assert!(error.to_string().starts_with("cursor"));
+            }
+        }
     }
 }

@@ -7,10 +7,11 @@ use jiff::Timestamp;
 
 use super::{App, Page, page_of};
 use crate::domain::{
-    CameraId, EpochReport, Error, ErrorKind, Recipe, Result, RunId, TrainingOptions, TrainingRun,
+    CameraId, EpochReport, Error, ErrorKind, Recipe, Result, RunId, TimeRange, TrainingOptions, TrainingRun,
 };
 use crate::geo::{Position, distance_m};
 use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
+use crate::store::SampleFilter;
 
 /// How often a watched run is read from the store.
 const WATCH_INTERVAL: Duration = Duration::from_millis(200);
@@ -42,11 +43,7 @@ impl App {
         if request.epochs.is_some_and(|epochs| !(1..=most).contains(&epochs)) {
             return Err(Error::invalid("epochs", format!("must be from 1 to {most}")));
         }
-        if let (Some(from), Some(until)) = (request.from, request.until)
-            && from >= until
-        {
-            return Err(Error::invalid("until", "must be later than from"));
-        }
+        let range = TimeRange::new(request.from, request.until)?;
         let options = TrainingOptions {
             recipe: request.recipe.unwrap_or(camera.profile.recipe),
             seed: request.seed.unwrap_or(0),
@@ -54,8 +51,7 @@ impl App {
             from: request.from,
             until: request.until,
         };
-        let filter = crate::store::SampleFilter { from: options.from, until: options.until, target_id: None };
-        let (count, extent) = self.store.sample_extent(id, &filter).await?;
+        let (count, extent) = self.store.sample_extent(id, &SampleFilter::within(range)).await?;
         check_extent(id, count, extent)?;
         let now = self.clock.now();
         let run = RunId(self.randomness.uuid_v7(now));

@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::DataFolder;
 
-/// Print the settings in force
+/// Print the effective settings
 #[derive(Args)]
 pub(super) struct PrintConfig {
     #[command(flatten)]
@@ -15,7 +15,7 @@ pub(super) struct PrintConfig {
 
 impl PrintConfig {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
-        // There is no secret among the settings yet; one must be a type that hides itself.
+        // No setting is secret; a secret one needs a type whose serialisation hides it.
         print!("{}", toml::to_string_pretty(&self.folder.settings(file)?)?);
         Ok(())
     }

@@ -14,27 +14,27 @@ use crate::exchange::{self, RowRules};
 use crate::fusion::two_step;
 use crate::model::{Artifact, Regressor};
 
-/// Answer observations from a file, without a server
+/// Fuse observations from a file, without a server
 #[derive(Args)]
 pub(super) struct Fuse {
-    /// Observations as CSV, NDJSON or JSON, told by the ending; boxes and fixes may be left empty
+    /// Observations as CSV, NDJSON or JSON, by file extension; boxes and fixes may be empty
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Where the positions go: CSV, NDJSON, JSON or GeoJSON, told by the ending
+    /// Output file: CSV, NDJSON, JSON or GeoJSON, by file extension
     #[arg(long, short, value_name = "FILE")]
     out: PathBuf,
-    /// The camera whose active model answers
+    /// The camera whose active model is used
     #[arg(long, value_name = "ID", value_parser = camera_id, required_unless_present = "model")]
     camera: Option<CameraId>,
-    /// A downloaded model file that answers instead; needs no data folder
+    /// A downloaded model file to use instead; needs no data folder
     #[arg(long, value_name = "FILE", conflicts_with = "camera")]
     model: Option<PathBuf>,
     #[command(flatten)]
     folder: DataFolder,
 }
 
-/// What answers: a model with its number, and what the profile says.
-struct Answering {
+/// A model with its version number, and the camera's profile as far as fusion uses it.
+struct FusionModel {
     regressor: std::sync::Arc<Regressor>,
     number: u32,
     image_size: Option<ImageSize>,
@@ -44,9 +44,11 @@ struct Answering {
 impl Fuse {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let (from, to) = (format_of(&self.file)?, format_of(&self.out)?);
-        let answering = self.answering(file)?;
-        let rules =
-            RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: answering.image_size };
+        let fusion_model = self.model(file)?;
+        let rules = RowRules {
+            time_bounds: TimeBounds::at(Clock::system().now()),
+            image_size: fusion_model.image_size,
+        };
         let rows = exchange::read_observations(open_file(&self.file)?, from, &rules)?;
         let out = File::create(&self.out).with_context(|| format!("cannot write {}", self.out.display()))?;
         let mut out = BufWriter::new(out);
@@ -61,9 +63,10 @@ impl Fuse {
                     continue;
                 }
             };
-            let model = Some((&*answering.regressor, answering.number));
-            let fused = two_step::fuse(&row.observation, model, answering.image_size, answering.e_gnss_m2)
-                .context("a model answers every observation")?;
+            let model = Some((&*fusion_model.regressor, fusion_model.number));
+            let fused =
+                two_step::fuse(&row.observation, model, fusion_model.image_size, fusion_model.e_gnss_m2)
+                    .context("the observation cannot be fused")?;
             writer.write(&fused)?;
             answered += 1;
         }
@@ -73,11 +76,11 @@ impl Fuse {
         Ok(())
     }
 
-    fn answering(&self, file: Option<&Path>) -> anyhow::Result<Answering> {
+    fn model(&self, file: Option<&Path>) -> anyhow::Result<FusionModel> {
         if let Some(path) = &self.model {
             let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
             let regressor = std::sync::Arc::new(Artifact::from_file(&bytes)?.load()?);
-            return Ok(Answering { regressor, number: 0, image_size: None, e_gnss_m2: None });
+            return Ok(FusionModel { regressor, number: 0, image_size: None, e_gnss_m2: None });
         }
         let id = self.camera.as_ref().context("give --camera or --model")?;
         let settings = self.folder.settings(file)?;
@@ -89,7 +92,12 @@ impl Fuse {
             let (regressor, number) = serving.model.clone().with_context(|| {
                 format!("camera {} has no active model: train it first (sightfix train)", camera.id())
             })?;
-            Ok(Answering { regressor, number, image_size: serving.image_size, e_gnss_m2: serving.e_gnss_m2 })
+            Ok(FusionModel {
+                regressor,
+                number,
+                image_size: serving.image_size,
+                e_gnss_m2: serving.e_gnss_m2,
+            })
         })
     }
 }

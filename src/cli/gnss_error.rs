@@ -14,16 +14,16 @@ use crate::exchange::{self, FixFormat};
 
 /// Estimate a receiver's error from many fixes at one fixed point
 #[derive(Args)]
-pub(super) struct GnssError {
-    /// Fixes as CSV (longitude, latitude), NMEA (GGA), GPX or gpsd's reports, told by the ending
+pub(super) struct EstimateGnssError {
+    /// Fixes as CSV (longitude, latitude), NMEA (GGA), GPX or gpsd reports, by file extension
     #[arg(value_name = "FILE")]
     file: PathBuf,
 }
 
-impl GnssError {
+impl EstimateGnssError {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let format = FixFormat::from_path(&self.file)
-            .context("the ending must be .csv, .nmea, .log, .txt, .gpx or .json")?;
+            .context("the extension must be .csv, .nmea, .log, .txt, .gpx or .json")?;
         let time_bounds = TimeBounds::at(Clock::system().now());
         let rows = exchange::read_fixes(open_file(&self.file)?, format, time_bounds)?;
         let estimate = GnssErrorEstimate::from_rows(rows, Limits::default().rejected_rows)?;

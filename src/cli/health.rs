@@ -10,9 +10,9 @@ use clap::Args;
 
 use crate::config::{Config, Overrides};
 
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Ask the server of these settings whether it is alive; for a container's health check
+/// Check whether the server of these settings is alive; for the health check of a container
 #[derive(Args)]
 pub(super) struct Health {
     /// Address of the server
@@ -27,16 +27,16 @@ impl Health {
         if address.ip().is_unspecified() {
             address.set_ip(IpAddr::V4(Ipv4Addr::LOCALHOST));
         }
-        let answer = ask(address).with_context(|| format!("no answer from {address}"))?;
-        anyhow::ensure!(answer.starts_with("HTTP/1.1 200"), "{address} says {answer:?}");
+        let answer = request_liveness(address).with_context(|| format!("no answer from {address}"))?;
+        anyhow::ensure!(answer.starts_with("HTTP/1.1 200"), "{address} answered {answer:?}");
         println!("{address} is alive");
         Ok(())
     }
 }
 
-fn ask(address: SocketAddr) -> std::io::Result<String> {
-    let mut stream = TcpStream::connect_timeout(&address, PATIENCE)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
+fn request_liveness(address: SocketAddr) -> std::io::Result<String> {
+    let mut stream = TcpStream::connect_timeout(&address, TIMEOUT)?;
+    stream.set_read_timeout(Some(TIMEOUT))?;
     stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n")?;
     let mut first = [0; 15];
     stream.read_exact(&mut first)?;

@@ -13,13 +13,13 @@ use crate::domain::{CameraId, Durability, Error, ErrorKind, ImageSize, NewCamera
 /// Import samples from a file into a camera
 #[derive(Args)]
 pub(super) struct Import {
-    /// Samples as CSV, NDJSON or JSON, told by the ending
+    /// Samples as CSV, NDJSON or JSON, by file extension
     #[arg(value_name = "FILE")]
     file: PathBuf,
     /// The camera's id
     #[arg(long, value_name = "ID", value_parser = camera_id)]
     camera: CameraId,
-    /// Make the camera if it is not there yet
+    /// Create the camera if it does not exist
     #[arg(long)]
     create: bool,
     /// Size of the camera's image, for --create
@@ -35,8 +35,12 @@ impl Import {
         let format = format_of(&self.file)?;
         let source = open_file(&self.file)?;
         let bytes = source.metadata()?.len();
-        let source =
-            Watched { source, read: 0, bytes, progress: Progress::new("{bar:40} {bytes}/{total_bytes}") };
+        let source = ProgressReader {
+            source,
+            read: 0,
+            bytes,
+            progress: Progress::new("{bar:40} {bytes}/{total_bytes}"),
+        };
         let report = runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix import").await?;
             if self.create {
@@ -80,15 +84,15 @@ pub(super) fn image_size(text: &str) -> Result<ImageSize, String> {
     ImageSize::new(width_px, height_px).map_err(|error| error.to_string())
 }
 
-/// A source that shows how far it was read.
-struct Watched<R> {
+/// A reader that shows the progress of reading.
+struct ProgressReader<R> {
     source: R,
     read: u64,
     bytes: u64,
     progress: Progress,
 }
 
-impl<R: Read> Read for Watched<R> {
+impl<R: Read> Read for ProgressReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.source.read(buffer)?;
         self.read += read as u64;

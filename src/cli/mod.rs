@@ -1,7 +1,7 @@
-//! The command line: a file per subcommand.
+//! The command line: one file per subcommand. A subcommand reads its flags, calls the layers below, and
+//! prints the result.
 //!
-//! What never happens here: rules of the domain. A subcommand reads its flags, calls `app`,
-//! `worker`, `model` or `fusion`, and prints.
+//! What never happens here: rules of the domain.
 
 mod config;
 mod evaluate;
@@ -31,11 +31,11 @@ use crate::exchange::Format;
 use crate::store::{Store, StoreOptions};
 use crate::telemetry::Metrics;
 
-/// Positions from what an uncalibrated fixed camera sees and what a GNSS receiver says
+/// Positions of targets from the bounding boxes of an uncalibrated fixed camera and from GNSS fixes
 #[derive(Parser)]
 #[command(name = "sightfix", version, arg_required_else_help = true)]
 pub struct Cli {
-    /// Settings file; else `sightfix.toml` in the working folder, if it is there
+    /// Settings file [default: sightfix.toml in the working folder, if it exists]
     #[arg(long, global = true, value_name = "FILE")]
     config: Option<PathBuf>,
     #[command(subcommand)]
@@ -44,43 +44,43 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Answer REST and gRPC on one port
+    /// Serve REST and gRPC on one port
     Serve(serve::Serve),
     /// Import samples from a file into a camera
     Import(import::Import),
-    /// Make samples of detections and fixes that were recorded apart
+    /// Pair detections and fixes that were recorded separately into samples
     Pair(pair::Pair),
-    /// Fit a camera's model from its samples
+    /// Train a camera's model from its samples
     Train(train::Train),
-    /// Answer observations from a file, without a server
+    /// Fuse observations from a file, without a server
     Fuse(fuse::Fuse),
     /// Estimate a receiver's error from many fixes at one fixed point
-    GnssError(gnss_error::GnssError),
-    /// Try methods side by side on a test file, without a server
+    GnssError(gnss_error::EstimateGnssError),
+    /// Compare methods on a test file, without a server
     Evaluate(evaluate::Evaluate),
-    /// Write a seeded synthetic world with its truth
+    /// Write a simulated world with its truth
     Simulate(simulate::Simulate),
     /// Stream recorded boxes and fixes to a server, as one or many cameras
     Replay(replay::Replay),
-    /// Ask a server whether it is alive
+    /// Check whether a server is alive
     Health(health::Health),
-    /// Print the settings in force
+    /// Print the effective settings
     Config(config::PrintConfig),
     /// Print the OpenAPI description of the REST interface
     Openapi(openapi::Openapi),
 }
 
 impl Cli {
-    /// The command that the process was started with; ends the process where it is none.
+    /// Parses the arguments of the process; exits if they are invalid.
     #[must_use]
     pub fn from_arguments() -> Self {
         Self::parse()
     }
 
-    /// Runs the command to its end.
+    /// Runs the command.
     ///
     /// # Errors
-    /// What went wrong, for a person.
+    /// A human-readable error.
     pub fn run(self) -> anyhow::Result<()> {
         let file = self.config.as_deref();
         match self.command {
@@ -100,10 +100,10 @@ impl Cli {
     }
 }
 
-/// The data folder that a command works on.
+/// The data folder of a command.
 #[derive(Args)]
 struct DataFolder {
-    /// Folder of the database; made if it is not there
+    /// Folder of the database; created if it does not exist
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
 }
@@ -114,8 +114,8 @@ impl DataFolder {
     }
 }
 
-/// The application over the data folder, without a server. A server may run beside it; both are told
-/// of each other, `role` is what the server's log calls this process.
+/// The application on the data folder, without a server. A server may use the same folder; each logs the
+/// other, this process by its `role`.
 async fn open_app(settings: &Config, role: &str) -> anyhow::Result<App> {
     let options = StoreOptions { limits: store_limits(&settings.limits), role: role.to_owned() };
     let store = Store::open_with(&settings.data, options)
@@ -128,7 +128,7 @@ async fn open_app(settings: &Config, role: &str) -> anyhow::Result<App> {
         .await?)
 }
 
-/// A runtime for one command.
+/// The tokio runtime of one command.
 fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
     tokio::runtime::Builder::new_multi_thread().enable_all().build().context("cannot start the runtime")
 }
@@ -145,14 +145,14 @@ fn target_id(text: &str) -> Result<TargetId, String> {
     TargetId::new(text).map_err(|error| error.to_string())
 }
 
-/// Opens a file to read, with its name in the error.
+/// Opens a file for reading; an error contains its name.
 fn open_file(path: &Path) -> anyhow::Result<File> {
     File::open(path).with_context(|| format!("cannot open {}", path.display()))
 }
 
-/// The format by a file's ending.
+/// The format by file extension.
 fn format_of(path: &Path) -> anyhow::Result<Format> {
     Format::from_path(path).with_context(|| {
-        format!("{}: the ending must be .csv, .ndjson, .jsonl, .json or .geojson", path.display())
+        format!("{}: the extension must be .csv, .ndjson, .jsonl, .json or .geojson", path.display())
     })
 }

@@ -16,47 +16,47 @@ use crate::exchange::{self, FixFormat, RowRules};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
 
-/// Make samples of detections and fixes that were recorded apart
+/// Pair detections and fixes that were recorded separately into samples
 #[derive(Args)]
 pub(super) struct Pair {
-    /// Boxes as CSV (time, target_id, left, top, width, height), NDJSON or JSON, told by the ending
+    /// Boxes as CSV (time, target_id, left, top, width, height), NDJSON or JSON, by file extension
     #[arg(long, value_name = "FILE")]
     detections: PathBuf,
-    /// Fixes as CSV, NMEA, GPX or gpsd's reports (.json), told by the ending
+    /// Fixes as CSV, NMEA, GPX or gpsd reports (.json), by file extension
     #[arg(long, value_name = "FILE")]
     fixes: PathBuf,
-    /// Format of the fixes, where the ending does not tell: csv, nmea, gpx or gpsd
+    /// Format of the fixes if the extension does not determine it: csv, nmea, gpx or gpsd
     #[arg(long, value_name = "FORMAT")]
     fixes_format: Option<FixFormat>,
-    /// Where the samples go, as `sightfix import` takes them: CSV, NDJSON or JSON by the ending
+    /// Output file for `sightfix import`: CSV, NDJSON or JSON, by file extension
     #[arg(long, value_name = "FILE", required_unless_present = "estimate_offset")]
     out: Option<PathBuf>,
-    /// How a box finds its fix: nearest (each is the other's nearest within the window) or
-    /// interpolate (on the line between the fixes before and after the box)
+    /// Pairing method: nearest (each is the other's nearest within the window) or interpolate (between
+    /// the fixes before and after the box)
     #[arg(long, value_name = "METHOD", default_value = "nearest")]
     method: PairingRule,
-    /// Box and fix are at most this far apart, s (nearest); 0.5 if left out
+    /// Largest time between box and fix, s (nearest) [default: 0.5]
     #[arg(long, value_name = "S")]
     window_s: Option<f64>,
-    /// Fixes are joined over at most this long a gap, s (interpolate); 2.5 if left out
+    /// Largest gap between fixes to interpolate over, s (interpolate) [default: 2.5]
     #[arg(long, value_name = "S")]
     longest_gap_s: Option<f64>,
-    /// Whose a receiver is; one that is not named carries its own id as target id
+    /// The target that carries a receiver; an unlisted receiver has its own id as target id
     #[arg(long = "receiver", value_name = "RECEIVER=TARGET", value_parser = binding)]
     receivers: Vec<Receiver>,
-    /// What is to be added to a receiver's time to get the camera's, s
+    /// Offset added to a receiver's time to get the camera's time, s
     #[arg(long = "clock-offset", value_name = "RECEIVER=S", value_parser = offset)]
     offsets: Vec<(ReceiverId, ClockOffset)>,
-    /// The receiver of fixes that name none; else the only --receiver, else the only target's own
+    /// Receiver of fixes that name none [default: the only --receiver, else that of the only target]
     #[arg(long, value_name = "RECEIVER", value_parser = receiver_id)]
     receiver_id: Option<ReceiverId>,
-    /// The target of boxes that name none
+    /// Target of boxes that name none
     #[arg(long, value_name = "TARGET", value_parser = target_id)]
     target_id: Option<TargetId>,
-    /// Print each receiver's clock offset as the files tell it
+    /// Print the estimated clock offset of each receiver
     #[arg(long)]
     estimate_offset: bool,
-    /// Pair by the estimated offsets in the place of those given
+    /// Pair with the estimated offsets instead of the given ones
     #[arg(long, requires = "estimate_offset")]
     apply_offset: bool,
 }
@@ -65,7 +65,7 @@ impl Pair {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let settings = PairingSettings::new(self.method, self.window_s, self.longest_gap_s)?;
         let (mut recording, format) = self.read()?;
-        tell_rejected(&recording.rejected);
+        print_rejected(&recording.rejected);
         let mut receivers = self.receivers()?;
         if let Some(receiver) = recording.name_fixes(format, &receivers, self.receiver_id.clone())? {
             println!("fixes that name no receiver are those of {}", carried(&receiver));
@@ -73,7 +73,7 @@ impl Pair {
         if self.estimate_offset {
             let estimates = recording.clock_offsets(&receivers);
             for (receiver, estimate) in &estimates {
-                tell_offset(receiver, estimate.as_ref());
+                print_offset(receiver, estimate.as_ref());
             }
             if self.apply_offset {
                 receivers = applied(&receivers, &estimates)?;
@@ -81,8 +81,8 @@ impl Pair {
         }
         let Some(out) = &self.out else { return Ok(()) };
         let (paired, counts, _) = recording.paired(&receivers, &settings);
-        tell_counts(&counts);
-        anyhow::ensure!(counts.paired > 0, "nothing could be paired, so {} is not written", out.display());
+        print_counts(&counts);
+        anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
         let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
         exchange::write_samples(BufWriter::new(file), format_of(out)?, &paired.samples)?;
         Ok(())
@@ -91,10 +91,10 @@ impl Pair {
     fn read(&self) -> anyhow::Result<(Recording, FixFormat)> {
         let format = self.fixes_format.or_else(|| FixFormat::from_path(&self.fixes)).with_context(|| {
             let name = self.fixes.display();
-            format!("{name}: the ending does not tell the format; give --fixes-format csv, nmea, gpx or gpsd")
+            format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx or gpsd")
         })?;
         if let Some(out) = &self.out {
-            format_of(out)?; // before the work, not after
+            format_of(out)?; // fail early
         }
         let rules = RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: None };
         let (detections, fixes) = (open_file(&self.detections)?, open_file(&self.fixes)?);
@@ -115,8 +115,8 @@ impl Pair {
     fn receivers(&self) -> anyhow::Result<Receivers> {
         let mut receivers = self.receivers.clone();
         for (index, (receiver_id, clock_offset)) in self.offsets.iter().enumerate() {
-            let twice = self.offsets[..index].iter().any(|(other, _)| other == receiver_id);
-            anyhow::ensure!(!twice, "--clock-offset {receiver_id} stands twice");
+            let is_duplicate = self.offsets[..index].iter().any(|(other, _)| other == receiver_id);
+            anyhow::ensure!(!is_duplicate, "--clock-offset {receiver_id} is a duplicate");
             match receivers.iter_mut().find(|receiver| &receiver.receiver_id == receiver_id) {
                 Some(receiver) => receiver.clock_offset = *clock_offset,
                 None => receivers
@@ -146,29 +146,29 @@ fn carried(receiver: &Receiver) -> String {
     format!("{}, carried by {}", receiver.receiver_id, receiver.target_id)
 }
 
-fn tell_rejected(rejected: &RejectedParts) {
+fn print_rejected(rejected: &RejectedParts) {
     for (part, row) in &rejected.rows {
         eprintln!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason);
     }
-    let told = rejected.rows.len() as u64;
-    if rejected.count > told {
-        eprintln!("... and {} more", rejected.count - told);
+    let printed = rejected.rows.len() as u64;
+    if rejected.count > printed {
+        eprintln!("... and {} more", rejected.count - printed);
     }
     if rejected.count > 0 {
         println!("rejected rows {}", rejected.count);
     }
 }
 
-fn tell_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) {
-    let whose = carried(receiver);
+fn print_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) {
+    let receiver_and_target = carried(receiver);
     let given_s = receiver.clock_offset.seconds();
     match estimate {
         None => println!(
-            "clock offset of {whose}: not told by these files (too little movement, too little in common, or \
+            "clock offset of {receiver_and_target}: cannot be estimated (too little movement, too little overlap, or \
              more than 10 s); {given_s:+.3} s is given"
         ),
         Some(found) => println!(
-            "clock offset of {whose}: {:+.3} s, standard deviation {:.3} s, explains {:.1} % of the movement \
+            "clock offset of {receiver_and_target}: {:+.3} s, standard deviation {:.3} s, explains {:.1} % of the movement \
              ({:.1} % without an offset); {given_s:+.3} s is given",
             found.clock_offset.as_secs_f64(),
             found.sigma_s,
@@ -178,7 +178,7 @@ fn tell_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) {
     }
 }
 
-fn tell_counts(counts: &PairingCounts) {
+fn print_counts(counts: &PairingCounts) {
     let PairingCounts { detections, fixes, paired, .. } = counts;
     println!("paired {paired} of {detections} detections and {fixes} fixes");
     println!(
@@ -186,12 +186,15 @@ fn tell_counts(counts: &PairingCounts) {
          another box {}, duplicate {}",
         counts.detections_without_fixes,
         counts.detections_far_from_fixes,
-        counts.detections_outbid,
+        counts.detections_with_fix_claimed,
         counts.detections_duplicate,
     );
     println!(
         "unused fixes: no receiver named {}, no box of the target {}, no box to take it {}, duplicate {}",
-        counts.fixes_unbound, counts.fixes_without_detections, counts.fixes_unused, counts.fixes_duplicate,
+        counts.fixes_without_receiver,
+        counts.fixes_without_detections,
+        counts.fixes_unused,
+        counts.fixes_duplicate,
     );
 }
 

@@ -1,49 +1,49 @@
-//! Progress of long work: a bar on a terminal, plain lines elsewhere.
+//! Progress of long operations: a bar on a terminal, plain lines otherwise.
 
 use std::io::IsTerminal as _;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// Between two plain lines.
-const LINE_EVERY: Duration = Duration::from_secs(2);
+/// Interval between plain lines.
+const LINE_INTERVAL: Duration = Duration::from_secs(2);
 
-/// Shows how far a piece of work has come, on standard error.
+/// Shows progress on standard error.
 pub(super) enum Progress {
     Bar(ProgressBar),
-    Lines { said: Option<Instant> },
+    Lines { printed_at: Option<Instant> },
 }
 
 impl Progress {
-    /// Nothing is done yet. The template says how the bar looks.
+    /// No progress yet. The template is that of the bar (indicatif).
     pub(super) fn new(template: &str) -> Self {
         if std::io::stderr().is_terminal() {
             let style =
                 ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
             Self::Bar(ProgressBar::no_length().with_style(style))
         } else {
-            Self::Lines { said: None }
+            Self::Lines { printed_at: None }
         }
     }
 
-    /// So much is done of so much, in words too.
-    pub(super) fn set(&mut self, done: u64, of: u64, words: &str) {
+    /// Shows that `done` of `total` is complete, with a message.
+    pub(super) fn set(&mut self, done: u64, total: u64, message: &str) {
         match self {
             Self::Bar(bar) => {
-                bar.set_length(of);
+                bar.set_length(total);
                 bar.set_position(done);
-                bar.set_message(words.to_owned());
+                bar.set_message(message.to_owned());
             }
-            Self::Lines { said } => {
-                if said.is_none_or(|said| said.elapsed() >= LINE_EVERY) {
-                    *said = Some(Instant::now());
-                    eprintln!("{done}/{of} {words}");
+            Self::Lines { printed_at } => {
+                if printed_at.is_none_or(|at| at.elapsed() >= LINE_INTERVAL) {
+                    *printed_at = Some(Instant::now());
+                    eprintln!("{done}/{total} {message}");
                 }
             }
         }
     }
 
-    /// The bar goes, the last line stays.
+    /// Removes the bar.
     pub(super) fn finish(self) {
         if let Self::Bar(bar) = self {
             bar.finish_and_clear();

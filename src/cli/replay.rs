@@ -15,7 +15,9 @@ use super::{camera_id, format_of, open_file, receiver_id, runtime, target_id};
 use crate::clock::Clock;
 use crate::domain::{CameraId, ReceiverId, TargetId, TimeBounds};
 use crate::exchange::{self, ObservedRow, RowRules};
-use crate::replay::{Counters, FaultShares, FixOwner, Pace, Recording, ReplayOptions, Report, replay};
+use crate::replay::{
+    Counters, FaultShares, FixOwner, Pace, RecordedStream, ReplayOptions, ReplayReport, replay,
+};
 
 /// Interval of the progress display.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
@@ -159,19 +161,19 @@ impl Replay {
         Ok(())
     }
 
-    fn recording(&self, time_bounds: TimeBounds) -> anyhow::Result<Recording> {
+    fn recording(&self, time_bounds: TimeBounds) -> anyhow::Result<RecordedStream> {
         let rules = RowRules { time_bounds, image_size: None };
         if let (Some(detections), Some(fixes)) = (&self.detections, &self.fixes) {
             let target = self.fix_target.clone().map(FixOwner::Target);
             let fix_owner = target.or_else(|| self.receiver.clone().map(FixOwner::Receiver));
-            return Ok(Recording::from_detections_and_fixes(
+            return Ok(RecordedStream::from_detections_and_fixes(
                 rows(detections, &rules)?,
                 rows(fixes, &rules)?,
                 fix_owner,
             )?);
         }
         let file = self.file.as_deref().unwrap_or_else(|| Path::new(""));
-        Ok(Recording::from_rows(rows(file, &rules)?)?)
+        Ok(RecordedStream::from_rows(rows(file, &rules)?)?)
     }
 }
 
@@ -206,7 +208,10 @@ fn rows(path: &Path, rules: &RowRules) -> anyhow::Result<Vec<ObservedRow>> {
 }
 
 /// Replays and shows the progress. A first interrupt closes the streams in order, a second one aborts.
-async fn replay_with_progress(recording: Recording, options: ReplayOptions) -> anyhow::Result<Report> {
+async fn replay_with_progress(
+    recording: RecordedStream,
+    options: ReplayOptions,
+) -> anyhow::Result<ReplayReport> {
     let items = recording.len() as u64 * options.repetitions.get() * options.cameras as u64;
     let (started, duration) = (Instant::now(), options.duration);
     let (counters, stop) = (Arc::new(Counters::default()), CancellationToken::new());

@@ -15,13 +15,13 @@ use crate::server::Server;
 use crate::shutdown::Shutdown;
 use crate::telemetry;
 
-/// Answer REST and gRPC on one port
+/// Serve REST and gRPC on one port
 #[derive(Args)]
 pub(super) struct Serve {
-    /// Address of the one port [default: 127.0.0.1:8080]
+    /// Address and port [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDR")]
     listen: Option<SocketAddr>,
-    /// Fill an empty data folder with a small simulated camera, train it, and print what to try
+    /// Fill an empty data folder with a small simulated camera, train it, and print requests to try
     #[arg(long)]
     demo: bool,
     #[command(flatten)]
@@ -35,23 +35,25 @@ impl Serve {
         telemetry::start_log(&settings)?;
         runtime()?.block_on(async {
             let server = Server::bind(settings.clone(), Clock::system(), Randomness::system()).await?;
-            let address = server.address().context("cannot tell the address")?;
+            let address = server.address().context("cannot determine the address")?;
             let (app, shutdown) = (server.app().clone(), server.shutdown());
-            tokio::spawn(end_on_signal(shutdown.clone()));
-            tracing::info!(%address, folder = %settings.data.display(), "answering REST and gRPC");
+            tokio::spawn(shut_down_on_signal(shutdown.clone()));
+            #[cfg(unix)]
+            log_hangups();
+            tracing::info!(%address, folder = %settings.data.display(), "serving REST and gRPC");
             let serving = tokio::spawn(server.run());
             let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
             if shown.is_err() {
                 shutdown.begin();
             }
-            serving.await.context("the server ended without a word")??;
+            serving.await.context("the server task panicked")??;
             shown
         })
     }
 }
 
-/// Ends the server at the first interrupt or termination; a second one ends the process at once.
-async fn end_on_signal(shutdown: Shutdown) {
+/// Shuts the server down at the first SIGINT or SIGTERM; a second one exits immediately.
+async fn shut_down_on_signal(shutdown: Shutdown) {
     wait_for_signal().await;
     shutdown.begin();
     wait_for_signal().await;
@@ -67,7 +69,7 @@ async fn wait_for_signal() {
             _ = terminate.recv() => {}
         },
         Err(error) => {
-            tracing::warn!(%error, "cannot listen for termination, only for interrupts");
+            tracing::warn!(%error, "cannot handle SIGTERM, only SIGINT");
             let _ = tokio::signal::ctrl_c().await;
         }
     }
@@ -76,4 +78,20 @@ async fn wait_for_signal() {
 #[cfg(not(unix))]
 async fn wait_for_signal() {
     let _ = tokio::signal::ctrl_c().await;
+}
+
+/// Logs each SIGHUP, which would else end the process: a closed terminal must not stop a server.
+#[cfg(unix)]
+fn log_hangups() {
+    use tokio::signal::unix::{SignalKind, signal};
+    match signal(SignalKind::hangup()) {
+        Ok(mut hangups) => {
+            tokio::spawn(async move {
+                while hangups.recv().await.is_some() {
+                    tracing::info!("SIGHUP received; settings are read at the start only");
+                }
+            });
+        }
+        Err(error) => tracing::warn!(%error, "cannot listen for SIGHUP, which will end the server"),
+    }
 }

@@ -10,52 +10,52 @@ use clap::Args;
 use crate::exchange::{self, Format};
 use crate::simulation::{Options, Route, Scene, World, simulate};
 
-/// Write a seeded synthetic world with its truth, as CSV
+/// Write a simulated world with its truth, as CSV
 #[derive(Args)]
 pub(super) struct Simulate {
-    /// The place: airport or square
+    /// The scene: airport or square
     #[arg(value_name = "SCENE")]
     scene: Scene,
-    /// Where the rows to learn from go
+    /// Output file of the training rows
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Rows
+    /// Number of training rows
     #[arg(long, value_name = "N", default_value_t = 10_000)]
     samples: usize,
-    /// Where rows to be tried on go: the same camera, other passes
+    /// Output file of the test rows: the same camera, other traverses
     #[arg(long, value_name = "FILE")]
     test_out: Option<PathBuf>,
-    /// Rows to be tried on
+    /// Number of test rows
     #[arg(long, value_name = "N", default_value_t = 400, requires = "test_out")]
     test_samples: usize,
-    /// Where the targets of the test go: lines, new-line or standing
+    /// Route of the test targets: lines, new-line or standing
     #[arg(long, value_name = "ROUTE", default_value = "lines", value_parser = route, requires = "test_out")]
     test_route: Route,
-    /// Seed of all that happens
+    /// Seed of everything but the camera
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// Seed of the camera's place and aim
+    /// Seed of the camera's height, focal length and orientation
     #[arg(long, value_name = "N", default_value_t = 1)]
     camera_seed: u64,
-    /// Targets, their rows interleaved
+    /// Number of targets; their rows are interleaved
     #[arg(long, value_name = "N", default_value_t = 1)]
     targets: usize,
-    /// Standard deviation per axis of the receivers, m; else the scene's own
+    /// Standard deviation per axis of the receivers, m [default: that of the scene]
     #[arg(long, value_name = "S")]
     gnss_sigma_m: Option<f64>,
     /// Standard deviation of each edge of a box, px
     #[arg(long, value_name = "N", default_value_t = 1.0)]
     box_noise_px: f64,
-    /// Radial displacement at the image's corner as a share; negative is a barrel
+    /// Relative radial displacement at the image's corner; negative for barrel distortion
     #[arg(long, value_name = "SHARE", default_value_t = -0.02, allow_negative_numbers = true)]
     lens_distortion: f64,
-    /// Keep boxes that the border cuts; else the scene decides
+    /// Keep boxes truncated by the image border [default: depends on the scene]
     #[arg(long, value_name = "BOOL")]
     border_cuts: Option<bool>,
-    /// Share of rows in which something hides the target
+    /// Share of rows in which the target is occluded
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     occlusion: f64,
-    /// Share of rows whose fix or box is far off
+    /// Share of rows whose fix or box is an outlier
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     outliers: f64,
     /// Share of rows without a fix
@@ -96,7 +96,7 @@ fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {
     Ok(BufWriter::new(file))
 }
 
-/// The columns of a sample file, box and fix left empty where there is none.
+/// Writes the columns of a sample file; missing boxes and fixes are empty.
 fn write_test(world: &World, mut out: impl io::Write) -> io::Result<()> {
     let columns =
         "time,target_id,left,top,width,height,longitude,latitude,class,truth_longitude,truth_latitude";
@@ -104,7 +104,9 @@ fn write_test(world: &World, mut out: impl io::Write) -> io::Result<()> {
     for row in &world.rows {
         write!(out, "{},{}", row.time, row.target_id)?;
         match row.bounding_box {
-            Some(drawn) => drawn.sides_px().iter().try_for_each(|side_px| write!(out, ",{side_px}"))?,
+            Some(bounding_box) => {
+                bounding_box.sides_px().iter().try_for_each(|side_px| write!(out, ",{side_px}"))?
+            }
             None => write!(out, ",,,,")?,
         }
         match row.fix.map(|fix| fix.position) {
@@ -116,7 +118,7 @@ fn write_test(world: &World, mut out: impl io::Write) -> io::Result<()> {
     out.flush()
 }
 
-/// What the simulation cannot make sense of.
+/// Checks the ranges of the options.
 fn check(options: &Options) -> anyhow::Result<()> {
     let Options { samples, targets, gnss_sigma_m, box_noise_px, lens_distortion, .. } = options;
     anyhow::ensure!((1..=10_000_000).contains(samples), "--samples must be from 1 to 10,000,000");

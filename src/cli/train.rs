@@ -1,7 +1,6 @@
 //! `sightfix train`
 
 use std::path::Path;
-use std::time::Duration;
 
 use clap::Args;
 use futures_util::StreamExt as _;
@@ -14,19 +13,19 @@ use crate::domain::{CameraId, JobState, Recipe, RunProgress, TrainingRun};
 use crate::shutdown::Shutdown;
 use crate::worker;
 
-/// Fit a camera's model from its samples
+/// Train a camera's model from its samples
 #[derive(Args)]
 pub(super) struct Train {
     /// The camera's id
     #[arg(long, value_name = "ID", value_parser = camera_id)]
     camera: CameraId,
-    /// How to learn it; else as its profile says
+    /// Recipe [default: that of the camera's profile]
     #[arg(long, value_name = "RECIPE")]
     recipe: Option<Recipe>,
-    /// Everything random in the run comes from it
+    /// Seed of all randomness in the run
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Passes over the samples; else the recipe's own number
+    /// Number of epochs [default: that of the recipe]
     #[arg(long, value_name = "N")]
     epochs: Option<u32>,
     #[command(flatten)]
@@ -55,8 +54,8 @@ impl Train {
     }
 }
 
-/// Queues a run, works on it in this process (a server beside it may be faster to take it), and
-/// shows it until it has ended.
+/// Queues a run, starts a worker in this process (a server on the same folder may claim the run first),
+/// and shows the progress until the run has ended.
 pub(super) async fn train(
     app: &App,
     settings: &Config,
@@ -67,15 +66,15 @@ pub(super) async fn train(
     let shutdown = Shutdown::new();
     shutdown.spawn(worker::train(app.clone(), settings.training.clone(), shutdown.clone()));
     let mut progress = Progress::new("{bar:40} {pos}/{len} epochs {msg}");
-    let mut seen = queued.clone();
+    let mut latest = queued.clone();
     let mut changes = std::pin::pin!(app.watch_run(camera, queued.id).await?);
     while let Some(run) = changes.next().await {
-        seen = run?;
-        let RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. } = &seen.progress;
-        let left = remaining_s.map(|seconds| format!(", {seconds:.0} s left")).unwrap_or_default();
-        progress.set((*epoch).into(), (*epochs).into(), &format!("{phase}, Es {error_scale:.3}{left}"));
+        latest = run?;
+        let RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. } = &latest.progress;
+        let remaining = remaining_s.map(|seconds| format!(", {seconds:.0} s left")).unwrap_or_default();
+        progress.set((*epoch).into(), (*epochs).into(), &format!("{phase}, Es {error_scale:.3}{remaining}"));
     }
     progress.finish();
-    shutdown.finish(Duration::from_secs(settings.limits.drain_s)).await;
-    Ok(seen)
+    shutdown.finish(settings.limits.drain_time()).await;
+    Ok(latest)
 }

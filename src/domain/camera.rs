@@ -139,9 +139,16 @@ impl CameraChange {
     }
 }
 
+/// Identifies a stored camera for good: a camera that is deleted and created again under the same id has
+/// another key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct CameraKey(pub i64);
+
 /// A stored camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
+    /// Identity of this camera among all that had its id.
+    pub key: CameraKey,
     /// The profile.
     pub profile: NewCamera,
     /// Revision of the profile.

@@ -67,8 +67,51 @@ pub enum ErrorKind {
     Timeout,
     /// The server is ending.
     ShuttingDown,
+    /// The request names a host that this server does not answer for.
+    HostNotAllowed,
+    /// A web page of another origin asks for a change.
+    OriginNotAllowed,
     /// A fault of the server.
     Internal,
+}
+
+/// Most fields at fault that one refusal names. gRPC sends them in headers, of which clients take no more
+/// than 8 kB.
+const MOST_VIOLATIONS: usize = 16;
+
+/// Converts all items of a list.
+///
+/// # Errors
+/// `InvalidArgument`, naming the fields at fault of all items below `list[index]`, so that a caller can
+/// mend them at once; any other error as it comes.
+pub fn convert_all<T, R>(
+    list: &str,
+    items: impl IntoIterator<Item = T>,
+    mut convert: impl FnMut(T) -> Result<R>,
+) -> Result<Vec<R>> {
+    let items = items.into_iter();
+    let mut converted = Vec::with_capacity(items.size_hint().0);
+    let mut violations = Vec::new();
+    for (index, item) in items.enumerate() {
+        match convert(item) {
+            Ok(item) => converted.push(item),
+            Err(Error::Refused(mut refusal)) if refusal.kind == ErrorKind::InvalidArgument => {
+                let parent = format!("{list}[{index}]");
+                refusal.violations.iter_mut().for_each(|violation| violation.move_under(&parent));
+                violations.append(&mut refusal.violations);
+            }
+            Err(error) => return Err(error),
+        }
+        if violations.len() >= MOST_VIOLATIONS {
+            violations.truncate(MOST_VIOLATIONS);
+            break;
+        }
+    }
+    if violations.is_empty() {
+        return Ok(converted);
+    }
+    let message = format!("nothing was done, for the {list} at fault");
+    Err(Error::Refused(Refusal { kind: ErrorKind::InvalidArgument, message, violations }))
 }
 
 /// One invalid field.
@@ -78,6 +121,16 @@ pub struct Violation {
     pub field: String,
     /// What is wrong and what is valid.
     pub message: String,
+}
+
+impl Violation {
+    fn move_under(&mut self, parent: &str) {
+        self.field = match self.field.as_str() {
+            "" => parent.to_owned(),
+            field if field.starts_with('[') => format!("{parent}{field}"),
+            field => format!("{parent}.{field}"),
+        };
+    }
 }
 
 /// An error that the caller can correct; all of it may be shown.
@@ -174,13 +227,7 @@ impl Error {
     #[must_use]
     pub fn under(mut self, parent: &str) -> Self {
         if let Self::Refused(refusal) = &mut self {
-            for violation in &mut refusal.violations {
-                violation.field = match violation.field.as_str() {
-                    "" => parent.to_owned(),
-                    field if field.starts_with('[') => format!("{parent}{field}"),
-                    field => format!("{parent}.{field}"),
-                };
-            }
+            refusal.violations.iter_mut().for_each(|violation| violation.move_under(parent));
         }
         self
     }

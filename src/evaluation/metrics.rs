@@ -102,10 +102,10 @@ impl Metrics {
 
 /// Quantile of ascending values (at least one), interpolated linearly between order statistics.
 fn quantile(ascending: &[f64], part: f64) -> f64 {
-    let place = part * (ascending.len() - 1) as f64;
-    let low = place.floor() as usize;
+    let rank = part * (ascending.len() - 1) as f64;
+    let low = rank.floor() as usize;
     let high = (low + 1).min(ascending.len() - 1);
-    ascending[low] + (place - place.floor()) * (ascending[high] - ascending[low])
+    ascending[low] + (rank - rank.floor()) * (ascending[high] - ascending[low])
 }
 
 fn coverage(predictions: &[ScoredPrediction], factor: f64) -> Option<f64> {

@@ -67,11 +67,11 @@ fn error_over_time(traces: &[Trace], test: &[TestRow]) -> String {
         let last_s = shown_s[shown_s.len() - 1];
         shown_s.push(last_s + (pair[1] - pair[0]).min(5.0));
     }
-    let place = |row: usize| {
+    let elapsed_s = |row: usize| {
         let time_s = test[row].observation.time.as_microsecond() as f64 * 1e-6;
         shown_s[times_s.partition_point(|&other_s| other_s < time_s).min(shown_s.len() - 1)]
     };
-    let points = |point: &TracePoint| Some([place(point.row), point.error_m?]);
+    let points = |point: &TracePoint| Some([elapsed_s(point.row), point.error_m?]);
     let series = of_traces(traces, Shape::Dots, &points);
     chart("Error over time", "seconds of test rows, gaps shortened", "error, m", &series, false)
 }
@@ -93,22 +93,22 @@ fn plane(traces: &[Trace], test: &[TestRow], truth: &Truth) -> String {
     let first = traces.iter().find_map(|trace| trace.points.first());
     let Some(first) = first else { return chart("Positions", "east, m", "north, m", &[], true) };
     let plane = LocalPlane::new(first.position);
-    let place = |position: Position| {
+    let in_plane = |position: Position| {
         let EastNorth { east_m, north_m } = plane.to_plane(position);
         [east_m, north_m]
     };
-    let mut series = of_traces(traces, Shape::Dots, &|point| Some(place(point.position)));
+    let mut series = of_traces(traces, Shape::Dots, &|point| Some(in_plane(point.position)));
     let mut known = |points: Vec<[f64; 2]>, shape| {
         series.push(Series { name: "truth".to_owned(), points, shape });
     };
     match truth {
         Truth::Columns => {
-            known(thin(test.iter().filter_map(|row| row.truth.map(place)).collect()), Shape::Dots);
+            known(thin(test.iter().filter_map(|row| row.truth.map(in_plane)).collect()), Shape::Dots);
         }
-        Truth::Point(point) => known(vec![place(*point)], Shape::Dots),
+        Truth::Point(point) => known(vec![in_plane(*point)], Shape::Dots),
         Truth::Lines(lines) => {
             for line in lines {
-                known(line.iter().map(|&point| place(point)).collect(), Shape::Line);
+                known(line.iter().map(|&point| in_plane(point)).collect(), Shape::Line);
             }
         }
     }

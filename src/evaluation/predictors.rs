@@ -5,13 +5,12 @@ use super::options::{EvaluateOptions, TestRow};
 use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, Sample, SigmaM};
 use crate::filters::ImmUkf;
-use crate::fusion::track::{MeasuredPosition, Measurement, Track, TrackSettings, traverses};
+use crate::fusion::observed::{ObservedPositions, UNKNOWN_RECEIVER_M2};
+use crate::fusion::target_track::TargetTrack;
+use crate::fusion::track::TrackSettings;
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regression, Regressor};
-
-/// Standard deviation per axis assumed for a receiver whose error is unknown, m.
-const UNKNOWN_RECEIVER_SIGMA_M: f64 = 5.0;
+use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regressor, fix_sequences};
 
 /// A predicted position with its stated 95 % radius.
 #[derive(Debug, Clone, Copy)]
@@ -51,7 +50,7 @@ impl<'a> Predictors<'a> {
     /// Error variance per axis of fixes that do not state their own, m2.
     fn gnss_variance_m2(&self, of_model_m2: Option<f64>) -> f64 {
         let known_m2 = self.options.gnss_sigma.map(SigmaM::variance_m2);
-        known_m2.or(of_model_m2).unwrap_or(UNKNOWN_RECEIVER_SIGMA_M * UNKNOWN_RECEIVER_SIGMA_M)
+        known_m2.or(of_model_m2).unwrap_or(UNKNOWN_RECEIVER_M2)
     }
 
     /// The predictor of a method that uses no recipe's model.
@@ -127,7 +126,7 @@ impl<'a> Predictors<'a> {
         'a: 'b,
     {
         let variance_m2 = self.gnss_variance_m2(None);
-        let tuned = imm_ukf::tune(&traverses(self.train, &self.plane), variance_m2);
+        let tuned = imm_ukf::tune(&fix_sequences(self.train, &self.plane), variance_m2);
         let (plane, test) = (self.plane, self.test);
         Box::new(move |target| {
             let mut filter = ImmUkf::new(tuned);
@@ -195,60 +194,23 @@ impl<'a> Predictors<'a> {
     where
         'a: 'b,
     {
-        let settings = TrackSettings::estimate(self.train, regressor);
-        let (plane, test) = (*regressor.plane(), self.test);
+        let settings = TrackSettings::from_model(regressor);
+        let (test, image_size) = (self.test, self.options.image_size);
         Box::new(move |target| {
-            let mut track: Option<Track> = None;
+            let mut track = TargetTrack::default();
             let predict = |&row: &usize| {
                 let mut observation = test[row].observation.clone();
                 observation.fix = observation.fix.filter(|_| with_fix);
-                let measurement = measurement(&observation, &plane, e_gnss_m2, |bounding_box, fix| {
-                    regressor.regress(bounding_box, fix)
-                });
-                step_track(&mut track, settings, &measurement, &plane)
+                let observed =
+                    ObservedPositions::of(&observation, Some(regressor), image_size, Some(e_gnss_m2));
+                let estimate = if observed.is_empty() {
+                    track.at(observation.time)
+                } else {
+                    track.update(&observed, || settings)
+                }?;
+                Some(Prediction { position: estimate.position, r95_m: Some(estimate.state.r95_m) })
             };
             target.iter().map(predict).collect()
         })
     }
-}
-
-/// The measurement of one row, with the regression's variance at its calibrated size.
-fn measurement(
-    observation: &Observation,
-    plane: &LocalPlane,
-    e_gnss_m2: f64,
-    regress: impl Fn(&BoundingBox, Option<EastNorth>) -> Regression,
-) -> Measurement {
-    let fix = observation.fix.map(|fix| {
-        let variance_m2 = fix.sigma_m.map_or(e_gnss_m2, SigmaM::variance_m2);
-        MeasuredPosition::isotropic(plane.to_plane(fix.position), variance_m2)
-    });
-    let regressed = observation.bounding_box.as_ref().map(|bounding_box| {
-        let regression = regress(bounding_box, fix.map(|fix| fix.position));
-        MeasuredPosition::isotropic(regression.regressed, regression.variance_m2())
-    });
-    Measurement { time: observation.time, fix, regressed }
-}
-
-/// Updates a track or starts one; a row without any measurement gets the track's prediction.
-fn step_track(
-    track: &mut Option<Track>,
-    settings: TrackSettings,
-    measurement: &Measurement,
-    plane: &LocalPlane,
-) -> Option<Prediction> {
-    if track.as_ref().is_some_and(|track| track.is_expired(measurement.time)) {
-        *track = None;
-    }
-    let state = match track {
-        Some(track) if measurement.fix.is_none() && measurement.regressed.is_none() => {
-            track.state_at(measurement.time)
-        }
-        Some(track) => track.update(measurement),
-        None => {
-            *track = Track::start(settings, measurement);
-            track.as_ref()?.state_at(measurement.time)
-        }
-    };
-    Some(Prediction { position: plane.to_position(state.position), r95_m: Some(state.r95_m) })
 }

@@ -10,6 +10,7 @@ use super::columns::{
     TARGET_ID, TIME, TRUTH_LATITUDE, TRUTH_LONGITUDE,
 };
 use super::file_row::{FileRow, RowError};
+use super::formula_guard::unguarded;
 use super::lines::{Line, Lines};
 use super::wire::{self, Text};
 use crate::domain::{Error, ErrorKind, Result};
@@ -18,7 +19,7 @@ use crate::domain::{Error, ErrorKind, Result};
 pub(super) struct CsvRows<R> {
     lines: Lines<R>,
     header: Box<Header>,
-    fields: Fields,
+    fields: FieldSplitter,
 }
 
 impl<R: Read> CsvRows<R> {
@@ -38,7 +39,7 @@ impl<R: Read> CsvRows<R> {
 
     fn with_columns(reader: R, required: &[usize], known: usize) -> Result<Self> {
         let mut lines = Lines::new(reader);
-        let mut fields = Fields::default();
+        let mut fields = FieldSplitter::default();
         let header = loop {
             match lines.next_line().map_err(Error::fault)? {
                 Some((_, Line::Text(text))) if text.trim().is_empty() => {}
@@ -78,31 +79,34 @@ impl<R: Read> CsvRows<R> {
                 }
             };
             let header = &self.header;
-            let row = self.fields.split(text).map_err(Fault::Whole).and_then(|fields| {
-                let cells = Cells::of(header, fields)?;
-                let row = cells.row().map_err(|(index, reason)| Fault::Column(index, reason))?;
-                convert(row).map_err(Fault::Domain)
+            let row = self.fields.split(text).map_err(CsvRowError::Row).and_then(|fields| {
+                let cells = CsvCells::of(header, fields)?;
+                let row = cells.row().map_err(|(index, reason)| CsvRowError::Column(index, reason))?;
+                convert(row).map_err(CsvRowError::Value)
             });
             return Some(match row {
                 Ok(value) => Ok(Ok(value)),
-                Err(Fault::Whole(reason)) => Ok(Err(RowError::whole(line, &reason))),
-                Err(Fault::Column(index, reason)) => {
+                Err(CsvRowError::Row(reason)) => Ok(Err(RowError::whole(line, &reason))),
+                Err(CsvRowError::Column(index, reason)) => {
                     Ok(Err(RowError { line, field: header.name(index).to_owned(), reason }))
                 }
-                Err(Fault::Domain(error)) => RowError::of(line, error).map(|mut fault| {
-                    fault.field = header.name_of_path(&fault.field).to_owned();
-                    Err(fault)
+                Err(CsvRowError::Value(error)) => RowError::of(line, error).map(|mut row_error| {
+                    row_error.field = header.name_of_path(&row_error.field).to_owned();
+                    Err(row_error)
                 }),
             });
         }
     }
 }
 
-/// Why a row is none.
-enum Fault {
-    Whole(String),
+/// Why a row is invalid.
+enum CsvRowError {
+    /// The row as a whole.
+    Row(String),
+    /// One column, by its index in [`super::columns::COLUMNS`].
     Column(usize, String),
-    Domain(Error),
+    /// A value that a domain constructor refuses.
+    Value(Error),
 }
 
 fn malformed(reason: &str) -> Error {
@@ -110,14 +114,14 @@ fn malformed(reason: &str) -> Error {
 }
 
 /// The cells of one line in the order of the known columns.
-struct Cells<'a> {
+struct CsvCells<'a> {
     cells: [&'a str; COUNT],
 }
 
-type Cell<T> = std::result::Result<T, (usize, String)>;
+type CellResult<T> = std::result::Result<T, (usize, String)>;
 
-impl<'a> Cells<'a> {
-    fn of(header: &Header, fields: impl Iterator<Item = &'a str>) -> Result<Self, Fault> {
+impl<'a> CsvCells<'a> {
+    fn of(header: &Header, fields: impl Iterator<Item = &'a str>) -> Result<Self, CsvRowError> {
         let mut in_file = [""; COUNT];
         let mut count = 0;
         for field in fields {
@@ -128,17 +132,17 @@ impl<'a> Cells<'a> {
         }
         if count != header.width() {
             let width = header.width();
-            return Err(Fault::Whole(format!("has {count} fields where the header names {width}")));
+            return Err(CsvRowError::Row(format!("has {count} fields where the header names {width}")));
         }
         let cells =
             std::array::from_fn(|index| header.position(index).map_or("", |position| in_file[position]));
         Ok(Self { cells })
     }
 
-    fn row(&self) -> Cell<FileRow<'a>> {
+    fn row(&self) -> CellResult<FileRow<'a>> {
         Ok(FileRow {
             time: self.text(TIME),
-            target_id: self.text(TARGET_ID),
+            target_id: self.name(TARGET_ID),
             bounding_box: self.numbers([LEFT, LEFT + 1, LEFT + 2, HEIGHT])?.map(
                 |[left_px, top_px, width_px, height_px]| wire::BoundingBox {
                     left_px,
@@ -148,16 +152,16 @@ impl<'a> Cells<'a> {
                 },
             ),
             fix: self.fix()?,
-            class: self.text(CLASS),
+            class: self.name(CLASS),
             score: self.number(SCORE)?,
             truth: self
                 .numbers([TRUTH_LONGITUDE, TRUTH_LATITUDE])?
                 .map(|[longitude_deg, latitude_deg]| wire::Position { longitude_deg, latitude_deg }),
-            receiver_id: self.text(RECEIVER_ID),
+            receiver_id: self.name(RECEIVER_ID),
         })
     }
 
-    fn fix(&self) -> Cell<Option<wire::Fix>> {
+    fn fix(&self) -> CellResult<Option<wire::Fix>> {
         let sigma_m = self.number(SIGMA)?;
         let degrees = self.numbers([LONGITUDE, LATITUDE])?;
         Ok(degrees.map(|[longitude_deg, latitude_deg]| wire::Fix { longitude_deg, latitude_deg, sigma_m }))
@@ -168,7 +172,13 @@ impl<'a> Cells<'a> {
         (!cell.is_empty()).then(|| Text::from(cell))
     }
 
-    fn number(&self, index: usize) -> Cell<Option<f64>> {
+    /// A name, without the guard that keeps spreadsheets from running it as a formula.
+    fn name(&self, index: usize) -> Option<Text<'a>> {
+        let cell = unguarded(self.cells[index]);
+        (!cell.is_empty()).then(|| Text::from(cell))
+    }
+
+    fn number(&self, index: usize) -> CellResult<Option<f64>> {
         let cell = self.cells[index];
         if cell.is_empty() {
             return Ok(None);
@@ -180,7 +190,7 @@ impl<'a> Cells<'a> {
     }
 
     /// The numbers of a group: `None` if all cells are empty, an error if some are.
-    fn numbers<const N: usize>(&self, indexes: [usize; N]) -> Cell<Option<[f64; N]>> {
+    fn numbers<const N: usize>(&self, indexes: [usize; N]) -> CellResult<Option<[f64; N]>> {
         let mut numbers = [0.0; N];
         let mut missing = None;
         let mut given = 0;
@@ -203,20 +213,20 @@ impl<'a> Cells<'a> {
 
 /// The fields of one line, as in RFC 4180 but without line breaks within quotes.
 #[derive(Default)]
-struct Fields {
+struct FieldSplitter {
     /// Text of the fields without quotes.
     unquoted: String,
     /// Range of every field in `unquoted`.
     spans: Vec<(usize, usize)>,
 }
 
-/// Fields borrowed from the line, or from the unquoted text.
-enum Split<'a> {
+/// FieldSplitter borrowed from the line, or from the unquoted text.
+enum SplitFields<'a> {
     Plain(std::str::Split<'a, char>),
     Quoted(&'a str, std::slice::Iter<'a, (usize, usize)>),
 }
 
-impl<'a> Iterator for Split<'a> {
+impl<'a> Iterator for SplitFields<'a> {
     type Item = &'a str;
 
     fn next(&mut self) -> Option<&'a str> {
@@ -227,10 +237,10 @@ impl<'a> Iterator for Split<'a> {
     }
 }
 
-impl Fields {
-    fn split<'a>(&'a mut self, line: &'a str) -> Result<Split<'a>, String> {
+impl FieldSplitter {
+    fn split<'a>(&'a mut self, line: &'a str) -> Result<SplitFields<'a>, String> {
         if !line.contains('"') {
-            return Ok(Split::Plain(line.split(',')));
+            return Ok(SplitFields::Plain(line.split(',')));
         }
         self.unquoted.clear();
         self.spans.clear();
@@ -240,7 +250,7 @@ impl Fields {
             rest = self.take_field(text)?;
             self.spans.push((begin, self.unquoted.len()));
         }
-        Ok(Split::Quoted(&self.unquoted, self.spans.iter()))
+        Ok(SplitFields::Quoted(&self.unquoted, self.spans.iter()))
     }
 
     /// Appends the first field of the text; returns the rest after the comma.
@@ -283,7 +293,7 @@ mod tests {
             let mut writer = csv::Writer::from_writer(Vec::new());
             writer.write_record(&fields).expect("memory");
             let line = String::from_utf8(writer.into_inner().expect("memory")).expect("UTF-8");
-            let mut splitter = Fields::default();
+            let mut splitter = FieldSplitter::default();
             let split: Vec<&str> = splitter.split(line.trim_end_matches('\n')).expect("well formed").collect();
             prop_assert_eq!(split, fields);
         }

@@ -3,34 +3,89 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
-use crate::domain::{Error, Result};
+use crate::domain::{CameraId, Error, EvaluationId, Result, RunId};
 
 /// Largest accepted cursor, bytes.
 const MAX_BYTES: usize = 512;
 
-/// The cursor after the item with that key, for a list.
-#[must_use]
-pub fn write_cursor(list: &str, key: &str) -> String {
-    URL_SAFE_NO_PAD.encode(format!("{list}:{key}"))
+/// The key of the last item of a page, behind which the next page begins.
+pub trait Cursor: Sized {
+    /// Name of the list, so that no list takes the cursor of another.
+    const LIST: &'static str;
+
+    /// The key as text.
+    fn to_key(&self) -> String;
+
+    /// The key that [`Cursor::to_key`] wrote.
+    fn from_key(key: &str) -> Option<Self>;
 }
 
-/// The key in a cursor of that list.
+/// A cursor as text.
+#[must_use]
+pub fn write_cursor<C: Cursor>(cursor: &C) -> String {
+    URL_SAFE_NO_PAD.encode(format!("{}:{}", C::LIST, cursor.to_key()))
+}
+
+/// The cursor in a text that [`write_cursor`] gave.
 ///
 /// # Errors
-/// Names the field `cursor` for text that is not a cursor of this list.
-pub fn read_cursor(list: &str, cursor: &str) -> Result<String> {
-    let key = (cursor.len() <= MAX_BYTES)
-        .then(|| URL_SAFE_NO_PAD.decode(cursor).ok())
+/// `InvalidArgument`, naming the field, for text that no page of this list gave.
+pub fn read_cursor<C: Cursor>(field: &str, text: &str) -> Result<C> {
+    let cursor = (text.len() <= MAX_BYTES)
+        .then(|| URL_SAFE_NO_PAD.decode(text).ok())
         .flatten()
         .and_then(|bytes| String::from_utf8(bytes).ok())
-        .and_then(|text| text.strip_prefix(list)?.strip_prefix(':').map(str::to_owned));
-    key.ok_or_else(foreign_cursor)
+        .and_then(|text| C::from_key(text.strip_prefix(C::LIST)?.strip_prefix(':')?));
+    cursor.ok_or_else(|| Error::invalid(field, "must be what the page of this list before gave for the next"))
 }
 
-/// The refusal of text that is not a cursor of the list.
-#[must_use]
-pub fn foreign_cursor() -> Error {
-    Error::invalid("cursor", "must be the next cursor returned with a page of this list")
+impl Cursor for CameraId {
+    const LIST: &'static str = "cameras";
+
+    fn to_key(&self) -> String {
+        self.as_str().to_owned()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        Self::new(key).ok()
+    }
+}
+
+impl Cursor for RunId {
+    const LIST: &'static str = "training-runs";
+
+    fn to_key(&self) -> String {
+        self.to_string()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        key.parse().ok()
+    }
+}
+
+impl Cursor for EvaluationId {
+    const LIST: &'static str = "evaluations";
+
+    fn to_key(&self) -> String {
+        self.to_string()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        key.parse().ok()
+    }
+}
+
+/// Number of a model version.
+impl Cursor for u32 {
+    const LIST: &'static str = "models";
+
+    fn to_key(&self) -> String {
+        self.to_string()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        key.parse().ok()
+    }
 }
 
 #[cfg(test)]
@@ -39,10 +94,11 @@ mod tests {
 
     #[test]
     fn a_cursor_is_read_by_its_own_list_only() {
-        let cursor = write_cursor("samples", "17:é");
-        assert_eq!(read_cursor("samples", &cursor).expect("own"), "17:é");
+        let cursor = write_cursor(&7_u32);
+        assert_eq!(read_cursor::<u32>("cursor", &cursor).expect("own"), 7);
         for foreign in ["", "*", "c2FtcGxlcw", cursor.as_str()] {
-            assert!(read_cursor("cameras", foreign).is_err(), "{foreign}");
+            let error = read_cursor::<CameraId>("page_token", foreign).expect_err(foreign);
+            assert!(error.to_string().starts_with("page_token: "), "{error}");
         }
     }
 }

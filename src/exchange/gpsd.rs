@@ -22,7 +22,7 @@ pub(super) struct GpsdFixes<R> {
 
 /// The fields of a report that are used.
 #[derive(Deserialize)]
-struct Report<'a> {
+struct GpsdReport<'a> {
     #[serde(borrow)]
     class: Text<'a>,
     #[serde(borrow)]
@@ -66,7 +66,7 @@ impl<R: Read> GpsdFixes<R> {
 
 /// The fix of a report; `None` for a report of another class.
 fn report(line: u64, text: &str, time_bounds: &TimeBounds) -> Result<Option<Result<FixRow, RowError>>> {
-    let report: Report<'_> = wire::parse_json(text.as_bytes())?;
+    let report: GpsdReport<'_> = wire::parse_json(text.as_bytes())?;
     if report.class.as_str() != "TPV" {
         return Ok(None);
     }

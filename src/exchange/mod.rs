@@ -15,6 +15,7 @@ mod file_row;
 mod fix_row;
 mod fixes;
 mod format;
+mod formula_guard;
 mod gpsd;
 mod gpx;
 mod lines;
@@ -25,7 +26,7 @@ mod tests;
 pub mod wire;
 mod write;
 
-pub use cursor::{foreign_cursor, read_cursor, write_cursor};
+pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};

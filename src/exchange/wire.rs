@@ -305,6 +305,15 @@ pub enum Flag {
     NoModel,
     /// The camera's pose has changed since its model was trained.
     CameraMoved,
+    /// Box and fix contradict each other beyond their stated errors (chi-square gate, 99.9 %).
+    SourcesDisagree,
+    /// The fix was not used for the position: it contradicts the box, or it is out of range.
+    FixRejected,
+    /// The box was not used for the position: it contradicts the fix and is unusual, or the model
+    /// gives no position for it.
+    BoxRejected,
+    /// The fix lies farther than 20 km from the camera's scene.
+    FixOutOfRange,
 }
 
 /// Flags by their names.

@@ -11,6 +11,7 @@ use serde::Serialize;
 
 use super::columns::{COLUMNS, OF_SAMPLES};
 use super::format::Format;
+use super::formula_guard::guarded;
 use super::wire;
 use crate::domain::{FusedFix, Sample};
 
@@ -193,11 +194,11 @@ fn sample_header<W: Write>(out: &mut W) -> io::Result<()> {
 
 fn sample_cells<W: Write>(out: &mut W, row: &wire::Sample<'_>) -> io::Result<()> {
     let wire::BoundingBox { left_px, top_px, width_px, height_px } = row.bounding_box;
-    write!(out, "{},{},", row.time, quoted(row.target_id))?;
+    write!(out, "{},{},", row.time, text_cell(row.target_id))?;
     write!(out, "{left_px},{top_px},{width_px},{height_px},")?;
     write!(out, "{:.8},{:.8},", row.fix.longitude_deg, row.fix.latitude_deg)?;
     cell(out, row.fix.sigma_m)?;
-    cell(out, row.class.map(quoted))?;
+    cell(out, row.class.map(text_cell))?;
     cell(out, row.score)?;
     match row.truth {
         Some(truth) => writeln!(out, "{:.8},{:.8}", truth.longitude_deg, truth.latitude_deg),
@@ -215,7 +216,7 @@ fn fused_header<W: Write>(out: &mut W) -> io::Result<()> {
 }
 
 fn fused_cells<W: Write>(out: &mut W, row: &wire::FusedFix<'_>) -> io::Result<()> {
-    write!(out, "{},{},", row.time, row.target_id.map(quoted).unwrap_or_default())?;
+    write!(out, "{},{},", row.time, row.target_id.map(text_cell).unwrap_or_default())?;
     degrees(out, Some(row.fused))?;
     write!(out, "{},", row.r95_m)?;
     degrees(out, row.regressed)?;
@@ -251,13 +252,10 @@ fn cell<W: Write>(out: &mut W, value: Option<impl Display>) -> io::Result<()> {
     }
 }
 
-/// Names contain no control characters, so only commas and quotes require quoting.
-fn quoted(name: &str) -> Cow<'_, str> {
-    if name.contains([',', '"']) {
-        Cow::Owned(format!("\"{}\"", name.replace('"', "\"\"")))
-    } else {
-        Cow::Borrowed(name)
-    }
+/// A name as a cell. Names contain no control characters, so only commas and quotes require quoting.
+fn text_cell(name: &str) -> Cow<'_, str> {
+    let name = guarded(name);
+    if name.contains([',', '"']) { Cow::Owned(format!("\"{}\"", name.replace('"', "\"\""))) } else { name }
 }
 
 /// A GeoJSON feature: a point with properties.

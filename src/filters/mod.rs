@@ -9,7 +9,7 @@ mod smoother;
 use crate::geo::EastNorth;
 
 pub use imm_ukf::{ImmUkf, ImmUkfEstimate, ImmUkfOptions};
-pub use smoother::{FixError, SmoothedPosition, smooth_traverse, tune_acceleration};
+pub use smoother::{SmoothedPosition, noise_of_fixes, smooth_traverse, tune_acceleration};
 
 /// One traverse of the scene by one target, without a gap: times in s, ascending, and a fix for each.
 pub type Traverse = (Vec<f64>, Vec<EastNorth>);

@@ -8,6 +8,7 @@
 use nalgebra::{Matrix3, Matrix3x2, RowVector2, Vector3};
 
 use super::Traverse;
+use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 use crate::geo::EastNorth;
 
 /// Initial variance per axis of position (m2) and velocity (m2/s2).
@@ -15,50 +16,35 @@ const INITIAL_M2: f64 = 1e6;
 const INITIAL_SPEED_M2_S2: f64 = 400.0;
 /// The variance of a fix is inflated until its NIS (two axes) is at most this.
 const MAX_NIS: f64 = 9.0;
+/// Least standard deviation of the white part, m.
+const MIN_WHITE_SIGMA_M: f64 = 0.01;
 /// Candidate accelerations of [`tune_acceleration`], m/s2.
 const ACCELERATIONS_M_S2: [f64; 9] = [0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0, 4.0];
 
-/// A receiver's error per axis: white noise plus a first-order Gauss-Markov bias.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FixError {
-    /// Standard deviation of the white part, m.
-    pub white_m: f64,
-    /// Standard deviation of the Gauss-Markov part, m.
-    pub coloured_m: f64,
-    /// Time constant of the Gauss-Markov part, s.
-    pub time_constant_s: f64,
-}
-
-impl FixError {
-    /// White noise only.
-    #[must_use]
-    pub const fn white(sigma_m: f64) -> Self {
-        Self { white_m: sigma_m, coloured_m: 0.0, time_constant_s: 40.0 }
+/// The noise of fixes whose variance per axis (m2) is known, decomposed by their second differences, whose
+/// variance is six times that of the white part. The rest is modelled with the time constant of phones.
+/// Accelerations of the target inflate the white part.
+#[must_use]
+pub fn noise_of_fixes(variance_m2: f64, traverses: &[Traverse]) -> GaussMarkovNoise {
+    let mut squared_m2: Vec<f64> =
+        traverses.iter().flat_map(|(times_s, fixes)| squared_second_differences_m2(times_s, fixes)).collect();
+    let time_constant_s = NoiseCorrelation::PHONE.time_constant_s;
+    let white =
+        GaussMarkovNoise { variance_m2, correlation: NoiseCorrelation { white_share: 1.0, time_constant_s } };
+    let Some(median) = squared_m2.len().checked_sub(1).map(|last| last / 2) else {
+        return white;
+    };
+    squared_m2.sort_by(f64::total_cmp);
+    // The squared length of a bivariate normal vector has the median 2 ln 2 times the variance.
+    let white_m2 = squared_m2[median] / (2.0 * std::f64::consts::LN_2) / 6.0;
+    let sigma_m = variance_m2.sqrt();
+    let white_m = white_m2.sqrt().min(sigma_m);
+    // Within the uncertainty of that estimate all of it is white.
+    if white_m > 0.9 * sigma_m {
+        return white;
     }
-
-    /// Splits a known standard deviation per axis (m) by the second differences of the fixes: their
-    /// variance is six times that of the white part. The rest is modelled with the time constant of
-    /// phones, 40 s. Accelerations of the target inflate the white part.
-    #[must_use]
-    pub fn split(sigma_m: f64, traverses: &[Traverse]) -> Self {
-        let mut squared_m2: Vec<f64> = traverses
-            .iter()
-            .flat_map(|(times_s, fixes)| squared_second_differences_m2(times_s, fixes))
-            .collect();
-        let Some(median) = squared_m2.len().checked_sub(1).map(|last| last / 2) else {
-            return Self::white(sigma_m);
-        };
-        squared_m2.sort_by(f64::total_cmp);
-        // The squared length of a bivariate normal vector has the median 2 ln 2 times the variance.
-        let white_m2 = squared_m2[median] / (2.0 * std::f64::consts::LN_2) / 6.0;
-        let white_m = white_m2.sqrt().min(sigma_m);
-        let coloured_m = (sigma_m * sigma_m - white_m * white_m).sqrt();
-        // Within the uncertainty of that estimate all of it is white.
-        if white_m > 0.9 * sigma_m {
-            return Self::white(sigma_m);
-        }
-        Self { white_m: white_m.max(0.01 * sigma_m), coloured_m, time_constant_s: 40.0 }
-    }
+    let white_share = white_m.max(0.01 * sigma_m).powi(2) / variance_m2;
+    GaussMarkovNoise { variance_m2, correlation: NoiseCorrelation { white_share, time_constant_s } }
 }
 
 /// Squared lengths of second differences of evenly spaced fixes, m2.
@@ -99,10 +85,10 @@ struct StateEstimate {
 pub fn smooth_traverse(
     times_s: &[f64],
     fixes: &[EastNorth],
-    error: &FixError,
+    noise: &GaussMarkovNoise,
     acceleration_m_s2: f64,
 ) -> Vec<SmoothedPosition> {
-    let (steps, _) = filter(times_s, fixes, error, acceleration_m_s2);
+    let (steps, _) = filter(times_s, fixes, noise, acceleration_m_s2);
     let Some(last) = steps.last() else { return Vec::new() };
     let mut estimate = last.updated;
     let mut reversed = vec![smoothed(&estimate)];
@@ -123,9 +109,9 @@ pub fn smooth_traverse(
 
 /// The acceleration (m/s2), of a coarse grid, that maximises the likelihood of the fixes.
 #[must_use]
-pub fn tune_acceleration(traverses: &[Traverse], error: &FixError) -> f64 {
+pub fn tune_acceleration(traverses: &[Traverse], noise: &GaussMarkovNoise) -> f64 {
     let likelihood = |&acceleration_m_s2: &f64| -> f64 {
-        traverses.iter().map(|(times_s, fixes)| filter(times_s, fixes, error, acceleration_m_s2).1).sum()
+        traverses.iter().map(|(times_s, fixes)| filter(times_s, fixes, noise, acceleration_m_s2).1).sum()
     };
     let scored = ACCELERATIONS_M_S2.iter().map(|candidate| (likelihood(candidate), *candidate));
     scored.max_by(|one, other| one.0.total_cmp(&other.0)).map_or(0.5, |(_, candidate)| candidate)
@@ -149,11 +135,12 @@ struct FilterStep {
 fn filter(
     times_s: &[f64],
     fixes: &[EastNorth],
-    error: &FixError,
+    noise: &GaussMarkovNoise,
     acceleration_m_s2: f64,
 ) -> (Vec<FilterStep>, f64) {
     // Bounded below to keep the covariance invertible for white noise.
-    let coloured_m2 = (error.coloured_m * error.coloured_m).max(1e-6);
+    let coloured_m2 = noise.coloured_sigma_m().powi(2).max(1e-6);
+    let white_m2 = noise.white_sigma_m().max(MIN_WHITE_SIGMA_M).powi(2);
     let Some(&first) = fixes.first() else { return (Vec::new(), 0.0) };
     let mut estimate = StateEstimate {
         mean: Matrix3x2::new(first.east_m, first.north_m, 0.0, 0.0, 0.0, 0.0),
@@ -162,20 +149,20 @@ fn filter(
     let (mut steps, mut log_likelihood) = (Vec::with_capacity(fixes.len()), 0.0);
     for (index, fix) in fixes.iter().enumerate() {
         let seconds = if index == 0 { 0.0 } else { times_s[index] - times_s[index - 1] };
-        let decay = (-seconds / error.time_constant_s).exp();
+        let decay = noise.correlation.decay(seconds);
         let transition = Matrix3::new(1.0, seconds, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, decay);
-        let mut noise = Matrix3::zeros();
+        let mut process = Matrix3::zeros();
         let density = acceleration_m_s2 * acceleration_m_s2;
-        noise[(0, 0)] = density * seconds.powi(3) / 3.0;
-        noise[(0, 1)] = density * seconds.powi(2) / 2.0;
-        noise[(1, 0)] = noise[(0, 1)];
-        noise[(1, 1)] = density * seconds;
-        noise[(2, 2)] = coloured_m2 * (1.0 - decay * decay);
+        process[(0, 0)] = density * seconds.powi(3) / 3.0;
+        process[(0, 1)] = density * seconds.powi(2) / 2.0;
+        process[(1, 0)] = process[(0, 1)];
+        process[(1, 1)] = density * seconds;
+        process[(2, 2)] = coloured_m2 * (1.0 - decay * decay);
         let predicted = StateEstimate {
             mean: transition * estimate.mean,
-            covariance: transition * estimate.covariance * transition.transpose() + noise,
+            covariance: transition * estimate.covariance * transition.transpose() + process,
         };
-        let (updated, density) = update(&predicted, *fix, error.white_m * error.white_m);
+        let (updated, density) = update(&predicted, *fix, white_m2);
         // The first fix initialises the position and has no likelihood.
         log_likelihood += if index == 0 { 0.0 } else { density };
         estimate = updated;
@@ -238,12 +225,12 @@ mod tests {
     /// error to stated variance.
     fn errors_and_ratio(scene: Scene, sigma_m: f64) -> (f64, f64, f64) {
         let (traverses, truths) = traverses(scene, 5, 4_000);
-        let error = FixError::split(sigma_m, &traverses);
-        let acceleration_m_s2 = tune_acceleration(&traverses, &error);
+        let noise = noise_of_fixes(sigma_m * sigma_m, &traverses);
+        let acceleration_m_s2 = tune_acceleration(&traverses, &noise);
         let (mut raw, mut smooth, mut ratio, mut count) = (0.0, 0.0, 0.0, 0.0);
         for ((times_s, fixes), truths) in traverses.iter().zip(&truths) {
             for ((answer, fix), truth) in
-                smooth_traverse(times_s, fixes, &error, acceleration_m_s2).iter().zip(fixes).zip(truths)
+                smooth_traverse(times_s, fixes, &noise, acceleration_m_s2).iter().zip(fixes).zip(truths)
             {
                 raw += fix.error_per_axis_m2(*truth);
                 smooth += answer.position.error_per_axis_m2(*truth);
@@ -269,13 +256,13 @@ mod tests {
     }
 
     #[test]
-    fn the_split_finds_the_white_part() {
+    fn the_decomposition_finds_the_white_part() {
         let (walked, _) = traverses(Scene::Square, 6, 3_000);
-        let phone = FixError::split(2.2, &walked);
-        assert!(phone.white_m < 0.4 && phone.coloured_m > 2.1, "{phone:?}");
+        let phone = noise_of_fixes(2.2 * 2.2, &walked);
+        assert!(phone.white_sigma_m() < 0.4 && phone.coloured_sigma_m() > 2.1, "{phone:?}");
         let (taxied, _) = traverses(Scene::Airport, 6, 3_000);
-        let noisy = FixError::split(29.5, &taxied);
-        assert!((noisy.white_m - 29.5).abs() < 1e-9 && noisy.coloured_m == 0.0, "{noisy:?}");
+        let noisy = noise_of_fixes(29.5 * 29.5, &taxied);
+        assert!((noisy.white_sigma_m() - 29.5).abs() < 1e-9 && noisy.coloured_sigma_m() == 0.0, "{noisy:?}");
     }
 
     #[test]
@@ -284,9 +271,9 @@ mod tests {
         let mut fixes: Vec<EastNorth> =
             times_s.iter().map(|&time_s| EastNorth { east_m: 1.2 * time_s, north_m: 0.0 }).collect();
         fixes[30].north_m = 500.0;
-        let smoothed = smooth_traverse(&times_s, &fixes, &FixError::white(2.0), 0.1);
+        let smoothed = smooth_traverse(&times_s, &fixes, &GaussMarkovNoise::white(4.0), 0.1);
         assert_eq!(smoothed.len(), 60);
         assert!(smoothed[30].position.north_m.abs() < 3.0, "{:?}", smoothed[30]);
-        assert!(smooth_traverse(&[], &[], &FixError::white(2.0), 0.1).is_empty());
+        assert!(smooth_traverse(&[], &[], &GaussMarkovNoise::white(4.0), 0.1).is_empty());
     }
 }

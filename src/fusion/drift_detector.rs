@@ -1,5 +1,5 @@
-//! Detects that a camera's pose has changed since its model was trained: a knocked or re-aimed camera
-//! otherwise goes on giving confident wrong positions.
+//! Detects that a camera's pose has changed since its model was trained: a camera that was
+//! bumped or re-aimed otherwise continues to give confident wrong positions.
 //!
 //! The difference d between regressed position and fix is averaged over blocks of two minutes per
 //! target. A generalised likelihood ratio test over all onsets k (Basseville and Nikiforov 1993, 2.4)
@@ -25,7 +25,7 @@ pub use self::block::ResidualSample;
 pub use self::settings::DriftDetectorSettings;
 pub use self::time_aligner::{TimeAligner, TimedEstimate};
 
-use self::block::{Block, Cell, OpenBlock};
+use self::block::{Block, GroundCell, OpenBlock};
 use self::pooling::{MeanDifference, PooledBlocks, SpatialCoverage, combine, glr_statistic, offset_prior};
 use crate::domain::TargetId;
 use crate::geo::EastNorth;
@@ -62,7 +62,7 @@ pub struct DriftDetector {
     /// The constant offset as estimated from the blocks that are no longer retained.
     archived_prior: Option<MeanDifference>,
     /// Ground covered by those blocks.
-    archived_cells: BTreeSet<Cell>,
+    archived_cells: BTreeSet<GroundCell>,
     alarm: Option<DriftAlarm>,
 }
 

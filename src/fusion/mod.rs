@@ -1,11 +1,14 @@
-//! Confidences, two-step fusion, pairing, tracks and drift detection: pure functions and values.
+//! Measured positions, confidences, two-step fusion, pairing, tracks and drift detection: pure functions and
+//! values.
 //!
 //! What never happens here: I/O, clocks, randomness, allocation that an outside client decides.
 
 pub mod clock_offset;
 pub mod drift_detector;
+pub mod observed;
 pub mod pairing;
 mod plane_covariance;
+pub mod target_track;
 pub mod track;
 pub mod two_step;
 

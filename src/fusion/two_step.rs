@@ -1,9 +1,21 @@
 //! The two-step fusion of Liang et al. 2022: (5) the regression's error from its reconstruction
-//! error, (6) and (7) the confidences, (8) the weighted mean.
+//! error, (6) and (7) the confidences, (8) the weighted mean; before it a chi-square test of box against
+//! fix, because a weighted mean of contradicting sources is wrong with confidence.
 
-use crate::domain::{Confidences, Flag, FusedFix, ImageSize, Observation, SigmaM};
-use crate::geo::EastNorth;
+use super::observed::{ObservedBox, ObservedPositions, PAIR_GATE, PairInnovation};
+use super::track::MeasurementSource;
+use crate::domain::{Confidences, Flag, FusedFix, ImageSize, Observation};
+use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, distance_m};
 use crate::model::{R95_PER_SIGMA, Regression, Regressor};
+
+/// 95 % quantile of chi-square with 2 degrees of freedom, -2 ln(0.05). From here to [`PAIR_GATE`] the
+/// stated radius grows from that of consistent sources to one that holds the truth whichever is right.
+const WIDENING_STARTS_AT: f64 = 5.991;
+/// 95 % quantile of the standard normal distribution, one-sided.
+const ONE_SIDED_95: f64 = 1.645;
+
+const ALL_REGRESSION: Confidences = Confidences { regression: 1.0, gnss: 0.0 };
+const ALL_GNSS: Confidences = Confidences { regression: 0.0, gnss: 1.0 };
 
 /// The weights (6) and (7): each source by the inverse of its error variance (m2, per axis).
 ///
@@ -25,92 +37,142 @@ pub fn two_step(regression: &Regression, fix: EastNorth, e_gnss_m2: f64) -> (Eas
         east_m: weights.regression * regression.regressed.east_m + weights.gnss * fix.east_m,
         north_m: weights.regression * regression.regressed.north_m + weights.gnss * fix.north_m,
     };
-    let regression_r95_m = weights.regression * regression.r95_scale * regression.e_regression_m2.sqrt();
-    let gnss_r95_m = weights.gnss * R95_PER_SIGMA * e_gnss_m2.sqrt();
+    let regression_r95_m = weights.regression * regression_r95_m(regression);
+    let gnss_r95_m = weights.gnss * gnss_r95_m(e_gnss_m2);
     (fused, weights, regression_r95_m.hypot(gnss_r95_m))
 }
 
 /// Answers one observation.
 ///
-/// `serving` is the active model and its version number, `image_size` that of the profile,
-/// `e_gnss_m2` the receiver's variance per axis for fixes that do not say their own. `None` where
-/// there is a box but no model: then there is no answer, and no guess either.
+/// `model` is the active model and its version number, `image_size` that of the profile,
+/// `e_gnss_m2` the receiver's variance per axis for fixes that do not state their own. `None` where
+/// there is a box but no model.
 #[must_use]
 pub fn fuse(
     observation: &Observation,
-    serving: Option<(&Regressor, u32)>,
+    model: Option<(&Regressor, u32)>,
     image_size: Option<ImageSize>,
     e_gnss_m2: Option<f64>,
 ) -> Option<FusedFix> {
-    let mut flags = Vec::new();
+    let regressor = model.map(|(regressor, _)| regressor);
+    let observed = ObservedPositions::of(observation, regressor, image_size, e_gnss_m2);
+    fuse_observed(observation, &observed, model, image_size)
+}
+
+/// As [`fuse`], for an observation whose positions are known.
+#[must_use]
+pub fn fuse_observed(
+    observation: &Observation,
+    observed: &ObservedPositions<'_>,
+    model: Option<(&Regressor, u32)>,
+    image_size: Option<ImageSize>,
+) -> Option<FusedFix> {
     let Some(bounding_box) = &observation.bounding_box else {
-        return pass_through(observation, serving.is_some(), e_gnss_m2);
+        return pass_through(observation, observed);
     };
-    let (regressor, version) = serving?;
-    let plane = regressor.plane();
-    let fix = observation
-        .fix
-        .map(|fix| (plane.to_plane(fix.position), fix_variance_m2(observation, Some(regressor), e_gnss_m2)));
-    let regression = regressor.regress(bounding_box, fix.map(|(point, _)| point));
-    if fix.is_none() {
+    let ((_, version), plane) = (model?, observed.plane?);
+    let regressed = observed.regressed.as_ref()?;
+    let mut flags = Vec::new();
+    if observation.fix.is_none() {
         flags.push(Flag::GnssDenied);
     }
     if bounding_box.touches_border(image_size) {
         flags.push(Flag::BoxAtBorder);
     }
-    if regression.outside_training {
+    if regressed.independent.outside_training {
         flags.push(Flag::OutsideTraining);
     }
-    let regressed = plane.to_position(regression.regressed);
-    let (fused, confidences, r95_m) = match fix {
-        Some((point, e_gnss_m2)) => {
-            let (fused, confidences, r95_m) = two_step(&regression, point, e_gnss_m2);
-            (plane.to_position(fused), confidences, r95_m)
-        }
-        None => (
-            regressed,
-            Confidences { regression: 1.0, gnss: 0.0 },
-            regression.r95_scale * regression.e_regression_m2.sqrt(),
-        ),
-    };
+    let Combined { position, confidences, r95_m } = combine(observed, regressed, &mut flags);
+    let Regression { e_regression_m2, reconstruction_error, .. } = regressed.one_step;
     Some(FusedFix {
         time: observation.time,
         target_id: observation.target_id.clone(),
-        fused,
-        regressed: Some(regressed),
+        fused: plane.to_position(position),
+        regressed: Some(plane.to_position(regressed.one_step.regressed)),
         gnss: observation.fix,
         confidences,
-        e_regression_m2: Some(regression.e_regression_m2),
-        e_gnss_m2: fix.map(|(_, e_gnss_m2)| e_gnss_m2),
+        e_regression_m2: Some(e_regression_m2),
+        e_gnss_m2: observed.fix.map(|fix| fix.variance_m2),
         r95_m,
-        reconstruction_error: Some(regression.reconstruction_error),
+        reconstruction_error: Some(reconstruction_error).filter(|error| error.is_finite()),
         model_version: Some(version),
         flags,
     })
 }
 
-/// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
-pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
-
-/// The error variance per axis, m2, of an observation's fix: by its own word, else by the camera's
-/// profile, else by the model, else that of a phone in the open.
-#[must_use]
-pub fn fix_variance_m2(
-    observation: &Observation,
-    regressor: Option<&Regressor>,
-    e_gnss_m2: Option<f64>,
-) -> f64 {
-    let own_m2 = observation.fix.and_then(|fix| fix.sigma_m).map(SigmaM::variance_m2);
-    own_m2.or(e_gnss_m2).or(regressor.map(Regressor::e_gnss_m2)).unwrap_or(UNKNOWN_RECEIVER_M2)
+/// A position in the model's plane with its weights and 95 % radius.
+struct Combined {
+    position: EastNorth,
+    confidences: Confidences,
+    r95_m: f64,
 }
 
-/// The answer for an observation without a box: its fix.
-fn pass_through(observation: &Observation, has_model: bool, e_gnss_m2: Option<f64>) -> Option<FusedFix> {
-    let fix = observation.fix?;
-    let e_gnss_m2 = fix_variance_m2(observation, None, e_gnss_m2);
+/// The position from a box and perhaps a fix; notes in `flags` which of them was not used.
+fn combine(observed: &ObservedPositions<'_>, regressed: &ObservedBox, flags: &mut Vec<Flag>) -> Combined {
+    let box_alone = || Combined {
+        position: regressed.independent.regressed,
+        confidences: ALL_REGRESSION,
+        r95_m: regression_r95_m(&regressed.independent),
+    };
+    if !regressed.is_usable {
+        flags.push(Flag::BoxRejected);
+    }
+    let Some(fix) = observed.fix else { return box_alone() };
+    let Some(fix_point) = fix.in_plane else {
+        flags.extend([Flag::SourcesDisagree, Flag::FixRejected, Flag::FixOutOfRange]);
+        return box_alone();
+    };
+    let fix_alone =
+        || Combined { position: fix_point, confidences: ALL_GNSS, r95_m: gnss_r95_m(fix.variance_m2) };
+    let Some(PairInnovation { distance_m, nis }) = observed.innovation() else { return fix_alone() };
+    let regression_sigma_m = regressed.independent.variance_m2().sqrt();
+    // The radius about a position that holds the truth if the source at that distance is right.
+    let reaching = |distance_m: f64, sigma_m: f64| distance_m + ONE_SIDED_95 * sigma_m;
+    match observed.contradicting_source() {
+        Some(MeasurementSource::Regressed) => {
+            flags.extend([Flag::SourcesDisagree, Flag::BoxRejected]);
+            let fix_alone = fix_alone();
+            Combined { r95_m: fix_alone.r95_m.max(reaching(distance_m, regression_sigma_m)), ..fix_alone }
+        }
+        Some(MeasurementSource::Fix) => {
+            flags.extend([Flag::SourcesDisagree, Flag::FixRejected]);
+            let box_alone = box_alone();
+            Combined { r95_m: box_alone.r95_m.max(reaching(distance_m, fix.variance_m2.sqrt())), ..box_alone }
+        }
+        None => {
+            let (position, confidences, r95_m) = two_step(&regressed.one_step, fix_point, fix.variance_m2);
+            let to_box_m = position.distance_m(regressed.independent.regressed);
+            let to_fix_m = position.distance_m(fix_point);
+            let either_m = reaching(to_box_m, regression_sigma_m)
+                .max(reaching(to_fix_m, fix.variance_m2.sqrt()))
+                .max(r95_m);
+            let share = ((nis - WIDENING_STARTS_AT) / (PAIR_GATE - WIDENING_STARTS_AT)).clamp(0.0, 1.0);
+            Combined { position, confidences, r95_m: r95_m + share * (either_m - r95_m) }
+        }
+    }
+}
+
+fn regression_r95_m(regression: &Regression) -> f64 {
+    regression.r95_scale * regression.e_regression_m2.sqrt()
+}
+
+fn gnss_r95_m(e_gnss_m2: f64) -> f64 {
+    R95_PER_SIGMA * e_gnss_m2.sqrt()
+}
+
+/// The answer for an observation without a box: its fix. A fix out of range of the camera's scene is
+/// answered with a radius that reaches back to the scene.
+fn pass_through(observation: &Observation, observed: &ObservedPositions<'_>) -> Option<FusedFix> {
+    let (fix, measured) = (observation.fix?, observed.fix?);
     let mut flags = vec![Flag::BoxMissing];
-    if !has_model {
+    if observed.plane.is_none() {
         flags.push(Flag::NoModel);
+    }
+    let mut r95_m = gnss_r95_m(measured.variance_m2);
+    if observed.fix_is_out_of_range() {
+        flags.push(Flag::FixOutOfRange);
+        let to_scene_m = |plane: &LocalPlane| distance_m(fix.position, plane.origin()) + PLANE_RANGE_M;
+        r95_m = r95_m.max(observed.plane.map_or(0.0, to_scene_m));
     }
     Some(FusedFix {
         time: observation.time,
@@ -118,10 +180,10 @@ fn pass_through(observation: &Observation, has_model: bool, e_gnss_m2: Option<f6
         fused: fix.position,
         regressed: None,
         gnss: Some(fix),
-        confidences: Confidences { regression: 0.0, gnss: 1.0 },
+        confidences: ALL_GNSS,
         e_regression_m2: None,
-        e_gnss_m2: Some(e_gnss_m2),
-        r95_m: R95_PER_SIGMA * e_gnss_m2.sqrt(),
+        e_gnss_m2: Some(measured.variance_m2),
+        r95_m,
         reconstruction_error: None,
         model_version: None,
         flags,

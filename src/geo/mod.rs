@@ -6,5 +6,5 @@
 mod plane;
 mod position;
 
-pub use plane::{EastNorth, LocalPlane};
+pub use plane::{EastNorth, LocalPlane, PLANE_RANGE_M};
 pub use position::{Position, PositionError, distance_m};

@@ -7,6 +7,10 @@ const EQUATORIAL_RADIUS_M: f64 = 6_378_137.0;
 /// First eccentricity of WGS 84, squared.
 const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_141_316e-3;
 
+/// Largest distance from the origin, m, at which a [`LocalPlane`] is used. Up to here the plane is exact
+/// to 1 mm in both directions; beyond it nothing that a ground camera sees is measured.
+pub const PLANE_RANGE_M: f64 = 20_000.0;
+
 /// Metres east and north of the origin of a [`LocalPlane`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct EastNorth {
@@ -21,6 +25,12 @@ impl EastNorth {
     #[must_use]
     pub fn distance_m(self, other: Self) -> f64 {
         (self.east_m - other.east_m).hypot(self.north_m - other.north_m)
+    }
+
+    /// Whether the point lies within [`PLANE_RANGE_M`] of the origin; false if it is not finite.
+    #[must_use]
+    pub fn is_within_range(self) -> bool {
+        self.east_m.hypot(self.north_m) <= PLANE_RANGE_M
     }
 
     /// Half the squared distance, m2: the mean squared error over the two axes, as in (2).
@@ -76,6 +86,21 @@ impl LocalPlane {
     /// Metres east and north of the origin.
     #[must_use]
     pub fn to_plane(&self, position: Position) -> EastNorth {
+        self.topocentric(position).0
+    }
+
+    /// Metres east and north of the origin; `None` for a position beyond [`PLANE_RANGE_M`] of it, by the
+    /// chord through the earth. Beyond a quarter of the earth [`Self::to_plane`] folds back towards the
+    /// origin, so its distance in the plane does not tell.
+    #[must_use]
+    pub fn to_plane_within_range(&self, position: Position) -> Option<EastNorth> {
+        let (point, up_m) = self.topocentric(position);
+        let chord_m = point.east_m.hypot(point.north_m).hypot(up_m);
+        (chord_m <= PLANE_RANGE_M).then_some(point)
+    }
+
+    /// East and north, and up along the normal at the origin, of a position on the ellipsoid, m.
+    fn topocentric(&self, position: Position) -> (EastNorth, f64) {
         let (sin_latitude, cos_latitude) = position.latitude_deg().to_radians().sin_cos();
         let prime_vertical_m =
             EQUATORIAL_RADIUS_M / (1.0 - ECCENTRICITY_SQUARED * sin_latitude * sin_latitude).sqrt();
@@ -86,10 +111,11 @@ impl LocalPlane {
         // Earth-centred difference, rotated about the polar axis to the origin's meridian, then by latitude.
         let outward_m = axis_m * cos_longitude - self.axis_m;
         let upward_m = equator_m - self.equator_m;
-        EastNorth {
+        let point = EastNorth {
             east_m: axis_m * sin_longitude,
             north_m: self.cos_latitude * upward_m - self.sin_latitude * outward_m,
-        }
+        };
+        (point, self.cos_latitude * outward_m + self.sin_latitude * upward_m)
     }
 
     /// The position on the ellipsoid vertically below a point of the plane.
@@ -151,6 +177,24 @@ mod tests {
             prop_assert!((geodesic_m - straight_m).abs() < 1e-3 + 1e-6 * straight_m,
                 "{geodesic_m} {straight_m}");
         }
+    }
+
+    #[test]
+    fn positions_beyond_the_range_are_not_projected() {
+        let plane = LocalPlane::new(Position::new(103.9, 30.6).expect("valid"));
+        let at = |longitude, latitude| {
+            plane.to_plane_within_range(Position::new(longitude, latitude).expect("valid"))
+        };
+        assert!(at(103.9, 30.77).is_some_and(|point| (point.north_m - 18_848.0).abs() < 20.0));
+        // Null island, the hemisphere across, the antipode (which projects onto the origin), a pole,
+        // swapped signs.
+        for (longitude, latitude) in
+            [(0.0, 0.0), (103.9, -30.6), (-76.1, -30.6), (0.0, 90.0), (-103.9, 30.6), (103.9, 30.79)]
+        {
+            assert_eq!(at(longitude, latitude), None, "{longitude} {latitude}");
+        }
+        assert!(!EastNorth { east_m: f64::NAN, north_m: 0.0 }.is_within_range());
+        assert!(!EastNorth { east_m: f64::INFINITY, north_m: 0.0 }.is_within_range());
     }
 
     #[test]

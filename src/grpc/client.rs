@@ -94,14 +94,14 @@ impl ClientError {
 
 impl From<Status> for ClientError {
     fn from(status: Status) -> Self {
-        let told = status.get_details_error_info().map(|info| info.reason);
+        let server_reason = status.get_details_error_info().map(|info| info.reason);
         let retryable = match status.code() {
             Code::Unavailable | Code::DeadlineExceeded | Code::Aborted | Code::Internal => true,
             // The line's own faults come under these codes, without any details.
-            Code::Unknown | Code::Cancelled | Code::ResourceExhausted => told.is_none(),
+            Code::Unknown | Code::Cancelled | Code::ResourceExhausted => server_reason.is_none(),
             _ => false,
         };
-        let reason = told.unwrap_or_else(|| format!("{:?}", status.code()).to_lowercase());
+        let reason = server_reason.unwrap_or_else(|| format!("{:?}", status.code()).to_lowercase());
         let message = match status.message() {
             "" => status.code().description().to_owned(),
             message => message.to_owned(),
@@ -248,9 +248,9 @@ mod tests {
         }
         let details =
             ErrorDetails::with_error_info("too-large", "sightfix", HashMap::<String, String>::new());
-        let told = ClientError::from(Status::with_error_details(Code::ResourceExhausted, "no", details));
-        assert_eq!((told.reason.as_str(), told.retryable), ("too-large", false));
-        assert_eq!(told.to_string(), "no (too-large)");
+        let error = ClientError::from(Status::with_error_details(Code::ResourceExhausted, "no", details));
+        assert_eq!((error.reason.as_str(), error.retryable), ("too-large", false));
+        assert_eq!(error.to_string(), "no (too-large)");
     }
 
     #[tokio::test]

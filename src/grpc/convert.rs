@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use super::proto;
 use crate::domain::{
     self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Sample,
-    Score, TargetClass, TargetId,
+    Score, TargetClass, TargetId, TimeRange,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -104,7 +104,7 @@ pub(super) fn timestamp(time: Timestamp) -> prost_types::Timestamp {
 }
 
 /// A time that a row or an observation may have.
-fn believable(time: Option<prost_types::Timestamp>, rules: &RowRules) -> Result<Timestamp> {
+fn checked_time(time: Option<prost_types::Timestamp>, rules: &RowRules) -> Result<Timestamp> {
     rules.time_bounds.check(required(instant(time, "time")?, "time")?)
 }
 
@@ -144,7 +144,7 @@ fn target_id(id: Option<&str>) -> Result<Option<TargetId>> {
 /// A sample that keeps the rules of its camera.
 pub(super) fn sample(sample: proto::Sample, rules: &RowRules) -> Result<Sample> {
     Ok(Sample {
-        time: believable(sample.time, rules)?,
+        time: checked_time(sample.time, rules)?,
         target_id: TargetId::new(required_text(&sample.target_id, "target_id")?)?,
         bounding_box: bounding_box(required(sample.bounding_box, "bounding_box")?, rules)?,
         fix: fix(required(sample.fix, "fix")?).map_err(|error| error.under("fix"))?,
@@ -157,7 +157,7 @@ pub(super) fn sample(sample: proto::Sample, rules: &RowRules) -> Result<Sample> 
 /// An observation that keeps the rules of its camera.
 pub(super) fn observation(observation: proto::Observation, rules: &RowRules) -> Result<Observation> {
     Observation::new(
-        believable(observation.time, rules)?,
+        checked_time(observation.time, rules)?,
         target_id(observation.target_id.as_deref())?,
         observation.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,
         observation.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,
@@ -167,7 +167,7 @@ pub(super) fn observation(observation: proto::Observation, rules: &RowRules) -> 
 /// An item of a live stream that keeps the rules of its camera.
 pub(super) fn live_item(item: proto::StreamItem, rules: &RowRules) -> Result<LiveItem> {
     Ok(LiveItem {
-        time: believable(item.time, rules)?,
+        time: checked_time(item.time, rules)?,
         target_id: target_id(item.target_id.as_deref())?,
         receiver_id: item.receiver_id.as_deref().map(ReceiverId::new).transpose()?,
         bounding_box: item.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,
@@ -181,11 +181,9 @@ pub(super) fn live_item(item: proto::StreamItem, rules: &RowRules) -> Result<Liv
 pub(super) fn sample_filter(filter: Option<proto::SampleFilter>) -> Result<SampleFilter> {
     let Some(filter) = filter else { return Ok(SampleFilter::default()) };
     let read = || {
-        Ok(SampleFilter {
-            from: instant(filter.from, "from")?,
-            until: instant(filter.until, "until")?,
-            target_id: target_id(filter.target_id.as_deref())?,
-        })
+        let range = TimeRange::new(instant(filter.from, "from")?, instant(filter.until, "until")?)?;
+        let target_id = target_id(filter.target_id.as_deref())?;
+        Ok(SampleFilter { target_id, ..SampleFilter::within(range) })
     };
     read().map_err(|error: Error| error.under("filter"))
 }

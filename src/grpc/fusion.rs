@@ -6,10 +6,10 @@ use super::convert::{camera_id, observation, timestamp};
 use super::outbox::Responses;
 use super::proto;
 use super::proto::fusion_service_server::FusionService;
-use super::statuses::{Reply, answer, request_id};
+use super::statuses::{Reply, answer, client_address, request_id};
 use super::stream;
 use crate::app::App;
-use crate::domain::{Flag, FusedFix, TargetId};
+use crate::domain::{Flag, FusedFix, TargetId, convert_all};
 use crate::shutdown::Shutdown;
 
 pub(super) struct Fusion {
@@ -32,7 +32,8 @@ impl FusionService for Fusion {
         request: tonic::Request<Streaming<proto::StreamRequest>>,
     ) -> Reply<Self::StreamStream> {
         let id = request_id(request.extensions());
-        let responses = stream::serve(&self.app, &self.shutdown, id, request.into_inner());
+        let client = client_address(request.extensions());
+        let responses = stream::serve(&self.app, &self.shutdown, id, client, request.into_inner());
         Ok(tonic::Response::new(responses))
     }
 
@@ -40,15 +41,11 @@ impl FusionService for Fusion {
         answer(request, |asked| async move {
             let camera = camera_id(&asked.camera_id)?;
             self.app.check_batch(asked.observations.len())?;
-            let rules = self.app.row_rules(&camera).await?;
-            let mut observations = Vec::with_capacity(asked.observations.len());
-            for (index, message) in asked.observations.into_iter().enumerate() {
-                observations.push(
-                    observation(message, &rules)
-                        .map_err(|error| error.under(&format!("observations[{index}]")))?,
-                );
-            }
-            let fused = self.app.fuse(&camera, &observations).await?;
+            let camera = self.app.active_camera(&camera).await?;
+            let rules = camera.row_rules(self.app.clock.now());
+            let convert = |message| observation(message, &rules);
+            let observations = convert_all("observations", asked.observations, convert)?;
+            let fused = self.app.fuse(camera, &observations).await?;
             Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
         })
         .await
@@ -84,6 +81,10 @@ impl From<Flag> for proto::Flag {
             Flag::OutsideTraining => Self::OutsideTraining,
             Flag::NoModel => Self::NoModel,
             Flag::CameraMoved => Self::CameraMoved,
+            Flag::SourcesDisagree => Self::SourcesDisagree,
+            Flag::FixRejected => Self::FixRejected,
+            Flag::BoxRejected => Self::BoxRejected,
+            Flag::FixOutOfRange => Self::FixOutOfRange,
         }
     }
 }

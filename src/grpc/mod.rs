@@ -4,9 +4,9 @@
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
 mod cameras;
+mod cancel_on_shutdown;
 pub mod client;
 mod convert;
-mod ending;
 mod fusion;
 mod models;
 mod outbox;
@@ -23,11 +23,12 @@ use tonic::service::Routes;
 use tonic_health::ServingStatus;
 use tonic_health::server::{HealthReporter, HealthService};
 
+use crate::admission::RequestClass;
 use crate::app::App;
 use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
-use ending::EndsWithServer;
+use cancel_on_shutdown::CancelOnShutdown;
 use proto::camera_service_server::CameraServiceServer;
 use proto::fusion_service_server::FusionServiceServer;
 use proto::model_service_server::ModelServiceServer;
@@ -64,7 +65,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .expect("the build wrote the descriptors");
     Routes::default()
         .add_service(health(shutdown))
-        .add_service(EndsWithServer::new(reflection, shutdown))
+        .add_service(CancelOnShutdown::new(reflection, shutdown))
         .add_service(cameras)
         .add_service(samples)
         .add_service(training)
@@ -73,8 +74,17 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .prepare()
 }
 
-/// The path of the live stream, which has an idle limit of its own.
-pub const LIVE_STREAM: &str = "/sightfix.v1.FusionService/Stream";
+/// What a request is for, by its path.
+#[must_use]
+pub fn class(path: &str) -> RequestClass {
+    match path {
+        "/grpc.health.v1.Health/Check" => RequestClass::Probe,
+        "/sightfix.v1.FusionService/Fuse" => RequestClass::Fusion,
+        "/sightfix.v1.SampleService/ImportSamples" => RequestClass::ImportStream,
+        "/sightfix.v1.FusionService/Stream" => RequestClass::LiveStream,
+        _ => RequestClass::Other,
+    }
+}
 
 /// A refusal before any service was asked, as a whole answer.
 #[must_use]
@@ -82,7 +92,7 @@ pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
     statuses::to_status(error, id).into_http()
 }
 
-/// The names under which health is told; the empty one is the server as a whole.
+/// The services whose health is reported; the empty name is the server as a whole.
 const HEALTHY: [&str; 6] = [
     "",
     CameraServiceServer::<()>::NAME,
@@ -92,7 +102,7 @@ const HEALTHY: [&str; 6] = [
     FusionServiceServer::<()>::NAME,
 ];
 
-/// Serving until the end begins; then watchers are told, and their streams end.
+/// Serving until the end begins; then watchers get a last status, and their streams end.
 fn health(shutdown: &Shutdown) -> tonic_health::pb::health_server::HealthServer<HealthService> {
     let mut reporter = HealthReporter::new();
     for name in HEALTHY {

@@ -1,4 +1,4 @@
-//! What a live stream has to tell a client who may read slowly.
+//! Messages of a live stream for a client that may read slowly.
 //!
 //! Answers beyond the limit push out the oldest, counted; what must not be lost (acknowledgements,
 //! alarms, the end) takes a place each, whatever the client does.
@@ -31,7 +31,7 @@ struct Shared {
 struct Waiting {
     opened: Option<StreamOpened>,
     answers: VecDeque<Box<StreamAnswer>>,
-    acknowledged: Option<u64>,
+    acknowledged: Option<StreamAcknowledgement>,
     moved: Option<CameraMoved>,
     reconnect: Option<StreamReconnect>,
     end: Option<Option<Status>>,
@@ -88,8 +88,8 @@ impl Outbox {
     }
 
     /// An acknowledgement takes the place of those before it.
-    pub(super) fn acknowledge(&self, seq: u64) {
-        self.0.put(|waiting| waiting.acknowledged = Some(seq));
+    pub(super) fn acknowledge(&self, acknowledgement: StreamAcknowledgement) {
+        self.0.put(|waiting| waiting.acknowledged = Some(acknowledgement));
     }
 
     pub(super) fn moved(&self, moved: CameraMoved) {
@@ -139,8 +139,8 @@ impl Stream for Responses {
             Kind::CameraMoved(moved)
         } else if let Some(answer) = waiting.answers.pop_front() {
             Kind::Answer(answer)
-        } else if let Some(seq) = waiting.acknowledged.take() {
-            Kind::Acknowledgement(StreamAcknowledgement { seq })
+        } else if let Some(acknowledgement) = waiting.acknowledged.take() {
+            Kind::Acknowledgement(acknowledgement)
         } else if let Some(reconnect) = waiting.reconnect.take() {
             Kind::Reconnect(reconnect)
         } else if let Some(end) = &mut waiting.end {

@@ -8,6 +8,7 @@ use super::pages;
 use super::proto;
 use super::proto::sample_service_server::SampleService;
 use super::statuses::{Reply, answer, broken};
+use crate::admission::BodyRefusal;
 use crate::app::{App, ImportReport, RejectedRow};
 use crate::domain::{Durability, Error, ErrorKind, Result, Sample};
 use crate::exchange::RowRules;
@@ -31,8 +32,10 @@ impl SampleService for Samples {
         &self,
         request: tonic::Request<Streaming<proto::ImportSamplesRequest>>,
     ) -> Reply<proto::ImportSamplesResponse> {
+        let refusal = request.extensions().get().cloned().unwrap_or_default();
         answer(request, |messages| async move {
-            let mut batches = Batches { messages, shutdown: self.shutdown.clone(), camera: String::new() };
+            let shutdown = self.shutdown.clone();
+            let mut batches = Batches { messages, refusal, shutdown, camera: String::new() };
             let Some(first) = batches.next().await? else {
                 return Err(Error::invalid("camera_id", "is required in the first message"));
             };
@@ -100,6 +103,7 @@ impl SampleService for Samples {
 /// The messages of an import, one at a time.
 struct Batches {
     messages: Streaming<proto::ImportSamplesRequest>,
+    refusal: BodyRefusal,
     shutdown: Shutdown,
     /// As the first message names it.
     camera: String,
@@ -108,12 +112,15 @@ struct Batches {
 impl Batches {
     async fn next(&mut self) -> Result<Option<proto::ImportSamplesRequest>> {
         tokio::select! {
+            // First, so that a client whose backlog never ends cannot hold the server up.
             biased;
-            message = self.messages.message() => message.map_err(|status| broken(&status)),
             () = self.shutdown.begun() => Err(Error::refused(
                 ErrorKind::ShuttingDown,
                 "the server is ending; send the samples again, those that are stored count as duplicates",
             )),
+            message = self.messages.message() => {
+                message.map_err(|status| self.refusal.get().unwrap_or_else(|| broken(&status)))
+            }
         }
     }
 

@@ -1,4 +1,4 @@
-//! Errors as gRPC tells them. The only place of this transport that makes a status.
+//! Errors as gRPC statuses. The only place of this transport that makes a status.
 
 use std::collections::HashMap;
 
@@ -8,6 +8,7 @@ use hyper::http::HeaderValue;
 use tonic::{Code, Request, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
 
+use crate::admission::ClientAddress;
 use crate::domain::{Error, ErrorKind, Refusal, Result, Violation};
 use crate::status;
 use crate::telemetry::RequestId;
@@ -16,8 +17,8 @@ use crate::telemetry::RequestId;
 const DOMAIN: &str = "sightfix";
 /// Clients take no more than some kB of headers, and texts may quote what they sent.
 const LONGEST_TEXT: usize = 400;
-/// Fields at fault that are told.
-const MOST_VIOLATIONS: usize = 8;
+/// The same for each text about a field at fault.
+const LONGEST_VIOLATION_TEXT: usize = 160;
 
 /// What a unary method gives.
 pub(super) type Reply<T> = std::result::Result<tonic::Response<T>, Status>;
@@ -40,38 +41,43 @@ pub(super) fn request_id(extensions: &Extensions) -> RequestId {
     extensions.get().cloned().unwrap_or_else(unknown)
 }
 
+/// Who sends the request.
+pub(super) fn client_address(extensions: &Extensions) -> ClientAddress {
+    extensions.get().copied().unwrap_or(ClientAddress::UNKNOWN)
+}
+
 /// An error with its code and details: `ErrorInfo` with the problem's slug as reason, `RequestInfo`,
 /// and `BadRequest` where fields are at fault. A fault is logged here and nothing of it is shown.
 pub(super) fn to_status(error: &Error, id: &RequestId) -> Status {
-    let told = status::of(error.kind());
-    let mut details = ErrorDetails::with_error_info(told.slug, DOMAIN, HashMap::new());
+    let row = status::of(error.kind());
+    let mut details = ErrorDetails::with_error_info(row.slug, DOMAIN, HashMap::new());
     details.set_request_info(id.as_str(), "");
     let message = match error {
         Error::Refused(refusal) => {
             if !refusal.violations.is_empty() {
                 details.set_bad_request(violations(refusal));
             }
-            shortened(&refusal.to_string())
+            shortened(&refusal.to_string(), LONGEST_TEXT)
         }
         Error::Fault(fault) => {
             tracing::error!(request.id = %id, error = %fault, "a request failed");
-            told.title.to_owned()
+            row.title.to_owned()
         }
     };
-    Status::with_error_details(Code::from(told.grpc), message, details)
+    Status::with_error_details(Code::from(row.grpc), message, details)
 }
 
 fn violations(refusal: &Refusal) -> Vec<FieldViolation> {
-    let told = refusal.violations.iter().take(MOST_VIOLATIONS);
-    told.map(|Violation { field, message }| FieldViolation::new(shortened(field), shortened(message)))
-        .collect()
+    let short = |text| shortened(text, LONGEST_VIOLATION_TEXT);
+    let violations = refusal.violations.iter();
+    violations.map(|Violation { field, message }| FieldViolation::new(short(field), short(message))).collect()
 }
 
-fn shortened(text: &str) -> String {
-    if text.len() <= LONGEST_TEXT {
+fn shortened(text: &str, most_bytes: usize) -> String {
+    if text.len() <= most_bytes {
         return text.to_owned();
     }
-    format!("{}...", &text[..text.floor_char_boundary(LONGEST_TEXT)])
+    format!("{}...", &text[..text.floor_char_boundary(most_bytes)])
 }
 
 /// An answer that tonic gave by itself (no such method, a message too large or not of its type) with

@@ -1,4 +1,4 @@
-//! `FusionService.Stream`: reads items, answers each, tells what is settled, ends in order.
+//! `FusionService.Stream`: reads items, answers each, acknowledges what is settled, ends in order.
 
 use std::time::Duration;
 
@@ -12,17 +12,18 @@ use super::proto;
 use super::proto::stream_answer::Outcome;
 use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
-use crate::app::{App, LiveStream, TrackPoint};
-use crate::domain::{CameraId, CameraMoved, Error, ErrorKind, Flag, Result};
+use crate::admission::ClientAddress;
+use crate::app::{Acknowledgement, App, ItemResult, LiveStream, NotStored, NotStoredReason, TrackPoint};
+use crate::domain::{CameraMoved, Error, ErrorKind, Flag, Result};
 use crate::fusion::track::{MeasurementSource, Rejection, RejectionReason};
 use crate::shutdown::Shutdown;
 use crate::status;
 use crate::telemetry::RequestId;
 
-/// How often age and silence are looked at.
+/// How often age, idle time and the reader are checked.
 const TICK: Duration = Duration::from_secs(1);
 /// Time that a client gets to half-close after it was asked to reconnect.
-const FAREWELL: Duration = Duration::from_secs(5);
+const HALF_CLOSE_GRACE: Duration = Duration::from_secs(5);
 /// Items that are answered together, if they are there.
 const BATCH: u32 = 32;
 
@@ -31,39 +32,48 @@ pub(super) fn serve(
     app: &App,
     shutdown: &Shutdown,
     id: RequestId,
+    client_address: ClientAddress,
     requests: Streaming<proto::StreamRequest>,
 ) -> Responses {
     let (outbox, responses) = outbox(app.limits.live_answers);
-    let conversation = Conversation { app: app.clone(), shutdown: shutdown.clone(), requests, outbox };
+    let mut session =
+        StreamSession { app: app.clone(), shutdown: shutdown.clone(), client_address, requests, outbox };
     shutdown.spawn(async move {
-        let mut conversation = conversation;
-        let ended = conversation.hold().await;
+        let ended = session.run().await;
         let status = ended.err().map(|error| to_status(&error, &id));
-        conversation.outbox.end(status);
+        session.outbox.end(status);
     });
     responses
 }
 
-struct Conversation {
+struct StreamSession {
     app: App,
     shutdown: Shutdown,
+    client_address: ClientAddress,
     requests: Streaming<proto::StreamRequest>,
     outbox: Outbox,
 }
 
-/// Why items are read no more.
-enum Stop {
+/// Why no more items are read.
+enum StopReason {
     /// The client has sent its last.
     HalfClosed,
-    /// The client was asked to come again.
+    /// The client was asked to reconnect, and has had time to half-close.
     Reconnect,
-    /// Nobody listens.
-    Gone,
+    /// The client does not read any more.
+    ReaderGone,
 }
 
-impl Conversation {
-    async fn hold(&mut self) -> Result<()> {
-        let (camera, mut stream) = self.open().await?;
+/// Age and silence of a stream.
+struct StreamClock {
+    opened_at: Instant,
+    last_item_at: Instant,
+    reconnect_sent_at: Option<Instant>,
+}
+
+impl StreamSession {
+    async fn run(&mut self) -> Result<()> {
+        let mut stream = self.open().await?;
         let limits = &self.app.limits;
         let idle_limit = Duration::from_secs(limits.live_idle_s);
         let opened = proto::StreamOpened {
@@ -75,25 +85,30 @@ impl Conversation {
                 .into(),
         };
         self.outbox.opened(opened);
-        let stop = self.answer_items(&camera, &mut stream, idle_limit).await?;
-        if matches!(stop, Stop::Gone) {
+        let shutdown = self.shutdown.clone();
+        // Also while an item waits for the database.
+        let stop = tokio::select! {
+            stop = self.answer_items(&mut stream, idle_limit) => stop?,
+            () = shutdown.overdue() => return Err(ending()),
+        };
+        if matches!(stop, StopReason::ReaderGone) {
             return Ok(());
         }
-        // A server that ends has no more time than this.
         let settled = tokio::select! {
             settled = stream.settle() => settled,
+            error = stream.deleted() => Err(error),
             () = self.shutdown.overdue() => Err(ending()),
         };
-        // What is acknowledged is so even where the rest could not be.
-        if let Ok(Some(seq)) = stream.acknowledged() {
-            self.outbox.acknowledge(seq);
+        // What is settled is acknowledged even where the rest could not be.
+        if let Ok(Some(acknowledgement)) = stream.acknowledgement() {
+            self.outbox.acknowledge(acknowledgement.into());
         }
         settled?;
         if self.shutdown.has_begun() { Err(ending()) } else { Ok(()) }
     }
 
-    /// The first message.
-    async fn open(&mut self) -> Result<(CameraId, LiveStream)> {
+    /// Reads the first message.
+    async fn open(&mut self) -> Result<LiveStream> {
         let patience = self.app.limits.header_time();
         let first = tokio::select! {
             first = tokio::time::timeout(patience, self.requests.message()) => first,
@@ -111,72 +126,80 @@ impl Conversation {
         let camera = camera_id(&opening.camera_id)?;
         let durability = durability(opening.durability)?;
         let store_samples = opening.store_samples.then_some(durability);
-        let stream = self
-            .app
-            .open_stream(&camera, &opening.client_name, opening.resume_after_seq, store_samples)
-            .await?;
-        Ok((camera, stream))
+        self.app
+            .open_stream(
+                &camera,
+                &opening.client_name,
+                self.client_address,
+                opening.resume_after_seq,
+                store_samples,
+            )
+            .await
     }
 
-    async fn answer_items(
-        &mut self,
-        camera: &CameraId,
-        stream: &mut LiveStream,
-        idle_limit: Duration,
-    ) -> Result<Stop> {
-        let opened_at = Instant::now();
-        let oldest = Duration::from_secs(self.app.limits.live_age_s);
-        let mut heard_at = opened_at;
-        let mut told_to_go: Option<Instant> = None;
+    /// Reads and answers items. Whatever may end the stream is looked at before each batch, so a client
+    /// whose backlog never ends cannot keep it open.
+    async fn answer_items(&mut self, stream: &mut LiveStream, idle_limit: Duration) -> Result<StopReason> {
+        let now = Instant::now();
+        let mut clock = StreamClock { opened_at: now, last_item_at: now, reconnect_sent_at: None };
         let mut tick = tokio::time::interval(TICK);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        let mut moves = stream.moves();
+        let mut change_notices = stream.change_notices();
         let mut acknowledged = None;
         loop {
             tokio::select! {
                 biased;
-                message = self.requests.message() => {
-                    let whole_batch = match self.answer_batch(camera, stream, message).await? {
-                        Some(answered) => answered == BATCH,
-                        None => return Ok(Stop::HalfClosed),
-                    };
-                    heard_at = Instant::now();
-                    self.acknowledge(stream, &mut acknowledged)?;
-                    if whole_batch {
-                        // Others on this thread, and the branches below, get their turn.
-                        tokio::task::yield_now().await;
-                    }
-                }
-                () = stream.acknowledgement_changed() => self.acknowledge(stream, &mut acknowledged)?,
-                moved = moves.next() => self.outbox.moved((*moved).clone().into()),
-                () = self.shutdown.begun(), if told_to_go.is_none() => {
-                    self.outbox.reconnect("the server is ending; its successor will take up the stream");
-                    told_to_go = Some(Instant::now());
+                error = stream.deleted() => return Err(error),
+                () = self.shutdown.begun(), if clock.reconnect_sent_at.is_none() => {
+                    self.outbox.reconnect("the server is ending; reconnect to continue the stream");
+                    clock.reconnect_sent_at = Some(Instant::now());
                 }
                 _ = tick.tick() => {
-                    if self.outbox.reader_is_gone() {
-                        return Ok(Stop::Gone);
+                    if let Some(stop) = self.check_time(&mut clock, idle_limit)? {
+                        return Ok(stop);
                     }
-                    if told_to_go.is_none() && opened_at.elapsed() >= oldest {
-                        self.outbox.reconnect("the stream has reached its greatest age");
-                        told_to_go = Some(Instant::now());
-                    }
-                    if told_to_go.is_some_and(|since| since.elapsed() >= FAREWELL) {
-                        return Ok(Stop::Reconnect);
-                    }
-                    if heard_at.elapsed() >= idle_limit {
-                        let message = format!("no item came for {} s", idle_limit.as_secs());
-                        return Err(Error::refused(ErrorKind::Timeout, message));
+                }
+                moved = change_notices.next() => self.outbox.moved((*moved).clone().into()),
+                () = stream.acknowledgement_changed() => self.acknowledge(stream, &mut acknowledged)?,
+                message = self.requests.message() => {
+                    let Some(answered) = self.answer_batch(stream, message).await? else {
+                        return Ok(StopReason::HalfClosed);
+                    };
+                    clock.last_item_at = Instant::now();
+                    self.acknowledge(stream, &mut acknowledged)?;
+                    if answered == BATCH {
+                        // Other tasks on this thread get their turn.
+                        tokio::task::yield_now().await;
                     }
                 }
             }
         }
     }
 
+    /// Ends the stream of a reader that is gone, of a client that did not half-close or of one that is
+    /// silent; asks the client of an old stream to reconnect.
+    fn check_time(&self, clock: &mut StreamClock, idle_limit: Duration) -> Result<Option<StopReason>> {
+        if self.outbox.reader_is_gone() {
+            return Ok(Some(StopReason::ReaderGone));
+        }
+        let greatest_age = Duration::from_secs(self.app.limits.live_age_s);
+        if clock.reconnect_sent_at.is_none() && clock.opened_at.elapsed() >= greatest_age {
+            self.outbox.reconnect("the stream has reached its greatest age");
+            clock.reconnect_sent_at = Some(Instant::now());
+        }
+        if clock.reconnect_sent_at.is_some_and(|since| since.elapsed() >= HALF_CLOSE_GRACE) {
+            return Ok(Some(StopReason::Reconnect));
+        }
+        if clock.last_item_at.elapsed() >= idle_limit {
+            let message = format!("no item came for {} s", idle_limit.as_secs());
+            return Err(Error::refused(ErrorKind::Timeout, message));
+        }
+        Ok(None)
+    }
+
     /// Answers a message and those behind it that are there already; how many, or `None` at the end.
     async fn answer_batch(
         &mut self,
-        camera: &CameraId,
         stream: &mut LiveStream,
         first: Result<Option<proto::StreamRequest>, Status>,
     ) -> Result<Option<u32>> {
@@ -187,7 +210,7 @@ impl Conversation {
                 self.outbox.flush();
                 return Ok(None);
             };
-            self.answer(camera, stream, message).await?;
+            self.answer(stream, message).await?;
             answered += 1;
             next = if answered < BATCH { self.requests.message().now_or_never() } else { None };
         }
@@ -195,25 +218,20 @@ impl Conversation {
         Ok(Some(answered))
     }
 
-    fn acknowledge(&self, stream: &LiveStream, acknowledged: &mut Option<u64>) -> Result<()> {
-        let now = stream.acknowledged()?;
-        if let Some(seq) = now
-            && *acknowledged != now
-        {
-            *acknowledged = now;
-            self.outbox.acknowledge(seq);
+    fn acknowledge(&self, stream: &LiveStream, sent: &mut Option<Acknowledgement>) -> Result<()> {
+        let current = stream.acknowledgement()?;
+        if current != *sent {
+            sent.clone_from(&current);
+            if let Some(acknowledgement) = current {
+                self.outbox.acknowledge(acknowledgement.into());
+            }
         }
         Ok(())
     }
 
-    async fn answer(
-        &self,
-        camera: &CameraId,
-        stream: &mut LiveStream,
-        message: proto::StreamRequest,
-    ) -> Result<()> {
+    async fn answer(&self, stream: &mut LiveStream, message: proto::StreamRequest) -> Result<()> {
         let answer = match message.kind {
-            Some(Kind::Item(item)) => self.answer_item(camera, stream, item).await?,
+            Some(Kind::Item(item)) => self.answer_item(stream, item).await?,
             Some(Kind::Opening(_)) => refused(
                 0,
                 &Error::invalid("opening", "the stream is open already; open another for another camera"),
@@ -229,28 +247,25 @@ impl Conversation {
 
     async fn answer_item(
         &self,
-        camera: &CameraId,
         stream: &mut LiveStream,
         item: proto::StreamItem,
     ) -> Result<proto::StreamAnswer> {
         let seq = item.seq;
-        if let Err(error) = stream.number(seq) {
+        if let Err(error) = stream.check_seq(seq) {
             return Ok(refused(seq, &error));
         }
-        let rules = self.app.row_rules(camera).await?;
-        let item = match live_item(item, &rules) {
-            Ok(item) => item,
-            Err(error) => {
-                stream.pass(seq);
-                return Ok(refused(seq, &error));
-            }
+        let camera = stream.current_camera()?;
+        // The receiver's clock offset is not applied yet, so only a wrong date is refused here.
+        let answered = match live_item(item, &camera.row_rules(self.app.clock.now())) {
+            Ok(item) => stream.take(&camera, seq, item).await,
+            Err(error) => Err(error),
         };
-        match stream.take(seq, item).await {
-            Ok(followed) => Ok(answered(seq, followed)),
+        match answered {
+            Ok(item) => Ok(answer_of(seq, item)),
             Err(Error::Refused(refusal)) if refusal.kind != ErrorKind::CameraNotFound => {
-                // What was taken before the refusal has its own receipt.
-                stream.acknowledged()?;
-                stream.pass(seq);
+                // What was recorded before the refusal is acknowledged with its commit.
+                stream.acknowledgement()?;
+                stream.ack_refused(seq);
                 Ok(refused(seq, &Error::Refused(refusal)))
             }
             Err(error) => Err(error),
@@ -265,31 +280,52 @@ fn ending() -> Error {
     )
 }
 
-fn answered(seq: u64, followed: crate::app::Followed) -> proto::StreamAnswer {
-    let flags = match &followed.fused {
+fn answer_of(seq: u64, item: ItemResult) -> proto::StreamAnswer {
+    let flags = match &item.fused {
         Some(_) => Vec::new(),
         None => vec![proto::Flag::from(Flag::NoModel).into()],
     };
     proto::StreamAnswer {
         seq,
-        outcome: followed.fused.map(|fused| Outcome::Fused(fused.into())),
-        track: followed.track.map(|point| point.as_ref().into()),
+        outcome: item.fused.map(|fused| Outcome::Fused(fused.into())),
+        track: item.track.map(|point| point.as_ref().into()),
         flags,
         lost_answers: 0,
     }
 }
 
 fn refused(seq: u64, error: &Error) -> proto::StreamAnswer {
-    let told = status::of(error.kind());
+    let status = status::of(error.kind());
     let (field, message) = match error {
         Error::Refused(refusal) => match refusal.violations.first() {
             Some(violation) => (violation.field.clone(), violation.message.clone()),
             None => (String::new(), refusal.message.clone()),
         },
-        Error::Fault(_) => (String::new(), told.title.to_owned()),
+        Error::Fault(_) => (String::new(), status.title.to_owned()),
     };
-    let error = proto::StreamItemError { reason: told.slug.to_owned(), field, message };
+    let error = proto::StreamItemError { reason: status.slug.to_owned(), field, message };
     proto::StreamAnswer { seq, outcome: Some(Outcome::Error(error)), ..proto::StreamAnswer::default() }
+}
+
+impl From<Acknowledgement> for proto::StreamAcknowledgement {
+    fn from(acknowledgement: Acknowledgement) -> Self {
+        let Acknowledgement { seq, stored, not_stored } = acknowledgement;
+        Self { seq, stored, not_stored: not_stored.into_iter().map(Into::into).collect() }
+    }
+}
+
+impl From<NotStored> for proto::NotStored {
+    fn from(not_stored: NotStored) -> Self {
+        use proto::not_stored::Reason;
+        let reason = match not_stored.reason {
+            NotStoredReason::NoTarget => Reason::NoTarget,
+            NotStoredReason::Refused => Reason::Refused,
+            NotStoredReason::Unpaired => Reason::Unpaired,
+            NotStoredReason::TooLate => Reason::TooLate,
+            NotStoredReason::Duplicate => Reason::Duplicate,
+        };
+        Self { reason: reason.into(), count: not_stored.count, last_seq: not_stored.last_seq }
+    }
 }
 
 impl From<&TrackPoint> for proto::TrackPoint {
@@ -322,6 +358,7 @@ impl From<&Rejection> for proto::TrackRejection {
             RejectionReason::TooLate => wire::Reason::TooLate,
             RejectionReason::Duplicate => wire::Reason::Duplicate,
             RejectionReason::UnusableVariance => wire::Reason::UnusableVariance,
+            RejectionReason::OutOfRange => wire::Reason::OutOfRange,
         };
         Self { source: source.into(), reason: reason.into(), nis: rejection.nis }
     }

@@ -1,17 +1,16 @@
 //! `TrainingService`.
 
 use std::pin::Pin;
-use std::sync::Arc;
 
 use futures_util::{Stream, StreamExt as _, stream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
 
 use super::convert::{camera_id, instant, recipe, run_id, timestamp};
 use super::pages;
 use super::proto;
 use super::proto::training_service_server::TrainingService;
-use super::statuses::{Reply, answer, request_id, to_status};
+use super::statuses::{Reply, answer, client_address, request_id, to_status};
+use crate::admission::Lease;
 use crate::app::{App, RunRequest};
 use crate::domain::{EpochReport, Error, ErrorKind, JobState, Result, RunId, RunProgress, TrainingRun};
 use crate::shutdown::Shutdown;
@@ -20,14 +19,11 @@ use crate::telemetry::RequestId;
 pub(super) struct Training {
     app: App,
     shutdown: Shutdown,
-    /// Places of those who watch.
-    places: Arc<Semaphore>,
 }
 
 impl Training {
     pub(super) fn new(app: &App, shutdown: &Shutdown) -> Self {
-        let places = Arc::new(Semaphore::new(app.limits.event_streams));
-        Self { app: app.clone(), shutdown: shutdown.clone(), places }
+        Self { app: app.clone(), shutdown: shutdown.clone() }
     }
 }
 
@@ -107,11 +103,12 @@ impl TrainingService for Training {
         request: tonic::Request<proto::WatchTrainingRunRequest>,
     ) -> Reply<Changes> {
         let id = request_id(request.extensions());
+        let client = client_address(request.extensions());
         answer(request, |asked| async move {
-            let place = self.places.clone().try_acquire_owned().map_err(|_| all_watched())?;
+            let lease = self.app.quotas.event_streams.try_acquire(client, 1)?;
             let (camera, run) = (camera_id(&asked.camera_id)?, run_id(&asked.run_id)?);
             let runs = self.app.watch_run(&camera, run).await?;
-            Ok(changes(runs, place, self.shutdown.clone(), id))
+            Ok(changes(runs, lease, self.shutdown.clone(), id))
         })
         .await
     }
@@ -144,19 +141,19 @@ impl TrainingService for Training {
 pub(super) type Changes =
     Pin<Box<dyn Stream<Item = std::result::Result<proto::WatchTrainingRunResponse, Status>> + Send>>;
 
-/// Ends with the run, with the first fault, or with the server, which is told as an error so that
+/// Ends with the run, with the first fault, or with the server, which is reported as an error so that
 /// nobody takes the run for ended.
 fn changes(
     runs: impl Stream<Item = Result<TrainingRun>> + Send + 'static,
-    place: OwnedSemaphorePermit,
+    lease: Lease,
     shutdown: Shutdown,
     id: RequestId,
 ) -> Changes {
-    let watched = Some((Box::pin(runs), place));
+    let watched = Some((Box::pin(runs), lease));
     stream::unfold(watched, move |watched| {
         let (shutdown, id) = (shutdown.clone(), id.clone());
         async move {
-            let (mut runs, place) = watched?;
+            let (mut runs, lease) = watched?;
             let next = tokio::select! {
                 biased;
                 next = runs.next() => next?,
@@ -164,7 +161,7 @@ fn changes(
             };
             Some(match next {
                 Ok(run) => {
-                    (Ok(proto::WatchTrainingRunResponse { run: Some(run.into()) }), Some((runs, place)))
+                    (Ok(proto::WatchTrainingRunResponse { run: Some(run.into()) }), Some((runs, lease)))
                 }
                 Err(error) => (Err(to_status(&error, &id)), None),
             })
@@ -175,10 +172,6 @@ fn changes(
 
 fn ending() -> Error {
     Error::refused(ErrorKind::ShuttingDown, "the server is ending; the run goes on when it is back")
-}
-
-fn all_watched() -> Error {
-    Error::refused(ErrorKind::Overloaded, "too many clients watch runs; ask for the run now and then")
 }
 
 impl From<TrainingRun> for proto::TrainingRun {

@@ -1,7 +1,6 @@
 //! Request bodies: read up to a limit, or spooled to a file so that a long one costs no memory.
 
 use std::collections::VecDeque;
-use std::error::Error as StdError;
 use std::fs::File;
 use std::io::{self, Read, Seek as _};
 use std::time::Duration;
@@ -11,9 +10,11 @@ use bytes::{Buf as _, Bytes, BytesMut};
 use http_body_util::BodyExt as _;
 use hyper::HeaderMap;
 use hyper::header::{CONTENT_LENGTH, EXPECT};
+use hyper::http::request::Parts;
 use tokio::io::AsyncWriteExt as _;
-use tower_http::timeout::TimeoutError;
 
+use crate::admission::{ClientAddress, Lease};
+use crate::app::App;
 use crate::domain::{Error, ErrorKind, Result};
 
 /// What is read and thrown away of a body that is too large, so that the client gets its answer
@@ -73,17 +74,23 @@ impl Gathered {
     }
 }
 
-/// A body to be read by blocking code, in memory or in a temporary file without a name.
-pub(super) enum Spooled {
+/// A body to be read by blocking code. What it holds of the quotas is given back when it is dropped.
+pub(super) struct Spooled {
+    pub(super) content: Content,
+    pub(super) leases: SpoolLeases,
+}
+
+/// Where a spooled body is: in memory, or in a temporary file without a name.
+pub(super) enum Content {
     Memory(VecDeque<Bytes>),
     File(File),
 }
 
 impl Read for Spooled {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        match self {
-            Self::File(file) => file.read(buffer),
-            Self::Memory(parts) => {
+        match &mut self.content {
+            Content::File(file) => file.read(buffer),
+            Content::Memory(parts) => {
                 let Some(part) = parts.front_mut() else { return Ok(0) };
                 let count = part.len().min(buffer.len());
                 part.copy_to_slice(&mut buffer[..count]);
@@ -96,68 +103,105 @@ impl Read for Spooled {
     }
 }
 
-/// The body, in memory up to a size and in a temporary file beyond.
+/// What a spooled body holds of the quotas of all imports.
+pub(super) struct SpoolLeases {
+    memory: Lease,
+    disk: Lease,
+}
+
+impl SpoolLeases {
+    fn new(app: &App, client: ClientAddress) -> Result<Self> {
+        let memory = app.quotas.import_memory.try_acquire(client, 0)?;
+        Ok(Self { memory, disk: app.quotas.import_disk.try_acquire(client, 0)? })
+    }
+}
+
+/// The body of an import, in memory up to a size and in a temporary file beyond.
 ///
 /// # Errors
-/// As [`whole`]; a fault if the temporary file cannot be written.
-pub(super) async fn spooled(
-    headers: &HeaderMap,
-    mut body: Body,
-    limit: usize,
-    memory_bytes: usize,
-) -> Result<Spooled> {
-    check_announced(headers, &mut body, limit).await?;
-    let mut spool = Spool::new(memory_bytes);
+/// As [`whole`]; `Overloaded` if all imports together hold as much as they may; a fault if the
+/// temporary file cannot be written.
+pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
+    let limit = app.limits.import_bytes;
+    check_announced(&head.headers, &mut body, limit).await?;
+    let mut spool = Spool::new(app, client_address(head))?;
     while let Some(part) = next(&mut body).await? {
-        if spool.length + part.len() > limit {
-            discard(headers, &mut body).await;
-            return Err(too_large(limit));
+        let pushed =
+            if spool.length + part.len() > limit { Err(too_large(limit)) } else { spool.push(part).await };
+        if let Err(error) = pushed {
+            discard(&head.headers, &mut body).await;
+            return Err(error);
         }
-        spool.push(part).await?;
     }
     spool.finish().await
 }
 
-/// Gathers what comes piece by piece, in memory up to a size and in a temporary file beyond.
+/// Who sends a request.
+pub(super) fn client_address(head: &Parts) -> ClientAddress {
+    head.extensions.get().copied().unwrap_or(ClientAddress::UNKNOWN)
+}
+
+/// Gathers what comes piece by piece, in memory up to a size and in a temporary file beyond, or where
+/// the memory of all imports is used up.
 pub(super) struct Spool {
     memory_bytes: usize,
     length: usize,
     parts: VecDeque<Bytes>,
     file: Option<tokio::fs::File>,
+    leases: SpoolLeases,
 }
 
 impl Spool {
-    pub(super) const fn new(memory_bytes: usize) -> Self {
-        Self { memory_bytes, length: 0, parts: VecDeque::new(), file: None }
+    pub(super) fn new(app: &App, client: ClientAddress) -> Result<Self> {
+        Ok(Self {
+            memory_bytes: app.limits.import_memory_bytes,
+            length: 0,
+            parts: VecDeque::new(),
+            file: None,
+            leases: SpoolLeases::new(app, client)?,
+        })
     }
 
     /// # Errors
-    /// `InsufficientStorage`, or a fault, if the temporary file cannot be written.
+    /// `Overloaded` if all imports together hold as much as they may; `InsufficientStorage`, or a
+    /// fault, if the temporary file cannot be written.
     pub(super) async fn push(&mut self, part: Bytes) -> Result<()> {
-        self.length += part.len();
-        if !part.is_empty() {
-            self.parts.push_back(part);
+        if part.is_empty() {
+            return Ok(());
         }
-        if self.length > self.memory_bytes {
-            let file = match &mut self.file {
-                Some(file) => file,
-                None => self.file.insert(temporary_file().await?),
-            };
-            for part in self.parts.drain(..) {
-                file.write_all(&part).await.map_err(unspoolable)?;
-            }
+        let bytes = part.len();
+        self.length += bytes;
+        self.parts.push_back(part);
+        let fits = self.file.is_none() && self.length <= self.memory_bytes;
+        if fits && self.leases.memory.try_grow(bytes as u64).is_ok() {
+            return Ok(());
         }
+        let moved: usize = self.parts.iter().map(Bytes::len).sum();
+        self.leases.disk.try_grow(moved as u64)?;
+        let file = match &mut self.file {
+            Some(file) => file,
+            None => self.file.insert(temporary_file().await?),
+        };
+        for part in self.parts.drain(..) {
+            file.write_all(&part).await.map_err(unspoolable)?;
+        }
+        self.leases.memory.clear();
         Ok(())
     }
 
     /// # Errors
     /// A fault if the temporary file cannot be written.
     pub(super) async fn finish(self) -> Result<Spooled> {
-        let Some(mut file) = self.file else { return Ok(Spooled::Memory(self.parts)) };
-        file.flush().await.map_err(unspoolable)?;
-        let mut file = file.into_std().await;
-        file.rewind().map_err(Error::fault)?;
-        Ok(Spooled::File(file))
+        let content = match self.file {
+            None => Content::Memory(self.parts),
+            Some(mut file) => {
+                file.flush().await.map_err(unspoolable)?;
+                let mut file = file.into_std().await;
+                file.rewind().map_err(Error::fault)?;
+                Content::File(file)
+            }
+        };
+        Ok(Spooled { content, leases: self.leases })
     }
 }
 
@@ -181,7 +225,8 @@ async fn next(body: &mut Body) -> Result<Option<Bytes>> {
     loop {
         match body.frame().await {
             None => return Ok(None),
-            Some(Err(error)) => return Err(broken(&error)),
+            // Why a body was refused is known, and reported, where requests are admitted.
+            Some(Err(_)) => return Err(Error::refused(ErrorKind::Cancelled, "the body broke off")),
             Some(Ok(frame)) => {
                 if let Ok(part) = frame.into_data() {
                     return Ok(Some(part));
@@ -189,17 +234,6 @@ async fn next(body: &mut Body) -> Result<Option<Bytes>> {
             }
         }
     }
-}
-
-fn broken(error: &axum::Error) -> Error {
-    let mut cause: Option<&(dyn StdError + 'static)> = Some(error);
-    while let Some(at) = cause {
-        if at.is::<TimeoutError>() {
-            return Error::refused(ErrorKind::Timeout, "the body stopped coming");
-        }
-        cause = at.source();
-    }
-    Error::refused(ErrorKind::Cancelled, "the body broke off")
 }
 
 fn too_large(limit: usize) -> Error {

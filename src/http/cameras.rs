@@ -13,12 +13,12 @@ use utoipa_axum::routes;
 
 use super::Rest;
 use super::extract::{CameraPath, JsonBody, Params};
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use super::receivers::{Receiver, receivers, shown};
-use super::wire::{Recipe, empty, json, made, nullable, with_etag};
+use super::wire::{Recipe, created, empty, json, nullable, with_etag};
 use crate::app::App;
 use crate::domain::{self, CameraId, Error, ErrorKind, NewCamera, Result, Revision, SigmaM, TargetClass};
-use crate::exchange::{read_cursor, write_cursor};
+use crate::exchange::write_cursor;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(create_camera, list_cameras)).routes(routes!(
@@ -87,7 +87,7 @@ struct CameraDraft {
     /// The name for people; the id if left out.
     #[schema(max_length = 200, example = "North gate")]
     display_name: Option<String>,
-    /// Without it, boxes cut by the right or lower border cannot be told.
+    /// Without it, boxes cut by the right or lower border cannot be recognised.
     image_size: Option<ImageSize>,
     /// `"unknown"` if left out.
     gnss_error: Option<GnssError>,
@@ -160,7 +160,7 @@ struct CameraChange {
     /// New receivers, all of them.
     #[schema(max_items = 1_024)]
     receivers: Option<Vec<Receiver>>,
-    /// Whether to train anew by itself once the camera is found to have moved.
+    /// Whether to start a training run once the camera is found to have moved.
     retrain_when_moved: Option<bool>,
 }
 
@@ -231,7 +231,7 @@ impl Camera {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
         let warnings = camera.profile.warnings();
-        let domain::Camera { profile, revision, created_at, updated_at, active_model } = camera;
+        let domain::Camera { profile, revision, created_at, updated_at, active_model, key: _ } = camera;
         Self {
             id: profile.id.as_str().to_owned(),
             display_name: profile.display_name,
@@ -261,7 +261,7 @@ impl Camera {
 pub(super) struct CameraMoved {
     /// Number of the model version that no longer fits.
     model_version: u32,
-    /// When it began, as well as can be told.
+    /// When it began, as well as it can be estimated.
     #[schema(value_type = String, format = DateTime)]
     began_at: Timestamp,
     /// When the evidence was enough.
@@ -304,10 +304,10 @@ struct CameraPage {
         (status = 409, description = "A camera of that id exists", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn create_camera(State(app): State<App>, body: JsonBody) -> Answer {
+async fn create_camera(State(app): State<App>, body: JsonBody) -> ApiResult {
     let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
     let (location, revision) = (format!("/v1/cameras/{}", camera.id()), camera.revision);
-    Ok(with_etag(made(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, revision)?)
+    Ok(with_etag(created(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, revision)?)
 }
 
 /// List cameras by id
@@ -319,15 +319,15 @@ async fn create_camera(State(app): State<App>, body: JsonBody) -> Answer {
     ),
     responses((status = 200, description = "A page of cameras", body = CameraPage))
 )]
-async fn list_cameras(State(app): State<App>, uri: Uri) -> Answer {
+async fn list_cameras(State(app): State<App>, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
-    let after = params.take("cursor", |text| CameraId::new(&read_cursor("cameras", text)?))?;
+    let after = params.cursor()?;
     params.end()?;
     let page = app.cameras(after.as_ref(), limit).await?;
     Ok(json(&CameraPage {
         items: page.items.into_iter().map(|camera| Camera::of(&app, camera)).collect(),
-        next_cursor: page.next.map(|id| write_cursor("cameras", id.as_str())),
+        next_cursor: page.next.map(|id| write_cursor(&id)),
     })?)
 }
 
@@ -336,7 +336,7 @@ async fn list_cameras(State(app): State<App>, uri: Uri) -> Answer {
     get, path = "/v1/cameras/{camera}", tag = "cameras", params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "The camera", body = Camera, headers(("etag" = String, description = "Its revision"))))
 )]
-async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
     let camera = app.camera(&id).await?;
     let revision = camera.revision;
     Ok(with_etag(json(&Camera::of(&app, camera))?, revision)?)
@@ -364,7 +364,7 @@ async fn change_camera(
     CameraPath(id): CameraPath,
     headers: HeaderMap,
     body: JsonBody,
-) -> Answer {
+) -> ApiResult {
     let expected = if_match(&headers)?.ok_or_else(|| {
         let message =
             "the header must name the revision that the change is based on, as `etag` gave it, or be *";
@@ -389,7 +389,7 @@ async fn change_camera(
         (status = 412, description = "The camera has another revision", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_camera(State(app): State<App>, CameraPath(id): CameraPath, headers: HeaderMap) -> Answer {
+async fn delete_camera(State(app): State<App>, CameraPath(id): CameraPath, headers: HeaderMap) -> ApiResult {
     let expected = if_match(&headers)?.and_then(IfMatch::revision);
     app.delete_camera(&id, expected).await?;
     Ok(empty())

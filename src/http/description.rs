@@ -23,8 +23,15 @@ const TAGS: [(&str, &str); 7] = [
 ];
 
 /// Refusals that any operation may meet.
-const ANY: [ErrorKind; 4] =
-    [ErrorKind::Timeout, ErrorKind::Internal, ErrorKind::Overloaded, ErrorKind::InvalidArgument];
+const ANY: [ErrorKind; 5] = [
+    ErrorKind::Timeout,
+    ErrorKind::Internal,
+    ErrorKind::Overloaded,
+    ErrorKind::InvalidArgument,
+    ErrorKind::HostNotAllowed,
+];
+/// Refusals of operations that change something.
+const OF_CHANGES: [ErrorKind; 1] = [ErrorKind::OriginNotAllowed];
 /// Refusals of operations with a body.
 const WITH_BODY: [ErrorKind; 3] =
     [ErrorKind::MalformedBody, ErrorKind::TooLarge, ErrorKind::UnsupportedMediaType];
@@ -51,10 +58,15 @@ pub(super) fn add_problems(openapi: &mut OpenApi) {
     for (path, item) in &mut openapi.paths.paths {
         let is_service = !path.starts_with("/v1/");
         let is_below_camera = path.contains("{camera}");
-        for operation in operations(item).into_iter().flatten() {
+        let [get, changes @ ..] = operations(item);
+        let changes = changes.into_iter().flatten().map(|operation| (operation, true));
+        for (operation, is_change) in get.into_iter().map(|operation| (operation, false)).chain(changes) {
             let mut kinds: Vec<ErrorKind> = Vec::new();
             if !is_service {
                 kinds.extend(ANY);
+            }
+            if is_change {
+                kinds.extend(OF_CHANGES);
             }
             if operation.request_body.is_some() {
                 kinds.extend(WITH_BODY);

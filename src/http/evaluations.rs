@@ -11,13 +11,13 @@ use utoipa_axum::routes;
 
 use super::Rest;
 use super::extract::{EvaluationPath, JsonBody, Params, camera_of};
-use super::problem::{Answer, Problem};
-use super::wire::{JobState, Recipe, empty, instant, json, made};
+use super::problem::{ApiResult, Problem};
+use super::wire::{JobState, Recipe, created, empty, instant, json};
 use crate::app::{App, EvaluationRequest};
 use crate::domain::{self, Error, EvaluationProgress, Method, Result, SigmaM, Truth};
 use crate::evaluation::Report;
 use crate::exchange::wire::Position;
-use crate::exchange::{foreign_cursor, read_cursor, write_cursor};
+use crate::exchange::write_cursor;
 use crate::geo;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -173,7 +173,7 @@ struct Evaluation {
     /// Standard deviation per axis of the receiver, if known.
     #[serde(skip_serializing_if = "Option::is_none")]
     gnss_sigma_m: Option<f64>,
-    /// Where it stands.
+    /// Its state.
     state: JobState,
     /// How far it has come.
     progress: EvaluationProgress,
@@ -185,7 +185,7 @@ struct Evaluation {
     /// When it was asked for.
     #[schema(value_type = String, format = DateTime)]
     created_at: Timestamp,
-    /// When a worker took it up last.
+    /// When a worker claimed it last.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     started_at: Option<Timestamp>,
@@ -256,11 +256,11 @@ struct EvaluationPage {
         (status = 404, description = "There is no such camera", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn start_evaluation(State(app): State<App>, body: JsonBody) -> Answer {
+async fn start_evaluation(State(app): State<App>, body: JsonBody) -> ApiResult {
     let draft: EvaluationDraft = body.read()?;
     let job = app.start_evaluation(&camera_of(&draft.camera_id)?, draft.to_domain()?).await?;
     let location = format!("/v1/evaluations/{}", job.id);
-    Ok(made(StatusCode::ACCEPTED, &location, &Evaluation::from(job))?)
+    Ok(created(StatusCode::ACCEPTED, &location, &Evaluation::from(job))?)
 }
 
 /// List evaluations, newest first
@@ -276,17 +276,16 @@ async fn start_evaluation(State(app): State<App>, body: JsonBody) -> Answer {
         (status = 404, description = "There is no such camera", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn list_evaluations(State(app): State<App>, uri: Uri) -> Answer {
+async fn list_evaluations(State(app): State<App>, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let camera = params.take("camera", camera_of)?;
     let limit = params.limit(app.limits.page_items)?;
-    let before = params
-        .take("cursor", |text| read_cursor("evaluations", text)?.parse().map_err(|_| foreign_cursor()))?;
+    let before = params.cursor()?;
     params.end()?;
     let page = app.evaluations(camera.as_ref(), before, limit).await?;
     Ok(json(&EvaluationPage {
         items: page.items.into_iter().map(Evaluation::from).collect(),
-        next_cursor: page.next.map(|id| write_cursor("evaluations", &id.to_string())),
+        next_cursor: page.next.map(|id| write_cursor(&id)),
     })?)
 }
 
@@ -299,7 +298,7 @@ async fn list_evaluations(State(app): State<App>, uri: Uri) -> Answer {
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn get_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> Answer {
+async fn get_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> ApiResult {
     let (job, report) = app.evaluation(id).await?;
     let report = report.map(RawValue::from_string).transpose().map_err(Error::fault)?;
     Ok(json(&Evaluation { report, ..Evaluation::from(job) })?)
@@ -312,12 +311,12 @@ async fn get_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPa
     post, path = "/v1/evaluations/{evaluation}/cancel", tag = "evaluations",
     params(("evaluation" = String, Path, description = "The evaluation's id")),
     responses(
-        (status = 200, description = "The evaluation as it stands now", body = Evaluation),
+        (status = 200, description = "The evaluation in its present state", body = Evaluation),
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "The evaluation has ended", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn cancel_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> Answer {
+async fn cancel_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> ApiResult {
     Ok(json(&Evaluation::from(app.cancel_evaluation(id).await?))?)
 }
 
@@ -332,7 +331,7 @@ async fn cancel_evaluation(State(app): State<App>, EvaluationPath(id): Evaluatio
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> Answer {
+async fn delete_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> ApiResult {
     app.delete_evaluation(id).await?;
     Ok(empty())
 }

@@ -10,23 +10,35 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
 use super::body;
-use super::problem::{Answer, Refused, no_route};
+use super::problem::{ApiError, ApiResult, no_route};
+use crate::admission::ClientAddress;
 use crate::app::App;
 use crate::domain::{
     CameraId, Durability, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time,
 };
-use crate::exchange::wire;
+use crate::exchange::{Cursor, read_cursor, wire};
 
 /// Items on a page whose length the client leaves open.
 const PAGE_ITEMS: u32 = 100;
+
+/// Who sends the request.
+pub(super) struct Client(pub(super) ClientAddress);
+
+impl<S: Send + Sync> FromRequestParts<S> for Client {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
+        Ok(Self(body::client_address(parts)))
+    }
+}
 
 /// A camera of the path. What is no slug names no camera.
 pub(super) struct CameraPath(pub(super) CameraId);
 
 impl<S: Send + Sync> FromRequestParts<S> for CameraPath {
-    type Rejection = Refused;
+    type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         Ok(Self(camera_of(&path::<CameraSegment, S>(parts, state).await?.camera)?))
     }
 }
@@ -35,9 +47,9 @@ impl<S: Send + Sync> FromRequestParts<S> for CameraPath {
 pub(super) struct RunPath(pub(super) CameraId, pub(super) RunId);
 
 impl<S: Send + Sync> FromRequestParts<S> for RunPath {
-    type Rejection = Refused;
+    type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         let RunSegments { camera, run } = path(parts, state).await?;
         Ok(Self(camera_of(&camera)?, run.parse()?))
     }
@@ -47,9 +59,9 @@ impl<S: Send + Sync> FromRequestParts<S> for RunPath {
 pub(super) struct TargetPath(pub(super) CameraId, pub(super) TargetId);
 
 impl<S: Send + Sync> FromRequestParts<S> for TargetPath {
-    type Rejection = Refused;
+    type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         let TargetSegments { camera, target } = path(parts, state).await?;
         let target = TargetId::new(&target)
             .map_err(|_| Error::refused(ErrorKind::TrackNotFound, "that is not the id of a target"))?;
@@ -61,9 +73,9 @@ impl<S: Send + Sync> FromRequestParts<S> for TargetPath {
 pub(super) struct EvaluationPath(pub(super) EvaluationId);
 
 impl<S: Send + Sync> FromRequestParts<S> for EvaluationPath {
-    type Rejection = Refused;
+    type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         Ok(Self(path::<EvaluationSegment, S>(parts, state).await?.evaluation.parse()?))
     }
 }
@@ -72,9 +84,9 @@ impl<S: Send + Sync> FromRequestParts<S> for EvaluationPath {
 pub(super) struct ModelPath(pub(super) CameraId, pub(super) u32);
 
 impl<S: Send + Sync> FromRequestParts<S> for ModelPath {
-    type Rejection = Refused;
+    type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Answer<Self> {
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         let ModelSegments { camera, model } = path(parts, state).await?;
         let number = model.parse();
         let number =
@@ -141,7 +153,7 @@ impl Params {
         let Some(at) = self.0.iter().position(|(given, _)| given == name) else { return Ok(None) };
         let (_, text) = self.0.swap_remove(at);
         if self.0.iter().any(|(given, _)| given == name) {
-            return Err(Error::invalid(name, "stands twice"));
+            return Err(Error::invalid(name, "appears twice"));
         }
         parse(&text).map(Some)
     }
@@ -152,6 +164,11 @@ impl Params {
             // A plus sign that was not escaped arrives as a space.
             parse_time(&text.replace(' ', "+")).map_err(|error| error.at(name))
         })
+    }
+
+    /// `cursor`: where the page begins; from the start without one.
+    pub(super) fn cursor<C: Cursor>(&mut self) -> Result<Option<C>> {
+        self.take("cursor", |text| read_cursor("cursor", text))
     }
 
     /// `limit`: items on a page, from 1 to the server's own limit.
@@ -185,9 +202,9 @@ where
     S: Send + Sync,
     App: FromRef<S>,
 {
-    type Rejection = Refused;
+    type Rejection = ApiError;
 
-    async fn from_request(request: Request, state: &S) -> Answer<Self> {
+    async fn from_request(request: Request, state: &S) -> ApiResult<Self> {
         let (parts, content) = request.into_parts();
         let is_json = media_type(&parts.headers).is_some_and(|essence| {
             let essence = essence.to_ascii_lowercase();

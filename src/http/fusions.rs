@@ -9,15 +9,13 @@ use utoipa_axum::routes;
 
 use super::Rest;
 use super::extract::{CameraPath, JsonBody};
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use super::wire::json_of_about;
 use crate::app::App;
-use crate::domain::{Error, ErrorKind, Observation, Refusal, Result, Violation};
+use crate::domain::{Error, Observation, Result, convert_all};
 use crate::exchange::{RowRules, wire};
 
-/// Most fields at fault that one answer names.
-const VIOLATIONS: usize = 100;
-/// A fused position as JSON is seldom longer.
+/// Typical size of a fused position as JSON, to reserve memory.
 const ITEM_BYTES: usize = 640;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -77,10 +75,11 @@ struct Fusions<'a> {
         (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn fuse(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer<Response> {
-    let rules = app.row_rules(&id).await?;
+async fn fuse(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult<Response> {
+    let camera = app.active_camera(&id).await?;
+    let rules = camera.row_rules(app.clock.now());
     let observations = observations(&app, &body.read()?, &rules)?;
-    let fused = app.fuse(&id, &observations).await?;
+    let fused = app.fuse(camera, &observations).await?;
     let items = fused.iter().map(wire::FusedFix::from).collect();
     Ok(json_of_about(&Fusions { items }, 64 + ITEM_BYTES * fused.len())?)
 }
@@ -105,32 +104,6 @@ pub(super) fn observations(app: &App, request: &Request<'_>, rules: &RowRules) -
     if let Some((field, _)) = beside.into_iter().find(|(_, given)| *given) {
         return Err(Error::invalid(field, "belongs into one of the observations"));
     }
-    if batch.is_empty() {
-        return Err(Error::invalid("observations", "must hold at least one"));
-    }
     app.check_batch(batch.len())?;
-    let mut taken = Vec::with_capacity(batch.len());
-    let mut violations = Vec::new();
-    for (index, observation) in batch.iter().enumerate() {
-        match observation.to_domain(time_bounds, *image_size) {
-            Ok(observation) => taken.push(observation),
-            Err(error) => violations.extend(told(error.under(&format!("observations[{index}]")))?),
-        }
-        if violations.len() >= VIOLATIONS {
-            break;
-        }
-    }
-    if violations.is_empty() { Ok(taken) } else { Err(refused(violations)) }
-}
-
-fn told(error: Error) -> Result<Vec<Violation>> {
-    match error {
-        Error::Refused(refusal) => Ok(refusal.violations),
-        fault @ Error::Fault(_) => Err(fault),
-    }
-}
-
-fn refused(violations: Vec<Violation>) -> Error {
-    let message = "nothing was fused, for the fields at fault".to_owned();
-    Error::Refused(Refusal { kind: ErrorKind::InvalidArgument, message, violations })
+    convert_all("observations", batch, |observation| observation.to_domain(time_bounds, *image_size))
 }

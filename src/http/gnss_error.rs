@@ -8,7 +8,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{CameraPath, media_type, not_read};
-use super::problem::Answer;
+use super::problem::ApiResult;
 use super::samples::RejectedRow;
 use super::wire::json;
 use super::{Rest, body};
@@ -29,7 +29,7 @@ struct Fixes {
     fixes: Vec<wire::Fix>,
 }
 
-/// What the fixes tell.
+/// The error of a receiver, estimated from its fixes.
 #[derive(Serialize, ToSchema)]
 struct Estimate {
     /// Fixes that were read.
@@ -60,13 +60,13 @@ struct Estimate {
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/gnss-error", tag = "cameras", params(("camera" = String, Path, description = "The camera's id")),
     request_body(content((String = "text/csv"), (String = "text/plain"), (Fixes = "application/json"))),
-    responses((status = 200, description = "What the fixes tell", body = Estimate))
+    responses((status = 200, description = "The receiver's error", body = Estimate))
 )]
 async fn estimate_gnss_error(
     State(app): State<App>,
     CameraPath(id): CameraPath,
     request: Request,
-) -> Answer<Response> {
+) -> ApiResult<Response> {
     let (parts, content) = request.into_parts();
     let time_bounds = app.row_rules(&id).await?.time_bounds;
     let limits = &app.limits;
@@ -79,8 +79,7 @@ async fn estimate_gnss_error(
         given => {
             let format = given.and_then(FixFormat::from_media_type);
             let format = format.ok_or_else(|| not_read(&["text/csv", "text/plain", "application/json"]))?;
-            let limit = (limits.import_bytes, limits.import_memory_bytes);
-            Source::File(body::spooled(&parts.headers, content, limit.0, limit.1).await?, format)
+            Source::File(body::spooled(&app, &parts, content).await?, format)
         }
     };
     let tell_at_most = limits.rejected_rows;
@@ -106,16 +105,16 @@ fn from_given(fixes: &[wire::Fix], tell_at_most: usize) -> Result<GnssErrorEstim
     GnssErrorEstimate::from_rows(rows, tell_at_most)
 }
 
-fn estimate(told: GnssErrorEstimate) -> Estimate {
+fn estimate(estimate: GnssErrorEstimate) -> Estimate {
     Estimate {
-        fixes: told.fixes,
-        mean: told.mean.into(),
-        east_variance_m2: told.east_variance_m2,
-        north_variance_m2: told.north_variance_m2,
-        e_gnss_m2: told.e_gnss_m2,
-        sigma_m: told.sigma_m,
-        mean_distance_m: told.mean_distance_m,
-        rejected: told.rejected,
-        rejected_rows: told.rejected_rows.into_iter().map(RejectedRow::from).collect(),
+        fixes: estimate.fixes,
+        mean: estimate.mean.into(),
+        east_variance_m2: estimate.east_variance_m2,
+        north_variance_m2: estimate.north_variance_m2,
+        e_gnss_m2: estimate.e_gnss_m2,
+        sigma_m: estimate.sigma_m,
+        mean_distance_m: estimate.mean_distance_m,
+        rejected: estimate.rejected,
+        rejected_rows: estimate.rejected_rows.into_iter().map(RejectedRow::from).collect(),
     }
 }

@@ -24,19 +24,20 @@ mod tracks;
 mod training_runs;
 mod wire;
 
-use std::sync::Arc;
-
 use axum::Router;
 use axum::body::Body;
 use axum::extract::FromRef;
-use axum::middleware::from_fn;
+use axum::middleware::{from_fn, map_response};
 use axum::response::Response;
-use tokio::sync::Semaphore;
+use hyper::Method;
+use hyper::header::{CONTENT_SECURITY_POLICY, REFERRER_POLICY, X_FRAME_OPTIONS};
+use hyper::http::HeaderValue;
 use tower_http::catch_panic::CatchPanicLayer;
 use utoipa::openapi::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_swagger_ui::{Config, SwaggerUi};
 
+use crate::admission::RequestClass;
 use crate::app::App;
 use crate::domain::Error;
 use crate::shutdown::Shutdown;
@@ -47,8 +48,6 @@ use crate::telemetry::RequestId;
 struct Rest {
     app: App,
     shutdown: Shutdown,
-    /// Places for event streams.
-    event_streams: Arc<Semaphore>,
 }
 
 impl FromRef<Rest> for App {
@@ -61,18 +60,48 @@ impl FromRef<Rest> for App {
 ///
 /// Requests carry their [`RequestId`] as an extension.
 pub fn router(app: App, shutdown: Shutdown) -> Router {
-    let event_streams = Arc::new(Semaphore::new(app.limits.event_streams));
-    let rest = Rest { app, shutdown, event_streams };
+    let rest = Rest { app, shutdown };
     let (routes, described) = described().split_for_parts();
     // The page would otherwise ask a server on the internet whether the description is well formed.
     let page = SwaggerUi::new("/docs")
         .url("/openapi.json", described)
         .config(Config::default().validator_url("none").use_base_layout());
+    let page = Router::from(page).layer(map_response(contain_page));
     routes
         .merge(page)
         .with_state(rest)
-        // As one layer: axum boxes every request anew for each.
-        .layer((from_fn(problem::tell), CatchPanicLayer::custom(problem::panicked)))
+        // As one layer: axum boxes every request again for each.
+        .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
+}
+
+/// What the page of the description may do: run its own scripts and ask its own server, nothing else.
+/// Swagger UI sets styles by attribute and shows images that it holds itself.
+const PAGE_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
+     img-src 'self' data:; font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
+     frame-ancestors 'none'";
+
+async fn contain_page(mut response: Response) -> Response {
+    for (name, value) in
+        [(CONTENT_SECURITY_POLICY, PAGE_POLICY), (X_FRAME_OPTIONS, "DENY"), (REFERRER_POLICY, "no-referrer")]
+    {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+/// What a request is for, by its method and path.
+#[must_use]
+pub fn class(method: &Method, path: &str) -> RequestClass {
+    let last = path.rsplit('/').next().unwrap_or_default();
+    match path.strip_prefix("/v1/") {
+        None if matches!(path, "/livez" | "/readyz" | "/metrics") => RequestClass::Probe,
+        Some(_) if method == Method::POST => match last {
+            "fusions" | "tracks" => RequestClass::Fusion,
+            "samples" | "pairings" | "gnss-error" => RequestClass::Import,
+            _ => RequestClass::Other,
+        },
+        _ => RequestClass::Other,
+    }
 }
 
 /// The description of the REST interface, by OpenAPI 3.1.

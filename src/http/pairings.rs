@@ -9,7 +9,7 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::extract::{CameraPath, Params};
 use super::parts::parts;
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use super::receivers::Receiver;
 use super::wire::{Durability, json};
 use crate::app::{App, PairedImport, PairedReport, PairingCounts, Part};
@@ -27,11 +27,11 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 #[expect(dead_code, reason = "describes the body, which is read part by part")]
 struct PairingParts {
     /// CSV with the columns `time`, `target_id`, `left`, `top`, `width`, `height`, or NDJSON or JSON
-    /// of the same; told by the part's content type or its file's name.
+    /// of the same; recognised by the part's content type or its file's name.
     #[schema(value_type = String, format = Binary)]
     detections: Vec<u8>,
-    /// CSV (`time`, `longitude`, `latitude`, at will `receiver_id` and `sigma_m`), NMEA 0183, GPX or
-    /// gpsd's reports, one a line; told by the part's content type or its file's name.
+    /// CSV (`time`, `longitude`, `latitude`, optional `receiver_id` and `sigma_m`), NMEA 0183, GPX or
+    /// gpsd's reports, one a line; recognised by the part's content type or its file's name.
     #[schema(value_type = String, format = Binary)]
     fixes: Vec<u8>,
 }
@@ -54,7 +54,7 @@ struct PairedSamples {
     /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
     #[serde(skip_serializing_if = "Option::is_none")]
     unnamed_fixes_of: Option<Receiver>,
-    /// What the files tell of the receivers' clocks, if that was asked for.
+    /// Clock offsets of the receivers as the files show them, if that was asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     clock_offsets: Option<Vec<ClockOffsetEstimate>>,
 }
@@ -114,7 +114,7 @@ struct UnusedFixes {
     duplicate: u64,
 }
 
-/// What the files tell of one receiver's clock.
+/// The clock offset of one receiver, estimated from the files.
 #[derive(Serialize, ToSchema)]
 struct ClockOffsetEstimate {
     /// The receiver.
@@ -122,7 +122,7 @@ struct ClockOffsetEstimate {
     /// The target that carries it.
     target_id: String,
     /// Seconds to be added to the receiver's time to get the camera's; missing, as all below, where
-    /// the files do not tell it.
+    /// the files do not determine it.
     #[serde(skip_serializing_if = "Option::is_none")]
     clock_offset_s: Option<f64>,
     /// Standard deviation of the estimate.
@@ -140,7 +140,7 @@ struct ClockOffsetEstimate {
 ///
 /// Both parts are paired by time: with the method `nearest` box and fix make a sample when each is
 /// the other's nearest within the window; with `interpolate` every box between two fixes gets a fix
-/// of its own time. Whose a receiver is and how far its clock is off stands in the camera's
+/// of its own time. Whose a receiver is and how far its clock is off is set in the camera's
 /// `receivers`. Fixes that name no receiver are those of `receiver_id`; else of the camera's only
 /// receiver; else of the only target among the detections. The device that a report of gpsd names is
 /// a receiver if it is among the camera's, and no name else.
@@ -164,7 +164,7 @@ struct ClockOffsetEstimate {
         (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> Answer {
+async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> ApiResult {
     let (head, content) = request.into_parts();
     let mut params = Params::of(&head.uri)?;
     let settings = settings(&mut params)?;
@@ -175,7 +175,7 @@ async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, reques
     params.end()?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let names = [Part::Detections, Part::Fixes].map(Part::as_str);
-    let [detections, fixes] = parts(&head.headers, content, &app.limits, names).await?;
+    let [detections, fixes] = parts(&app, &head, content, names).await?;
     let readable = |format: &Format| *format != Format::GeoJson;
     let detections_format = detections.format(
         names[0],
@@ -201,7 +201,7 @@ async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, reques
         estimates_offsets,
     };
     let report = app.import_paired(&id, import).await?;
-    Ok(json(&told(report, durability, estimates_offsets))?)
+    Ok(json(&paired_samples(report, durability, estimates_offsets))?)
 }
 
 fn settings(params: &mut Params) -> Result<PairingSettings> {
@@ -218,7 +218,7 @@ fn truth(text: &str) -> Result<bool> {
     text.parse().map_err(|_| Error::invalid("estimate_offset", "must be true or false"))
 }
 
-fn told(report: PairedReport, durability: domain::Durability, with_offsets: bool) -> PairedSamples {
+fn paired_samples(report: PairedReport, durability: domain::Durability, with_offsets: bool) -> PairedSamples {
     let PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets } = report;
     let estimates = clock_offsets.iter().map(|(receiver, found)| offset(receiver, found.as_ref()));
     PairedSamples {
@@ -257,11 +257,11 @@ impl From<PairingCounts> for Pairing {
             unpaired_detections: UnpairedDetections {
                 no_fix_of_target: counts.detections_without_fixes,
                 no_fix_near: counts.detections_far_from_fixes,
-                fix_nearer_to_another: counts.detections_outbid,
+                fix_nearer_to_another: counts.detections_with_fix_claimed,
                 duplicate: counts.detections_duplicate,
             },
             unused_fixes: UnusedFixes {
-                no_receiver: counts.fixes_unbound,
+                no_receiver: counts.fixes_without_receiver,
                 no_box_of_target: counts.fixes_without_detections,
                 no_box_near: counts.fixes_unused,
                 duplicate: counts.fixes_duplicate,

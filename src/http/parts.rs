@@ -1,7 +1,9 @@
 //! Bodies of several named files: `multipart/form-data`.
 //!
 //! The whole body is spooled first, under the same limits and timeouts as any import; then each part
-//! is spooled by itself. What never happens here: a part held in memory beyond the spool's limit.
+//! is spooled by itself. multer, the library beneath, has constraints on sizes of the whole body and of fields,
+//! but none on the head of a part, which it gathers in memory; so chunks are handed to it one by one, and those
+//! without a part are counted here. What never happens here: a part held in memory beyond the spool's limit.
 
 use std::collections::VecDeque;
 use std::io;
@@ -15,14 +17,15 @@ use bytes::Bytes;
 use futures_util::{Stream, stream};
 use hyper::HeaderMap;
 use hyper::header::CONTENT_TYPE;
+use hyper::http::request::Parts;
 use tokio::io::AsyncReadExt as _;
 
-use super::body::{self, Spool, Spooled};
+use super::body::{self, Content, Spool, SpoolLeases, Spooled, client_address};
 use super::extract::{media_type, not_read};
-use crate::config::Limits;
+use crate::app::App;
 use crate::domain::{Error, ErrorKind, Result};
 
-/// Read at once while parts are told apart.
+/// Read at once while the body is split into its parts.
 const CHUNK_BYTES: usize = 32 * 1024;
 /// What may come between two parts: a boundary and a few headers.
 const LONGEST_HEAD_BYTES: usize = 8 * CHUNK_BYTES;
@@ -66,18 +69,17 @@ impl Part {
 /// `InvalidArgument` naming a part that is missing, doubled or unknown; `TooLarge` and the rest as
 /// [`body::spooled`].
 pub(super) async fn parts<const N: usize>(
-    headers: &HeaderMap,
+    app: &App,
+    head: &Parts,
     content: Body,
-    limits: &Limits,
     names: [&str; N],
 ) -> Result<[Part; N]> {
-    if !media_type(headers).is_some_and(|essence| essence.eq_ignore_ascii_case("multipart/form-data")) {
+    if !media_type(&head.headers).is_some_and(|essence| essence.eq_ignore_ascii_case("multipart/form-data")) {
         return Err(not_read(&["multipart/form-data"]));
     }
-    let memory_bytes = limits.import_memory_bytes;
-    let whole = body::spooled(headers, content, limits.import_bytes, memory_bytes).await?;
+    let whole = body::spooled(app, head, content).await?;
     let since = Arc::new(AtomicUsize::new(0));
-    let mut multipart = multipart(headers, chunks(whole, since.clone())).await?;
+    let mut multipart = multipart(&head.headers, chunks(whole, since.clone())).await?;
     let mut found: [Option<Part>; N] = std::array::from_fn(|_| None);
     loop {
         since.store(0, Ordering::Relaxed);
@@ -93,9 +95,9 @@ pub(super) async fn parts<const N: usize>(
             return Err(Error::invalid(shown, format!("is not a part of this body; they are {known}")));
         };
         if place.is_some() {
-            return Err(Error::invalid(name, "the part stands twice"));
+            return Err(Error::invalid(name, "the part appears twice"));
         }
-        *place = Some(spooled(field, memory_bytes, &since).await?);
+        *place = Some(spooled(field, Spool::new(app, client_address(head))?, &since).await?);
     }
     let mut missing = None;
     let found = found.into_iter().zip(names).map(|(part, name)| part.ok_or(name));
@@ -116,10 +118,9 @@ async fn multipart(
     Multipart::from_request(request, &()).await.map_err(|error| malformed(&error.body_text()))
 }
 
-async fn spooled(mut field: Field<'_>, memory_bytes: usize, since: &AtomicUsize) -> Result<Part> {
+async fn spooled(mut field: Field<'_>, mut spool: Spool, since: &AtomicUsize) -> Result<Part> {
     let media_type = field.content_type().map(str::to_owned);
     let file_name = field.file_name().map(str::to_owned);
-    let mut spool = Spool::new(memory_bytes);
     while let Some(chunk) = field.chunk().await.map_err(|error| malformed(&error.body_text()))? {
         since.store(0, Ordering::Relaxed);
         spool.push(chunk).await?;
@@ -134,11 +135,12 @@ fn malformed(reason: &str) -> Error {
 /// A spooled body in chunks, one for each time it is asked: the library would else gather all that is
 /// ready. `since` counts what was read since a part or a piece of one was found.
 fn chunks(whole: Spooled, since: Arc<AtomicUsize>) -> impl Stream<Item = io::Result<Bytes>> + Send + 'static {
-    let source = match whole {
-        Spooled::Memory(parts) => Source::Memory(parts),
-        Spooled::File(file) => Source::File(tokio::fs::File::from_std(file)),
+    let Spooled { content, leases } = whole;
+    let source = match content {
+        Content::Memory(parts) => Source::Memory(parts),
+        Content::File(file) => Source::File(tokio::fs::File::from_std(file)),
     };
-    stream::try_unfold(source, move |mut source| {
+    stream::try_unfold((source, leases), move |(mut source, leases): (Source, SpoolLeases)| {
         let since = since.clone();
         async move {
             tokio::task::yield_now().await;
@@ -146,7 +148,7 @@ fn chunks(whole: Spooled, since: Arc<AtomicUsize>) -> impl Stream<Item = io::Res
             if since.fetch_add(chunk.len(), Ordering::Relaxed) > LONGEST_HEAD_BYTES {
                 return Err(io::Error::new(io::ErrorKind::InvalidData, "the head of a part is too long"));
             }
-            Ok((!chunk.is_empty()).then_some((chunk, source)))
+            Ok((!chunk.is_empty()).then_some((chunk, (source, leases))))
         }
     })
 }

@@ -1,6 +1,6 @@
 //! Errors as RFC 9457 problems, by the one table in [`crate::status`].
 //!
-//! A handler's error carries no request; the layer [`tell`] knows the request and writes the
+//! A handler's error carries no request; the layer [`problem_layer`] knows the request and writes the
 //! problem, and the log line of a fault, once and here.
 
 use std::any::Any;
@@ -23,20 +23,20 @@ use crate::telemetry::RequestId;
 /// Media type of a problem.
 pub(super) const PROBLEM_JSON: &str = "application/problem+json";
 
-/// An error on its way to the layer that tells it.
+/// An error on its way to the layer that writes its problem.
 #[derive(Clone)]
-pub(super) struct Refused(Arc<Error>);
+pub(super) struct ApiError(Arc<Error>);
 
 /// What a handler gives.
-pub(super) type Answer<T = Response> = std::result::Result<T, Refused>;
+pub(super) type ApiResult<T = Response> = std::result::Result<T, ApiError>;
 
-impl From<Error> for Refused {
+impl From<Error> for ApiError {
     fn from(error: Error) -> Self {
         Self(Arc::new(error))
     }
 }
 
-impl IntoResponse for Refused {
+impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
         let mut response = status_of(&self.0).into_response();
         response.extensions_mut().insert(self);
@@ -91,12 +91,12 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
     let (detail, violations) = match error {
         Error::Refused(refusal) => {
             let violations = refusal.violations.iter();
-            let told = violations.map(|at| Violation { field: &at.field, message: &at.message });
-            (refusal.to_string(), told.collect())
+            let violations = violations.map(|at| Violation { field: &at.field, message: &at.message });
+            (refusal.to_string(), violations.collect())
         }
         Error::Fault(fault) => {
             tracing::error!(request.id = %id, error = %fault, "a request failed");
-            ("the server failed; its log tells more under this trace_id".to_owned(), Vec::new())
+            ("the server failed; its log has more under this trace_id".to_owned(), Vec::new())
         }
     };
     let problem = Problem {
@@ -120,33 +120,33 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
 }
 
 /// Writes the problem of a refused request, in whatever part of the router it was refused.
-pub(super) async fn tell(request: Request, next: Next) -> Response {
+pub(super) async fn problem_layer(request: Request, next: Next) -> Response {
     let id = request.extensions().get::<RequestId>().cloned();
     let uri = request.uri().clone();
     let is_head = request.method() == Method::HEAD;
     let answer = next.run(request).await;
-    let error = match answer.extensions().get::<Refused>() {
+    let error = match answer.extensions().get::<ApiError>() {
         Some(refused) => refused.0.clone(),
-        None => match unsaid(&answer) {
+        None => match routing_error(&answer) {
             Some(error) => Arc::new(error),
             None => return answer,
         },
     };
     let id = id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
-    let mut told = response(&error, &id, Some(uri.path()));
+    let mut problem = response(&error, &id, Some(uri.path()));
     for (name, value) in answer.headers() {
         if name != CONTENT_TYPE && name != CONTENT_LENGTH {
-            told.headers_mut().insert(name, value.clone());
+            problem.headers_mut().insert(name, value.clone());
         }
     }
     if is_head {
-        *told.body_mut() = Body::empty();
+        *problem.body_mut() = Body::empty();
     }
-    told
+    problem
 }
 
-/// What the router itself refuses, it refuses without a word.
-fn unsaid(answer: &Response) -> Option<Error> {
+/// The error of a request that the router itself refused, with a status alone.
+fn routing_error(answer: &Response) -> Option<Error> {
     if answer.headers().contains_key(CONTENT_TYPE) {
         return None;
     }
@@ -165,7 +165,8 @@ pub(super) fn no_route() -> Error {
 
 /// What is answered when a handler panics.
 pub(super) fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
-    let said = panic.downcast_ref::<String>().cloned();
-    let said = said.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()));
-    Refused::from(Error::fault(format!("a handler panicked: {}", said.unwrap_or_default()))).into_response()
+    let message = panic.downcast_ref::<String>().cloned();
+    let message = message.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()));
+    ApiError::from(Error::fault(format!("a handler panicked: {}", message.unwrap_or_default())))
+        .into_response()
 }

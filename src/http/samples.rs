@@ -8,20 +8,19 @@ use futures_util::stream;
 use hyper::header::{CONTENT_DISPOSITION, CONTENT_TYPE, VARY};
 use hyper::http::HeaderValue;
 use hyper::{HeaderMap, Uri};
-use jiff::Timestamp;
 use serde::Serialize;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{CameraPath, Params, media_type, negotiate, not_read};
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use super::wire::{Durability, json};
 use super::{Rest, body};
 use crate::app::{App, ImportReport};
-use crate::domain::{self, CameraId, Error, Result, Sample, TargetId};
+use crate::domain::{self, CameraId, Error, Result, Sample, TargetId, TimeRange};
 use crate::exchange::wire;
-use crate::exchange::{Format, SampleWriter, foreign_cursor, read_cursor, write_cursor};
+use crate::exchange::{Format, SampleWriter, write_cursor};
 use crate::store::{SampleFilter, SampleKey};
 
 /// Samples read from the store at once for an export.
@@ -38,7 +37,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 pub(super) struct Imported {
     /// Stored now.
     accepted: u64,
-    /// The same camera, target and time were stored before, or stand twice in the import.
+    /// The same camera, target and time were stored before, or appear twice in the import.
     duplicate: u64,
     /// Not stored for a fault of their own.
     rejected: u64,
@@ -102,7 +101,7 @@ struct DeletedSamples {
 ///
 /// CSV has a header naming the columns `time`, `target_id`, `left`, `top`, `width`, `height`,
 /// `longitude`, `latitude` in any order (also with their units: `left_px`, `longitude_deg`), and
-/// at will `sigma_m`, `class`, `score`, `truth_longitude`, `truth_latitude`. NDJSON has one sample
+/// optional `sigma_m`, `class`, `score`, `truth_longitude`, `truth_latitude`. NDJSON has one sample
 /// a line. JSON is an array of samples, or an object with the array `samples`.
 ///
 /// One bad row never loses the others. Samples that are stored already are counted, not stored
@@ -123,16 +122,15 @@ struct DeletedSamples {
         (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn import_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> Answer {
+async fn import_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> ApiResult {
     let (parts, content) = request.into_parts();
     let mut params = Params::of(&parts.uri)?;
     let durability = params.durability()?;
     params.end()?;
     let format = import_format(&parts.headers)?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
-    let limits = &app.limits;
-    let spooled = body::spooled(&parts.headers, content, limits.import_bytes, limits.import_memory_bytes);
-    let report = app.import_file(&id, spooled.await?, format, durability).await?;
+    let spooled = body::spooled(&app, &parts, content).await?;
+    let report = app.import_file(&id, spooled, format, durability).await?;
     Ok(json(&Imported::new(report, durability))?)
 }
 
@@ -169,14 +167,14 @@ async fn list_samples(
     CameraPath(id): CameraPath,
     uri: Uri,
     headers: HeaderMap,
-) -> Answer {
+) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let filter = filter(&mut params)?;
     let formats = [Format::Json, Format::Csv, Format::Ndjson, Format::GeoJson];
     let mut response = match negotiate(&headers, &formats.map(|format| (format.media_type(), format)))? {
         Format::Json => {
             let limit = params.limit(app.limits.page_items)?;
-            let after = params.take("cursor", sample_key)?;
+            let after = params.cursor()?;
             params.end()?;
             page(&app, &id, &filter, after, limit).await?
         }
@@ -197,20 +195,8 @@ async fn page(
     limit: u32,
 ) -> Result<Response> {
     let page = app.samples(id, filter, after, limit).await?;
-    let next_cursor = page
-        .next
-        .map(|key| write_cursor("samples", &format!("{}:{}", key.time.as_microsecond(), key.target_id)));
+    let next_cursor = page.next.as_ref().map(write_cursor);
     json(&SamplePage { items: page.items.iter().map(wire::Sample::from).collect(), next_cursor })
-}
-
-fn sample_key(cursor: &str) -> Result<SampleKey> {
-    let key = read_cursor("samples", cursor)?;
-    let (time_us, target_id) = key.split_once(':').ok_or_else(foreign_cursor)?;
-    let time = time_us.parse().ok().and_then(|time_us| Timestamp::from_microsecond(time_us).ok());
-    Ok(SampleKey {
-        time: time.ok_or_else(foreign_cursor)?,
-        target_id: TargetId::new(target_id).map_err(|_| foreign_cursor())?,
-    })
 }
 
 /// How far an export has come; each step writes one page.
@@ -279,7 +265,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
     ),
     responses((status = 200, description = "Their number", body = SampleCount))
 )]
-async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> Answer {
+async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let filter = filter(&mut params)?;
     params.end()?;
@@ -299,7 +285,7 @@ async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: 
     ),
     responses((status = 200, description = "How many were deleted", body = DeletedSamples))
 )]
-async fn delete_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> Answer {
+async fn delete_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let filter = filter(&mut params)?;
     params.end()?;
@@ -310,15 +296,6 @@ async fn delete_samples(State(app): State<App>, CameraPath(id): CameraPath, uri:
 }
 
 fn filter(params: &mut Params) -> Result<SampleFilter> {
-    let filter = SampleFilter {
-        from: params.time("from")?,
-        until: params.time("until")?,
-        target_id: params.take("target_id", TargetId::new)?,
-    };
-    if let (Some(from), Some(until)) = (filter.from, filter.until)
-        && from >= until
-    {
-        return Err(Error::invalid("until", "must be later than from"));
-    }
-    Ok(filter)
+    let range = TimeRange::new(params.time("from")?, params.time("until")?)?;
+    Ok(SampleFilter { target_id: params.take("target_id", TargetId::new)?, ..SampleFilter::within(range) })
 }

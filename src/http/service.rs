@@ -1,5 +1,7 @@
 //! What watches the server: `/livez`, `/readyz`, `/metrics`.
 
+use std::time::Duration;
+
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use hyper::header::CONTENT_TYPE;
@@ -7,9 +9,12 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind};
+
+/// Time for the store's response, below the timeouts that probes of readiness have.
+const PING_TIME: Duration = Duration::from_secs(1);
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz)).routes(routes!(metrics))
@@ -31,23 +36,26 @@ const NAMED_CAMERAS: usize = 100;
 ///
 /// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
 /// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
-/// a line `warning: insufficient-storage: ...`.
+/// a line `degraded: insufficient-storage: ...`.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
         (status = 200, description = "It can", body = String, content_type = "text/plain"),
-        (status = 503, description = "It is ending, or its store does not answer", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "It is shutting down, or its store does not respond", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn readyz(State(rest): State<Rest>) -> Answer<String> {
+async fn readyz(State(rest): State<Rest>) -> ApiResult<String> {
     if rest.shutdown.has_begun() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }
-    rest.app.store.ping().await?;
+    match tokio::time::timeout(PING_TIME, rest.app.store.ping()).await {
+        Ok(answered) => answered?,
+        Err(_) => return Err(slow_store().into()),
+    }
     let faults = rest.app.registry.model_faults();
     let mut text = "ready\n".to_owned();
     if rest.app.store.is_full() {
-        text.push_str("warning: insufficient-storage: imports are refused until space is freed\n");
+        text.push_str("degraded: insufficient-storage: imports are refused until space is freed\n");
     }
     for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {
         text.push_str(&format!("degraded: camera {camera}: {}\n", fault.reason));
@@ -56,6 +64,11 @@ async fn readyz(State(rest): State<Rest>) -> Answer<String> {
         text.push_str(&format!("degraded: {} more cameras\n", faults.len() - NAMED_CAMERAS));
     }
     Ok(text)
+}
+
+fn slow_store() -> Error {
+    let seconds = PING_TIME.as_secs();
+    Error::refused(ErrorKind::Overloaded, format!("the store did not answer within {seconds} s"))
 }
 
 /// Counters and times, in the text format of Prometheus

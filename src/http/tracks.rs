@@ -12,25 +12,24 @@ use hyper::header::CONTENT_TYPE;
 use hyper::http::HeaderValue;
 use jiff::Timestamp;
 use serde::Serialize;
-use tokio::sync::broadcast::error::RecvError;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
 use super::cameras::CameraMoved;
-use super::extract::{CameraPath, JsonBody, TargetPath};
+use super::extract::{CameraPath, Client, JsonBody, TargetPath};
 use super::fusions::{FusionRequest, observations};
-use super::problem::{Answer, Problem};
+use super::problem::{ApiResult, Problem};
 use super::wire::{json, json_of_about};
-use crate::app::{App, CameraEvent, Followed, TrackPoint};
-use crate::domain::{Error, ErrorKind, Result};
+use crate::app::{App, CameraEvent, ItemResult, LostEvents, TrackPoint};
+use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
 
-/// How often a silent event stream says that it is still there.
+/// Interval of the keep-alive comments of a silent event stream.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
-/// A followed observation as JSON is seldom longer.
+/// Typical size of a followed observation as JSON, to reserve memory.
 const ITEM_BYTES: usize = 1_024;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -40,7 +39,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(watch_camera))
 }
 
-/// Why a measured position was not taken up.
+/// Why a measured position was not used.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 enum RejectionReason {
@@ -48,10 +47,12 @@ enum RejectionReason {
     OutsideGate,
     /// Older than the window of late items.
     TooLate,
-    /// The same source has spoken for this instant before.
+    /// A measurement of the same source and instant was used before.
     Duplicate,
     /// Its error variance is not positive.
     UnusableVariance,
+    /// Farther than 20 km from the origin of the track's plane.
+    OutOfRange,
 }
 
 impl From<track::RejectionReason> for RejectionReason {
@@ -61,6 +62,7 @@ impl From<track::RejectionReason> for RejectionReason {
             track::RejectionReason::TooLate => Self::TooLate,
             track::RejectionReason::Duplicate => Self::Duplicate,
             track::RejectionReason::UnusableVariance => Self::UnusableVariance,
+            track::RejectionReason::OutOfRange => Self::OutOfRange,
         }
     }
 }
@@ -75,12 +77,12 @@ enum Source {
     Fix,
 }
 
-/// A measured position that a track did not take up.
+/// A measured position that a track did not use.
 #[derive(Serialize, ToSchema)]
 struct Rejection {
-    /// Which half of the observation.
+    /// Box or fix.
     source: Source,
-    /// Why.
+    /// The cause.
     reason: RejectionReason,
     /// Squared Mahalanobis length of its innovation, where one was computed.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -100,9 +102,9 @@ impl From<&track::Rejection> for Rejection {
 /// What a track says of its target at one instant.
 #[derive(Serialize, ToSchema)]
 struct TrackState {
-    /// Who.
+    /// The target.
     target_id: String,
-    /// When: the latest instant measured.
+    /// The latest instant measured.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
     /// Velocity towards east, m/s.
@@ -111,14 +113,14 @@ struct TrackState {
     velocity_north_m_s: f64,
     /// Radius about the position that holds the true one with 95 % probability, m.
     r95_m: f64,
-    /// Probability that the target stands, 0 to 1.
+    /// Probability that the target is stationary, 0 to 1.
     still: f64,
-    /// Normalised innovation squared of what was taken up; 2 on average for each of box and fix.
+    /// Normalised innovation squared of what was used; 2 on average for each of box and fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     nis: Option<f64>,
-    /// What was not taken up.
+    /// What was not used.
     rejections: Vec<Rejection>,
-    /// Whether the track began anew.
+    /// Whether the track was restarted at this measurement.
     restarted: bool,
 }
 
@@ -155,7 +157,7 @@ struct TrackFeature {
     /// `Feature`.
     #[schema(example = "Feature")]
     r#type: &'static str,
-    /// Where.
+    /// The position.
     geometry: PointGeometry,
     /// Time, error and motion.
     properties: TrackState,
@@ -199,19 +201,19 @@ fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "Positions, by target", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> Answer {
+async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
     Ok(geojson(&app.tracks(&id).await?)?)
 }
 
 /// Read where a target was
 ///
-/// Oldest first, as far back as is kept.
+/// Oldest first, as far back as the history reaches.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/tracks/{target}", tag = "tracks",
     params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id")),
     responses((status = 200, description = "Positions, oldest first", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> Answer {
+async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> ApiResult {
     Ok(geojson(&app.track_history(&id, &target).await?)?)
 }
 
@@ -226,8 +228,8 @@ struct FollowedObservation<'a> {
     track: Option<TrackFeature>,
 }
 
-impl<'a> From<&'a Followed> for FollowedObservation<'a> {
-    fn from(followed: &'a Followed) -> Self {
+impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
+    fn from(followed: &'a ItemResult) -> Self {
         Self {
             fused: followed.fused.as_ref().map(Into::into),
             track: followed.track.as_ref().map(|point| point.as_ref().into()),
@@ -244,8 +246,8 @@ struct FollowedObservations<'a> {
 
 /// Follow targets
 ///
-/// Takes what `fusions` takes, box and fix together or apart, and takes each observation up into
-/// the track of its target.
+/// Takes what `fusions` takes, box and fix together or apart, and feeds each observation to the
+/// track of its target.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/tracks", tag = "tracks", params(("camera" = String, Path, description = "The camera's id")),
     request_body = FusionRequest,
@@ -254,14 +256,15 @@ struct FollowedObservations<'a> {
         (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
-    let rules = app.row_rules(&id).await?;
-    let observations = observations(&app, &body.read()?, &rules)?;
+async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
+    let camera = app.active_camera(&id).await?;
+    // Times ahead of the clock are refused before any track has changed.
+    let observations = observations(&app, &body.read()?, &app.live_rules(&camera))?;
     app.check_batch(observations.len())?;
-    let mut followed = Vec::with_capacity(observations.len());
-    for observation in &observations {
-        followed.push(app.follow(&id, observation).await?);
-    }
+    let followed = observations
+        .iter()
+        .map(|observation| app.follow(&camera, observation))
+        .collect::<Result<Vec<_>>>()?;
     let items = followed.iter().map(Into::into).collect();
     Ok(json_of_about(&FollowedObservations { items }, 64 + ITEM_BYTES * followed.len())?)
 }
@@ -269,33 +272,34 @@ async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBo
 /// Watch a camera
 ///
 /// Server-sent events from now on: `track` with a position as GeoJSON whenever a target was
-/// measured, `camera_moved` when the camera is found to look elsewhere than it did, and `lost` with
-/// the number of events that were lost because the client read too slowly.
+/// measured, `camera_moved` when the camera's pose is found to have changed, and `lost` with the number
+/// of events that were lost because the client read too slowly. They end when the camera is deleted.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/events", tag = "tracks",
     params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "Events", body = TrackFeature, content_type = "text/event-stream"))
 )]
-async fn watch_camera(State(rest): State<Rest>, CameraPath(id): CameraPath) -> Answer {
-    let place = rest.event_streams.clone().try_acquire_owned().map_err(|_| {
-        Error::refused(ErrorKind::Overloaded, "too many event streams are open; poll the tracks instead")
-    })?;
+async fn watch_camera(
+    State(rest): State<Rest>,
+    CameraPath(id): CameraPath,
+    Client(client): Client,
+) -> ApiResult {
+    let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
     let events = rest.app.camera_events(&id).await?;
     let shutdown = rest.shutdown.clone();
-    let told = stream::unfold(events, |mut events| async move {
-        let event = match events.recv().await {
+    let sent = stream::unfold(events, |mut events| async move {
+        let event = match events.next().await? {
             Ok(CameraEvent::Track(point)) => event_of("track", &TrackFeature::from(&*point)),
             Ok(CameraEvent::Moved(moved)) => event_of("camera_moved", &CameraMoved::from(&*moved)),
-            Err(RecvError::Lagged(lost)) => event_of("lost", &lost),
-            Err(RecvError::Closed) => return None,
+            Err(LostEvents(lost)) => event_of("lost", &lost),
         };
         Some((event, events))
     });
-    let told = told.take_until(async move { shutdown.begun().await }).map(move |event| {
-        let _held = &place; // until the stream is dropped
+    let sent = sent.take_until(async move { shutdown.begun().await }).map(move |event| {
+        let _held = &lease; // until the stream is dropped
         Ok::<_, Infallible>(event)
     });
-    Ok(Sse::new(told).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
+    Ok(Sse::new(sent).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
 }
 
 fn event_of(name: &str, value: &impl Serialize) -> Event {

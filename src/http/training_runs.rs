@@ -15,12 +15,12 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
-use super::extract::{CameraPath, JsonBody, Params, RunPath};
-use super::problem::{Answer, Problem};
-use super::wire::{JobState, Recipe, empty, instant, json, made};
+use super::extract::{CameraPath, Client, JsonBody, Params, RunPath};
+use super::problem::{ApiResult, Problem};
+use super::wire::{JobState, Recipe, created, empty, instant, json};
 use crate::app::{App, RunRequest};
-use crate::domain::{self, EpochReport, Error, ErrorKind, Result, RunProgress};
-use crate::exchange::{foreign_cursor, read_cursor, write_cursor};
+use crate::domain::{self, EpochReport, Error, Result, RunProgress};
+use crate::exchange::write_cursor;
 
 /// How often a silent event stream says that it is still there.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -91,7 +91,7 @@ struct TrainingRun {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     until: Option<Timestamp>,
-    /// Where it stands.
+    /// Its state.
     state: JobState,
     /// How far it has come.
     progress: RunProgress,
@@ -106,7 +106,7 @@ struct TrainingRun {
     /// When it was asked for.
     #[schema(value_type = String, format = DateTime)]
     created_at: Timestamp,
-    /// When a worker took it up last.
+    /// When a worker claimed it last.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     started_at: Option<Timestamp>,
@@ -159,10 +159,10 @@ struct RunPage {
         (status = 409, description = "The camera has a live run", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn start_training_run(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> Answer {
+async fn start_training_run(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
     let run = app.start_run(&id, body.read_or_default::<RunDraft>()?.to_domain()?).await?;
     let location = format!("/v1/cameras/{id}/training-runs/{}", run.id);
-    Ok(made(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
+    Ok(created(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
 }
 
 /// List training runs, newest first
@@ -175,16 +175,15 @@ async fn start_training_run(State(app): State<App>, CameraPath(id): CameraPath, 
     ),
     responses((status = 200, description = "A page of runs", body = RunPage))
 )]
-async fn list_training_runs(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> Answer {
+async fn list_training_runs(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
-    let before = params
-        .take("cursor", |text| read_cursor("training-runs", text)?.parse().map_err(|_| foreign_cursor()))?;
+    let before = params.cursor()?;
     params.end()?;
     let page = app.runs(&id, before, limit).await?;
     Ok(json(&RunPage {
         items: page.items.into_iter().map(TrainingRun::from).collect(),
-        next_cursor: page.next.map(|run| write_cursor("training-runs", &run.to_string())),
+        next_cursor: page.next.map(|run| write_cursor(&run)),
     })?)
 }
 
@@ -194,7 +193,7 @@ async fn list_training_runs(State(app): State<App>, CameraPath(id): CameraPath, 
     params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
     responses((status = 200, description = "The run", body = TrainingRun))
 )]
-async fn get_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+async fn get_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
     Ok(json(&TrainingRun::from(app.run(&id, run).await?))?)
 }
 
@@ -210,7 +209,7 @@ async fn get_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> 
         (status = 409, description = "The run has not ended", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+async fn delete_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
     app.delete_run(&id, run).await?;
     Ok(empty())
 }
@@ -222,11 +221,11 @@ async fn delete_training_run(State(app): State<App>, RunPath(id, run): RunPath) 
     post, path = "/v1/cameras/{camera}/training-runs/{run}/cancel", tag = "training",
     params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
     responses(
-        (status = 200, description = "The run as it stands now", body = TrainingRun),
+        (status = 200, description = "The run in its present state", body = TrainingRun),
         (status = 409, description = "The run has ended", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn cancel_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+async fn cancel_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
     Ok(json(&TrainingRun::from(app.cancel_run(&id, run).await?))?)
 }
 
@@ -245,18 +244,17 @@ async fn cancel_training_run(State(app): State<App>, RunPath(id, run): RunPath) 
 async fn watch_training_run(
     State(rest): State<Rest>,
     RunPath(id, run): RunPath,
+    Client(client): Client,
     headers: HeaderMap,
-) -> Answer {
+) -> ApiResult {
     if headers.get("last-event-id").is_some_and(|last| last == ENDED) {
         return Ok(empty());
     }
-    let place = rest.event_streams.clone().try_acquire_owned().map_err(|_| {
-        Error::refused(ErrorKind::Overloaded, "too many event streams are open; poll the run instead")
-    })?;
+    let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
     let changes = rest.app.watch_run(&id, run).await?;
     let shutdown = rest.shutdown.clone();
     let events = changes.take_until(async move { shutdown.begun().await }).map(move |change| {
-        let _held = &place; // until the stream is dropped
+        let _held = &lease; // until the stream is dropped
         Ok(event_of(change))
     });
     Ok(event_stream(events))
@@ -267,11 +265,11 @@ fn event_stream(events: impl Stream<Item = Result<Event, Infallible>> + Send + '
 }
 
 fn event_of(change: Result<domain::TrainingRun>) -> Event {
-    let told = change.and_then(|run| {
+    let event = change.and_then(|run| {
         let event = if run.state.has_ended() { Event::default().id(ENDED) } else { Event::default() };
         event.event("run").json_data(TrainingRun::from(run)).map_err(Error::fault)
     });
-    told.unwrap_or_else(|error| {
+    event.unwrap_or_else(|error| {
         tracing::error!(%error, "a watched run cannot be read");
         Event::default().event("error").data("the server failed; read the run again")
     })
@@ -280,7 +278,7 @@ fn event_of(change: Result<domain::TrainingRun>) -> Event {
 /// A line of a run's log.
 #[derive(Serialize, ToSchema)]
 struct LogLine {
-    /// When.
+    /// When it was written.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
     /// What happened.
@@ -300,7 +298,7 @@ struct TrainingLog {
     params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
     responses((status = 200, description = "The log", body = TrainingLog))
 )]
-async fn get_training_log(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+async fn get_training_log(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
     let lines = app.run_log(&id, run).await?;
     Ok(json(&TrainingLog { items: lines.into_iter().map(|(time, text)| LogLine { time, text }).collect() })?)
 }
@@ -318,6 +316,6 @@ struct TrainingCurve {
     params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
     responses((status = 200, description = "The curve", body = TrainingCurve))
 )]
-async fn get_training_curve(State(app): State<App>, RunPath(id, run): RunPath) -> Answer {
+async fn get_training_curve(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
     Ok(json(&TrainingCurve { items: app.run_epochs(&id, run).await? })?)
 }

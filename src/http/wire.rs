@@ -70,7 +70,7 @@ impl From<domain::Durability> for Durability {
     }
 }
 
-/// Where a job stands. Queued and running jobs are live; the others have ended.
+/// State of a job. Queued and running jobs are live; the others have ended.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum JobState {
@@ -125,8 +125,8 @@ pub(super) fn json_of_about(value: &impl Serialize, bytes: usize) -> Result<Resp
     Ok(response)
 }
 
-/// A 201 or 202 of JSON, with the path of what was made.
-pub(super) fn made(status: StatusCode, location: &str, value: &impl Serialize) -> Result<Response> {
+/// A 201 or 202 of JSON, with the path of what was created.
+pub(super) fn created(status: StatusCode, location: &str, value: &impl Serialize) -> Result<Response> {
     let mut response = json(value)?;
     *response.status_mut() = status;
     insert(&mut response, LOCATION, location)?;

@@ -112,6 +112,12 @@ impl Regressor {
         self.white_share
     }
 
+    /// Whether the regressed position depends on the fix: a network of `paper` has it among its inputs.
+    #[must_use]
+    pub const fn uses_fix(&self) -> bool {
+        matches!(self.encoder, Encoder::Paper(_))
+    }
+
     /// Position of a box's target, with its error. Only the recipe `paper` uses the fix, which is among
     /// the inputs of one of its networks.
     #[must_use]

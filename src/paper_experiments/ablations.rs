@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::ops::ControlFlow;
 
 use super::Runner;
-use super::experiments::{Split, Worlds, conditions};
+use super::experiments::{TrainTestSplit, Worlds, conditions};
 use crate::clock::process_cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;
@@ -107,7 +107,7 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
         let (mut most_s, mut most_bytes) = (0.0f64, 0);
         for seed in worlds.seeds() {
             let base = Options::new(scene);
-            let world = Split::of_world(&base, seed, 1, Route::Lines);
+            let world = TrainTestSplit::of_world(&base, seed, 1, Route::Lines);
             let started_s = process_cpu_s();
             let artifact = train(&world, &base, Recipe::Auto, FitOverrides::default())?;
             most_s = most_s.max(process_cpu_s() - started_s);
@@ -128,7 +128,7 @@ fn mean_over(
 ) -> anyhow::Result<(f64, f64)> {
     let (mut held_out_m, mut error_m) = (0.0, 0.0);
     for seed in worlds.seeds() {
-        let world = Split::of_world(base, seed, 1_000, Route::Lines);
+        let world = TrainTestSplit::of_world(base, seed, 1_000, Route::Lines);
         let artifact = train(&world, base, recipe, overrides)?;
         held_out_m += artifact.metadata.held_out.as_ref().map_or(f64::NAN, |found| found.mean_to_fix_m);
         let regressor = artifact.load()?;
@@ -145,7 +145,7 @@ fn mean_over(
 }
 
 fn train(
-    world: &Split,
+    world: &TrainTestSplit,
     base: &Options,
     recipe: Recipe,
     overrides: FitOverrides<'_>,

@@ -20,13 +20,13 @@ const DEFAULTS: &str =
     "gnss,imm_ukf,homography.denied,auto.one_step,auto.two_step,auto.denied,track,track.denied";
 
 /// Training and test rows of one camera.
-pub(super) struct Split {
+pub(super) struct TrainTestSplit {
     pub(super) train: Vec<Sample>,
     pub(super) test: Vec<TestRow>,
     pub(super) image_size: Option<ImageSize>,
 }
 
-impl Split {
+impl TrainTestSplit {
     /// The world of a seed, also the camera's, with test rows on a route.
     pub(super) fn of_world(base: &Options, seed: u64, test_rows: usize, route: Route) -> Self {
         let train = Options { seed, camera_seed: seed, ..base.clone() };
@@ -71,7 +71,7 @@ pub(super) struct Experiment {
     /// Commands that reproduce the experiment, where `simulate` and `evaluate` can.
     pub(super) command: Option<String>,
     /// One per seed, or one recording.
-    pub(super) worlds: Vec<Split>,
+    pub(super) worlds: Vec<TrainTestSplit>,
     /// Number of training seeds on every world.
     pub(super) seeds: u64,
     pub(super) truth: Truth,
@@ -92,8 +92,8 @@ impl Experiment {
         worlds: Worlds,
         flags: &str,
     ) -> anyhow::Result<Self> {
-        let splits: Vec<Split> =
-            worlds.seeds().map(|seed| Split::of_world(base, seed, test_samples, route)).collect();
+        let splits: Vec<TrainTestSplit> =
+            worlds.seeds().map(|seed| TrainTestSplit::of_world(base, seed, test_samples, route)).collect();
         let first = worlds.first;
         let size = splits[0].image_size.map_or_else(String::new, |size| {
             format!(" --image-size {}x{}", size.width_px(), size.height_px())
@@ -287,7 +287,7 @@ pub(super) fn real_square(recording: &RealRecording, seeds: u64) -> anyhow::Resu
             description: "Trained on the other sessions; the error is the distance to the surveyed line."
                 .to_owned(),
             command: None,
-            worlds: vec![Split {
+            worlds: vec![TrainTestSplit {
                 train: rows.iter().filter(outside).cloned().collect(),
                 test: session.iter().map(test_row).collect(),
                 image_size: None,

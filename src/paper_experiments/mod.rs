@@ -141,26 +141,25 @@ const HEAD: &str = "\
 
 Generated; do not edit. Errors are horizontal and geodesic (WGS 84), in metres. `cov50` and `cov95` are
 the shares of true positions inside the stated 50 % and 95 % radius. The error to a line is the
-distance to its nearest point, so it is smaller than the error to a known position, and coverage of it
-larger. A method that tells a row without a box (by its fix, or by what came before) is judged on more
-rows than one that cannot.
+distance to its nearest point, so it is smaller than the error to a known position, and its coverage
+larger. A method that gives a position without a box (from the fix, or from earlier rows) is evaluated on
+more rows than one that does not.
 
-Each simulated table is over several worlds, each with its own camera, ways, noises and receiver;
-figures are means over worlds, `spread` is the standard deviation of the worlds' means. Of one world the
-same figures over seeds of training alone stand in a section of their own, and so does the spread on
-the real square.
+Each simulated table is over several worlds, each with its own camera, paths, noise and receiver; the
+numbers are means over worlds, and `spread` is the standard deviation of the worlds' means. The variation
+over training seeds of one world has a section of its own; on the real square `spread` is over training
+seeds.
 
-What was looked at while the method was built: the truth of simulated worlds (seeds 1 to 6, 101 to 103,
-201, 202, and 1000 to 1099), after which constants of the stated errors and of the track were set, and
-the surveyed line of the real square, after which earlier constants and settings of the track were
-compared, and after which the error that contradicting sessions leave was added. So the figures of the
-real square are not those of untouched data. The simulated worlds of this page (from seed 2001 on) were
-looked at by nobody before, and nothing was changed after but that same addition, which changes none of
-their figures: each is one session.
+Ground truth used during development: that of simulated worlds (seeds 1 to 6, 101 to 103, 201, 202, and
+1000 to 1099), with which constants of the error estimates and of the tracks were set; and the surveyed
+line of the real square, with which earlier constants and settings of the track were compared and the
+between-session variance was added. So the results on the real square are not on untouched data. The
+simulated worlds of this page (from seed 2001 on) were not used before, and nothing was changed
+afterwards but that addition, which does not affect them: each is one session.
 
-Where a receiver's error stays for minutes, one map is off by much the same everywhere, so in one world
-nearly all or nearly none of the true positions are inside a radius; coverage of such cases means
-something only over many worlds.
+If a receiver's error is correlated over minutes, the error of one model is nearly the same everywhere, so
+in one world nearly all or nearly none of the true positions are inside a radius; coverage is meaningful
+only over many worlds.
 
 ";
 

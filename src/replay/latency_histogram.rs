@@ -6,7 +6,7 @@ use hdrhistogram::Histogram;
 
 /// Decimal digits that are kept: a quantile is at most 1 % above the true one.
 const SIGNIFICANT_DIGITS: u8 = 2;
-/// Largest latency that is told apart, microseconds: an hour.
+/// Largest resolved latency, microseconds: an hour.
 const MAX_US: u64 = 3_600_000_000;
 
 /// A histogram of latencies in microseconds; its memory grows with the logarithm of the largest.
@@ -70,7 +70,7 @@ mod tests {
         #[test]
         fn quantiles_are_within_one_percent_of_the_sorted_latencies(
             mut us in proptest::collection::vec(0_u64..3_000_000_000, 1..300),
-            share in 0.0..=1.0_f64,
+            share in 0.001..=1.0_f64,
         ) {
             let (mut one, mut other) = (LatencyHistogram::default(), LatencyHistogram::default());
             for (index, us) in us.iter().enumerate() {

@@ -28,7 +28,7 @@ use tokio_util::sync::CancellationToken;
 use crate::grpc::client::{ClientError, Connection};
 use backoff::Backoff;
 use fault_injection::FaultInjector;
-use paced_feed::{PacedFeed, Schedule};
+use paced_feed::{PacedFeed, ReplaySchedule};
 use report::Counts;
 use resend_buffer::ResendBuffer;
 use simulated_camera::{Link, SimulatedCamera};
@@ -37,8 +37,8 @@ pub use fault_injection::FaultShares;
 pub use options::ReplayOptions;
 pub use paced_feed::Pace;
 pub use progress::Counters;
-pub use recording::{FixOwner, Recording};
-pub use report::Report;
+pub use recording::{FixOwner, RecordedStream};
+pub use report::ReplayReport;
 
 /// Streams that share an HTTP/2 connection; servers commonly allow 256 or fewer.
 const STREAMS_PER_CONNECTION: usize = 128;
@@ -49,11 +49,11 @@ const STREAMS_PER_CONNECTION: usize = 128;
 /// # Errors
 /// An invalid address. All other errors are in the report.
 pub async fn replay(
-    recording: Arc<Recording>,
+    recording: Arc<RecordedStream>,
     options: Arc<ReplayOptions>,
     counters: Arc<Counters>,
     stop: CancellationToken,
-) -> Result<Report, ClientError> {
+) -> Result<ReplayReport, ClientError> {
     let connections = options.cameras.div_ceil(STREAMS_PER_CONNECTION).max(1);
     let connections: Vec<_> =
         (0..connections).map(|_| Connection::to(&options.server)).collect::<Result<_, _>>()?;
@@ -71,13 +71,13 @@ pub async fn replay(
             Err(panic) => totals.record_give_up(&ClientError::broken_line(&panic.to_string())),
         }
     }
-    Ok(Report::new(totals, options.cameras, started.elapsed(), options.store_samples))
+    Ok(ReplayReport::new(totals, options.cameras, started.elapsed(), options.store_samples))
 }
 
 /// One simulated camera with its own random streams.
 fn simulated_camera(
     number: usize,
-    recording: Arc<Recording>,
+    recording: Arc<RecordedStream>,
     options: &Arc<ReplayOptions>,
     link: Link,
     started: Instant,
@@ -88,7 +88,8 @@ fn simulated_camera(
         random
     };
     let repetitions = if options.duration.is_some() { u64::MAX } else { options.repetitions.get() };
-    let items = FaultInjector::new(Schedule::new(recording.len(), repetitions), options.faults, random(0));
+    let items =
+        FaultInjector::new(ReplaySchedule::new(recording.len(), repetitions), options.faults, random(0));
     // Without an initial delay all cameras would send every item at the same instant.
     let delay = match options.cameras {
         1 => Duration::ZERO,

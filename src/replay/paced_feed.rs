@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use rand::{Rng, RngExt as _};
 
 use super::fault_injection::{FaultCounts, FaultInjector};
-use super::recording::Recording;
+use super::recording::RecordedStream;
 
 /// When items are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,7 +28,7 @@ pub enum Pace {
 
 impl Pace {
     /// A random delay of up to one interval before the first item.
-    pub(super) fn initial_delay(self, recording: &Recording, random: &mut impl Rng) -> Duration {
+    pub(super) fn initial_delay(self, recording: &RecordedStream, random: &mut impl Rng) -> Duration {
         let interval_s = match self {
             Self::Recorded { speed } => recording.interval().as_secs_f64() / speed,
             Self::ConstantRate { items_per_s } => items_per_s.recip(),
@@ -52,19 +52,19 @@ pub(super) struct ScheduledItem {
 
 /// All rows of all repetitions.
 #[derive(Debug)]
-pub(super) struct Schedule {
+pub(super) struct ReplaySchedule {
     next: ScheduledItem,
     rows: usize,
     repetitions: u64,
 }
 
-impl Schedule {
+impl ReplaySchedule {
     pub(super) const fn new(rows: usize, repetitions: u64) -> Self {
         Self { next: ScheduledItem { row: 0, repetition: 0 }, rows, repetitions }
     }
 }
 
-impl Iterator for Schedule {
+impl Iterator for ReplaySchedule {
     type Item = ScheduledItem;
 
     fn next(&mut self) -> Option<ScheduledItem> {
@@ -83,7 +83,7 @@ impl Iterator for Schedule {
 /// Items with their due times.
 #[derive(Debug)]
 pub(super) struct PacedFeed {
-    pub(super) recording: Arc<Recording>,
+    pub(super) recording: Arc<RecordedStream>,
     items: Peekable<CountedFaults>,
     pace: Pace,
     begin: Instant,
@@ -96,7 +96,7 @@ pub(super) struct PacedFeed {
 
 /// Pairs every item with the faults injected before it.
 #[derive(Debug)]
-struct CountedFaults(FaultInjector<Schedule>);
+struct CountedFaults(FaultInjector<ReplaySchedule>);
 
 impl Iterator for CountedFaults {
     type Item = (ScheduledItem, FaultCounts);
@@ -109,8 +109,8 @@ impl Iterator for CountedFaults {
 
 impl PacedFeed {
     pub(super) fn new(
-        recording: Arc<Recording>,
-        items: FaultInjector<Schedule>,
+        recording: Arc<RecordedStream>,
+        items: FaultInjector<ReplaySchedule>,
         pace: Pace,
         begin: Instant,
         until: Option<Instant>,
@@ -175,7 +175,7 @@ mod tests {
     ) -> PacedFeed {
         let recording = Arc::new(recording(&[0.0, 1.0, 3.0]));
         let items = FaultInjector::new(
-            Schedule::new(recording.len(), repetitions),
+            ReplaySchedule::new(recording.len(), repetitions),
             shares,
             ChaCha8Rng::seed_from_u64(3),
         );

@@ -16,14 +16,14 @@ pub enum FixOwner {
 
 /// Items to replay, at least one.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Recording {
+pub struct RecordedStream {
     items: Vec<LiveItem>,
     first: Timestamp,
     last: Timestamp,
     interval: SignedDuration,
 }
 
-impl Recording {
+impl RecordedStream {
     /// Rows in the order of their file.
     ///
     /// # Errors
@@ -161,12 +161,12 @@ pub(super) mod tests {
     }
 
     /// One box per time given in seconds.
-    pub(in crate::replay) fn recording(seconds: &[f64]) -> Recording {
+    pub(in crate::replay) fn recording(seconds: &[f64]) -> RecordedStream {
         let mut csv = "time,target_id,left,top,width,height\n".to_owned();
         for second in seconds {
             csv.push_str(&format!("{},a,1,2,3,4\n", time(*second)));
         }
-        Recording::from_rows(rows(&csv)).expect("rows")
+        RecordedStream::from_rows(rows(&csv)).expect("rows")
     }
 
     #[test]
@@ -192,15 +192,16 @@ pub(super) mod tests {
             time(0.0)
         );
         let fixes = format!("time,longitude,latitude\n{},3,4\n{},3,4\n", time(1.0), time(2.0));
-        let merged = Recording::from_detections_and_fixes(rows(&boxes), rows(&fixes), None).expect("rows");
+        let merged =
+            RecordedStream::from_detections_and_fixes(rows(&boxes), rows(&fixes), None).expect("rows");
         let order: Vec<_> = merged.items.iter().map(|item| (item.time, item.fix.is_some())).collect();
         let expected = [(0.0, false), (1.0, true), (2.0, false), (2.0, true)];
         assert_eq!(order, expected.map(|(second, is_fix)| (time(second), is_fix)));
         assert!(merged.items.iter().all(|item| item.target_id.as_ref().is_some_and(|id| id.as_str() == "a")));
 
         let receiver = FixOwner::Receiver(ReceiverId::new("phone").expect("a name"));
-        let merged =
-            Recording::from_detections_and_fixes(rows(&boxes), rows(&fixes), Some(receiver)).expect("rows");
+        let merged = RecordedStream::from_detections_and_fixes(rows(&boxes), rows(&fixes), Some(receiver))
+            .expect("rows");
         let receivers =
             merged.items.iter().filter(|item| item.receiver_id.is_some() && item.target_id.is_none());
         assert_eq!(receivers.count(), 2);
@@ -210,7 +211,7 @@ pub(super) mod tests {
     fn fix_owner_nobody_are_refused() {
         let two = format!("time,target_id,left,top,width,height\n{0},a,1,2,3,4\n{0},b,1,2,3,4\n", time(0.0));
         let fixes = format!("time,longitude,latitude\n{},3,4\n", time(1.0));
-        Recording::from_detections_and_fixes(rows(&two), rows(&fixes), None).expect_err("no owner");
-        Recording::from_rows(Vec::new()).expect_err("no rows");
+        RecordedStream::from_detections_and_fixes(rows(&two), rows(&fixes), None).expect_err("no owner");
+        RecordedStream::from_rows(Vec::new()).expect_err("no rows");
     }
 }

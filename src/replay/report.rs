@@ -80,7 +80,7 @@ fn add_each(totals: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
 /// Result of a replay. `items` = `answered` + `refused` + `lost_answers` + `unanswered`, and with
 /// acknowledgements `items` = `acknowledged` + `unacknowledged`.
 #[derive(Debug, Clone, Serialize)]
-pub struct Report {
+pub struct ReplayReport {
     /// Simulated cameras.
     pub cameras: usize,
     /// Duration of the replay, s.
@@ -151,7 +151,7 @@ pub struct Injected {
     pub reordered: u64,
 }
 
-impl Report {
+impl ReplayReport {
     pub(super) fn new(counts: Counts, cameras: usize, elapsed: Duration, must_acknowledge: bool) -> Self {
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
         let quantile = |share| ms(counts.latencies.quantile(share));
@@ -199,7 +199,7 @@ impl Report {
     }
 }
 
-impl fmt::Display for Report {
+impl fmt::Display for ReplayReport {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { cameras, elapsed_s, items, resent, answers_per_s, .. } = self;
         writeln!(

@@ -1,53 +1,74 @@
-//! Connections: accepted up to a limit, each with a timer on everything a client may leave half done.
+//! Connections: accepted up to a limit, each with a deadline for everything that a client may leave
+//! half done, and closed when it is of no more use.
 //!
-//! `axum::serve` sets no timers: a half-sent header would stay open for ever. hyper's own timer
-//! begins when it knows the protocol, so the first bytes have a deadline of their own here.
+//! `axum::serve` sets no deadlines: a half-sent header would stay open without end.
 
-use std::io;
-use std::pin::Pin;
+use std::net::SocketAddr;
 use std::sync::Arc;
-use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
-use tokio::time::{Instant, Sleep};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::time::{Instant, MissedTickBehavior};
 
-use super::entrance::Entrance;
+use super::activity::Activity;
+use super::guarded_stream::GuardedStream;
+use super::pipeline::{Peer, RequestPipeline};
+use crate::admission::{ClientAddress, Quota};
 use crate::config::Limits;
 use crate::shutdown::Shutdown;
+use crate::telemetry::CloseReason;
 
+/// Connections that the system may complete before they are accepted.
+const BACKLOG: u32 = 4_096;
+/// Connections beyond the limit at a time, which get an answer: probes theirs, all else a refusal.
+const EXCESS_CONNECTIONS: usize = 128;
 /// hyper cannot work with a smaller buffer.
 const SMALLEST_BUFFER: u32 = 8 << 10;
 /// Time for the answer to a keep-alive ping.
 const PING_TIME: Duration = Duration::from_secs(10);
 /// Bytes of one HTTP/2 stream that wait for a client who does not read.
 const SEND_BUFFER: usize = 128 << 10;
+/// How often a connection is looked at, to close it in time if it is of no more use.
+const LOOKS_PER_IDLE_TIME: u32 = 8;
+/// Time for the last bytes of a connection that is dropped by the shutdown.
+const LAST_BYTES_TIME: Duration = Duration::from_millis(500);
+
+/// Takes the address.
+///
+/// # Errors
+/// The system's, for an address that is taken or not this machine's.
+pub(super) fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = if address.is_ipv4() { TcpSocket::new_v4()? } else { TcpSocket::new_v6()? };
+    // A server that is started again finds connections of the one before in TIME_WAIT.
+    #[cfg(not(windows))]
+    socket.set_reuseaddr(true)?;
+    socket.bind(address)?;
+    socket.listen(BACKLOG)
+}
 
 /// Accepts connections until the shutdown begins.
 pub(super) async fn accept(
     listener: TcpListener,
-    entrance: Arc<Entrance>,
+    pipeline: Arc<RequestPipeline>,
     limits: &Limits,
     shutdown: &Shutdown,
 ) {
-    let builder = builder(limits);
-    let header_time = limits.header_time();
-    let places = Arc::new(Semaphore::new(limits.connections));
+    let server = Arc::new(ConnectionServer {
+        builder: builder(limits),
+        pipeline,
+        limits: limits.clone(),
+        shutdown: shutdown.clone(),
+    });
+    let connections = Quota::new("connections", limits.connections, limits.client_share);
+    let excess = Quota::new("connections", EXCESS_CONNECTIONS, limits.client_share);
     loop {
-        let place = places.clone().acquire_owned();
-        let place = tokio::select! {
-            () = shutdown.begun() => return,
-            place = place => place.expect("the semaphore is never closed"),
-        };
-        let stream = tokio::select! {
+        let (stream, address) = tokio::select! {
             () = shutdown.begun() => return,
             accepted = listener.accept() => match accepted {
-                Ok((stream, _)) => stream,
+                Ok(accepted) => accepted,
                 Err(error) => {
                     // Out of file descriptors, mostly: wait until some are given back.
                     tracing::warn!(%error, "cannot accept a connection");
@@ -56,10 +77,19 @@ pub(super) async fn accept(
                 }
             },
         };
-        let (builder, entrance, ending) = (builder.clone(), entrance.clone(), shutdown.clone());
+        let client = ClientAddress::from(address.ip());
+        let (lease, refusal) = match connections.try_acquire(client, 1) {
+            Ok(lease) => (lease, None),
+            Err(error) => {
+                server.pipeline.metrics().connection_refused();
+                let Ok(lease) = excess.try_acquire(client, 1) else { continue };
+                (lease, Some(Arc::new(error)))
+            }
+        };
+        let server = server.clone();
         shutdown.spawn(async move {
-            serve(stream, &builder, entrance, header_time, &ending).await;
-            drop(place);
+            server.serve(stream, Peer { client, refusal }).await;
+            drop(lease);
         });
     }
 }
@@ -82,97 +112,104 @@ fn builder(limits: &Limits) -> Builder<TokioExecutor> {
     builder
 }
 
-async fn serve(
-    stream: TcpStream,
-    builder: &Builder<TokioExecutor>,
-    entrance: Arc<Entrance>,
-    header_time: Duration,
-    shutdown: &Shutdown,
-) {
-    // Answers are written whole; waiting to fill a packet only delays them.
-    let _ = stream.set_nodelay(true);
-    let _open = entrance.metrics().connection();
-    let service = service_fn(move |request| {
-        let entrance = entrance.clone();
-        async move { Ok::<_, std::convert::Infallible>(entrance.answer(request).await) }
-    });
-    let stream = TokioIo::new(Greeted::new(stream, header_time));
-    let mut connection = std::pin::pin!(builder.serve_connection(stream, service));
-    tokio::select! {
-        // A connection that breaks is the client's affair.
-        _ = connection.as_mut() => return,
-        () = shutdown.begun() => connection.as_mut().graceful_shutdown(),
-    }
-    tokio::select! {
-        _ = connection => {}
-        () = shutdown.overdue() => {}
-    }
+/// What all connections share.
+struct ConnectionServer {
+    builder: Builder<TokioExecutor>,
+    pipeline: Arc<RequestPipeline>,
+    limits: Limits,
+    shutdown: Shutdown,
 }
 
-/// A stream whose first bytes, enough to tell HTTP/1 from HTTP/2, must come in time.
-struct Greeted {
-    stream: TcpStream,
-    missing: usize,
-    deadline: Option<Pin<Box<Sleep>>>,
-}
-
-impl Greeted {
-    /// Length of HTTP/2's preface.
-    const PREFACE: usize = 24;
-
-    fn new(stream: TcpStream, within: Duration) -> Self {
-        let deadline = Some(Box::pin(tokio::time::sleep_until(Instant::now() + within)));
-        Self { stream, missing: Self::PREFACE, deadline }
-    }
-}
-
-impl AsyncRead for Greeted {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        let before = buffer.filled().len();
-        let read = Pin::new(&mut self.stream).poll_read(context, buffer);
-        let Some(deadline) = &mut self.deadline else { return read };
-        if read.is_pending() {
-            ready!(deadline.as_mut().poll(context));
-            return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
+impl ConnectionServer {
+    async fn serve(&self, stream: TcpStream, peer: Peer) {
+        // Answers are written whole; waiting to fill a packet only delays them.
+        let _ = stream.set_nodelay(true);
+        let metrics = self.pipeline.metrics();
+        let _open = metrics.connection();
+        let activity = Activity::new();
+        let mut closing = Closing::new(&self.limits, peer.refusal.is_some());
+        let stream = TokioIo::new(GuardedStream::new(stream, &self.limits, activity.clone()));
+        let (pipeline, requests) = (self.pipeline.clone(), activity.clone());
+        let service = service_fn(move |request| {
+            let (pipeline, peer, open) = (pipeline.clone(), peer.clone(), requests.request());
+            async move { Ok::<_, std::convert::Infallible>(pipeline.answer(request, &peer, open).await) }
+        });
+        let mut connection = std::pin::pin!(self.builder.serve_connection(stream, service));
+        let mut looks = tokio::time::interval(self.limits.idle_time() / LOOKS_PER_IDLE_TIME);
+        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut is_draining = false;
+        let reason = loop {
+            tokio::select! {
+                // A connection that breaks is the client's affair.
+                _ = connection.as_mut() => break closing.reason,
+                () = self.shutdown.begun(), if !is_draining => {
+                    connection.as_mut().graceful_shutdown();
+                    is_draining = true;
+                }
+                () = self.shutdown.overdue() => {
+                    let _ = tokio::time::timeout(LAST_BYTES_TIME, connection.as_mut()).await;
+                    break Some(CloseReason::Shutdown);
+                }
+                _ = looks.tick() => match closing.next(&activity) {
+                    Step::Keep => {}
+                    Step::Finish => connection.as_mut().graceful_shutdown(),
+                    Step::Drop => break closing.reason,
+                },
+            }
+        };
+        if let Some(reason) = activity.given_up().or(reason) {
+            tracing::debug!(?reason, "closed a connection");
+            metrics.connection_closed(reason);
         }
-        self.missing = self.missing.saturating_sub(buffer.filled().len() - before);
-        if self.missing == 0 {
-            self.deadline = None;
-        }
-        read
     }
 }
 
-impl AsyncWrite for Greeted {
-    fn poll_write(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        bytes: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(context, bytes)
+/// Decides when a connection is of no more use.
+struct Closing {
+    idle_time: Duration,
+    bytes_per_s: u64,
+    /// Time for the client's part in closing the connection in order.
+    finish_time: Duration,
+    dropped_at: Option<Instant>,
+    reason: Option<CloseReason>,
+}
+
+/// What to do with a connection.
+enum Step {
+    Keep,
+    /// Let open requests end and take no new ones.
+    Finish,
+    Drop,
+}
+
+impl Closing {
+    /// A connection beyond the limit is to end soon in any case.
+    fn new(limits: &Limits, is_excess: bool) -> Self {
+        let finish_time = limits.header_time();
+        Self {
+            idle_time: limits.idle_time(),
+            bytes_per_s: limits.body_bytes_per_s,
+            finish_time,
+            dropped_at: is_excess.then(|| Instant::now() + finish_time),
+            reason: None,
+        }
     }
 
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        bytes: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write_vectored(context, bytes)
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(context)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
+    fn next(&mut self, activity: &Activity) -> Step {
+        if self.dropped_at.is_some_and(|at| Instant::now() >= at) {
+            return Step::Drop;
+        }
+        match activity.close_reason(self.idle_time, self.bytes_per_s) {
+            Some(CloseReason::Idle) if self.reason.is_none() => {
+                self.reason = Some(CloseReason::Idle);
+                self.dropped_at = Some(Instant::now() + self.finish_time);
+                Step::Finish
+            }
+            Some(CloseReason::Stalled) => {
+                self.reason = Some(CloseReason::Stalled);
+                Step::Drop
+            }
+            _ => Step::Keep,
+        }
     }
 }

@@ -14,7 +14,7 @@ pub(super) struct Point {
 
 /// A camera on a mast at the origin of the plane.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Camera {
+pub(super) struct PinholeCamera {
     pub(super) image_size: ImageSize,
     pub(super) height_m: f64,
     pub(super) focal_px: f64,
@@ -27,7 +27,7 @@ pub(super) struct Camera {
     pub(super) lens_distortion: f64,
 }
 
-impl Camera {
+impl PinholeCamera {
     /// Column and row of a point, px; `None` behind the camera.
     pub(super) fn project(&self, point: Point) -> Option<[f64; 2]> {
         let (sin_pan, cos_pan) = self.pan_deg.to_radians().sin_cos();
@@ -78,8 +78,8 @@ impl Camera {
 mod tests {
     use super::*;
 
-    fn camera(lens_distortion: f64) -> Camera {
-        Camera {
+    fn camera(lens_distortion: f64) -> PinholeCamera {
+        PinholeCamera {
             image_size: ImageSize::new(1280, 720).expect("valid"),
             height_m: 10.0,
             focal_px: 1000.0,

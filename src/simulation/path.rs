@@ -8,7 +8,7 @@ use crate::geo::EastNorth;
 
 /// A polyline in the plane.
 #[derive(Debug, Clone)]
-pub(super) struct Path {
+pub(super) struct Polyline {
     pub(super) points: Vec<EastNorth>,
 }
 
@@ -34,7 +34,7 @@ pub(super) struct MotionProfile {
     pub(super) both_ways: bool,
 }
 
-impl Path {
+impl Polyline {
     /// Length in m.
     pub(super) fn length_m(&self) -> f64 {
         self.points.windows(2).map(|pair| pair[0].distance_m(pair[1])).sum()
@@ -139,9 +139,9 @@ mod tests {
     use super::super::noise::stream;
     use super::*;
 
-    fn corner() -> Path {
+    fn corner() -> Polyline {
         let at = |east_m, north_m| EastNorth { east_m, north_m };
-        Path { points: vec![at(0.0, 0.0), at(30.0, 0.0), at(30.0, 40.0)] }
+        Polyline { points: vec![at(0.0, 0.0), at(30.0, 0.0), at(30.0, 40.0)] }
     }
 
     #[test]
@@ -165,7 +165,7 @@ mod tests {
     #[test]
     fn a_bend_is_longer_than_the_chord_and_shorter_than_the_corner() {
         let [from, turn, to] = corner().points[..] else { unreachable!("three points") };
-        let bent = Path::bent(from, turn, to, 10.0).length_m();
+        let bent = Polyline::bent(from, turn, to, 10.0).length_m();
         assert!(bent > 50.0 && bent < 70.0, "{bent}");
     }
 }

@@ -5,9 +5,9 @@ use std::f64::consts::TAU;
 use rand::{Rng, RngExt};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
-use super::camera::{Camera, Point};
+use super::camera::{PinholeCamera, Point};
 use super::noise::ReceiverError;
-use super::path::{MotionProfile, Path, Pose};
+use super::path::{MotionProfile, Polyline, Pose};
 use crate::domain::{Error, ImageSize};
 use crate::geo::{EastNorth, Position};
 
@@ -54,12 +54,17 @@ impl Scene {
 
     /// Draws a camera. On the square a longer focal length makes the border truncate boxes; at the
     /// airport the aircraft enters and leaves across the border in any case.
-    pub(super) fn camera(self, border_cuts: bool, lens_distortion: f64, random: &mut impl Rng) -> Camera {
+    pub(super) fn camera(
+        self,
+        border_cuts: bool,
+        lens_distortion: f64,
+        random: &mut impl Rng,
+    ) -> PinholeCamera {
         let (size, height_m, focal_px, tilt_deg) = match self {
             Self::Airport => ((1920, 1080), 30.0, 1660.0, 4.0),
             Self::Square => ((1280, 720), 7.0, if border_cuts { 1800.0 } else { 1080.0 }, 13.0),
         };
-        Camera {
+        PinholeCamera {
             image_size: ImageSize::new(size.0, size.1).expect("constants above 0"),
             height_m: height_m * random.random_range(0.9..1.1),
             focal_px: focal_px * random.random_range(0.96..1.04),
@@ -70,15 +75,15 @@ impl Scene {
     }
 
     /// The lines that targets follow in turn, about the camera's optical axis.
-    pub(super) fn paths(self, pan_deg: f64) -> Vec<Path> {
+    pub(super) fn paths(self, pan_deg: f64) -> Vec<Polyline> {
         let at = |right_m: f64, ahead_m: f64| rotated(right_m, ahead_m, pan_deg);
         match self {
             Self::Airport => {
                 let (from, to) = (at(-250.0, 260.0), at(250.0, 330.0));
-                let straight = Path { points: vec![from, to] };
-                vec![straight, Path::bent(from, at(30.0, 299.0), at(10.0, 620.0), 90.0)]
+                let straight = Polyline { points: vec![from, to] };
+                vec![straight, Polyline::bent(from, at(30.0, 299.0), at(10.0, 620.0), 90.0)]
             }
-            Self::Square => vec![Path { points: vec![at(-9.0, 19.0), at(11.0, 25.0), at(2.0, 50.0)] }],
+            Self::Square => vec![Polyline { points: vec![at(-9.0, 19.0), at(11.0, 25.0), at(2.0, 50.0)] }],
         }
     }
 

@@ -4,10 +4,10 @@ use jiff::{SignedDuration, Timestamp};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::camera::Camera;
+use super::camera::PinholeCamera;
 use super::noise::{Episodes, SimulatedReceiver, standard_normal, stream};
 use super::options::{Options, Route};
-use super::path::{Path, Pose};
+use super::path::{Polyline, Pose};
 use super::row::SimulatedRow;
 use crate::domain::{BoundingBox, Fix, TargetClass, TargetId};
 use crate::geo::LocalPlane;
@@ -18,7 +18,7 @@ const MIN_VISIBLE_SHARE: f64 = 0.25;
 /// One target with its receiver and the noise of its detections.
 pub(super) struct SimulatedTarget<'a> {
     options: &'a Options,
-    camera: Camera,
+    camera: PinholeCamera,
     plane: LocalPlane,
     id: TargetId,
     class: TargetClass,
@@ -36,7 +36,7 @@ pub(super) struct SimulatedTarget<'a> {
 }
 
 impl<'a> SimulatedTarget<'a> {
-    pub(super) fn new(options: &'a Options, camera: Camera, plane: LocalPlane, index: usize) -> Self {
+    pub(super) fn new(options: &'a Options, camera: PinholeCamera, plane: LocalPlane, index: usize) -> Self {
         let scene = options.scene;
         let number = index as u64;
         let draw = |kind: u64| stream(options.seed, 16 * number + kind);
@@ -67,7 +67,7 @@ impl<'a> SimulatedTarget<'a> {
     }
 
     /// Appends that many rows, traverse by traverse.
-    pub(super) fn run(&mut self, paths: &[Path], count: usize, rows: &mut Vec<SimulatedRow>) {
+    pub(super) fn run(&mut self, paths: &[Polyline], count: usize, rows: &mut Vec<SimulatedRow>) {
         let end = rows.len() + count;
         // Bounded, because a camera that was rotated away never sees the target again.
         for traverse in 0..20 + 2 * count {
@@ -89,7 +89,7 @@ impl<'a> SimulatedTarget<'a> {
         }
     }
 
-    fn poses(&mut self, path: &Path, traverse: usize, count: usize) -> Vec<Pose> {
+    fn poses(&mut self, path: &Polyline, traverse: usize, count: usize) -> Vec<Pose> {
         if self.options.route == Route::Standing {
             let along_m = path.length_m() * self.motion.random_range(0.3..0.7);
             return vec![path.pose(along_m, 0.0); count];

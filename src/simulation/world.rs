@@ -2,7 +2,7 @@
 
 use super::noise::stream;
 use super::options::{Options, Route};
-use super::path::Path;
+use super::path::Polyline;
 use super::row::SimulatedRow;
 use super::target::SimulatedTarget;
 use crate::domain::{ImageSize, Sample};
@@ -66,7 +66,7 @@ pub fn simulate(options: &Options) -> World {
         }
     }
     rows.sort_by(|one, other| (one.time, &one.target_id).cmp(&(other.time, &other.target_id)));
-    let positions = |path: &Path| path.points.iter().map(|&point| plane.to_position(point)).collect();
+    let positions = |path: &Polyline| path.points.iter().map(|&point| plane.to_position(point)).collect();
     World {
         image_size: camera.image_size,
         gnss_sigma_m: options.gnss_sigma_m,

@@ -8,11 +8,11 @@ use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 
 use super::Store;
-use super::faults::{failed, no_camera};
-use super::fields::Fields;
+use super::errors::{failed, no_camera};
+use super::row_decoder::RowDecoder;
 use crate::domain::{
-    Camera, CameraId, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver, ReceiverId,
-    Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver,
+    ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
 };
 
 macro_rules! columns {
@@ -77,20 +77,21 @@ impl Store {
         rows.iter().map(read_camera).collect()
     }
 
-    /// Id, revision and active model of every camera: enough to see what has changed.
+    /// Id, key, revision and active model of every camera: enough to see what has changed.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn camera_heads(&self) -> Result<Vec<(CameraId, Revision, Option<u32>)>> {
-        let rows = sqlx::query("SELECT id, revision, active_model FROM cameras")
+    pub async fn camera_versions(&self) -> Result<Vec<(CameraId, CameraKey, Revision, Option<u32>)>> {
+        let rows = sqlx::query("SELECT id, key, revision, active_model FROM cameras")
             .fetch_all(self.readers())
             .await
             .map_err(failed)?;
         let read = |row| {
-            let mut fields = Fields::of("cameras", row);
-            let id = fields.make(CameraId::new)?;
-            let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
-            Ok((id, revision, fields.some_count()?))
+            let mut fields = RowDecoder::new("cameras", row);
+            let id = fields.parse(CameraId::new)?;
+            let key = CameraKey(fields.get()?);
+            let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
+            Ok((id, key, revision, fields.optional_count()?))
         };
         rows.iter().map(read).collect()
     }
@@ -106,8 +107,8 @@ impl Store {
         expected: Option<Revision>,
         now: Timestamp,
     ) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
@@ -229,22 +230,23 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
 }
 
 fn read_camera(row: &SqliteRow) -> Result<Camera> {
-    let mut fields = Fields::of("cameras", row).skip(1);
-    let id = fields.make(CameraId::new)?;
-    let display_name = fields.take()?;
-    let width_px = fields.some_count()?;
-    let height_px = fields.some_count()?;
+    let mut fields = RowDecoder::new("cameras", row);
+    let key = CameraKey(fields.get()?);
+    let id = fields.parse(CameraId::new)?;
+    let display_name = fields.get()?;
+    let width_px = fields.optional_count()?;
+    let height_px = fields.optional_count()?;
     let image_size = width_px.zip(height_px).map(|(width, height)| ImageSize::new(width, height)).transpose();
-    let image_size = fields.made(image_size)?;
-    let gnss_error = fields.make_some(SigmaM::new)?.map_or(GnssError::Unknown, GnssError::Known);
-    let recipe = fields.make(|name: &str| name.parse())?;
-    let target_classes = fields.make(read_classes)?;
-    let labels = fields.make(serde_json::from_str::<BTreeMap<String, String>>)?;
-    let receivers = fields.make(read_receivers)?;
-    let retrain_when_moved = fields.take()?;
-    let revision = Revision(fields.make(|stored: i64| u64::try_from(stored))?);
-    let (created_at, updated_at) = (fields.time()?, fields.time()?);
-    let active_model = fields.some_count()?;
+    let image_size = fields.checked(image_size)?;
+    let gnss_error = fields.parse_optional(SigmaM::new)?.map_or(GnssError::Unknown, GnssError::Known);
+    let recipe = fields.parse(|name: &str| name.parse())?;
+    let target_classes = fields.parse(read_classes)?;
+    let labels = fields.parse(serde_json::from_str::<BTreeMap<String, String>>)?;
+    let receivers = fields.parse(read_receivers)?;
+    let retrain_when_moved = fields.get()?;
+    let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
+    let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
+    let active_model = fields.optional_count()?;
     let profile = NewCamera {
         id,
         display_name,
@@ -256,7 +258,7 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
         receivers,
         retrain_when_moved,
     };
-    Ok(Camera { profile, revision, created_at, updated_at, active_model })
+    Ok(Camera { key, profile, revision, created_at, updated_at, active_model })
 }
 
 fn read_classes(json: &str) -> Result<Vec<TargetClass>> {

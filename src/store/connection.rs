@@ -9,7 +9,7 @@ use sqlx::sqlite::{
 };
 use sqlx::{ConnectOptions, Connection, SqliteConnection, SqlitePool};
 
-use super::faults::{is_busy, primary_code};
+use super::errors::{is_busy, primary_code};
 use super::folder;
 use super::writer::Writer;
 use crate::domain::{Error, Result};

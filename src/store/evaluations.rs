@@ -9,10 +9,10 @@ use uuid::Uuid;
 
 use super::Store;
 use super::cameras::camera_key;
-use super::faults::{failed, no_evaluation};
-use super::fields::Fields;
+use super::errors::{failed, no_evaluation};
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
 use super::retention::prune_evaluations;
+use super::row_decoder::RowDecoder;
 use crate::domain::{
     CameraId, Error, ErrorKind, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, Method,
     Result, SigmaM, TimeRange, Truth,
@@ -94,7 +94,7 @@ impl Store {
         find_evaluation(self.readers(), id).await
     }
 
-    /// The report of an evaluation as it was handed in, `None` unless it has succeeded.
+    /// The report of an evaluation as it was stored, `None` unless it has succeeded.
     ///
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`].
@@ -144,8 +144,8 @@ impl Store {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Option<Claim<EvaluationJob>>> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let Some(claim) = EVALUATIONS.claim(&mut transaction, lease, now).await? else { return Ok(None) };
         let job = find_evaluation(&mut *transaction, EvaluationId(claim.job)).await?;
         transaction.commit().await.map_err(failed)?;
@@ -164,8 +164,8 @@ impl Store {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Heartbeat> {
-        let mut turn = self.relaxed().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
         let heartbeat = EVALUATIONS.heartbeat(&mut transaction, (id.0, fence), lease, now).await?;
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
@@ -191,8 +191,8 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`], [`ErrorKind::EvaluationEnded`].
     pub async fn cancel_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<EvaluationJob> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let stored = find_evaluation(&mut *transaction, id).await?;
         if stored.state.has_ended() {
             let ended = format!("the evaluation has ended already: {}", stored.state.as_str());
@@ -217,8 +217,8 @@ impl Store {
         end: JobEnd<String>,
         now: Timestamp,
     ) -> Result<Option<EvaluationJob>> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let Some(finished) = EVALUATIONS.finish(&mut transaction, (id.0, fence), end, now).await? else {
             return Ok(None);
         };
@@ -263,38 +263,38 @@ async fn find_evaluation(executor: impl SqliteExecutor<'_>, id: EvaluationId) ->
 }
 
 fn read_evaluation(row: &SqliteRow) -> Result<EvaluationJob> {
-    let mut fields = Fields::of("evaluations", row);
+    let mut fields = RowDecoder::new("evaluations", row);
     Ok(EvaluationJob {
-        id: EvaluationId(fields.make(Uuid::parse_str)?),
-        camera_id: fields.make(CameraId::new)?,
+        id: EvaluationId(fields.parse(Uuid::parse_str)?),
+        camera_id: fields.parse(CameraId::new)?,
         plan: EvaluationPlan {
             train: read_range(&mut fields)?,
             test: read_range(&mut fields)?,
             truth: read_truth(&mut fields)?,
-            methods: fields.make(read_methods)?,
-            recipe: fields.make(|name: &str| name.parse())?,
+            methods: fields.parse(read_methods)?,
+            recipe: fields.parse(|name: &str| name.parse())?,
             seeds: fields.count()?,
-            box_shift_px: fields.take()?,
-            gnss_sigma: fields.make_some(SigmaM::new)?,
+            box_shift_px: fields.get()?,
+            gnss_sigma: fields.parse_optional(SigmaM::new)?,
         },
-        state: fields.make(read_state)?,
+        state: fields.parse(read_state)?,
         attempt: fields.count()?,
         progress: EvaluationProgress {
-            phase: fields.take()?,
+            phase: fields.get()?,
             steps_done: fields.count()?,
             steps: fields.count()?,
-            remaining_s: fields.take()?,
+            remaining_s: fields.get()?,
         },
-        outcome: fields.take()?,
-        created_at: fields.time()?,
-        started_at: fields.some_time()?,
-        ended_at: fields.some_time()?,
+        outcome: fields.get()?,
+        created_at: fields.timestamp()?,
+        started_at: fields.optional_timestamp()?,
+        ended_at: fields.optional_timestamp()?,
     })
 }
 
-fn read_range(fields: &mut Fields<'_>) -> Result<TimeRange> {
-    let (from, until) = (fields.some_time()?, fields.some_time()?);
-    fields.made(TimeRange::new(from, until))
+fn read_range(fields: &mut RowDecoder<'_>) -> Result<TimeRange> {
+    let (from, until) = (fields.optional_timestamp()?, fields.optional_timestamp()?);
+    fields.checked(TimeRange::new(from, until))
 }
 
 fn read_methods(json: &str) -> Result<Vec<Method>> {
@@ -316,12 +316,12 @@ fn written_truth(truth: &Truth) -> Result<(Option<Position>, Option<String>)> {
     }
 }
 
-fn read_truth(fields: &mut Fields<'_>) -> Result<Truth> {
-    let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.take()?, fields.take()?);
+fn read_truth(fields: &mut RowDecoder<'_>) -> Result<Truth> {
+    let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
     let point =
         longitude_deg.zip(latitude_deg).map(|(longitude, latitude)| Position::new(longitude, latitude));
-    let point = fields.made(point.transpose())?;
-    let lines = fields.make_some(read_lines)?;
+    let point = fields.checked(point.transpose())?;
+    let lines = fields.parse_optional(read_lines)?;
     Ok(match (point, lines) {
         (Some(point), _) => Truth::Point(point),
         (None, Some(lines)) => Truth::Lines(lines),

@@ -1,9 +1,9 @@
-//! Storing samples: one task takes what many callers hand in and commits it together.
+//! Group commit of samples: one task commits what many callers have queued in one transaction.
 //!
-//! A commit costs much more than a row, so whoever waits when a transaction begins is taken along.
-//! Nothing is acknowledged before its commit, and a caller's samples are stored wholly or not at all.
+//! A commit costs much more than a row, so every batch that is queued when a transaction begins joins
+//! it. Nothing is acknowledged before its commit, and a caller's batch is stored atomically.
 //! What never happens here: a caller waits for more callers to come, the queue grows without bound, a
-//! caller who went away disturbs the others.
+//! cancelled caller disturbs the others.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -13,18 +13,18 @@ use sqlx::sqlite::SqliteArguments;
 use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
-use super::faults::{closed, failed, no_camera, same};
+use super::errors::{closed, copy_of, failed, no_camera};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
-use crate::domain::{CameraId, Durability, Error, Result, Sample};
+use crate::domain::{CameraId, CameraKey, Durability, Error, Result, Sample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
 
-/// Rows that wait or are being committed; callers beyond wait to hand theirs in.
+/// Rows that wait or are being committed; further callers wait to queue theirs.
 const ROWS_IN_FLIGHT: u32 = 65_536;
 
-/// Callers that wait; each hands in at least one row, so more never wait.
+/// Callers that wait; each has at least one row, so more never wait.
 const QUEUE: usize = 16_384;
 
 /// What became of the samples of one call.
@@ -36,7 +36,7 @@ pub struct Inserted {
     pub duplicate: u64,
 }
 
-/// The way into the task.
+/// Queues batches for the task.
 pub(super) struct GroupCommit {
     queue: mpsc::Sender<Request>,
     rows: Arc<Semaphore>,
@@ -44,17 +44,19 @@ pub(super) struct GroupCommit {
 
 enum Request {
     Insert(Batch),
-    /// All before it is committed, then the task ends.
+    /// Everything queued before is committed, then the task ends.
     End(oneshot::Sender<()>),
 }
 
 struct Batch {
     camera: CameraId,
+    /// The camera must still be this one; `None` for whichever has the id.
+    key: Option<CameraKey>,
     samples: Vec<Sample>,
     durability: Durability,
     reply: oneshot::Sender<Result<Inserted>>,
-    /// Makes room for other rows when the batch is done.
-    _room: OwnedSemaphorePermit,
+    /// Limits the rows in flight; released when the batch is done.
+    _permit: OwnedSemaphorePermit,
 }
 
 impl GroupCommit {
@@ -67,15 +69,16 @@ impl GroupCommit {
     pub(super) async fn insert(
         &self,
         camera: CameraId,
+        key: Option<CameraKey>,
         samples: Vec<Sample>,
         durability: Durability,
     ) -> Result<Inserted> {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
-        let room = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
+        let permit = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = Batch { camera, samples, durability, reply, _room: room };
-        self.queue.send(Request::Insert(batch)).await.map_err(|_| self.gone())?;
-        answer.await.map_err(|_| self.gone())?
+        let batch = Batch { camera, key, samples, durability, reply, _permit: permit };
+        self.queue.send(Request::Insert(batch)).await.map_err(|_| self.task_ended())?;
+        answer.await.map_err(|_| self.task_ended())?
     }
 
     pub(super) async fn close(&self) {
@@ -91,21 +94,21 @@ impl GroupCommit {
         self.queue.is_closed()
     }
 
-    /// Callers whose samples have not been taken up.
+    /// Callers whose batches are still queued.
     #[cfg(test)]
     pub(super) fn waiting(&self) -> usize {
         self.queue.max_capacity() - self.queue.capacity()
     }
 
-    /// The task has ended, in order or not.
-    fn gone(&self) -> Error {
+    /// Why the task has ended: closed, or failed.
+    fn task_ended(&self) -> Error {
         if self.rows.is_closed() { closed() } else { Error::fault("the task that stores samples has ended") }
     }
 }
 
 async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<Request>) {
     while let Some(first) = requests.recv().await {
-        // The writer first: samples that are handed in while another change is written join the group.
+        // The writer first: batches that are queued while it is locked for another change join the group.
         let guard = writer.lock(Durability::default(), Growth::Limited).await;
         let (group, end) = gather(first, &mut requests);
         match guard {
@@ -116,7 +119,7 @@ async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receive
             Err(error) => refuse_all(group, &error),
         }
         if let Some(ended) = end {
-            // Whoever asked may have gone; nothing is left to tell.
+            // The caller may have been cancelled.
             let _ = ended.send(());
             return;
         }
@@ -155,7 +158,7 @@ async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch
     match commit(guard, space, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
-                // A caller who went away needs no answer.
+                // A cancelled caller needs no answer.
                 let _ = batch.reply.send(outcome);
             }
         }
@@ -175,7 +178,7 @@ async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch
 
 fn refuse_all(group: Vec<Batch>, error: &Error) {
     for batch in group {
-        let _ = batch.reply.send(Err(same(error)));
+        let _ = batch.reply.send(Err(copy_of(error)));
     }
 }
 
@@ -233,7 +236,7 @@ struct Row<'a> {
     sample: &'a Sample,
 }
 
-/// `None` if a statement over several batches met duplicates, so that nobody can tell whose.
+/// `None` if a statement over several batches met duplicates, so that they cannot be attributed.
 async fn store(
     connection: &mut SqliteConnection,
     space: &Space,
@@ -246,16 +249,19 @@ async fn store(
     let mut rows = Vec::with_capacity(group.iter().map(|batch| batch.samples.len()).sum());
     let mut borders = Vec::new();
     for (index, batch) in group.iter().enumerate() {
-        let admitted = match cameras.get_mut(batch.camera.as_str()) {
-            Some(camera) => quota.admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64),
+        let camera = cameras
+            .get_mut(batch.camera.as_str())
+            .filter(|camera| batch.key.is_none_or(|key| key == CameraKey(camera.key)));
+        let admitted = match camera {
+            Some(camera) => quota
+                .admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64)
+                .map(|()| camera.key),
             None => Err(no_camera(&batch.camera)),
         };
-        if let (Ok(()), Some(&Known { key: camera_key, .. })) =
-            (&admitted, cameras.get(batch.camera.as_str()))
-        {
+        if let Ok(camera_key) = admitted {
             rows.extend(batch.samples.iter().map(|sample| Row { batch: index, camera_key, sample }));
         }
-        outcomes.push(admitted.map(|()| Inserted::default()));
+        outcomes.push(admitted.map(|_| Inserted::default()));
         if counting == Counting::Apart {
             borders.push(rows.len());
         }
@@ -265,7 +271,7 @@ async fn store(
     let mut next = statements.first().map(|range| Insert::of(&rows[range.clone()])).transpose()?;
     for (index, range) in statements.iter().enumerate() {
         let Some(insert) = next.take() else { break };
-        // The next statement's values are laid out while the database works on this one.
+        // The next statement's values are bound while the database executes this one.
         let following = async { statements.get(index + 1).map(|range| Insert::of(&rows[range.clone()])) };
         let (accepted, following) = tokio::join!(insert.execute(connection), following);
         if !count(&mut outcomes, &rows[range.clone()], accepted?) {
@@ -277,7 +283,7 @@ async fn store(
     Ok(Some(outcomes))
 }
 
-/// Adds a statement's count to its batches; false if it cannot be told whose rows were duplicates.
+/// Adds a statement's count to its batches; false if its duplicates cannot be attributed to one.
 fn count(outcomes: &mut [Result<Inserted>], rows: &[Row<'_>], accepted: u64) -> bool {
     let all = rows.len() as u64;
     if accepted == all || accepted == 0 {
@@ -377,7 +383,7 @@ static INSERTS: LazyLock<[Arc<str>; SIZES.len()]> = LazyLock::new(|| {
     })
 });
 
-/// Cuts the stretches between borders into statements of the sizes there are.
+/// Splits the ranges between borders into statements of the available sizes.
 fn statements(borders: &[usize]) -> Vec<Range<usize>> {
     let mut ranges = Vec::new();
     let mut start = 0;

@@ -15,7 +15,7 @@ use jiff::Timestamp;
 use sqlx::{AssertSqlSafe, SqliteConnection};
 use uuid::Uuid;
 
-use super::faults::failed;
+use super::errors::failed;
 use crate::domain::{Error, ErrorKind, JobState, Result};
 
 /// Condition under which no worker holds a live lease on a job; `?1` is the time now in microseconds.

@@ -1,4 +1,4 @@
-//! Everything that lasts, behind one type: [`Store`]; the only floor that knows SQL.
+//! Persistent storage behind one type, [`Store`]; the only module with SQL.
 //!
 //! A file `sightfix.db` (SQLite, write-ahead log) with one writer connection and a few readers.
 //! Samples of many callers share transactions (`group_commit`). A change is flushed to the disk before
@@ -6,22 +6,23 @@
 //! sender asks for less.
 //!
 //! What never happens here: clocks are read, numbers are checked (they are valid by construction),
-//! a transaction is held across anything but statements, a type of the database library gets out.
+//! a transaction is held across anything but statements, a type of the database library becomes public.
 //! Rows that the constructors of `domain` refuse are faults that name table, column and row.
 
+mod camera_moves;
 mod cameras;
 mod connection;
+mod errors;
 mod evaluations;
-mod faults;
-mod fields;
+
 mod folder;
 mod group_commit;
 mod jobs;
 mod models;
-mod moves;
 mod occupants;
 mod reserve;
 mod retention;
+mod row_decoder;
 mod runs;
 mod samples;
 mod space;
@@ -34,6 +35,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use sqlx::SqlitePool;
+use sqlx::sqlite::SqlitePoolOptions;
 
 use crate::domain::{Durability, Error, ErrorKind, Result};
 
@@ -45,14 +47,14 @@ pub use runs::{RunEnd, RunOutput};
 pub use samples::{SampleFilter, SampleKey};
 pub use space::{StorageStatus, StoreLimits};
 
-use faults::failed;
+use errors::failed;
 use group_commit::GroupCommit;
 use occupants::Presence;
 use reserve::Reserve;
 use space::Space;
 use writer::{Growth, Writer, WriterGuard};
 
-/// All that lasts. Clones share one store; it lives until the last clone is dropped or it is closed.
+/// The storage of one data folder. Clones share one store; it lives until the last clone is dropped or it is closed.
 ///
 /// Every method may fail with a fault of the server (disk, file), with
 /// [`ErrorKind::Overloaded`] when another process holds the file for seconds, with
@@ -66,6 +68,8 @@ pub struct Store {
 struct Inner {
     writer: Arc<Writer>,
     readers: SqlitePool,
+    /// One reader for [`Store::ping`] alone, which slow reads do not keep waiting.
+    probe: SqlitePool,
     samples: GroupCommit,
     space: Arc<Space>,
     /// `None` where the process could not announce itself, and after closing.
@@ -114,17 +118,22 @@ impl Store {
             )
             .ok();
         let presence = Mutex::new(presence);
-        let store = Self { inner: Arc::new(Inner { writer, readers, samples, space, presence }) };
+        let probe = SqlitePoolOptions::new()
+            .max_connections(1)
+            .connect_lazy_with(readers.connect_options().as_ref().clone());
+        let inner = Inner { writer, readers, probe, samples, space, presence };
+        let store = Self { inner: Arc::new(inner) };
         store.reserve_space().await;
         store.count_all_samples().await?;
         Ok(store)
     }
 
-    /// Commits what was handed in, copies the log back into the file and closes it. Later calls
+    /// Commits what is queued, copies the log back into the file and closes it. Later calls
     /// are refused with [`ErrorKind::ShuttingDown`]. Closing twice does nothing.
     pub async fn close(&self) {
         self.inner.samples.close().await;
         self.inner.readers.close().await;
+        self.inner.probe.close().await;
         self.inner.writer.close().await;
         self.presence().take();
     }
@@ -142,7 +151,8 @@ impl Store {
             .unwrap_or_default()
     }
 
-    fn log_newcomers(&self) {
+    /// Logs the processes of [`Store::newcomers`].
+    pub fn log_newcomers(&self) {
         for Occupant { pid, host, role } in self.newcomers() {
             tracing::warn!(pid, host, role, "another process uses the same data folder");
         }
@@ -161,7 +171,7 @@ impl Store {
             return Err(Error::refused(ErrorKind::ShuttingDown, "the store is closed"));
         }
         sqlx::query_scalar::<_, i64>("SELECT count(*) FROM cameras WHERE key = 0")
-            .fetch_one(self.readers())
+            .fetch_one(&self.inner.probe)
             .await
             .map_err(failed)?;
         Ok(())

@@ -1,4 +1,4 @@
-//! Model versions, and which of them is active.
+//! Model versions with their checksums and held-out errors, and which version is active.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -7,9 +7,9 @@ use uuid::Uuid;
 
 use super::Store;
 use super::cameras::{camera_key, find_camera};
-use super::faults::{failed, no_model};
-use super::fields::Fields;
+use super::errors::{failed, no_model};
 use super::retention::prune_models;
+use super::row_decoder::RowDecoder;
 use crate::domain::{
     BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata, ModelVersion, Result,
     RunId, TargetId, model_sha256,
@@ -60,7 +60,7 @@ impl Store {
         find_model(&mut reader, camera, number).await?.ok_or_else(|| no_model(camera, number))
     }
 
-    /// Metadata and weights of one version, as they were handed in.
+    /// Metadata and weights of one version, as they were stored.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`]; [`ErrorKind::ModelUnusable`] where what
@@ -89,8 +89,8 @@ impl Store {
     /// # Errors
     /// Faults only.
     pub async fn fill_in_model_checksums(&self) -> Result<u64> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let missing: Vec<(i64, i64)> =
             sqlx::query_as("SELECT camera_key, number FROM models WHERE sha256 IS NULL")
                 .fetch_all(&mut *transaction)
@@ -161,13 +161,13 @@ impl Store {
         rows.iter().map(read_model).collect()
     }
 
-    /// Makes a version the one that answers. Naming the active one changes nothing.
+    /// Makes a version the active one. Naming the active one changes nothing.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
     pub async fn activate_model(&self, camera: &CameraId, number: u32, now: Timestamp) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         if find_model(&mut transaction, camera, number).await?.is_none() {
             return Err(no_model(camera, number));
@@ -178,14 +178,13 @@ impl Store {
         Ok(camera)
     }
 
-    /// Goes back to the version that was active before the one that is; again and again, until none
-    /// was.
+    /// Makes the version active that was before the active one. Repeated calls go further back.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none was active before.
     pub async fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         let latest: Vec<(i64, i64)> = sqlx::query_as(
             "SELECT position, model_number FROM activations \
@@ -208,7 +207,7 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
-        point_at(&mut transaction, key, number).await?;
+        set_active(&mut transaction, key, number).await?;
         let camera = find_camera(&mut *transaction, camera).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
@@ -225,8 +224,8 @@ impl Store {
                 .await
                 .map_err(failed)?;
         let read = |row| {
-            let mut fields = Fields::of("cameras", row);
-            Ok((fields.make(CameraId::new)?, fields.count()?))
+            let mut fields = RowDecoder::new("cameras", row);
+            Ok((fields.parse(CameraId::new)?, fields.count()?))
         };
         rows.iter().map(read).collect()
     }
@@ -316,13 +315,13 @@ pub struct StoredHeldOutError {
 }
 
 fn read_held_out_error(row: &SqliteRow) -> Result<StoredHeldOutError> {
-    let mut fields = Fields::of("held_out_errors", row).skip(1);
-    let time = fields.time()?;
-    let target_id = fields.make(TargetId::new)?;
-    let error = HeldOutSampleError { time, target_id, distance_m: fields.take()? };
+    let mut fields = RowDecoder::new("held_out_errors", row).skip(1);
+    let time = fields.timestamp()?;
+    let target_id = fields.parse(TargetId::new)?;
+    let error = HeldOutSampleError { time, target_id, distance_m: fields.get()? };
     let mut columns = [None; 6];
     for column in &mut columns {
-        *column = fields.take::<Option<f64>>()?;
+        *column = fields.get::<Option<f64>>()?;
     }
     let [
         Some(left_px),
@@ -335,12 +334,12 @@ fn read_held_out_error(row: &SqliteRow) -> Result<StoredHeldOutError> {
     else {
         return Ok(StoredHeldOutError { error, sample: None });
     };
-    let bounding_box = fields.made(BoundingBox::new(left_px, top_px, width_px, height_px))?;
-    let position = fields.made(Position::new(longitude_deg, latitude_deg))?;
+    let bounding_box = fields.checked(BoundingBox::new(left_px, top_px, width_px, height_px))?;
+    let position = fields.checked(Position::new(longitude_deg, latitude_deg))?;
     Ok(StoredHeldOutError { error, sample: Some((bounding_box, position)) })
 }
 
-/// Moves the pointer to a version that exists, and writes it into the history.
+/// Points the camera to a version that exists, and records it in the history of activations.
 pub(super) async fn activate(
     connection: &mut SqliteConnection,
     camera_key: i64,
@@ -366,10 +365,10 @@ pub(super) async fn activate(
     .execute(&mut *connection)
     .await
     .map_err(failed)?;
-    point_at(connection, camera_key, i64::from(number)).await
+    set_active(connection, camera_key, i64::from(number)).await
 }
 
-async fn point_at(connection: &mut SqliteConnection, camera_key: i64, number: i64) -> Result<()> {
+async fn set_active(connection: &mut SqliteConnection, camera_key: i64, number: i64) -> Result<()> {
     sqlx::query("UPDATE cameras SET active_model = ? WHERE key = ?")
         .bind(number)
         .bind(camera_key)
@@ -394,13 +393,13 @@ async fn find_model(
 }
 
 fn read_model(row: &SqliteRow) -> Result<ModelVersion> {
-    let mut fields = Fields::of("models", row);
+    let mut fields = RowDecoder::new("models", row);
     Ok(ModelVersion {
-        camera_id: fields.make(CameraId::new)?,
+        camera_id: fields.parse(CameraId::new)?,
         number: fields.count()?,
-        run_id: fields.make_some(Uuid::parse_str)?.map(RunId),
-        created_at: fields.time()?,
-        weights_bytes: fields.make(|stored: i64| u64::try_from(stored))?,
-        metadata: fields.make(serde_json::from_str)?,
+        run_id: fields.parse_optional(Uuid::parse_str)?.map(RunId),
+        created_at: fields.timestamp()?,
+        weights_bytes: fields.parse(|stored: i64| u64::try_from(stored))?,
+        metadata: fields.parse(serde_json::from_str)?,
     })
 }

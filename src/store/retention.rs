@@ -4,7 +4,7 @@ use sqlx::SqliteConnection;
 
 use super::Store;
 use super::cameras::{camera_key, find_camera};
-use super::faults::{failed, no_model, no_run};
+use super::errors::{failed, no_model, no_run};
 use crate::domain::{CameraId, Error, ErrorKind, Result, RunId};
 
 impl Store {

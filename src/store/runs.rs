@@ -9,11 +9,11 @@ use uuid::Uuid;
 
 use super::Store;
 use super::cameras::camera_key;
-use super::faults::{failed, no_run};
-use super::fields::Fields;
+use super::errors::{failed, no_run};
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
 use super::models::{NewModel, activate, add_model};
 use super::retention::{prune_models, prune_runs};
+use super::row_decoder::RowDecoder;
 use crate::domain::{
     CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
 };
@@ -128,8 +128,8 @@ impl Store {
     /// # Errors
     /// Faults only.
     pub async fn claim_run(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<TrainingRun>>> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let Some(claim) = RUNS.claim(&mut transaction, lease, now).await? else { return Ok(None) };
         let id = RunId(claim.job);
         sqlx::query("DELETE FROM training_epochs WHERE run_id = ?")
@@ -154,8 +154,8 @@ impl Store {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Heartbeat> {
-        let mut turn = self.relaxed().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
         let heartbeat = RUNS.heartbeat(&mut transaction, (run.0, fence), lease, now).await?;
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
@@ -185,8 +185,8 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunEnded`].
     pub async fn cancel_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<TrainingRun> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         camera_key(&mut *transaction, camera).await?;
         let stored = run_of(find_run(&mut *transaction, run).await?, camera, run)?;
         if stored.state.has_ended() {
@@ -212,8 +212,8 @@ impl Store {
         end: RunEnd<'_>,
         now: Timestamp,
     ) -> Result<Option<TrainingRun>> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let Some(finished) = RUNS.finish(&mut transaction, (run.0, fence), end, now).await? else {
             return Ok(None);
         };
@@ -270,32 +270,32 @@ fn run_of(found: Option<TrainingRun>, camera: &CameraId, run: RunId) -> Result<T
 }
 
 fn read_run(row: &SqliteRow) -> Result<TrainingRun> {
-    let mut fields = Fields::of("training_runs", row);
+    let mut fields = RowDecoder::new("training_runs", row);
     Ok(TrainingRun {
-        id: RunId(fields.make(Uuid::parse_str)?),
-        camera_id: fields.make(CameraId::new)?,
+        id: RunId(fields.parse(Uuid::parse_str)?),
+        camera_id: fields.parse(CameraId::new)?,
         options: TrainingOptions {
-            recipe: fields.make(|name: &str| name.parse::<Recipe>())?,
-            seed: fields.take::<i64>()?.cast_unsigned(),
-            epochs: fields.some_count()?,
-            from: fields.some_time()?,
-            until: fields.some_time()?,
+            recipe: fields.parse(|name: &str| name.parse::<Recipe>())?,
+            seed: fields.get::<i64>()?.cast_unsigned(),
+            epochs: fields.optional_count()?,
+            from: fields.optional_timestamp()?,
+            until: fields.optional_timestamp()?,
         },
-        state: fields.make(read_state)?,
+        state: fields.parse(read_state)?,
         attempt: fields.count()?,
         progress: RunProgress {
-            phase: fields.take()?,
+            phase: fields.get()?,
             epoch: fields.count()?,
             epochs: fields.count()?,
-            reconstruction_error: fields.number()?,
-            regression_error: fields.number()?,
-            error_scale: fields.number()?,
-            remaining_s: fields.take()?,
+            reconstruction_error: fields.nullable_f64()?,
+            regression_error: fields.nullable_f64()?,
+            error_scale: fields.nullable_f64()?,
+            remaining_s: fields.get()?,
         },
-        model_version: fields.some_count()?,
-        outcome: fields.take()?,
-        created_at: fields.time()?,
-        started_at: fields.some_time()?,
-        ended_at: fields.some_time()?,
+        model_version: fields.optional_count()?,
+        outcome: fields.get()?,
+        created_at: fields.timestamp()?,
+        started_at: fields.optional_timestamp()?,
+        ended_at: fields.optional_timestamp()?,
     })
 }

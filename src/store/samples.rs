@@ -6,11 +6,12 @@ use sqlx::{AssertSqlSafe, Sqlite};
 
 use super::Store;
 use super::cameras::camera_key;
-use super::faults::failed;
-use super::fields::Fields;
+use super::errors::failed;
 use super::group_commit::Inserted;
+use super::row_decoder::RowDecoder;
 use crate::domain::{
-    BoundingBox, CameraId, Durability, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId, TimeRange,
+    BoundingBox, CameraId, CameraKey, Durability, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId,
+    TimeRange,
 };
 use crate::geo::Position;
 
@@ -64,7 +65,22 @@ impl Store {
         samples: Vec<Sample>,
         durability: Durability,
     ) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), samples, durability).await
+        self.inner.samples.insert(id.clone(), None, samples, durability).await
+    }
+
+    /// As [`Store::insert_samples`], for the camera of that key alone: if it was deleted and created again
+    /// under the same id, nothing is stored.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`], [`crate::domain::ErrorKind::InsufficientStorage`].
+    pub async fn insert_samples_of(
+        &self,
+        id: &CameraId,
+        key: CameraKey,
+        samples: Vec<Sample>,
+        durability: Durability,
+    ) -> Result<Inserted> {
+        self.inner.samples.insert(id.clone(), Some(key), samples, durability).await
     }
 
     /// A page of samples ordered by time and target, after a key.
@@ -108,7 +124,7 @@ impl Store {
         let range = Range::of(camera_key(self.readers(), id).await?, filter, None);
         let sql = range.sql(head, "");
         let row = range.bind(&sql).fetch_one(self.readers()).await.map_err(failed)?;
-        Fields::of("samples", &row).make(|stored: i64| u64::try_from(stored))
+        RowDecoder::new("samples", &row).parse(|stored: i64| u64::try_from(stored))
     }
 
     /// Time of the sample that has so many before it, in order of time; `None` behind the last.
@@ -120,7 +136,7 @@ impl Store {
         let sql = range.sql("SELECT time_us FROM samples", " ORDER BY time_us, target_id LIMIT 1 OFFSET ?");
         let offset = i64::try_from(before).unwrap_or(i64::MAX);
         let row = range.bind(&sql).bind(offset).fetch_optional(self.readers()).await.map_err(failed)?;
-        row.map(|row| Fields::of("samples", &row).time()).transpose()
+        row.map(|row| RowDecoder::new("samples", &row).timestamp()).transpose()
     }
 
     /// How many samples a filter selects, and the corners of the ground they cover (south-west,
@@ -140,14 +156,14 @@ impl Store {
             "",
         );
         let row = range.bind(&sql).fetch_one(self.readers()).await.map_err(failed)?;
-        let mut fields = Fields::of("samples", &row);
-        let count = fields.make(|stored: i64| u64::try_from(stored))?;
+        let mut fields = RowDecoder::new("samples", &row);
+        let count = fields.parse(|stored: i64| u64::try_from(stored))?;
         if count == 0 {
             return Ok((0, None));
         }
-        let (west, south) = (fields.take()?, fields.take()?);
-        let (east, north) = (fields.take()?, fields.take()?);
-        let corner = |longitude_deg, latitude_deg| fields.made(Position::new(longitude_deg, latitude_deg));
+        let (west, south) = (fields.get()?, fields.get()?);
+        let (east, north) = (fields.get()?, fields.get()?);
+        let corner = |longitude_deg, latitude_deg| fields.checked(Position::new(longitude_deg, latitude_deg));
         Ok((count, Some([corner(west, south)?, corner(east, north)?])))
     }
 
@@ -220,20 +236,20 @@ impl Range {
 }
 
 fn read_sample(row: &SqliteRow) -> Result<Sample> {
-    let mut fields = Fields::of("samples", row).skip(1);
-    let time = fields.time()?;
-    let target_id = fields.make(TargetId::new)?;
-    let (left_px, top_px) = (fields.take()?, fields.take()?);
-    let (width_px, height_px) = (fields.take()?, fields.take()?);
-    let bounding_box = fields.made(BoundingBox::new(left_px, top_px, width_px, height_px))?;
-    let (longitude_deg, latitude_deg) = (fields.take()?, fields.take()?);
-    let position = fields.made(Position::new(longitude_deg, latitude_deg))?;
-    let sigma_m = fields.make_some(SigmaM::new)?;
-    let class = fields.make_some(TargetClass::new)?;
-    let score = fields.make_some(Score::new)?;
-    let truth: (Option<f64>, Option<f64>) = (fields.take()?, fields.take()?);
+    let mut fields = RowDecoder::new("samples", row).skip(1);
+    let time = fields.timestamp()?;
+    let target_id = fields.parse(TargetId::new)?;
+    let (left_px, top_px) = (fields.get()?, fields.get()?);
+    let (width_px, height_px) = (fields.get()?, fields.get()?);
+    let bounding_box = fields.checked(BoundingBox::new(left_px, top_px, width_px, height_px))?;
+    let (longitude_deg, latitude_deg) = (fields.get()?, fields.get()?);
+    let position = fields.checked(Position::new(longitude_deg, latitude_deg))?;
+    let sigma_m = fields.parse_optional(SigmaM::new)?;
+    let class = fields.parse_optional(TargetClass::new)?;
+    let score = fields.parse_optional(Score::new)?;
+    let truth: (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
     let truth =
         truth.0.zip(truth.1).map(|(longitude, latitude)| Position::new(longitude, latitude)).transpose();
-    let truth = fields.made(truth)?;
+    let truth = fields.checked(truth)?;
     Ok(Sample { time, target_id, bounding_box, fix: Fix { position, sigma_m }, class, score, truth })
 }

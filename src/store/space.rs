@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use sqlx::{Sqlite, Transaction};
 
 use super::Store;
-use super::faults::failed;
+use super::errors::failed;
 use super::reserve::Reserve;
 use super::writer::{Growth, WriterGuard};
 use crate::domain::{CameraId, Durability, Error, ErrorKind, Result};

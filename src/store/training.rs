@@ -3,8 +3,8 @@
 use jiff::Timestamp;
 
 use super::Store;
-use super::faults::{failed, no_run};
-use super::fields::Fields;
+use super::errors::{failed, no_run};
+use super::row_decoder::RowDecoder;
 use super::runs::RUNS;
 use crate::domain::{EpochReport, Result, RunId};
 
@@ -21,8 +21,8 @@ impl Store {
     /// # Errors
     /// Faults only.
     pub async fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()> {
-        let mut turn = self.relaxed().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
         if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
@@ -53,8 +53,8 @@ impl Store {
     /// # Errors
     /// Faults only.
     pub async fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()> {
-        let mut turn = self.relaxed().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
         if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
@@ -94,13 +94,13 @@ impl Store {
         .await
         .map_err(failed)?;
         let read = |row| {
-            let mut fields = Fields::of("training_epochs", row).skip(1);
+            let mut fields = RowDecoder::new("training_epochs", row).skip(1);
             Ok(EpochReport {
                 epoch: fields.count()?,
-                loss: fields.number()?,
-                reconstruction_error: fields.number()?,
-                regression_error: fields.number()?,
-                error_scale: fields.number()?,
+                loss: fields.nullable_f64()?,
+                reconstruction_error: fields.nullable_f64()?,
+                regression_error: fields.nullable_f64()?,
+                error_scale: fields.nullable_f64()?,
             })
         };
         rows.iter().map(read).collect()
@@ -120,8 +120,8 @@ impl Store {
         .await
         .map_err(failed)?;
         let read = |row| {
-            let mut fields = Fields::of("training_log", row).skip(2);
-            Ok((fields.time()?, fields.take()?))
+            let mut fields = RowDecoder::new("training_log", row).skip(2);
+            Ok((fields.timestamp()?, fields.get()?))
         };
         rows.iter().map(read).collect()
     }

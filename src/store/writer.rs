@@ -4,7 +4,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection, Sqlite, SqliteConnection, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
-use super::faults::{closed, failed, is_busy};
+use super::errors::{closed, failed, is_busy};
 use crate::domain::{Durability, Result};
 
 /// Pages above the database's limit that are left to transactions other than growing ones.

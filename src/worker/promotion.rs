@@ -2,8 +2,8 @@
 //!
 //! Two versions are compared by their mean distance to the fixes of held-out samples, that is, samples
 //! predicted by a fit that had not seen them. With each version a sample of its held-out errors is stored,
-//! so a later version must hold its ground on what the earlier one was good at, whatever its own training
-//! samples are. Both versions of a comparison choose their samples by the same hash of time and target, so
+//! so a later version is measured on what the earlier one was good at, whatever its own training samples
+//! are. Both versions of a comparison choose their samples by the same hash of time and target, so
 //! that a sample that both have trained on is in both choices or in none.
 
 use std::collections::{HashMap, HashSet};
@@ -105,6 +105,9 @@ pub(super) async fn decide(app: &App, id: &CameraId, new: &Candidate<'_>) -> Res
     let Some((active, _)) = app.registry.refresh_camera(&app.store, id).await?.model.clone() else {
         return Ok(activate(format!("version {number} cannot be used")));
     };
+    if new.held_out.is_empty() {
+        return Ok(keep(number, "the new one has no held-out errors to compare"));
+    }
     let moved_at = app.store.camera_move(id, number).await?.map(|moved| moved.began_at);
     let counts =
         |time: Timestamp| new.range.contains(time) && moved_at.is_none_or(|moved_at| time >= moved_at);

@@ -9,7 +9,6 @@ use crate::app::{App, JobQueue};
 use crate::domain::{
     EpochReport, Error, HeldOutSampleError, JobState, Result, RunProgress, Sample, TimeRange, TrainingRun,
 };
-use crate::fusion::track::TrackSettings;
 use crate::model::{self, Artifact, FitError, FitEvent, FitOptions};
 use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
@@ -84,7 +83,6 @@ impl Job for TrainingRun {
                 }
                 report(sink, event)
             });
-            let fitted = fitted.and_then(|artifact| with_track_noise(artifact, &samples));
             samples.sort_by(|one, other| (&one.target_id, one.time).cmp(&(&other.target_id, other.time)));
             let outcome =
                 fitted.map(|artifact| Model { artifact, held_out: errors_of(&samples, &distances_m) });
@@ -142,14 +140,6 @@ impl Job for TrainingRun {
 /// The model with the noise parameters that its samples show, for the tracks that it will serve.
 ///
 /// # Errors
-/// `Unusable` where the fitted model does not pass the checks of every loaded model.
-fn with_track_noise(mut artifact: Artifact, samples: &[Sample]) -> std::result::Result<Artifact, FitError> {
-    let regressor = artifact.load().map_err(FitError::Unusable)?;
-    let settings = TrackSettings::estimate(samples, &regressor);
-    settings.noise_model().write(&mut artifact.metadata.parameters);
-    Ok(artifact)
-}
-
 /// Pairs samples in the order of target and time with their distances, m.
 fn errors_of(samples: &[Sample], distances_m: &[f64]) -> Vec<HeldOutSampleError> {
     let pairs = samples.iter().zip(distances_m);

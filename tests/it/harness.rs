@@ -15,6 +15,7 @@ use hyper_util::client::legacy::connect::HttpConnector;
 use hyper_util::rt::TokioExecutor;
 use serde_json::Value;
 use tempfile::TempDir;
+use tokio::net::{TcpSocket, TcpStream};
 
 /// A command of the binary, without arguments.
 pub(crate) fn sightfix() -> Command {
@@ -152,6 +153,7 @@ impl TestServer {
         }
     }
 
+    /// Process id of the server.
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
     }
@@ -239,6 +241,14 @@ pub(crate) fn own_address() -> SocketAddr {
             return address;
         }
     }
+}
+
+/// Connects to a server from another loopback address than its other clients, which makes it another
+/// client to limits that count by address.
+pub(crate) async fn connect_from(ip: [u8; 4], server: SocketAddr) -> TcpStream {
+    let socket = TcpSocket::new_v4().expect("a socket");
+    socket.bind(SocketAddr::from((ip, 0))).expect("all of 127.0.0.0/8 is this machine");
+    socket.connect(server).await.expect("the server listens")
 }
 
 pub(crate) fn data_folder() -> TempDir {

@@ -18,6 +18,7 @@ const LAYERS: &[(&str, u32)] = &[
     ("store", 2),
     ("filters", 2),
     ("model", 3),
+    ("admission", 3),
     ("telemetry", 5),
     ("fusion", 4),
     ("simulation", 4),

@@ -2,15 +2,21 @@
 
 mod bad_input;
 mod connections;
+mod cross_site;
 mod evaluations;
 mod gaussian_process;
 mod grpc;
 mod harness;
 mod job_leases;
 mod layering;
+mod live_client;
+mod live_faults;
+mod live_saturation;
 mod model_integrity;
 mod openapi;
+mod overload;
 mod pairing;
+mod parity;
 mod power_cut;
 mod promotion;
 mod replay;

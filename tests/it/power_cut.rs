@@ -295,7 +295,7 @@ async fn import(server: &TestServer, life: usize, durability: &str) {
 }
 
 /// Samples of each import that a folder's database holds, once the server's store has opened it.
-async fn stored(folder: &Path) -> HashMap<String, usize> {
+async fn stored(folder: &Path) -> HashMap<String, i64> {
     let store = Store::open(folder).await.expect("a database that can be opened");
     store.close().await;
     let database = rusqlite::Connection::open(folder.join("sightfix.db")).expect("a database");
@@ -355,7 +355,7 @@ async fn cut_power(durability: &str) -> (usize, usize) {
             disk.leave(after.path(), remains);
             let found = stored(after.path()).await;
             tried += acknowledged.len();
-            lost += acknowledged.iter().filter(|id| found.get(*id) != Some(&ROWS)).count();
+            lost += acknowledged.iter().filter(|id| found.get(*id) != Some(&(ROWS as i64))).count();
         }
     }
     (tried, lost)

@@ -9,6 +9,7 @@ use std::time::Duration;
 use futures_util::stream;
 use serde_json::{Value, json};
 use sightfix::grpc::proto;
+use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::model_service_client::ModelServiceClient;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
 use sightfix::grpc::proto::training_service_client::TrainingServiceClient;
@@ -106,6 +107,23 @@ async fn imports_say_how_durable_they_are() {
         let report = samples.import_samples(stream::iter([message])).await.expect("taken").into_inner();
         assert_eq!(report.durability(), told);
     }
+
+    let mut fusion = FusionServiceClient::new(channel(&server).await);
+    for (store_samples, told) in [(true, proto::Durability::Relaxed), (false, proto::Durability::Unspecified)]
+    {
+        let opening = proto::StreamOpening {
+            camera_id: "c".to_owned(),
+            client_name: "edge-1".to_owned(),
+            store_samples,
+            durability: proto::Durability::Relaxed.into(),
+            ..Default::default()
+        };
+        let first = proto::StreamRequest { kind: Some(proto::stream_request::Kind::Opening(opening)) };
+        let mut answers = fusion.stream(stream::iter([first])).await.expect("taken").into_inner();
+        let answer = answers.message().await.expect("no error").expect("an answer");
+        let Some(proto::stream_response::Kind::Opened(opened)) = answer.kind else { panic!("{answer:?}") };
+        assert_eq!(opened.durability(), told);
+    }
 }
 
 /// Fills the storage with imports until one is refused for want of space.
@@ -151,7 +169,7 @@ async fn check_full_storage(server: &TestServer, refused: &Answer) {
     assert_eq!(details.error_info().expect("ErrorInfo").reason, "insufficient-storage");
 
     let ready = server.get("/readyz").await.expect(200).text();
-    assert!(ready.starts_with("ready\n") && ready.contains("warning: insufficient-storage"), "{ready}");
+    assert!(ready.starts_with("ready\n") && ready.contains("degraded: insufficient-storage"), "{ready}");
     metric(server, "sightfix_storage_full 1").await;
     let observation = json!({"observations": [{
         "time": "2026-01-01T00:00:00Z",
@@ -202,8 +220,9 @@ async fn a_full_disk_refuses_imports_fuses_on_and_recovers_by_deleting() {
     }
 
     let folder = data_folder();
-    let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
-    assert!(mounted.status().expect("mount runs").success(), "needs the superuser");
+    let mut mount = Command::new("mount");
+    mount.args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
+    assert!(mount.status().expect("mount runs").success(), "needs the superuser");
     let _mounted = Mounted(folder.path());
     let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__RESERVE_BYTES", "20971520")]);
     create_camera(&server, "c").await.expect(201);
@@ -211,7 +230,6 @@ async fn a_full_disk_refuses_imports_fuses_on_and_recovers_by_deleting() {
     activate(&server, 1).await;
     let refused = fill(&server).await;
     check_full_storage(&server, &refused).await;
-    assert!(server.terminate());
 }
 
 #[tokio::test]

@@ -1,13 +1,18 @@
-//! One client's live stream: its place, its items, its acknowledgements.
+//! One client's live stream: its slot, its items, its acknowledgements.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::watch;
 
-use super::keeping::{Half, Keeping, Ledger};
-use super::{CameraLive, Followed, lock};
+use super::ItemResult;
+use super::acknowledgements::{AckTracker, Acknowledgement, NotStoredReason};
+use super::sample_committer::{self, SampleSink};
+use super::sample_recorder::{SampleRecorder, UnpairedItem};
+use super::sync::lock;
+use crate::admission::{ClientAddress, Lease};
 use crate::app::App;
+use crate::app::registry::ActiveCamera;
 use crate::domain::{
     CameraId, CameraMoved, Detection, Durability, Error, ErrorKind, LiveItem, Observation, Result, Sample,
     Score, TargetClass, check_text,
@@ -18,16 +23,16 @@ const LONGEST_CLIENT_NAME: usize = 128;
 
 /// Streams that are open, counted by client.
 #[derive(Default)]
-pub(super) struct Places(Arc<Mutex<HashMap<String, usize>>>);
+pub(in crate::app) struct StreamSlots(Arc<Mutex<HashMap<String, usize>>>);
 
-/// A stream's place; free again when dropped.
-struct Place {
-    places: Arc<Mutex<HashMap<String, usize>>>,
+/// A stream's slot; free again when dropped.
+struct SlotGuard {
+    slots: Arc<Mutex<HashMap<String, usize>>>,
     client: String,
 }
 
-impl Places {
-    fn take(&self, client: &str, most: usize, most_of_client: usize) -> Result<Place> {
+impl StreamSlots {
+    fn take(&self, client: &str, most: usize, most_of_client: usize) -> Result<SlotGuard> {
         let mut open = lock(&self.0);
         if open.values().sum::<usize>() >= most {
             return Err(overloaded(format!("{most} live streams are open already; try again later")));
@@ -37,13 +42,13 @@ impl Places {
             return Err(overloaded(format!("this client has {most_of_client} live streams open already")));
         }
         *of_client += 1;
-        Ok(Place { places: self.0.clone(), client: client.to_owned() })
+        Ok(SlotGuard { slots: self.0.clone(), client: client.to_owned() })
     }
 }
 
-impl Drop for Place {
+impl Drop for SlotGuard {
     fn drop(&mut self) {
-        let mut open = lock(&self.places);
+        let mut open = lock(&self.slots);
         if let Some(of_client) = open.get_mut(&self.client) {
             *of_client -= 1;
             if *of_client == 0 {
@@ -60,16 +65,17 @@ fn overloaded(message: String) -> Error {
 /// An open stream.
 pub struct LiveStream {
     app: App,
-    id: CameraId,
-    live: Arc<CameraLive>,
-    kept: Option<Kept>,
+    /// As it was when the stream was opened; its key and its live state do not change.
+    camera: Arc<ActiveCamera>,
+    recording: Option<Recording>,
     last_seq: u64,
-    _place: Place,
+    _slot: SlotGuard,
+    _address_lease: Lease,
 }
 
-struct Kept {
-    keeping: Arc<Keeping>,
-    ledger: Arc<Ledger>,
+struct Recording {
+    recorder: Arc<SampleRecorder>,
+    tracker: Arc<AckTracker>,
 }
 
 impl App {
@@ -83,41 +89,47 @@ impl App {
         &self,
         id: &CameraId,
         client_name: &str,
+        client_address: ClientAddress,
         resume_after_seq: u64,
         store_samples: Option<Durability>,
     ) -> Result<LiveStream> {
         check_text("client_name", client_name, LONGEST_CLIENT_NAME)?;
-        self.serving(id).await?;
+        let camera = self.active_camera(id).await?;
         let limits = &self.limits;
-        let place =
-            self.live.places.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
-        let live = self.live.of(id);
-        let kept = store_samples.map(|durability| Kept {
-            keeping: live.keeping(self, id),
-            ledger: Ledger::beginning_after(resume_after_seq, durability),
+        // Names are the client's choice; its address is not.
+        let address_lease = self.quotas.live_streams.try_acquire(client_address, 1)?;
+        let slot =
+            self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
+        let recording = store_samples.map(|durability| Recording {
+            recorder: self.recorder_of(&camera),
+            tracker: AckTracker::beginning_after(resume_after_seq, durability),
         });
         self.metrics.stream_opened();
         Ok(LiveStream {
             app: self.clone(),
-            id: id.clone(),
-            live,
-            kept,
+            camera,
+            recording,
             last_seq: resume_after_seq,
-            _place: place,
+            _slot: slot,
+            _address_lease: address_lease,
         })
     }
-}
 
-impl CameraLive {
     /// The pairing that all storing streams of the camera share.
-    fn keeping(&self, app: &App, id: &CameraId) -> Arc<Keeping> {
-        let mut shared = lock(&self.keeping);
-        match shared.upgrade().filter(|keeping| !keeping.has_failed()) {
-            Some(keeping) => keeping,
+    fn recorder_of(&self, camera: &ActiveCamera) -> Arc<SampleRecorder> {
+        let mut shared = lock(&camera.live.recorder);
+        match shared.upgrade().filter(|recorder| !recorder.has_failed()) {
+            Some(recorder) => recorder,
             None => {
-                let keeping = Keeping::start(id.clone(), app.store.clone(), app.metrics.clone());
-                *shared = Arc::downgrade(&keeping);
-                keeping
+                let sink = SampleSink {
+                    store: self.store.clone(),
+                    metrics: self.metrics.clone(),
+                    id: camera.id.clone(),
+                    key: camera.key,
+                };
+                let recorder = sample_committer::start(sink, |task| drop(self.tasks.spawn(task)));
+                *shared = Arc::downgrade(&recorder);
+                recorder
             }
         }
     }
@@ -127,20 +139,39 @@ impl LiveStream {
     /// The model version that answers now.
     #[must_use]
     pub fn model_version(&self) -> Option<u32> {
-        self.app.registry.get(&self.id)?.model.as_ref().map(|(_, version)| *version)
+        self.current_camera().ok()?.model.as_ref().map(|(_, version)| *version)
+    }
+
+    /// The camera as it is now.
+    ///
+    /// # Errors
+    /// `CameraNotFound` if it was deleted, even if another has its id now.
+    pub fn current_camera(&self) -> Result<Arc<ActiveCamera>> {
+        let current = self.app.registry.get(&self.camera.id);
+        current.filter(|camera| camera.key == self.camera.key).ok_or_else(|| self.camera_deleted())
+    }
+
+    /// Waits until the camera is deleted.
+    pub async fn deleted(&self) -> Error {
+        self.camera.live.deleted().await;
+        self.camera_deleted()
+    }
+
+    fn camera_deleted(&self) -> Error {
+        Error::refused(ErrorKind::CameraNotFound, format!("camera {} was deleted", self.camera.id))
     }
 
     /// When items are acknowledged; `None` on a stream that stores nothing.
     #[must_use]
     pub fn durability(&self) -> Option<Durability> {
-        self.kept.as_ref().map(|kept| kept.ledger.durability())
+        self.recording.as_ref().map(|recording| recording.tracker.durability())
     }
 
     /// Checks that seqs rise; an item that cannot be read has one, too.
     ///
     /// # Errors
     /// `InvalidArgument` naming `seq`.
-    pub fn number(&mut self, seq: u64) -> Result<()> {
+    pub fn check_seq(&mut self, seq: u64) -> Result<()> {
         if seq <= self.last_seq {
             return Err(Error::invalid(
                 "seq",
@@ -151,107 +182,114 @@ impl LiveStream {
         Ok(())
     }
 
-    /// An item that could not be taken: it is settled as it is.
-    pub fn pass(&self, seq: u64) {
-        if let Some(kept) = &self.kept {
-            kept.ledger.pass(seq);
+    /// Acknowledges an item that was answered with an error.
+    pub fn ack_refused(&self, seq: u64) {
+        self.ack_without_storing(seq, NotStoredReason::Refused);
+    }
+
+    fn ack_without_storing(&self, seq: u64, reason: NotStoredReason) {
+        if let Some(Recording { tracker, .. }) = &self.recording {
+            tracker.ack_without_storing(seq, reason);
         }
     }
 
     /// Takes an item: its own position, its target's track with it, and its part in a sample.
     ///
     /// # Errors
-    /// `InvalidArgument` for neither box nor fix, naming the field; `CameraNotFound`; as
-    /// [`App::follow`].
-    pub async fn take(&mut self, seq: u64, item: LiveItem) -> Result<Followed> {
-        let serving = self.app.serving(&self.id).await?;
+    /// `InvalidArgument` for neither box nor fix, or for a time ahead of the server's clock, naming the
+    /// field; as [`App::follow`].
+    pub async fn take(&self, camera: &Arc<ActiveCamera>, seq: u64, item: LiveItem) -> Result<ItemResult> {
         let (target_id, time) = match (item.target_id, &item.receiver_id) {
             (Some(target_id), _) => (Some(target_id), item.time),
             (None, Some(receiver_id)) => {
-                let (target_id, time) = serving.receivers.resolve(receiver_id, item.time);
+                let (target_id, time) = camera.receivers.resolve(receiver_id, item.time);
                 (Some(target_id), time)
             }
             (None, None) => (None, item.time),
         };
         let observation = Observation::new(time, target_id, item.bounding_box, item.fix)?;
-        self.keep(seq, observation.clone(), item.class, item.score).await?;
-        self.app.follow_in(&self.live, &self.id, &serving, &observation).await
+        // A time that no track takes must not move the pairing either.
+        self.app.live_time_bounds().check(time)?;
+        self.record(seq, &observation, item.class, item.score).await?;
+        self.app.follow(camera, &observation)
     }
 
-    async fn keep(
+    async fn record(
         &self,
         seq: u64,
-        observation: Observation,
+        observation: &Observation,
         class: Option<TargetClass>,
         score: Option<Score>,
     ) -> Result<()> {
-        let Some(Kept { keeping, ledger }) = &self.kept else { return Ok(()) };
-        let Observation { time, target_id, bounding_box, fix } = observation;
-        let Some(target_id) = target_id else {
-            ledger.pass(seq);
+        let Some(Recording { recorder, tracker }) = &self.recording else { return Ok(()) };
+        let Observation { time, bounding_box, fix, .. } = *observation;
+        let Some(target_id) = observation.target_id.clone() else {
+            self.ack_without_storing(seq, NotStoredReason::NoTarget);
             return Ok(());
         };
         match (bounding_box, fix) {
             (Some(bounding_box), Some(fix)) => {
                 let sample = Sample { time, target_id, bounding_box, fix, class, score, truth: None };
-                keeping.whole(ledger, seq, sample).await
+                recorder.push_sample(tracker, seq, sample).await
             }
             (Some(bounding_box), None) => {
                 let detection = Detection { time, target_id, bounding_box, class, score };
-                keeping.half(ledger, seq, Half::Box(detection)).await
+                recorder.push_unpaired(tracker, seq, UnpairedItem::Box(detection)).await
             }
-            (None, Some(fix)) => keeping.half(ledger, seq, Half::Fix(target_id, time, fix)).await,
+            (None, Some(fix)) => {
+                recorder.push_unpaired(tracker, seq, UnpairedItem::Fix(target_id, time, fix)).await
+            }
             (None, None) => Ok(()),
         }
     }
 
-    /// The seq up to which everything is settled; `None` on a stream that keeps nothing.
+    /// What is settled; `None` on a stream that stores nothing.
     ///
     /// # Errors
     /// The samples could not be stored; the stream must end, for nothing behind is acknowledged.
-    pub fn acknowledged(&self) -> Result<Option<u64>> {
-        let Some(kept) = &self.kept else { return Ok(None) };
-        kept.ledger.is_settled()?;
-        Ok(Some(kept.ledger.settled()))
+    pub fn acknowledgement(&self) -> Result<Option<Acknowledgement>> {
+        let Some(recording) = &self.recording else { return Ok(None) };
+        recording.tracker.is_settled()?;
+        Ok(Some(recording.tracker.acknowledgement()))
     }
 
-    /// Waits until more may be settled; for ever on a stream that keeps nothing.
+    /// Waits until more may be settled; without end on a stream that stores nothing.
     pub async fn acknowledgement_changed(&self) {
-        match &self.kept {
-            Some(kept) => kept.ledger.changed().await,
+        match &self.recording {
+            Some(recording) => recording.tracker.changed().await,
             None => std::future::pending().await,
         }
     }
 
     /// The alarms from now on.
     #[must_use]
-    pub fn moves(&self) -> Moves {
-        Moves(self.live.moved.subscribe())
+    pub fn change_notices(&self) -> ChangeNotices {
+        ChangeNotices(self.camera.live.moved.subscribe())
     }
 
     /// Settles everything at the end of the items: late partners on other streams get their time,
-    /// then what is left is decided.
+    /// then the rest is decided.
     ///
     /// # Errors
     /// The samples could not be stored.
     pub async fn settle(&self) -> Result<()> {
-        let Some(Kept { keeping, ledger }) = &self.kept else { return Ok(()) };
-        let alone = Arc::strong_count(keeping) == 1;
-        if !alone {
-            // Elapsed is no failure: what is still open is decided below.
-            let _ = tokio::time::timeout(keeping.lateness(), settled(ledger)).await;
+        let Some(Recording { recorder, tracker }) = &self.recording else { return Ok(()) };
+        let is_alone = Arc::strong_count(recorder) == 1;
+        if !is_alone {
+            // Elapsed is no failure: the rest is decided below.
+            let _ = tokio::time::timeout(recorder.allowed_lateness(), tracker.settled()).await;
         }
-        if !ledger.is_settled()? {
-            keeping.end(ledger).await?;
+        if !tracker.is_settled()? {
+            recorder.end_stream(tracker).await?;
         }
-        settled(ledger).await
+        tracker.settled().await
     }
 }
 
 /// Alarms that a camera was moved, as they are raised.
-pub struct Moves(watch::Receiver<Option<Arc<CameraMoved>>>);
+pub struct ChangeNotices(watch::Receiver<Option<Arc<CameraMoved>>>);
 
-impl Moves {
+impl ChangeNotices {
     /// Waits for the next one.
     pub async fn next(&mut self) -> Arc<CameraMoved> {
         loop {
@@ -263,13 +301,6 @@ impl Moves {
             }
         }
     }
-}
-
-async fn settled(ledger: &Ledger) -> Result<()> {
-    while !ledger.is_settled()? {
-        ledger.changed().await;
-    }
-    Ok(())
 }
 
 impl Drop for LiveStream {

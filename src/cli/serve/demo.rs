@@ -1,4 +1,4 @@
-//! The demonstration: a simulated camera, through the same ways that a real one goes.
+//! The demonstration: a simulated camera, created and trained like a real one.
 
 use std::io::Write as _;
 use std::net::SocketAddr;
@@ -13,7 +13,7 @@ use crate::simulation::{Options, SimulatedRow, simulate};
 
 const CAMERA: &str = "demo";
 
-/// Fills the data folder if it is empty, waits until the camera answers, prints what to try.
+/// Fills the data folder if it is empty, trains the camera, and prints requests to try.
 pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
     let id = CameraId::new(CAMERA)?;
     let world = simulate(&Options::demo());
@@ -36,9 +36,9 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
         .rows
         .iter()
         .find(|row| row.bounding_box.is_some() && row.fix.is_some())
-        .context("the simulation shows no target")?;
-    // Whoever started the server may have stopped reading; it serves all the same.
-    let _ = writeln!(std::io::stdout(), "{}", things_to_try(address, row));
+        .context("the simulation has no detected target")?;
+    // A closed standard output must not stop the server.
+    let _ = writeln!(std::io::stdout(), "{}", requests_to_try(address, row));
     Ok(())
 }
 
@@ -59,7 +59,7 @@ async fn train(app: &App, id: &CameraId) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn things_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
+fn requests_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
     let (Some(bounding_box), Some(fix)) = (row.bounding_box, row.fix) else { return String::new() };
     let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
     let observation = format!(
@@ -69,13 +69,13 @@ fn things_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
         fix.position.latitude_deg(),
     );
     format!(
-        "The camera `{CAMERA}` answers. Three things to try:\n\n\
+        "The camera `{CAMERA}` is ready. Three things to try:\n\n\
          1. Fuse a box and a fix:\n\n   \
          curl -s http://{address}/v1/cameras/{CAMERA}/fusions --json '{observation}'\n\n\
          2. The same over gRPC:\n\n   \
          grpcurl -plaintext -d '{{\"camera_id\":\"{CAMERA}\",\"observations\":[{observation}]}}' {address} \
          sightfix.v1.FusionService/Fuse\n\n\
-         3. Read and try the whole interface in a browser:\n\n   \
+         3. Explore the whole interface in a browser:\n\n   \
          http://{address}/docs\n"
     )
 }

@@ -42,7 +42,7 @@ fn rmc(time: &str, status: &str, date: &str) -> String {
 #[test]
 fn nmea_dates_are_those_of_rmc_and_zda_across_midnight() {
     let zda = sentence("GPZDA,000001.00,15,12,2020,00,00");
-    // A receiver without a fix tells the date of its firmware.
+    // A receiver without a fix reports the date of its firmware.
     let log = [
         rmc("235957.00", "V", "060180"),
         gga("235958.00"),
@@ -131,8 +131,8 @@ fn invalid_gpx_ends_with_a_reason() {
         (format!("<gpx><trkpt lat=\"1\" lon=\"{}\"/></gpx>", "1".repeat(200_000)), "64 KiB"),
         (format!("<gpx><name>{}</name></gpx>", "x".repeat(1_000_000)), "64 KiB"),
     ] {
-        let told = broken(text);
-        assert!(told.contains(reason), "{told} does not say {reason}");
+        let error = broken(text);
+        assert!(error.contains(reason), "{error} does not contain {reason}");
     }
 }
 

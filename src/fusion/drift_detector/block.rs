@@ -17,7 +17,7 @@ const MIN_SAMPLES: u32 = 3;
 const MAX_CELLS: usize = 16;
 
 /// A square cell of ground, counted from the plane's origin towards east and north.
-pub(super) type Cell = (i64, i64);
+pub(super) type GroundCell = (i64, i64);
 
 /// Regressed position and fix of one target at one instant.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,7 +50,7 @@ pub(super) struct Block {
     pub(super) bias_m2: f64,
     /// Mean error variance per axis of the regressed positions, m2.
     pub(super) e_regression_m2: f64,
-    pub(super) cells: BTreeSet<Cell>,
+    pub(super) cells: BTreeSet<GroundCell>,
 }
 
 /// A block that still accepts samples.
@@ -62,7 +62,7 @@ pub(super) struct OpenBlock {
     samples: u32,
     e_regression_m2: f64,
     e_gnss_m2: f64,
-    cells: BTreeSet<Cell>,
+    cells: BTreeSet<GroundCell>,
 }
 
 impl OpenBlock {

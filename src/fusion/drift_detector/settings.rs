@@ -1,12 +1,12 @@
 //! Parameters of the drift detector.
 
-use crate::fusion::track::GnssNoise;
+use crate::domain::NoiseCorrelation;
 
 /// Error model, thresholds and bounds of a drift detector.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DriftDetectorSettings {
     /// Temporal correlation of the receivers' error over seconds.
-    pub gnss: GnssNoise,
+    pub gnss: NoiseCorrelation,
     /// Length of a block, s.
     pub block_s: f64,
     /// A block is closed when its target was not sampled for longer than this, s.
@@ -36,7 +36,7 @@ pub struct DriftDetectorSettings {
 impl Default for DriftDetectorSettings {
     fn default() -> Self {
         Self {
-            gnss: GnssNoise::default(),
+            gnss: NoiseCorrelation::PHONE,
             block_s: 120.0,
             gap_s: 30.0,
             receiver_share: 0.4,

@@ -1,14 +1,17 @@
 //! Lists with known partners, streams against lists, and the square's own files.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
+
+use jiff::Timestamp;
 
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
-use crate::domain::{BoundingBox, ClockOffset, Receiver, ReceiverId, parse_time};
+use crate::domain::{BoundingBox, ClockOffset, Fix, Receiver, ReceiverId, TargetId, parse_time};
 use crate::fusion::clock_offset::{OffsetSearch, estimate_clock_offset};
-use crate::geo::Position;
+use crate::geo::{LocalPlane, Position};
 use crate::simulation::{Walk, at_s, standard_normal, stream};
 
 fn target(name: &str) -> TargetId {
@@ -164,7 +167,7 @@ fn no_fix_labels_two_boxes_and_the_window_holds() {
     assert_eq!(times, [0.48, 1.48, 2.48, 3.48].map(at_s), "the fixes at 4.49 and 5.49 see no box");
     assert_eq!((found.unpaired.detections, found.unpaired.fixes), (96, 2));
     // No box is farther than the window from its nearest fix.
-    assert_eq!((found.unpaired.outbid, found.detections_without_fixes), (96, 0));
+    assert_eq!((found.unpaired.fix_claimed_by_nearer_box, found.detections_without_fixes), (96, 0));
 }
 
 #[test]
@@ -180,7 +183,7 @@ fn receivers_are_bound_to_targets_with_their_clocks() {
     );
     let longitudes: Vec<f64> = found.samples.iter().map(|it| it.fix.position.longitude_deg()).collect();
     assert!((longitudes[0] - 5.0).abs() < 1e-12 && (longitudes[1] - 6.0).abs() < 1e-12, "{longitudes:?}");
-    assert_eq!(found.unpaired.unbound, 1);
+    assert_eq!(found.unpaired.receiver_missing, 1);
 }
 
 #[test]
@@ -199,11 +202,11 @@ fn what_stays_without_a_partner_is_told_by_its_reason() {
         assert_eq!(found.samples.len(), 1);
         let expected = Unpaired {
             detections: 3,
-            outbid: u64::from(nearest),
+            fix_claimed_by_nearer_box: u64::from(nearest),
             fixes: if nearest { 3 } else { 2 },
             duplicates: 2,
             duplicate_fixes: 1,
-            unbound: 1,
+            receiver_missing: 1,
         };
         assert_eq!(found.unpaired, expected, "{rule:?}");
         assert_eq!((found.detections_without_fixes, found.fixes_without_detections), (1, 1));
@@ -226,18 +229,62 @@ fn a_fix_between_two_lies_on_their_line_across_the_antimeridian() {
 fn a_stream_without_partners_stays_bounded() {
     let settings = PairingSettings { items_per_target: 16, targets: 4, ..PairingSettings::default() };
     let mut pairer = Pairer::new(settings);
+    let mut released = 0;
     for index in 0..10_000 {
         let name = format!("target-{}", index % 50);
-        pairer.push_detection(detection(&name, 0.001 * f64::from(index)));
+        released += pairer.push_detection(detection(&name, 0.001 * f64::from(index)), ()).released.len();
         let fix = received(None, 0.001 * f64::from(index), 5.0);
-        pairer.push_fix(&target("lone"), fix.time, fix.fix);
+        released += pairer.push_fix(&target("lone"), fix.time, fix.fix, ()).released.len();
     }
-    assert!(pairer.lanes.len() <= 4);
-    assert!(pairer.lanes.values().all(|lane| lane.detections.len() <= 16 && lane.fixes.len() <= 16));
+    assert!(pairer.buffered().count() <= 4);
+    assert!(pairer.buffered().all(|(detections, fixes)| detections <= 16 && fixes <= 16));
     // Nothing is dropped: what gave way was decided, and is counted.
     let told = pairer.unpaired().detections + pairer.unpaired().fixes;
-    let kept: usize = pairer.lanes.values().map(|lane| lane.detections.len() + lane.fixes.len()).sum();
-    assert_eq!(told + kept as u64, 20_000);
+    let buffered: usize = pairer.buffered().map(|(detections, fixes)| detections + fixes).sum();
+    assert_eq!(told + buffered as u64, 20_000);
+    assert_eq!(released + buffered, 20_000, "every item is released once");
+}
+
+/// Boxes at 2 Hz and fixes at 1 Hz for two minutes, and what becomes of them by outcome.
+fn outcomes(change: impl Fn(usize, &mut Vec<(TargetId, Timestamp, Fix)>)) -> BTreeMap<ItemOutcome, usize> {
+    let mut pairer = Pairer::new(PairingSettings::default());
+    let mut outcomes = BTreeMap::new();
+    let mut count = |items: PairedItems<()>| {
+        for item in items.released {
+            *outcomes.entry(item.outcome).or_default() += 1;
+        }
+    };
+    for index in 0..240 {
+        let seconds = 0.5 * f64::from(index);
+        count(pairer.push_detection(detection("a", seconds), ()));
+        let mut fixes = Vec::new();
+        if index % 2 == 0 {
+            let received = received(None, seconds, 5.0);
+            fixes.push((target("a"), received.time, received.fix));
+        }
+        change(index as usize, &mut fixes);
+        for (target_id, time, fix) in fixes {
+            count(pairer.push_fix(&target_id, time, fix, ()));
+        }
+    }
+    count(pairer.end(&target("a")));
+    outcomes
+}
+
+#[test]
+fn a_fix_hours_ahead_makes_nothing_late() {
+    let undisturbed = outcomes(|_, _| {});
+    assert_eq!(undisturbed, BTreeMap::from([(ItemOutcome::Paired, 240), (ItemOutcome::Unpaired, 120)]));
+    let ahead = |index: usize, fixes: &mut Vec<(TargetId, Timestamp, Fix)>| {
+        // One in the middle, then a receiver that stays two hours ahead beside the right one.
+        if index == 50 || index > 100 {
+            let received = received(None, 7_200.0 + index as f64, 5.0);
+            fixes.push((target("a"), received.time, received.fix));
+        }
+    };
+    let disturbed = outcomes(ahead);
+    assert_eq!(disturbed[&ItemOutcome::Paired], 240, "{disturbed:?}");
+    assert!(!disturbed.contains_key(&ItemOutcome::TooLate), "{disturbed:?}");
 }
 
 proptest! {
@@ -271,14 +318,14 @@ proptest! {
         let mut samples = Vec::new();
         for (_, item) in items {
             let decided = match item {
-                Item::Box(it) => pairer.push_detection(it),
+                Item::Box(it) => pairer.push_detection(it, ()),
                 Item::Fix(it) => {
                     let receiver_id = it.receiver_id.as_ref().expect("named");
                     let (target_id, time) = Receivers::default().resolve(receiver_id, it.time);
-                    pairer.push_fix(&target_id, time, it.fix)
+                    pairer.push_fix(&target_id, time, it.fix, ())
                 }
             };
-            samples.extend(decided.into_iter().flat_map(|decided| decided.samples));
+            samples.extend(decided.samples);
         }
         let early = samples.len();
         samples.extend(pairer.finish());

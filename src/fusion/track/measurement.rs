@@ -64,11 +64,14 @@ pub enum RejectionReason {
     Duplicate,
     /// Its covariance is not positive definite.
     UnusableVariance,
+    /// It is farther than 20 km from the origin of the track's plane.
+    OutOfRange,
 }
 
 impl RejectionReason {
     /// All reasons.
-    pub const ALL: [Self; 4] = [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance];
+    pub const ALL: [Self; 5] =
+        [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance, Self::OutOfRange];
 
     /// Name in logs, metrics and wire formats.
     #[must_use]

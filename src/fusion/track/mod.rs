@@ -9,12 +9,10 @@
 //! not change the state by a single bit. What never happens here: clocks, I/O, pixels, degrees.
 
 mod gate;
-mod gnss_noise;
 mod imm_filter;
 mod measurement;
 mod mode_filter;
 mod settings;
-mod settings_estimation;
 mod state;
 #[cfg(test)]
 mod tests;
@@ -24,10 +22,8 @@ use std::collections::VecDeque;
 
 use jiff::Timestamp;
 
-pub use gnss_noise::{GnssNoiseEstimate, TimedResidual, estimate_gnss_noise};
 pub use measurement::{MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason};
-pub use settings::{GnssNoise, MotionModel, RegressionNoise, TrackSettings};
-pub use settings_estimation::traverses;
+pub use settings::{MotionModel, RegressionNoise, TrackSettings};
 pub use state::{Innovation, TrackState, Velocity};
 
 use self::gate::GateOutcome;

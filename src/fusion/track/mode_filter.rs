@@ -72,7 +72,7 @@ impl NoiseDecomposition {
     ) -> Self {
         let (bias, white_share) = match source {
             MeasurementSource::Fix => (GNSS_BIAS, settings.gnss.white_share),
-            MeasurementSource::Regressed => (CAMERA_BIAS, settings.regression.white_share),
+            MeasurementSource::Regressed => (CAMERA_BIAS, settings.regression.correlation.white_share),
         };
         Self {
             position: measured.position,
@@ -148,7 +148,8 @@ impl ModeFilter {
             (GNSS_BIAS, step_s / settings.gnss.time_constant_s),
             (
                 CAMERA_BIAS,
-                step_s / regression.time_constant_s + step_s * speed_m_s / regression.correlation_length_m,
+                step_s / regression.correlation.time_constant_s
+                    + step_s * speed_m_s / regression.correlation_length_m,
             ),
         ];
         for (bias, rate) in rates {

@@ -1,33 +1,14 @@
 //! Noise, motion and window parameters of a track.
 
-/// Smallest white share that a filter may use: below it the filter would attribute every change of
-/// the bias to the target's motion, and fixes cannot tell smaller values apart.
-pub(super) const MIN_WHITE_SHARE: f64 = 0.01;
-
-/// Temporal correlation of a receiver's error, whose variance is known: a white part plus a
-/// first-order Gauss-Markov bias.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct GnssNoise {
-    /// Share of the variance that is white, 0 to 1; the rest is the bias.
-    pub white_share: f64,
-    /// Time constant of the bias: its autocorrelation is `exp(-t / time_constant_s)`, s.
-    pub time_constant_s: f64,
-}
-
-impl Default for GnssNoise {
-    /// A phone in the open: nearly all of the error is a bias with a time constant of about 40 s.
-    fn default() -> Self {
-        Self { white_share: 0.02, time_constant_s: 40.0 }
-    }
-}
+use crate::domain::NoiseCorrelation;
+use crate::model::Regressor;
 
 /// Correlation in time and space of a regressed position's error, whose variance is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RegressionNoise {
-    /// Share of the variance that is white, 0 to 1; the rest is the bias of the camera's model.
-    pub white_share: f64,
-    /// Time constant of the bias while the target is stationary, s.
-    pub time_constant_s: f64,
+    /// Correlation over time while the target is stationary; the Gauss-Markov part is the bias of the
+    /// camera's model.
+    pub correlation: NoiseCorrelation,
     /// Travelled distance over which the bias decorrelates to 1/e, m: the model's error depends on
     /// the place.
     pub correlation_length_m: f64,
@@ -40,8 +21,7 @@ pub struct RegressionNoise {
 impl Default for RegressionNoise {
     fn default() -> Self {
         Self {
-            white_share: 0.3,
-            time_constant_s: 300.0,
+            correlation: NoiseCorrelation { white_share: 0.3, time_constant_s: 300.0 },
             correlation_length_m: 10.0,
             detector_correlation_s: 0.5,
         }
@@ -91,7 +71,7 @@ impl Default for MotionModel {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackSettings {
     /// Noise of the receiver.
-    pub gnss: GnssNoise,
+    pub gnss: NoiseCorrelation,
     /// Noise of the camera's model.
     pub regression: RegressionNoise,
     /// Motion of the target.
@@ -111,7 +91,7 @@ pub struct TrackSettings {
 impl Default for TrackSettings {
     fn default() -> Self {
         Self {
-            gnss: GnssNoise::default(),
+            gnss: NoiseCorrelation::PHONE,
             regression: RegressionNoise::default(),
             motion: MotionModel::default(),
             // Rejects one consistent measurement in 2,000.
@@ -120,6 +100,24 @@ impl Default for TrackSettings {
             window_s: 3.0,
             window_items: 128,
             time_to_live_s: 60.0,
+        }
+    }
+}
+
+impl TrackSettings {
+    /// The settings with the noise model that was estimated with a camera's model; the defaults for a model
+    /// of an earlier format without it.
+    #[must_use]
+    pub fn from_model(regressor: &Regressor) -> Self {
+        let Some(noise) = regressor.track_noise() else { return Self::default() };
+        Self {
+            gnss: noise.gnss,
+            regression: RegressionNoise {
+                correlation: noise.regression,
+                correlation_length_m: noise.regression_length_m,
+                ..RegressionNoise::default()
+            },
+            ..Self::default()
         }
     }
 }

@@ -4,8 +4,13 @@ use jiff::SignedDuration;
 use proptest::prelude::*;
 
 use super::*;
+use crate::domain::{GnssError, NoiseCorrelation, Recipe};
 use crate::geo::EastNorth;
-use crate::simulation::{PositionNoise, SimulatedPositions, Walk, at_s, standard_normal, stream};
+use crate::model::{FitOptions, TimedResidual, estimate_gnss_noise, fit};
+use crate::simulation::{
+    Options, PositionNoise, SimulatedPositions, Walk, at_s, simulate as simulate_world, standard_normal,
+    stream,
+};
 
 /// Both positions of an instant, with the covariances that the simulation has.
 fn measurement(walk: &Walk, positions: &SimulatedPositions) -> Measurement {
@@ -26,7 +31,7 @@ fn simulate(walk: &Walk, seed: u64, seconds: u32) -> Vec<(EastNorth, Measurement
 
 /// Means over the steps of some runs; counts of rejections and steps.
 #[derive(Default, Debug)]
-struct Summary {
+struct RunSummary {
     error_m: f64,
     gnss_error_m: f64,
     two_step_error_m: f64,
@@ -37,8 +42,8 @@ struct Summary {
     steps: f64,
 }
 
-fn run(settings: TrackSettings, walk: &Walk, seeds: std::ops::Range<u64>, seconds: u32) -> Summary {
-    let mut summary = Summary::default();
+fn run(settings: TrackSettings, walk: &Walk, seeds: std::ops::Range<u64>, seconds: u32) -> RunSummary {
+    let mut summary = RunSummary::default();
     for seed in seeds {
         let measurements = simulate(walk, seed, seconds);
         let mut track = Track::start(settings, &measurements[0].1).expect("has both");
@@ -132,14 +137,15 @@ fn the_estimated_noise_improves_tracks_of_white_and_of_correlated_receivers() {
             .collect();
         let e_regression_m2 = walk.regression.sigma_m.powi(2);
         let estimate =
-            estimate_gnss_noise(&traverses, e_regression_m2, &RegressionNoise::default()).expect("enough");
+            estimate_gnss_noise(&traverses, e_regression_m2, &RegressionNoise::default().correlation)
+                .expect("enough");
         println!("{estimate:?}");
-        assert!((estimate.noise.white_share - walk.gnss.white_share).abs() < 0.1, "{estimate:?}");
+        assert!((estimate.correlation.white_share - walk.gnss.white_share).abs() < 0.1, "{estimate:?}");
         assert!((estimate.variance_m2.sqrt() / walk.gnss.sigma_m - 1.0).abs() < 0.15, "{estimate:?}");
-        let informed = TrackSettings { gnss: estimate.noise, ..TrackSettings::default() };
+        let informed = TrackSettings { gnss: estimate.correlation, ..TrackSettings::default() };
         let wrong_share = 1.0 - walk.gnss.white_share;
         let misled = TrackSettings {
-            gnss: GnssNoise { white_share: wrong_share, time_constant_s: 40.0 },
+            gnss: NoiseCorrelation { white_share: wrong_share, time_constant_s: 40.0 },
             ..TrackSettings::default()
         };
         let (right, wrong) = (run(informed, &walk, 0..10, 400), run(misled, &walk, 0..10, 400));
@@ -158,8 +164,8 @@ fn residual(measurement: &Measurement) -> TimedResidual {
 fn too_few_residuals_give_no_estimate() {
     let walk = simulate(&Walk::pedestrian(), 1, 20);
     let traverse: Vec<TimedResidual> = walk.iter().map(|(_, it)| residual(it)).collect();
-    assert!(estimate_gnss_noise(&[traverse], 0.5, &RegressionNoise::default()).is_none());
-    assert!(estimate_gnss_noise(&[], 0.5, &RegressionNoise::default()).is_none());
+    assert!(estimate_gnss_noise(&[traverse], 0.5, &RegressionNoise::default().correlation).is_none());
+    assert!(estimate_gnss_noise(&[], 0.5, &RegressionNoise::default().correlation).is_none());
 }
 
 #[test]
@@ -275,7 +281,9 @@ fn the_first_steps_of_a_stationary_target_are_accepted() {
         fix: None,
         regressed: Some(MeasuredPosition::isotropic(EastNorth { east_m, north_m: 0.0 }, 0.1)),
     };
-    let regression = RegressionNoise { white_share: 0.1, ..RegressionNoise::default() };
+    let default = RegressionNoise::default();
+    let correlation = NoiseCorrelation { white_share: 0.1, ..default.correlation };
+    let regression = RegressionNoise { correlation, ..default };
     let settings = TrackSettings { regression, ..TrackSettings::default() };
     let mut track = Track::start(settings, &regressed_at(0, 0.0)).expect("a position");
     for second in 1..40 {
@@ -374,4 +382,23 @@ fn past_states_within_the_window_are_reproduced() {
         assert_eq!(again.position, state.position);
         assert_eq!(again.covariance, state.covariance);
     }
+}
+
+#[test]
+fn settings_are_those_of_the_model_and_the_defaults_for_an_earlier_format() {
+    let train = simulate_world(&Options { samples: 400, ..Options::demo() }).training_samples();
+    let options = FitOptions {
+        recipe: Recipe::Hybrid,
+        seed: 1,
+        epochs: Some(5),
+        image_size: None,
+        gnss_error: GnssError::Unknown,
+    };
+    let mut artifact =
+        fit(&train, &options, &mut |_| std::ops::ControlFlow::Continue(())).expect("usable samples");
+    let fitted = TrackSettings::from_model(&artifact.load().expect("a model"));
+    assert_ne!(fitted, TrackSettings::default());
+    artifact.metadata.parameters.retain(|name, _| !name.starts_with("track_"));
+    let earlier = TrackSettings::from_model(&artifact.load().expect("a model"));
+    assert_eq!(earlier, TrackSettings::default());
 }

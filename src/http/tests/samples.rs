@@ -14,7 +14,10 @@ fn rows(count: u32) -> String {
 async fn every_format_is_imported_and_exported() {
     let rest = Rest::with_camera().await;
     let imported = rest.csv(SAMPLES, rows(2_500)).await.expect(200).json();
-    assert_eq!(imported, json!({"accepted": 2500, "duplicate": 0, "rejected": 0, "rejected_rows": []}));
+    assert_eq!(
+        imported,
+        json!({"accepted": 2500, "duplicate": 0, "rejected": 0, "rejected_rows": [], "durability": "synced"})
+    );
     for (media_type, lines) in [("text/csv", 2_501), ("application/x-ndjson", 2_500)] {
         let export = rest.send("GET", SAMPLES, &[("accept", media_type)], Body::empty()).await.expect(200);
         assert_eq!(export.header("content-type"), media_type);

@@ -16,6 +16,7 @@ use crate::domain::{Error, FeatureScale, ModelMetadata, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 pub use self::tensors::LARGEST_WEIGHTS_BYTES;
+pub(crate) use self::track_noise::LEAST_GNSS_WHITE_SHARE;
 pub use self::track_noise::TrackNoiseModel;
 
 /// Version of the metadata document.

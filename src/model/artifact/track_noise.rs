@@ -1,26 +1,23 @@
-//! How the errors of receiver and model are correlated over time and ground, for tracks: scalars of a
+//! The correlation of the errors of receiver and model over time and ground, for tracks: scalars of a
 //! model's metadata.
 
-use std::collections::BTreeMap;
-
 use super::ModelParts;
-use crate::domain::Result;
+use crate::domain::{NoiseCorrelation, Result};
 
-/// Autocorrelation of the errors of receiver and model, whose variances are stated elsewhere.
+/// Correlation of the errors of receiver and model, whose variances are stated elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackNoiseModel {
-    /// White share of the receiver's error variance, 0 to 1; the rest is a Gauss-Markov process.
-    pub gnss_white_share: f64,
-    /// Time in which the correlation of that process falls to 1/e, s.
-    pub gnss_time_constant_s: f64,
-    /// White share of the model's error variance, 0 to 1; the rest is a Gauss-Markov process of time and
-    /// distance.
-    pub regression_white_share: f64,
-    /// Time in which the correlation of that process falls to 1/e for a stationary target, s.
-    pub regression_time_constant_s: f64,
-    /// Distance over which it falls to 1/e, m.
+    /// Of the receiver's error.
+    pub gnss: NoiseCorrelation,
+    /// Of the model's error while the target is stationary.
+    pub regression: NoiseCorrelation,
+    /// Distance over which the correlation of the model's error falls to 1/e, m.
     pub regression_length_m: f64,
 }
+
+/// Least white share of a receiver's error: below it a filter would attribute every change of the bias to the
+/// target's motion, and fixes cannot distinguish smaller values.
+pub(crate) const LEAST_GNSS_WHITE_SHARE: f64 = 0.01;
 
 const NAMES: [&str; 5] = [
     "track_gnss_white_share",
@@ -31,16 +28,18 @@ const NAMES: [&str; 5] = [
 ];
 
 impl TrackNoiseModel {
-    /// Adds the scalars to a model's metadata.
-    pub fn write(&self, parameters: &mut BTreeMap<String, f64>) {
+    /// Adds the scalars to the parts of a model.
+    pub(crate) fn put(&self, parts: &mut ModelParts) {
         let values = [
-            self.gnss_white_share,
-            self.gnss_time_constant_s,
-            self.regression_white_share,
-            self.regression_time_constant_s,
+            self.gnss.white_share,
+            self.gnss.time_constant_s,
+            self.regression.white_share,
+            self.regression.time_constant_s,
             self.regression_length_m,
         ];
-        parameters.extend(NAMES.map(str::to_owned).into_iter().zip(values));
+        for (name, value) in NAMES.into_iter().zip(values) {
+            parts.set(name, value);
+        }
     }
 
     /// The scalars of a model's metadata; `None` in an earlier format, which has none of them.
@@ -51,12 +50,17 @@ impl TrackNoiseModel {
         if !NAMES.iter().any(|name| parts.parameters.contains_key(*name)) {
             return Ok(None);
         }
+        let [gnss_share, gnss_constant, regression_share, regression_constant, regression_length] = NAMES;
         Ok(Some(Self {
-            gnss_white_share: parts.parameter(NAMES[0])?.clamp(0.0, 1.0),
-            gnss_time_constant_s: parts.positive_parameter(NAMES[1])?,
-            regression_white_share: parts.parameter(NAMES[2])?.clamp(0.0, 1.0),
-            regression_time_constant_s: parts.positive_parameter(NAMES[3])?,
-            regression_length_m: parts.positive_parameter(NAMES[4])?,
+            gnss: NoiseCorrelation {
+                white_share: parts.parameter(gnss_share)?.clamp(LEAST_GNSS_WHITE_SHARE, 1.0),
+                time_constant_s: parts.positive_parameter(gnss_constant)?,
+            },
+            regression: NoiseCorrelation {
+                white_share: parts.parameter(regression_share)?.clamp(0.0, 1.0),
+                time_constant_s: parts.positive_parameter(regression_constant)?,
+            },
+            regression_length_m: parts.positive_parameter(regression_length)?,
         }))
     }
 }

@@ -34,7 +34,7 @@ const WHITE_PER_JITTER_VARIANCE: f64 = 20.0;
 const NUMERATOR_SIGMA: f64 = 10.0;
 const DENOMINATOR_SIGMA: f64 = 0.7;
 const SIZE_SIGMA: f64 = 0.3;
-/// The same of a coefficient that is not part of the form: it stays at 0.
+/// The same of a coefficient that is not part of the form: it remains at 0.
 const EXCLUDED_SIGMA: f64 = 1e-6;
 
 /// The terms that a fit may use.

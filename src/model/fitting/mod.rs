@@ -2,8 +2,11 @@
 //! to all samples.
 
 mod candidates;
+mod gnss_noise;
 mod held_out;
 mod pipeline;
 mod report;
+mod track_noise;
 
+pub use self::gnss_noise::{TimedResidual, estimate_gnss_noise};
 pub use self::pipeline::{FitOptions, FitOverrides, fit, fit_with};

@@ -12,6 +12,7 @@ use super::held_out::{choose, cross_validate};
 use super::report::{
     coverage_of_fixes, held_out_error, mean_variance_m2, note_choice, note_errors, note_samples,
 };
+use super::track_noise::estimate_track_noise;
 use crate::domain::{
     CandidateReport, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError, ImageSize,
     ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
@@ -22,6 +23,7 @@ use crate::model::encoder::projection_fit::ParameterCovariance;
 use crate::model::encoder::projective::{GeometricCovariance, fit_geometry};
 use crate::model::network::LossWeights;
 use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
+use crate::model::regressor::Regressor;
 use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRows, sha256_of};
 use crate::model::uncertainty::calibration::{HeldOut, calibrate};
 use crate::model::uncertainty::error_model::set_image_size;
@@ -93,10 +95,13 @@ pub fn fit_with(
     };
     let mut run = FitRun { observer, progress: RunProgress::default() };
     let chosen = select(&rows, &context, &selected(options.recipe, overrides.candidate)?, &mut run)?;
-    let fit = FinalFit { rows: &rows, context: &context, options, e_gnss_source };
+    let fit = FinalFit { samples, rows: &rows, context: &context, options, e_gnss_source };
     let (parts, held_out) = fit.run(&chosen, geometry.covariance, &mut run)?;
     note_errors(&held_out, &parts, &mut run)?;
-    artifact_of(parts, samples, &fit, chosen, held_out)
+    let artifact = artifact_of(parts, &fit, chosen, held_out)?;
+    // A model that does not pass the checks of every loaded model must not be stored.
+    artifact.load().map_err(FitError::Unusable)?;
+    Ok(artifact)
 }
 
 /// The candidates of a recipe, or the one of that name.
@@ -184,6 +189,7 @@ fn select(
 
 /// The fit of the chosen candidate to all rows.
 struct FinalFit<'a> {
+    samples: &'a [Sample],
     rows: &'a TrainingRows,
     context: &'a FitContext,
     options: &'a FitOptions,
@@ -198,7 +204,7 @@ impl FinalFit<'_> {
         geometry: ParameterCovariance,
         run: &mut FitRun<'_>,
     ) -> Result<(ModelParts, HeldOutError), FitError> {
-        let Self { rows, context, options, e_gnss_source } = self;
+        let Self { samples, rows, context, options, e_gnss_source } = self;
         let rng = ChaCha8Rng::seed_from_u64(options.seed);
         let loss_weights = context.loss_weights;
         let mut phase = Phase { run, name: "final fit".to_owned(), rng, is_final: true, loss_weights };
@@ -221,17 +227,18 @@ impl FinalFit<'_> {
         }
         let mut parts = fitted.parts;
         parts.set("fix_scatter_m2", context.noise.variance_m2);
-        parts.set("fix_white_share", context.noise.white_share);
-        parts.set("fix_time_constant_s", context.noise.time_constant_s);
+        parts.set("fix_white_share", context.noise.correlation.white_share);
+        parts.set("fix_time_constant_s", context.noise.correlation.time_constant_s);
         parts.set("labels_smoothed", f64::from(u8::from(candidate.is_smoothed())));
+        let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
+        estimate_track_noise(samples, &regressor).put(&mut parts);
         Ok((parts, held_out))
     }
 }
 
 fn artifact_of(
     parts: ModelParts,
-    samples: &[Sample],
-    FinalFit { rows, context, options, e_gnss_source }: &FinalFit<'_>,
+    FinalFit { samples, rows, context, options, e_gnss_source }: &FinalFit<'_>,
     Chosen { candidate, reports, .. }: Chosen,
     held_out: HeldOutError,
 ) -> Result<Artifact, FitError> {

@@ -2,7 +2,7 @@
 
 use super::candidates::{Candidate, FitContext};
 use super::held_out::HeldOutResiduals;
-use crate::domain::{GaussMarkovNoise, HeldOutError};
+use crate::domain::{GaussMarkovNoise, HeldOutError, NoiseCorrelation};
 use crate::model::artifact::ModelParts;
 use crate::model::progress::{FitError, FitRun};
 use crate::model::regressor::Regressor;
@@ -16,7 +16,8 @@ pub(super) fn note_samples(
     context: &FitContext,
     run: &mut FitRun<'_>,
 ) -> Result<(), FitError> {
-    let GaussMarkovNoise { white_share, time_constant_s, variance_m2 } = context.noise;
+    let GaussMarkovNoise { variance_m2, correlation } = context.noise;
+    let NoiseCorrelation { white_share, time_constant_s } = correlation;
     run.note(&format!(
         "{} samples of {} targets in {} passes; the receiver's sigma is {:.2} m per axis",
         rows.rows.len(),
@@ -24,17 +25,17 @@ pub(super) fn note_samples(
         rows.traverses,
         context.e_gnss_m2.sqrt()
     ))?;
-    let correlation = if white_share < 1.0 {
+    let over_time = if white_share < 1.0 {
         let coloured = 100.0 * (1.0 - white_share);
         format!("{coloured:.0} % of the variance has a correlation time of about {time_constant_s:.0} s")
     } else {
         "independent from fix to fix".to_owned()
     };
     run.note(&format!(
-        "about the geometric map the fixes scatter by {:.2} m per axis, {correlation}; the effective sample \
+        "about the geometric map the fixes scatter by {:.2} m per axis, {over_time}; the effective sample \
          size is {:.0}",
         variance_m2.sqrt(),
-        effective_sample_size(&rows.rows, &context.noise)
+        effective_sample_size(&rows.rows, &correlation)
     ))
 }
 

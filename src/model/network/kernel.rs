@@ -1,7 +1,7 @@
 //! Loss and gradient of a minibatch in explicit vector code.
 //!
 //! Units are rows and samples are lanes, so that every inner loop runs over whole vectors; a tile of
-//! [`LANES`] samples stays in the first-level cache through all layers. Nothing is allocated per batch.
+//! [`LANES`] samples remains in the first-level cache through all layers. Nothing is allocated per batch.
 //! Vector operations are not wrapped in closures: a closure is compiled for the baseline instruction set
 //! and called once per operation.
 

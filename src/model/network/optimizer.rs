@@ -51,9 +51,10 @@ impl Adam {
         let flush = |moment: f32| if moment.abs() < Self::FLUSH { 0.0 } else { moment };
         pulp::Arch::new().dispatch(|| {
             let moments = self.first.iter_mut().zip(&mut self.second);
-            for ((parameter, slope), (first, second)) in parameters.iter_mut().zip(gradient).zip(moments) {
-                *first = flush(beta_1 * *first + (1.0 - beta_1) * slope);
-                *second = flush(beta_2 * *second + (1.0 - beta_2) * slope * slope);
+            for ((parameter, derivative), (first, second)) in parameters.iter_mut().zip(gradient).zip(moments)
+            {
+                *first = flush(beta_1 * *first + (1.0 - beta_1) * derivative);
+                *second = flush(beta_2 * *second + (1.0 - beta_2) * derivative * derivative);
                 *parameter -= rate * *first / (second.sqrt() + 1e-8);
             }
         });

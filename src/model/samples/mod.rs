@@ -2,5 +2,6 @@
 
 pub(crate) mod rows;
 pub(crate) mod second_differences;
+pub(crate) mod sequences;
 pub(crate) mod target_groups;
 pub(crate) mod whitening;

@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::target_groups::{MIN_TARGETS, groups_of_targets};
 use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, Result, Sample};
-use crate::filters::{FixError, smooth_traverse, tune_acceleration};
+use crate::filters::{Traverse, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::statistics::{median, std_dev};
 
@@ -25,8 +25,6 @@ pub(crate) const HELD_OUT_BLOCKS: u32 = 4;
 const TRAVERSE_GAP_S: f64 = 3.0;
 /// The same in median intervals between samples.
 const GAP_INTERVALS: f64 = 10.0;
-/// Least standard deviation of the fixes' white noise for the smoother, m.
-const LEAST_WHITE_SIGMA_M: f64 = 0.01;
 
 /// One training sample.
 #[derive(Debug, Clone, Copy)]
@@ -182,18 +180,13 @@ impl TrainingRows {
 
     /// The same rows with the fixes of each traverse smoothed by a kinematic smoother as labels.
     pub(crate) fn smoothed(&self, noise: &GaussMarkovNoise) -> Self {
-        let error = FixError {
-            white_m: noise.white_variance_m2().sqrt().max(LEAST_WHITE_SIGMA_M),
-            coloured_m: noise.coloured_variance_m2().sqrt(),
-            time_constant_s: noise.time_constant_s,
-        };
-        let traverses: Vec<(Vec<f64>, Vec<EastNorth>)> = traverses(&self.rows)
+        let traverses: Vec<Traverse> = traverses(&self.rows)
             .map(|traverse| traverse.iter().map(|row| (row.time_s, row.label)).unzip())
             .collect();
-        let acceleration_mps2 = tune_acceleration(&traverses, &error);
+        let acceleration_m_s2 = tune_acceleration(&traverses, noise);
         let labels = traverses
             .iter()
-            .flat_map(|(times_s, fixes)| smooth_traverse(times_s, fixes, &error, acceleration_mps2));
+            .flat_map(|(times_s, fixes)| smooth_traverse(times_s, fixes, noise, acceleration_m_s2));
         let mut smoothed = self.clone();
         for (row, label) in smoothed.rows.iter_mut().zip(labels) {
             row.label = label.position;

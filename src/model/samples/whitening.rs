@@ -8,7 +8,7 @@
 //! `s[k]`, and the residuals' log-likelihood is `-1/2 sum(v^2 / s + ln s)` (Schweppe 1965).
 
 use super::rows::{TrainingRow, traverses};
-use crate::domain::GaussMarkovNoise;
+use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 
 /// Candidates of the time constant, s.
 const TIME_CONSTANTS_S: [f64; 5] = [5.0, 15.0, 40.0, 100.0, 250.0];
@@ -31,8 +31,7 @@ pub(crate) fn fit_noise(
     let coloured = TIME_CONSTANTS_S.iter().flat_map(|time_constant_s| {
         WHITE_SHARES.iter().map(|white_share| GaussMarkovNoise {
             variance_m2: 1.0,
-            white_share: *white_share,
-            time_constant_s: *time_constant_s,
+            correlation: NoiseCorrelation { white_share: *white_share, time_constant_s: *time_constant_s },
         })
     });
     for candidate in std::iter::once(unit).chain(coloured) {
@@ -57,7 +56,7 @@ pub(crate) fn fit_noise(
 }
 
 /// The number of independent fixes per axis that has the same information about a constant as the rows.
-pub(crate) fn effective_sample_size(rows: &[TrainingRow], noise: &GaussMarkovNoise) -> f64 {
+pub(crate) fn effective_sample_size(rows: &[TrainingRow], noise: &NoiseCorrelation) -> f64 {
     let coloured_share = 1.0 - noise.white_share;
     let mut sum = 0.0;
     for traverse in traverses(rows) {
@@ -97,7 +96,7 @@ impl Whitener {
         let (mut state_variance_m2, mut log_determinant) = (coloured_m2, 0.0);
         for (at, row) in rows.iter().enumerate() {
             let same = at > 0 && rows[at - 1].target == row.target;
-            let decay = if same { noise.decay(row.time_s - rows[at - 1].time_s) } else { 0.0 };
+            let decay = if same { noise.correlation.decay(row.time_s - rows[at - 1].time_s) } else { 0.0 };
             state_variance_m2 = decay * decay * state_variance_m2 + (1.0 - decay * decay) * coloured_m2;
             let innovation_variance_m2 = state_variance_m2 + white_m2 + inflation[at] * noise.variance_m2;
             let gain = state_variance_m2 / innovation_variance_m2;
@@ -150,7 +149,7 @@ mod tests {
             target: (at / 2000) as u32,
             traverse: (at / 2000) as u32,
             bounding_box: BoundingBox::new(0.0, 0.0, 1.0, 1.0).expect("a box"),
-            position: Position::new(0.0, 0.0).expect("a place"),
+            position: Position::new(0.0, 0.0).expect("a position"),
             label: EastNorth::default(),
             stated_variance_m2: None,
         };
@@ -166,8 +165,11 @@ mod tests {
     fn coloured_residuals_are_whitened_to_unit_variance() {
         let rows = rows(8000);
         let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let truth = GaussMarkovNoise { variance_m2: 4.0, white_share: 0.1, time_constant_s: 40.0 };
-        let decay = (-1.0 / truth.time_constant_s).exp();
+        let truth = GaussMarkovNoise {
+            variance_m2: 4.0,
+            correlation: NoiseCorrelation { white_share: 0.1, time_constant_s: 40.0 },
+        };
+        let decay = truth.correlation.decay(1.0);
         let mut column = || {
             let mut state = 0.0;
             let mut values = Vec::new();
@@ -181,8 +183,8 @@ mod tests {
         let residuals = [column(), column()];
         let inflation = vec![0.0; rows.len()];
         let fitted = fit_noise(&rows, &residuals, &inflation);
-        assert!((15.0..=100.0).contains(&fitted.time_constant_s), "{fitted:?}");
-        assert!((0.03..=0.25).contains(&fitted.white_share), "{fitted:?}");
+        assert!((15.0..=100.0).contains(&fitted.correlation.time_constant_s), "{fitted:?}");
+        assert!((0.03..=0.25).contains(&fitted.correlation.white_share), "{fitted:?}");
         assert!((2.5..=6.0).contains(&fitted.variance_m2), "{fitted:?}");
         let mut whitened = residuals[0].clone();
         Whitener::new(&rows, &truth, &inflation).apply(&mut whitened);

@@ -30,7 +30,7 @@ fn candle_layers(shape: &NetShape, flat: &Tensor) -> Vec<Linear> {
         .collect()
 }
 
-/// Outputs of the middle and of the last layer, for rows of inputs.
+/// Outputs of the bottleneck and of the last layer, for rows of inputs.
 fn candle_forward(shape: &NetShape, flat: &Tensor, inputs: &Tensor) -> (Tensor, Tensor) {
     let mut units = inputs.clone();
     let mut bottleneck = None;

@@ -83,7 +83,7 @@ pub(crate) fn calibrate(
         .with_edge_noise(edge_noise_px2(rows, &encoded, &centres, &local_boxes));
     let coverage = coverage.with_errors(components.nominal_errors_m2(&centres));
     let error_m2 = centres.mean(coverage.errors_m2());
-    let effective_size = effective_sample_size(rows, noise);
+    let effective_size = effective_sample_size(rows, &noise.correlation);
     components.set(parts, &centres, error_m2);
     parts.error_scale = centres.mean(centres.height_m2.iter().copied()).clamp(1e-9, 1e9);
     parts.set("reconstruction_usual", nominal_reconstruction_error(rows, &encoded));

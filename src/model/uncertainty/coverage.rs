@@ -3,7 +3,7 @@
 //! A box is a point `z = (foot_x, foot_y, ln width, ln height)`, each coordinate divided by its unit. Up to
 //! 64 training boxes are chosen as centres by farthest-point sampling (Gonzalez 1985), whose covering
 //! radius `rho` is at most twice the optimum: every training box is within `rho` of a centre. The distance
-//! of a box from the nearest centre in units of `rho` is at most 1 for training boxes and tells how far a
+//! of a box from the nearest centre in units of `rho` is at most 1 for training boxes and measures how far a
 //! box extrapolates. The error variance at a box is interpolated between the centres by inverse distance
 //! weighting (Shepard 1968) with the exponent 4.
 

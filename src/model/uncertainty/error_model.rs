@@ -1,4 +1,4 @@
-//! The error variance of one box: the nominal variance at its place, and the excess of an atypical box.
+//! The error variance of one box: the nominal variance at its position in the image, and the excess of an atypical box.
 //!
 //! ```text
 //! variance = nominal * border * (1 + e^2) + factor * min(excess, limit) + max(excess - limit, 0)

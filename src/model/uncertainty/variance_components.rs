@@ -75,7 +75,7 @@ pub(super) fn between_session_m2(rows: &[TrainingRow], own: &[Residual], noise: 
         // The rows of a traverse are adjacent again.
         session.sort_unstable();
         let session_rows: Vec<TrainingRow> = session.iter().map(|index| rows[*index]).collect();
-        let size = effective_sample_size(&session_rows, noise);
+        let size = effective_sample_size(&session_rows, &noise.correlation);
         if size < LEAST_SESSION_SIZE {
             continue;
         }

@@ -31,10 +31,11 @@ fn full(name: &str) -> NewCamera {
 }
 
 #[tokio::test]
-async fn a_profile_comes_back_as_it_was_given() {
+async fn a_profile_is_read_as_it_was_stored() {
     let Fixture { store, folder: _folder, .. } = Fixture::new().await;
     let made = store.insert_camera(&full("gate"), at(5)).await.expect("new");
     let expected = Camera {
+        key: made.key,
         profile: full("gate"),
         revision: Revision(1),
         created_at: at(5),
@@ -83,7 +84,7 @@ async fn a_change_needs_the_revision_it_was_made_from() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn of_changes_at_once_from_one_revision_one_wins() {
+async fn one_of_several_concurrent_changes_of_one_revision_succeeds() {
     let Fixture { store, folder: _folder, .. } = Fixture::new().await;
     let attempts: Vec<_> = (0..8)
         .map(|_| {
@@ -102,7 +103,7 @@ async fn of_changes_at_once_from_one_revision_one_wins() {
 }
 
 #[tokio::test]
-async fn a_deleted_camera_takes_all_along_and_its_name_starts_anew() {
+async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     store
         .insert_samples(&camera, vec![sample(1, "a"), sample(2, "a")], Durability::Synced)

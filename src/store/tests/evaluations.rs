@@ -101,7 +101,7 @@ async fn an_evaluation_goes_from_queue_to_report() {
 }
 
 #[tokio::test]
-async fn a_worker_that_stopped_beating_can_report_nothing_more() {
+async fn a_worker_without_a_lease_cannot_store_a_report() {
     let fixture = Fixture::new().await;
     fixture.queue_evaluation(1).await;
     let old = fixture.claim_evaluation(2).await;
@@ -109,7 +109,7 @@ async fn a_worker_that_stopped_beating_can_report_nothing_more() {
     assert!(fixture.store.claim_evaluation(LEASE, at(32)).await.expect("works").is_none(), "the lease holds");
     let new = fixture.claim_evaluation(33).await;
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
-    assert_eq!(new.job.progress, EvaluationProgress::default(), "its progress begins anew");
+    assert_eq!(new.job.progress, EvaluationProgress::default(), "its progress is reset");
     assert_eq!(fixture.heartbeat_evaluation(old.fence, 34).await, Heartbeat::Lost);
     assert_eq!(fixture.store.evaluation(nth(1)).await.expect("known").progress, new.job.progress);
     assert!(fixture.finish_evaluation(old.fence, success()).await.is_none());

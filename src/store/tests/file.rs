@@ -112,3 +112,16 @@ async fn an_open_store_answers() {
     let fixture = Fixture::new().await;
     fixture.store.ping().await.expect("answers");
 }
+
+#[tokio::test]
+async fn slow_reads_do_not_keep_a_health_check_waiting() {
+    let Fixture { store, .. } = Fixture::new().await;
+    let mut held = Vec::new();
+    while let Some(reader) = store.readers().try_acquire() {
+        held.push(reader);
+    }
+    while held.len() < store.readers().options().get_max_connections() as usize {
+        held.push(store.readers().acquire().await.expect("a reader"));
+    }
+    store.ping().await.expect("a connection of its own");
+}

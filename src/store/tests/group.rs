@@ -14,13 +14,13 @@ fn call(store: &Store, camera: &CameraId, samples: Vec<Sample>) -> Call {
     tokio::spawn(async move { store.insert_samples(&camera, samples, Durability::Synced).await })
 }
 
-/// Lets the writer go once all but the first of so many calls wait in the queue: they share the
-/// next transaction with it.
-async fn release(store: &Store, turn: WriterGuard<'_>, calls: usize) {
+/// Releases the writer once all but the first of so many calls are queued: they share the next
+/// transaction with it.
+async fn release(store: &Store, writer: WriterGuard<'_>, calls: usize) {
     while store.inner.samples.waiting() + 1 < calls {
         tokio::task::yield_now().await;
     }
-    drop(turn);
+    drop(writer);
 }
 
 async fn count(store: &Store, camera: &CameraId) -> u64 {
@@ -31,7 +31,7 @@ async fn count(store: &Store, camera: &CameraId) -> u64 {
 async fn callers_of_one_transaction_are_each_counted_right() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     store.insert_samples(&camera, vec![sample(0, "old")], Durability::Synced).await.expect("stored");
-    let turn = store.relaxed().await.expect("a turn");
+    let writer = store.relaxed().await.expect("the writer");
     let calls = vec![
         call(&store, &camera, vec![sample(1, "a")]),
         call(&store, &camera, vec![sample(1, "a")]),
@@ -41,7 +41,7 @@ async fn callers_of_one_transaction_are_each_counted_right() {
         call(&store, &camera, (3..1500).map(|second| sample(second, "a")).collect()),
         call(&store, &camera, vec![sample(1499, "a"), sample(1500, "a"), sample(1500, "a")]),
     ];
-    release(&store, turn, calls.len()).await;
+    release(&store, writer, calls.len()).await;
     let mut answers = Vec::new();
     for call in calls {
         answers.push(call.await.expect("no panic").map_err(|error| error.kind()));
@@ -66,13 +66,13 @@ async fn a_row_that_fails_fails_only_its_caller() {
              BEGIN SELECT RAISE(ABORT, 'poisoned'); END",
         )
         .await;
-    let turn = store.relaxed().await.expect("a turn");
+    let writer = store.relaxed().await.expect("the writer");
     let calls = vec![
         call(store, camera, vec![sample(1, "a")]),
         call(store, camera, vec![sample(2, "a"), sample(2, "poison")]),
         call(store, camera, vec![sample(3, "a"), sample(4, "a")]),
     ];
-    release(store, turn, calls.len()).await;
+    release(store, writer, calls.len()).await;
     let mut accepted = Vec::new();
     for call in calls {
         accepted.push(
@@ -84,16 +84,16 @@ async fn a_row_that_fails_fails_only_its_caller() {
 }
 
 #[tokio::test]
-async fn callers_who_go_away_do_not_disturb_the_others() {
+async fn cancelled_callers_do_not_disturb_the_others() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    let turn = store.relaxed().await.expect("a turn");
+    let writer = store.relaxed().await.expect("the writer");
     let gone = call(&store, &camera, vec![sample(1, "a")]);
     let stays = call(&store, &camera, vec![sample(2, "a")]);
     while store.inner.samples.waiting() + 1 < 2 {
         tokio::task::yield_now().await;
     }
     gone.abort();
-    drop(turn);
+    drop(writer);
     assert_eq!(stays.await.expect("no panic").expect("stored").accepted, 1);
     assert_eq!(
         store
@@ -106,11 +106,11 @@ async fn callers_who_go_away_do_not_disturb_the_others() {
 }
 
 #[tokio::test]
-async fn a_change_dropped_half_way_leaves_nothing_and_holds_nobody_up() {
+async fn a_dropped_transaction_is_rolled_back_and_releases_the_writer() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     {
-        let mut turn = store.synced().await.expect("a turn");
-        let mut transaction = turn.begin().await.expect("begins");
+        let mut writer = store.synced().await.expect("the writer");
+        let mut transaction = writer.begin().await.expect("begins");
         sqlx::query("DELETE FROM cameras").execute(&mut *transaction).await.expect("deletes");
     }
     assert_eq!(
@@ -125,15 +125,15 @@ async fn a_change_dropped_half_way_leaves_nothing_and_holds_nobody_up() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn many_callers_at_once_lose_and_double_nothing() {
+async fn concurrent_callers_lose_and_duplicate_nothing() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    // Every key is handed in by two callers; a third of the rows is of a camera that comes and goes.
+    // Every key is inserted by two callers; other rows belong to a camera that is created and deleted.
     let calls: Vec<Call> = (0..2_000).map(|n| call(&store, &camera, vec![sample(n / 2, "a")])).collect();
-    let fleeting = id("fleeting");
+    let short_lived = id("short-lived");
     for round in 0..20 {
-        store.insert_camera(&NewCamera::named(fleeting.clone()), at(round)).await.expect("new");
-        let insert = call(&store, &fleeting, vec![sample(round, "a")]);
-        store.delete_camera(&fleeting, None).await.expect("deleted");
+        store.insert_camera(&NewCamera::named(short_lived.clone()), at(round)).await.expect("new");
+        let insert = call(&store, &short_lived, vec![sample(round, "a")]);
+        store.delete_camera(&short_lived, None).await.expect("deleted");
         match insert.await.expect("no panic") {
             Ok(inserted) => assert_eq!(inserted.accepted, 1),
             Err(error) => assert_eq!(error.kind(), ErrorKind::CameraNotFound),
@@ -150,11 +150,11 @@ async fn many_callers_at_once_lose_and_double_nothing() {
 }
 
 #[tokio::test]
-async fn closing_commits_what_was_handed_in_and_refuses_what_comes_later() {
+async fn closing_commits_what_is_queued_and_refuses_later_calls() {
     let Fixture { store, camera, folder } = Fixture::new().await;
-    let turn = store.relaxed().await.expect("a turn");
+    let writer = store.relaxed().await.expect("the writer");
     let calls: Vec<Call> = (0..50).map(|n| call(&store, &camera, vec![sample(n, "a")])).collect();
-    release(&store, turn, calls.len()).await;
+    release(&store, writer, calls.len()).await;
     store.close().await;
     store.close().await;
     for call in calls {
@@ -167,13 +167,13 @@ async fn closing_commits_what_was_handed_in_and_refuses_what_comes_later() {
     assert_eq!(kind(store.camera(&camera).await), ErrorKind::ShuttingDown);
     assert_eq!(kind(store.roll_back(&camera, at(1)).await), ErrorKind::ShuttingDown);
     assert_eq!(kind(store.ping().await), ErrorKind::ShuttingDown);
-    assert!(!folder.path().join("sightfix.db-wal").exists(), "the log went back into the file");
+    assert!(!folder.path().join("sightfix.db-wal").exists(), "the log was copied back into the file");
     let again = Store::open(folder.path()).await.expect("opens");
     assert_eq!(count(&again, &camera).await, 50);
 }
 
-/// After some failures (a full disk, an I/O error) the database ends a transaction by itself, which the
-/// connection must not stumble over.
+/// After some failures (a full disk, an I/O error) the database ends a transaction by itself; the
+/// connection must stay usable.
 #[tokio::test]
 async fn the_writer_survives_a_transaction_that_ended_under_it() {
     let fixture = Fixture::new().await;
@@ -185,13 +185,13 @@ async fn the_writer_survives_a_transaction_that_ended_under_it() {
         )
         .await;
     for round in 0..3 {
-        let turn = store.relaxed().await.expect("a turn");
+        let writer = store.relaxed().await.expect("the writer");
         let calls = vec![
             call(store, camera, vec![sample(round, "a")]),
             call(store, camera, vec![sample(round, "b"), sample(round, "poison")]),
             call(store, camera, vec![sample(round, "c")]),
         ];
-        release(store, turn, calls.len()).await;
+        release(store, writer, calls.len()).await;
         let mut accepted = Vec::new();
         for call in calls {
             let outcome = call.await.expect("no panic");
@@ -207,14 +207,14 @@ async fn the_writer_survives_a_transaction_that_ended_under_it() {
 }
 
 #[tokio::test]
-async fn a_full_disk_is_said_and_leaves_nothing_half_done() {
+async fn a_full_disk_is_reported_and_the_transaction_rolled_back() {
     let fixture = Fixture::new().await;
     let (store, camera) = (&fixture.store, &fixture.camera);
     store.insert_samples(camera, vec![sample(0, "a")], Durability::Synced).await.expect("stored");
     {
         // The limit is the connection's own, so it must be the one that stores the samples.
-        let mut turn = store.relaxed().await.expect("a turn");
-        let mut transaction = turn.begin().await.expect("begins");
+        let mut writer = store.relaxed().await.expect("the writer");
+        let mut transaction = writer.begin().await.expect("begins");
         sqlx::raw_sql("PRAGMA max_page_count = 60").execute(&mut *transaction).await.expect("set");
         transaction.commit().await.expect("commits");
     }
@@ -233,7 +233,7 @@ async fn a_full_disk_is_said_and_leaves_nothing_half_done() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
 
-    /// Whatever callers share a transaction, each is counted as if they had come one after another.
+    /// Callers that share a transaction are each counted as if they were served one after another.
     #[test]
     fn sharing_a_transaction_changes_no_count(
         before in prop::collection::vec((0_i64..40, "[ab]"), 0..20),
@@ -244,9 +244,9 @@ proptest! {
             let Fixture { store, camera, folder: _folder } = Fixture::new().await;
             let rows = |keys: &[(i64, String)]| keys.iter().map(|(n, who)| sample(*n, who)).collect::<Vec<_>>();
             store.insert_samples(&camera, rows(&before), Durability::Synced).await.expect("stored");
-            let turn = store.relaxed().await.expect("a turn");
+            let writer = store.relaxed().await.expect("the writer");
             let tasks: Vec<Call> = calls.iter().map(|keys| call(&store, &camera, rows(keys))).collect();
-            release(&store, turn, tasks.len()).await;
+            release(&store, writer, tasks.len()).await;
             let mut known: HashSet<_> = before.into_iter().collect();
             for (task, keys) in tasks.into_iter().zip(calls) {
                 let asked = keys.len() as u64;

@@ -19,7 +19,7 @@ use crate::domain::{
 };
 use crate::geo::Position;
 
-/// A store in a folder that vanishes with it, holding the camera `square`.
+/// A store with the camera `square`, in a folder that is deleted with it.
 struct Fixture {
     folder: TempDir,
     store: Store,
@@ -35,10 +35,10 @@ impl Fixture {
         Self { folder, store, camera }
     }
 
-    /// Runs statements past the store's rules.
+    /// Executes statements without the checks of the store.
     async fn tamper(&self, sql: &'static str) {
-        let mut turn = self.store.relaxed().await.expect("a turn");
-        let mut transaction = turn.begin().await.expect("begins");
+        let mut writer = self.store.relaxed().await.expect("the writer");
+        let mut transaction = writer.begin().await.expect("begins");
         sqlx::raw_sql(sql).execute(&mut *transaction).await.expect("runs");
         transaction.commit().await.expect("commits");
     }

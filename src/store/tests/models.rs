@@ -1,5 +1,6 @@
 use super::*;
-use crate::domain::ModelVersion;
+use crate::domain::{Durability, HeldOutSampleError, ModelVersion};
+use crate::store::{NewModel, RunEnd, RunOutput};
 
 async fn active(store: &Store, camera: &CameraId) -> Option<u32> {
     store.camera(camera).await.expect("known").active_model
@@ -67,4 +68,47 @@ async fn metadata_that_could_not_be_read_again_is_not_stored() {
     let broken = ModelMetadata { error_scale: f64::NAN, ..metadata() };
     assert_eq!(kind(store.insert_model(&camera, &broken, b"w", at(1)).await), ErrorKind::Internal);
     assert_eq!(store.models(&camera, None, 9).await.expect("a page"), []);
+}
+
+#[tokio::test]
+async fn a_changed_row_does_not_match_its_checksum() {
+    let fixture = Fixture::new().await;
+    let Fixture { store, camera, .. } = &fixture;
+    store.insert_model(camera, &metadata(), b"weights", at(1)).await.expect("stored");
+    fixture.tamper("UPDATE models SET sha256 = NULL").await;
+    assert_eq!(store.fill_in_model_checksums().await.expect("works"), 1);
+    assert_eq!(store.fill_in_model_checksums().await.expect("works"), 0);
+    assert_eq!(store.model_content(camera, 1).await.expect("sound").1, b"weights");
+    for damage in [
+        "UPDATE models SET weights = x'77656967687471'",
+        "UPDATE models SET metadata = replace(metadata, '120.5', '120.6')",
+        "UPDATE models SET metadata = '{'",
+    ] {
+        fixture.tamper(damage).await;
+        assert_eq!(kind(store.model_content(camera, 1).await), ErrorKind::ModelUnusable, "{damage}");
+    }
+}
+
+#[tokio::test]
+async fn held_out_errors_come_back_with_their_samples_while_those_are_stored() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    store.insert_samples(&camera, vec![sample(1, "a")], Durability::default()).await.expect("stored");
+    let error = |second: i64, distance_m: f64| HeldOutSampleError {
+        time: at(second),
+        target_id: target("a"),
+        distance_m,
+    };
+    let held_out = [error(1, 2.5), error(2, 3.5)];
+    let metadata = metadata();
+    let model = NewModel { metadata: &metadata, weights: b"w", held_out: &held_out };
+    store.insert_run(run_id(1), &camera, &options(), 9, at(1)).await.expect("queued");
+    let claim =
+        store.claim_run(std::time::Duration::from_secs(9), at(2)).await.expect("works").expect("a run");
+    let end = RunEnd::Succeeded { output: RunOutput { model, activate: true }, outcome: None };
+    store.finish_run(run_id(1), claim.fence, end, at(3)).await.expect("works").expect("owned");
+    let stored = store.held_out_errors(&camera, 1).await.expect("read");
+    assert_eq!(stored.iter().map(|stored| stored.error.clone()).collect::<Vec<_>>(), held_out);
+    let expected = sample(1, "a");
+    assert_eq!(stored[0].sample, Some((expected.bounding_box, expected.fix.position)));
+    assert_eq!(stored[1].sample, None);
 }

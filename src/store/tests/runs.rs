@@ -15,7 +15,7 @@ impl Fixture {
         self.store.claim_run(LEASE, at(second)).await.expect("works").expect("a run")
     }
 
-    async fn beat(&self, fence: i64, second: i64) -> Heartbeat {
+    async fn heartbeat(&self, fence: i64, second: i64) -> Heartbeat {
         self.store.heartbeat_run(run_id(1), fence, &progress(), LEASE, at(second)).await.expect("works")
     }
 
@@ -54,7 +54,7 @@ async fn a_run_goes_from_queue_to_active_model() {
     assert_eq!((run.state, run.attempt, run.started_at), (JobState::Running, 1, Some(at(2))));
     assert!(!cancel_requested);
     assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
-    assert_eq!(fixture.beat(fence, 4).await, Heartbeat::Continue);
+    assert_eq!(fixture.heartbeat(fence, 4).await, Heartbeat::Continue);
     let seen = fixture.store.run(&fixture.camera, run_id(1)).await.expect("known");
     assert_eq!(seen.progress, progress());
     let ended = fixture.finish(fence, success(&metadata(), true)).await.expect("still mine");
@@ -65,7 +65,7 @@ async fn a_run_goes_from_queue_to_active_model() {
     assert_eq!(ended.outcome.as_deref(), Some("better"));
     assert_eq!(fixture.store.model(&fixture.camera, 1).await.expect("stored").run_id, Some(run_id(1)));
     assert_eq!(fixture.store.active_models().await.expect("known"), [(fixture.camera.clone(), 1)]);
-    assert_eq!(fixture.beat(fence, 51).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(fence, 51).await, Heartbeat::Lost);
     assert!(fixture.finish(fence, RunEnd::Requeue).await.is_none(), "a run ends once");
 }
 
@@ -80,7 +80,7 @@ async fn a_worker_that_lost_its_lease_can_write_nothing_more() {
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert_eq!(fixture.store.epochs(run_id(1)).await.expect("known"), [], "a new attempt, a new curve");
 
-    assert_eq!(fixture.beat(old.fence, 33).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(old.fence, 33).await, Heartbeat::Lost);
     fixture.store.append_epochs(run_id(1), old.fence, &[report(2, 9.0)]).await.expect("ignored");
     fixture.store.append_log(run_id(1), old.fence, at(33), "old").await.expect("ignored");
     assert!(fixture.finish(old.fence, success(&metadata(), true)).await.is_none());
@@ -136,7 +136,7 @@ async fn of_claims_at_once_one_gets_the_run() {
 }
 
 #[tokio::test]
-async fn a_cancelled_run_yields_nothing() {
+async fn a_cancelled_run_stores_no_model() {
     let fixture = Fixture::new().await;
     let store = &fixture.store;
     fixture.queue(1).await;
@@ -173,7 +173,7 @@ async fn a_run_returned_to_the_queue_is_claimed_at_once_and_the_attempt_does_not
 }
 
 #[tokio::test]
-async fn curve_and_log_keep_what_they_were_told_within_limits() {
+async fn curve_and_log_are_stored_within_limits() {
     let fixture = Fixture::new().await;
     let store = &fixture.store;
     fixture.queue(1).await;
@@ -208,4 +208,41 @@ async fn pages_show_the_newest_runs_first() {
     assert_eq!(page.iter().map(|run| run.id).collect::<Vec<_>>(), [5, 4, 3].map(run_id));
     let page = fixture.store.runs(&fixture.camera, Some(run_id(3)), 3).await.expect("a page");
     assert_eq!(page.iter().map(|run| run.id).collect::<Vec<_>>(), [2, 1].map(run_id));
+}
+
+/// A day of the clock in which a run was claimed by mistake.
+const DAY_S: i64 = 86_400;
+
+#[tokio::test]
+async fn a_lease_that_ends_further_ahead_than_its_length_counts_as_expired() {
+    let fixture = Fixture::new().await;
+    fixture.queue(1).await;
+    let ahead = fixture.claim(400 * DAY_S).await;
+    // The clock was set right: the lease ends in 400 days.
+    let now = fixture.claim(2).await;
+    assert_eq!((now.job.attempt, now.fence), (2, ahead.fence + 1));
+    assert_eq!(fixture.heartbeat(ahead.fence, 400 * DAY_S + 1).await, Heartbeat::Lost);
+    assert_eq!(fixture.heartbeat(now.fence, 3).await, Heartbeat::Continue);
+    assert!(fixture.store.claim_run(LEASE, at(4)).await.expect("works").is_none(), "a sound lease holds");
+}
+
+#[tokio::test]
+async fn a_worker_with_a_longer_lease_keeps_its_run() {
+    let fixture = Fixture::new().await;
+    fixture.queue(1).await;
+    let hour = Duration::from_secs(3_600);
+    fixture.store.claim_run(hour, at(2)).await.expect("works").expect("a run");
+    assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is claimed");
+}
+
+#[tokio::test]
+async fn cancelling_a_run_without_a_live_lease_ends_it_at_once() {
+    for second in [400 * DAY_S, -400 * DAY_S] {
+        let fixture = Fixture::new().await;
+        fixture.queue(1).await;
+        fixture.claim(second).await;
+        let cancelled = fixture.store.cancel_run(&fixture.camera, run_id(1), at(2)).await.expect("cancelled");
+        assert_eq!(cancelled.state, JobState::Cancelled);
+        fixture.queue(2).await;
+    }
 }

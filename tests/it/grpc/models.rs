@@ -85,7 +85,8 @@ async fn fuses_as_the_application_does(server: &Server) {
     }
     let request = proto::FuseRequest { camera_id: "yard".to_owned(), observations: messages };
     let told = server.fusion().fuse(request).await.expect("positions").into_inner().fusions;
-    let expected = server.app.fuse(&camera, &observations).await.expect("positions");
+    let active = server.app.active_camera(&camera).await.expect("known");
+    let expected = server.app.fuse(active, &observations).await.expect("positions");
     assert_eq!(told.len(), expected.len());
     for (told, expected) in told.iter().zip(&expected) {
         let position = told.fused.expect("set");

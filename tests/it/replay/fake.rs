@@ -184,7 +184,11 @@ impl ServedStream {
             )
         });
         self.fake.received().committed.extend(committed);
-        self.respond(ResponseKind::Acknowledgement(proto::StreamAcknowledgement { seq })).await;
+        self.respond(ResponseKind::Acknowledgement(proto::StreamAcknowledgement {
+            seq,
+            ..Default::default()
+        }))
+        .await;
     }
 }
 

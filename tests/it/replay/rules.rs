@@ -8,7 +8,7 @@ use std::time::Duration;
 use jiff::SignedDuration;
 use sightfix::domain::{CameraId, TimeBounds};
 use sightfix::exchange::{Format, RowRules, read_observations};
-use sightfix::replay::{Counters, FaultShares, Pace, Recording, ReplayOptions, Report, replay};
+use sightfix::replay::{Counters, FaultShares, Pace, RecordedStream, ReplayOptions, ReplayReport, replay};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -17,7 +17,7 @@ use super::fake::{Fake, Script};
 const BEGIN_S: i64 = 1_700_000_000;
 
 /// That many boxes at intervals of a second.
-fn recording(rows: i64) -> Recording {
+fn recording(rows: i64) -> RecordedStream {
     let mut csv = "time,target_id,left,top,width,height\n".to_owned();
     for second in 0..rows {
         let time = jiff::Timestamp::from_second(BEGIN_S + second).expect("in range");
@@ -26,7 +26,7 @@ fn recording(rows: i64) -> Recording {
     let bounds = TimeBounds::at("2027-01-01T00:00:00Z".parse().expect("a time"));
     let rules = RowRules { time_bounds: bounds, image_size: None };
     let rows = read_observations(csv.as_bytes(), Format::Csv, &rules).expect("a header");
-    Recording::from_rows(rows.map(|row| row.expect("a file").expect("a row"))).expect("rows")
+    RecordedStream::from_rows(rows.map(|row| row.expect("a file").expect("a row"))).expect("rows")
 }
 
 fn options(fake: &Fake) -> ReplayOptions {
@@ -50,7 +50,7 @@ fn options(fake: &Fake) -> ReplayOptions {
 }
 
 /// Replays 200 rows and checks the sums of the report.
-async fn run(fake: &Fake, options: ReplayOptions) -> Report {
+async fn run(fake: &Fake, options: ReplayOptions) -> ReplayReport {
     let must_acknowledge = options.store_samples;
     let replaying = replay(
         Arc::new(recording(200)),

@@ -1,21 +1,22 @@
-//! Cameras that no longer look where they looked.
+//! Detected changes of camera poses.
 
 use sqlx::sqlite::SqliteRow;
 
 use super::Store;
 use super::cameras::camera_key;
-use super::faults::failed;
-use super::fields::Fields;
-use crate::domain::{CameraId, CameraMoved, Result, RunId};
+use super::errors::failed;
+use super::jobs::read_state;
+use super::row_decoder::RowDecoder;
+use crate::domain::{CameraId, CameraMoved, Error, JobState, Result, RunId};
 
 impl Store {
-    /// Keeps a move, unless one was found with that model version before; says whether it is new.
+    /// Stores a pose change, unless one was stored for that model version before; returns whether it is new.
     ///
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
     pub async fn insert_move(&self, camera: &CameraId, moved: &CameraMoved) -> Result<bool> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         let stored = sqlx::query(
             "INSERT INTO camera_moves (camera_key, model_number, began_at_us, raised_at_us, shift_east_m, \
@@ -37,7 +38,7 @@ impl Store {
         Ok(stored.rows_affected() > 0)
     }
 
-    /// The move that was found with a model version.
+    /// The pose change that was detected with a model version.
     ///
     /// # Errors
     /// Faults only.
@@ -55,35 +56,32 @@ impl Store {
         row.as_ref().map(read_move).transpose()
     }
 
-    /// Cameras whose active model no longer fits, that are to be trained anew and were not yet, with
-    /// the move.
+    /// State of the run that was started last because of the pose change found with a model version; `None` if
+    /// there was none, or it was deleted.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn moves_to_retrain(&self) -> Result<Vec<(CameraId, CameraMoved)>> {
-        let rows = sqlx::query(
-            "SELECT cameras.id, model_number, began_at_us, raised_at_us, shift_east_m, shift_north_m, statistic, \
-             targets FROM camera_moves JOIN cameras ON cameras.key = camera_key \
-             AND cameras.active_model = model_number \
-             WHERE retrain_when_moved AND retraining_run IS NULL ORDER BY cameras.id",
+    pub async fn retraining_state(&self, camera: &CameraId, model_version: u32) -> Result<Option<JobState>> {
+        let state: Option<String> = sqlx::query_scalar(
+            "SELECT state FROM camera_moves JOIN cameras ON cameras.key = camera_moves.camera_key \
+             JOIN training_runs ON training_runs.id = retraining_run \
+             WHERE cameras.id = ? AND model_number = ?",
         )
-        .fetch_all(self.readers())
+        .bind(camera.as_str())
+        .bind(model_version)
+        .fetch_optional(self.readers())
         .await
         .map_err(failed)?;
-        let read = |row: &SqliteRow| {
-            let id = Fields::of("camera_moves", row).make(CameraId::new)?;
-            Ok((id, read_move(row)?))
-        };
-        rows.iter().map(read).collect()
+        state.as_deref().map(read_state).transpose().map_err(Error::fault)
     }
 
-    /// Notes the run that a move has started.
+    /// Stores which run was started because of a pose change.
     ///
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
     pub async fn note_retraining(&self, camera: &CameraId, model_version: u32, run: RunId) -> Result<()> {
-        let mut turn = self.synced().await?;
-        let mut transaction = turn.begin().await?;
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
         sqlx::query("UPDATE camera_moves SET retraining_run = ? WHERE camera_key = ? AND model_number = ?")
             .bind(run.to_string())
@@ -97,14 +95,14 @@ impl Store {
 }
 
 fn read_move(row: &SqliteRow) -> Result<CameraMoved> {
-    let mut fields = Fields::of("camera_moves", row).skip(1);
+    let mut fields = RowDecoder::new("camera_moves", row).skip(1);
     Ok(CameraMoved {
         model_version: fields.count()?,
-        began_at: fields.time()?,
-        raised_at: fields.time()?,
-        shift_east_m: fields.take()?,
-        shift_north_m: fields.take()?,
-        statistic: fields.take()?,
+        began_at: fields.timestamp()?,
+        raised_at: fields.timestamp()?,
+        shift_east_m: fields.get()?,
+        shift_north_m: fields.get()?,
+        statistic: fields.get()?,
         targets: fields.count()?,
     })
 }

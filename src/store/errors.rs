@@ -1,10 +1,10 @@
-//! Errors of the database as errors of the domain: the one place where they meet.
+//! Conversion of database errors into errors of the domain.
 
 use sqlx::error::DatabaseError;
 
 use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, RunId};
 
-/// A row that does not hold what was written: another program changed it, or the disk did.
+/// A row that does not hold what was written: another program or the disk has changed it.
 #[derive(Debug, thiserror::Error)]
 #[error("the store is corrupt: table {table}, column {column}, row {row}: {cause}")]
 pub(super) struct Corrupt {
@@ -51,8 +51,8 @@ pub(super) fn failed(error: sqlx::Error) -> Error {
     }
 }
 
-/// The same error once more, for another caller of the same transaction.
-pub(super) fn same(error: &Error) -> Error {
+/// A copy of an error, for another caller of the same transaction.
+pub(super) fn copy_of(error: &Error) -> Error {
     match error {
         Error::Refused(refusal) => Error::Refused(refusal.clone()),
         Error::Fault(fault) => Error::fault(fault.to_string()),

@@ -7,8 +7,9 @@
 
 use jiff::Timestamp;
 
-use super::settings::{GnssNoise, MIN_WHITE_SHARE, RegressionNoise};
+use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 use crate::geo::EastNorth;
+use crate::model::artifact::LEAST_GNSS_WHITE_SHARE;
 
 /// Lags of the autocovariance, in units of the fixes' interval (at least one second).
 const LAGS: [u32; 11] = [1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 50];
@@ -30,34 +31,19 @@ pub struct TimedResidual {
     pub difference: EastNorth,
 }
 
-/// The estimated error of a receiver.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct GnssNoiseEstimate {
-    /// Temporal correlation, as a track uses it.
-    pub noise: GnssNoise,
-    /// Error variance per axis without that of the regression, m2.
-    pub variance_m2: f64,
-    /// Standard deviation of the white part, m.
-    pub white_sigma_m: f64,
-    /// Standard deviation of the bias, m.
-    pub bias_sigma_m: f64,
-    /// Autocorrelation of the residuals at the first lag.
-    pub first_correlation: f64,
-}
-
 /// Fits `bias_m2 * exp(-lag / tau)` to the residuals' autocovariance at eleven lags by least squares,
 /// weighted by their number of pairs; what the fit leaves of the variance at lag 0 is white.
 ///
 /// `traverses` are gap-free sequences in order of time; residuals of held-out traverses are
 /// preferable, because a fit follows the bias of its training samples. `e_regression_m2` is the error
 /// variance per axis of the regressed positions and `regression` its temporal correlation; both parts
-/// are subtracted. `None` for fewer than 30 pairs at the first lag, or residuals without variance.
+/// are subtracted from the receiver's. `None` for fewer than 30 pairs at the first lag, or residuals without variance.
 #[must_use]
 pub fn estimate_gnss_noise(
     traverses: &[Vec<TimedResidual>],
     e_regression_m2: f64,
-    regression: &RegressionNoise,
-) -> Option<GnssNoiseEstimate> {
+    regression: &NoiseCorrelation,
+) -> Option<GaussMarkovNoise> {
     let unit_s = median_interval_s(traverses)?.max(1.0);
     let (variance, lags) = autocovariance(traverses, unit_s)?;
     let (fitted_bias, time_constant) = fit_exponential(&lags);
@@ -66,14 +52,9 @@ pub fn estimate_gnss_noise(
     let white_m2 = (residual_white_m2 - regression.white_share * e_regression_m2).max(0.0);
     let bias_m2 = (residual_bias_m2 - (1.0 - regression.white_share) * e_regression_m2).max(0.0);
     let variance_m2 = (white_m2 + bias_m2).max(MIN_VARIANCE_SHARE * variance);
-    let white_share = (white_m2 / variance_m2).clamp(MIN_WHITE_SHARE, 1.0);
-    Some(GnssNoiseEstimate {
-        noise: GnssNoise { white_share, time_constant_s: time_constant * unit_s },
-        variance_m2,
-        white_sigma_m: (white_share * variance_m2).sqrt(),
-        bias_sigma_m: ((1.0 - white_share) * variance_m2).sqrt(),
-        first_correlation: lags[0].covariance_m2 / variance,
-    })
+    let white_share = (white_m2 / variance_m2).clamp(LEAST_GNSS_WHITE_SHARE, 1.0);
+    let correlation = NoiseCorrelation { white_share, time_constant_s: time_constant * unit_s };
+    Some(GaussMarkovNoise { variance_m2, correlation })
 }
 
 /// Median interval between neighbouring residuals, s.

@@ -1,10 +1,12 @@
-//! Client streams that end when the server does.
+//! Client streams that end when the server shuts down.
 
 use std::convert::Infallible;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
 use bytes::Bytes;
+use futures_util::FutureExt as _;
+use futures_util::future::{BoxFuture, Fuse, FusedFuture as _};
 use hyper::Request;
 use hyper::body::{Frame, SizeHint};
 use tonic::Status;
@@ -14,25 +16,25 @@ use tower::Service;
 
 use crate::shutdown::Shutdown;
 
-/// A service whose clients' streams end when the server's end begins. For services of others that
-/// would otherwise listen for as long as a client pleases.
+/// A service whose client streams are at their end when the server begins to shut down. For services of
+/// other crates, which would otherwise read for as long as a client sends.
 #[derive(Clone)]
-pub(super) struct EndsWithServer<S> {
+pub(super) struct CancelOnShutdown<S> {
     service: S,
     shutdown: Shutdown,
 }
 
-impl<S> EndsWithServer<S> {
+impl<S> CancelOnShutdown<S> {
     pub(super) fn new(service: S, shutdown: &Shutdown) -> Self {
         Self { service, shutdown: shutdown.clone() }
     }
 }
 
-impl<S: NamedService> NamedService for EndsWithServer<S> {
+impl<S: NamedService> NamedService for CancelOnShutdown<S> {
     const NAME: &'static str = S::NAME;
 }
 
-impl<S> Service<Request<Body>> for EndsWithServer<S>
+impl<S> Service<Request<Body>> for CancelOnShutdown<S>
 where
     S: Service<Request<Body>, Error = Infallible>,
 {
@@ -46,18 +48,18 @@ where
 
     fn call(&mut self, request: Request<Body>) -> S::Future {
         let shutdown = self.shutdown.clone();
-        let ending = Box::pin(async move { shutdown.begun().await });
-        self.service.call(request.map(|body| Body::new(Until { body, ending })))
+        let drained = async move { shutdown.begun().await }.boxed().fuse();
+        self.service.call(request.map(|body| Body::new(CancellableBody { body, drained })))
     }
 }
 
-/// A body that is at its end when the server's end begins.
-struct Until {
+/// A body that is at its end once the server begins to shut down.
+struct CancellableBody {
     body: Body,
-    ending: Pin<Box<dyn Future<Output = ()> + Send>>,
+    drained: Fuse<BoxFuture<'static, ()>>,
 }
 
-impl hyper::body::Body for Until {
+impl hyper::body::Body for CancellableBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -65,10 +67,11 @@ impl hyper::body::Body for Until {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        match Pin::new(&mut self.body).poll_frame(context) {
-            Poll::Pending if self.ending.as_mut().poll(context).is_ready() => Poll::Ready(None),
-            polled => polled,
+        // First, so that a client whose backlog never ends cannot hold the server up.
+        if self.drained.is_terminated() || self.drained.poll_unpin(context).is_ready() {
+            return Poll::Ready(None);
         }
+        Pin::new(&mut self.body).poll_frame(context)
     }
 
     fn is_end_stream(&self) -> bool {

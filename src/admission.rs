@@ -1,0 +1,290 @@
+//! Admission control: how much of each bounded resource all clients together, and one client
+//! address, may hold at a time.
+//!
+//! What never happens here: waiting. Whoever gets nothing is refused at once and may try again.
+
+use std::collections::HashMap;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+use crate::config::Limits;
+use crate::domain::{Error, ErrorKind, Refusal, Result};
+
+/// What a request costs while it is open, besides its body: connection buffers and its task. Charged
+/// to [`Quotas::request_memory`].
+const REQUEST_OVERHEAD_BYTES: u64 = 16 << 10;
+
+/// A client as limits count it: an IPv4 address, or the first 64 bits of an IPv6 address, of which one
+/// host commonly has all the rest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct ClientAddress(IpAddr);
+
+impl ClientAddress {
+    /// Stands for requests that came over no connection.
+    pub const UNKNOWN: Self = Self(IpAddr::V4(Ipv4Addr::UNSPECIFIED));
+}
+
+impl From<IpAddr> for ClientAddress {
+    fn from(address: IpAddr) -> Self {
+        match address.to_canonical() {
+            IpAddr::V6(address) => {
+                let prefix = address.to_bits() & !u128::from(u64::MAX);
+                Self(IpAddr::V6(Ipv6Addr::from_bits(prefix)))
+            }
+            address @ IpAddr::V4(_) => Self(address),
+        }
+    }
+}
+
+/// What a request is for, which decides what it must be granted before it is worked on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RequestClass {
+    /// Health and metrics: always answered.
+    Probe,
+    /// Positions from observations: may also use the places reserved for them.
+    Fusion,
+    /// A file that is spooled before it is worked on.
+    Import,
+    /// Samples that are worked on while they are received.
+    ImportStream,
+    /// A live stream, which has quotas and timeouts of its own.
+    LiveStream,
+    /// Everything else.
+    Other,
+}
+
+/// Why a request's body was refused while it was read, once it was. Clones share it.
+#[derive(Clone, Default)]
+pub struct BodyRefusal(Arc<OnceLock<Refusal>>);
+
+impl BodyRefusal {
+    /// Records why; the first reason stays.
+    pub fn set(&self, refusal: Refusal) {
+        let _ = self.0.set(refusal);
+    }
+
+    /// The reason, if the body was refused.
+    #[must_use]
+    pub fn get(&self) -> Option<Error> {
+        self.0.get().cloned().map(Error::Refused)
+    }
+}
+
+/// A resource of which all clients together and one client may hold so much at a time. Clones share it.
+#[derive(Clone)]
+pub struct Quota(Arc<Shared>);
+
+struct Shared {
+    /// What is counted, in the plural, for the refusal.
+    what: &'static str,
+    total: u64,
+    per_client: u64,
+    held: Mutex<Held>,
+}
+
+#[derive(Default)]
+struct Held {
+    total: u64,
+    by_client: HashMap<ClientAddress, u64>,
+}
+
+impl Quota {
+    /// A quota of `total`, of which one client may hold `client_share` (0 to 1), but at least 1.
+    #[must_use]
+    pub fn new(what: &'static str, total: usize, client_share: f64) -> Self {
+        let total = total as u64;
+        let per_client = ((total as f64 * client_share).ceil() as u64).clamp(1, total.max(1));
+        Self(Arc::new(Shared { what, total, per_client, held: Mutex::default() }))
+    }
+
+    /// Takes an amount, which is given back when the lease is dropped.
+    ///
+    /// # Errors
+    /// `Overloaded`, naming the limit that is reached.
+    pub fn try_acquire(&self, client: ClientAddress, amount: u64) -> Result<Lease> {
+        let mut lease = Lease { quota: self.clone(), client, amount: 0 };
+        lease.try_grow(amount)?;
+        Ok(lease)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Held> {
+        self.0.held.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn exceeded(&self, limit: u64, holder: &str) -> Error {
+        let what = self.0.what;
+        Error::refused(
+            ErrorKind::Overloaded,
+            format!("{holder} has reached its limit of {limit} {what}; try again in a second"),
+        )
+    }
+}
+
+/// What one holder has of a [`Quota`].
+pub struct Lease {
+    quota: Quota,
+    client: ClientAddress,
+    amount: u64,
+}
+
+impl Lease {
+    /// Takes more.
+    ///
+    /// # Errors
+    /// `Overloaded`, naming the limit that is reached; the lease stays as it was.
+    pub fn try_grow(&mut self, amount: u64) -> Result<()> {
+        let Shared { total, per_client, .. } = *self.quota.0;
+        let mut held = self.quota.lock();
+        if held.total + amount > total {
+            return Err(self.quota.exceeded(total, "the server"));
+        }
+        let of_client = held.by_client.entry(self.client).or_default();
+        if *of_client + amount > per_client {
+            if *of_client == 0 {
+                held.by_client.remove(&self.client);
+            }
+            return Err(self.quota.exceeded(per_client, "this client address"));
+        }
+        *of_client += amount;
+        held.total += amount;
+        self.amount += amount;
+        Ok(())
+    }
+
+    /// Gives all of it back.
+    pub fn clear(&mut self) {
+        if self.amount == 0 {
+            return;
+        }
+        let mut held = self.quota.lock();
+        held.total -= self.amount;
+        if let Some(of_client) = held.by_client.get_mut(&self.client) {
+            *of_client -= self.amount;
+            if *of_client == 0 {
+                held.by_client.remove(&self.client);
+            }
+        }
+        self.amount = 0;
+    }
+}
+
+impl Drop for Lease {
+    fn drop(&mut self) {
+        self.clear();
+    }
+}
+
+/// The quotas of a server.
+pub struct Quotas {
+    /// Requests that are worked on, but for the reserved places.
+    requests: Quota,
+    /// Places that only fusions take.
+    reserved_requests: Quota,
+    import_streams: Quota,
+    /// Bytes of requests under way, their bodies included.
+    request_memory: Quota,
+    /// Bytes of imports in memory until they are worked on.
+    pub import_memory: Quota,
+    /// Bytes of imports in temporary files.
+    pub import_disk: Quota,
+    /// Open live streams.
+    pub live_streams: Quota,
+    /// Open event streams, server-sent events and watched runs alike.
+    pub event_streams: Quota,
+}
+
+impl Quotas {
+    /// The quotas that the limits describe.
+    #[must_use]
+    pub fn new(limits: &Limits) -> Self {
+        let quota = |what, total| Quota::new(what, total, limits.client_share);
+        Self {
+            requests: quota("requests at work", limits.requests.saturating_sub(limits.reserved_requests)),
+            reserved_requests: quota("requests at work", limits.reserved_requests),
+            import_streams: quota("import streams", limits.import_streams),
+            request_memory: quota("bytes of requests under way", limits.request_memory_bytes),
+            import_memory: quota("bytes of imports in memory", limits.spool_memory_bytes),
+            import_disk: quota("bytes of imports in temporary files", limits.spool_disk_bytes),
+            live_streams: quota("live streams", limits.live_streams),
+            event_streams: quota("event streams", limits.event_streams),
+        }
+    }
+
+    /// Memory for a request that begins; grows with its body.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub fn open_request(&self, client: ClientAddress) -> Result<Lease> {
+        self.request_memory.try_acquire(client, REQUEST_OVERHEAD_BYTES)
+    }
+
+    /// The place of a request that begins to be worked on; `None` where the class needs none.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub fn begin_work(&self, class: RequestClass, client: ClientAddress) -> Result<Option<Lease>> {
+        match class {
+            RequestClass::Probe | RequestClass::LiveStream => Ok(None),
+            RequestClass::ImportStream => self.import_streams.try_acquire(client, 1).map(Some),
+            RequestClass::Import | RequestClass::Other => self.requests.try_acquire(client, 1).map(Some),
+            RequestClass::Fusion => {
+                let place = self.requests.try_acquire(client, 1);
+                place.or_else(|_| self.reserved_requests.try_acquire(client, 1)).map(Some)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn client(last: u8) -> ClientAddress {
+        IpAddr::from([127, 0, 0, last]).into()
+    }
+
+    #[test]
+    fn neither_all_clients_nor_one_get_more_than_their_limit() {
+        let quota = Quota::new("things", 4, 0.5);
+        let first = quota.try_acquire(client(1), 2).expect("half is free");
+        let refused = quota.try_acquire(client(1), 1).err().expect("the client's share is used up");
+        assert_eq!(refused.kind(), ErrorKind::Overloaded);
+        assert!(refused.to_string().contains("this client address"), "{refused}");
+        let mut second = quota.try_acquire(client(2), 1).expect("another client");
+        second.try_grow(1).expect("up to its share");
+        assert!(quota.try_acquire(client(3), 1).is_err(), "all is used up");
+        drop(first);
+        quota.try_acquire(client(1), 2).expect("it was given back");
+    }
+
+    #[test]
+    fn what_is_given_back_leaves_no_trace() {
+        let quota = Quota::new("things", 4, 1.0);
+        let mut lease = quota.try_acquire(client(1), 3).expect("free");
+        assert!(lease.try_grow(2).is_err());
+        lease.clear();
+        lease.try_grow(4).expect("all is free again");
+        drop(lease);
+        let held = quota.lock();
+        assert_eq!((held.total, held.by_client.len()), (0, 0));
+    }
+
+    #[test]
+    fn fusions_find_a_place_when_others_do_not() {
+        let limits = Limits { requests: 2, reserved_requests: 1, client_share: 1.0, ..Limits::default() };
+        let quotas = Quotas::new(&limits);
+        let _busy = quotas.begin_work(RequestClass::Other, client(1)).expect("the one place");
+        assert!(quotas.begin_work(RequestClass::Import, client(2)).is_err());
+        let _fusion = quotas.begin_work(RequestClass::Fusion, client(2)).expect("the reserved place");
+        assert!(quotas.begin_work(RequestClass::Fusion, client(2)).is_err());
+        assert!(quotas.begin_work(RequestClass::Probe, client(2)).expect("always").is_none());
+    }
+
+    #[test]
+    fn one_host_is_one_client() {
+        let of = |text: &str| ClientAddress::from(text.parse::<IpAddr>().expect("an address"));
+        assert_eq!(of("::ffff:192.0.2.1"), of("192.0.2.1"));
+        assert_eq!(of("2001:db8::1"), of("2001:db8::2:3:4:5"));
+        assert_ne!(of("2001:db8::1"), of("2001:db8:0:1::1"));
+    }
+}

@@ -1,0 +1,136 @@
+//! Residuals on their way to the drift detectors, and the alarms that come of them.
+//!
+//! Answers hand residuals to one task and never wait for it: detecting costs time and an alarm goes to
+//! the database. Where the task falls behind, residuals are dropped, for a camera that moved goes on
+//! producing them.
+
+use std::sync::{Arc, Weak};
+
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use crate::app::registry::ActiveCamera;
+use crate::app::{App, Parts};
+use crate::domain::{CameraMoved, Error, ErrorKind, Observation, Result};
+use crate::fusion::drift_detector::ResidualSample;
+use crate::fusion::observed::ObservedPositions;
+
+/// Residuals that wait for their detector.
+const QUEUE: usize = 4_096;
+
+/// A residual of one camera.
+struct Residual {
+    camera: Arc<ActiveCamera>,
+    residual: ResidualSample,
+}
+
+/// The way to the drift detectors.
+pub(in crate::app) struct ResidualQueue {
+    sender: mpsc::Sender<Residual>,
+    closed: CancellationToken,
+}
+
+impl ResidualQueue {
+    /// Ends the task once it has worked off what waits now.
+    pub(in crate::app) fn close(&self) {
+        self.closed.cancel();
+    }
+}
+
+/// What waits, for the task.
+pub(in crate::app) struct WaitingResiduals {
+    receiver: mpsc::Receiver<Residual>,
+    closed: CancellationToken,
+}
+
+/// Both ends of an empty queue.
+pub(in crate::app) fn residual_queue() -> (ResidualQueue, WaitingResiduals) {
+    let (sender, receiver) = mpsc::channel(QUEUE);
+    let closed = CancellationToken::new();
+    (ResidualQueue { sender, closed: closed.clone() }, WaitingResiduals { receiver, closed })
+}
+
+impl WaitingResiduals {
+    /// Feeds the detectors until the application is closed or dropped.
+    pub(in crate::app) async fn run(mut self, app: Weak<Parts>) {
+        loop {
+            let next = tokio::select! {
+                next = self.receiver.recv() => next,
+                () = self.closed.cancelled() => self.receiver.try_recv().ok(),
+            };
+            let (Some(Residual { camera, residual }), Some(parts)) = (next, app.upgrade()) else { return };
+            App(parts).detect_drift(&camera, &residual).await;
+        }
+    }
+}
+
+impl App {
+    /// Hands a residual to the camera's drift detector.
+    pub(super) fn hand_over(&self, camera: &Arc<ActiveCamera>, residual: ResidualSample) {
+        if self.residuals.sender.try_send(Residual { camera: camera.clone(), residual }).is_err() {
+            tracing::debug!(camera.id = %camera.id, "a residual was dropped, the drift detectors are behind");
+        }
+    }
+
+    /// Hands over the residual of the last of some observations with box, fix and target: for clients who
+    /// only ask for positions. One of a batch is enough.
+    pub(in crate::app) fn hand_over_last(
+        &self,
+        camera: &Arc<ActiveCamera>,
+        observations: &[(&Observation, ObservedPositions<'_>)],
+    ) {
+        let bounds = self.live_time_bounds();
+        let residual = observations.iter().rev().find_map(|(observation, observed)| {
+            let (regressed, fix) = (observed.usable_box()?.independent, observed.fix?);
+            bounds.check(observation.time).ok()?;
+            Some(ResidualSample {
+                time: observation.time,
+                target_id: observation.target_id.clone()?,
+                regressed: regressed.regressed,
+                fix: fix.in_plane?,
+                e_regression_m2: regressed.variance_m2(),
+                e_gnss_m2: fix.variance_m2,
+            })
+        });
+        if let Some(residual) = residual {
+            self.hand_over(camera, residual);
+        }
+    }
+
+    async fn detect_drift(&self, camera: &ActiveCamera, residual: &ResidualSample) {
+        let Some(model) = camera.model() else { return };
+        let Some(moved) = camera.live.drift.observe(model, residual) else { return };
+        // An alarm that cannot be stored is raised again with the next residual.
+        if let Err(error) = self.raise(camera, moved).await {
+            tracing::error!(camera.id = %camera.id, %error, "the alarm that the camera was moved cannot be stored");
+        }
+    }
+
+    /// Stores an alarm and announces it, once per model version.
+    ///
+    /// # Errors
+    /// A fault of the store.
+    async fn raise(&self, camera: &ActiveCamera, moved: CameraMoved) -> Result<()> {
+        let id = &camera.id;
+        let is_same = |current: Arc<ActiveCamera>| current.key == camera.key;
+        if !self.registry.get(id).is_some_and(is_same) {
+            return Ok(());
+        }
+        let is_new = match self.store.insert_move(id, &moved).await {
+            Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraNotFound => return Ok(()),
+            stored => stored?,
+        };
+        camera.live.drift.saved();
+        self.registry.refresh_camera(&self.store, id).await?;
+        if is_new {
+            tracing::warn!(
+                camera.id = %id, model = moved.model_version, began_at = %moved.began_at,
+                shift_east_m = moved.shift_east_m, shift_north_m = moved.shift_north_m,
+                "the camera's pose has changed since its model was trained"
+            );
+            self.metrics.camera_moved();
+            camera.live.announce_move(Arc::new(moved));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,187 @@
+//! From an observation to measured positions: where the box and the fix of one instant say their target
+//! is, each with its error variance. [`super::two_step`] and [`super::target_track`] both start here, so
+//! a box goes through the model once and both test the same numbers.
+
+use jiff::Timestamp;
+
+use super::track::MeasurementSource;
+use crate::domain::{BoundingBox, ImageSize, Observation, SigmaM};
+use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, Position};
+use crate::model::{Regression, Regressor};
+
+/// 99.9 % quantile of chi-square with 2 degrees of freedom, -2 ln(0.001): beyond it box and fix are taken
+/// to contradict each other. One consistent pair in 1,000 is.
+pub const PAIR_GATE: f64 = 13.816;
+
+/// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
+pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
+
+/// The error variance per axis, m2, of an observation's fix: its own, else the camera profile's, else the
+/// model's, else that of a phone in the open.
+#[must_use]
+pub fn fix_variance_m2(
+    observation: &Observation,
+    regressor: Option<&Regressor>,
+    e_gnss_m2: Option<f64>,
+) -> f64 {
+    let own_m2 = observation.fix.and_then(|fix| fix.sigma_m).map(SigmaM::variance_m2);
+    own_m2.or(e_gnss_m2).or(regressor.map(Regressor::e_gnss_m2)).unwrap_or(UNKNOWN_RECEIVER_M2)
+}
+
+/// A fix as a measured position.
+#[derive(Debug, Clone, Copy)]
+pub struct ObservedFix {
+    /// As the receiver reports it.
+    pub position: Position,
+    /// Error variance per axis, m2.
+    pub variance_m2: f64,
+    /// In the model's plane; `None` without a model, or beyond the plane's range.
+    pub in_plane: Option<EastNorth>,
+}
+
+/// A box as a measured position.
+#[derive(Debug, Clone, Copy)]
+pub struct ObservedBox {
+    /// The recipe's one-step answer. The network of `paper` has the fix among its inputs.
+    pub one_step: Regression,
+    /// From the box alone, so independent of the fix.
+    pub independent: Regression,
+    /// Whether `independent` is finite and within the plane's range. If not, both regressions are
+    /// replaced by the plane's origin with [`PLANE_RANGE_M`] as their 95 % radius.
+    pub is_usable: bool,
+    /// Whether the box is unlike those of training or cut by the image's border.
+    pub is_unusual: bool,
+}
+
+/// What an observation measures.
+#[derive(Debug, Clone, Copy)]
+pub struct ObservedPositions<'a> {
+    /// When.
+    pub time: Timestamp,
+    /// The plane of the camera's model; `None` without a model.
+    pub plane: Option<&'a LocalPlane>,
+    /// The fix, if there is one.
+    pub fix: Option<ObservedFix>,
+    /// The box, if there are one and a model.
+    pub regressed: Option<ObservedBox>,
+}
+
+/// Box and fix held against each other.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PairInnovation {
+    /// Distance of the regressed position (from the box alone) and the fix, m.
+    pub distance_m: f64,
+    /// Normalised innovation squared, e' S^-1 e with S the sum of both error covariances (Bar-Shalom, Li
+    /// and Kirubarajan 2001, 5.4): chi-square with 2 degrees of freedom for consistent sources.
+    pub nis: f64,
+}
+
+impl ObservedFix {
+    fn of(observation: &Observation, regressor: Option<&Regressor>, e_gnss_m2: Option<f64>) -> Option<Self> {
+        let position = observation.fix?.position;
+        Some(Self {
+            position,
+            variance_m2: fix_variance_m2(observation, regressor, e_gnss_m2),
+            in_plane: regressor.and_then(|regressor| regressor.plane().to_plane_within_range(position)),
+        })
+    }
+}
+
+impl ObservedBox {
+    fn of(
+        bounding_box: &BoundingBox,
+        regressor: &Regressor,
+        fix: Option<EastNorth>,
+        image_size: Option<ImageSize>,
+    ) -> Self {
+        let independent = regressor.regress(bounding_box, None);
+        let one_step = match fix {
+            Some(_) if regressor.uses_fix() => regressor.regress(bounding_box, fix),
+            _ => independent,
+        };
+        let is_usable = is_usable(&independent) && is_usable(&one_step);
+        Self {
+            one_step: if is_usable { one_step } else { anywhere_in_range(&one_step) },
+            independent: if is_usable { independent } else { anywhere_in_range(&independent) },
+            is_usable,
+            is_unusual: independent.outside_training || bounding_box.touches_border(image_size),
+        }
+    }
+}
+
+fn is_usable(regression: &Regression) -> bool {
+    regression.regressed.is_within_range() && regression.e_regression_m2.is_finite()
+}
+
+/// Replaces a regression without a usable position: the origin, with the plane's range as `r95_m`.
+fn anywhere_in_range(regression: &Regression) -> Regression {
+    Regression {
+        regressed: EastNorth::default(),
+        e_regression_m2: (PLANE_RANGE_M / regression.r95_scale).powi(2),
+        outside_training: true,
+        ..*regression
+    }
+}
+
+impl<'a> ObservedPositions<'a> {
+    /// `e_gnss_m2` is the receiver's variance per axis by the camera's profile, `image_size` the
+    /// profile's. A box without a model measures nothing.
+    #[must_use]
+    pub fn of(
+        observation: &Observation,
+        regressor: Option<&'a Regressor>,
+        image_size: Option<ImageSize>,
+        e_gnss_m2: Option<f64>,
+    ) -> Self {
+        let fix = ObservedFix::of(observation, regressor, e_gnss_m2);
+        let in_plane = fix.and_then(|fix| fix.in_plane);
+        let regressed = observation.bounding_box.as_ref().zip(regressor);
+        Self {
+            time: observation.time,
+            plane: regressor.map(Regressor::plane),
+            fix,
+            regressed: regressed.map(|(bounding_box, regressor)| {
+                ObservedBox::of(bounding_box, regressor, in_plane, image_size)
+            }),
+        }
+    }
+
+    /// Whether neither the box nor the fix gives a position.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.fix.is_none() && self.usable_box().is_none()
+    }
+
+    /// The box, if it gives a position.
+    #[must_use]
+    pub fn usable_box(&self) -> Option<&ObservedBox> {
+        self.regressed.as_ref().filter(|observed| observed.is_usable)
+    }
+
+    /// Whether the fix lies beyond the range of the model's plane.
+    #[must_use]
+    pub fn fix_is_out_of_range(&self) -> bool {
+        self.plane.is_some() && self.fix.is_some_and(|fix| fix.in_plane.is_none())
+    }
+
+    /// Box against fix, where both give a position.
+    #[must_use]
+    pub fn innovation(&self) -> Option<PairInnovation> {
+        let observed = self.usable_box()?;
+        let fix = self.fix?;
+        let distance_m = observed.independent.regressed.distance_m(fix.in_plane?);
+        let variance_m2 = observed.independent.variance_m2() + fix.variance_m2;
+        Some(PairInnovation { distance_m, nis: distance_m * distance_m / variance_m2 })
+    }
+
+    /// The source not to use where the two contradict each other: the box if it is unusual, for then its
+    /// stated error rests on no training box; else the fix, for multipath, a frozen receiver and swapped
+    /// coordinates give it errors that no receiver states.
+    #[must_use]
+    pub fn contradicting_source(&self) -> Option<MeasurementSource> {
+        let contradicts = self.innovation().is_some_and(|innovation| innovation.nis > PAIR_GATE);
+        let is_unusual =
+            contradicts.then(|| self.usable_box().is_some_and(|observed| observed.is_unusual))?;
+        Some(if is_unusual { MeasurementSource::Regressed } else { MeasurementSource::Fix })
+    }
+}

@@ -1,0 +1,248 @@
+//! One target over time: starts, feeds, restarts and ends its [`Track`], and keeps the plane it runs in.
+//! The live service and the evaluation both follow a target through this type.
+//!
+//! Each target has a plane of its own, so one target's wrong fix cannot displace another's track: that of
+//! the camera's model where there is one, else one about the target's own fixes.
+
+use std::collections::VecDeque;
+
+use jiff::Timestamp;
+
+use super::observed::ObservedPositions;
+use super::track::{
+    MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason, Track, TrackSettings,
+    TrackState,
+};
+use crate::geo::{EastNorth, LocalPlane, Position};
+
+/// Latest fixes of a target without a model that decide by majority where its plane belongs.
+const RECENT_FIXES: usize = 5;
+/// Measurements in a row from before the track's time to live, after which the track restarts at theirs:
+/// one instant far ahead, or a recording that is played again, must not reject all that follows.
+const REWIND_AFTER: u32 = 3;
+
+/// The sequence fusion of one target.
+#[derive(Debug, Clone, Default)]
+pub struct TargetTrack {
+    active: Option<ActiveTrack>,
+    /// Only without a model.
+    recent_fixes: VecDeque<Position>,
+    /// Measurements in a row that are older than the track by more than its time to live.
+    rewound: u32,
+}
+
+#[derive(Debug, Clone)]
+struct ActiveTrack {
+    plane: LocalPlane,
+    track: Track,
+}
+
+/// Where a target is by its track.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrackEstimate {
+    /// On the ground.
+    pub position: Position,
+    /// All that the track states, in its own plane.
+    pub state: TrackState,
+}
+
+impl TargetTrack {
+    /// Feeds what was observed at one instant, late observations at their place in time. `settings` are
+    /// those of a track that starts. `None` while nothing usable was observed.
+    pub fn update(
+        &mut self,
+        observed: &ObservedPositions<'_>,
+        settings: impl FnOnce() -> TrackSettings,
+    ) -> Option<TrackEstimate> {
+        self.end_if_outdated(observed);
+        let mut rejected = Vec::new();
+        let plane = self.plane_for(observed, &mut rejected);
+        let Some(plane) = plane else { return self.estimate_with(rejected) };
+        let mut measurement = measurement_in(&plane, observed, rejected.is_empty());
+        if self.active.is_none() {
+            withdraw_contradicting(&mut measurement, observed, &mut rejected);
+        }
+        let mut state = match &mut self.active {
+            Some(active) => active.track.update(&measurement),
+            None => {
+                let track = Track::start(settings(), &measurement)?;
+                let state = track.state_at(measurement.time);
+                self.active = Some(ActiveTrack { plane, track });
+                state
+            }
+        };
+        state.rejected.extend(rejected);
+        Some(TrackEstimate { position: plane.to_position(state.position), state })
+    }
+
+    /// The state at an instant, predicted beyond the latest measurement; `None` before the first one and
+    /// after the time to live.
+    #[must_use]
+    pub fn at(&self, time: Timestamp) -> Option<TrackEstimate> {
+        let ActiveTrack { plane, track } =
+            self.active.as_ref().filter(|active| !active.track.is_expired(time))?;
+        let state = track.state_at(time);
+        Some(TrackEstimate { position: plane.to_position(state.position), state })
+    }
+
+    /// The instant measured last.
+    #[must_use]
+    pub fn measured_at(&self) -> Option<Timestamp> {
+        Some(self.active.as_ref()?.track.measured_at())
+    }
+
+    /// Ends a track that the observation cannot continue: its time to live is over, the target's clock
+    /// went back for good, or the model's plane is elsewhere.
+    fn end_if_outdated(&mut self, observed: &ObservedPositions<'_>) {
+        let Some(ActiveTrack { plane, track }) = &self.active else { return };
+        let behind_s = track.measured_at().duration_since(observed.time).as_secs_f64();
+        let is_behind = behind_s > track.settings().time_to_live_s;
+        self.rewound = if is_behind { self.rewound + 1 } else { 0 };
+        let is_elsewhere =
+            observed.plane.is_some_and(|scene| scene.to_plane_within_range(plane.origin()).is_none());
+        if track.is_expired(observed.time) || is_elsewhere || self.rewound >= REWIND_AFTER {
+            self.active = None;
+            self.rewound = 0;
+        }
+    }
+
+    /// The plane for this observation; `None` if no position of it can be measured. A fix out of range is
+    /// added to `rejected`.
+    fn plane_for(
+        &mut self,
+        observed: &ObservedPositions<'_>,
+        rejected: &mut Vec<Rejection>,
+    ) -> Option<LocalPlane> {
+        let out_of_range =
+            Rejection { source: MeasurementSource::Fix, reason: RejectionReason::OutOfRange, nis: None };
+        if let Some(scene) = observed.plane {
+            if observed.fix_is_out_of_range() {
+                rejected.push(out_of_range);
+            }
+            let usable_fix = observed.fix.is_some_and(|fix| fix.in_plane.is_some());
+            let is_usable = usable_fix || observed.usable_box().is_some();
+            return is_usable.then(|| self.active.as_ref().map_or(*scene, |active| active.plane));
+        }
+        let position = observed.fix?.position;
+        if self.recent_fixes.len() == RECENT_FIXES {
+            self.recent_fixes.pop_front();
+        }
+        self.recent_fixes.push_back(position);
+        let Some(active) = &self.active else { return Some(LocalPlane::new(position)) };
+        if active.plane.to_plane_within_range(position).is_some() {
+            return Some(active.plane);
+        }
+        let candidate = LocalPlane::new(position);
+        let votes = |plane: &LocalPlane| {
+            self.recent_fixes.iter().filter(|fix| plane.to_plane_within_range(**fix).is_some()).count()
+        };
+        if votes(&candidate) > votes(&active.plane) {
+            self.active = None;
+            return Some(candidate);
+        }
+        rejected.push(out_of_range);
+        None
+    }
+
+    /// The track as it is, after an observation of which nothing was used.
+    fn estimate_with(&self, rejected: Vec<Rejection>) -> Option<TrackEstimate> {
+        let mut estimate = self.at(self.measured_at()?)?;
+        estimate.state.rejected = rejected;
+        Some(estimate)
+    }
+}
+
+/// The positions in a track's plane. The regressed one is that of the box alone: the track must not use a
+/// fix twice.
+fn measurement_in(plane: &LocalPlane, observed: &ObservedPositions<'_>, with_fix: bool) -> Measurement {
+    let is_model_plane = observed.plane == Some(plane);
+    let from_model_plane = |point: EastNorth| match observed.plane {
+        Some(scene) if !is_model_plane => plane.to_plane(scene.to_position(point)),
+        _ => point,
+    };
+    let fix = observed.fix.filter(|_| with_fix).map(|fix| {
+        let point = fix.in_plane.map_or_else(|| plane.to_plane(fix.position), from_model_plane);
+        MeasuredPosition::isotropic(point, fix.variance_m2)
+    });
+    let regressed = observed.usable_box().map(|observed| {
+        let point = from_model_plane(observed.independent.regressed);
+        MeasuredPosition::isotropic(point, observed.independent.variance_m2())
+    });
+    Measurement { time: observed.time, fix, regressed }
+}
+
+/// A track must not start between, or at the wrong one of, two positions that contradict each other.
+fn withdraw_contradicting(
+    measurement: &mut Measurement,
+    observed: &ObservedPositions<'_>,
+    rejected: &mut Vec<Rejection>,
+) {
+    let Some(source) = observed.contradicting_source() else { return };
+    match source {
+        MeasurementSource::Regressed => measurement.regressed = None,
+        MeasurementSource::Fix => measurement.fix = None,
+    }
+    let nis = observed.innovation().map(|innovation| innovation.nis);
+    rejected.push(Rejection { source, reason: RejectionReason::OutsideGate, nis });
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::SignedDuration;
+
+    use super::*;
+    use crate::domain::{Fix, Observation};
+
+    fn fix_at(seconds: i64, longitude_deg: f64, latitude_deg: f64) -> Observation {
+        let position = Position::new(longitude_deg, latitude_deg).expect("valid");
+        let time = Timestamp::UNIX_EPOCH + SignedDuration::from_secs(1_600_000_000 + seconds);
+        Observation { time, target_id: None, bounding_box: None, fix: Some(Fix { position, sigma_m: None }) }
+    }
+
+    fn feed(track: &mut TargetTrack, observation: &Observation) -> Option<TrackEstimate> {
+        track.update(&ObservedPositions::of(observation, None, None, None), TrackSettings::default)
+    }
+
+    fn near(estimate: &TrackEstimate, longitude_deg: f64, latitude_deg: f64) -> bool {
+        let position = Position::new(longitude_deg, latitude_deg).expect("valid");
+        crate::geo::distance_m(estimate.position, position) < 20.0
+    }
+
+    #[test]
+    fn a_first_fix_far_away_gives_way_to_the_majority() {
+        for (longitude_deg, latitude_deg) in [(0.0, 0.0), (8.0, 90.0), (-172.0, -47.0), (8.0, 47.5)] {
+            let mut track = TargetTrack::default();
+            feed(&mut track, &fix_at(0, longitude_deg, latitude_deg)).expect("started");
+            let second = feed(&mut track, &fix_at(1, 8.0, 47.0)).expect("the first is kept for now");
+            assert_eq!(second.state.rejected[0].reason, RejectionReason::OutOfRange);
+            let third = feed(&mut track, &fix_at(2, 8.0, 47.0)).expect("restarted");
+            assert!(near(&third, 8.0, 47.0) && third.state.rejected.is_empty(), "{third:?}");
+        }
+    }
+
+    #[test]
+    fn a_fix_far_away_in_between_is_rejected_and_changes_nothing() {
+        let mut track = TargetTrack::default();
+        for second in 0..4 {
+            feed(&mut track, &fix_at(second, 8.0, 47.0)).expect("followed");
+        }
+        let far = feed(&mut track, &fix_at(4, 0.0, 0.0)).expect("followed");
+        assert!(near(&far, 8.0, 47.0), "{far:?}");
+        assert_eq!(far.state.rejected[0].reason, RejectionReason::OutOfRange);
+        let next = feed(&mut track, &fix_at(5, 8.0, 47.0)).expect("followed");
+        assert!(near(&next, 8.0, 47.0) && next.state.rejected.is_empty(), "{next:?}");
+    }
+
+    #[test]
+    fn one_instant_far_ahead_rejects_three_measurements_and_no_more() {
+        let mut track = TargetTrack::default();
+        feed(&mut track, &fix_at(0, 8.0, 47.0)).expect("followed");
+        feed(&mut track, &fix_at(7_200, 8.0, 47.0)).expect("restarted two hours on");
+        let accepted: Vec<bool> = (1..6)
+            .map(|second| {
+                feed(&mut track, &fix_at(second, 8.0, 47.0)).expect("followed").state.rejected.is_empty()
+            })
+            .collect();
+        assert_eq!(accepted, [false, false, true, true, true]);
+    }
+}

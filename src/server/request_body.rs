@@ -1,0 +1,334 @@
+//! A request's body on its way in: at a least rate, within the memory of all requests, and worked on
+//! only once a place is free.
+//!
+//! A slow upload holds memory for what it has sent, never a place among the requests at work: that is
+//! taken when the last byte has come.
+
+use std::fmt;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
+
+use bytes::Bytes;
+use hyper::body::{Body, Frame, Incoming, SizeHint};
+use tokio::time::{Instant, Sleep};
+
+use crate::admission::{BodyRefusal, ClientAddress, Lease, RequestClass};
+use crate::app::App;
+use crate::domain::{Error, ErrorKind, Result};
+
+/// What is read and discarded of a refused request, so that its client reads the refusal and not a
+/// broken connection.
+const DISCARD_BYTES: u64 = 64 << 20;
+
+/// What one request was granted, shared between its body and the pipeline.
+#[derive(Clone)]
+pub(super) struct Ticket(Arc<Mutex<Grant>>);
+
+struct Grant {
+    app: App,
+    class: RequestClass,
+    client: ClientAddress,
+    /// Most bytes of the body that are held in memory and charged for.
+    charged_bytes: u64,
+    memory: Option<Lease>,
+    place: Option<Lease>,
+    refusal: BodyRefusal,
+}
+
+impl Ticket {
+    /// A request that may send its body. At most `charged_bytes` of it are held in memory.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub(super) fn open(
+        app: &App,
+        class: RequestClass,
+        client: ClientAddress,
+        charged_bytes: usize,
+    ) -> Result<Self> {
+        let memory = match class {
+            RequestClass::Probe => None,
+            _ => Some(app.quotas.open_request(client)?),
+        };
+        let grant = Grant {
+            app: app.clone(),
+            class,
+            client,
+            charged_bytes: charged_bytes as u64,
+            memory,
+            place: None,
+            refusal: BodyRefusal::default(),
+        };
+        Ok(Self(Arc::new(Mutex::new(grant))))
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Grant> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes the place among the requests at work.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub(super) fn begin_work(&self) -> Result<()> {
+        let mut grant = self.lock();
+        if grant.place.is_none() {
+            grant.place = grant.app.quotas.begin_work(grant.class, grant.client)?;
+        }
+        Ok(())
+    }
+
+    /// The work is done and the answer begins.
+    pub(super) fn end_work(&self) {
+        self.lock().place = None;
+    }
+
+    /// Why the body was refused, if it was or will be.
+    pub(super) fn refusal(&self) -> BodyRefusal {
+        self.lock().refusal.clone()
+    }
+
+    fn charge(&self, bytes: u64) -> Result<()> {
+        let mut grant = self.lock();
+        let charged = bytes.min(grant.charged_bytes);
+        grant.charged_bytes -= charged;
+        match &mut grant.memory {
+            Some(memory) if charged > 0 => memory.try_grow(charged),
+            _ => Ok(()),
+        }
+    }
+
+    fn refuse(&self, error: Error) {
+        if let Error::Refused(refusal) = error {
+            self.lock().refusal.set(refusal);
+        }
+    }
+}
+
+/// The body of a request.
+pub(super) struct AdmittedBody {
+    body: Incoming,
+    ticket: Ticket,
+    /// `None` for a body that may be silent.
+    pace: Option<Pace>,
+    state: State,
+}
+
+#[derive(PartialEq, Eq)]
+enum State {
+    Open,
+    /// Refused; so many bytes are still discarded before the reader is told so.
+    Discarding(u64),
+    Ended,
+}
+
+impl AdmittedBody {
+    pub(super) const fn new(body: Incoming, ticket: Ticket, pace: Option<Pace>) -> Self {
+        Self { body, ticket, pace, state: State::Open }
+    }
+
+    /// What to do with a frame: pass it on, or begin to discard the body.
+    fn receive(&mut self, frame: Frame<Bytes>) -> Option<Frame<Bytes>> {
+        let bytes = frame.data_ref().map_or(0, Bytes::len) as u64;
+        if let Some(pace) = &mut self.pace {
+            pace.received(bytes);
+        }
+        if let State::Discarding(left) = &mut self.state {
+            *left = left.saturating_sub(bytes);
+            return None;
+        }
+        let charged = self.ticket.charge(bytes).and_then(|()| {
+            // Readers that know the length do not ask for the end.
+            if self.body.is_end_stream() { self.ticket.begin_work() } else { Ok(()) }
+        });
+        match charged {
+            Ok(()) => Some(frame),
+            Err(error) => {
+                self.ticket.refuse(error);
+                self.state = State::Discarding(DISCARD_BYTES);
+                None
+            }
+        }
+    }
+}
+
+impl Body for AdmittedBody {
+    type Data = Bytes;
+    type Error = BodyRefused;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, BodyRefused>>> {
+        let this = &mut *self;
+        loop {
+            match this.state {
+                State::Ended => return Poll::Ready(None),
+                State::Discarding(0) => {
+                    this.state = State::Ended;
+                    return Poll::Ready(Some(Err(BodyRefused)));
+                }
+                State::Open | State::Discarding(_) => {}
+            }
+            let end = match Pin::new(&mut this.body).poll_frame(context) {
+                Poll::Ready(Some(Ok(frame))) => {
+                    if let Some(frame) = this.receive(frame) {
+                        return Poll::Ready(Some(Ok(frame)));
+                    }
+                    continue;
+                }
+                Poll::Ready(Some(Err(error))) => {
+                    let message = format!("the body broke off: {error}");
+                    Err(Error::refused(ErrorKind::Cancelled, message))
+                }
+                Poll::Ready(None) => this.ticket.begin_work(),
+                Poll::Pending => match &mut this.pace {
+                    None => return Poll::Pending,
+                    Some(pace) => Err(ready!(pace.poll_too_slow(context))),
+                },
+            };
+            let was_open = this.state == State::Open;
+            this.state = State::Ended;
+            return Poll::Ready(match end {
+                Ok(()) if was_open => None,
+                Ok(()) => Some(Err(BodyRefused)),
+                Err(error) => {
+                    if was_open {
+                        this.ticket.refuse(error);
+                    }
+                    Some(Err(BodyRefused))
+                }
+            });
+        }
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.state == State::Ended || self.state == State::Open && self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+/// Tells a reader of the body that it was refused; the ticket knows why.
+#[derive(Debug)]
+pub(super) struct BodyRefused;
+
+impl fmt::Display for BodyRefused {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str("the body was refused")
+    }
+}
+
+impl std::error::Error for BodyRefused {}
+
+/// Holds a body to a least rate. Only time in which the server waits for the client counts.
+pub(super) struct Pace {
+    rate: LeastRate,
+    waiting_since: Option<Instant>,
+    deadline: Option<Pin<Box<Sleep>>>,
+}
+
+impl Pace {
+    /// Every `window` of waiting must bring `bytes_per_s` on average.
+    pub(super) const fn new(window: Duration, bytes_per_s: u64) -> Self {
+        Self { rate: LeastRate::new(window, bytes_per_s), waiting_since: None, deadline: None }
+    }
+
+    fn received(&mut self, bytes: u64) {
+        if let Some(since) = self.waiting_since.take() {
+            self.rate.waited += since.elapsed();
+        }
+        self.rate.received += bytes;
+    }
+
+    /// Ready with a refusal once a window brought too little.
+    fn poll_too_slow(&mut self, context: &mut Context<'_>) -> Poll<Error> {
+        loop {
+            let now = Instant::now();
+            if let Some(since) = self.waiting_since.replace(now) {
+                self.rate.waited += now.duration_since(since);
+            }
+            if !self.rate.holds() {
+                return Poll::Ready(self.rate.too_slow());
+            }
+            let end = now + self.rate.remaining();
+            let deadline = self.deadline.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(end)));
+            if deadline.deadline() != end {
+                deadline.as_mut().reset(end);
+            }
+            ready!(deadline.as_mut().poll(context));
+        }
+    }
+}
+
+/// Bytes per second over one window of waiting after another.
+struct LeastRate {
+    window: Duration,
+    bytes_per_s: u64,
+    received: u64,
+    waited: Duration,
+}
+
+impl LeastRate {
+    const fn new(window: Duration, bytes_per_s: u64) -> Self {
+        Self { window, bytes_per_s, received: 0, waited: Duration::ZERO }
+    }
+
+    /// Whether a window that is over brought enough; begins the next one.
+    fn holds(&mut self) -> bool {
+        if self.waited < self.window {
+            return true;
+        }
+        let holds = self.received >= self.bytes_per_s.saturating_mul(self.window.as_secs()).max(1);
+        if holds {
+            self.received = 0;
+            self.waited = Duration::ZERO;
+        }
+        holds
+    }
+
+    /// Time of waiting until the window is over.
+    fn remaining(&self) -> Duration {
+        self.window.saturating_sub(self.waited)
+    }
+
+    fn too_slow(&self) -> Error {
+        let (received, seconds) = (self.received, self.window.as_secs());
+        let message = format!(
+            "the body came too slowly: {received} bytes in {seconds} s, at least {} per second are needed",
+            self.bytes_per_s
+        );
+        Error::refused(ErrorKind::Timeout, message)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WINDOW: Duration = Duration::from_secs(10);
+
+    /// Whether the rate holds when so many bytes come after each of these times of waiting.
+    fn holds(bytes: u64, waits_s: &[u64]) -> bool {
+        let mut rate = LeastRate::new(WINDOW, 10);
+        waits_s.iter().all(|&wait_s| {
+            rate.waited += Duration::from_secs(wait_s);
+            let holds = rate.holds();
+            rate.received += bytes;
+            holds
+        })
+    }
+
+    #[test]
+    fn a_body_that_trickles_is_refused_and_a_steady_one_is_not() {
+        assert!(holds(60, &[0, 5, 5, 5, 5, 5, 5]), "60 bytes in 5 s");
+        assert!(!holds(20, &[0, 5, 5]), "20 bytes in 5 s");
+        assert!(!holds(60, &[0, 5, 5, 5, 10]), "silence after a steady begin");
+        assert!(holds(1, &[0, 0, 0, 9]), "the first window is not over");
+        assert!(!holds(0, &[10]), "nothing at all");
+    }
+}

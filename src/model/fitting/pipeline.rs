@@ -154,10 +154,19 @@ fn select(
     run.progress.epochs = in_blocks + longest;
     note_samples(rows, context, run)?;
     let blocks = rows.held_out_groups(HELD_OUT_BLOCKS);
+    let mut usable = Vec::with_capacity(candidates.len());
     let mut validated = Vec::with_capacity(candidates.len());
     let mut reports = Vec::with_capacity(candidates.len());
-    for candidate in candidates {
-        let held_out = cross_validate(candidate, rows, &blocks, context, run)?;
+    for (at, candidate) in candidates.iter().enumerate() {
+        let held_out = match cross_validate(candidate, rows, &blocks, context, run) {
+            // Another candidate may do with these samples.
+            Err(FitError::Unusable(reason)) if at + 1 < candidates.len() || !usable.is_empty() => {
+                run.note(&format!("{}: left out, {reason}", candidate.name))?;
+                continue;
+            }
+            held_out => held_out?,
+        };
+        usable.push(*candidate);
         let report = held_out_error(&held_out, context.e_gnss_m2);
         run.note(&format!("{}: {:.3} m from the held-out fixes", candidate.name, report.mean_to_fix_m))?;
         reports.push(CandidateReport { candidate: candidate.name.to_owned(), held_out: report });
@@ -165,13 +174,13 @@ fn select(
     }
     let residuals: Vec<&[[f64; 2]]> = validated.iter().map(|it| it.residuals.as_slice()).collect();
     let (chosen, scores) = choose(rows, &residuals);
-    note_choice(candidates, chosen, &scores, run)?;
+    note_choice(&usable, chosen, &scores, run)?;
     let distances_m: Vec<f64> = residuals[chosen].iter().map(|[east, north]| east.hypot(*north)).collect();
     run.notify(FitEvent::HeldOut(&distances_m))?;
     // The final fit may be shorter than the longest candidate's.
-    run.progress.epochs = in_blocks + candidates[chosen].total_epochs(context);
+    run.progress.epochs = in_blocks + usable[chosen].total_epochs(context);
     Ok(Chosen {
-        candidate: *candidates[chosen],
+        candidate: *usable[chosen],
         residuals: validated.swap_remove(chosen).residuals,
         held_out: reports[chosen].held_out.clone(),
         reports,

@@ -3,7 +3,7 @@
 use super::box_plausibility::BoxPlausibility;
 use super::candidate::{Candidate, Draft, Form};
 use super::edge_noise::edge_covariance_px2;
-use super::groups::groups;
+use super::groups::{Grouping, groups};
 use super::hyperparameters::{Hyperparameters, Priors};
 use super::kernel::InputScales;
 use super::leave_out::{calibrate, weigh};
@@ -18,6 +18,8 @@ use super::upright_camera::UprightCamera;
 const MAX_ROWS: usize = 20_000;
 /// A candidate of less weight is left out of the mixture.
 const MIN_WEIGHT: f64 = 0.02;
+/// Least variance of the fixes about the homography, m2.
+const MIN_SCATTER_M2: f64 = 1e-6;
 
 /// What a fit found out, for people.
 #[derive(Debug, Clone)]
@@ -58,8 +60,6 @@ pub(crate) struct FitSettings {
 
 /// Fits a model; `None` where the rows determine nothing (not finite, or all alike).
 pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, FitReport)> {
-    let FitSettings { shared_bias_m2, seed, .. } = *settings;
-    let edge_px2 = edge_covariance_px2(&all.epochs, &all.boxes);
     let thinned = all.thinned(MAX_ROWS);
     let mut mean = ProjectiveMean::of_rows(&thinned.boxes, &thinned.labels_m);
     mean.fit_foot(&thinned.boxes, &thinned.labels_m);
@@ -67,74 +67,89 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     let rows = thinned.without_gross_errors(&mean);
     let input_scales = InputScales::of_rows(&rows.boxes);
     let inputs: Vec<[f64; 4]> = rows.boxes.iter().map(|sides| input_scales.input(sides)).collect();
-
-    let residuals_m = rows.misses_m(&mean);
-    let scatter_m2 = scatter_m2(&residuals_m).max(1e-6);
-    let white = Whitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
-    let mut draft = Draft {
-        form: Form::Residual,
-        rows: &rows,
-        inputs: &inputs,
-        mean,
-        inflation_m2: white.inflation_m2(&residuals_m),
-        upright: None,
-    };
-    let start = draft.clone();
-    let (parameters, receiver) = draft.estimate(&Priors::new(scatter_m2.sqrt(), start.mean.spread_m))?;
     let grouping = groups(&rows.epochs);
-    let mut homography = Draft { form: Form::Homography, ..start };
-    homography.relinearize(&parameters)?;
-    let upright =
-        settings.upright.as_ref().and_then(|camera| homography.clone().into_upright(camera, &parameters));
-    let mut candidates = vec![homography.solve(&parameters, &grouping)?];
-    candidates.extend(upright.and_then(|draft| draft.solve(&parameters, &grouping)));
-    candidates.push(draft.solve(&parameters, &grouping)?);
+    let Solutions { parameters, receiver, candidates } =
+        solve(&rows, &inputs, mean, settings.upright.as_ref(), &grouping)?;
 
-    let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, seed);
-    let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise);
+    let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, settings.seed);
+    let kept = without_negligible(&weights);
     let jackknives: Vec<_> = candidates.iter().map(Candidate::jackknife).collect();
-    let kept = weights.iter().map(|weight| if *weight < MIN_WEIGHT { 0.0 } else { *weight });
-    let kept: Vec<f64> = kept.collect();
-    let sum: f64 = kept.iter().sum();
     let maps = candidates
         .iter()
         .zip(&jackknives)
         .zip(&kept)
         .filter(|(_, weight)| **weight > 0.0)
-        .map(|((candidate, (_, deviations)), weight)| Map::new(candidate, deviations, weight / sum))
+        .map(|((candidate, (_, deviations)), weight)| Map::new(candidate, deviations, *weight))
         .collect::<Option<Vec<Map>>>()?;
+    let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise);
     let stated = Stated {
-        edge_px2,
-        shared_bias_m2,
+        edge_px2: edge_covariance_px2(&all.epochs, &all.boxes),
+        shared_bias_m2: settings.shared_bias_m2,
         freedom,
         plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes),
     };
     let mut predictor = Predictor::new(maps, input_scales, stated);
-    let kept: Vec<f64> = kept.iter().map(|weight| weight / sum).collect();
     let extra_m2 = |row: usize| predictor.jackknife_m2(&rows.boxes[row]);
     let calibration = calibrate(&candidates, &kept, &grouping, &rows, &parameters.noise, &extra_m2);
     predictor.widening = calibration.widening;
     let residuals_m: Vec<[f64; 2]> =
         (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
-    let sessions = Sessions::new(&rows.epochs, &residuals_m, &parameters.noise);
+    let of_candidate = |((candidate, weight), miss_m2): ((&Candidate, &f64), &f64)| {
+        (candidate.form.as_str(), *weight, *miss_m2)
+    };
     let report = FitReport {
         parameters,
         receiver,
         gross_errors: thinned.boxes.len() - rows.boxes.len(),
         groups: grouping.members().len(),
-        candidates: candidates
-            .iter()
-            .zip(weights.iter().zip(&misses_m2))
-            .map(|(candidate, (weight, miss_m2))| (candidate.form.as_str(), *weight, *miss_m2))
-            .collect(),
+        candidates: candidates.iter().zip(&weights).zip(&misses_m2).map(of_candidate).collect(),
         widening: calibration.widening,
-        sessions,
+        sessions: Sessions::new(&rows.epochs, &residuals_m, &parameters.noise),
         jackknife_shares: jackknives.iter().map(|(share, _)| *share).collect(),
         freedom,
         held_out_m2: calibration.miss_m2,
         held_out_coverage: calibration.coverage,
     };
     Some((predictor, report))
+}
+
+/// The candidates under common hyper-parameters.
+struct Solutions {
+    parameters: Hyperparameters,
+    /// The noise before its white part was raised.
+    receiver: ReceiverNoise,
+    candidates: Vec<Candidate>,
+}
+
+/// Estimates the hyper-parameters and solves every form of the map.
+fn solve(
+    rows: &MapRows,
+    inputs: &[[f64; 4]],
+    mean: ProjectiveMean,
+    upright: Option<&UprightCamera>,
+    grouping: &Grouping,
+) -> Option<Solutions> {
+    let residuals_m = rows.misses_m(&mean);
+    let scatter_m2 = scatter_m2(&residuals_m).max(MIN_SCATTER_M2);
+    let white = Whitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
+    let inflation_m2 = white.inflation_m2(&residuals_m);
+    let mut residual = Draft { form: Form::Residual, rows, inputs, mean, inflation_m2, upright: None };
+    let mut homography = Draft { form: Form::Homography, ..residual.clone() };
+    let priors = Priors::new(scatter_m2.sqrt(), residual.mean.spread_m);
+    let (parameters, receiver) = residual.estimate(&priors)?;
+    homography.relinearize(&parameters)?;
+    let upright = upright.and_then(|camera| homography.clone().into_upright(camera, &parameters));
+    let mut candidates = vec![homography.solve(&parameters, grouping)?];
+    candidates.extend(upright.and_then(|draft| draft.solve(&parameters, grouping)));
+    candidates.push(residual.solve(&parameters, grouping)?);
+    Some(Solutions { parameters, receiver, candidates })
+}
+
+/// Weights that add up to 1, without the negligible ones.
+fn without_negligible(weights: &[f64]) -> Vec<f64> {
+    let kept = weights.iter().map(|weight| if *weight < MIN_WEIGHT { 0.0 } else { *weight });
+    let sum: f64 = kept.clone().sum();
+    kept.map(|weight| weight / sum).collect()
 }
 
 fn mixed_residual(candidates: &[Candidate], weights: &[f64], row: usize) -> [f64; 2] {

@@ -11,6 +11,7 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::projective_mean::{Box4, FOOT_COEFFICIENTS, ProjectiveMean};
+use crate::statistics::median;
 
 /// Log focal length (px), pitch (rad, down), roll (rad), log of target height over camera height, log
 /// camera height (m), yaw (rad), east and north of the camera less the centre of the positions (m), log
@@ -325,7 +326,8 @@ impl UprightCamera {
             .min_by(|one, other| one.0.total_cmp(&other.0))
     }
 
-    /// Place and direction of a camera by robust least squares on fixes: a similarity without scale.
+    /// Place and direction of a camera by robust least squares on fixes: a rotation and a shift, under
+    /// Cauchy's loss.
     pub(crate) fn placed(
         &self,
         start: &Parameters,
@@ -334,63 +336,24 @@ impl UprightCamera {
         labels_m: &[[f64; 2]],
     ) -> Parameters {
         let camera_m = start[4].exp();
-        let ground: Vec<Option<[f64; 2]>> = boxes
-            .iter()
-            .map(|sides| {
-                let ray = self.ray(start, sides[0], sides[1]);
-                (ray.down > 0.01)
-                    .then(|| [camera_m * ray.right / ray.down, camera_m * ray.forward / ray.down])
-            })
-            .collect();
-        let mut weights = vec![1.0; boxes.len()];
-        let mut placed = *start;
-        for _ in 0..20 {
-            let (mut total, mut from, mut to) = (0.0, [0.0; 2], [0.0; 2]);
-            let pairs = || {
-                ground.iter().zip(labels_m).zip(&weights).filter_map(|((ground, label), weight)| {
-                    ground.map(|ground| {
-                        (ground, [label[0] - mean.centre_m[0], label[1] - mean.centre_m[1]], *weight)
-                    })
-                })
-            };
-            for (ground, label, weight) in pairs() {
-                total += weight;
-                for axis in 0..2 {
-                    from[axis] += weight * ground[axis];
-                    to[axis] += weight * label[axis];
-                }
-            }
-            (from, to) = (from.map(|sum| sum / total), to.map(|sum| sum / total));
-            let (mut cosine, mut sine) = (0.0, 0.0);
-            for (ground, label, weight) in pairs() {
-                let (a, b) =
-                    ([ground[0] - from[0], ground[1] - from[1]], [label[0] - to[0], label[1] - to[1]]);
-                cosine += weight * (a[0] * b[0] + a[1] * b[1]);
-                sine += weight * (a[1] * b[0] - a[0] * b[1]);
-            }
-            let yaw = sine.atan2(cosine);
-            let (sin_yaw, cos_yaw) = yaw.sin_cos();
-            let turned = |ground: [f64; 2]| {
-                [cos_yaw * ground[0] + sin_yaw * ground[1], cos_yaw * ground[1] - sin_yaw * ground[0]]
-            };
-            let offset = turned(from);
-            (placed[5], placed[6], placed[7]) = (yaw, to[0] - offset[0], to[1] - offset[1]);
-            let misses: Vec<f64> = pairs()
-                .map(|(ground, label, _)| {
-                    let [east, north] = turned(ground);
-                    (east + placed[6] - label[0]).hypot(north + placed[7] - label[1])
-                })
-                .collect();
-            let scale = crate::statistics::median(misses.clone()).max(1e-3);
-            let mut misses = misses.into_iter();
-            for (weight, ground) in weights.iter_mut().zip(&ground) {
-                *weight = if ground.is_some() {
-                    1.0 / (1.0 + (misses.next().unwrap_or(0.0) / (2.0 * scale)).powi(2))
-                } else {
-                    0.0
-                };
+        let on_ground = |(sides, label): (&Box4, &[f64; 2])| {
+            let ray = self.ray(start, sides[0], sides[1]);
+            let ground = [camera_m * ray.right / ray.down, camera_m * ray.forward / ray.down];
+            (ray.down > 0.01).then_some((ground, [label[0] - mean.centre_m[0], label[1] - mean.centre_m[1]]))
+        };
+        let pairs: Vec<([f64; 2], [f64; 2])> = boxes.iter().zip(labels_m).filter_map(on_ground).collect();
+        let mut weights = vec![1.0; pairs.len()];
+        let mut placement = Placement { yaw: 0.0, shift_m: [0.0; 2] };
+        for _ in 0..ROUNDS {
+            placement = Placement::fit(&pairs, &weights);
+            let misses_m: Vec<f64> = pairs.iter().map(|pair| placement.miss_m(pair)).collect();
+            let scale_m = median(misses_m.clone()).max(1e-3);
+            for (weight, miss_m) in weights.iter_mut().zip(misses_m) {
+                *weight = 1.0 / (1.0 + (miss_m / (2.0 * scale_m)).powi(2));
             }
         }
+        let mut placed = *start;
+        (placed[5], placed[6], placed[7]) = (placement.yaw, placement.shift_m[0], placement.shift_m[1]);
         placed
     }
 
@@ -418,5 +381,43 @@ impl UprightCamera {
         let precision = inverse.transpose() * covariance.cholesky()?.inverse() * inverse;
         let centre = self.coefficients(parameters, mean)? + jacobian * step.remove_row(RATIO);
         Some((centre, 0.5 * (precision + precision.transpose())))
+    }
+}
+
+/// A rotation and a shift from (right, forward) of the camera to (east, north).
+struct Placement {
+    yaw: f64,
+    shift_m: [f64; 2],
+}
+
+impl Placement {
+    fn turned(&self, [right, forward]: [f64; 2]) -> [f64; 2] {
+        let (sin_yaw, cos_yaw) = self.yaw.sin_cos();
+        [cos_yaw * right + sin_yaw * forward, cos_yaw * forward - sin_yaw * right]
+    }
+
+    /// Weighted least squares (Kabsch 1976 in the plane).
+    fn fit(pairs: &[([f64; 2], [f64; 2])], weights: &[f64]) -> Self {
+        let weighted = || pairs.iter().zip(weights);
+        let total: f64 = weights.iter().sum();
+        let mean = |of: fn(&([f64; 2], [f64; 2])) -> [f64; 2]| {
+            [0, 1].map(|axis| weighted().map(|(pair, weight)| weight * of(pair)[axis]).sum::<f64>() / total)
+        };
+        let (from, to) = (mean(|pair| pair.0), mean(|pair| pair.1));
+        let (mut cosine, mut sine) = (0.0, 0.0);
+        for ((ground, label), weight) in weighted() {
+            let (a, b) = ([ground[0] - from[0], ground[1] - from[1]], [label[0] - to[0], label[1] - to[1]]);
+            cosine += weight * (a[0] * b[0] + a[1] * b[1]);
+            sine += weight * (a[1] * b[0] - a[0] * b[1]);
+        }
+        let mut placement = Self { yaw: sine.atan2(cosine), shift_m: [0.0; 2] };
+        let turned = placement.turned(from);
+        placement.shift_m = [to[0] - turned[0], to[1] - turned[1]];
+        placement
+    }
+
+    fn miss_m(&self, (ground, label): &([f64; 2], [f64; 2])) -> f64 {
+        let [east, north] = self.turned(*ground);
+        (east + self.shift_m[0] - label[0]).hypot(north + self.shift_m[1] - label[1])
     }
 }

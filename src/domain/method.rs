@@ -115,7 +115,7 @@ mod tests {
     #[test]
     fn every_name_is_parsed() {
         let all = Method::all();
-        assert_eq!(all.len(), 19);
+        assert_eq!(all.len(), 22);
         for method in &all {
             assert_eq!(method.to_string().parse::<Method>().expect("a name"), *method);
         }

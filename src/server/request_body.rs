@@ -327,7 +327,7 @@ mod tests {
     fn a_body_that_trickles_is_refused_and_a_steady_one_is_not() {
         assert!(holds(60, &[0, 5, 5, 5, 5, 5, 5]), "60 bytes in 5 s");
         assert!(!holds(20, &[0, 5, 5]), "20 bytes in 5 s");
-        assert!(!holds(60, &[0, 5, 5, 5, 10]), "silence after a steady begin");
+        assert!(!holds(60, &[0, 5, 5, 5, 5, 10]), "silence after a steady begin");
         assert!(holds(1, &[0, 0, 0, 9]), "the first window is not over");
         assert!(!holds(0, &[10]), "nothing at all");
     }

@@ -115,7 +115,8 @@ async fn an_open_store_answers() {
 
 #[tokio::test]
 async fn slow_reads_do_not_keep_a_health_check_waiting() {
-    let Fixture { store, .. } = Fixture::new().await;
+    let fixture = Fixture::new().await;
+    let store = &fixture.store;
     let mut held = Vec::new();
     while let Some(reader) = store.readers().try_acquire() {
         held.push(reader);

@@ -203,18 +203,12 @@ impl Observation<'_> {
         bounds: &TimeBounds,
         image_size: Option<domain::ImageSize>,
     ) -> Result<domain::Observation> {
-        if self.bounding_box.is_none() && self.fix.is_none() {
-            return Err(Error::invalid(
-                "bounding_box",
-                "an observation needs a bounding_box, a fix, or both",
-            ));
-        }
-        Ok(domain::Observation {
-            time: bounds.check(parse_time(self.time.as_str())?)?,
-            target_id: self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?,
-            bounding_box: self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
-            fix: self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
-        })
+        domain::Observation::new(
+            bounds.check(parse_time(self.time.as_str())?)?,
+            self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?,
+            self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
+            self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
+        )
     }
 }
 

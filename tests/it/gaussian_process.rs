@@ -31,7 +31,7 @@ async fn a_model_states_weights_and_an_error_that_grows_with_an_odd_box() {
         row[at].parse::<f64>().expect("a number")
     };
     let fuse = |grown_px: f64| {
-        json!({"bounding_box": {
+        json!({"time": "2026-01-01T00:00:00Z", "bounding_box": {
             "left_px": number("left") - grown_px,
             "top_px": number("top") - grown_px,
             "width_px": number("width") + grown_px,

@@ -341,8 +341,12 @@ async fn ten_thousand_streams_are_attempted_and_the_server_goes_on() {
     const STREAMS: usize = 250;
     const TAKEN: usize = 100;
     let folder = data_folder();
-    let limits =
-        [("SIGHTFIX_LIMITS__LIVE_STREAMS", "100"), ("SIGHTFIX_LIMITS__LIVE_STREAMS_PER_CLIENT", "30")];
+    let limits = [
+        ("SIGHTFIX_LIMITS__LIVE_STREAMS", "100"),
+        ("SIGHTFIX_LIMITS__LIVE_STREAMS_PER_CLIENT", "30"),
+        // All streams come from one address.
+        ("SIGHTFIX_LIMITS__CLIENT_SHARE", "1"),
+    ];
     let server = yard(folder.path(), &limits, json!({}), true).await;
     let mut held = Vec::new();
     let mut refused = 0;

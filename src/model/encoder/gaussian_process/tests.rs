@@ -215,16 +215,20 @@ fn the_stated_radius_holds_where_every_receiver_keeps_a_bias() {
 #[test]
 fn fixes_off_by_a_kilometre_change_the_map_by_a_twentieth_at_most() {
     let (rows, tests) = walkers(4200, 8, 120, 0.5);
-    let clean_m = score(&fitted(&rows).0, &tests, 0.0).0;
+    let (clean_m, clean_inside) = score(&fitted(&rows).0, &tests, 0.0);
     let mut wrong = rows.clone();
     for label in wrong.labels_m.iter_mut().step_by(20) {
         label[0] += 1_000.0;
     }
     let (predictor, report) = fitted(&wrong);
     let (mean_m, inside) = score(&predictor, &tests, 0.0);
-    println!("{clean_m:.3} m, with gross errors {mean_m:.3} m, {} rows left out", report.gross_errors);
+    println!(
+        "{clean_m:.3} m, {clean_inside:.2} inside; with gross errors {mean_m:.3} m, {inside:.2} inside, {} rows left out",
+        report.gross_errors
+    );
     assert!(mean_m <= 1.05 * clean_m + 0.02, "{clean_m} {mean_m}");
-    assert!(report.gross_errors >= rows.boxes.len() / 25 && inside > 0.85, "{inside}");
+    assert!(report.gross_errors >= rows.boxes.len() / 25, "{}", report.gross_errors);
+    assert!(inside >= clean_inside - 0.05, "{clean_inside} {inside}");
 }
 
 #[test]

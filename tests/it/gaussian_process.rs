@@ -40,7 +40,7 @@ async fn a_model_states_weights_and_an_error_that_grows_with_an_odd_box() {
     };
     let radius_m = async |grown_px: f64| {
         let answer = server.post("/v1/cameras/c/fusions", &fuse(grown_px)).await.expect(200).json();
-        answer["r95_m"].as_f64().unwrap_or_else(|| panic!("no radius: {answer}"))
+        answer["items"][0]["r95_m"].as_f64().unwrap_or_else(|| panic!("no radius: {answer}"))
     };
     let (usual_m, odd_m) = (radius_m(0.0).await, radius_m(30.0).await);
     println!("95 % radius {usual_m:.2} m, of the box grown by 30 px {odd_m:.2} m");

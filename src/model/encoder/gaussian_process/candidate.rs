@@ -41,6 +41,10 @@ impl Form {
     }
 }
 
+/// Change of the coefficients when one group is left out: those of the tangent columns, and the kernel
+/// weights of each axis.
+type Deviation = (DVector<f64>, [DVector<f64>; 2]);
+
 /// A map on its way: rows, where it is linearised, and what gross errors have cost each row.
 #[derive(Debug, Clone)]
 pub(crate) struct Draft<'a> {
@@ -272,7 +276,7 @@ impl Candidate {
     /// Coefficients without each group less their mean, scaled so that the squares of what they move add
     /// up to the variance to state: the delete-group jackknife, by the share of it that the posterior
     /// does not state already.
-    pub(crate) fn jackknife(&self) -> (f64, Vec<(DVector<f64>, [DVector<f64>; 2])>) {
+    pub(crate) fn jackknife(&self) -> (f64, Vec<Deviation>) {
         let count = self.without.len() as f64;
         let mean = |of: &dyn Fn(&Posterior) -> DVector<f64>| {
             self.without.iter().map(of).fold(of(&self.posterior) * 0.0, |sum, own| sum + own) / count
@@ -297,7 +301,7 @@ impl Candidate {
         (share, deviations)
     }
 
-    fn jackknife_share(&self, deviations: &[(DVector<f64>, [DVector<f64>; 2])]) -> f64 {
+    fn jackknife_share(&self, deviations: &[Deviation]) -> f64 {
         let rows = self.columns.tangent.nrows();
         let (mut jackknife_m2, mut posterior_m2) = (0.0, 0.0);
         for row in (0..rows).step_by(rows.div_ceil(200)) {

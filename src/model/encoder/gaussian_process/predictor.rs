@@ -252,8 +252,9 @@ impl Map {
         let mut sum = self.jackknife_m2(terms);
         sum[0] += own_m2;
         sum[2] += own_m2;
-        for at in 0..COEFFICIENTS {
-            add_outer(&mut sum, [whitened[0][at], whitened[1][at]], 1.0);
+        let [east, north] = whitened;
+        for (east, north) in east.into_iter().zip(north) {
+            add_outer(&mut sum, [east, north], 1.0);
         }
         sum
     }

@@ -99,8 +99,7 @@ fn innovations_of_the_three_part_noise_are_white_with_unit_variance() {
             column.push(state[0] + state[1] + 0.5 * normal(&mut rng));
             for (value, (variance_m2, time_s)) in state.iter_mut().zip([(4.0, 30.0), (2.0, 900.0)]) {
                 let decay = f64::exp(-1.0 / time_s);
-                *value =
-                    decay * *value + (variance_m2 * (1.0 - decay * decay) as f64).sqrt() * normal(&mut rng);
+                *value = decay * *value + f64::sqrt(variance_m2 * (1.0 - decay * decay)) * normal(&mut rng);
             }
         }
     }

@@ -384,6 +384,9 @@ impl UprightCamera {
     }
 }
 
+/// A point on the ground as (right, forward) of the camera, and its label as (east, north), both m.
+type PointPair = ([f64; 2], [f64; 2]);
+
 /// A rotation and a shift from (right, forward) of the camera to (east, north).
 struct Placement {
     yaw: f64,
@@ -391,16 +394,16 @@ struct Placement {
 }
 
 impl Placement {
-    fn turned(&self, [right, forward]: [f64; 2]) -> [f64; 2] {
+    fn rotated(&self, [right, forward]: [f64; 2]) -> [f64; 2] {
         let (sin_yaw, cos_yaw) = self.yaw.sin_cos();
         [cos_yaw * right + sin_yaw * forward, cos_yaw * forward - sin_yaw * right]
     }
 
     /// Weighted least squares (Kabsch 1976 in the plane).
-    fn fit(pairs: &[([f64; 2], [f64; 2])], weights: &[f64]) -> Self {
+    fn fit(pairs: &[PointPair], weights: &[f64]) -> Self {
         let weighted = || pairs.iter().zip(weights);
         let total: f64 = weights.iter().sum();
-        let mean = |of: fn(&([f64; 2], [f64; 2])) -> [f64; 2]| {
+        let mean = |of: fn(&PointPair) -> [f64; 2]| {
             [0, 1].map(|axis| weighted().map(|(pair, weight)| weight * of(pair)[axis]).sum::<f64>() / total)
         };
         let (from, to) = (mean(|pair| pair.0), mean(|pair| pair.1));
@@ -411,13 +414,13 @@ impl Placement {
             sine += weight * (a[1] * b[0] - a[0] * b[1]);
         }
         let mut placement = Self { yaw: sine.atan2(cosine), shift_m: [0.0; 2] };
-        let turned = placement.turned(from);
-        placement.shift_m = [to[0] - turned[0], to[1] - turned[1]];
+        let rotated = placement.rotated(from);
+        placement.shift_m = [to[0] - rotated[0], to[1] - rotated[1]];
         placement
     }
 
-    fn miss_m(&self, (ground, label): &([f64; 2], [f64; 2])) -> f64 {
-        let [east, north] = self.turned(*ground);
+    fn miss_m(&self, (ground, label): &PointPair) -> f64 {
+        let [east, north] = self.rotated(*ground);
         (east + self.shift_m[0] - label[0]).hypot(north + self.shift_m[1] - label[1])
     }
 }

@@ -1,7 +1,7 @@
 //! Admission control: how much of each bounded resource all clients together, and one client
 //! address, may hold at a time.
 //!
-//! What never happens here: waiting. Whoever gets nothing is refused at once and may try again.
+//! What never happens here: waiting. A request beyond a quota is refused at once and may be tried again.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};

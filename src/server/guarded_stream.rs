@@ -20,7 +20,7 @@ pub(super) struct GuardedStream {
     stream: TcpStream,
     activity: Arc<Activity>,
     frames: FrameLimit,
-    /// Bytes that are missing until HTTP/1 and HTTP/2 can be told apart. hyper's own timers begin
+    /// Bytes missing until HTTP/1 and HTTP/2 can be distinguished. hyper's own timers begin
     /// only then.
     missing: usize,
     first_bytes: Option<Pin<Box<Sleep>>>,

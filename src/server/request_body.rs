@@ -119,7 +119,7 @@ pub(super) struct AdmittedBody {
 #[derive(PartialEq, Eq)]
 enum State {
     Open,
-    /// Refused; so many bytes are still discarded before the reader is told so.
+    /// Refused; so many bytes are still discarded before the reader gets the error.
     Discarding(u64),
     Ended,
 }

@@ -25,7 +25,7 @@ struct Mode {
     growth: Growth,
 }
 
-/// The writing connection. Whoever writes locks it.
+/// The writing connection; a writer locks it.
 pub(super) struct Writer {
     options: SqliteConnectOptions,
     /// Limit of the database's size.

@@ -239,9 +239,9 @@ fn a_stream_without_partners_stays_bounded() {
     assert!(pairer.buffered().count() <= 4);
     assert!(pairer.buffered().all(|(detections, fixes)| detections <= 16 && fixes <= 16));
     // Nothing is dropped: what gave way was decided, and is counted.
-    let told = pairer.unpaired().detections + pairer.unpaired().fixes;
+    let reported = pairer.unpaired().detections + pairer.unpaired().fixes;
     let buffered: usize = pairer.buffered().map(|(detections, fixes)| detections + fixes).sum();
-    assert_eq!(told + buffered as u64, 20_000);
+    assert_eq!(reported + buffered as u64, 20_000);
     assert_eq!(released + buffered, 20_000, "every item is released once");
 }
 

@@ -153,14 +153,14 @@ async fn a_receivers_error_is_told_from_fixes_at_one_point() {
     let path = "/v1/cameras/c/gnss-error";
     let spread: Vec<f64> = (0..50).map(|n| f64::from(n % 7) * 1e-5).collect();
     let csv: String = spread.iter().map(|d| format!("{},{}\n", 103.9 + d, 30.6 - d)).collect();
-    let told = rest.csv(path, format!("longitude,latitude\n{csv}181,30\n")).await.expect(200).json();
-    assert_eq!((&told["fixes"], &told["rejected"]), (&json!(50), &json!(1)), "{told}");
-    assert_eq!(told["rejected_rows"][0]["field"], "longitude");
+    let response = rest.csv(path, format!("longitude,latitude\n{csv}181,30\n")).await.expect(200).json();
+    assert_eq!((&response["fixes"], &response["rejected"]), (&json!(50), &json!(1)), "{response}");
+    assert_eq!(response["rejected_rows"][0]["field"], "longitude");
     let fixes: Vec<Value> =
         spread.iter().map(|d| json!({"longitude_deg": 103.9 + d, "latitude_deg": 30.6 - d})).collect();
     let same = rest.post(path, &json!({"fixes": fixes})).await.expect(200).json();
-    let sigma = |told: &Value| told["sigma_m"].as_f64().expect("a number");
-    assert!((sigma(&told) - sigma(&same)).abs() < 1e-6 && sigma(&told) > 0.5, "{told} {same}");
+    let sigma = |response: &Value| response["sigma_m"].as_f64().expect("a number");
+    assert!((sigma(&response) - sigma(&same)).abs() < 1e-6 && sigma(&response) > 0.5, "{response} {same}");
 
     assert_eq!(rest.post(path, &json!({"fixes": []})).await.problem(422, "invalid-argument"), ["fixes"]);
     let bad = json!({"fixes": [{"longitude_deg": 1, "latitude_deg": 91}]});

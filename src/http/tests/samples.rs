@@ -71,9 +71,9 @@ async fn samples_are_counted_and_deleted_by_time() {
 async fn rejected_rows_are_told_up_to_a_hundred() {
     let rest = Rest::with_camera().await;
     let bad = "2025-01-01T00:00:00Z,a,1,2,30,40,103.9,91\n".repeat(150);
-    let told = rest.csv(SAMPLES, format!("{}{bad}", rows(3))).await.expect(200).json();
-    assert_eq!((&told["accepted"], &told["rejected"]), (&json!(3), &json!(150)));
-    let rows = told["rejected_rows"].as_array().expect("rows");
+    let response = rest.csv(SAMPLES, format!("{}{bad}", rows(3))).await.expect(200).json();
+    assert_eq!((&response["accepted"], &response["rejected"]), (&json!(3), &json!(150)));
+    let rows = response["rejected_rows"].as_array().expect("rows");
     assert_eq!((rows.len(), &rows[0]["line"], &rows[0]["field"]), (100, &json!(5), &json!("latitude")));
 }
 
@@ -105,8 +105,8 @@ async fn long_imports_go_through_a_file_and_too_long_ones_nowhere() {
             csv.into_bytes().chunks(777).map(|part| Ok(Bytes::copy_from_slice(part))).collect();
         Body::from_stream(futures_util::stream::iter(parts))
     };
-    let told = rest.csv(SAMPLES, parts(rows(1_000))).await.expect(200).json();
-    assert_eq!(told["accepted"], 1_000);
+    let response = rest.csv(SAMPLES, parts(rows(1_000))).await.expect(200).json();
+    assert_eq!(response["accepted"], 1_000);
     rest.csv(SAMPLES, parts(rows(5_000))).await.problem(413, "too-large");
     rest.csv(SAMPLES, rows(5_000)).await.problem(413, "too-large");
     assert_eq!(rest.get(&format!("{SAMPLES}/count")).await.expect(200).json(), json!({"count": 1_000}));

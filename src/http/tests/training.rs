@@ -61,8 +61,8 @@ async fn watching_has_few_places_and_ends_with_the_server() {
     let events = format!("{}/events", run.header("location"));
 
     let mut first = rest.open("GET", &events, &[], Body::empty()).await;
-    let told = first.body_mut().frame().await.expect("an event").expect("whole").into_data().expect("text");
-    assert!(String::from_utf8_lossy(&told).contains("\"queued\""), "{told:?}");
+    let event = first.body_mut().frame().await.expect("an event").expect("whole").into_data().expect("text");
+    assert!(String::from_utf8_lossy(&event).contains("\"queued\""), "{event:?}");
     let second = rest.get(&events).await;
     assert_eq!(second.header("retry-after"), "1");
     second.problem(503, "overloaded");
@@ -95,7 +95,7 @@ async fn bad_runs_name_their_fields() {
 }
 
 #[tokio::test]
-async fn models_that_are_not_there_are_told() {
+async fn missing_models_are_reported() {
     let rest = Rest::with_camera().await;
     let models = "/v1/cameras/c/models";
     assert_eq!(rest.get(models).await.expect(200).json(), json!({"items": []}));

@@ -22,7 +22,7 @@ const SHARED_BIAS_SHARE: f64 = 0.1;
 const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
     [(&["person", "pedestrian"], (1.70, 0.05)), (&["car"], (1.50, 0.10)), (&[], (1.70, 1.0))];
 
-/// What the recipe is told beside the samples.
+/// Input of the recipe besides the samples.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Settings {
     /// Error variance per axis of the receiver, m2.

@@ -42,7 +42,7 @@ const BORDER_PX: f64 = 3.0;
 /// What a real camera departs from the ideal one by: standard deviations of log focal length, pitch, roll
 /// and log height ratio that no number of boxes goes below.
 const MODEL_ERROR: [f64; OF_BOXES] = [0.02, 0.003, 0.004, 0.01];
-/// Prior standard deviation of the log aspect ratio; it also takes up what lenses do.
+/// Prior standard deviation of the log aspect ratio; it also absorbs lens distortion.
 const ASPECT_PRIOR: f64 = 0.02;
 const ROUNDS: usize = 25;
 /// Of numerical derivatives.

@@ -28,9 +28,9 @@ impl Artifact {
         let document =
             serde_json::to_string(&self.metadata).map_err(SafeTensorError::InvalidHeaderDeserialization)?;
         let checksum = model_sha256(document.as_bytes(), &self.weights);
-        let header =
-            HashMap::from([(DOCUMENT_KEY.to_owned(), document), (CHECKSUM_KEY.to_owned(), checksum)]);
-        safetensors::serialize(tensors.tensors(), Some(header)).map(Bytes::from)
+        let header = HashMap::from([(DOCUMENT_KEY.to_owned(), document)]);
+        let file = safetensors::serialize(tensors.tensors(), Some(header))?;
+        with_checksum(&file, &checksum).map(Bytes::from).ok_or(SafeTensorError::HeaderTooSmall)
     }
 
     /// The artifact of a file by [`Artifact::to_file`].
@@ -72,4 +72,19 @@ impl Artifact {
             .map_err(|error| Error::invalid("metadata", format!("cannot be read: {error}")))?;
         Ok(Self { metadata, weights: weights.into() })
     }
+}
+
+/// The file with the checksum as the first entry of its header. The library writes entries in the random
+/// order of a hash map, which would give one model version different bytes with every download.
+fn with_checksum(file: &[u8], checksum: &str) -> Option<Vec<u8>> {
+    const LENGTH_BYTES: usize = 8;
+    let (length, rest) = file.split_first_chunk::<LENGTH_BYTES>()?;
+    let (header, weights) = rest.split_at_checked(usize::try_from(u64::from_le_bytes(*length)).ok()?)?;
+    let entries = header.trim_ascii_end().strip_prefix(br#"{"__metadata__":{"#)?;
+    let mut written = format!(r#"{{"__metadata__":{{"{CHECKSUM_KEY}":"{checksum}","#).into_bytes();
+    written.extend_from_slice(entries);
+    // Weights begin at a multiple of eight bytes.
+    written.resize(written.len().next_multiple_of(LENGTH_BYTES), b' ');
+    let length = u64::try_from(written.len()).ok()?.to_le_bytes();
+    Some([&length[..], &written, weights].concat())
 }

@@ -72,6 +72,7 @@ impl Job for TrainingRun {
             epochs: run.options.epochs,
             image_size: camera.profile.image_size,
             gnss_error: camera.profile.gnss_error,
+            gnss_bias_sigma_m: None,
         };
         let line = format!("{} samples, recipe {}, seed {}", samples.len(), options.recipe, options.seed);
         app.store.append_log(run.id, claim.fence, app.clock.now(), &line).await?;

@@ -30,7 +30,7 @@ pub(super) fn cross_validate(
     candidate: &Candidate,
     rows: &TrainingRows,
     blocks: &[u32],
-    context: &FitContext,
+    context: &FitContext<'_>,
     run: &mut FitRun<'_>,
 ) -> Result<HeldOutResiduals, FitError> {
     let mut residuals = vec![[0.0; 2]; rows.rows.len()];

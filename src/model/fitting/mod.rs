@@ -9,4 +9,4 @@ mod report;
 mod track_noise;
 
 pub use self::gnss_noise::{TimedResidual, estimate_gnss_noise};
-pub use self::pipeline::{FitOptions, FitOverrides, fit, fit_with};
+pub use self::pipeline::{FitInput, FitOptions, FitOverrides, fit, fit_with};

@@ -14,7 +14,7 @@ use super::report::{
 };
 use super::track_noise::estimate_track_noise;
 use crate::domain::{
-    CandidateReport, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError, ImageSize,
+    CandidateReport, Detection, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError, ImageSize,
     ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
 };
 use crate::model::artifact::{Artifact, FORMAT, ModelParts};
@@ -25,11 +25,34 @@ use crate::model::network::LossWeights;
 use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
 use crate::model::regressor::Regressor;
 use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRows, sha256_of};
+use crate::model::samples::unpaired::unpaired_boxes;
 use crate::model::uncertainty::calibration::{HeldOut, calibrate};
 use crate::model::uncertainty::error_model::set_image_size;
 
 /// Least error variance of a receiver that is estimated, m2.
 const LEAST_GNSS_VARIANCE_M2: f64 = 1e-4;
+
+/// What a fit learns from.
+#[derive(Debug, Clone, Copy)]
+pub struct FitInput<'a> {
+    /// Boxes with the fix of the same instant.
+    pub samples: &'a [Sample],
+    /// Boxes without a fix. They tell the geometry of a camera whose image size is known; recipes
+    /// `gaussian_process` and `auto` use those of the class that most samples have.
+    pub unpaired: &'a [Detection],
+}
+
+impl<'a> From<&'a [Sample]> for FitInput<'a> {
+    fn from(samples: &'a [Sample]) -> Self {
+        Self { samples, unpaired: &[] }
+    }
+}
+
+impl<'a> From<&'a Vec<Sample>> for FitInput<'a> {
+    fn from(samples: &'a Vec<Sample>) -> Self {
+        Self::from(samples.as_slice())
+    }
+}
 
 /// What a fit is asked to do.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,6 +67,10 @@ pub struct FitOptions {
     pub image_size: Option<ImageSize>,
     /// The receiver's error, if known.
     pub gnss_error: GnssError,
+    /// Standard deviation per axis, m, of the bias that all fixes of the training have in common and that
+    /// no sample can show: that of the one session of the one receiver, or what several receivers share.
+    /// `None` for a share of the estimated receiver error.
+    pub gnss_bias_sigma_m: Option<f64>,
 }
 
 /// Changes to a fit for an evaluation; operators have no access to them.
@@ -62,31 +89,35 @@ pub struct FitOverrides<'a> {
 /// # Errors
 /// [`FitError::Cancelled`] when the observer breaks, [`FitError::Unusable`] where the samples cannot
 /// support a fit.
-pub fn fit(
-    samples: &[Sample],
+pub fn fit<'a>(
+    input: impl Into<FitInput<'a>>,
     options: &FitOptions,
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
-    fit_with(samples, options, FitOverrides::default(), observer)
+    fit_with(input, options, FitOverrides::default(), observer)
 }
 
 /// Fits a model with some overrides.
 ///
 /// # Errors
 /// As [`fit`], and [`FitError::Fault`] where the recipe has no such candidate.
-pub fn fit_with(
-    samples: &[Sample],
+pub fn fit_with<'a>(
+    input: impl Into<FitInput<'a>>,
     options: &FitOptions,
     overrides: FitOverrides<'_>,
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
+    let FitInput { samples, unpaired } = input.into();
     let rows = TrainingRows::new(samples).map_err(FitError::Unusable)?;
+    let unpaired = unpaired_boxes(samples, unpaired);
     let geometry = fit_geometry(&rows);
     let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &geometry.noise);
     let context = FitContext {
         e_gnss_m2,
         e_gnss_is_estimated: e_gnss_source == GnssErrorSource::Estimated,
         image_size: options.image_size,
+        gnss_bias_sigma_m: options.gnss_bias_sigma_m,
+        unpaired: &unpaired,
         target_height_m: target_height_m(samples.iter().map(|sample| sample.class.as_ref())),
         noise: geometry.noise,
         epochs: options.epochs,
@@ -144,7 +175,7 @@ struct Chosen {
 /// Cross-validates the candidates and chooses one.
 fn select(
     rows: &TrainingRows,
-    context: &FitContext,
+    context: &FitContext<'_>,
     candidates: &[&Candidate],
     run: &mut FitRun<'_>,
 ) -> Result<Chosen, FitError> {
@@ -191,7 +222,7 @@ fn select(
 struct FinalFit<'a> {
     samples: &'a [Sample],
     rows: &'a TrainingRows,
-    context: &'a FitContext,
+    context: &'a FitContext<'a>,
     options: &'a FitOptions,
     e_gnss_source: GnssErrorSource,
 }

@@ -13,7 +13,7 @@ use crate::statistics::R95_PER_SIGMA;
 /// Logs the samples and the noise of their fixes.
 pub(super) fn note_samples(
     rows: &TrainingRows,
-    context: &FitContext,
+    context: &FitContext<'_>,
     run: &mut FitRun<'_>,
 ) -> Result<(), FitError> {
     let GaussMarkovNoise { variance_m2, correlation } = context.noise;

@@ -13,6 +13,7 @@ use crate::model::encoder::FittedEncoder;
 use crate::model::encoder::features::{Encoded, features_of};
 use crate::model::progress::{FitError, Phase};
 use crate::model::samples::rows::TrainingRows;
+use crate::model::samples::unpaired::TargetBox;
 
 /// Standard deviation of a bias that all receivers share, as a share of the receiver's standard deviation:
 /// no training sample can show it, so it is a prior.
@@ -24,12 +25,16 @@ const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
 
 /// Input of the recipe besides the samples.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Settings {
+pub(crate) struct Settings<'a> {
     /// Error variance per axis of the receiver, m2.
     pub(crate) e_gnss_m2: f64,
     /// Whether that was estimated, and may be replaced by the estimate of this recipe.
     pub(crate) e_gnss_is_estimated: bool,
+    /// Standard deviation per axis of the bias that all fixes have in common, m, if known.
+    pub(crate) gnss_bias_sigma_m: Option<f64>,
     pub(crate) image_size: Option<ImageSize>,
+    /// Boxes without a fix, in the order of target and time.
+    pub(crate) unpaired: &'a [TargetBox],
     /// Median height of the targets, m, and the standard deviation of its logarithm.
     pub(crate) target_height_m: (f64, f64),
     pub(crate) seed: u64,
@@ -59,7 +64,7 @@ pub(crate) fn target_height_m<'a>(classes: impl Iterator<Item = Option<&'a Targe
 /// [`FitError::Unusable`] where the rows determine no map.
 pub(crate) fn fit(
     rows: &TrainingRows,
-    settings: &Settings,
+    settings: &Settings<'_>,
     phase: &mut Phase<'_, '_>,
 ) -> Result<FittedEncoder, FitError> {
     let map_rows = MapRows {
@@ -67,13 +72,17 @@ pub(crate) fn fit(
         boxes: rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect(),
         labels_m: rows.rows.iter().map(|row| [row.label.east_m, row.label.north_m]).collect(),
     };
-    let boxes: Vec<(u32, [f64; 4])> =
-        rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides)).collect();
+    let unpaired =
+        settings.unpaired.iter().map(|own| (rows.targets + own.target, features_of(&own.bounding_box)));
+    let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
+    let boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
     let upright = settings.image_size.and_then(|size| {
         let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
         UprightCamera::new(&boxes, size_px, settings.target_height_m)
     });
-    let shared_bias_m2 = SHARED_BIAS_SHARE * SHARED_BIAS_SHARE * settings.e_gnss_m2;
+    let shared_bias_m2 = settings
+        .gnss_bias_sigma_m
+        .map_or(SHARED_BIAS_SHARE * SHARED_BIAS_SHARE * settings.e_gnss_m2, |sigma_m| sigma_m * sigma_m);
     let fitted = fit_map(&map_rows, &FitSettings { shared_bias_m2, seed: settings.seed, upright });
     let Some((predictor, report)) = fitted else {
         return Err(FitError::Unusable(Error::field(

@@ -99,6 +99,7 @@ pub(crate) fn fit(
     let mut parts = ModelParts::new(Recipe::GaussianProcess, rows.plane, predictor.features(), e_gnss_m2);
     predictor.put(&mut parts);
     put_report(&report, &mut parts);
+    parts.set("boxes_without_fix", settings.unpaired.len() as f64);
     parts.set("unrest_share", white_share(&predictor, &map_rows));
     Ok(FittedEncoder { parts, covariance: None })
 }

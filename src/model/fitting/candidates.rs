@@ -89,6 +89,7 @@ impl FitContext<'_> {
             e_gnss_m2: self.e_gnss_m2,
             e_gnss_is_estimated: self.e_gnss_is_estimated,
             gnss_bias_sigma_m: self.gnss_bias_sigma_m,
+            white_share: self.noise.correlation.white_share,
             image_size: self.image_size,
             unpaired: self.unpaired,
             target_height_m: self.target_height_m,
@@ -109,18 +110,18 @@ impl Candidate {
             Estimator::Paper => paper::EPOCHS,
             Estimator::Hybrid => hybrid::EPOCHS,
             Estimator::Projective(_) => projective::EPOCHS,
-            Estimator::GaussianProcess => 1,
+            Estimator::GaussianProcess => gaussian_process::EPOCHS,
         };
         context.epochs.unwrap_or(default).max(1)
     }
 
-    /// Epochs of one fit, over all of its networks.
-    pub(super) fn total_epochs(&self, context: &FitContext<'_>) -> u32 {
+    /// Epochs of one fit, over all of its networks; the final one of `gaussian_process` has one.
+    pub(super) fn total_epochs(&self, context: &FitContext<'_>, is_final: bool) -> u32 {
         let networks = match self.estimator {
             Estimator::Paper => 2,
             Estimator::Hybrid => 1,
             Estimator::Projective(variant) => u32::from(variant.residual),
-            Estimator::GaussianProcess => 0,
+            Estimator::GaussianProcess => u32::from(is_final),
         };
         networks.saturating_mul(self.epochs(context))
     }
@@ -139,7 +140,7 @@ impl Candidate {
             Estimator::Paper => paper::fit(rows, e_gnss_m2, epochs, phase),
             Estimator::Hybrid => hybrid::fit(rows, e_gnss_m2, epochs, phase),
             Estimator::Projective(variant) => projective::fit(rows, variant, e_gnss_m2, epochs, phase),
-            Estimator::GaussianProcess => gaussian_process::fit(rows, &context.map_settings(), phase),
+            Estimator::GaussianProcess => gaussian_process::fit(rows, &context.map_settings(), epochs, phase),
         }?;
         let coverage = Coverage::new(rows.rows.iter().map(|row| row.bounding_box));
         match self.estimator {

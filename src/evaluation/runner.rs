@@ -10,7 +10,7 @@ use super::predictors::{Prediction, Predictor, Predictors, TargetRows};
 use super::report::MethodReport;
 use super::traces::{Curve, Evaluation, Trace, TracePoint};
 use super::training::{RecipeModel, Timed, fit_recipe, recipes_of};
-use crate::domain::{BoundingBox, Method, Result, Sample, Truth};
+use crate::domain::{Method, Result, Sample, Truth};
 use crate::geo::{LocalPlane, Position};
 
 /// Fits what the methods need on the training samples and scores every method on the test rows.
@@ -29,9 +29,9 @@ pub fn evaluate(
 ) -> Result<Evaluation> {
     let mut test = test.to_vec();
     for row in &mut test {
-        let shifted =
-            row.observation.bounding_box.map(|bounding_box| shifted(bounding_box, options.box_shift_px));
-        row.observation.bounding_box = shifted.transpose()?;
+        let bounding_box = row.observation.bounding_box;
+        let grown = bounding_box.map(|bounding_box| bounding_box.grown_to_upper_left(options.box_shift_px));
+        row.observation.bounding_box = grown.transpose()?;
     }
     let plane = LocalPlane::new(first_fix(train, &test));
     let mut run = Run {
@@ -51,12 +51,6 @@ pub fn evaluate(
         }
     }
     Ok(run.finish())
-}
-
-/// The box with its left and top edges moved outwards, as in the paper's test of inaccurate boxes.
-fn shifted(bounding_box: BoundingBox, by_px: f64) -> Result<BoundingBox> {
-    let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
-    BoundingBox::new(left_px - by_px, top_px - by_px, width_px + by_px, height_px + by_px)
 }
 
 fn rows_by_target(test: &[TestRow]) -> Vec<TargetRows> {
@@ -159,10 +153,10 @@ impl Run<'_> {
             predicting_s += start.elapsed().as_secs_f64();
             for (&row, prediction) in target.iter().zip(predictions) {
                 rows += 1;
-                let Some(Prediction { position, r95_m }) = prediction else { continue };
+                let Some(Prediction { position, r95_m, covariance }) = prediction else { continue };
                 let error_m = self.truth.error_m(self.predictors.test[row].truth, position);
                 scored.extend(error_m.map(|error_m| ScoredPrediction { error_m, r95_m }));
-                points.push(TracePoint { row, position, error_m });
+                points.push(TracePoint { row, position, error_m, r95_m, covariance });
             }
         }
         let Some(metrics) = Metrics::of(&scored) else {

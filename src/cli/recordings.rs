@@ -37,19 +37,16 @@ pub(super) fn plaza(folder: &Path) -> anyhow::Result<Vec<RealCamera>> {
         let (own, others): (Vec<Detection>, Vec<Detection>) =
             boxes.into_iter().partition(|detection| carriers.contains(&detection.target_id));
         let settings = PairingSettings::new(PairingRule::Interpolated, None, None)?;
-        let test_row = |detection: Detection| TestRow {
-            truth: truth.get(&(detection.time, detection.target_id.clone())).copied(),
-            observation: Observation {
-                time: detection.time,
-                target_id: Some(detection.target_id),
-                bounding_box: Some(detection.bounding_box),
-                fix: None,
-            },
+        let test_row = |detection: Detection| {
+            let Detection { time, target_id, bounding_box, .. } = detection;
+            let truth = truth.get(&(time, target_id.clone())).copied();
+            let observation = Observation::new(time, Some(target_id), Some(bounding_box), None)?;
+            Ok(TestRow { observation, truth })
         };
         Ok(RealCamera {
             name: name.to_owned(),
             train: pair(own, fixes.clone(), &receivers, &settings).samples,
-            test: others.into_iter().map(test_row).collect(),
+            test: others.into_iter().map(test_row).collect::<anyhow::Result<_>>()?,
             image_size: Some(ImageSize::new(PLAZA_SIZE_PX.0, PLAZA_SIZE_PX.1)?),
         })
     };

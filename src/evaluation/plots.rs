@@ -60,7 +60,7 @@ fn error_over_time(traces: &[&Trace], test: &[TestRow]) -> Option<String> {
 }
 
 fn time_s(row: &TestRow) -> f64 {
-    row.observation.time.as_microsecond() as f64 * 1e-6
+    row.observation.time().as_microsecond() as f64 * 1e-6
 }
 
 fn errors_m<'a>(traces: &'a [&Trace]) -> impl Iterator<Item = f64> + 'a {

@@ -113,7 +113,7 @@ struct WorldScore {
 impl WorldScore {
     /// The part of an evaluation that is about some of its test rows.
     fn of(evaluation: &Evaluation, split: &Split, test: &[TestRow], rows: std::ops::Range<usize>) -> Self {
-        let has_box = |point: &&TracePoint| test[point.row].observation.bounding_box.is_some();
+        let has_box = |point: &&TracePoint| test[point.row].observation.bounding_box().is_some();
         let own = |trace: &Trace| {
             let points = trace.points.iter().filter(|point| rows.contains(&point.row));
             let moved = points.map(|point| TracePoint { row: point.row - rows.start, ..*point });

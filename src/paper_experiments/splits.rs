@@ -4,7 +4,7 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::RealRecording;
 use super::cases::TestSet;
-use crate::domain::{ImageSize, Observation, Sample, TargetId};
+use crate::domain::{BoundingBox, ImageSize, Observation, Sample, TargetId};
 use crate::evaluation::TestRow;
 use crate::simulation::{Options, SimulatedRow, World, simulate};
 
@@ -52,33 +52,26 @@ impl Split {
         for (number, rows) in self.tests.iter().enumerate() {
             begins.push(joined.len());
             for row in rows {
-                let mut row = row.clone();
-                let id = row.observation.target_id.as_ref().map_or("target", TargetId::as_str);
-                row.observation.target_id = Some(TargetId::new(&format!("{id}-set-{number}"))?);
-                joined.push(row);
+                let (time, target_id, bounding_box, fix) = row.observation.clone().into_parts();
+                let id = target_id.as_ref().map_or("target", TargetId::as_str);
+                let target_id = Some(TargetId::new(&format!("{id}-set-{number}"))?);
+                let observation = Observation::new(time, target_id, bounding_box, fix)?;
+                joined.push(TestRow { observation, truth: row.truth });
             }
         }
         Ok((joined, begins))
     }
 }
 
-fn shifted(mut row: TestRow, by_px: f64) -> anyhow::Result<TestRow> {
-    let grown = row.observation.bounding_box.map(|bounding_box| bounding_box.grown_to_upper_left(by_px));
-    row.observation.bounding_box = grown.transpose()?;
-    Ok(row)
+fn shifted(row: TestRow, by_px: f64) -> anyhow::Result<TestRow> {
+    let grow = |bounding_box: BoundingBox| bounding_box.grown_to_upper_left(by_px);
+    Ok(TestRow { observation: row.observation.try_map_box(grow)?, ..row })
 }
 
 fn test_rows_of(world: &World) -> Vec<TestRow> {
-    let test_row = |row: &SimulatedRow| TestRow {
-        observation: Observation {
-            time: row.time,
-            target_id: Some(row.target_id.clone()),
-            bounding_box: row.bounding_box,
-            fix: row.fix,
-        },
-        truth: Some(row.truth),
-    };
-    world.rows.iter().map(test_row).collect()
+    let test_row =
+        |row: &SimulatedRow| Some(TestRow { observation: row.observation()?, truth: Some(row.truth) });
+    world.rows.iter().filter_map(test_row).collect()
 }
 
 /// The traverses of one target's samples, which are in order of time.
@@ -123,12 +116,12 @@ pub(super) fn leave_out(recording: &RealRecording, session: &Session) -> Split {
 
 fn test_row(sample: &Sample) -> TestRow {
     TestRow {
-        observation: Observation {
-            time: sample.time,
-            target_id: Some(sample.target_id.clone()),
-            bounding_box: Some(sample.bounding_box),
-            fix: Some(sample.fix),
-        },
+        observation: Observation::with_fix(
+            sample.time,
+            Some(sample.target_id.clone()),
+            Some(sample.bounding_box),
+            sample.fix,
+        ),
         truth: None,
     }
 }

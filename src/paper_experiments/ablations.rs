@@ -4,8 +4,8 @@ use std::fmt::Write as _;
 use std::ops::ControlFlow;
 
 use super::Runner;
-use super::cases::{TestSet, Worlds};
-use super::splits::Split;
+use super::simulated::Worlds;
+use super::splits::{Split, TestSet};
 use crate::clock::process_cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;

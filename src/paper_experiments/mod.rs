@@ -8,7 +8,9 @@ mod ablations;
 mod cases;
 mod marks;
 mod page;
+mod recorded;
 mod scores;
+mod simulated;
 mod splits;
 mod tables;
 mod walks;
@@ -16,11 +18,12 @@ mod walks;
 use crate::domain::{ImageSize, Sample};
 use crate::evaluation::{EvaluateOptions, Evaluation, TestRow, Truth};
 use crate::simulation::Scene;
+use cases::Experiment;
 use page::Picture;
 use scores::CaseScore;
 use walks::WalkCurves;
 
-pub use cases::Worlds;
+pub use simulated::Worlds;
 
 /// A recording of a real camera with a surveyed line as ground truth.
 #[derive(Clone)]
@@ -97,7 +100,7 @@ pub fn run(
     runner: &mut dyn Runner,
 ) -> anyhow::Result<Vec<Document>> {
     let mut scores: Vec<CaseScore> = Vec::new();
-    let experiments = cases::all(worlds, recordings)?;
+    let experiments = experiments(worlds, recordings)?;
     let count = experiments.len();
     for (number, experiment) in experiments.into_iter().enumerate() {
         let title = experiment.cases.first().map_or("", |case| case.title.as_str());
@@ -121,6 +124,18 @@ pub fn run(
     let picture = |Picture { name, svg, .. }| Document { path: format!("{stem}/{name}.svg"), text: svg };
     documents.extend(pictures.into_iter().map(picture));
     Ok(documents)
+}
+
+fn experiments(worlds: Worlds, recordings: &Recordings) -> anyhow::Result<Vec<Experiment>> {
+    let mut all = simulated::airport(worlds)?;
+    all.extend(simulated::square(worlds)?);
+    all.extend(simulated::few_traverses(worlds)?);
+    if let Some(recording) = &recordings.square {
+        all.extend(recorded::real_square(recording)?);
+    }
+    all.extend(recorded::plaza(&recordings.plaza)?);
+    all.extend(simulated::training_seeds(worlds)?);
+    Ok(all)
 }
 
 fn command(Worlds { first, count }: Worlds, recordings: &Recordings) -> String {

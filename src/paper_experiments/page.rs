@@ -2,9 +2,10 @@
 
 use std::fmt::Write as _;
 
-use super::cases::{Worlds, key};
+use super::cases::key;
 use super::marks::{self, Mark, ONE_STEP, TRACK, TWO_STEP};
 use super::scores::CaseScore;
+use super::simulated::Worlds;
 use super::walks::{DEFAULT, WALKS, WalkCurves};
 use crate::evaluation::{Trace, Truth, plots};
 

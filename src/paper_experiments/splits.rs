@@ -3,10 +3,9 @@
 use jiff::{SignedDuration, Timestamp};
 
 use super::RealRecording;
-use super::cases::TestSet;
 use crate::domain::{BoundingBox, ImageSize, Observation, Sample, TargetId};
 use crate::evaluation::TestRow;
-use crate::simulation::{Options, SimulatedRow, World, simulate};
+use crate::simulation::{Options, Route, SimulatedRow, World, simulate};
 
 /// A gap in a recording longer than this separates sessions.
 const MAX_GAP: SignedDuration = SignedDuration::from_mins(10);
@@ -14,6 +13,30 @@ const MAX_GAP: SignedDuration = SignedDuration::from_mins(10);
 const MIN_SESSION_ROWS: usize = 300;
 /// A gap longer than this separates traverses, s.
 const TRAVERSE_GAP_S: i64 = 20;
+
+/// How the test rows of a simulated case differ from its training rows.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TestSet {
+    pub(super) rows: usize,
+    /// `None` for that of training.
+    pub(super) route: Option<Route>,
+    pub(super) new_line_offset_m: Option<f64>,
+    pub(super) box_shift_px: f64,
+}
+
+impl TestSet {
+    pub(super) const fn new(rows: usize) -> Self {
+        Self { rows, route: None, new_line_offset_m: None, box_shift_px: 0.0 }
+    }
+
+    pub(super) const fn on(self, route: Route) -> Self {
+        Self { route: Some(route), ..self }
+    }
+
+    pub(super) const fn enlarged_by(self, box_shift_px: f64) -> Self {
+        Self { box_shift_px, ..self }
+    }
+}
 
 /// Training rows of one camera, and one or several sets of test rows.
 pub(super) struct Split {

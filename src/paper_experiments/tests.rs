@@ -1,8 +1,9 @@
 //! The format of the page, from figures that are made up: what it shows, and which marks it calls met.
 
-use super::cases::{Case, Worlds, key};
+use super::cases::{Case, key};
 use super::marks::{self, ONE_STEP, TRACK, TWO_STEP};
 use super::scores::{CaseScore, MethodScore};
+use super::simulated::Worlds;
 use super::walks::{WALKS, WalkCurves};
 use super::{page, tables};
 use crate::evaluation::{MethodReport, Metrics, ScoredPrediction};

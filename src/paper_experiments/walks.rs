@@ -3,14 +3,13 @@
 use std::collections::BTreeMap;
 
 use super::Runner;
-use super::cases::{Worlds, walks_of};
-use super::splits::{Split, traverses};
+use super::simulated::{Worlds, walks_of};
+use super::splits::{Split, TestSet, traverses};
 use crate::clock::process_cpu_s;
 use crate::domain::{Recipe, Sample, SigmaM};
 use crate::evaluation::axis::{Axes, AxisSpec};
 use crate::evaluation::chart::{Series, Shape, chart};
 use crate::evaluation::{EvaluateOptions, Method, Metrics, Truth};
-use crate::paper_experiments::cases::TestSet;
 use crate::simulation::Scene;
 
 /// Numbers of walks.

@@ -12,6 +12,7 @@ mod import;
 mod openapi;
 mod pair;
 mod progress;
+mod recordings;
 mod replay;
 mod serve;
 mod simulate;

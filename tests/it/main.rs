@@ -22,6 +22,7 @@ mod parity;
 mod power_cut;
 mod promotion;
 mod replay;
+mod simulations;
 mod storage;
 mod story;
 mod stream;

@@ -4,12 +4,13 @@ use std::time::Duration;
 
 use super::job_thread::{JobProgress, ProgressSink};
 use super::promotion::{self, PromotionCandidate};
-use super::{Ended, Job, JobIdentity, Work, load_samples};
+use super::{Ended, Job, JobIdentity, Work, load_samples, load_unpaired};
 use crate::app::{App, JobQueue};
 use crate::domain::{
-    EpochReport, Error, HeldOutSampleError, JobState, Result, RunProgress, Sample, TimeRange, TrainingRun,
+    EpochReport, Error, GnssBiasSigma, HeldOutSampleError, JobState, Result, RunProgress, Sample, TimeRange,
+    TrainingRun,
 };
-use crate::model::{self, Artifact, FitError, FitEvent, FitOptions};
+use crate::model::{self, Artifact, FitError, FitEvent, FitInput, FitOptions};
 use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
 
@@ -64,21 +65,30 @@ impl Job for TrainingRun {
     async fn prepare(app: &App, claim: &Claim<Self>) -> Result<Work<Self>> {
         let run = &claim.job;
         let camera = app.store.camera(&run.camera_id).await?;
-        let filter = SampleFilter { from: run.options.from, until: run.options.until, target_id: None };
+        let filter =
+            SampleFilter { from: run.options.from, until: run.options.until, ..SampleFilter::default() };
         let samples = load_samples(app, &run.camera_id, &filter, app.limits.samples_per_run).await?;
+        let unpaired = load_unpaired(app, &run.camera_id, &filter).await?;
         let options = FitOptions {
             recipe: run.options.recipe,
             seed: run.options.seed,
             epochs: run.options.epochs,
             image_size: camera.profile.image_size,
             gnss_error: camera.profile.gnss_error,
-            gnss_bias_sigma_m: None,
+            gnss_bias_sigma_m: camera.profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
         };
-        let line = format!("{} samples, recipe {}, seed {}", samples.len(), options.recipe, options.seed);
+        let line = format!(
+            "{} samples and {} boxes without a fix, recipe {}, seed {}",
+            samples.len(),
+            unpaired.len(),
+            options.recipe,
+            options.seed
+        );
         app.store.append_log(run.id, claim.fence, app.clock.now(), &line).await?;
         Ok(Box::new(move |sink| {
             let mut held_out = Vec::new();
-            let fitted = model::fit(&samples, &options, &mut |event| {
+            let input = FitInput { samples: &samples, unpaired: &unpaired };
+            let fitted = model::fit(input, &options, &mut |event| {
                 if let FitEvent::HeldOut(errors) = event {
                     held_out = errors.to_vec();
                 }

@@ -318,7 +318,7 @@ fn artifact_of(
             origin: OriginDeg { longitude_deg: origin.longitude_deg(), latitude_deg: origin.latitude_deg() },
             seed: context.seed,
             epochs: candidate.epochs(context),
-            training_rows_sha256: sha256_of(samples),
+            training_rows_sha256: sha256_of(samples, context.unpaired),
             samples: rows.rows.len() as u32,
             targets: rows.targets,
             passes: rows.traverses,

@@ -10,6 +10,7 @@ use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
 use super::target_groups::groups_of_targets;
+use super::unpaired::TargetBox;
 use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, Result, Sample};
 use crate::filters::{Traverse, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
@@ -243,8 +244,9 @@ fn cut_near(times: &[f64], rank: usize, reach: usize) -> f64 {
     times[at]
 }
 
-/// SHA-256 of time, target, box and fix of each sample, in their order, hexadecimal.
-pub(crate) fn sha256_of(samples: &[Sample]) -> String {
+/// SHA-256 of time, target, box and fix of each sample, then of target and box of each box without a fix, in
+/// their order, hexadecimal.
+pub(crate) fn sha256_of(samples: &[Sample], unpaired: &[TargetBox]) -> String {
     let mut hash = Sha256::new();
     for sample in samples {
         hash.update(sample.time.as_microsecond().to_le_bytes());
@@ -257,6 +259,12 @@ pub(crate) fn sha256_of(samples: &[Sample]) -> String {
         hash.update(fix.position.longitude_deg().to_le_bytes());
         hash.update(fix.position.latitude_deg().to_le_bytes());
         hash.update(fix.sigma_m.map_or(0.0, |sigma| sigma.metres()).to_le_bytes());
+    }
+    for own in unpaired {
+        hash.update(own.target.to_le_bytes());
+        for side in own.bounding_box.sides_px() {
+            hash.update(side.to_le_bytes());
+        }
     }
     hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }

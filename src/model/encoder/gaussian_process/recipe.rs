@@ -101,6 +101,7 @@ pub(crate) fn fit(
     let mut parts = ModelParts::new(Recipe::GaussianProcess, rows.plane, predictor.features(), e_gnss_m2);
     predictor.put(&mut parts);
     put_report(&report, &mut parts);
+    parts.set("boxes_without_fix", settings.unpaired.len() as f64);
     parts.set("unrest_share", white_share(&predictor, &map_rows));
     if phase.is_final {
         companion::fit(rows, epochs, &mut parts, phase)?;

@@ -36,3 +36,39 @@ fn most_frequent_class(samples: &[Sample]) -> Option<&TargetClass> {
     }
     counts.into_values().max_by_key(|(count, _)| *count).and_then(|(_, class)| class)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::unpaired_boxes;
+    use crate::domain::{BoundingBox, Detection, Fix, Sample, TargetClass, TargetId};
+    use crate::geo::Position;
+
+    #[test]
+    fn only_boxes_of_the_usual_class_are_taken_in_the_order_of_target_and_time() {
+        let class = |name: &str| Some(TargetClass::new(name).expect("a class"));
+        let bounding_box = BoundingBox::new(1.0, 2.0, 3.0, 4.0).expect("a box");
+        let sample = |name: &str| Sample {
+            time: jiff::Timestamp::UNIX_EPOCH,
+            target_id: TargetId::new("walker").expect("an id"),
+            bounding_box,
+            fix: Fix { position: Position::new(11.0, 48.0).expect("a position"), sigma_m: None },
+            class: class(name),
+            score: None,
+            truth: None,
+        };
+        let detection = |target: &str, name: &str, left_px: f64| Detection {
+            time: jiff::Timestamp::UNIX_EPOCH,
+            target_id: TargetId::new(target).expect("an id"),
+            bounding_box: BoundingBox::new(left_px, 2.0, 3.0, 4.0).expect("a box"),
+            class: class(name),
+            score: None,
+        };
+        let samples = [sample("person"), sample("car"), sample("person")];
+        let unpaired =
+            [detection("b", "person", 5.0), detection("a", "car", 6.0), detection("a", "person", 7.0)];
+        let boxes = unpaired_boxes(&samples, &unpaired);
+        let found: Vec<(u32, f64)> =
+            boxes.iter().map(|own| (own.target, own.bounding_box.sides_px()[0])).collect();
+        assert_eq!(found, [(0, 7.0), (1, 5.0)]);
+    }
+}

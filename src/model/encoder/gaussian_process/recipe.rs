@@ -174,19 +174,7 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
         report.groups,
         100.0 * report.held_out_coverage,
         report.widening
-    ))?;
-    match report.sessions {
-        Some(sessions) if sessions.between_m2 > noise.white_m2 + noise.short_m2 / 4.0 => phase.run.note(&format!(
-            "{} sessions disagree by {:.1} m: one more session on another day would help",
-            sessions.count,
-            (2.0 * sessions.between_m2).sqrt() * std::f64::consts::SQRT_2
-        )),
-        None => phase.run.note(
-            "one session only: a bias that the receivers keep for all of it is a prior; a session on another day \
-             would measure it",
-        ),
-        Some(_) => Ok(()),
-    }
+    ))
 }
 
 /// The encoder of a loaded model.

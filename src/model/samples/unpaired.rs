@@ -1,13 +1,13 @@
 //! Boxes without a fix, which tell the geometry of a camera but not its place.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use crate::domain::{BoundingBox, Detection, Sample, TargetClass};
+use crate::domain::{BoundingBox, Detection, Sample, TargetClass, TargetId};
 
 /// A box of a target.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TargetBox {
-    /// Index of the target, from 0; the boxes of one are adjacent and in order of time.
+    /// Index of the target: that of the training rows, or a later one for a target that has no fix at all.
     pub(crate) target: u32,
     pub(crate) bounding_box: BoundingBox,
 }
@@ -18,10 +18,13 @@ pub(crate) fn unpaired_boxes(samples: &[Sample], unpaired: &[Detection]) -> Vec<
     let class = most_frequent_class(samples);
     let mut sorted: Vec<&Detection> = unpaired.iter().filter(|own| own.class.as_ref() == class).collect();
     sorted.sort_by(|one, other| (&one.target_id, one.time).cmp(&(&other.target_id, other.time)));
-    let mut target = 0;
+    // The targets of training rows are numbered in the order of their ids.
+    let paired: BTreeSet<&TargetId> = samples.iter().map(|sample| &sample.target_id).collect();
+    let mut targets: BTreeMap<&TargetId, u32> = paired.into_iter().zip(0..).collect();
     let mut boxes = Vec::with_capacity(sorted.len());
-    for (at, own) in sorted.iter().enumerate() {
-        target += u32::from(at > 0 && sorted[at - 1].target_id != own.target_id);
+    for own in sorted {
+        let next = targets.len() as u32;
+        let target = *targets.entry(&own.target_id).or_insert(next);
         boxes.push(TargetBox { target, bounding_box: own.bounding_box });
     }
     boxes

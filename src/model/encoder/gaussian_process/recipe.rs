@@ -74,10 +74,10 @@ pub(crate) fn fit(
         boxes: rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect(),
         labels_m: rows.rows.iter().map(|row| [row.label.east_m, row.label.north_m]).collect(),
     };
-    let unpaired =
-        settings.unpaired.iter().map(|own| (rows.targets + own.target, features_of(&own.bounding_box)));
+    let unpaired = settings.unpaired.iter().map(|own| (own.target, features_of(&own.bounding_box)));
     let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
-    let boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
+    let mut boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
+    boxes.sort_by_key(|(target, _)| *target);
     let upright = settings.image_size.and_then(|size| {
         let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
         UprightCamera::new(&boxes, size_px, settings.target_height_m)

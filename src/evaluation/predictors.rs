@@ -202,7 +202,7 @@ impl<'a> Predictors<'a> {
                 let given = &test[row].observation;
                 let used = if with_fix { Some(given.clone()) } else { given.without_fix() };
                 let observed = used.as_ref().map(|observation| {
-                    ObservedPositions::of(observation, Some(regressor), image_size, Some(e_gnss_m2))
+                    track.observe(observation, Some(regressor), image_size, Some(e_gnss_m2))
                 });
                 let estimate = match observed.filter(|observed| !observed.is_empty()) {
                     Some(observed) => track.update(&observed, || settings),

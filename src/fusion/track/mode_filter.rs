@@ -4,8 +4,8 @@
 //! m, velocity v in m/s, and the biases of receiver (b) and camera (c) in units of their own standard
 //! deviation, so that one unit-variance Gauss-Markov state serves measurements of any covariance.
 //!
-//! A measured position with error covariance R and white share w is modelled as
-//! `z = p + L b + e`, with `L = sqrtm((1 - w) R)` and `e ~ N(0, w R k)`, where k inflates the white
+//! A measured position with error covariance R, of which W is white, is modelled as
+//! `z = p + L b + e`, with `L = sqrtm(R - W)` and `e ~ N(0, k W)`, where k inflates the white
 //! part for measurements closer in time than its own correlation
 //! (Bar-Shalom, Li and Kirubarajan 2001, 8.2: state augmentation for autocorrelated noise).
 
@@ -13,8 +13,8 @@ use nalgebra::{SMatrix, SVector};
 
 use super::measurement::{MeasuredPosition, MeasurementSource};
 use super::settings::TrackSettings;
-use crate::fusion::plane_covariance::PlaneCovariance;
 use crate::geo::EastNorth;
+use crate::geo::PlaneCovariance;
 
 /// Components of the state.
 pub(super) const STATES: usize = 8;
@@ -74,11 +74,12 @@ impl NoiseDecomposition {
             MeasurementSource::Fix => (GNSS_BIAS, settings.gnss.white_share),
             MeasurementSource::Regressed => (CAMERA_BIAS, settings.regression.correlation.white_share),
         };
+        let white = measured.white.unwrap_or_else(|| measured.covariance.scaled(white_share));
         Self {
             position: measured.position,
             bias,
-            bias_root_m: measured.covariance.scaled(1.0 - white_share).square_root_m(),
-            white: measured.covariance.scaled(white_share * white_inflation),
+            bias_root_m: measured.covariance.minus(white).square_root_m(),
+            white: white.scaled(white_inflation),
         }
     }
 }

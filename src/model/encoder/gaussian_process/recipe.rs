@@ -7,7 +7,7 @@ use super::noise::Epoch;
 use super::predictor::Predictor;
 use super::upright_camera::UprightCamera;
 use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, Recipe, TargetClass};
-use crate::geo::EastNorth;
+use crate::geo::{EastNorth, PlaneCovariance};
 use crate::model::artifact::ModelParts;
 use crate::model::encoder::FittedEncoder;
 use crate::model::encoder::features::{Encoded, features_of};
@@ -99,7 +99,7 @@ fn white_share(predictor: &Predictor, rows: &MapRows) -> f64 {
     let (mut white_m2, mut all_m2) = (0.0, 0.0);
     for sides in rows.boxes.iter().step_by(rows.boxes.len().div_ceil(500)) {
         let prediction = predictor.predict(sides, None);
-        white_m2 += prediction.box_noise_m2;
+        white_m2 += 0.5 * (prediction.box_noise_m2[0] + prediction.box_noise_m2[2]);
         all_m2 += prediction.variance_m2();
     }
     (white_m2 / all_m2).clamp(0.0, 1.0)
@@ -182,8 +182,10 @@ pub(crate) struct GaussianProcessEncoder(Predictor);
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Estimate {
     pub(crate) encoded: Encoded,
-    /// Mean error variance per axis, m2.
-    pub(crate) variance_m2: f64,
+    /// Of the position's error, m2.
+    pub(crate) covariance: PlaneCovariance,
+    /// Of it, the part that is new with each box, m2.
+    pub(crate) box_noise: PlaneCovariance,
     /// Radius of 95 % in standard deviations.
     pub(crate) r95_scale: f64,
 }
@@ -210,8 +212,14 @@ impl GaussianProcessEncoder {
                 position: EastNorth { east_m, north_m },
                 reconstruction_px: self.0.reconstruct(&sides, &prediction.deviation),
             },
-            variance_m2: prediction.variance_m2(),
+            covariance: plane_covariance(prediction.covariance_m2),
+            box_noise: plane_covariance(prediction.box_noise_m2),
             r95_scale: prediction.r95_scale,
         }
     }
+}
+
+/// From east, cross, north, m2.
+const fn plane_covariance([east_m2, east_north_m2, north_m2]: [f64; 3]) -> PlaneCovariance {
+    PlaneCovariance { east_m2, north_m2, east_north_m2 }
 }

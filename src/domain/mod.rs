@@ -41,6 +41,7 @@ pub use sample::Sample;
 pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{
-    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, HeldOutSampleError,
-    ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingRun,
+    CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
+    HeldOutSampleError, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingReport,
+    TrainingRun,
 };

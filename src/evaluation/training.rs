@@ -50,6 +50,7 @@ pub(super) fn fit_recipe(
         epochs: options.epochs,
         image_size: options.image_size,
         gnss_error: options.gnss_sigma.map_or(GnssError::Unknown, GnssError::Known),
+        gnss_bias_sigma_m: None,
     };
     Timed::run(options, || {
         let mut curve = Vec::new();

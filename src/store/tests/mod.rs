@@ -103,6 +103,7 @@ fn metadata() -> ModelMetadata {
         e_gnss_source: GnssErrorSource::Estimated,
         held_out: None,
         candidates: Vec::new(),
+        report: None,
         parameters: std::collections::BTreeMap::new(),
     }
 }

@@ -20,6 +20,7 @@ fn file(seed: u64) -> bytes::Bytes {
         epochs: Some(3),
         image_size: None,
         gnss_error: GnssError::Unknown,
+        gnss_bias_sigma_m: None,
     };
     let samples = simulate(&Options::demo()).training_samples();
     let fitted = fit(&samples, &options, &mut |_| ControlFlow::Continue(()));

@@ -5,7 +5,7 @@ use super::options::{EvaluateOptions, TestRow};
 use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, Sample, SigmaM};
 use crate::filters::ImmUkf;
-use crate::fusion::observed::{ObservedPositions, UNKNOWN_RECEIVER_M2};
+use crate::fusion::observed::UNKNOWN_RECEIVER_M2;
 use crate::fusion::target_track::TargetTrack;
 use crate::fusion::track::TrackSettings;
 use crate::fusion::two_step::fuse;

@@ -30,6 +30,7 @@ use crate::domain::{
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
+use crate::fusion::target_track::TargetTrack;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};

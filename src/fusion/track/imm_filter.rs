@@ -261,7 +261,7 @@ impl ImmFilter {
         if other_is_active {
             let mut candidate = self.clone();
             for mode in &mut candidate.modes {
-                mode.reset_bias(decomposition.bias);
+                mode.reset_bias(decomposition.biases[0].state);
             }
             let predicted = candidate.predict_measurement(decomposition);
             let (_, nis) = candidate.innovation(&predicted);

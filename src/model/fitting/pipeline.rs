@@ -295,7 +295,7 @@ impl FinalFit<'_> {
         parts.set("fix_time_constant_s", context.noise.correlation.time_constant_s);
         parts.set("labels_smoothed", f64::from(u8::from(candidate.is_smoothed())));
         let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
-        estimate_track_noise(samples, &regressor).put(&mut parts);
+        estimate_track_noise(samples, &regressor, &parts).put(&mut parts);
         Ok((parts, held_out))
     }
 }

@@ -7,9 +7,9 @@ use super::map_rows::MapRows;
 use super::noise::Epoch;
 use super::predictor::Predictor;
 use super::upright_camera::UprightCamera;
-use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, Recipe, TargetClass};
-use crate::geo::EastNorth;
-use crate::model::artifact::ModelParts;
+use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, TargetClass};
+use crate::geo::{EastNorth, PlaneCovariance};
+use crate::model::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
 use crate::model::encoder::FittedEncoder;
 use crate::model::encoder::auto_encoder::AutoEncoder;
 use crate::model::encoder::features::{Encoded, features_of};
@@ -109,12 +109,24 @@ pub(crate) fn fit(
     Ok(FittedEncoder { parts, covariance: None })
 }
 
+/// How the receiver's error is correlated beside its bias of the session, and the share of the latter in its
+/// variance; `None` in the parts of another recipe.
+pub(crate) fn receiver_correlation(parts: &ModelParts) -> Option<(NoiseCorrelation, f64)> {
+    let of = |name: &str| parts.parameters.get(name).copied();
+    let (white_m2, short_m2) = (of("receiver_white_m2")?, of("receiver_short_m2")?);
+    let (session_m2, short_time_s) = (of("receiver_session_m2")?, of("receiver_short_time_s")?);
+    let within_m2 = white_m2 + short_m2;
+    let white_share = (white_m2 / within_m2).clamp(LEAST_GNSS_WHITE_SHARE, 1.0);
+    let correlation = NoiseCorrelation { white_share, time_constant_s: short_time_s };
+    Some((correlation, session_m2 / (within_m2 + session_m2)))
+}
+
 /// White share of the error variance: what the detector's noise makes of it, over the training boxes.
 fn white_share(predictor: &Predictor, rows: &MapRows) -> f64 {
     let (mut white_m2, mut all_m2) = (0.0, 0.0);
     for sides in rows.boxes.iter().step_by(rows.boxes.len().div_ceil(500)) {
         let prediction = predictor.predict(sides, None);
-        white_m2 += prediction.box_noise_m2;
+        white_m2 += 0.5 * (prediction.box_noise_m2[0] + prediction.box_noise_m2[2]);
         all_m2 += prediction.variance_m2();
     }
     (white_m2 / all_m2).clamp(0.0, 1.0)
@@ -189,8 +201,10 @@ pub(crate) struct GaussianProcessEncoder {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Estimate {
     pub(crate) encoded: Encoded,
-    /// Mean error variance per axis, m2.
-    pub(crate) variance_m2: f64,
+    /// Of the position's error, m2.
+    pub(crate) covariance: PlaneCovariance,
+    /// Of it, the part that is new with each box, m2.
+    pub(crate) box_noise: PlaneCovariance,
     /// Radius of 95 % in standard deviations.
     pub(crate) r95_scale: f64,
 }
@@ -218,8 +232,14 @@ impl GaussianProcessEncoder {
         };
         Estimate {
             encoded: Encoded { position: EastNorth { east_m, north_m }, reconstruction_px },
-            variance_m2: prediction.variance_m2(),
+            covariance: plane_covariance(prediction.covariance_m2),
+            box_noise: plane_covariance(prediction.box_noise_m2),
             r95_scale: prediction.r95_scale,
         }
     }
+}
+
+/// From east, cross, north, m2.
+const fn plane_covariance([east_m2, east_north_m2, north_m2]: [f64; 3]) -> PlaneCovariance {
+    PlaneCovariance { east_m2, north_m2, east_north_m2 }
 }

@@ -31,6 +31,7 @@ mod code {
     pub(super) const UNIMPLEMENTED: i32 = 12;
     pub(super) const INTERNAL: i32 = 13;
     pub(super) const UNAVAILABLE: i32 = 14;
+    pub(super) const UNAUTHENTICATED: i32 = 16;
 }
 
 /// The row of the table.
@@ -63,6 +64,7 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::ModelNotFound => {
             (404, code::NOT_FOUND, "model-not-found", "There is no such model version")
         }
+        ErrorKind::KeyNotFound => (404, code::NOT_FOUND, "key-not-found", "There is no such key"),
         ErrorKind::CameraExists => {
             (409, code::ALREADY_EXISTS, "camera-exists", "A camera of that id exists already")
         }
@@ -99,6 +101,12 @@ pub const fn of(kind: ErrorKind) -> Status {
         ErrorKind::Overloaded => (503, code::UNAVAILABLE, "overloaded", "The server has too much to do"),
         ErrorKind::Timeout => (408, code::DEADLINE_EXCEEDED, "timeout", "The request took too long"),
         ErrorKind::ShuttingDown => (503, code::UNAVAILABLE, "shutting-down", "The server is shutting down"),
+        ErrorKind::Unauthenticated => {
+            (401, code::UNAUTHENTICATED, "unauthenticated", "The request needs a key that works")
+        }
+        ErrorKind::PermissionDenied => {
+            (403, code::PERMISSION_DENIED, "permission-denied", "The key may not do this")
+        }
         ErrorKind::HostNotAllowed => {
             (421, code::PERMISSION_DENIED, "host-not-allowed", "The server does not answer for this host")
         }

@@ -56,7 +56,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `RevisionMismatch`, `RunLive`.
     pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
-        self.store.delete_camera(id, expected).await?;
+        self.store.delete_camera(id, expected, self.clock.now()).await?;
         self.registry.forget(id).await;
         Ok(())
     }

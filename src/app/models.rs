@@ -146,7 +146,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`, `ModelActive`.
     pub async fn delete_model(&self, id: &CameraId, number: u32) -> Result<()> {
-        self.store.delete_model(id, number).await
+        self.store.delete_model(id, number, self.clock.now()).await
     }
 
     /// Makes a version the active one, which answers from now on.

@@ -22,7 +22,7 @@ pub(super) struct Health {
 
 impl Health {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
-        let settings = Config::load(file, Overrides { data: None, listen: self.listen })?;
+        let settings = Config::load(file, Overrides { listen: self.listen, ..Overrides::default() })?;
         let mut address = settings.listen;
         if address.ip().is_unspecified() {
             address.set_ip(IpAddr::V4(Ipv4Addr::LOCALHOST));

@@ -9,7 +9,9 @@ mod fuse;
 mod gnss_error;
 mod health;
 mod import;
+mod keys;
 mod openapi;
+mod output;
 mod pair;
 mod progress;
 mod replay;
@@ -23,6 +25,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::{Args, Parser, Subcommand};
 
+use crate::app::access::Caller;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
@@ -62,6 +65,8 @@ enum Command {
     Simulate(simulate::Simulate),
     /// Stream recorded boxes and fixes to a server, as one or many cameras
     Replay(replay::Replay),
+    /// Create, list and revoke the keys that clients of a server present
+    Keys(keys::Keys),
     /// Check whether a server is alive
     Health(health::Health),
     /// Print the effective settings
@@ -92,7 +97,8 @@ impl Cli {
             Command::GnssError(command) => command.run(),
             Command::Evaluate(command) => command.run(),
             Command::Simulate(command) => command.run(),
-            Command::Replay(command) => command.run(),
+            Command::Replay(command) => command.run(file),
+            Command::Keys(command) => command.run(file),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),
@@ -110,7 +116,7 @@ struct DataFolder {
 
 impl DataFolder {
     fn settings(&self, file: Option<&Path>) -> anyhow::Result<Config> {
-        Config::load(file, Overrides { data: self.data.clone(), listen: None })
+        Config::load(file, Overrides { data: self.data.clone(), ..Overrides::default() })
     }
 }
 
@@ -124,8 +130,8 @@ async fn open_app(settings: &Config, role: &str) -> anyhow::Result<App> {
     for other in store.newcomers() {
         eprintln!("note: another process uses the same data folder: {other}");
     }
-    Ok(App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new())
-        .await?)
+    let app = App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new());
+    Ok(app.await?.on_behalf_of(Caller::program(role)))
 }
 
 /// The tokio runtime of one command.

@@ -37,6 +37,8 @@ pub enum ErrorKind {
     EvaluationNotFound,
     /// No such model version.
     ModelNotFound,
+    /// No such key.
+    KeyNotFound,
     /// A camera of that id exists already.
     CameraExists,
     /// `If-Match` names another revision than the stored one.
@@ -67,6 +69,10 @@ pub enum ErrorKind {
     Timeout,
     /// The server is ending.
     ShuttingDown,
+    /// No key was presented, or one that does not work.
+    Unauthenticated,
+    /// The key may not do this.
+    PermissionDenied,
     /// The request names a host that this server does not answer for.
     HostNotAllowed,
     /// A web page of another origin asks for a change.

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use axum::extract::State;
 use hyper::header::IF_MATCH;
 use hyper::{HeaderMap, StatusCode, Uri};
 use jiff::Timestamp;
@@ -12,6 +11,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::extract::{CameraPath, JsonBody, Params};
 use super::problem::{ApiResult, Problem};
 use super::receivers::{Receiver, receivers, shown};
@@ -304,7 +304,7 @@ struct CameraPage {
         (status = 409, description = "A camera of that id exists", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn create_camera(State(app): State<App>, body: JsonBody) -> ApiResult {
+async fn create_camera(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
     let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
     let (location, revision) = (format!("/v1/cameras/{}", camera.id()), camera.revision);
     Ok(with_etag(created(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, revision)?)
@@ -319,7 +319,7 @@ async fn create_camera(State(app): State<App>, body: JsonBody) -> ApiResult {
     ),
     responses((status = 200, description = "A page of cameras", body = CameraPage))
 )]
-async fn list_cameras(State(app): State<App>, uri: Uri) -> ApiResult {
+async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
     let after = params.cursor()?;
@@ -336,7 +336,7 @@ async fn list_cameras(State(app): State<App>, uri: Uri) -> ApiResult {
     get, path = "/v1/cameras/{camera}", tag = "cameras", params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "The camera", body = Camera, headers(("etag" = String, description = "Its revision"))))
 )]
-async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
+async fn get_camera(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
     let camera = app.camera(&id).await?;
     let revision = camera.revision;
     Ok(with_etag(json(&Camera::of(&app, camera))?, revision)?)
@@ -360,7 +360,7 @@ async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> ApiRe
     )
 )]
 async fn change_camera(
-    State(app): State<App>,
+    CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
     headers: HeaderMap,
     body: JsonBody,
@@ -389,7 +389,11 @@ async fn change_camera(
         (status = 412, description = "The camera has another revision", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_camera(State(app): State<App>, CameraPath(id): CameraPath, headers: HeaderMap) -> ApiResult {
+async fn delete_camera(
+    CallerApp(app): CallerApp,
+    CameraPath(id): CameraPath,
+    headers: HeaderMap,
+) -> ApiResult {
     let expected = if_match(&headers)?.and_then(IfMatch::revision);
     app.delete_camera(&id, expected).await?;
     Ok(empty())

@@ -12,13 +12,14 @@ use super::problem::PROBLEM_JSON;
 use crate::domain::ErrorKind;
 use crate::status;
 
-const TAGS: [(&str, &str); 7] = [
+const TAGS: [(&str, &str); 8] = [
     ("cameras", "Profiles of cameras that nobody calibrated"),
     ("samples", "Boxes and fixes that cameras learn from"),
     ("training", "Background fits of a camera's model"),
     ("models", "Model versions that runs yield"),
     ("fusion", "Positions of targets"),
     ("evaluations", "Methods side by side on stored samples, against the truth"),
+    ("access", "Keys that clients present, and sessions of browsers"),
     ("service", "What watches the server"),
 ];
 

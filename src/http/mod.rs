@@ -4,6 +4,8 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+mod access;
+mod audit;
 mod body;
 mod cameras;
 mod description;
@@ -11,6 +13,7 @@ mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
+mod keys;
 mod models;
 mod pairings;
 mod parts;
@@ -18,6 +21,7 @@ mod problem;
 mod receivers;
 mod samples;
 mod service;
+mod session;
 #[cfg(test)]
 mod tests;
 mod tracks;
@@ -26,7 +30,6 @@ mod wire;
 
 use axum::Router;
 use axum::body::Body;
-use axum::extract::FromRef;
 use axum::middleware::{from_fn, map_response};
 use axum::response::Response;
 use hyper::Method;
@@ -43,6 +46,8 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
+pub use session::session_token;
+
 /// What the handlers share.
 #[derive(Clone)]
 struct Rest {
@@ -50,15 +55,9 @@ struct Rest {
     shutdown: Shutdown,
 }
 
-impl FromRef<Rest> for App {
-    fn from_ref(rest: &Rest) -> Self {
-        rest.app.clone()
-    }
-}
-
 /// All REST routes, the description at `/openapi.json` and its page at `/docs`.
 ///
-/// Requests carry their [`RequestId`] as an extension.
+/// Requests carry their [`RequestId`] and their [`Caller`](crate::app::access::Caller) as extensions.
 pub fn router(app: App, shutdown: Shutdown) -> Router {
     let rest = Rest { app, shutdown };
     let (routes, described) = described().split_for_parts();
@@ -68,6 +67,7 @@ pub fn router(app: App, shutdown: Shutdown) -> Router {
         .config(Config::default().validator_url("none").use_base_layout());
     let page = Router::from(page).layer(map_response(contain_page));
     routes
+        .route_layer(from_fn(access::authorize))
         .merge(page)
         .with_state(rest)
         // As one layer: axum boxes every request again for each.
@@ -127,6 +127,9 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(tracks::routes())
         .merge(gnss_error::routes())
         .merge(evaluations::routes())
+        .merge(keys::routes())
+        .merge(audit::routes())
+        .merge(session::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
     router

@@ -39,6 +39,24 @@ impl HostCheck {
         Ok(())
     }
 
+    /// Whether a request that a browser's cookie vouches for comes from a page of this server, if it is
+    /// to change anything. Other origins may not even be allowed by the settings.
+    ///
+    /// # Errors
+    /// `OriginNotAllowed`.
+    pub(super) fn check_same_origin<B>(&self, request: &Request<B>) -> Result<()> {
+        if matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS) {
+            return Ok(());
+        }
+        let origin = only_value(request, &ORIGIN)?.and_then(|origin| origin.split_once("://"));
+        let host = self.host(request)?;
+        if origin.is_some_and(|(_, origin)| host.is_some_and(|host| origin.eq_ignore_ascii_case(host))) {
+            return Ok(());
+        }
+        let message = "changes with a session's cookie must come from a page of this server itself";
+        Err(Error::field(ErrorKind::OriginNotAllowed, "origin", message))
+    }
+
     /// The host that the request names, where it may.
     fn host<'r, B>(&self, request: &'r Request<B>) -> Result<Option<&'r str>> {
         let header = only_value(request, &HOST)?;

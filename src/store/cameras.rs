@@ -8,11 +8,12 @@ use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 
 use super::Store;
+use super::audit::Change;
 use super::errors::{failed, no_camera};
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver,
-    ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    AuditAction, Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera,
+    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
 };
 
 macro_rules! columns {
@@ -50,6 +51,8 @@ impl Store {
         };
         let camera = read_camera(&row)?;
         check_limit(&mut transaction, self.limits().cameras).await?;
+        let change = Change::of_camera(AuditAction::CameraCreated, &profile.id, None);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
     }
@@ -123,6 +126,9 @@ impl Store {
             .await
             .map_err(failed)?;
         let camera = read_camera(&row)?;
+        let revision = Some(format!("revision {}", camera.revision.0));
+        let change = Change::of_camera(AuditAction::CameraChanged, &profile.id, revision);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
     }
@@ -132,7 +138,12 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::RunLive`] while a
     /// training run has not ended.
-    pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
+    pub async fn delete_camera(
+        &self,
+        id: &CameraId,
+        expected: Option<Revision>,
+        now: Timestamp,
+    ) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         check_revision(&find_camera(&mut *transaction, id).await?, expected)?;
@@ -155,6 +166,8 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+        let change = Change::of_camera(AuditAction::CameraDeleted, id, None);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
         Ok(())

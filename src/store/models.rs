@@ -6,13 +6,14 @@ use sqlx::sqlite::SqliteRow;
 use uuid::Uuid;
 
 use super::Store;
+use super::audit::{Change, version};
 use super::cameras::{camera_key, find_camera};
 use super::errors::{failed, no_model};
 use super::retention::prune_models;
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata, ModelVersion, Result,
-    RunId, TargetId, model_sha256,
+    AuditAction, BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata,
+    ModelVersion, Result, RunId, TargetId, model_sha256,
 };
 use crate::geo::Position;
 
@@ -45,6 +46,8 @@ impl Store {
         let model = NewModel { metadata, weights, held_out: &[] };
         let number = add_model(&mut transaction, key, None, &model, now).await?;
         prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
+        let change = Change::of_camera(AuditAction::ModelImported, camera, Some(version(number)));
+        self.record(&mut transaction, change, now).await?;
         let version = find_model(&mut transaction, camera, number).await?;
         transaction.commit().await.map_err(failed)?;
         version.ok_or_else(|| no_model(camera, number))
@@ -173,6 +176,8 @@ impl Store {
             return Err(no_model(camera, number));
         }
         activate(&mut transaction, key, number, now).await?;
+        let change = Change::of_camera(AuditAction::ModelActivated, camera, Some(version(number)));
+        self.record(&mut transaction, change, now).await?;
         let camera = find_camera(&mut *transaction, camera).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
@@ -208,6 +213,8 @@ impl Store {
             .await
             .map_err(failed)?;
         set_active(&mut transaction, key, number).await?;
+        let change = Change::of_camera(AuditAction::ModelRolledBack, camera, Some(version(number)));
+        self.record(&mut transaction, change, now).await?;
         let camera = find_camera(&mut *transaction, camera).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)

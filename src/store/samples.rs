@@ -5,13 +5,14 @@ use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{AssertSqlSafe, Sqlite};
 
 use super::Store;
+use super::audit::Change;
 use super::cameras::camera_key;
 use super::errors::failed;
 use super::group_commit::Inserted;
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    BoundingBox, CameraId, CameraKey, Durability, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId,
-    TimeRange,
+    AuditAction, BoundingBox, CameraId, CameraKey, Durability, Fix, Result, Sample, Score, SigmaM,
+    TargetClass, TargetId, TimeRange,
 };
 use crate::geo::Position;
 
@@ -171,7 +172,7 @@ impl Store {
     ///
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
-    pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+    pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter, now: Timestamp) -> Result<u64> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         let key = camera_key(&mut *transaction, id).await?;
@@ -184,6 +185,9 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+        let subject = Some(format!("{deleted} samples"));
+        let change = Change::of_camera(AuditAction::SamplesDeleted, id, subject);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
         Ok(deleted)

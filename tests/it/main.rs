@@ -1,5 +1,7 @@
 //! The one integration test binary: everything from the outside, through real ports and files.
 
+mod access;
+mod audit;
 mod bad_input;
 mod connections;
 mod cross_site;

@@ -59,7 +59,7 @@ impl WaitingResiduals {
                 () = self.closed.cancelled() => self.receiver.try_recv().ok(),
             };
             let (Some(Residual { camera, residual }), Some(parts)) = (next, app.upgrade()) else { return };
-            App(parts).detect_drift(&camera, &residual).await;
+            App::of_program(parts, "drift detection").detect_drift(&camera, &residual).await;
         }
     }
 }

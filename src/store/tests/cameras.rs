@@ -75,7 +75,7 @@ async fn a_change_needs_the_revision_it_was_made_from() {
     let stale = store.replace_camera(&full("square"), Some(Revision(1)), at(8)).await;
     assert_eq!(kind(stale), ErrorKind::RevisionMismatch);
     assert_eq!(
-        kind(store.delete_camera(&id("square"), Some(Revision(1))).await),
+        kind(store.delete_camera(&id("square"), Some(Revision(1)), at(9)).await),
         ErrorKind::RevisionMismatch
     );
     let forced = store.replace_camera(&full("square"), None, at(9)).await.expect("unconditional");
@@ -112,10 +112,10 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
     store.insert_model(&camera, &metadata(), b"w", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
     store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
-    assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::RunLive);
+    assert_eq!(kind(store.delete_camera(&camera, None, at(9)).await), ErrorKind::RunLive);
     store.cancel_run(&camera, run_id(1), at(4)).await.expect("cancelled");
 
-    store.delete_camera(&camera, Some(Revision(1))).await.expect("deleted");
+    store.delete_camera(&camera, Some(Revision(1)), at(9)).await.expect("deleted");
     assert_eq!(kind(store.camera(&camera).await), ErrorKind::CameraNotFound);
     assert_eq!(
         kind(store.insert_samples(&camera, vec![sample(1, "a")], Durability::Synced).await),
@@ -123,7 +123,7 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
     );
     assert_eq!(kind(store.log(run_id(1)).await), ErrorKind::RunNotFound);
     assert_eq!(store.active_models().await.expect("none"), []);
-    assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::CameraNotFound);
+    assert_eq!(kind(store.delete_camera(&camera, None, at(9)).await), ErrorKind::CameraNotFound);
 
     store.insert_camera(&NewCamera::named(camera.clone()), at(5)).await.expect("new again");
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 0);

@@ -77,11 +77,11 @@ async fn deleting_takes_what_the_filter_selects() {
     let all = (0..10).flat_map(|second| [sample(second, "a"), sample(second, "b")]).collect();
     store.insert_samples(&camera, all, Durability::Synced).await.expect("stored");
     let filter = SampleFilter { from: Some(at(3)), until: Some(at(5)), target_id: Some(target("b")) };
-    assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 2);
+    assert_eq!(store.delete_samples(&camera, &filter, at(9)).await.expect("deleted"), 2);
     let filter = SampleFilter { from: Some(at(8)), ..SampleFilter::default() };
-    assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 4);
+    assert_eq!(store.delete_samples(&camera, &filter, at(9)).await.expect("deleted"), 4);
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 14);
-    assert_eq!(kind(store.delete_samples(&id("none"), &filter).await), ErrorKind::CameraNotFound);
+    assert_eq!(kind(store.delete_samples(&id("none"), &filter, at(9)).await), ErrorKind::CameraNotFound);
     assert_eq!(kind(store.count_samples(&id("none"), &filter).await), ErrorKind::CameraNotFound);
     assert_eq!(kind(store.samples(&id("none"), &filter, None, 1).await), ErrorKind::CameraNotFound);
 }

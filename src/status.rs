@@ -78,6 +78,9 @@ pub const fn of(kind: ErrorKind) -> Status {
             "The change needs the revision it is based on",
         ),
         ErrorKind::NoModel => (409, code::FAILED_PRECONDITION, "no-model", "The camera has no active model"),
+        ErrorKind::NoEarlierModel => {
+            (409, code::FAILED_PRECONDITION, "no-earlier-model", "No other model version was active before")
+        }
         ErrorKind::ModelUnusable => {
             (409, code::FAILED_PRECONDITION, "model-unusable", "The stored model version cannot be used")
         }

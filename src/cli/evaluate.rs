@@ -7,6 +7,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::import::image_size;
+use super::output::print_line;
 use super::progress::Progress;
 use super::{format_of, open_file};
 use crate::clock::{Clock, process_cpu_s};
@@ -104,7 +105,7 @@ impl Evaluate {
             cpu_s: process_cpu_s,
         };
         let evaluation = evaluate_with_progress(&train, &test, &truth, &options)?;
-        print!("{}", evaluation.report.table());
+        print_line(&format_args!("{}", evaluation.report.table().trim_end()))?;
         if let Some(path) = &self.json {
             std::fs::write(path, evaluation.report.to_json()?)
                 .with_context(|| format!("cannot write {}", path.display()))?;
@@ -134,7 +135,7 @@ impl Evaluate {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
         }
         std::fs::write(&self.out, &page).with_context(|| format!("cannot write {}", self.out.display()))?;
-        println!("{page}");
+        print_line(&format_args!("{page}"))?;
         Ok(())
     }
 

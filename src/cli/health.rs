@@ -8,6 +8,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use clap::Args;
 
+use super::output::print_line;
 use crate::config::{Config, Overrides};
 
 const TIMEOUT: Duration = Duration::from_secs(2);
@@ -29,7 +30,7 @@ impl Health {
         }
         let answer = request_liveness(address).with_context(|| format!("no answer from {address}"))?;
         anyhow::ensure!(answer.starts_with("HTTP/1.1 200"), "{address} answered {answer:?}");
-        println!("{address} is alive");
+        print_line(&format_args!("{address} is alive"))?;
         Ok(())
     }
 }

@@ -8,7 +8,7 @@ use clap::{Args, Subcommand};
 use jiff::Timestamp;
 
 use super::output::print_line;
-use super::{DataFolder, camera_id, open_app, runtime};
+use super::{DataFolder, MissingData, camera_id, open_app, runtime};
 use crate::app::App;
 use crate::clock::{Clock, Randomness};
 use crate::domain::{ApiKey, CameraId, KeyId, KeySecret, NewKey, Role, Scope};
@@ -92,7 +92,7 @@ impl Create {
             self.expires_in_days.map(|days| now + Duration::from_secs(u64::from(days) * SECONDS_PER_DAY));
         let key = NewKey::new(&self.name, scope, expires_at, now)?;
         runtime()?.block_on(async {
-            let app = open_app(&settings, "sightfix keys").await?;
+            let app = open_app(&settings, "sightfix keys", MissingData::Create).await?;
             let created = app.create_key(&key).await;
             app.close().await;
             let (key, secret) = created?;
@@ -106,7 +106,7 @@ impl List {
     fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
-            let app = open_app(&settings, "sightfix keys").await?;
+            let app = open_app(&settings, "sightfix keys", MissingData::Refuse).await?;
             let listed = print_all(&app).await;
             app.close().await;
             listed
@@ -149,7 +149,7 @@ impl Revoke {
     fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
-            let app = open_app(&settings, "sightfix keys").await?;
+            let app = open_app(&settings, "sightfix keys", MissingData::Refuse).await?;
             let revoked = app.revoke_key(self.key).await;
             app.close().await;
             let revoked_at = revoked?.revoked_at.context("the key was not revoked")?;

@@ -109,7 +109,7 @@ impl Cli {
 /// The data folder of a command.
 #[derive(Args)]
 struct DataFolder {
-    /// Folder of the database; created if it does not exist
+    /// Folder of the database
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
 }
@@ -120,13 +120,26 @@ impl DataFolder {
     }
 }
 
+/// What to do where there is no data folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum MissingData {
+    Create,
+    /// A mistyped path must not become a folder.
+    Refuse,
+}
+
 /// The application on the data folder, without a server. A server may use the same folder; each logs the
 /// other, this process by its `role`.
-async fn open_app(settings: &Config, role: &str) -> anyhow::Result<App> {
+async fn open_app(settings: &Config, role: &str, missing: MissingData) -> anyhow::Result<App> {
+    let folder = settings.data.display();
+    anyhow::ensure!(
+        missing == MissingData::Create || settings.data.is_dir(),
+        "there is no data folder {folder}; `sightfix serve` and `sightfix import --create` make one"
+    );
     let options = StoreOptions { limits: store_limits(&settings.limits), role: role.to_owned() };
     let store = Store::open_with(&settings.data, options)
         .await
-        .with_context(|| format!("cannot open the data folder {}", settings.data.display()))?;
+        .with_context(|| format!("cannot open the data folder {folder}"))?;
     for other in store.newcomers() {
         eprintln!("note: another process uses the same data folder: {other}");
     }

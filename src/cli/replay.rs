@@ -11,6 +11,7 @@ use clap::{Args, value_parser};
 use jiff::SignedDuration;
 use tokio_util::sync::CancellationToken;
 
+use super::output::print_line;
 use super::progress::Progress;
 use super::{camera_id, format_of, open_file, receiver_id, runtime, target_id};
 use crate::clock::Clock;
@@ -159,9 +160,9 @@ impl Replay {
         };
         let report = runtime()?.block_on(replay_with_progress(recording, options))?;
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&report)?);
+            print_line(&format_args!("{}", serde_json::to_string_pretty(&report)?))?;
         } else {
-            print!("{report}");
+            print_line(&format_args!("{}", report.to_string().trim_end()))?;
         }
         anyhow::ensure!(report.is_complete(), "not every item was answered and acknowledged");
         Ok(())

@@ -27,6 +27,9 @@ pub enum Role {
 }
 
 impl Role {
+    /// All roles, the most restricted first.
+    pub const ALL: &'static [Self] = Self::VARIANTS;
+
     /// Name in the database and in wire formats.
     #[must_use]
     pub fn as_str(self) -> &'static str {

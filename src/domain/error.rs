@@ -47,6 +47,8 @@ pub enum ErrorKind {
     RevisionRequired,
     /// The camera has no active model yet.
     NoModel,
+    /// No other model version was active before the active one.
+    NoEarlierModel,
     /// The stored model version is damaged or cannot be loaded.
     ModelUnusable,
     /// The camera has a training run that has not ended.

@@ -28,7 +28,7 @@ mod training;
 pub use access::{ApiKey, KeyId, KeySecret, NewKey, Role, Scope, SecretDigest};
 pub use audit::{Actor, AuditAction, AuditEntry, AuditNumber};
 pub use bounding_box::{BoundingBox, ImageSize};
-pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, NewCamera, Revision};
+pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, ExpectedVersion, NewCamera, Revision};
 pub use checksum::model_sha256;
 pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};

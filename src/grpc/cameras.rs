@@ -71,7 +71,7 @@ impl CameraService for Cameras {
     ) -> Reply<proto::UpdateCameraResponse> {
         answer(&self.app, request, |app, asked| async move {
             let id = camera_id(&asked.camera_id)?;
-            let expected = asked.expected_revision.map(Revision);
+            let expected = asked.expected_revision.map(|revision| Revision(revision).into());
             let change = camera_change(&id, required(asked.profile, "profile")?, asked.update_mask)?;
             let changed = app.change_camera(&id, change, expected).await;
             let camera = changed.map_err(|error| of_field(error, "profile"))?;
@@ -86,7 +86,7 @@ impl CameraService for Cameras {
     ) -> Reply<proto::DeleteCameraResponse> {
         answer(&self.app, request, |app, asked| async move {
             let id = camera_id(&asked.camera_id)?;
-            app.delete_camera(&id, asked.expected_revision.map(Revision)).await?;
+            app.delete_camera(&id, asked.expected_revision.map(|revision| Revision(revision).into())).await?;
             Ok(proto::DeleteCameraResponse {})
         })
         .await
@@ -220,7 +220,7 @@ impl proto::Camera {
             moved: app.camera_moved(camera.id()).map(|moved| (*moved).clone().into()),
             model_fault: app.model_fault(camera.id()).map(|fault| fault.reason),
             id: camera.id().as_str().to_owned(),
-            warnings: camera.profile.warnings(),
+            warnings: app.camera_warnings(&camera),
             profile: Some(camera.profile.into()),
             revision: camera.revision.0,
             created_at: Some(timestamp(camera.created_at)),

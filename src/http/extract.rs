@@ -189,12 +189,18 @@ impl Params {
         Ok(self.take("durability", str::parse)?.unwrap_or_default())
     }
 
-    /// Nothing may be left.
-    pub(super) fn end(self) -> Result<()> {
-        match self.0.first() {
+    /// # Errors
+    /// `InvalidArgument` naming a parameter that is none.
+    pub(super) fn check_names(&self, is_known: impl Fn(&str) -> bool) -> Result<()> {
+        match self.0.iter().find(|(name, _)| !is_known(name)) {
             None => Ok(()),
             Some((name, _)) => Err(Error::invalid(name.clone(), "is not a parameter of this operation")),
         }
+    }
+
+    /// Nothing may be left.
+    pub(super) fn end(self) -> Result<()> {
+        self.check_names(|_| false)
     }
 }
 

@@ -28,9 +28,11 @@ mod tracks;
 mod training_runs;
 mod wire;
 
+use std::sync::Arc;
+
 use axum::Router;
 use axum::body::Body;
-use axum::middleware::{from_fn, map_response};
+use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::response::Response;
 use hyper::Method;
 use hyper::header::{CONTENT_SECURITY_POLICY, REFERRER_POLICY, X_FRAME_OPTIONS};
@@ -61,13 +63,14 @@ struct Rest {
 pub fn router(app: App, shutdown: Shutdown) -> Router {
     let rest = Rest { app, shutdown };
     let (routes, described) = described().split_for_parts();
+    let parameters = Arc::new(access::QueryParameters::of(&described));
     // The page would otherwise ask a server on the internet whether the description is well formed.
     let page = SwaggerUi::new("/docs")
         .url("/openapi.json", described)
         .config(Config::default().validator_url("none").use_base_layout());
     let page = Router::from(page).layer(map_response(contain_page));
     routes
-        .route_layer(from_fn(access::authorize))
+        .route_layer(from_fn_with_state(parameters, access::authorize))
         .merge(page)
         .with_state(rest)
         // As one layer: axum boxes every request again for each.
@@ -132,5 +135,6 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(session::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
+    description::add_security(router.get_openapi_mut());
     router
 }

@@ -19,7 +19,7 @@ use crate::app::access::{Principal, SESSION_TIME};
 use crate::domain::{Error, Result};
 
 /// Name of the cookie that carries a session's token.
-const SESSION_COOKIE: &str = "sightfix_session";
+pub(super) const SESSION_COOKIE: &str = "sightfix_session";
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(start_session, get_session, end_session))

@@ -12,8 +12,8 @@ use super::audit::Change;
 use super::errors::{failed, no_camera};
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    AuditAction, Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera,
-    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    AuditAction, Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssError,
+    ImageSize, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
 };
 
 macro_rules! columns {
@@ -107,12 +107,12 @@ impl Store {
     pub async fn replace_camera(
         &self,
         profile: &NewCamera,
-        expected: Option<Revision>,
+        expected: Option<ExpectedVersion>,
         now: Timestamp,
     ) -> Result<Camera> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
-        check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
+        check_version(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
              gnss_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, retrain_when_moved = ?, \
@@ -141,12 +141,12 @@ impl Store {
     pub async fn delete_camera(
         &self,
         id: &CameraId,
-        expected: Option<Revision>,
+        expected: Option<ExpectedVersion>,
         now: Timestamp,
     ) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
-        check_revision(&find_camera(&mut *transaction, id).await?, expected)?;
+        check_version(&find_camera(&mut *transaction, id).await?, expected)?;
         let live: i64 = sqlx::query_scalar(
             "SELECT count(*) FROM training_runs JOIN cameras ON cameras.key = camera_key \
              WHERE cameras.id = ? AND state IN ('queued', 'running')",
@@ -209,17 +209,8 @@ pub(super) async fn camera_key(executor: impl SqliteExecutor<'_>, id: &CameraId)
         .ok_or_else(|| no_camera(id))
 }
 
-fn check_revision(camera: &Camera, expected: Option<Revision>) -> Result<()> {
-    match expected {
-        Some(expected) if expected != camera.revision => Err(Error::refused(
-            ErrorKind::RevisionMismatch,
-            format!(
-                "the camera is at revision {}, not {}; read it again and repeat the change",
-                camera.revision.0, expected.0
-            ),
-        )),
-        _ => Ok(()),
-    }
+fn check_version(camera: &Camera, expected: Option<ExpectedVersion>) -> Result<()> {
+    expected.map_or(Ok(()), |expected| expected.check(camera))
 }
 
 /// Binds the changeable columns in the order that INSERT and UPDATE share.

@@ -186,7 +186,8 @@ impl Store {
     /// Makes the version active that was before the active one. Repeated calls go further back.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none was active before.
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none is active, [`ErrorKind::NoEarlierModel`]
+    /// if none was active before.
     pub async fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
@@ -199,11 +200,14 @@ impl Store {
         .fetch_all(&mut *transaction)
         .await
         .map_err(failed)?;
-        let [(position, _), (_, number)] = latest[..] else {
-            return Err(Error::refused(
-                ErrorKind::NoModel,
-                "no other model version was active before; activate one by its number",
-            ));
+        let (position, number) = match latest[..] {
+            [(position, _), (_, number)] => (position, number),
+            [(_, active), ..] => return Err(no_earlier_model(camera, active)),
+            [] => {
+                let message =
+                    format!("camera {camera} has no active model; activate a version by its number");
+                return Err(Error::refused(ErrorKind::NoModel, message));
+            }
         };
         sqlx::query("UPDATE activations SET rolled_back_at_us = ? WHERE camera_key = ? AND position = ?")
             .bind(now.as_microsecond())
@@ -300,6 +304,14 @@ pub(super) async fn add_model(
         .map_err(failed)?;
     }
     u32::try_from(number).map_err(Error::fault)
+}
+
+fn no_earlier_model(camera: &CameraId, active: i64) -> Error {
+    let message = format!(
+        "version {active} of camera {camera} stays active: no other version was active before it; activate one by \
+         its number"
+    );
+    Error::refused(ErrorKind::NoEarlierModel, message)
 }
 
 fn unusable(camera: &CameraId, number: u32, reason: &str) -> Error {

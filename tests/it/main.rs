@@ -25,3 +25,5 @@ mod replay;
 mod storage;
 mod story;
 mod stream;
+mod tls;
+mod usage;

@@ -25,6 +25,7 @@ pub(crate) fn run() {
             epochs: Some(50),
             image_size: Some(world.image_size),
             gnss_error: sightfix::domain::GnssError::Unknown,
+            gnss_bias_sigma_m: None,
         };
         let artifact = model::fit(&samples, &options, &mut |_| std::ops::ControlFlow::Continue(()))
             .expect("the demonstration can be learnt");
@@ -32,11 +33,9 @@ pub(crate) fn run() {
         let mut times = [true, false].map(|with_fix| {
             let observations: Vec<_> = samples
                 .iter()
-                .map(|sample| Observation {
-                    time: sample.time,
-                    target_id: None,
-                    bounding_box: Some(sample.bounding_box),
-                    fix: with_fix.then_some(sample.fix),
+                .map(|sample| {
+                    let fix = with_fix.then_some(sample.fix);
+                    Observation::new(sample.time, None, Some(sample.bounding_box), fix).expect("a box")
                 })
                 .collect();
             let mut rounds: Vec<f64> = (0..7)

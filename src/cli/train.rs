@@ -50,6 +50,9 @@ impl Train {
             let outcome = ended.outcome.as_deref().unwrap_or("no outcome was recorded");
             anyhow::ensure!(ended.state == JobState::Succeeded, "{}: {outcome}", ended.state.as_str());
             print_line(&format_args!("version {} {outcome}", ended.model_version.unwrap_or_default()))?;
+            if let Some(report) = &ended.report {
+                print_line(report)?;
+            }
             Ok(())
         })
     }

@@ -1,7 +1,7 @@
 use std::ops::ControlFlow;
 
 use super::*;
-use crate::domain::{Observation, Recipe, SigmaM};
+use crate::domain::{Recipe, SigmaM};
 use crate::simulation::{Options, Scene, World, simulate, simulate_split};
 
 fn options(methods: &str) -> EvaluateOptions {
@@ -12,6 +12,7 @@ fn options(methods: &str) -> EvaluateOptions {
         epochs: Some(40),
         image_size: None,
         gnss_sigma: Some(SigmaM::new(2.2).expect("valid")),
+        gnss_bias_sigma: None,
         box_shift_px: 0.0,
         cpu_s: || 0.0,
     }
@@ -21,15 +22,7 @@ fn test_rows(world: &World) -> Vec<TestRow> {
     world
         .rows
         .iter()
-        .map(|row| TestRow {
-            observation: Observation {
-                time: row.time,
-                target_id: Some(row.target_id.clone()),
-                bounding_box: row.bounding_box,
-                fix: row.fix,
-            },
-            truth: Some(row.truth),
-        })
+        .filter_map(|row| Some(TestRow { observation: row.observation()?, truth: Some(row.truth) }))
         .collect()
 }
 
@@ -50,11 +43,11 @@ fn every_method_predicts_for_interleaved_targets_with_gaps() {
     assert!(evaluation.report.failed.is_empty(), "{:?}", evaluation.report.failed);
     let n = |name: &str| evaluation.report.methods[name].metrics.n;
     let count = |holds: &dyn Fn(&TestRow) -> bool| test_rows(&test).iter().filter(|row| holds(row)).count();
-    assert_eq!(n("gnss"), count(&|row| row.observation.fix.is_some()));
-    assert_eq!(n("hybrid.denied"), count(&|row| row.observation.bounding_box.is_some()));
-    let either = |row: &TestRow| row.observation.bounding_box.is_some() || row.observation.fix.is_some();
+    assert_eq!(n("gnss"), count(&|row| row.observation.fix().is_some()));
+    assert_eq!(n("hybrid.denied"), count(&|row| row.observation.bounding_box().is_some()));
+    let either = |row: &TestRow| row.observation.bounding_box().is_some() || row.observation.fix().is_some();
     assert_eq!(n("hybrid.two_step"), count(&either));
-    let both = |row: &TestRow| row.observation.bounding_box.is_some() && row.observation.fix.is_some();
+    let both = |row: &TestRow| row.observation.bounding_box().is_some() && row.observation.fix().is_some();
     assert_eq!(n("dnn"), count(&both));
     assert!(n("track") >= n("hybrid.two_step"));
     let mean_m = |name: &str| evaluation.report.methods[name].metrics.mean_m;
@@ -98,7 +91,7 @@ fn a_method_that_cannot_run_is_named_and_the_others_run() {
     let mut rows = test_rows(&test);
     rows.iter_mut().for_each(|row| row.truth = None);
     let unscored =
-        evaluate(&[], &rows, &Truth::Columns, &options("gnss"), &mut |_| ControlFlow::Continue(()))
+        evaluate(&Vec::new(), &rows, &Truth::Columns, &options("gnss"), &mut |_| ControlFlow::Continue(()))
             .expect("valid boxes");
     assert!(unscored.report.failed.contains_key("gnss"));
 }

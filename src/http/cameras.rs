@@ -23,8 +23,8 @@ use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, created, empty, json};
 use crate::app::App;
 use crate::domain::{
-    self, CameraId, CameraKey, Error, ErrorKind, ExpectedVersion, NewCamera, Result, Revision, SigmaM,
-    TargetClass,
+    self, CameraId, CameraKey, Error, ErrorKind, ExpectedVersion, GnssBiasSigma, NewCamera, Result, Revision,
+    SigmaM, TargetClass,
 };
 use crate::exchange::wire::parse_json;
 use crate::exchange::write_cursor;
@@ -100,6 +100,10 @@ struct CameraDraft {
     image_size: Option<ImageSize>,
     /// `"unknown"` if left out.
     gnss_error: Option<GnssError>,
+    /// Standard deviation per axis, m, of the bias that all fixes have in common, which no sample can show;
+    /// without it, the model has a prior of its own.
+    #[schema(exclusive_minimum = 0.0, maximum = 100.0, example = 1.5)]
+    gnss_bias_sigma_m: Option<f64>,
     /// The server's default if left out.
     recipe: Option<Recipe>,
     /// Classes that the camera is used for; none means all.
@@ -125,6 +129,7 @@ impl CameraDraft {
             display_name: self.display_name.unwrap_or(blank.display_name),
             image_size: self.image_size.map(ImageSize::to_domain).transpose()?,
             gnss_error: self.gnss_error.map_or(Ok(blank.gnss_error), GnssError::to_domain)?,
+            gnss_bias_sigma: self.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
             recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
             target_classes: classes(&self.target_classes)?,
             labels: self.labels,
@@ -157,6 +162,10 @@ struct CameraChange {
     image_size: Option<ImageSize>,
     /// New error of the receiver; null is `"unknown"`.
     gnss_error: Option<GnssError>,
+    /// New standard deviation per axis, m, of the bias that all fixes have in common; null is the model's own
+    /// prior.
+    #[schema(exclusive_minimum = 0.0, maximum = 100.0)]
+    gnss_bias_sigma_m: Option<f64>,
     /// New recipe, for runs to come; null is the server's default.
     recipe: Option<Recipe>,
     /// New classes, all of them; null is none.
@@ -173,10 +182,11 @@ struct CameraChange {
 type Document = serde_json::Map<String, Value>;
 
 /// The fields that a patch may name.
-const PATCHED_FIELDS: [&str; 8] = [
+const PATCHED_FIELDS: [&str; 9] = [
     "display_name",
     "image_size",
     "gnss_error",
+    "gnss_bias_sigma_m",
     "recipe",
     "target_classes",
     "labels",
@@ -201,6 +211,7 @@ fn patched(app: &App, camera: domain::Camera, patch: &Document) -> Result<domain
         display_name: names("display_name").then_some(profile.display_name),
         image_size: names("image_size").then_some(profile.image_size),
         gnss_error: names("gnss_error").then_some(profile.gnss_error),
+        gnss_bias_sigma: names("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
         recipe: names("recipe").then_some(profile.recipe),
         target_classes: names("target_classes").then_some(profile.target_classes),
         labels: names("labels").then_some(profile.labels),
@@ -241,6 +252,9 @@ pub(super) struct Camera {
     image_size: Option<ImageSize>,
     /// The receiver's error.
     gnss_error: GnssError,
+    /// Standard deviation per axis, m, of the bias that all fixes have in common, if stated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    gnss_bias_sigma_m: Option<f64>,
     /// How the camera is learnt.
     recipe: Recipe,
     /// Classes that the camera is used for; none means all.
@@ -268,6 +282,10 @@ pub(super) struct Camera {
     /// Set if the camera no longer looks where it looked when its active model was trained.
     #[serde(skip_serializing_if = "Option::is_none")]
     moved: Option<CameraMoved>,
+    /// Number of stored samples.
+    samples: u64,
+    /// Of these, those without a fix.
+    samples_without_fix: u64,
     /// What is lost by what was left out.
     warnings: Vec<String>,
 }
@@ -277,7 +295,8 @@ impl Camera {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
         let warnings = app.camera_warnings(&camera);
-        let domain::Camera { profile, revision, created_at, updated_at, active_model, key: _ } = camera;
+        let domain::Camera { profile, revision, created_at, updated_at, active_model, samples, key: _ } =
+            camera;
         Self {
             id: profile.id.as_str().to_owned(),
             display_name: profile.display_name,
@@ -285,6 +304,7 @@ impl Camera {
                 .image_size
                 .map(|size| ImageSize { width_px: size.width_px(), height_px: size.height_px() }),
             gnss_error: profile.gnss_error.into(),
+            gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             recipe: profile.recipe.into(),
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels,
@@ -296,6 +316,8 @@ impl Camera {
             active_model,
             model_fault,
             moved,
+            samples: samples.all,
+            samples_without_fix: samples.without_fix,
             warnings,
         }
     }

@@ -39,8 +39,8 @@ impl HostCheck {
         Ok(())
     }
 
-    /// Whether a request that a browser's cookie vouches for comes from a page of this server, if it is
-    /// to change anything. Other origins may not even be allowed by the settings.
+    /// Checks that a request that a browser's cookie vouches for comes from a page of this server, if it is
+    /// to change anything: `allowed_hosts = *` does not extend to cookies.
     ///
     /// # Errors
     /// `OriginNotAllowed`.
@@ -50,7 +50,10 @@ impl HostCheck {
         }
         let origin = only_value(request, &ORIGIN)?.and_then(|origin| origin.split_once("://"));
         let host = self.host(request)?;
-        if origin.is_some_and(|(_, origin)| host.is_some_and(|host| origin.eq_ignore_ascii_case(host))) {
+        let is_own = |origin: &str| {
+            host.is_some_and(|host| origin.eq_ignore_ascii_case(host)) || self.is_configured(origin)
+        };
+        if origin.is_some_and(|(_, origin)| is_own(origin)) {
             return Ok(());
         }
         let message = "changes with a session's cookie must come from a page of this server itself";

@@ -14,12 +14,13 @@ use hyper::http::HeaderValue;
 use hyper::{Method, Request, Response, Version};
 use tokio::sync::Semaphore;
 use tower::Service as _;
-use tracing::Instrument as _;
+use tracing::field::{Empty, display};
+use tracing::{Instrument as _, Span};
 
 use super::activity::{ObservedBody, OpenRequest};
 use super::credentials::credential;
 use super::host_check::HostCheck;
-use super::request_body::{AdmittedBody, Pace, Ticket};
+use super::request_body::{AdmittedBody, RateGuard, Ticket};
 use super::revocable_body::RevocableBody;
 use crate::admission::{BodyRefusal, ClientAddress, RequestClass};
 use crate::app::App;
@@ -99,7 +100,7 @@ impl RequestPipeline {
             .get(CONTENT_TYPE)
             .is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"));
         let span = tracing::debug_span!(
-            "request", id = %id, method = %request.method(), path = request.uri().path()
+            "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
         let (mut response, ticket) = async {
             match self.admit(request, is_grpc, peer, &id).await {
@@ -144,7 +145,7 @@ impl RequestPipeline {
                 let limits = &self.app.limits;
                 // A live stream may be silent for longer, and looks after that itself.
                 let pace = (class != RequestClass::LiveStream)
-                    .then(|| Pace::new(limits.body_grace(), limits.body_bytes_per_s));
+                    .then(|| RateGuard::new(limits.body_grace(), limits.body_bytes_per_s));
                 let mut request = request
                     .map(|body| Body::new(AdmittedBody::new(body, ticket.clone(), caller.clone(), pace)));
                 let extensions = request.extensions_mut();
@@ -216,7 +217,11 @@ impl RequestPipeline {
             Err(_) if class == RequestClass::Probe => Principal::Anonymous,
             principal => principal?,
         };
-        Ok(Caller::new(principal, Some(peer.address), Some(id.as_str().into())))
+        let caller = Caller::new(principal, Some(peer.address), Some(id.as_str().into()));
+        if let Some(key) = caller.actor().key_id {
+            Span::current().record("key", display(key));
+        }
+        Ok(caller)
     }
 
     async fn route(

@@ -99,8 +99,8 @@ impl Space {
     }
 
     /// What one transaction may add.
-    pub(super) fn quota(&self) -> Quota<'_> {
-        Quota { limits: &self.limits, samples: self.samples.load(Ordering::Relaxed) }
+    pub(super) fn quota(&self) -> SampleQuota<'_> {
+        SampleQuota { limits: &self.limits, samples: self.samples.load(Ordering::Relaxed) }
     }
 
     /// Samples were committed.
@@ -120,13 +120,13 @@ impl Space {
 }
 
 /// Admits rows of one transaction.
-pub(super) struct Quota<'s> {
+pub(super) struct SampleQuota<'s> {
     limits: &'s StoreLimits,
     /// Stored, and admitted before.
     samples: u64,
 }
 
-impl Quota<'_> {
+impl SampleQuota<'_> {
     /// Admits a batch of a camera that has so many samples, and counts it. Rows that will turn out to
     /// be duplicates count, too.
     pub(super) fn admit(&mut self, id: &CameraId, of_camera: &mut u64, rows: u64) -> Result<()> {
@@ -266,10 +266,11 @@ impl Store {
     }
 
     pub(super) async fn count_all_samples(&self) -> Result<()> {
-        let samples: i64 = sqlx::query_scalar("SELECT coalesce(sum(samples), 0) FROM sample_counts")
-            .fetch_one(self.readers())
-            .await
-            .map_err(failed)?;
+        let samples: i64 =
+            sqlx::query_scalar("SELECT coalesce(sum(samples + without_fix), 0) FROM sample_counts")
+                .fetch_one(self.readers())
+                .await
+                .map_err(failed)?;
         self.inner.space.samples.store(u64::try_from(samples).unwrap_or_default(), Ordering::Relaxed);
         Ok(())
     }

@@ -3,9 +3,11 @@
 mod access;
 mod audit;
 mod bad_input;
+mod boxes_without_fix;
 mod connections;
 mod cross_site;
 mod evaluations;
+mod few_receivers;
 mod gaussian_process;
 mod grpc;
 mod harness;

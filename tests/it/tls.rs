@@ -202,12 +202,17 @@ async fn client_certificates_have_the_role_of_their_authority() {
     assert!(is_refused, "a certificate of somebody else");
 }
 
+/// Whether the server presents a certificate of the authority.
+async fn trusts(address: SocketAddr, authority: &Authority) -> bool {
+    connect(address, authority, &["h2"], None).await.is_ok()
+}
+
 #[tokio::test]
 async fn a_changed_certificate_is_loaded_and_a_broken_one_is_not() {
     let (first, second, data) = (Authority::new(), Authority::new(), data_folder());
     let files = Files::new(&first);
     let server = TestServer::run(files.serve(&data));
-    let trusts = |authority| async { connect(server.address, authority, &["h2"], None).await.is_ok() };
+    let trusts = |authority| trusts(server.address, authority);
     assert!(trusts(&first).await);
     files.replace(&second);
     while !trusts(&second).await {

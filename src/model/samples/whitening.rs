@@ -139,12 +139,14 @@ mod tests {
     use super::*;
     use crate::domain::BoundingBox;
     use crate::geo::{EastNorth, Position};
-    use rand::{RngExt, SeedableRng};
+    use crate::simulation::standard_normal;
+    use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
     /// Rows of targets with 2,000 s each.
     fn rows(count: usize) -> Vec<TrainingRow> {
         let row = |at: usize| TrainingRow {
+            sample: 0,
             time_s: at as f64,
             target: (at / 2000) as u32,
             traverse: (at / 2000) as u32,
@@ -154,11 +156,6 @@ mod tests {
             stated_variance_m2: None,
         };
         (0..count).map(row).collect()
-    }
-
-    fn normal(rng: &mut ChaCha8Rng) -> f64 {
-        let sum: f64 = (0..12).map(|_| rng.random::<f64>()).sum();
-        sum - 6.0
     }
 
     #[test]
@@ -175,8 +172,8 @@ mod tests {
             let mut values = Vec::new();
             for at in 0..rows.len() {
                 let decay = if at % 2000 == 0 { 0.0 } else { decay };
-                state = decay * state + (3.6 * (1.0 - decay * decay)).sqrt() * normal(&mut rng);
-                values.push(state + 0.4f64.sqrt() * normal(&mut rng));
+                state = decay * state + (3.6 * (1.0 - decay * decay)).sqrt() * standard_normal(&mut rng);
+                values.push(state + 0.4f64.sqrt() * standard_normal(&mut rng));
             }
             values
         };

@@ -2,6 +2,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rand_distr::Exp1;
 
 use super::candidate::Candidate;
 use super::groups::Grouping;
@@ -75,7 +76,8 @@ pub(crate) fn weigh(
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut wins = vec![0.0; candidates.len()];
     for _ in 0..BOOTSTRAP_DRAWS {
-        let weights: Vec<f64> = sequences.iter().map(|_| -(1.0 - rng.random::<f64>()).ln()).collect();
+        // Exponential weights, normalised, are a draw of the Dirichlet distribution.
+        let weights: Vec<f64> = sequences.iter().map(|_| rng.sample(Exp1)).collect();
         let score =
             |own: &Vec<f64>| own.iter().zip(&weights).map(|(miss, weight)| miss * weight).sum::<f64>();
         let scores: Vec<f64> = misses.iter().map(score).collect();
@@ -136,17 +138,17 @@ fn mixed(candidates: &[Candidate], weights: &[f64], group: usize, row: usize) ->
 }
 
 /// The mean residual of one left-out sequence.
-struct SequenceMean {
+pub(crate) struct SequenceMean {
     /// Its square per axis, m2.
-    square_m2: f64,
+    pub(crate) square_m2: f64,
     /// Its variance by the receiver's noise, m2.
-    noise_m2: f64,
+    pub(crate) noise_m2: f64,
     /// Its variance by the map, taken for fully correlated along the sequence, m2.
-    map_m2: f64,
+    pub(crate) map_m2: f64,
 }
 
 /// The factor, at least 1, at which the sequences' mean squares agree with what is stated.
-fn widening(means: &[SequenceMean]) -> f64 {
+pub(crate) fn widening(means: &[SequenceMean]) -> f64 {
     let ratio = |factor: f64| {
         let own = |mean: &SequenceMean| mean.square_m2 / (mean.noise_m2 + factor * mean.map_m2);
         means.iter().map(own).sum::<f64>() / means.len() as f64

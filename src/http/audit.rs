@@ -85,7 +85,7 @@ struct AuditPage {
 #[utoipa::path(
     get, path = "/v1/audit", tag = "access",
     params(
-        ("camera_id" = Option<String>, Query, description = "Only entries of this camera, which may have been deleted"),
+        ("camera" = Option<String>, Query, description = "Only entries of this camera, which may have been deleted"),
         ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
     ),
@@ -93,7 +93,7 @@ struct AuditPage {
 )]
 async fn list_audit_entries(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
-    let camera = params.take("camera_id", camera_of)?;
+    let camera = params.take("camera", camera_of)?;
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;

@@ -44,7 +44,7 @@ async fn every_change_has_its_entry() {
     server.send("DELETE", "/v1/cameras/c/samples?until=2000-01-01T00:00:00Z", &[], "").await.expect(200);
     server.send("DELETE", "/v1/cameras/c", &[("x-request-id", "the-last")], "").await.expect(204);
 
-    let log = entries(&server, &[], "?camera_id=c").await;
+    let log = entries(&server, &[], "?camera=c").await;
     let actions: Vec<&str> = log.iter().rev().filter_map(|entry| entry["action"].as_str()).collect();
     assert_eq!(
         actions,

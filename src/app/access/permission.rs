@@ -73,7 +73,6 @@ use Permission::{Administer, Authenticated, Ingest, Operate, Public, Read};
 pub const OPERATIONS: &[Operation] = &[
     operation(Public, "GET /livez", "grpc.health.v1.Health/Check"),
     operation(Public, "GET /readyz", "grpc.health.v1.Health/Watch"),
-    operation(Public, "", "grpc.health.v1.Health/List"),
     operation(Read, "GET /metrics", ""),
     operation(Authenticated, "", "grpc.reflection.v1.ServerReflection/ServerReflectionInfo"),
     operation(Authenticated, "", "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo"),

@@ -4,6 +4,8 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+mod access;
+mod audit;
 mod body;
 mod cameras;
 mod description;
@@ -11,6 +13,7 @@ mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
+mod keys;
 mod models;
 mod pairings;
 mod parts;
@@ -18,16 +21,18 @@ mod problem;
 mod receivers;
 mod samples;
 mod service;
+mod session;
 #[cfg(test)]
 mod tests;
 mod tracks;
 mod training_runs;
 mod wire;
 
+use std::sync::Arc;
+
 use axum::Router;
 use axum::body::Body;
-use axum::extract::FromRef;
-use axum::middleware::{from_fn, map_response};
+use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::response::Response;
 use hyper::Method;
 use hyper::header::{CONTENT_SECURITY_POLICY, REFERRER_POLICY, X_FRAME_OPTIONS};
@@ -43,6 +48,8 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
+pub use session::session_token;
+
 /// What the handlers share.
 #[derive(Clone)]
 struct Rest {
@@ -50,24 +57,20 @@ struct Rest {
     shutdown: Shutdown,
 }
 
-impl FromRef<Rest> for App {
-    fn from_ref(rest: &Rest) -> Self {
-        rest.app.clone()
-    }
-}
-
 /// All REST routes, the description at `/openapi.json` and its page at `/docs`.
 ///
-/// Requests carry their [`RequestId`] as an extension.
+/// Requests carry their [`RequestId`] and their [`Caller`](crate::app::access::Caller) as extensions.
 pub fn router(app: App, shutdown: Shutdown) -> Router {
     let rest = Rest { app, shutdown };
     let (routes, described) = described().split_for_parts();
+    let parameters = Arc::new(access::QueryParameters::of(&described));
     // The page would otherwise ask a server on the internet whether the description is well formed.
     let page = SwaggerUi::new("/docs")
         .url("/openapi.json", described)
         .config(Config::default().validator_url("none").use_base_layout());
     let page = Router::from(page).layer(map_response(contain_page));
     routes
+        .route_layer(from_fn_with_state(parameters, access::authorize))
         .merge(page)
         .with_state(rest)
         // As one layer: axum boxes every request again for each.
@@ -127,7 +130,11 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(tracks::routes())
         .merge(gnss_error::routes())
         .merge(evaluations::routes())
+        .merge(keys::routes())
+        .merge(audit::routes())
+        .merge(session::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
+    description::add_security(router.get_openapi_mut());
     router
 }

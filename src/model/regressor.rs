@@ -95,7 +95,8 @@ impl Regressor {
     }
 
     /// Size of the image that it was trained on, if known.
-    pub(super) const fn image_size(&self) -> Option<ImageSize> {
+    #[must_use]
+    pub const fn image_size(&self) -> Option<ImageSize> {
         self.error_model.image_size()
     }
 

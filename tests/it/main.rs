@@ -1,5 +1,7 @@
 //! The one integration test binary: everything from the outside, through real ports and files.
 
+mod access;
+mod audit;
 mod bad_input;
 mod boxes_without_fix;
 mod connections;
@@ -26,3 +28,5 @@ mod simulations;
 mod storage;
 mod story;
 mod stream;
+mod tls;
+mod usage;

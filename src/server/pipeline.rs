@@ -20,6 +20,7 @@ use super::host_check::HostCheck;
 use super::request_body::{AdmittedBody, Pace, Ticket};
 use crate::admission::{BodyRefusal, ClientAddress, RequestClass};
 use crate::app::App;
+use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
 use crate::telemetry::{Metrics, REQUEST_ID, RequestId};
@@ -54,9 +55,9 @@ pub(super) struct Peer {
 pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
 
 impl RequestPipeline {
-    pub(super) fn new(app: App, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+    pub(super) fn new(app: App, console: Console, hosts: HostCheck, shutdown: &Shutdown) -> Self {
         Self {
-            http: http::router(app.clone(), shutdown.clone()),
+            http: http::router(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
             shutdown: shutdown.clone(),

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod connections;
+mod console;
 mod cross_site;
 mod evaluations;
 mod gaussian_process;

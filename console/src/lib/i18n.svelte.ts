@@ -31,4 +31,9 @@ export function t(key: TextKey, values: Record<string, string | number> = {}): s
   return texts[i18n.language][key].replace(/\{(\w+)\}/g, (whole, name: string) => String(values[name] ?? whole));
 }
 
+/** The singular for one, else the plural with its `{n}`. */
+export function plural(n: number, one: TextKey, many: TextKey): string {
+  return n === 1 ? t(one) : t(many, { n });
+}
+
 export type { TextKey };

@@ -6,6 +6,8 @@ import type { BoundingBox, CameraMoved, FusedFix, Position, TrackFeature, TrackU
 const TRAIL_POINTS = 120;
 /** A target that was not measured for this long is shown as lost. */
 export const LOST_AFTER_MS = 5_000;
+/** Targets whose trail is read when the view opens. */
+const MOST_HISTORIES = 50;
 const FORGET_AFTER_MS = 60_000;
 /** Flags are shown for this long after their last observation. */
 export const FLAG_SHOWN_MS = 4_000;
@@ -58,10 +60,17 @@ export class Live {
 
   /** What was tracked before the events began. */
   async #readTracks(camera: string): Promise<void> {
-    const tracks = await get<{ features: TrackFeature[] }>(cameraPath(camera, 'tracks')).catch(() => ({ features: [] }));
-    for (const feature of tracks.features) {
-      if (!this.#targets.has(feature.properties.target_id)) this.#take(feature, Date.now());
+    const read = async (...path: string[]): Promise<TrackFeature[]> =>
+      (await get<{ features: TrackFeature[] }>(cameraPath(camera, 'tracks', ...path)).catch(() => ({ features: [] }))).features;
+    for (const feature of (await read()).slice(0, MOST_HISTORIES)) {
+      const id = feature.properties.target_id;
+      const history = await read(id);
+      if (!this.#targets.has(id)) this.#take(feature, Date.now());
+      const target = this.#targets.get(id)!;
+      const before = history.map(({ geometry: { coordinates } }) => ({ longitude_deg: coordinates[0], latitude_deg: coordinates[1] }));
+      target.trail = [...before, ...target.trail].slice(-TRAIL_POINTS);
     }
+    this.#publish();
   }
 
   #take(update: TrackUpdate, now_ms: number): void {

@@ -1,7 +1,8 @@
 // The samples of one camera with what its active model answers for them.
 import { cameraPath, get, getAll, messageOf, post } from './api';
 import { distance_m } from './geo';
-import type { BoundingBox, Camera, FusedFix, ImageSize, Sample } from './types';
+import { footOf } from './image';
+import type { FusedFix, Sample } from './types';
 
 /** Samples that are read for drawing; cameras with more are shown in part. */
 export const MOST_SAMPLES = 12_000;
@@ -15,23 +16,6 @@ export interface ScenePoint {
   answer?: FusedFix;
   /** From the regressed position to the fix, m. */
   distance_m?: number;
-}
-
-/** The lower middle of a box, where its target stands. */
-export function footOf(box: BoundingBox): { x: number; y: number } {
-  return { x: box.left_px + box.width_px / 2, y: box.top_px + box.height_px };
-}
-
-/** The camera's image, or what the boxes span where its size is unknown. */
-export function imageSizeOf(camera: Camera | undefined, boxes: BoundingBox[]): ImageSize {
-  if (camera?.image_size) return camera.image_size;
-  let [width_px, height_px] = [0, 0];
-  for (const box of boxes) {
-    width_px = Math.max(width_px, box.left_px + box.width_px);
-    height_px = Math.max(height_px, box.top_px + box.height_px);
-  }
-  const round = (value: number, least: number): number => Math.ceil(Math.max(value * 1.02, least) / 10) * 10;
-  return boxes.length > 0 ? { width_px: round(width_px, 10), height_px: round(height_px, 10) } : { width_px: 1280, height_px: 720 };
 }
 
 export class Scene {
@@ -88,26 +72,4 @@ export class Scene {
       this.points = [...this.points];
     }
   }
-}
-
-export interface Coverage {
-  columns: number;
-  rows: number;
-  counts: number[];
-  most: number;
-  /** Occupied cells among all. */
-  share: number;
-}
-
-/** Counts foot points in cells of the image. */
-export function coverageOf(points: { foot: { x: number; y: number } }[], size: ImageSize, columns = 24): Coverage {
-  const rows = Math.max(1, Math.round((columns * size.height_px) / size.width_px));
-  const counts = new Array<number>(columns * rows).fill(0);
-  for (const { foot } of points) {
-    const column = Math.floor((foot.x / size.width_px) * columns);
-    const row = Math.floor((Math.min(foot.y, size.height_px - 1e-6) / size.height_px) * rows);
-    if (column >= 0 && column < columns && row >= 0 && row < rows) counts[row * columns + column]! += 1;
-  }
-  const occupied = counts.filter((count) => count > 0).length;
-  return { columns, rows, counts, most: Math.max(1, ...counts), share: occupied / counts.length };
 }

@@ -66,7 +66,9 @@ const table = {
   'overview.state': ['State', 'Zustand'],
   'overview.states': ['Filter by state', 'Nach Zustand filtern'],
   'overview.streams': ['{n} streams', '{n} Streams'],
+  'overview.stream': ['1 stream', '1 Stream'],
   'overview.targets': ['{n} targets', '{n} Ziele'],
+  'overview.target': ['1 target', '1 Ziel'],
 
   'map.fit': ['Show everything', 'Alles zeigen'],
   'map.north': ['North is up', 'Norden ist oben'],
@@ -218,7 +220,7 @@ const table = {
   'mapping.times': ['Times are', 'Zeiten sind'],
 
   'guide.cells': ['{value} of 64 cells of the image hold 3 foot points or more (wanted: {wanted})', '{value} von 64 Bildzellen enthalten mindestens 3 Fußpunkte (gewünscht: {wanted})'],
-  'guide.enough': ['Enough. The map from image to ground is well determined; train now.', 'Genug. Die Abbildung vom Bild auf den Boden ist gut bestimmt; jetzt trainieren.'],
+  'guide.enough': ['Enough for a good model where you have walked; train now. Beyond the green cells it extrapolates and says so by a larger radius.', 'Genug für ein gutes Modell dort, wo gegangen wurde; jetzt trainieren. Außerhalb der grünen Zellen extrapoliert es und gibt einen größeren Radius an.'],
   'guide.how': ['Walk with a phone through the whole view: along the edges first, then across, near and far. Come back on another day or at another hour: the receiver’s slow error is another one then, and the model learns to tell it from the camera’s.', 'Mit einem Telefon durch das ganze Sichtfeld gehen: erst an den Rändern entlang, dann quer, nah und fern. An einem anderen Tag oder zu anderer Stunde wiederholen: Der langsame Fehler des Empfängers ist dann ein anderer, und das Modell kann ihn von der Kamera trennen.'],
   'guide.met': ['met', 'erfüllt'],
   'guide.none': ['Not enough yet: a training run needs at least 20 samples.', 'Noch nicht genug: Ein Training braucht mindestens 20 Messpaare.'],
@@ -229,6 +231,7 @@ const table = {
   'guide.samples': ['{value} samples (wanted: {wanted})', '{value} Messpaare (gewünscht: {wanted})'],
   'guide.spread': ['Fixes spread over {value} (wanted: {wanted})', 'Fixe verteilen sich über {value} (gewünscht: {wanted})'],
   'guide.stretches': ['{value} separate recordings (wanted: {wanted})', '{value} getrennte Aufnahmen (gewünscht: {wanted})'],
+  'guide.width': ['Foot points spread {value} as far across their main direction as along it (wanted: {wanted}); a single straight line leaves the map undetermined', 'Fußpunkte streuen quer zur Hauptrichtung {value} so weit wie längs (gewünscht: {wanted}); eine einzige Gerade lässt die Abbildung unbestimmt'],
   'guide.title': ['Recording guide', 'Aufnahmehilfe'],
 
   'job.cancelled': ['cancelled', 'abgebrochen'],
@@ -265,7 +268,7 @@ const table = {
   'training.recipe': ['Recipe', 'Rezept'],
   'training.reconstructionError': ['Reconstruction error (2)', 'Rekonstruktionsfehler (2)'],
   'training.regressionError': ['Regression error (3)', 'Regressionsfehler (3)'],
-  'training.report': ['Version {version} ({recipe}) was fitted to {samples} samples of {targets} targets in {time}.', 'Version {version} ({recipe}) wurde in {time} an {samples} Messpaare von {targets} Zielen angepasst.'],
+  'training.report': ['Version {version} ({recipe}) was fitted in {time} to {samples} samples (targets: {targets}).', 'Version {version} ({recipe}) wurde in {time} an {samples} Messpaare angepasst (Ziele: {targets}).'],
   'training.report.estimated': ['estimated from the samples', 'aus den Messpaaren geschätzt'],
   'training.report.fromProfile': ['from the profile', 'aus dem Profil'],
   'training.report.gnss': ['Receiver sigma per axis: {sigma}, {source}.', 'Sigma des Empfängers je Achse: {sigma}, {source}.'],

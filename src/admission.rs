@@ -72,9 +72,9 @@ impl BodyRefusal {
 
 /// A resource of which all clients together and one client may hold so much at a time. Clones share it.
 #[derive(Clone)]
-pub struct Quota(Arc<Shared>);
+pub struct Quota(Arc<QuotaState>);
 
-struct Shared {
+struct QuotaState {
     /// What is counted, in the plural, for the refusal.
     what: &'static str,
     total: u64,
@@ -94,7 +94,7 @@ impl Quota {
     pub fn new(what: &'static str, total: usize, client_share: f64) -> Self {
         let total = total as u64;
         let per_client = ((total as f64 * client_share).ceil() as u64).clamp(1, total.max(1));
-        Self(Arc::new(Shared { what, total, per_client, held: Mutex::default() }))
+        Self(Arc::new(QuotaState { what, total, per_client, held: Mutex::default() }))
     }
 
     /// Takes an amount, which is given back when the lease is dropped.
@@ -133,7 +133,7 @@ impl Lease {
     /// # Errors
     /// `Overloaded`, naming the limit that is reached; the lease stays as it was.
     pub fn try_grow(&mut self, amount: u64) -> Result<()> {
-        let Shared { total, per_client, .. } = *self.quota.0;
+        let QuotaState { total, per_client, .. } = *self.quota.0;
         let mut held = self.quota.lock();
         if held.total + amount > total {
             return Err(self.quota.exceeded(total, "the server"));

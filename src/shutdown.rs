@@ -13,10 +13,10 @@ const FORCED_TIME: Duration = Duration::from_secs(1);
 ///
 /// One pointer: handlers clone it with every request, and each clone of a token takes its lock.
 #[derive(Clone, Default)]
-pub struct Shutdown(Arc<State>);
+pub struct Shutdown(Arc<ShutdownState>);
 
 #[derive(Default)]
-struct State {
+struct ShutdownState {
     draining: CancellationToken,
     forced: CancellationToken,
     tasks: TaskTracker,

@@ -35,80 +35,43 @@ mod code {
 
 /// The row of the table.
 #[must_use]
-pub const fn of(kind: ErrorKind) -> Status {
-    let (http, grpc, slug, title) = match kind {
-        ErrorKind::InvalidArgument => {
-            (422, code::INVALID_ARGUMENT, "invalid-argument", "A field has a value that cannot be used")
+pub fn of(kind: ErrorKind) -> Status {
+    use ErrorKind as Kind;
+    let (http, grpc, title) = match kind {
+        Kind::InvalidArgument => (422, code::INVALID_ARGUMENT, "A field has a value that cannot be used"),
+        Kind::MalformedBody => (400, code::INVALID_ARGUMENT, "The body is not of its format"),
+        Kind::UnsupportedMediaType => (415, code::INVALID_ARGUMENT, "The content type is not read here"),
+        Kind::NotAcceptable => (406, code::INVALID_ARGUMENT, "None of the accepted types is written here"),
+        Kind::TooLarge => (413, code::RESOURCE_EXHAUSTED, "The request is beyond a limit"),
+        Kind::RouteNotFound => (404, code::UNIMPLEMENTED, "There is no such path"),
+        Kind::MethodNotAllowed => (405, code::UNIMPLEMENTED, "The path does not know this method"),
+        Kind::CameraNotFound => (404, code::NOT_FOUND, "There is no such camera"),
+        Kind::RunNotFound => (404, code::NOT_FOUND, "There is no such training run"),
+        Kind::TrackNotFound => (404, code::NOT_FOUND, "No such target is followed"),
+        Kind::EvaluationNotFound => (404, code::NOT_FOUND, "There is no such evaluation"),
+        Kind::ModelNotFound => (404, code::NOT_FOUND, "There is no such model version"),
+        Kind::CameraExists => (409, code::ALREADY_EXISTS, "A camera of that id exists already"),
+        Kind::RevisionMismatch => (412, code::ABORTED, "The camera was changed in the meantime"),
+        Kind::RevisionRequired => {
+            (428, code::FAILED_PRECONDITION, "The change needs the revision it is based on")
         }
-        ErrorKind::MalformedBody => {
-            (400, code::INVALID_ARGUMENT, "malformed-body", "The body is not of its format")
+        Kind::NoModel => (409, code::FAILED_PRECONDITION, "The camera has no active model"),
+        Kind::ModelUnusable => (409, code::FAILED_PRECONDITION, "The stored model version cannot be used"),
+        Kind::RunLive => (409, code::FAILED_PRECONDITION, "The camera has a training run that has not ended"),
+        Kind::RunEnded => (409, code::FAILED_PRECONDITION, "The training run has ended"),
+        Kind::EvaluationEnded => (409, code::FAILED_PRECONDITION, "The evaluation has ended"),
+        Kind::ModelActive => (409, code::FAILED_PRECONDITION, "The model version is the active one"),
+        Kind::InsufficientStorage => (507, code::RESOURCE_EXHAUSTED, "There is no space to store it"),
+        Kind::UnusableSamples => (422, code::FAILED_PRECONDITION, "The samples cannot support a fit"),
+        Kind::Cancelled => (499, code::CANCELLED, "The request was cancelled"),
+        Kind::Overloaded => (503, code::UNAVAILABLE, "The server has too much to do"),
+        Kind::Timeout => (408, code::DEADLINE_EXCEEDED, "The request took too long"),
+        Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
+        Kind::HostNotAllowed => (421, code::PERMISSION_DENIED, "The server does not answer for this host"),
+        Kind::OriginNotAllowed => {
+            (403, code::PERMISSION_DENIED, "A page of another origin asked for a change")
         }
-        ErrorKind::UnsupportedMediaType => {
-            (415, code::INVALID_ARGUMENT, "unsupported-media-type", "The content type is not read here")
-        }
-        ErrorKind::NotAcceptable => {
-            (406, code::INVALID_ARGUMENT, "not-acceptable", "None of the accepted types is written here")
-        }
-        ErrorKind::TooLarge => (413, code::RESOURCE_EXHAUSTED, "too-large", "The request is beyond a limit"),
-        ErrorKind::RouteNotFound => (404, code::UNIMPLEMENTED, "route-not-found", "There is no such path"),
-        ErrorKind::MethodNotAllowed => {
-            (405, code::UNIMPLEMENTED, "method-not-allowed", "The path does not know this method")
-        }
-        ErrorKind::CameraNotFound => (404, code::NOT_FOUND, "camera-not-found", "There is no such camera"),
-        ErrorKind::RunNotFound => (404, code::NOT_FOUND, "run-not-found", "There is no such training run"),
-        ErrorKind::TrackNotFound => (404, code::NOT_FOUND, "track-not-found", "No such target is followed"),
-        ErrorKind::EvaluationNotFound => {
-            (404, code::NOT_FOUND, "evaluation-not-found", "There is no such evaluation")
-        }
-        ErrorKind::ModelNotFound => {
-            (404, code::NOT_FOUND, "model-not-found", "There is no such model version")
-        }
-        ErrorKind::CameraExists => {
-            (409, code::ALREADY_EXISTS, "camera-exists", "A camera of that id exists already")
-        }
-        ErrorKind::RevisionMismatch => {
-            (412, code::ABORTED, "revision-mismatch", "The camera was changed in the meantime")
-        }
-        ErrorKind::RevisionRequired => (
-            428,
-            code::FAILED_PRECONDITION,
-            "revision-required",
-            "The change needs the revision it is based on",
-        ),
-        ErrorKind::NoModel => (409, code::FAILED_PRECONDITION, "no-model", "The camera has no active model"),
-        ErrorKind::ModelUnusable => {
-            (409, code::FAILED_PRECONDITION, "model-unusable", "The stored model version cannot be used")
-        }
-        ErrorKind::RunLive => {
-            (409, code::FAILED_PRECONDITION, "run-live", "The camera has a training run that has not ended")
-        }
-        ErrorKind::RunEnded => (409, code::FAILED_PRECONDITION, "run-ended", "The training run has ended"),
-        ErrorKind::EvaluationEnded => {
-            (409, code::FAILED_PRECONDITION, "evaluation-ended", "The evaluation has ended")
-        }
-        ErrorKind::ModelActive => {
-            (409, code::FAILED_PRECONDITION, "model-active", "The model version is the active one")
-        }
-        ErrorKind::InsufficientStorage => {
-            (507, code::RESOURCE_EXHAUSTED, "insufficient-storage", "There is no space to store it")
-        }
-        ErrorKind::UnusableSamples => {
-            (422, code::FAILED_PRECONDITION, "unusable-samples", "The samples cannot support a fit")
-        }
-        ErrorKind::Cancelled => (499, code::CANCELLED, "cancelled", "The request was cancelled"),
-        ErrorKind::Overloaded => (503, code::UNAVAILABLE, "overloaded", "The server has too much to do"),
-        ErrorKind::Timeout => (408, code::DEADLINE_EXCEEDED, "timeout", "The request took too long"),
-        ErrorKind::ShuttingDown => (503, code::UNAVAILABLE, "shutting-down", "The server is shutting down"),
-        ErrorKind::HostNotAllowed => {
-            (421, code::PERMISSION_DENIED, "host-not-allowed", "The server does not answer for this host")
-        }
-        ErrorKind::OriginNotAllowed => (
-            403,
-            code::PERMISSION_DENIED,
-            "origin-not-allowed",
-            "A page of another origin asked for a change",
-        ),
-        ErrorKind::Internal => (500, code::INTERNAL, "internal", "The server failed"),
+        Kind::Internal => (500, code::INTERNAL, "The server failed"),
     };
-    Status { http, grpc, slug, title }
+    Status { http, grpc, slug: kind.as_str(), title }
 }

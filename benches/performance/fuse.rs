@@ -32,11 +32,9 @@ pub(crate) fn run() {
         let mut times = [true, false].map(|with_fix| {
             let observations: Vec<_> = samples
                 .iter()
-                .map(|sample| Observation {
-                    time: sample.time,
-                    target_id: None,
-                    bounding_box: Some(sample.bounding_box),
-                    fix: with_fix.then_some(sample.fix),
+                .map(|sample| {
+                    let fix = with_fix.then_some(sample.fix);
+                    Observation::new(sample.time, None, Some(sample.bounding_box), fix).expect("a box")
                 })
                 .collect();
             let mut rounds: Vec<f64> = (0..7)

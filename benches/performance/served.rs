@@ -43,11 +43,9 @@ impl Served {
         let samples = world.training_samples();
         let observations = samples
             .iter()
-            .map(|sample| Observation {
-                time: sample.time,
-                target_id: Some(sample.target_id.clone()),
-                bounding_box: Some(sample.bounding_box),
-                fix: Some(sample.fix),
+            .map(|sample| {
+                let target_id = Some(sample.target_id.clone());
+                Observation::with_fix(sample.time, target_id, Some(sample.bounding_box), sample.fix)
             })
             .collect();
         app.store.insert_samples(&camera, samples, Durability::Synced).await.expect("samples are stored");

@@ -90,7 +90,7 @@ struct Feed {
 
 impl Feed {
     fn new(observations: &Arc<Vec<Observation>>, target: String, step: Option<Duration>) -> Self {
-        let (first, last) = (observations[0].time, observations[observations.len() - 1].time);
+        let (first, last) = (observations[0].time(), observations[observations.len() - 1].time());
         let round_s = last.duration_since(first).as_secs() + 60;
         let rounds = (ITEMS / observations.len()) as i64 + 1;
         let begin_s = NEXT_BEGIN_S.fetch_add(rounds * round_s, Ordering::Relaxed) % FURTHEST_S;
@@ -105,19 +105,19 @@ impl Feed {
             None => {
                 let rounds = (index / self.observations.len()) as i64;
                 (
-                    self.begin_s + observation.time.as_second() + rounds * self.round_s,
-                    observation.time.subsec_nanosecond(),
+                    self.begin_s + observation.time().as_second() + rounds * self.round_s,
+                    observation.time().subsec_nanosecond(),
                 )
             }
             Some(step) => {
                 let passed = step * u32::try_from(index).expect("a short bench");
                 let nanos = i32::try_from(passed.subsec_nanos()).expect("below a second");
-                (self.begin_s + self.observations[0].time.as_second() + passed.as_secs() as i64, nanos)
+                (self.begin_s + self.observations[0].time().as_second() + passed.as_secs() as i64, nanos)
             }
         };
         let [left_px, top_px, width_px, height_px] =
-            observation.bounding_box.expect("a box").sides_px().map(Some);
-        let fix = observation.fix.expect("a fix").position;
+            observation.bounding_box().expect("a box").sides_px().map(Some);
+        let fix = observation.fix().expect("a fix").position;
         let item = proto::StreamItem {
             seq: index as u64 + 1,
             time: Some(prost_types::Timestamp { seconds, nanos }),

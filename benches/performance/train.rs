@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
+use rand_distr::StandardNormal;
 use sightfix::domain::{GnssError, Recipe, SigmaM};
 use sightfix::model::FitOptions;
 use sightfix::model::network::{Activation, LossWeights, NetShape, Schedule, TrainingSet, train};
@@ -60,9 +61,8 @@ fn whole() {
 
 /// The peer's own figures: boxes of unit variance, fixes that bend with them.
 fn training_set(rng: &mut ChaCha8Rng) -> TrainingSet {
-    // A sum of twelve uniforms has variance 1.
-    let mut normal = || (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0;
-    let inputs: Vec<Vec<f32>> = (0..INPUTS).map(|_| (0..SAMPLES).map(|_| normal()).collect()).collect();
+    let inputs: Vec<Vec<f32>> =
+        (0..INPUTS).map(|_| (0..SAMPLES).map(|_| rng.sample(StandardNormal)).collect()).collect();
     let target = |axis: usize| {
         let (straight, bent) = (&inputs[axis], &inputs[axis + 2]);
         straight.iter().zip(bent).map(|(straight, bent)| 0.7 * straight + 0.3 * bent * bent).collect()

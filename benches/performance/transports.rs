@@ -29,12 +29,12 @@ pub(crate) fn request_body(observations: &[Observation]) -> String {
     let items: Vec<_> = observations
         .iter()
         .map(|observation| {
-            let bounding_box = observation.bounding_box.expect("a box");
+            let bounding_box = observation.bounding_box().expect("a box");
             let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
-            let fix = observation.fix.expect("a fix").position;
+            let fix = observation.fix().expect("a fix").position;
             serde_json::json!({
-                "time": observation.time.to_string(),
-                "target_id": observation.target_id.as_ref().map(|target| target.as_str()),
+                "time": observation.time().to_string(),
+                "target_id": observation.target_id().map(|target| target.as_str()),
                 "bounding_box":
                     {"left_px": left_px, "top_px": top_px, "width_px": width_px, "height_px": height_px},
                 "fix": {"longitude_deg": fix.longitude_deg(), "latitude_deg": fix.latitude_deg()},
@@ -152,14 +152,14 @@ fn proto_request(served: &Served, items: usize) -> proto::FuseRequest {
         .iter()
         .map(|observation| {
             let [left_px, top_px, width_px, height_px] =
-                observation.bounding_box.expect("a box").sides_px().map(Some);
-            let fix = observation.fix.expect("a fix").position;
+                observation.bounding_box().expect("a box").sides_px().map(Some);
+            let fix = observation.fix().expect("a fix").position;
             proto::Observation {
                 time: Some(prost_types::Timestamp {
-                    seconds: observation.time.as_second(),
-                    nanos: observation.time.subsec_nanosecond(),
+                    seconds: observation.time().as_second(),
+                    nanos: observation.time().subsec_nanosecond(),
                 }),
-                target_id: observation.target_id.as_ref().map(ToString::to_string),
+                target_id: observation.target_id().map(ToString::to_string),
                 bounding_box: Some(proto::BoundingBox { left_px, top_px, width_px, height_px }),
                 fix: Some(proto::Fix {
                     longitude_deg: Some(fix.longitude_deg()),

@@ -24,7 +24,7 @@ impl App {
         let mut camera = camera;
         if camera.model.is_none()
             && camera.model_fault.is_none()
-            && observations.iter().any(|observation| observation.bounding_box.is_some())
+            && observations.iter().any(|observation| observation.bounding_box().is_some())
         {
             // A run may have ended a moment ago, here or in another process.
             camera = self.registry.refresh_camera(&self.store, &camera.id).await?;
@@ -86,13 +86,8 @@ pub(super) fn fuse_observed(
     observation: &Observation,
     observed: &ObservedPositions<'_>,
 ) -> Option<FusedFix> {
-    let without_box;
-    let observation = if camera.model_fault.is_some() && observation.fix.is_some() {
-        without_box = Observation { bounding_box: None, ..observation.clone() };
-        &without_box
-    } else {
-        observation
-    };
+    let without_box = camera.model_fault.as_ref().and_then(|_| observation.without_box());
+    let observation = without_box.as_ref().unwrap_or(observation);
     let mut fused = two_step::fuse_observed(observation, observed, camera.model(), camera.image_size)?;
     if camera.moved.is_some() && fused.regressed.is_some() {
         fused.flags.push(Flag::CameraMoved);

@@ -6,8 +6,11 @@ use super::registry::{ModelFault, load_model};
 use super::{App, Page, page_of};
 use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelVersion, Result};
 use crate::exchange::{RowError, TimedFix};
-use crate::geo::LocalPlane;
+use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::Artifact;
+
+/// Fewest fixes from which the error is estimated.
+const FEWEST_FIXES: u64 = 10;
 
 /// The receiver's error from many fixes at one fixed point.
 #[derive(Debug, Clone, PartialEq)]
@@ -19,7 +22,7 @@ pub struct GnssErrorEstimate {
     /// The first of them, with their reasons.
     pub rejected_rows: Vec<RowError>,
     /// Their mean position.
-    pub mean: crate::geo::Position,
+    pub mean: Position,
     /// Variance of the east component, m2.
     pub east_variance_m2: f64,
     /// Variance of the north component, m2.
@@ -42,50 +45,39 @@ impl GnssErrorEstimate {
         rows: impl Iterator<Item = Result<std::result::Result<TimedFix, RowError>>>,
         reported_rows: usize,
     ) -> Result<Self> {
-        const FEWEST: u64 = 10;
-        let mut plane: Option<LocalPlane> = None;
-        let (mut count, mut mean, mut squares) = (0_u64, [0.0; 2], [0.0; 2]);
+        let mut moments = PlaneMoments::default();
         let (mut rejected, mut rejected_rows) = (0, Vec::new());
         for row in rows {
-            let position = match row? {
-                Ok(row) => row.fix.position,
+            match row? {
+                Ok(row) => moments.add(row.fix.position),
                 Err(row) => {
                     rejected += 1;
                     if rejected_rows.len() < reported_rows {
                         rejected_rows.push(row);
                     }
-                    continue;
                 }
-            };
-            let plane = plane.get_or_insert_with(|| LocalPlane::new(position));
-            let point = plane.to_plane(position);
-            count += 1;
-            // Welford: stable in one pass.
-            for (axis, value) in [point.east_m, point.north_m].into_iter().enumerate() {
-                let before = value - mean[axis];
-                mean[axis] += before / count as f64;
-                squares[axis] += before * (value - mean[axis]);
             }
         }
-        let Some(plane) = plane.filter(|_| count >= FEWEST) else {
+        let Some(mean) = moments.mean_position().filter(|_| moments.count >= FEWEST_FIXES) else {
             let first = rejected_rows.first().map_or_else(String::new, |row: &RowError| {
                 format!("; {rejected} were rejected, first line {}: {}: {}", row.line, row.field, row.reason)
             });
+            let count = moments.count;
             return Err(Error::invalid(
                 "fixes",
-                format!("are {count}, at least {FEWEST} from one fixed point are needed{first}"),
+                format!("are {count}, at least {FEWEST_FIXES} from one fixed point are needed{first}"),
             ));
         };
-        let [east_variance_m2, north_variance_m2] = squares.map(|sum| sum / (count - 1) as f64);
+        let [east_variance_m2, north_variance_m2] = moments.variances_m2();
         let e_gnss_m2 = 0.5 * (east_variance_m2 + north_variance_m2);
         if e_gnss_m2 <= 0.0 {
             return Err(Error::invalid("fixes", "are all the same, so they do not show the error"));
         }
         Ok(Self {
-            fixes: count,
+            fixes: moments.count,
             rejected,
             rejected_rows,
-            mean: plane.to_position(crate::geo::EastNorth { east_m: mean[0], north_m: mean[1] }),
+            mean,
             east_variance_m2,
             north_variance_m2,
             e_gnss_m2,
@@ -93,6 +85,39 @@ impl GnssErrorEstimate {
             // Rayleigh: the mean length of an isotropic normal vector.
             mean_distance_m: (std::f64::consts::FRAC_PI_2 * e_gnss_m2).sqrt(),
         })
+    }
+}
+
+/// Mean and scatter of positions in the plane of the first of them, in one pass (Welford 1962).
+#[derive(Default)]
+struct PlaneMoments {
+    plane: Option<LocalPlane>,
+    count: u64,
+    /// East and north, m.
+    mean_m: [f64; 2],
+    /// Sums of squared deviations from the mean, m2.
+    squares_m2: [f64; 2],
+}
+
+impl PlaneMoments {
+    fn add(&mut self, position: Position) {
+        let point = self.plane.get_or_insert_with(|| LocalPlane::new(position)).to_plane(position);
+        self.count += 1;
+        for (axis, value_m) in [point.east_m, point.north_m].into_iter().enumerate() {
+            let before_m = value_m - self.mean_m[axis];
+            self.mean_m[axis] += before_m / self.count as f64;
+            self.squares_m2[axis] += before_m * (value_m - self.mean_m[axis]);
+        }
+    }
+
+    fn mean_position(&self) -> Option<Position> {
+        let [east_m, north_m] = self.mean_m;
+        self.plane.as_ref().map(|plane| plane.to_position(EastNorth { east_m, north_m }))
+    }
+
+    /// Sample variances of east and north; for two positions or more.
+    fn variances_m2(&self) -> [f64; 2] {
+        self.squares_m2.map(|sum_m2| sum_m2 / (self.count - 1) as f64)
     }
 }
 
@@ -193,16 +218,14 @@ impl App {
 mod tests {
     use super::*;
     use crate::domain::Fix;
-    use crate::geo::{EastNorth, Position};
-    use rand::{Rng, SeedableRng};
+    use crate::simulation::standard_normal;
+    use rand::SeedableRng;
 
     #[test]
     fn the_estimate_finds_the_spread() {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(1);
         let plane = LocalPlane::new(Position::new(103.9, 30.6).expect("valid"));
-        // A sum of twelve uniforms has variance 1.
-        let mut normal =
-            || (0..12).map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX)).sum::<f64>() - 6.0;
+        let mut normal = || standard_normal(&mut random);
         let fixes: Vec<_> = (0..4_000)
             .map(|_| {
                 let point = EastNorth { east_m: 2.0 * normal(), north_m: 3.0 * normal() };

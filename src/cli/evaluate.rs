@@ -210,10 +210,10 @@ fn read_train(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<
 fn sample(row: ObservedRow) -> Option<Sample> {
     let ObservedRow { observation, class, score, truth } = row;
     Some(Sample {
-        time: observation.time,
-        target_id: observation.target_id.or_else(|| TargetId::new("target").ok())?,
-        bounding_box: observation.bounding_box?,
-        fix: observation.fix?,
+        time: observation.time(),
+        target_id: observation.target_id().cloned().or_else(|| TargetId::new("target").ok())?,
+        bounding_box: observation.bounding_box()?,
+        fix: observation.fix()?,
         class,
         score,
         truth,

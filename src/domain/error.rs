@@ -6,12 +6,15 @@
 use std::error::Error as StdError;
 use std::fmt;
 
+use strum::IntoStaticStr;
+
 /// `std::result::Result` with this crate's error.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// Every kind of error that a caller can receive. `status.rs` gives each its HTTP status, gRPC code and
 /// problem type.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum ErrorKind {
     /// A field has a value that cannot be used.
     InvalidArgument,
@@ -73,6 +76,14 @@ pub enum ErrorKind {
     OriginNotAllowed,
     /// A fault of the server.
     Internal,
+}
+
+impl ErrorKind {
+    /// Stable name, as in problem types and in the `reason` of gRPC's `ErrorInfo`.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
 }
 
 /// Most fields at fault that one refusal names. gRPC sends them in headers, of which clients take no more

@@ -53,17 +53,13 @@ pub struct LiveItem {
     pub score: Option<Score>,
 }
 
-/// A box, a fix, or both, of one target at one instant.
+/// A box, a fix, or both, of one target at one instant; at least one of the two.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// Time of the measurement.
-    pub time: Timestamp,
-    /// The target, if known.
-    pub target_id: Option<TargetId>,
-    /// The detection.
-    pub bounding_box: Option<BoundingBox>,
-    /// The fix.
-    pub fix: Option<Fix>,
+    time: Timestamp,
+    target_id: Option<TargetId>,
+    bounding_box: Option<BoundingBox>,
+    fix: Option<Fix>,
 }
 
 impl Observation {
@@ -79,6 +75,67 @@ impl Observation {
             return Err(Error::invalid("bounding_box", "give a bounding_box, a fix, or both"));
         }
         Ok(Self { time, target_id, bounding_box, fix })
+    }
+
+    /// Of a fix, with or without a box.
+    #[must_use]
+    pub const fn with_fix(
+        time: Timestamp,
+        target_id: Option<TargetId>,
+        bounding_box: Option<BoundingBox>,
+        fix: Fix,
+    ) -> Self {
+        Self { time, target_id, bounding_box, fix: Some(fix) }
+    }
+
+    /// Time of the measurement.
+    #[must_use]
+    pub const fn time(&self) -> Timestamp {
+        self.time
+    }
+
+    /// The target, if known.
+    #[must_use]
+    pub const fn target_id(&self) -> Option<&TargetId> {
+        self.target_id.as_ref()
+    }
+
+    /// The detection.
+    #[must_use]
+    pub const fn bounding_box(&self) -> Option<BoundingBox> {
+        self.bounding_box
+    }
+
+    /// The fix.
+    #[must_use]
+    pub const fn fix(&self) -> Option<Fix> {
+        self.fix
+    }
+
+    /// The same with the fix alone; `None` without one.
+    #[must_use]
+    pub fn without_box(&self) -> Option<Self> {
+        self.fix.map(|fix| Self::with_fix(self.time, self.target_id.clone(), None, fix))
+    }
+
+    /// The same with the box alone; `None` without one.
+    #[must_use]
+    pub fn without_fix(&self) -> Option<Self> {
+        self.bounding_box.map(|_| Self { fix: None, ..self.clone() })
+    }
+
+    /// The same with its box changed, if it has one.
+    ///
+    /// # Errors
+    /// That of the change.
+    pub fn try_map_box(self, change: impl FnOnce(BoundingBox) -> Result<BoundingBox>) -> Result<Self> {
+        Ok(Self { bounding_box: self.bounding_box.map(change).transpose()?, ..self })
+    }
+
+    /// Time, target, box and fix.
+    #[must_use]
+    pub fn into_parts(self) -> (Timestamp, Option<TargetId>, Option<BoundingBox>, Option<Fix>) {
+        (self.time, self.target_id, self.bounding_box, self.fix)
     }
 }
 

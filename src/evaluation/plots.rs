@@ -59,7 +59,7 @@ struct Series {
 /// Errors over test time, with gaps shortened to 5 s so that passes are adjacent.
 fn error_over_time(traces: &[Trace], test: &[TestRow]) -> String {
     let mut times_s: Vec<f64> =
-        test.iter().map(|row| row.observation.time.as_microsecond() as f64 * 1e-6).collect();
+        test.iter().map(|row| row.observation.time().as_microsecond() as f64 * 1e-6).collect();
     times_s.sort_by(f64::total_cmp);
     times_s.dedup();
     let mut shown_s = vec![0.0];
@@ -68,7 +68,7 @@ fn error_over_time(traces: &[Trace], test: &[TestRow]) -> String {
         shown_s.push(last_s + (pair[1] - pair[0]).min(5.0));
     }
     let elapsed_s = |row: usize| {
-        let time_s = test[row].observation.time.as_microsecond() as f64 * 1e-6;
+        let time_s = test[row].observation.time().as_microsecond() as f64 * 1e-6;
         shown_s[times_s.partition_point(|&other_s| other_s < time_s).min(shown_s.len() - 1)]
     };
     let points = |point: &TracePoint| Some([elapsed_s(point.row), point.error_m?]);

@@ -77,7 +77,7 @@ impl<'a> Predictors<'a> {
     {
         let known_sigma_m = self.options.gnss_sigma.map(SigmaM::metres);
         self.per_row(move |observation| {
-            let fix = observation.fix?;
+            let fix = observation.fix()?;
             let sigma_m = fix.sigma_m.map(SigmaM::metres).or(known_sigma_m);
             Some(Prediction { position: fix.position, r95_m: sigma_m.map(|sigma_m| R95_PER_SIGMA * sigma_m) })
         })
@@ -96,8 +96,8 @@ impl<'a> Predictors<'a> {
         let plane = self.plane;
         let network = dnn::fit(self.train, &plane, with_fix, seed);
         Ok(self.per_row(move |observation| {
-            let bounding_box = observation.bounding_box.as_ref()?;
-            let fix = observation.fix.filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
+            let bounding_box = &observation.bounding_box()?;
+            let fix = observation.fix().filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
             let point = (fix.is_some() == with_fix).then(|| network.regress(bounding_box, fix))?;
             Some(Prediction { position: plane.to_position(point), r95_m: None })
         }))
@@ -116,7 +116,7 @@ impl<'a> Predictors<'a> {
         let homography = homography::fit(&pairs, seed)
             .ok_or("fewer than 8 training samples, or all of them at one position")?;
         Ok(self.per_row(move |observation| {
-            let point = homography.project(observation.bounding_box.as_ref()?)?;
+            let point = homography.project(&observation.bounding_box()?)?;
             Some(Prediction { position: plane.to_position(point), r95_m: None })
         }))
     }
@@ -130,10 +130,10 @@ impl<'a> Predictors<'a> {
         let (plane, test) = (self.plane, self.test);
         Box::new(move |target| {
             let mut filter = ImmUkf::new(tuned);
-            let mut last = target.first().map(|&row| test[row].observation.time);
+            let mut last = target.first().map(|&row| test[row].observation.time());
             let predict = |&row: &usize| {
-                let Observation { time, fix, .. } = &test[row].observation;
-                let seconds = last.replace(*time).map_or(0.0, |last| time.duration_since(last).as_secs_f64());
+                let (time, fix) = (test[row].observation.time(), test[row].observation.fix());
+                let seconds = last.replace(time).map_or(0.0, |last| time.duration_since(last).as_secs_f64());
                 let fix = fix.map(|fix| {
                     let stated_m2 = fix.sigma_m.map_or(variance_m2, SigmaM::variance_m2);
                     (plane.to_plane(fix.position), stated_m2)
@@ -180,8 +180,8 @@ impl<'a> Predictors<'a> {
     {
         let plane = *regressor.plane();
         self.per_row(move |observation| {
-            let fix = observation.fix.filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
-            let regression = regressor.regress(observation.bounding_box.as_ref()?, fix);
+            let fix = observation.fix().filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
+            let regression = regressor.regress(&observation.bounding_box()?, fix);
             Some(Prediction {
                 position: plane.to_position(regression.regressed),
                 r95_m: Some(regression.r95_scale * regression.e_regression_m2.sqrt()),
@@ -199,14 +199,14 @@ impl<'a> Predictors<'a> {
         Box::new(move |target| {
             let mut track = TargetTrack::default();
             let predict = |&row: &usize| {
-                let mut observation = test[row].observation.clone();
-                observation.fix = observation.fix.filter(|_| with_fix);
-                let observed =
-                    ObservedPositions::of(&observation, Some(regressor), image_size, Some(e_gnss_m2));
-                let estimate = if observed.is_empty() {
-                    track.at(observation.time)
-                } else {
-                    track.update(&observed, || settings)
+                let given = &test[row].observation;
+                let used = if with_fix { Some(given.clone()) } else { given.without_fix() };
+                let observed = used.as_ref().map(|observation| {
+                    ObservedPositions::of(observation, Some(regressor), image_size, Some(e_gnss_m2))
+                });
+                let estimate = match observed.filter(|observed| !observed.is_empty()) {
+                    Some(observed) => track.update(&observed, || settings),
+                    None => track.at(given.time()),
                 }?;
                 Some(Prediction { position: estimate.position, r95_m: Some(estimate.state.r95_m) })
             };

@@ -29,9 +29,10 @@ pub fn evaluate(
 ) -> Result<Evaluation> {
     let mut test = test.to_vec();
     for row in &mut test {
-        let shifted =
-            row.observation.bounding_box.map(|bounding_box| shifted(bounding_box, options.box_shift_px));
-        row.observation.bounding_box = shifted.transpose()?;
+        row.observation = row
+            .observation
+            .clone()
+            .try_map_box(|bounding_box| shifted(bounding_box, options.box_shift_px))?;
     }
     let plane = LocalPlane::new(first_fix(train, &test));
     let mut run = Run {
@@ -61,17 +62,17 @@ fn shifted(bounding_box: BoundingBox, by_px: f64) -> Result<BoundingBox> {
 
 fn rows_by_target(test: &[TestRow]) -> Vec<TargetRows> {
     let mut order: Vec<usize> = (0..test.len()).collect();
-    let key = |index: &usize| (&test[*index].observation.target_id, test[*index].observation.time);
+    let key = |index: &usize| (test[*index].observation.target_id(), test[*index].observation.time());
     order.sort_by(|one, other| key(one).cmp(&key(other)));
     let same =
-        |one: &usize, next: &usize| test[*one].observation.target_id == test[*next].observation.target_id;
+        |one: &usize, next: &usize| test[*one].observation.target_id() == test[*next].observation.target_id();
     order.chunk_by(same).map(<[usize]>::to_vec).collect()
 }
 
 /// Origin of the baselines' plane.
 fn first_fix(train: &[Sample], test: &[TestRow]) -> Position {
     let first = train.first().map(|sample| sample.fix.position);
-    let in_test = || test.iter().find_map(|row| Some(row.observation.fix?.position));
+    let in_test = || test.iter().find_map(|row| Some(row.observation.fix()?.position));
     first.or_else(in_test).unwrap_or_else(|| Position::new(0.0, 0.0).expect("within range"))
 }
 

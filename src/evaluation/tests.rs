@@ -1,7 +1,7 @@
 use std::ops::ControlFlow;
 
 use super::*;
-use crate::domain::{Observation, Recipe, SigmaM};
+use crate::domain::{Recipe, SigmaM};
 use crate::simulation::{Options, Scene, World, simulate, simulate_split};
 
 fn options(methods: &str) -> EvaluateOptions {
@@ -21,15 +21,7 @@ fn test_rows(world: &World) -> Vec<TestRow> {
     world
         .rows
         .iter()
-        .map(|row| TestRow {
-            observation: Observation {
-                time: row.time,
-                target_id: Some(row.target_id.clone()),
-                bounding_box: row.bounding_box,
-                fix: row.fix,
-            },
-            truth: Some(row.truth),
-        })
+        .filter_map(|row| Some(TestRow { observation: row.observation()?, truth: Some(row.truth) }))
         .collect()
 }
 
@@ -50,11 +42,11 @@ fn every_method_predicts_for_interleaved_targets_with_gaps() {
     assert!(evaluation.report.failed.is_empty(), "{:?}", evaluation.report.failed);
     let n = |name: &str| evaluation.report.methods[name].metrics.n;
     let count = |holds: &dyn Fn(&TestRow) -> bool| test_rows(&test).iter().filter(|row| holds(row)).count();
-    assert_eq!(n("gnss"), count(&|row| row.observation.fix.is_some()));
-    assert_eq!(n("hybrid.denied"), count(&|row| row.observation.bounding_box.is_some()));
-    let either = |row: &TestRow| row.observation.bounding_box.is_some() || row.observation.fix.is_some();
+    assert_eq!(n("gnss"), count(&|row| row.observation.fix().is_some()));
+    assert_eq!(n("hybrid.denied"), count(&|row| row.observation.bounding_box().is_some()));
+    let either = |row: &TestRow| row.observation.bounding_box().is_some() || row.observation.fix().is_some();
     assert_eq!(n("hybrid.two_step"), count(&either));
-    let both = |row: &TestRow| row.observation.bounding_box.is_some() && row.observation.fix.is_some();
+    let both = |row: &TestRow| row.observation.bounding_box().is_some() && row.observation.fix().is_some();
     assert_eq!(n("dnn"), count(&both));
     assert!(n("track") >= n("hybrid.two_step"));
     let mean_m = |name: &str| evaluation.report.methods[name].metrics.mean_m;

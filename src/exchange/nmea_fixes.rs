@@ -39,7 +39,7 @@ enum PendingRow {
 }
 
 /// Content of a line.
-enum Content {
+enum SentenceContent {
     Fix(Option<Time>, Fix),
     Date(Timestamp),
     None,
@@ -76,9 +76,9 @@ impl<R: Read> NmeaFixes<R> {
             Line::TooLong => Err("is longer than 64 KiB".to_owned()),
         };
         match content {
-            Ok(Content::None) => {}
-            Ok(Content::Date(instant)) => self.dated_instant = Some(instant),
-            Ok(Content::Fix(time_of_day, fix)) => {
+            Ok(SentenceContent::None) => {}
+            Ok(SentenceContent::Date(instant)) => self.dated_instant = Some(instant),
+            Ok(SentenceContent::Fix(time_of_day, fix)) => {
                 self.pending.push_back(PendingRow::Fix { line, time_of_day, fix });
             }
             Err(reason) => self.pending.push_back(PendingRow::Invalid(RowError::whole(line, &reason))),
@@ -114,15 +114,19 @@ fn instant(date: Date, time: Time) -> Option<Timestamp> {
 }
 
 /// Parses a line; blank lines and other sentences have no content.
-fn content_of(text: &str) -> Result<Content, String> {
-    let Some(sentence) = sentence_of(text) else { return Ok(Content::None) };
+fn content_of(text: &str) -> Result<SentenceContent, String> {
+    let Some(sentence) = sentence_of(text) else { return Ok(SentenceContent::None) };
     match nmea::parse_str(text) {
-        Ok(ParseResult::GGA(gga)) => Ok(Content::Fix(time_of(gga.fix_time), fix_of(&gga)?)),
-        Ok(ParseResult::RMC(rmc)) => Ok(date_of_rmc(&rmc).map_or(Content::None, Content::Date)),
-        Ok(ParseResult::ZDA(zda)) => Ok(date_of_zda(&zda).map_or(Content::None, Content::Date)),
-        Ok(_) => Ok(Content::None),
+        Ok(ParseResult::GGA(gga)) => Ok(SentenceContent::Fix(time_of(gga.fix_time), fix_of(&gga)?)),
+        Ok(ParseResult::RMC(rmc)) => {
+            Ok(date_of_rmc(&rmc).map_or(SentenceContent::None, SentenceContent::Date))
+        }
+        Ok(ParseResult::ZDA(zda)) => {
+            Ok(date_of_zda(&zda).map_or(SentenceContent::None, SentenceContent::Date))
+        }
+        Ok(_) => Ok(SentenceContent::None),
         // An invalid sentence without a position loses no fix.
-        Err(_) if sentence == Sentence::Date => Ok(Content::None),
+        Err(_) if sentence == Sentence::Date => Ok(SentenceContent::None),
         Err(nmea::Error::ChecksumMismatch { .. }) => Err("the sentence's checksum is wrong".to_owned()),
         Err(_) => Err("is not an NMEA 0183 sentence".to_owned()),
     }

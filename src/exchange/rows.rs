@@ -106,7 +106,7 @@ impl RowConverter {
 
     fn sample(&mut self, row: &FileRow<'_>) -> Result<Sample> {
         let ObservedRow { observation, class, score, truth } = self.observed(row)?;
-        let Observation { time, target_id, bounding_box, fix } = observation;
+        let (time, target_id, bounding_box, fix) = observation.into_parts();
         Ok(Sample {
             time,
             target_id: target_id.ok_or_else(|| missing("target_id"))?,
@@ -120,11 +120,12 @@ impl RowConverter {
 
     fn detection(&mut self, row: &FileRow<'_>, default_target: Option<&TargetId>) -> Result<Detection> {
         let ObservedRow { observation, class, score, .. } = self.observed(row)?;
-        let target_id = observation.target_id.or_else(|| default_target.cloned());
+        let (time, target_id, bounding_box, _) = observation.into_parts();
+        let target_id = target_id.or_else(|| default_target.cloned());
         Ok(Detection {
-            time: observation.time,
+            time,
             target_id: target_id.ok_or_else(|| missing("target_id"))?,
-            bounding_box: observation.bounding_box.ok_or_else(|| missing("bounding_box"))?,
+            bounding_box: bounding_box.ok_or_else(|| missing("bounding_box"))?,
             class,
             score,
         })
@@ -132,18 +133,13 @@ impl RowConverter {
 
     fn observed(&mut self, row: &FileRow<'_>) -> Result<ObservedRow> {
         let time = parse_time(row.time.as_ref().ok_or_else(|| missing("time"))?.as_str())?;
-        let observation = Observation {
-            time: self.rules.time_bounds.check(time)?,
-            target_id: shared(row.target_id.as_ref(), &mut self.target_id, TargetId::as_str, TargetId::new)?,
-            bounding_box: row
-                .bounding_box
-                .map(|sides| box_within(sides, self.rules.image_size))
-                .transpose()?,
-            fix: row.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
-        };
-        if observation.bounding_box.is_none() && observation.fix.is_none() {
-            return Err(Error::invalid("", "has neither a box nor a fix"));
-        }
+        let time = self.rules.time_bounds.check(time)?;
+        let target_id = shared(row.target_id.as_ref(), &mut self.target_id, TargetId::as_str, TargetId::new)?;
+        let bounding_box =
+            row.bounding_box.map(|sides| box_within(sides, self.rules.image_size)).transpose()?;
+        let fix = row.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?;
+        let observation = Observation::new(time, target_id, bounding_box, fix)
+            .map_err(|_| Error::invalid("", "has neither a box nor a fix"))?;
         let truth = row.truth.map(|truth| truth.to_domain().map_err(|error| error.under("truth")));
         Ok(ObservedRow {
             observation,

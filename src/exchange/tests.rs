@@ -285,9 +285,9 @@ fn observations_may_lack_box_or_fix_but_not_both() {
         .map(|row| row.expect("a line"))
         .collect();
     let boxed = rows[0].as_ref().expect("a box");
-    assert!(boxed.observation.bounding_box.is_some() && boxed.observation.fix.is_none());
+    assert!(boxed.observation.bounding_box().is_some() && boxed.observation.fix().is_none());
     assert!(boxed.truth.is_some() && boxed.class.is_some());
-    assert!(rows[1].as_ref().expect("a fix").observation.fix.is_some());
+    assert!(rows[1].as_ref().expect("a fix").observation.fix().is_some());
     assert_eq!(rows[2].as_ref().expect_err("nothing").line, 4);
 }
 

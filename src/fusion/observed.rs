@@ -24,7 +24,7 @@ pub fn fix_variance_m2(
     regressor: Option<&Regressor>,
     e_gnss_m2: Option<f64>,
 ) -> f64 {
-    let own_m2 = observation.fix.and_then(|fix| fix.sigma_m).map(SigmaM::variance_m2);
+    let own_m2 = observation.fix().and_then(|fix| fix.sigma_m).map(SigmaM::variance_m2);
     own_m2.or(e_gnss_m2).or(regressor.map(Regressor::e_gnss_m2)).unwrap_or(UNKNOWN_RECEIVER_M2)
 }
 
@@ -78,7 +78,7 @@ pub struct PairInnovation {
 
 impl ObservedFix {
     fn of(observation: &Observation, regressor: Option<&Regressor>, e_gnss_m2: Option<f64>) -> Option<Self> {
-        let position = observation.fix?.position;
+        let position = observation.fix()?.position;
         Some(Self {
             position,
             variance_m2: fix_variance_m2(observation, regressor, e_gnss_m2),
@@ -135,9 +135,10 @@ impl<'a> ObservedPositions<'a> {
     ) -> Self {
         let fix = ObservedFix::of(observation, regressor, e_gnss_m2);
         let in_plane = fix.and_then(|fix| fix.in_plane);
-        let regressed = observation.bounding_box.as_ref().zip(regressor);
+        let bounding_box = observation.bounding_box();
+        let regressed = bounding_box.as_ref().zip(regressor);
         Self {
-            time: observation.time,
+            time: observation.time(),
             plane: regressor.map(Regressor::plane),
             fix,
             regressed: regressed.map(|(bounding_box, regressor)| {

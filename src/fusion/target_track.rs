@@ -196,7 +196,7 @@ mod tests {
     fn fix_at(seconds: i64, longitude_deg: f64, latitude_deg: f64) -> Observation {
         let position = Position::new(longitude_deg, latitude_deg).expect("valid");
         let time = Timestamp::UNIX_EPOCH + SignedDuration::from_secs(1_600_000_000 + seconds);
-        Observation { time, target_id: None, bounding_box: None, fix: Some(Fix { position, sigma_m: None }) }
+        Observation::with_fix(time, None, None, Fix { position, sigma_m: None })
     }
 
     fn feed(track: &mut TargetTrack, observation: &Observation) -> Option<TrackEstimate> {

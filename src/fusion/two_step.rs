@@ -67,13 +67,13 @@ pub fn fuse_observed(
     model: Option<(&Regressor, u32)>,
     image_size: Option<ImageSize>,
 ) -> Option<FusedFix> {
-    let Some(bounding_box) = &observation.bounding_box else {
+    let Some(bounding_box) = observation.bounding_box() else {
         return pass_through(observation, observed);
     };
     let ((_, version), plane) = (model?, observed.plane?);
     let regressed = observed.regressed.as_ref()?;
     let mut flags = Vec::new();
-    if observation.fix.is_none() {
+    if observation.fix().is_none() {
         flags.push(Flag::GnssDenied);
     }
     if bounding_box.touches_border(image_size) {
@@ -85,11 +85,11 @@ pub fn fuse_observed(
     let Combined { position, confidences, r95_m } = combine(observed, regressed, &mut flags);
     let Regression { e_regression_m2, reconstruction_error, .. } = regressed.one_step;
     Some(FusedFix {
-        time: observation.time,
-        target_id: observation.target_id.clone(),
+        time: observation.time(),
+        target_id: observation.target_id().cloned(),
         fused: plane.to_position(position),
         regressed: Some(plane.to_position(regressed.one_step.regressed)),
-        gnss: observation.fix,
+        gnss: observation.fix(),
         confidences,
         e_regression_m2: Some(e_regression_m2),
         e_gnss_m2: observed.fix.map(|fix| fix.variance_m2),
@@ -163,7 +163,7 @@ fn gnss_r95_m(e_gnss_m2: f64) -> f64 {
 /// The answer for an observation without a box: its fix. A fix out of range of the camera's scene is
 /// answered with a radius that reaches back to the scene.
 fn pass_through(observation: &Observation, observed: &ObservedPositions<'_>) -> Option<FusedFix> {
-    let (fix, measured) = (observation.fix?, observed.fix?);
+    let (fix, measured) = (observation.fix()?, observed.fix?);
     let mut flags = vec![Flag::BoxMissing];
     if observed.plane.is_none() {
         flags.push(Flag::NoModel);
@@ -175,8 +175,8 @@ fn pass_through(observation: &Observation, observed: &ObservedPositions<'_>) -> 
         r95_m = r95_m.max(observed.plane.map_or(0.0, to_scene_m));
     }
     Some(FusedFix {
-        time: observation.time,
-        target_id: observation.target_id.clone(),
+        time: observation.time(),
+        target_id: observation.target_id().cloned(),
         fused: fix.position,
         regressed: None,
         gnss: Some(fix),

@@ -17,12 +17,12 @@ use super::proto::{
 };
 
 /// The writer's side.
-pub(super) struct Outbox(Arc<Shared>);
+pub(super) struct Outbox(Arc<OutboxState>);
 
 /// The reader's side: the stream of responses that the transport sends.
-pub(super) struct Responses(Arc<Shared>);
+pub(super) struct Responses(Arc<OutboxState>);
 
-struct Shared {
+struct OutboxState {
     waiting: Mutex<Waiting>,
     most_answers: usize,
 }
@@ -42,11 +42,11 @@ struct Waiting {
 
 /// Both sides of an empty outbox.
 pub(super) fn outbox(most_answers: usize) -> (Outbox, Responses) {
-    let shared = Arc::new(Shared { waiting: Mutex::default(), most_answers: most_answers.max(1) });
+    let shared = Arc::new(OutboxState { waiting: Mutex::default(), most_answers: most_answers.max(1) });
     (Outbox(shared.clone()), Responses(shared))
 }
 
-impl Shared {
+impl OutboxState {
     fn lock(&self) -> MutexGuard<'_, Waiting> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -35,7 +35,7 @@ where
     }
 }
 
-/// The id that the entrance gave.
+/// The id that the pipeline assigned to the request.
 pub(super) fn request_id(extensions: &Extensions) -> RequestId {
     let unknown = || RequestId::new(HeaderValue::from_static("unknown"));
     extensions.get().cloned().unwrap_or_else(unknown)

@@ -74,25 +74,25 @@ async fn estimate_gnss_error(
         Some("application/json") => {
             let json = body::whole(&parts.headers, content, limits.body_bytes).await?;
             let Fixes { fixes } = wire::parse_json(&json)?;
-            Source::Given(fixes)
+            FixSource::Given(fixes)
         }
         given => {
             let format = given.and_then(FixFormat::from_media_type);
             let format = format.ok_or_else(|| not_read(&["text/csv", "text/plain", "application/json"]))?;
-            Source::File(body::spooled(&app, &parts, content).await?, format)
+            FixSource::File(body::spooled(&app, &parts, content).await?, format)
         }
     };
     let tell_at_most = limits.rejected_rows;
     let estimating = tokio::task::spawn_blocking(move || match source {
-        Source::Given(fixes) => from_given(&fixes, tell_at_most),
-        Source::File(file, format) => {
+        FixSource::Given(fixes) => from_given(&fixes, tell_at_most),
+        FixSource::File(file, format) => {
             GnssErrorEstimate::from_rows(read_fixes(file, format, time_bounds)?, tell_at_most)
         }
     });
     Ok(json(&estimate(estimating.await.map_err(Error::fault)??))?)
 }
 
-enum Source {
+enum FixSource {
     Given(Vec<wire::Fix>),
     File(body::Spooled, FixFormat),
 }

@@ -31,7 +31,7 @@ const CHUNK_BYTES: usize = 32 * 1024;
 const LONGEST_HEAD_BYTES: usize = 8 * CHUNK_BYTES;
 
 /// A part of a body.
-pub(super) struct Part {
+pub(super) struct BodyPart {
     /// Its content.
     pub(super) content: Spooled,
     /// Its announced type, if any.
@@ -40,7 +40,7 @@ pub(super) struct Part {
     pub(super) file_name: Option<String>,
 }
 
-impl Part {
+impl BodyPart {
     /// The format that the type announces or, where it says nothing of use, the file's name.
     ///
     /// # Errors
@@ -73,14 +73,14 @@ pub(super) async fn parts<const N: usize>(
     head: &Parts,
     content: Body,
     names: [&str; N],
-) -> Result<[Part; N]> {
+) -> Result<[BodyPart; N]> {
     if !media_type(&head.headers).is_some_and(|essence| essence.eq_ignore_ascii_case("multipart/form-data")) {
         return Err(not_read(&["multipart/form-data"]));
     }
     let whole = body::spooled(app, head, content).await?;
     let since = Arc::new(AtomicUsize::new(0));
     let mut multipart = multipart(&head.headers, chunks(whole, since.clone())).await?;
-    let mut found: [Option<Part>; N] = std::array::from_fn(|_| None);
+    let mut found: [Option<BodyPart>; N] = std::array::from_fn(|_| None);
     loop {
         since.store(0, Ordering::Relaxed);
         let Some(field) = multipart.next_field().await.map_err(|error| malformed(&error.body_text()))? else {
@@ -101,7 +101,8 @@ pub(super) async fn parts<const N: usize>(
     }
     let mut missing = None;
     let found = found.into_iter().zip(names).map(|(part, name)| part.ok_or(name));
-    let found: Vec<Part> = found.filter_map(|part| part.map_err(|name| missing = Some(name)).ok()).collect();
+    let found: Vec<BodyPart> =
+        found.filter_map(|part| part.map_err(|name| missing = Some(name)).ok()).collect();
     found.try_into().map_err(|_| Error::invalid(missing.unwrap_or_default(), "the part is required"))
 }
 
@@ -118,14 +119,14 @@ async fn multipart(
     Multipart::from_request(request, &()).await.map_err(|error| malformed(&error.body_text()))
 }
 
-async fn spooled(mut field: Field<'_>, mut spool: Spool, since: &AtomicUsize) -> Result<Part> {
+async fn spooled(mut field: Field<'_>, mut spool: Spool, since: &AtomicUsize) -> Result<BodyPart> {
     let media_type = field.content_type().map(str::to_owned);
     let file_name = field.file_name().map(str::to_owned);
     while let Some(chunk) = field.chunk().await.map_err(|error| malformed(&error.body_text()))? {
         since.store(0, Ordering::Relaxed);
         spool.push(chunk).await?;
     }
-    Ok(Part { content: spool.finish().await?, media_type, file_name })
+    Ok(BodyPart { content: spool.finish().await?, media_type, file_name })
 }
 
 fn malformed(reason: &str) -> Error {
@@ -137,10 +138,10 @@ fn malformed(reason: &str) -> Error {
 fn chunks(whole: Spooled, since: Arc<AtomicUsize>) -> impl Stream<Item = io::Result<Bytes>> + Send + 'static {
     let Spooled { content, leases } = whole;
     let source = match content {
-        Content::Memory(parts) => Source::Memory(parts),
-        Content::File(file) => Source::File(tokio::fs::File::from_std(file)),
+        Content::Memory(parts) => SpoolSource::Memory(parts),
+        Content::File(file) => SpoolSource::File(tokio::fs::File::from_std(file)),
     };
-    stream::try_unfold((source, leases), move |(mut source, leases): (Source, SpoolLeases)| {
+    stream::try_unfold((source, leases), move |(mut source, leases): (SpoolSource, SpoolLeases)| {
         let since = since.clone();
         async move {
             tokio::task::yield_now().await;
@@ -153,12 +154,12 @@ fn chunks(whole: Spooled, since: Arc<AtomicUsize>) -> impl Stream<Item = io::Res
     })
 }
 
-enum Source {
+enum SpoolSource {
     Memory(VecDeque<Bytes>),
     File(tokio::fs::File),
 }
 
-impl Source {
+impl SpoolSource {
     /// The next chunk; empty at the end.
     async fn chunk(&mut self) -> io::Result<Bytes> {
         match self {

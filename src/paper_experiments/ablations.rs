@@ -134,7 +134,7 @@ fn mean_over(
         let regressor = artifact.load()?;
         let (mut sum_m, mut count) = (0.0, 0.0);
         for row in &world.test {
-            let (Some(drawn), Some(truth)) = (&row.observation.bounding_box, row.truth) else { continue };
+            let (Some(drawn), Some(truth)) = (&row.observation.bounding_box(), row.truth) else { continue };
             let position = regressor.plane().to_position(regressor.regress(drawn, None).regressed);
             sum_m += distance_m(truth, position);
             count += 1.0;

@@ -122,16 +122,10 @@ impl Experiment {
 }
 
 fn test_rows_of(world: &World) -> Vec<TestRow> {
-    let test_row = |row: &crate::simulation::SimulatedRow| TestRow {
-        observation: Observation {
-            time: row.time,
-            target_id: Some(row.target_id.clone()),
-            bounding_box: row.bounding_box,
-            fix: row.fix,
-        },
-        truth: Some(row.truth),
+    let test_row = |row: &crate::simulation::SimulatedRow| {
+        Some(TestRow { observation: row.observation()?, truth: Some(row.truth) })
     };
-    world.rows.iter().map(test_row).collect()
+    world.rows.iter().filter_map(test_row).collect()
 }
 
 /// All experiments on simulated worlds.
@@ -306,12 +300,12 @@ pub(super) fn real_square(recording: &RealRecording, seeds: u64) -> anyhow::Resu
 
 fn test_row(sample: &Sample) -> TestRow {
     TestRow {
-        observation: Observation {
-            time: sample.time,
-            target_id: Some(sample.target_id.clone()),
-            bounding_box: Some(sample.bounding_box),
-            fix: Some(sample.fix),
-        },
+        observation: Observation::with_fix(
+            sample.time,
+            Some(sample.target_id.clone()),
+            Some(sample.bounding_box),
+            sample.fix,
+        ),
         truth: None,
     }
 }

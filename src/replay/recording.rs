@@ -130,15 +130,8 @@ impl RecordedStream {
 
 fn item(row: ObservedRow) -> LiveItem {
     let ObservedRow { observation, class, score, truth: _ } = row;
-    LiveItem {
-        time: observation.time,
-        target_id: observation.target_id,
-        receiver_id: None,
-        bounding_box: observation.bounding_box,
-        fix: observation.fix,
-        class,
-        score,
-    }
+    let (time, target_id, bounding_box, fix) = observation.into_parts();
+    LiveItem { time, target_id, receiver_id: None, bounding_box, fix, class, score }
 }
 
 #[cfg(test)]

@@ -20,21 +20,21 @@ pub(super) struct Activity {
     written_bytes: AtomicU64,
     /// Why the stream gave up, if it did.
     given_up: OnceLock<CloseReason>,
-    open: Mutex<Open>,
+    open: Mutex<OpenRequests>,
 }
 
-struct Open {
+struct OpenRequests {
     requests: usize,
     /// When the last request ended, or the connection was opened.
     idle_since: Instant,
     next_response: u64,
     /// Responses whose bodies are still being produced.
-    responses: HashMap<u64, Arc<Progress>>,
+    responses: HashMap<u64, Arc<ResponseProgress>>,
 }
 
 /// Whether the connection has a part of a response that it has not sent yet.
 #[derive(Default)]
-struct Progress {
+struct ResponseProgress {
     is_held_back: AtomicBool,
     /// Milliseconds from the opening of the connection until the part was handed over.
     since_ms: AtomicU64,
@@ -45,7 +45,7 @@ struct Progress {
 impl Activity {
     pub(super) fn new() -> Arc<Self> {
         let now = Instant::now();
-        let open = Open { requests: 0, idle_since: now, next_response: 0, responses: HashMap::new() };
+        let open = OpenRequests { requests: 0, idle_since: now, next_response: 0, responses: HashMap::new() };
         Arc::new(Self {
             opened_at: now,
             written_bytes: AtomicU64::new(0),
@@ -54,7 +54,7 @@ impl Activity {
         })
     }
 
-    fn lock(&self) -> MutexGuard<'_, Open> {
+    fn lock(&self) -> MutexGuard<'_, OpenRequests> {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -105,13 +105,13 @@ impl Activity {
 /// A request from its header to the end of its response.
 pub(super) struct OpenRequest {
     activity: Arc<Activity>,
-    response: Option<(u64, Arc<Progress>)>,
+    response: Option<(u64, Arc<ResponseProgress>)>,
 }
 
 impl OpenRequest {
     /// A response whose body comes part by part; the connection may be slow to take them.
     fn streams(&mut self) {
-        let progress = Arc::new(Progress::default());
+        let progress = Arc::new(ResponseProgress::default());
         let mut open = self.activity.lock();
         let number = open.next_response;
         open.next_response += 1;

@@ -151,9 +151,9 @@ impl ConnectionServer {
                     break Some(CloseReason::Shutdown);
                 }
                 _ = looks.tick() => match closing.next(&activity) {
-                    Step::Keep => {}
-                    Step::Finish => connection.as_mut().graceful_shutdown(),
-                    Step::Drop => break closing.reason,
+                    ConnectionAction::Keep => {}
+                    ConnectionAction::Finish => connection.as_mut().graceful_shutdown(),
+                    ConnectionAction::Drop => break closing.reason,
                 },
             }
         };
@@ -175,7 +175,7 @@ struct Closing {
 }
 
 /// What to do with a connection.
-enum Step {
+enum ConnectionAction {
     Keep,
     /// Let open requests end and take no new ones.
     Finish,
@@ -195,21 +195,21 @@ impl Closing {
         }
     }
 
-    fn next(&mut self, activity: &Activity) -> Step {
+    fn next(&mut self, activity: &Activity) -> ConnectionAction {
         if self.dropped_at.is_some_and(|at| Instant::now() >= at) {
-            return Step::Drop;
+            return ConnectionAction::Drop;
         }
         match activity.close_reason(self.idle_time, self.bytes_per_s) {
             Some(CloseReason::Idle) if self.reason.is_none() => {
                 self.reason = Some(CloseReason::Idle);
                 self.dropped_at = Some(Instant::now() + self.finish_time);
-                Step::Finish
+                ConnectionAction::Finish
             }
             Some(CloseReason::Stalled) => {
                 self.reason = Some(CloseReason::Stalled);
-                Step::Drop
+                ConnectionAction::Drop
             }
-            _ => Step::Keep,
+            _ => ConnectionAction::Keep,
         }
     }
 }

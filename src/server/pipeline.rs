@@ -17,7 +17,7 @@ use tracing::Instrument as _;
 
 use super::activity::{ObservedBody, OpenRequest};
 use super::host_check::HostCheck;
-use super::request_body::{AdmittedBody, Pace, Ticket};
+use super::request_body::{AdmittedBody, RateGuard, Ticket};
 use crate::admission::{BodyRefusal, ClientAddress, RequestClass};
 use crate::app::App;
 use crate::config::Console;
@@ -128,7 +128,7 @@ impl RequestPipeline {
                 let limits = &self.app.limits;
                 // A live stream may be silent for longer, and looks after that itself.
                 let pace = (class != RequestClass::LiveStream)
-                    .then(|| Pace::new(limits.body_grace(), limits.body_bytes_per_s));
+                    .then(|| RateGuard::new(limits.body_grace(), limits.body_bytes_per_s));
                 let mut request =
                     request.map(|body| Body::new(AdmittedBody::new(body, ticket.clone(), pace)));
                 let extensions = request.extensions_mut();

@@ -112,12 +112,12 @@ pub(super) struct AdmittedBody {
     body: Incoming,
     ticket: Ticket,
     /// `None` for a body that may be silent.
-    pace: Option<Pace>,
-    state: State,
+    pace: Option<RateGuard>,
+    state: BodyState,
 }
 
 #[derive(PartialEq, Eq)]
-enum State {
+enum BodyState {
     Open,
     /// Refused; so many bytes are still discarded before the reader gets the error.
     Discarding(u64),
@@ -125,8 +125,8 @@ enum State {
 }
 
 impl AdmittedBody {
-    pub(super) const fn new(body: Incoming, ticket: Ticket, pace: Option<Pace>) -> Self {
-        Self { body, ticket, pace, state: State::Open }
+    pub(super) const fn new(body: Incoming, ticket: Ticket, pace: Option<RateGuard>) -> Self {
+        Self { body, ticket, pace, state: BodyState::Open }
     }
 
     /// What to do with a frame: pass it on, or begin to discard the body.
@@ -135,7 +135,7 @@ impl AdmittedBody {
         if let Some(pace) = &mut self.pace {
             pace.received(bytes);
         }
-        if let State::Discarding(left) = &mut self.state {
+        if let BodyState::Discarding(left) = &mut self.state {
             *left = left.saturating_sub(bytes);
             return None;
         }
@@ -147,7 +147,7 @@ impl AdmittedBody {
             Ok(()) => Some(frame),
             Err(error) => {
                 self.ticket.refuse(error);
-                self.state = State::Discarding(DISCARD_BYTES);
+                self.state = BodyState::Discarding(DISCARD_BYTES);
                 None
             }
         }
@@ -165,12 +165,12 @@ impl Body for AdmittedBody {
         let this = &mut *self;
         loop {
             match this.state {
-                State::Ended => return Poll::Ready(None),
-                State::Discarding(0) => {
-                    this.state = State::Ended;
+                BodyState::Ended => return Poll::Ready(None),
+                BodyState::Discarding(0) => {
+                    this.state = BodyState::Ended;
                     return Poll::Ready(Some(Err(BodyRefused)));
                 }
-                State::Open | State::Discarding(_) => {}
+                BodyState::Open | BodyState::Discarding(_) => {}
             }
             let end = match Pin::new(&mut this.body).poll_frame(context) {
                 Poll::Ready(Some(Ok(frame))) => {
@@ -189,8 +189,8 @@ impl Body for AdmittedBody {
                     Some(pace) => Err(ready!(pace.poll_too_slow(context))),
                 },
             };
-            let was_open = this.state == State::Open;
-            this.state = State::Ended;
+            let was_open = this.state == BodyState::Open;
+            this.state = BodyState::Ended;
             return Poll::Ready(match end {
                 Ok(()) if was_open => None,
                 Ok(()) => Some(Err(BodyRefused)),
@@ -205,7 +205,7 @@ impl Body for AdmittedBody {
     }
 
     fn is_end_stream(&self) -> bool {
-        self.state == State::Ended || self.state == State::Open && self.body.is_end_stream()
+        self.state == BodyState::Ended || self.state == BodyState::Open && self.body.is_end_stream()
     }
 
     fn size_hint(&self) -> SizeHint {
@@ -226,13 +226,13 @@ impl fmt::Display for BodyRefused {
 impl std::error::Error for BodyRefused {}
 
 /// Holds a body to a least rate. Only time in which the server waits for the client counts.
-pub(super) struct Pace {
+pub(super) struct RateGuard {
     rate: LeastRate,
     waiting_since: Option<Instant>,
     deadline: Option<Pin<Box<Sleep>>>,
 }
 
-impl Pace {
+impl RateGuard {
     /// Every `window` of waiting must bring `bytes_per_s` on average.
     pub(super) const fn new(window: Duration, bytes_per_s: u64) -> Self {
         Self { rate: LeastRate::new(window, bytes_per_s), waiting_since: None, deadline: None }

@@ -4,6 +4,7 @@
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rand_distr::StandardNormal;
 
 use crate::geo::EastNorth;
 
@@ -14,10 +15,9 @@ pub(crate) fn stream(seed: u64, number: u64) -> ChaCha8Rng {
     random
 }
 
-/// A draw from the standard normal distribution (Box and Muller 1958).
+/// A draw from the standard normal distribution.
 pub(crate) fn standard_normal(random: &mut impl Rng) -> f64 {
-    let radius = (-2.0 * (1.0 - random.random::<f64>()).ln()).sqrt();
-    radius * (std::f64::consts::TAU * random.random::<f64>()).cos()
+    random.sample(StandardNormal)
 }
 
 /// A stationary first-order Gauss-Markov process of standard deviation 1.

@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 
-use crate::domain::{BoundingBox, Fix, TargetClass, TargetId};
+use crate::domain::{BoundingBox, Fix, Observation, TargetClass, TargetId};
 use crate::geo::Position;
 
 /// What camera and receiver measured of one target at one second, with the truth.
@@ -20,4 +20,12 @@ pub struct SimulatedRow {
     pub fix: Option<Fix>,
     /// True position of the antenna.
     pub truth: Position,
+}
+
+impl SimulatedRow {
+    /// What camera and receiver give; `None` if neither gives anything.
+    #[must_use]
+    pub fn observation(&self) -> Option<Observation> {
+        Observation::new(self.time, Some(self.target_id.clone()), self.bounding_box, self.fix).ok()
+    }
 }

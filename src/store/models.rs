@@ -278,7 +278,17 @@ pub(super) async fn add_model(
     .execute(&mut *connection)
     .await
     .map_err(failed)?;
-    for error in *held_out {
+    add_held_out_errors(connection, camera_key, number, held_out).await?;
+    u32::try_from(number).map_err(Error::fault)
+}
+
+async fn add_held_out_errors(
+    connection: &mut SqliteConnection,
+    camera_key: i64,
+    number: i64,
+    held_out: &[HeldOutSampleError],
+) -> Result<()> {
+    for error in held_out {
         sqlx::query(
             "INSERT INTO held_out_errors (camera_key, model_number, time_us, target_id, distance_m) \
              VALUES (?, ?, ?, ?, ?)",
@@ -292,7 +302,7 @@ pub(super) async fn add_model(
         .await
         .map_err(failed)?;
     }
-    u32::try_from(number).map_err(Error::fault)
+    Ok(())
 }
 
 fn unusable(camera: &CameraId, number: u32, reason: &str) -> Error {

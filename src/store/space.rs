@@ -93,8 +93,8 @@ impl Space {
     }
 
     /// What one transaction may add.
-    pub(super) fn quota(&self) -> Quota<'_> {
-        Quota { limits: &self.limits, samples: self.samples.load(Ordering::Relaxed) }
+    pub(super) fn quota(&self) -> SampleQuota<'_> {
+        SampleQuota { limits: &self.limits, samples: self.samples.load(Ordering::Relaxed) }
     }
 
     /// Samples were committed.
@@ -114,13 +114,13 @@ impl Space {
 }
 
 /// Admits rows of one transaction.
-pub(super) struct Quota<'s> {
+pub(super) struct SampleQuota<'s> {
     limits: &'s StoreLimits,
     /// Stored, and admitted before.
     samples: u64,
 }
 
-impl Quota<'_> {
+impl SampleQuota<'_> {
     /// Admits a batch of a camera that has so many samples, and counts it. Rows that will turn out to
     /// be duplicates count, too.
     pub(super) fn admit(&mut self, id: &CameraId, of_camera: &mut u64, rows: u64) -> Result<()> {

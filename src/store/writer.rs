@@ -20,7 +20,7 @@ pub(super) enum Growth {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Mode {
+struct ConnectionMode {
     durability: Durability,
     growth: Growth,
 }
@@ -30,19 +30,19 @@ pub(super) struct Writer {
     options: SqliteConnectOptions,
     /// Limit of the database's size.
     max_pages: Option<u32>,
-    open: Mutex<Option<Open>>,
+    open: Mutex<Option<OpenConnection>>,
 }
 
-struct Open {
+struct OpenConnection {
     connection: SqliteConnection,
     /// What the connection is set to; `None` while it is being changed, so that a caller that is
     /// cancelled half way leaves no wrong assumption behind.
-    mode: Option<Mode>,
+    mode: Option<ConnectionMode>,
     /// A transaction could not begin, and no other process held the file.
     broken: bool,
 }
 
-impl Open {
+impl OpenConnection {
     const fn new(connection: SqliteConnection) -> Self {
         Self { connection, mode: None, broken: false }
     }
@@ -57,7 +57,7 @@ impl Open {
         Ok(self.connection.is_in_transaction())
     }
 
-    async fn set(&mut self, mode: Mode, max_pages: Option<u32>) -> Result<(), sqlx::Error> {
+    async fn set(&mut self, mode: ConnectionMode, max_pages: Option<u32>) -> Result<(), sqlx::Error> {
         if self.mode == Some(mode) {
             return Ok(());
         }
@@ -87,8 +87,8 @@ impl Open {
 /// The writer, locked.
 pub(super) struct WriterGuard<'w> {
     writer: &'w Writer,
-    open: MutexGuard<'w, Option<Open>>,
-    mode: Mode,
+    open: MutexGuard<'w, Option<OpenConnection>>,
+    mode: ConnectionMode,
 }
 
 impl Writer {
@@ -97,7 +97,7 @@ impl Writer {
         max_pages: Option<u32>,
         connection: SqliteConnection,
     ) -> Self {
-        Self { options, max_pages, open: Mutex::new(Some(Open::new(connection))) }
+        Self { options, max_pages, open: Mutex::new(Some(OpenConnection::new(connection))) }
     }
 
     /// Waits for the writer; durability and growth are those of the transactions of this guard.
@@ -106,7 +106,7 @@ impl Writer {
         if open.is_none() {
             return Err(closed());
         }
-        Ok(WriterGuard { writer: self, open, mode: Mode { durability, growth } })
+        Ok(WriterGuard { writer: self, open, mode: ConnectionMode { durability, growth } })
     }
 
     /// Copies the write-ahead log back into the file and closes it.
@@ -149,11 +149,11 @@ impl WriterGuard<'_> {
     }
 
     /// The connection, opened again if it cannot be used any more, and set to the guard's mode.
-    async fn ready(&mut self) -> Result<&mut Open> {
+    async fn ready(&mut self) -> Result<&mut OpenConnection> {
         let open = self.open.as_mut().ok_or_else(closed)?;
         // An error here means a connection that cannot be used any more.
         if open.broken || open.is_stuck().await.unwrap_or(true) {
-            *open = Open::new(self.writer.options.connect().await.map_err(failed)?);
+            *open = OpenConnection::new(self.writer.options.connect().await.map_err(failed)?);
         }
         if let Err(error) = open.set(self.mode, self.writer.max_pages).await {
             open.broken = true;

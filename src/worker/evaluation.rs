@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::job_thread::Progress;
+use super::job_thread::JobProgress;
 use super::{Ended, Job, JobIdentity, Work, load_samples};
 use crate::app::{App, JobQueue};
 use crate::clock::thread_cpu_s;
@@ -11,7 +11,7 @@ use crate::evaluation::{self, EvaluateOptions, Report, TestRow, evaluate};
 use crate::store::{Claim, Heartbeat, JobEnd, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
 
-impl Progress for EvaluationProgress {
+impl JobProgress for EvaluationProgress {
     fn take(&mut self) -> Self {
         self.clone()
     }
@@ -131,7 +131,6 @@ async fn finish(app: &App, claim: &Claim<EvaluationJob>, end: JobEnd<String>) ->
 
 fn test_row(sample: Sample) -> TestRow {
     let Sample { time, target_id, bounding_box, fix, truth, .. } = sample;
-    let observation =
-        Observation { time, target_id: Some(target_id), bounding_box: Some(bounding_box), fix: Some(fix) };
+    let observation = Observation::with_fix(time, Some(target_id), Some(bounding_box), fix);
     TestRow { observation, truth }
 }

@@ -11,19 +11,19 @@ use tokio::sync::oneshot;
 const NICE: i32 = 19;
 
 /// What a job reports while it runs.
-pub(super) trait Progress: Default + Send + 'static {
+pub(super) trait JobProgress: Default + Send + 'static {
     /// What was reported since the last call. Events are taken out; the current state stays.
     fn take(&mut self) -> Self;
 }
 
-struct Shared<P> {
+struct ThreadState<P> {
     started: Instant,
     cancelled: AtomicBool,
     progress: Mutex<P>,
 }
 
 /// Where work reports its progress and learns whether it was cancelled.
-pub(super) struct ProgressSink<P>(Arc<Shared<P>>);
+pub(super) struct ProgressSink<P>(Arc<ThreadState<P>>);
 
 impl<P> ProgressSink<P> {
     /// Changes the reported progress. Breaks once the work was cancelled.
@@ -49,19 +49,19 @@ fn remaining_s(done: u32, planned: u32, elapsed: Duration) -> Option<f64> {
 
 /// A running thread of work. Dropping it asks the work to stop.
 pub(super) struct JobThread<P, O> {
-    shared: Arc<Shared<P>>,
+    shared: Arc<ThreadState<P>>,
     output: oneshot::Receiver<O>,
     /// The outer `Option`: whether the thread has ended. The inner: its output, `None` if it panicked.
     ended: Option<Option<O>>,
 }
 
-impl<P: Progress, O: Send + 'static> JobThread<P, O> {
+impl<P: JobProgress, O: Send + 'static> JobThread<P, O> {
     /// Starts the thread.
     pub(super) fn spawn(
         name: &str,
         work: impl FnOnce(&ProgressSink<P>) -> O + Send + 'static,
     ) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ThreadState {
             started: Instant::now(),
             cancelled: AtomicBool::new(false),
             progress: Mutex::default(),

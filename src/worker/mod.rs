@@ -23,7 +23,7 @@ use crate::shutdown::Shutdown;
 use crate::store::{Claim, Heartbeat, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
 
-use job_thread::{JobThread, Progress, ProgressSink};
+use job_thread::{JobProgress, JobThread, ProgressSink};
 
 /// How often a worker looks for jobs of which it was not notified (another process, an expired lease).
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
@@ -59,7 +59,7 @@ trait Job: Send + Sync + Sized + 'static {
     /// Name of the kind in the log, and of its thread.
     const NAME: &'static str;
     /// What the work reports while it runs.
-    type Progress: Progress;
+    type Progress: JobProgress;
     /// What the work gives.
     type Output: Send + 'static;
 

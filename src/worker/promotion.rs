@@ -32,7 +32,7 @@ pub(super) struct PromotionDecision {
 }
 
 /// A fitted model that asks for promotion.
-pub(super) struct Candidate<'a> {
+pub(super) struct PromotionCandidate<'a> {
     pub(super) artifact: &'a Artifact,
     /// Its training samples.
     pub(super) samples: &'a [Sample],
@@ -97,7 +97,11 @@ fn hash_of((time, target_id): Key<'_>) -> u64 {
 /// The new version must be no worse on the held-out samples of both together, repeated rows counted once,
 /// nor (but for [`TOLERANCE`]) on those of the active version alone. Only samples count that the run was
 /// asked to learn from and that the active version can be held to: after a camera was moved, those since.
-pub(super) async fn decide(app: &App, id: &CameraId, new: &Candidate<'_>) -> Result<PromotionDecision> {
+pub(super) async fn decide(
+    app: &App,
+    id: &CameraId,
+    new: &PromotionCandidate<'_>,
+) -> Result<PromotionDecision> {
     let camera = app.store.camera(id).await?;
     let Some(number) = camera.active_model else {
         return Ok(activate("the camera had no model".to_owned()));
@@ -134,7 +138,7 @@ pub(super) async fn decide(app: &App, id: &CameraId, new: &Candidate<'_>) -> Res
 /// Both versions on the stored held-out samples of the active one. The new version's error there is its own
 /// held-out error where it has trained on the sample.
 fn on_active_samples(
-    new: &Candidate<'_>,
+    new: &PromotionCandidate<'_>,
     stored: &[StoredHeldOutError],
     counts: &impl Fn(Timestamp) -> bool,
 ) -> Result<Comparison> {
@@ -156,7 +160,7 @@ fn on_active_samples(
 /// Both versions on the new one's held-out samples that the active one has not trained on, repeated rows
 /// counted once.
 fn on_new_samples(
-    new: &Candidate<'_>,
+    new: &PromotionCandidate<'_>,
     active: &Regressor,
     stored: &[StoredHeldOutError],
     counts: &impl Fn(Timestamp) -> bool,
@@ -191,7 +195,7 @@ fn on_new_samples(
 /// larger of what its metadata state and what it shows on the new version's samples.
 fn against_recorded(
     number: u32,
-    new: &Candidate<'_>,
+    new: &PromotionCandidate<'_>,
     active: &Regressor,
     recorded: &ModelMetadata,
 ) -> PromotionDecision {

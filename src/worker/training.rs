@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use super::job_thread::{Progress, ProgressSink};
-use super::promotion::{self, Candidate};
+use super::job_thread::{JobProgress, ProgressSink};
+use super::promotion::{self, PromotionCandidate};
 use super::{Ended, Job, JobIdentity, Work, load_samples};
 use crate::app::{App, JobQueue};
 use crate::domain::{
@@ -21,7 +21,7 @@ pub(super) struct Update {
     notes: Vec<String>,
 }
 
-impl Progress for Update {
+impl JobProgress for Update {
     fn take(&mut self) -> Self {
         let progress = self.progress.clone();
         std::mem::replace(self, Self { progress, ..Self::default() })
@@ -172,7 +172,7 @@ async fn succeed(
 ) -> Result<Option<JobState>> {
     let TrainingRun { camera_id, options, .. } = &claim.job;
     let range = TimeRange::new(options.from, options.until)?;
-    let candidate = Candidate { artifact, samples, held_out, range };
+    let candidate = PromotionCandidate { artifact, samples, held_out, range };
     let decision = promotion::decide(app, camera_id, &candidate).await?;
     let stored = promotion::stored_errors(held_out);
     let model = NewModel { metadata: &artifact.metadata, weights: &artifact.weights, held_out: &stored };

@@ -48,7 +48,10 @@ async fn hashed_files_are_kept_for_a_year_and_sent_compressed() {
         let mut tags = vec![whole.header("etag").to_owned()];
         for (accepted, encoding) in [("gzip, deflate", "gzip"), ("gzip, deflate, br", "br")] {
             let short = asset(&server, path, &[("accept-encoding", accepted)]).await.expect(200);
-            assert_eq!((short.header("content-encoding"), short.header("vary")), (encoding, "accept-encoding"));
+            assert_eq!(
+                (short.header("content-encoding"), short.header("vary")),
+                (encoding, "accept-encoding")
+            );
             assert!(short.body.len() < whole.body.len(), "{path} as {encoding}");
             tags.push(short.header("etag").to_owned());
         }

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use futures_util::{Stream, stream};
+use jiff::Timestamp;
 use serde_json::{Value, json};
-use sightfix::domain::Observation;
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 pub(crate) use sightfix::grpc::proto::stream_request::Kind as Sent;
@@ -152,23 +152,14 @@ pub(crate) fn rows(options: &Options) -> Vec<SimulatedRow> {
     simulate(options).rows
 }
 
-pub(crate) fn time(observation: &Observation) -> Option<prost_types::Timestamp> {
-    Some(prost_types::Timestamp {
-        seconds: observation.time.as_second(),
-        nanos: observation.time.subsec_nanosecond(),
-    })
+pub(crate) fn time(time: Timestamp) -> Option<prost_types::Timestamp> {
+    Some(prost_types::Timestamp { seconds: time.as_second(), nanos: time.subsec_nanosecond() })
 }
 
 /// Both halves of a row.
 pub(crate) fn whole(row: &SimulatedRow) -> proto::StreamItem {
-    let observation = Observation {
-        time: row.time,
-        target_id: Some(row.target_id.clone()),
-        bounding_box: row.bounding_box,
-        fix: row.fix,
-    };
     proto::StreamItem {
-        time: time(&observation),
+        time: time(row.time),
         target_id: Some(row.target_id.as_str().to_owned()),
         bounding_box: row.bounding_box.map(Into::into),
         fix: row.fix.map(Into::into),

@@ -190,12 +190,7 @@ fn the_reference_model_loads() {
     let (mut fused_m, mut gnss_m, mut rows) = (0.0, 0.0, 0.0);
     for row in &world.rows {
         let (Some(bounding_box), Some(fix)) = (row.bounding_box, row.fix) else { continue };
-        let observation = sightfix::domain::Observation {
-            time: row.time,
-            target_id: None,
-            bounding_box: Some(bounding_box),
-            fix: Some(fix),
-        };
+        let observation = sightfix::domain::Observation::with_fix(row.time, None, Some(bounding_box), fix);
         let fused = sightfix::fusion::two_step::fuse(&observation, Some((&regressor, 1)), None, None);
         fused_m += distance_m(fused.expect("a model answers").fused, row.truth);
         gnss_m += distance_m(fix.position, row.truth);

@@ -19,14 +19,14 @@ use crate::fusion::observed::ObservedPositions;
 const QUEUE: usize = 4_096;
 
 /// A residual of one camera.
-struct Residual {
+struct PairResidual {
     camera: Arc<ActiveCamera>,
     residual: ResidualSample,
 }
 
 /// The way to the drift detectors.
 pub(in crate::app) struct ResidualQueue {
-    sender: mpsc::Sender<Residual>,
+    sender: mpsc::Sender<PairResidual>,
     closed: CancellationToken,
 }
 
@@ -39,7 +39,7 @@ impl ResidualQueue {
 
 /// What waits, for the task.
 pub(in crate::app) struct WaitingResiduals {
-    receiver: mpsc::Receiver<Residual>,
+    receiver: mpsc::Receiver<PairResidual>,
     closed: CancellationToken,
 }
 
@@ -58,7 +58,9 @@ impl WaitingResiduals {
                 next = self.receiver.recv() => next,
                 () = self.closed.cancelled() => self.receiver.try_recv().ok(),
             };
-            let (Some(Residual { camera, residual }), Some(parts)) = (next, app.upgrade()) else { return };
+            let (Some(PairResidual { camera, residual }), Some(parts)) = (next, app.upgrade()) else {
+                return;
+            };
             App(parts).detect_drift(&camera, &residual).await;
         }
     }
@@ -67,7 +69,7 @@ impl WaitingResiduals {
 impl App {
     /// Hands a residual to the camera's drift detector.
     pub(super) fn hand_over(&self, camera: &Arc<ActiveCamera>, residual: ResidualSample) {
-        if self.residuals.sender.try_send(Residual { camera: camera.clone(), residual }).is_err() {
+        if self.residuals.sender.try_send(PairResidual { camera: camera.clone(), residual }).is_err() {
             tracing::debug!(camera.id = %camera.id, "a residual was dropped, the drift detectors are behind");
         }
     }
@@ -82,10 +84,10 @@ impl App {
         let bounds = self.live_time_bounds();
         let residual = observations.iter().rev().find_map(|(observation, observed)| {
             let (regressed, fix) = (observed.usable_box()?.independent, observed.fix?);
-            bounds.check(observation.time).ok()?;
+            bounds.check(observation.time()).ok()?;
             Some(ResidualSample {
-                time: observation.time,
-                target_id: observation.target_id.clone()?,
+                time: observation.time(),
+                target_id: observation.target_id().cloned()?,
                 regressed: regressed.regressed,
                 fix: fix.in_plane?,
                 e_regression_m2: regressed.variance_m2(),

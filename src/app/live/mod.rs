@@ -105,21 +105,21 @@ impl App {
     /// `InvalidArgument` naming `time` for a time ahead of the server's clock; `Overloaded` if the camera
     /// tracks as many targets as it may.
     pub fn follow(&self, camera: &Arc<ActiveCamera>, observation: &Observation) -> Result<ItemResult> {
-        self.live_time_bounds().check(observation.time)?;
+        self.live_time_bounds().check(observation.time())?;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);
         let observed = ObservedPositions::of(observation, regressor, camera.image_size, camera.e_gnss_m2);
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(self.clock.now());
-        let Some(target_id) = &observation.target_id else { return Ok(ItemResult { fused, track: None }) };
+        let Some(target_id) = observation.target_id() else { return Ok(ItemResult { fused, track: None }) };
         let seen = TargetObservation { target_id, observed, model, now: self.clock.monotonic() };
         let (track, residual) = camera.live.tracks.update(&camera.id, &seen, &self.limits)?;
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
             camera.live.announce_track(|| TargetUpdate {
                 point: point.clone(),
-                bounding_box: observation.bounding_box,
+                bounding_box: observation.bounding_box(),
                 fused: fused.clone(),
             });
         }

@@ -68,14 +68,14 @@ pub struct LiveStream {
     app: App,
     /// As it was when the stream was opened; its key and its live state do not change.
     camera: Arc<ActiveCamera>,
-    recording: Option<Recording>,
+    recording: Option<StreamRecording>,
     last_seq: u64,
     _slot: SlotGuard,
     _count: StreamCount,
     _address_lease: Lease,
 }
 
-struct Recording {
+struct StreamRecording {
     recorder: Arc<SampleRecorder>,
     tracker: Arc<AckTracker>,
 }
@@ -102,7 +102,7 @@ impl App {
         let address_lease = self.quotas.live_streams.try_acquire(client_address, 1)?;
         let slot =
             self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
-        let recording = store_samples.map(|durability| Recording {
+        let recording = store_samples.map(|durability| StreamRecording {
             recorder: self.recorder_of(&camera),
             tracker: AckTracker::beginning_after(resume_after_seq, durability),
         });
@@ -191,7 +191,7 @@ impl LiveStream {
     }
 
     fn ack_without_storing(&self, seq: u64, reason: NotStoredReason) {
-        if let Some(Recording { tracker, .. }) = &self.recording {
+        if let Some(StreamRecording { tracker, .. }) = &self.recording {
             tracker.ack_without_storing(seq, reason);
         }
     }
@@ -224,13 +224,13 @@ impl LiveStream {
         class: Option<TargetClass>,
         score: Option<Score>,
     ) -> Result<()> {
-        let Some(Recording { recorder, tracker }) = &self.recording else { return Ok(()) };
-        let Observation { time, bounding_box, fix, .. } = *observation;
-        let Some(target_id) = observation.target_id.clone() else {
+        let Some(StreamRecording { recorder, tracker }) = &self.recording else { return Ok(()) };
+        let time = observation.time();
+        let Some(target_id) = observation.target_id().cloned() else {
             self.ack_without_storing(seq, NotStoredReason::NoTarget);
             return Ok(());
         };
-        match (bounding_box, fix) {
+        match (observation.bounding_box(), observation.fix()) {
             (Some(bounding_box), Some(fix)) => {
                 let sample = Sample { time, target_id, bounding_box, fix, class, score, truth: None };
                 recorder.push_sample(tracker, seq, sample).await
@@ -276,7 +276,7 @@ impl LiveStream {
     /// # Errors
     /// The samples could not be stored.
     pub async fn settle(&self) -> Result<()> {
-        let Some(Recording { recorder, tracker }) = &self.recording else { return Ok(()) };
+        let Some(StreamRecording { recorder, tracker }) = &self.recording else { return Ok(()) };
         let is_alone = Arc::strong_count(recorder) == 1;
         if !is_alone {
             // Elapsed is no failure: the rest is decided below.

@@ -132,7 +132,7 @@ pub(crate) fn fit(
         projection,
         noise: GaussMarkovNoise::white(1.0),
     };
-    let problem = Problem { rows, columns, prior: prior(form, columns.len()) };
+    let problem = LeastSquaresProblem { rows, columns, prior: prior(form, columns.len()) };
     let (noise, mut inflation) = initial_noise(&fitted.residuals(rows, columns));
     fitted.noise = noise;
     let mut weighting = noise;
@@ -188,7 +188,7 @@ fn prior(form: Form, columns: usize) -> Vec<f64> {
 }
 
 /// What does not change during a fit.
-struct Problem<'a> {
+struct LeastSquaresProblem<'a> {
     rows: &'a [TrainingRow],
     columns: &'a [Vec<f64>],
     prior: Vec<f64>,
@@ -210,7 +210,7 @@ impl ProjectionFit {
     }
 
     /// Variance per axis of the detector's jitter in the map's positions, m2.
-    fn jitter_variance_m2(&self, Problem { rows, columns, .. }: &Problem<'_>) -> f64 {
+    fn jitter_variance_m2(&self, LeastSquaresProblem { rows, columns, .. }: &LeastSquaresProblem<'_>) -> f64 {
         let [east, north] = self.residuals(rows, columns);
         let positions: Vec<EastNorth> = east
             .iter()
@@ -227,7 +227,7 @@ impl ProjectionFit {
     }
 
     /// Levenberg and Marquardt's method from the present parameters.
-    fn refine(&mut self, problem: &Problem<'_>, whitener: &Whitener) {
+    fn refine(&mut self, problem: &LeastSquaresProblem<'_>, whitener: &Whitener) {
         let mut damping = 1e-3;
         let mut cost = self.cost(problem, whitener);
         for _ in 0..STEPS {
@@ -265,7 +265,11 @@ impl ProjectionFit {
         parameters.zip(step.iter()).for_each(|(parameter, step)| *parameter += step);
     }
 
-    fn cost(&self, Problem { rows, columns, prior }: &Problem<'_>, whitener: &Whitener) -> f64 {
+    fn cost(
+        &self,
+        LeastSquaresProblem { rows, columns, prior }: &LeastSquaresProblem<'_>,
+        whitener: &Whitener,
+    ) -> f64 {
         let squares: f64 = self
             .residuals(rows, columns)
             .into_iter()
@@ -279,8 +283,12 @@ impl ProjectionFit {
     }
 
     /// The normal matrix `J^T W^T W J + prior` and the negative gradient of half the cost.
-    fn normal_equations(&self, problem: &Problem<'_>, whitener: &Whitener) -> (DMatrix<f64>, DVector<f64>) {
-        let Problem { rows, columns, prior } = problem;
+    fn normal_equations(
+        &self,
+        problem: &LeastSquaresProblem<'_>,
+        whitener: &Whitener,
+    ) -> (DMatrix<f64>, DVector<f64>) {
+        let LeastSquaresProblem { rows, columns, prior } = problem;
         let mut normal = DMatrix::<f64>::from_diagonal(&DVector::from_column_slice(prior));
         let mut gradient =
             DVector::from_iterator(prior.len(), self.parameters().zip(prior).map(|(value, p)| -value * p));

@@ -75,11 +75,14 @@ pub(crate) fn fit(
         let net = Net::new(shape(), &parameters);
         fitted = projection_fit::fit(&rows.rows, form, &hidden_columns(&net, &inputs), &mut subset_rng());
         put_residual(&mut parts.tensors, &parameters, &fitted.extra);
-        residual = Some(Residual { net, weights: fitted.extra.clone() });
+        residual = Some(ResidualNetwork { net, weights: fitted.extra.clone() });
     }
     let network = residual.as_ref().map(|residual| residual.net.clone());
-    let map =
-        Map { bounds: bounds_of(&fitted.projection, &rows.rows), residual, projection: fitted.projection };
+    let map = ProjectiveMap {
+        bounds: bounds_of(&fitted.projection, &rows.rows),
+        residual,
+        projection: fitted.projection,
+    };
     parts.tensors.put_f64("projection", &[COEFFICIENTS], map.projection.coefficients.to_vec());
     parts.tensors.put_f64("bounds", &[2, 2], map.bounds.into_iter().flatten().collect());
     let boxes = rows.rows.iter().map(|row| {
@@ -179,7 +182,7 @@ fn hidden_columns(net: &Net, inputs: &[[f32; FEATURE_COUNT]]) -> Vec<Vec<f64>> {
 
 /// Weights of the hidden units for east and north, in units of position.
 #[derive(Debug, Clone)]
-struct Residual {
+struct ResidualNetwork {
     net: Net,
     weights: [Vec<f64>; 2],
 }
@@ -193,7 +196,7 @@ fn put_residual(tensors: &mut Tensors, parameters: &[f32], weights: &[Vec<f64>; 
     tensors.put_f64("residual.1.weight", &[2, HIDDEN], weights);
 }
 
-fn take_residual(tensors: &mut Tensors) -> Result<Option<Residual>> {
+fn take_residual(tensors: &mut Tensors) -> Result<Option<ResidualNetwork>> {
     if !tensors.holds("residual.0.weight") {
         return Ok(None);
     }
@@ -202,19 +205,22 @@ fn take_residual(tensors: &mut Tensors) -> Result<Option<Residual>> {
     parameters.resize(shape().parameter_count(), 0.0);
     let weights = tensors.take_f64("residual.1.weight", &[2, HIDDEN])?;
     let (east, north) = weights.split_at(HIDDEN);
-    Ok(Some(Residual { net: Net::new(shape(), &parameters), weights: [east.to_vec(), north.to_vec()] }))
+    Ok(Some(ResidualNetwork {
+        net: Net::new(shape(), &parameters),
+        weights: [east.to_vec(), north.to_vec()],
+    }))
 }
 
 /// The map from a box to a position.
 #[derive(Debug, Clone)]
-struct Map {
+struct ProjectiveMap {
     projection: Projection,
     /// Least and greatest position per axis, in units.
     bounds: [[f64; 2]; 2],
-    residual: Option<Residual>,
+    residual: Option<ResidualNetwork>,
 }
 
-impl Map {
+impl ProjectiveMap {
     #[inline]
     fn position(&self, bounding_box: &BoundingBox) -> EastNorth {
         let extra = self.residual.as_ref().map_or([0.0; 2], |residual| {
@@ -232,7 +238,7 @@ impl Map {
 /// Map and inverse camera for inference.
 #[derive(Debug, Clone)]
 pub(crate) struct ProjectiveEncoder {
-    map: Map,
+    map: ProjectiveMap,
     decoder: InverseCamera,
 }
 
@@ -253,7 +259,7 @@ impl ProjectiveEncoder {
         let residual = take_residual(&mut parts.tensors)?;
         let bounds = take_bounds(&mut parts.tensors)?;
         let decoder = InverseCamera::take(&mut parts.tensors)?;
-        Ok(Self { map: Map { projection, bounds, residual }, decoder })
+        Ok(Self { map: ProjectiveMap { projection, bounds, residual }, decoder })
     }
 
     /// Position and reconstruction of a box.

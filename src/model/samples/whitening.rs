@@ -139,7 +139,8 @@ mod tests {
     use super::*;
     use crate::domain::BoundingBox;
     use crate::geo::{EastNorth, Position};
-    use rand::{RngExt, SeedableRng};
+    use crate::simulation::standard_normal;
+    use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
     /// Rows of targets with 2,000 s each.
@@ -156,11 +157,6 @@ mod tests {
         (0..count).map(row).collect()
     }
 
-    fn normal(rng: &mut ChaCha8Rng) -> f64 {
-        let sum: f64 = (0..12).map(|_| rng.random::<f64>()).sum();
-        sum - 6.0
-    }
-
     #[test]
     fn coloured_residuals_are_whitened_to_unit_variance() {
         let rows = rows(8000);
@@ -175,8 +171,8 @@ mod tests {
             let mut values = Vec::new();
             for at in 0..rows.len() {
                 let decay = if at % 2000 == 0 { 0.0 } else { decay };
-                state = decay * state + (3.6 * (1.0 - decay * decay)).sqrt() * normal(&mut rng);
-                values.push(state + 0.4f64.sqrt() * normal(&mut rng));
+                state = decay * state + (3.6 * (1.0 - decay * decay)).sqrt() * standard_normal(&mut rng);
+                values.push(state + 0.4f64.sqrt() * standard_normal(&mut rng));
             }
             values
         };

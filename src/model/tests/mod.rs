@@ -16,6 +16,7 @@ use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::network::kernel::{BatchLoss, Scratch};
 use crate::model::network::{Activation, LossWeights, Net, NetShape, TrainingSet};
 use crate::model::{Artifact, FitError, FitEvent, FitOptions, fit};
+use crate::simulation::standard_normal;
 
 /// The same network built of candle's layers over the flat parameters.
 fn candle_layers(shape: &NetShape, flat: &Tensor) -> Vec<Linear> {
@@ -147,13 +148,13 @@ pub(super) fn walk(passes: usize, per_pass: usize, sigma_m: f64, seed: u64) -> V
     let mut samples = Vec::new();
     for pass in 0..passes {
         let across_m = rng.random_range(-12.0..12.0);
-        let bias: [f64; 2] = std::array::from_fn(|_| 0.8 * sigma_m * normal(&mut rng));
+        let bias: [f64; 2] = std::array::from_fn(|_| 0.8 * sigma_m * standard_normal(&mut rng));
         for step in 0..per_pass {
             let part = step as f64 / per_pass as f64;
             let truth = EastNorth { east_m: across_m + 6.0 * part, north_m: 15.0 + 30.0 * part };
             let fix = EastNorth {
-                east_m: truth.east_m + bias[0] + 0.6 * sigma_m * normal(&mut rng),
-                north_m: truth.north_m + bias[1] + 0.6 * sigma_m * normal(&mut rng),
+                east_m: truth.east_m + bias[0] + 0.6 * sigma_m * standard_normal(&mut rng),
+                north_m: truth.north_m + bias[1] + 0.6 * sigma_m * standard_normal(&mut rng),
             };
             samples.push(Sample {
                 time: Timestamp::from_second(1_600_000_000 + (pass * 1000 + step) as i64).expect("time"),
@@ -169,11 +170,6 @@ pub(super) fn walk(passes: usize, per_pass: usize, sigma_m: f64, seed: u64) -> V
     samples
 }
 
-fn normal(rng: &mut ChaCha8Rng) -> f64 {
-    let (one, other): (f64, f64) = (rng.random_range(1e-12..1.0), rng.random_range(0.0..1.0));
-    (-2.0 * one.ln()).sqrt() * (std::f64::consts::TAU * other).cos()
-}
-
 /// The box of a person of 1.75 m at a position, for a camera 6 m up that looks north and 15 deg down.
 fn box_of(truth: EastNorth, rng: &mut ChaCha8Rng) -> BoundingBox {
     let (sin, cos) = 15f64.to_radians().sin_cos();
@@ -183,9 +179,9 @@ fn box_of(truth: EastNorth, rng: &mut ChaCha8Rng) -> BoundingBox {
         (960.0 + 1200.0 * truth.east_m / depth_m, 540.0 + 1200.0 * down_m / depth_m, depth_m)
     };
     let ((foot_x, foot_y, depth_m), (_, head_y, _)) = (pixel(0.0), pixel(1.75));
-    let width_px = 1200.0 * 0.6 / depth_m + 0.5 * normal(rng);
-    let height_px = foot_y - head_y + 0.5 * normal(rng);
-    let left_px = foot_x - 0.5 * width_px + 0.5 * normal(rng);
+    let width_px = 1200.0 * 0.6 / depth_m + 0.5 * standard_normal(rng);
+    let height_px = foot_y - head_y + 0.5 * standard_normal(rng);
+    let left_px = foot_x - 0.5 * width_px + 0.5 * standard_normal(rng);
     BoundingBox::new(left_px, foot_y - height_px, width_px, height_px).expect("a box")
 }
 

@@ -2,6 +2,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rand_distr::Exp1;
 
 use super::candidate::Candidate;
 use super::groups::Grouping;
@@ -75,7 +76,8 @@ pub(crate) fn weigh(
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut wins = vec![0.0; candidates.len()];
     for _ in 0..BOOTSTRAP_DRAWS {
-        let weights: Vec<f64> = sequences.iter().map(|_| -(1.0 - rng.random::<f64>()).ln()).collect();
+        // Exponential weights, normalised, are a draw of the Dirichlet distribution.
+        let weights: Vec<f64> = sequences.iter().map(|_| rng.sample(Exp1)).collect();
         let score =
             |own: &Vec<f64>| own.iter().zip(&weights).map(|(miss, weight)| miss * weight).sum::<f64>();
         let scores: Vec<f64> = misses.iter().map(score).collect();

@@ -1,7 +1,7 @@
 //! The numerics against direct computations, and the stated error against the truth of simulated worlds.
 
 use nalgebra::DMatrix;
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::box_plausibility::RecentBoxes;
@@ -17,14 +17,10 @@ use crate::geo::{EastNorth, LocalPlane};
 use crate::model::artifact::ModelParts;
 use crate::model::artifact::tensors::{LARGEST_WEIGHTS_BYTES, Tensors};
 use crate::model::encoder::features::features_of;
-use crate::simulation::{Options, Scene, simulate};
+use crate::simulation::{Options, Scene, simulate, standard_normal};
 
 const IMAGE_PX: (f64, f64) = (1280.0, 720.0);
 const PERSON_M: (f64, f64) = (1.70, 0.05);
-
-fn normal(rng: &mut ChaCha8Rng) -> f64 {
-    (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0
-}
 
 /// Boxes and fixes of walkers on the simulated square, each with a receiver of its own that keeps a bias
 /// of `bias_m` per axis, and boxes with their true positions.
@@ -41,8 +37,9 @@ fn walkers(seed: u64, targets: usize, rows_each: usize, bias_m: f64) -> (MapRows
     let mut samples = world.training_samples();
     samples.sort_by(|one, other| (&one.target_id, one.time).cmp(&(&other.target_id, other.time)));
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let biases: Vec<[f64; 2]> =
-        (0..targets).map(|_| [bias_m * normal(&mut rng), bias_m * normal(&mut rng)]).collect();
+    let biases: Vec<[f64; 2]> = (0..targets)
+        .map(|_| [bias_m * standard_normal(&mut rng), bias_m * standard_normal(&mut rng)])
+        .collect();
     let mut rows = MapRows::default();
     let mut target = 0;
     for (at, sample) in samples.iter().enumerate() {
@@ -93,13 +90,14 @@ fn innovations_of_the_three_part_noise_are_white_with_unit_variance() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     let (mut epochs, mut column) = (Vec::new(), Vec::new());
     for sequence in 0..40 {
-        let mut state = [2.0 * normal(&mut rng), 2.0_f64.sqrt() * normal(&mut rng)];
+        let mut state = [2.0 * standard_normal(&mut rng), 2.0_f64.sqrt() * standard_normal(&mut rng)];
         for second in 0..250 {
             epochs.push(Epoch { time_s: f64::from(second), sequence });
-            column.push(state[0] + state[1] + 0.5 * normal(&mut rng));
+            column.push(state[0] + state[1] + 0.5 * standard_normal(&mut rng));
             for (value, (variance_m2, time_s)) in state.iter_mut().zip([(4.0, 30.0), (2.0, 900.0)]) {
                 let decay = f64::exp(-1.0 / time_s);
-                *value = decay * *value + f64::sqrt(variance_m2 * (1.0 - decay * decay)) * normal(&mut rng);
+                *value = decay * *value
+                    + f64::sqrt(variance_m2 * (1.0 - decay * decay)) * standard_normal(&mut rng);
             }
         }
     }
@@ -116,7 +114,8 @@ fn innovations_of_the_three_part_noise_are_white_with_unit_variance() {
 fn subtracting_a_groups_gram_matrix_is_a_fit_without_it() {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let kernel_columns = 6;
-    let columns = DMatrix::from_fn(90, 2 * COEFFICIENTS + kernel_columns + 2, |_, _| normal(&mut rng));
+    let columns =
+        DMatrix::from_fn(90, 2 * COEFFICIENTS + kernel_columns + 2, |_, _| standard_normal(&mut rng));
     let epochs: Vec<Epoch> =
         (0..90).map(|row| Epoch { time_s: f64::from(row), sequence: row as u32 / 30 }).collect();
     let noise = ReceiverNoise { short_m2: 1.0, short_time_s: 10.0, ..ReceiverNoise::white(0.5) };

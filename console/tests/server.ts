@@ -63,10 +63,10 @@ export class Server {
     rmSync(this.#folder, { recursive: true, force: true });
   }
 
-  async request<T>(method: string, path: string, body?: unknown, type = 'application/json'): Promise<T> {
+  async request<T>(method: string, path: string, body?: unknown, type = 'application/json', headers: Record<string, string> = {}): Promise<T> {
     const response = await fetch(this.url + path, {
       method,
-      headers: body === undefined ? {} : { 'content-type': type },
+      headers: body === undefined ? headers : { 'content-type': type, ...headers },
       ...(body === undefined ? {} : { body: typeof body === 'string' ? body : JSON.stringify(body) }),
     });
     const text = await response.text();

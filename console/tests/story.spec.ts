@@ -23,6 +23,8 @@ function toLine(position: Position, line: [number, number][]): number {
 const mean = (values: number[]): number => values.reduce((a, b) => a + b, 0) / values.length;
 
 test('the real square: drop, map, train, look, try, live', async ({ console: page, server }) => {
+  // Training runs at the lowest priority: on a busy machine it takes as long as it takes.
+  test.setTimeout(1_200_000);
   test.skip(!existsSync(SQUARE), 'the real square is not on this machine');
   const [head, ...lines] = readFileSync(`${SQUARE}/training.csv`, 'utf8').trim().split('\n');
   // The last recording is judged on; it is not among what is dropped.
@@ -32,8 +34,9 @@ test('the real square: drop, map, train, look, try, live', async ({ console: pag
   expect(learned.length).toBeGreaterThan(5000);
 
   await page.getByRole('button', { name: 'New camera' }).first().click();
-  await page.getByLabel('Name').fill('City square');
-  await expect(page.getByLabel('Id', { exact: false }).first()).toHaveValue('city-square');
+  const dialog = page.getByRole('dialog');
+  await dialog.getByLabel('Name').fill('City square');
+  await expect(dialog.locator('input[required]')).toHaveValue('city-square');
   await page.getByRole('button', { name: 'Create camera' }).click();
   await expect(page.getByRole('heading', { name: 'City square' })).toBeVisible();
 
@@ -46,7 +49,7 @@ test('the real square: drop, map, train, look, try, live', async ({ console: pag
   await page.getByLabel('Recipe').selectOption('projective');
   await page.getByRole('button', { name: 'Start training' }).click();
   await expect(page.getByRole('progressbar')).toBeVisible();
-  await expect(page.getByText('Version 1 (projective) was fitted')).toBeVisible({ timeout: 200_000 });
+  await expect(page.getByText('Version 1 (projective) was fitted')).toBeVisible({ timeout: 1_000_000 });
 
   await page.getByRole('link', { name: 'Look at the scene' }).click();
   await expect(page.getByText(/From the regressed position to the fix: mean/)).toBeVisible();
@@ -75,7 +78,7 @@ test('two files recorded apart are mapped, paired, trained and followed', async 
   const world = simulate(3, [0, 0], 300);
   const rows = rowsOf(world.csv);
   // As a German spreadsheet and another detector would write them: separators, names, corners.
-  const detections = ['Zeit;Track_ID;X1;Y1;X2;Y2;Extra', ...rows.map((it) => [it.time, it.target_id, it.box.left_px, it.box.top_px, it.box.left_px + it.box.width_px, it.box.top_px + it.box.height_px, 'x'].join(';').replaceAll('.', '.'))].join('\r\n');
+  const detections = ['Zeit;Track_ID;X1;Y1;X2;Y2;Extra', ...rows.map((it) => [it.time, it.target_id, it.box.left_px, it.box.top_px, it.box.left_px + it.box.width_px, it.box.top_px + it.box.height_px, 'x'].join(';'))].join('\r\n');
   const fixes = ['TIMESTAMP,LON,LAT,RECEIVER_ID', ...rows.map((it) => [it.time, it.fix!.longitude_deg, it.fix!.latitude_deg, it.target_id].join(','))].join('\n');
 
   await server.request('POST', '/v1/cameras', { id: 'gate', image_size: { width_px: 1280, height_px: 720 } });

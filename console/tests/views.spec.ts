@@ -36,18 +36,19 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
 
 /** A town with trained cameras, one without samples, one ready to train, and an evaluation. */
 async function buildTown(server: Server): Promise<() => void> {
-  const worlds = TOWN.map(([, , , east, north], at) => simulate(at + 1, [east, north], 400));
-  for (const [at, [id, name, site]] of TOWN.entries()) await addCamera(server, id, name, worlds[at]!, { site });
+  const town = PICTURES ? TOWN : TOWN.slice(0, 1);
+  const worlds = town.map(([, , , east, north], at) => simulate(at + 1, [east, north], 300));
+  for (const [at, [id, name, site]] of town.entries()) await addCamera(server, id, name, worlds[at]!, { site });
   await server.request('POST', '/v1/cameras', { id: 'roof-east', display_name: 'Roof east', labels: { site: 'roof' } });
   await server.request('POST', '/v1/cameras', { id: 'car-park', display_name: 'Car park', labels: { site: 'parking' } });
   await server.request('POST', '/v1/cameras/car-park/samples', worlds[0]!.csv, 'text/csv');
   const { id } = await server.request<{ id: string }>('POST', '/v1/evaluations', {
     camera_id: 'north-gate',
-    methods: ['gnss', 'imm_ukf', 'homography.denied', 'projective.two_step'],
+    methods: ['gnss', 'imm_ukf', 'homography.denied', ...(PICTURES ? ['projective.two_step'] : [])],
     ...(worlds[0]!.csv.includes('truth') ? {} : { truth_point: rowsOf(worlds[0]!.csv)[0]!.fix }),
   });
-  await expect.poll(async () => (await server.request<{ state: string }>('GET', `/v1/evaluations/${id}`)).state, { timeout: 120_000 }).toBe('succeeded');
-  const stops = TOWN.slice(0, 3).map(([camera], at) => walk(server, camera, worlds[at]!.live));
+  await expect.poll(async () => (await server.request<{ state: string }>('GET', `/v1/evaluations/${id}`)).state, { timeout: 600_000 }).toBe('succeeded');
+  const stops = town.slice(0, 3).map(([camera], at) => walk(server, camera, worlds[at]!.live));
   return () => stops.forEach((stop) => stop());
 }
 
@@ -57,8 +58,11 @@ async function look(page: Page, server: Server, path: string, ready: (page: Page
   await ready(page);
 }
 
+// A server without access control answers 404 to the questions for keys and the audit log.
+test.use({ allowed: /status of 404/ });
+
 test('every view is accessible, fits and can be shown', async ({ console: page, server }) => {
-  test.setTimeout(600_000);
+  test.setTimeout(1_200_000);
   const stop = await buildTown(server);
   // Trails grow while other views are looked at.
   for (const theme of ['dark', 'light'] as const) {
@@ -66,7 +70,7 @@ test('every view is accessible, fits and can be shown', async ({ console: page, 
     for (const [name, path, ready] of VIEWS) {
       await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: 900 });
       await look(page, server, path, ready);
-      expect(await accessibilityFindings(page), `${name}, ${theme}`).toEqual([]);
+      expect.soft(await accessibilityFindings(page), `${name}, ${theme}`).toEqual([]);
       if (PICTURES) {
         await page.waitForTimeout(name === 'live' ? 6000 : 1200);
         await page.screenshot({ path: `${PICTURES}/${name}-${theme}.png` });
@@ -77,11 +81,11 @@ test('every view is accessible, fits and can be shown', async ({ console: page, 
   await page.evaluate(() => localStorage.setItem('sightfix.language', 'de'));
   for (const [name, path, ready] of VIEWS) {
     await look(page, server, path, ready);
-    expect(await accessibilityFindings(page), `${name}, narrow`).toEqual([]);
+    expect.soft(await accessibilityFindings(page), `${name}, narrow`).toEqual([]);
     const overflow = await page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
-    expect(overflow, `${name} scrolls sideways at 390 px`).toBeLessThanOrEqual(0);
+    expect.soft(overflow, `${name} scrolls sideways at 390 px`).toBeLessThanOrEqual(0);
     const hidden = await page.locator('main').evaluate((main) => main.scrollWidth - main.clientWidth);
-    expect(hidden, `${name} is cut off at 390 px`).toBeLessThanOrEqual(0);
+    expect.soft(hidden, `${name} is cut off at 390 px`).toBeLessThanOrEqual(0);
     if (PICTURES && (name === 'overview' || name === 'scene')) await page.screenshot({ path: `${PICTURES}/${name}-phone.png` });
   }
   stop();
@@ -100,7 +104,7 @@ test('the keyboard reaches a camera and its tabs', async ({ console: page, serve
   }
   await page.keyboard.press('Enter');
   await expect(page.getByRole('heading', { name: 'Gate' })).toBeVisible();
-  await page.getByRole('link', { name: 'Data' }).focus();
+  await page.getByRole('link', { name: 'Data', exact: true }).focus();
   await page.keyboard.press('Enter');
   await expect(page.getByText('Drop files here')).toBeVisible();
 });

@@ -59,7 +59,7 @@ function moved(csv: string, [east_deg, north_deg]: [number, number]): string {
 export async function addCamera(server: Server, id: string, name: string, world: SimulatedCamera, labels: Record<string, string> = {}): Promise<void> {
   await server.request('POST', '/v1/cameras', { id, display_name: name, image_size: { width_px: 1280, height_px: 720 }, labels });
   await server.request('POST', `/v1/cameras/${id}/samples`, world.csv, 'text/csv');
-  await server.train(id, { recipe: 'projective', epochs: 30 });
+  await server.train(id, { recipe: 'projective', epochs: 10 });
 }
 
 /** Lets people walk in a camera's view until the returned function is called. */

@@ -83,8 +83,9 @@ export async function patch<T>(path: string, body: unknown, revision: number): P
   return (await send('PATCH', path, { body: JSON.stringify(body), headers })).json() as Promise<T>;
 }
 
-export async function del(path: string): Promise<void> {
-  await send('DELETE', path, {});
+/** Deletes; a profile only at the revision that the operator saw. */
+export async function del(path: string, revision?: number): Promise<void> {
+  await send('DELETE', path, revision === undefined ? {} : { headers: { 'if-match': `"${revision}"` } });
 }
 
 /** All pages of a list, up to a number of items. */

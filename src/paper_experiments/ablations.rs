@@ -156,6 +156,7 @@ fn train(
         epochs: None,
         image_size: world.image_size,
         gnss_error: GnssError::Known(SigmaM::new(base.gnss_sigma_m)?),
+        gnss_bias_sigma_m: None,
     };
     fit_with(&world.train, &options, overrides, &mut |_| ControlFlow::Continue(()))
         .map_err(|error| anyhow::anyhow!("{error}"))

@@ -107,6 +107,7 @@ fn over_worlds(experiment: &Experiment, runner: &mut dyn Runner) -> anyhow::Resu
                 epochs: None,
                 image_size: world.image_size,
                 gnss_sigma: Some(experiment.gnss_sigma),
+                gnss_bias_sigma: None,
                 box_shift_px: experiment.box_shift_px,
                 cpu_s: process_cpu_s,
             },

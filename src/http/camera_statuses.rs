@@ -20,13 +20,11 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(list_camera_statuses))
 }
 
-/// A camera with its data, its latest run, its model and what happens in its view.
+/// A camera with its latest run, its model and what happens in its view.
 #[derive(Serialize, ToSchema)]
 struct CameraStatus {
-    /// The profile.
+    /// The profile, with the number of its samples.
     camera: Camera,
-    /// Stored samples.
-    samples: u64,
     /// The latest training run.
     #[serde(skip_serializing_if = "Option::is_none")]
     latest_run: Option<LatestRun>,
@@ -79,13 +77,10 @@ impl From<&app::ModelSummary> for ModelSummary {
 
 impl CameraStatus {
     fn of(app: &App, status: app::CameraStatus) -> Self {
-        let app::CameraStatus { camera, stored, model_summary, activity } = status;
+        let app::CameraStatus { camera, latest_run, model_summary, activity } = status;
         Self {
             camera: Camera::of(app, camera),
-            samples: stored.samples,
-            latest_run: stored
-                .latest_run
-                .map(|(run, state)| LatestRun { id: run.to_string(), state: state.into() }),
+            latest_run: latest_run.map(|(run, state)| LatestRun { id: run.to_string(), state: state.into() }),
             model: model_summary.as_deref().map(Into::into),
             targets: activity.targets,
             streams: activity.streams,
@@ -106,8 +101,8 @@ struct CameraStatusPage {
 
 /// List the statuses of all cameras by id
 ///
-/// Each is the camera's profile with its samples, its latest training run, its model's error and area, and
-/// what happens in its view.
+/// Each is the camera's profile with its latest training run, its model's error and area, and what happens in
+/// its view.
 #[utoipa::path(
     get, path = "/v1/camera-statuses", tag = "cameras",
     params(

@@ -9,7 +9,6 @@
 //! a transaction is held across anything but statements, a type of the database library becomes public.
 //! Rows that the constructors of `domain` refuse are faults that name table, column and row.
 
-mod camera_activities;
 mod camera_moves;
 mod cameras;
 mod connection;
@@ -19,6 +18,7 @@ mod evaluations;
 mod folder;
 mod group_commit;
 mod jobs;
+mod latest_runs;
 mod models;
 mod occupants;
 mod reserve;
@@ -41,7 +41,6 @@ use sqlx::sqlite::SqlitePoolOptions;
 
 use crate::domain::{Durability, Error, ErrorKind, Result};
 
-pub use camera_activities::StoredActivity;
 pub use group_commit::Inserted;
 pub use jobs::{Claim, Heartbeat, JobEnd};
 pub use models::{NewModel, StoredHeldOutError};

@@ -73,7 +73,7 @@ async fn a_status_shows_samples_run_model_and_activity() {
     server.post("/v1/cameras", &json!({"id": "a"})).await.expect(201);
     server.post("/v1/cameras", &json!({"id": "b"})).await.expect(201);
     let empty = status().await;
-    assert_eq!((&empty["camera"]["id"], &empty["samples"]), (&json!("a"), &json!(0)), "{empty}");
+    assert_eq!((&empty["camera"]["id"], &empty["camera"]["samples"]), (&json!("a"), &json!(0)), "{empty}");
     assert!(empty.get("model").is_none() && empty.get("last_observed_at").is_none(), "{empty}");
 
     let headers = [("content-type", "text/csv")];
@@ -82,7 +82,11 @@ async fn a_status_shows_samples_run_model_and_activity() {
     server.send("POST", "/v1/cameras/a/samples", &headers, csv).await.expect(200);
     let run = server.train("a", &json!({"recipe": "projective", "epochs": 5})).await;
     let trained = status().await;
-    assert_eq!((&trained["samples"], &trained["latest_run"]["id"]), (&json!(rows), &run["id"]), "{trained}");
+    assert_eq!(
+        (&trained["camera"]["samples"], &trained["latest_run"]["id"]),
+        (&json!(rows), &run["id"]),
+        "{trained}"
+    );
     let corners = trained["model"]["view_area"].as_array().expect("corners");
     assert!(corners.len() >= 3 && trained["model"]["median_r95_m"].as_f64() > Some(0.0), "{trained}");
 

@@ -5,7 +5,7 @@ import type { TextKey } from './i18n.svelte';
 export const CAMERA_STATES = ['moved', 'fault', 'training', 'live', 'stale', 'idle', 'ready', 'empty'] as const;
 export type CameraState = (typeof CAMERA_STATES)[number];
 
-/** A model needs at least this many samples (the server refuses a run with fewer). */
+/** A model needs at least this many samples with a fix (the server refuses a run with fewer). */
 export const FEWEST_SAMPLES = 20;
 const LIVE_WITHIN_MS = 60_000;
 const STALE_AFTER_MS = 15 * 60_000;
@@ -15,7 +15,7 @@ export function stateOf(status: CameraStatus, now_ms: number): CameraState {
   if (camera.moved) return 'moved';
   if (camera.model_fault) return 'fault';
   if (latest_run?.state === 'queued' || latest_run?.state === 'running') return 'training';
-  if (camera.active_model === undefined) return status.samples < FEWEST_SAMPLES ? 'empty' : 'ready';
+  if (camera.active_model === undefined) return camera.samples - camera.samples_without_fix < FEWEST_SAMPLES ? 'empty' : 'ready';
   const silent_ms = last_observed_at ? now_ms - Date.parse(last_observed_at) : undefined;
   if (silent_ms === undefined) return 'idle';
   if (silent_ms <= LIVE_WITHIN_MS) return 'live';

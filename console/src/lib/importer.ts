@@ -14,6 +14,7 @@ export interface SourceFile {
 
 export interface ImportOutcome {
   accepted: number;
+  withoutFix: number;
   duplicate: number;
   rejected: number;
   rejectedRows: RejectedRow[];
@@ -45,7 +46,7 @@ export async function importSamples(
   signal: AbortSignal,
 ): Promise<ImportOutcome> {
   const { rows, rejected } = mapAll(source, image);
-  const outcome: ImportOutcome = { accepted: 0, duplicate: 0, rejected: rejected.length, rejectedRows: rejected };
+  const outcome: ImportOutcome = { accepted: 0, withoutFix: 0, duplicate: 0, rejected: rejected.length, rejectedRows: rejected };
   const columns = outputColumns(source.mapping);
   for (let from = 0; from < rows.length; from += ROWS_PER_PART) {
     const part = rows.slice(from, from + ROWS_PER_PART);
@@ -54,6 +55,7 @@ export async function importSamples(
       signal,
     });
     outcome.accepted += report.accepted;
+    outcome.withoutFix += report.accepted_without_fix;
     outcome.duplicate += report.duplicate;
     outcome.rejected += report.rejected;
     outcome.rejectedRows.push(...atOriginalLines(report.rejected_rows, part));
@@ -69,6 +71,7 @@ export async function importPair(
   detections: SourceFile,
   fixes: SourceFile,
   image: ImageSize | undefined,
+  keepUnpaired: boolean,
   signal: AbortSignal,
 ): Promise<ImportOutcome> {
   const form = new FormData();
@@ -85,10 +88,11 @@ export async function importPair(
     const csv = toCsv(outputColumns(source.mapping), mapped.rows);
     form.append(part, new Blob([csv], { type: 'text/csv' }), `${part}.csv`);
   }
-  const report = await post<PairedSamples>(cameraPath(camera, 'samples', 'pairings'), form, { signal });
+  const report = await post<PairedSamples>(`${cameraPath(camera, 'samples', 'pairings')}?keep_unpaired=${keepUnpaired}`, form, { signal });
   const reported = report.rejected_rows.flatMap((row) => atOriginalLines([row], mappedRows[row.part ?? ''] ?? []));
   return {
     accepted: report.accepted,
+    withoutFix: report.accepted_without_fix,
     duplicate: report.duplicate,
     rejected: report.rejected + rejected.length,
     rejectedRows: [...rejected, ...reported],

@@ -51,7 +51,7 @@ export class Scene {
     }
   }
 
-  /** Asks the active model for evenly chosen samples, with their fixes. */
+  /** Asks the active model for evenly chosen samples, with the fixes that they have. */
   async #answer(signal: AbortSignal): Promise<void> {
     const step = Math.max(1, Math.ceil(this.points.length / MOST_ANSWERS));
     const chosen = this.points.filter((_, at) => at % step === 0);
@@ -61,13 +61,13 @@ export class Scene {
         time: sample.time,
         target_id: sample.target_id,
         bounding_box: sample.bounding_box,
-        fix: { longitude_deg: sample.fix.longitude_deg, latitude_deg: sample.fix.latitude_deg, ...(sample.fix.sigma_m ? { sigma_m: sample.fix.sigma_m } : {}) },
+        ...(sample.fix ? { fix: sample.fix } : {}),
       }));
       const { items } = await post<{ items: FusedFix[] }>(cameraPath(this.#camera, 'fusions'), { observations }, { signal });
       items.forEach((answer, at) => {
         const point = batch[at]!;
         point.answer = answer;
-        if (answer.regressed) point.distance_m = distance_m(answer.regressed, point.sample.fix);
+        if (answer.regressed && point.sample.fix) point.distance_m = distance_m(answer.regressed, point.sample.fix);
       });
       this.points = [...this.points];
     }

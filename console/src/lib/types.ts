@@ -48,6 +48,9 @@ export interface Camera {
   revision: number;
   created_at: string;
   updated_at: string;
+  samples: number;
+  samples_without_fix: number;
+  gnss_bias_sigma_m?: number;
   active_model?: number;
   model_fault?: string;
   moved?: CameraMoved;
@@ -55,7 +58,6 @@ export interface Camera {
 }
 export interface CameraStatus {
   camera: Camera;
-  samples: number;
   latest_run?: { id: string; state: JobState };
   model?: { held_out_mean_to_fix_m?: number; median_r95_m: number; view_area: Position[] };
   targets: number;
@@ -70,7 +72,8 @@ export interface Sample {
   time: string;
   target_id: string;
   bounding_box: BoundingBox;
-  fix: Fix;
+  /** Missing for a box that only shows the camera's geometry. */
+  fix?: Fix | null;
   truth?: Position | null;
 }
 export interface RejectedRow {
@@ -81,6 +84,7 @@ export interface RejectedRow {
 }
 export interface Imported {
   accepted: number;
+  accepted_without_fix: number;
   duplicate: number;
   rejected: number;
   rejected_rows: RejectedRow[];

@@ -13,8 +13,8 @@ use super::track::{
     MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason, Track, TrackSettings,
     TrackState,
 };
-use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::domain::{ImageSize, Observation};
+use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::{RecentBoxes, Regression, Regressor};
 
 /// Latest fixes of a target without a model that decide by majority where its plane belongs.

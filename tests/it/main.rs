@@ -5,6 +5,7 @@ mod audit;
 mod bad_input;
 mod boxes_without_fix;
 mod connections;
+mod console;
 mod cross_site;
 mod evaluations;
 mod few_receivers;

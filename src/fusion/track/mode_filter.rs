@@ -81,9 +81,7 @@ impl NoiseDecomposition {
         white_inflation: f64,
     ) -> Self {
         let (bias, white_share, session_share) = match source {
-            MeasurementSource::Fix => {
-                (GNSS_BIAS, settings.gnss.white_share, settings.gnss_session.share)
-            }
+            MeasurementSource::Fix => (GNSS_BIAS, settings.gnss.white_share, settings.gnss_session.share),
             MeasurementSource::Regressed => (CAMERA_BIAS, settings.regression.correlation.white_share, 0.0),
         };
         let session = measured.covariance.scaled(session_share);

@@ -132,12 +132,10 @@ impl Evaluate {
         let stem = self.out.file_stem().and_then(|stem| stem.to_str()).context("--out must name a file")?;
         let folder = self.out.parent().unwrap_or(Path::new(""));
         let worlds = Worlds { first: self.first_world, count: self.seeds };
-        let started_s = process_cpu_s();
         let documents = paper_experiments::run(worlds, &recordings, stem, &mut PaperRunner)?;
         for document in &documents {
             write(&folder.join(&document.path), &document.text)?;
         }
-        eprintln!("{:.0} CPU s", process_cpu_s() - started_s);
         print!("{}", documents.first().map_or("", |page| &page.text));
         Ok(())
     }

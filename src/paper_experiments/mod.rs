@@ -15,11 +15,12 @@ mod splits;
 mod tables;
 mod walks;
 
+use crate::clock::process_cpu_s;
 use crate::domain::{ImageSize, Sample};
 use crate::evaluation::{EvaluateOptions, Evaluation, TestRow, Truth};
 use crate::simulation::Scene;
 use cases::Experiment;
-use page::Picture;
+use page::{Made, Picture};
 use scores::CaseScore;
 use walks::WalkCurves;
 
@@ -99,6 +100,7 @@ pub fn run(
     stem: &str,
     runner: &mut dyn Runner,
 ) -> anyhow::Result<Vec<Document>> {
+    let started_s = process_cpu_s();
     let mut scores: Vec<CaseScore> = Vec::new();
     let experiments = experiments(worlds, recordings)?;
     let count = experiments.len();
@@ -114,9 +116,10 @@ pub fn run(
     }
     let command = command(worlds, recordings);
     let pictures = page::pictures(&scores, &curves);
-    let page = page::page(stem, (worlds, &command), &scores, &curves, &pictures);
     let mut tables = tables::tables(stem, &command, &scores);
     ablations::tables(&mut tables, worlds, runner)?;
+    let made = Made { worlds, command, cpu_s: process_cpu_s() - started_s };
+    let page = page::page(stem, &made, &scores, &curves, &pictures);
     let mut documents = vec![
         Document { path: format!("{stem}.md"), text: page },
         Document { path: format!("{stem}-tables.md"), text: tables },

@@ -131,8 +131,10 @@ pub struct Limits {
     /// Seconds until a retraining after a camera was moved is tried again, if it could not start, failed or
     /// was not promoted; doubled with each attempt, up to 64 times as long.
     pub retrain_pause_s: u32,
-    /// Samples of one training run; the latest are taken.
+    /// Samples with a fix of one training run; the latest are taken.
     pub samples_per_run: u32,
+    /// Boxes without a fix of one training run or evaluation; more are thinned evenly.
+    pub boxes_without_fix_per_run: u32,
     /// Evaluations that have not ended, over all cameras.
     pub live_evaluations: u32,
     /// Seeds of one evaluation.
@@ -223,6 +225,7 @@ impl Default for Limits {
             epochs: 10_000,
             retrain_pause_s: 15,
             samples_per_run: 100_000,
+            boxes_without_fix_per_run: 20_000,
             live_evaluations: 64,
             evaluation_seeds: 20,
             rows_per_evaluation: 100_000,

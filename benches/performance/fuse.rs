@@ -25,6 +25,7 @@ pub(crate) fn run() {
             epochs: Some(50),
             image_size: Some(world.image_size),
             gnss_error: sightfix::domain::GnssError::Unknown,
+            gnss_bias_sigma_m: None,
         };
         let artifact = model::fit(&samples, &options, &mut |_| std::ops::ControlFlow::Continue(()))
             .expect("the demonstration can be learnt");

@@ -44,7 +44,7 @@ pub(crate) fn run() {
             let rate = samples.len() as f64 / began.elapsed().as_secs_f64();
             let stored =
                 runtime.block_on(served.app.count_samples(&id, &Default::default())).expect("a count");
-            assert_eq!(stored as usize, samples.len(), "every row is stored");
+            assert_eq!(stored.all as usize, samples.len(), "every row is stored");
             rate
         };
         ratio::row(

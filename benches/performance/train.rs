@@ -51,6 +51,7 @@ fn whole() {
             epochs: None,
             image_size: Some(world.image_size),
             gnss_error: GnssError::Known(SigmaM::new(options.gnss_sigma_m).expect("above 0")),
+            gnss_bias_sigma_m: None,
         };
         let began = Instant::now();
         let artifact = sightfix::model::fit(&samples, &fit_options, &mut |_| ControlFlow::Continue(()))

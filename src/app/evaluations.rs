@@ -168,7 +168,8 @@ impl App {
             let (least, most) = (TEST_SHARES.start(), TEST_SHARES.end());
             return Err(Error::invalid("test_share", format!("must be from {least} to {most}")));
         }
-        let count = self.store.count_samples(id, &SampleFilter::default()).await?;
+        let with_fix = SampleFilter { has_fix: Some(true), ..SampleFilter::default() };
+        let count = self.store.count_samples(id, &with_fix).await?;
         let before = (count as f64 * (1.0 - test_share)).round() as u64;
         let at = self.store.sample_time(id, before.min(count.saturating_sub(1))).await?;
         let last = self.store.sample_time(id, count.saturating_sub(1)).await?;
@@ -186,7 +187,8 @@ impl App {
         test: TimeRange,
         truth: &Truth,
     ) -> Result<()> {
-        let (train_filter, test_filter) = (SampleFilter::within(train), SampleFilter::within(test));
+        let train_filter = SampleFilter::within(train);
+        let test_filter = SampleFilter { has_fix: Some(true), ..SampleFilter::within(test) };
         let (train_count, extent) = self.store.sample_extent(id, &train_filter).await?;
         check_extent(id, train_count, extent).map_err(|error| error.at("train"))?;
         let test_count = self.store.count_samples(id, &test_filter).await?;

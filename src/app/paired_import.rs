@@ -5,7 +5,9 @@ use std::io::Read;
 use super::recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use super::samples::{BATCH_ROWS, told_what_is_stored};
 use super::{App, ImportReport};
-use crate::domain::{CameraId, Durability, Error, Receiver, ReceiverId, Receivers, Result, Sample, TargetId};
+use crate::domain::{
+    CameraId, Durability, Error, Receiver, ReceiverId, Receivers, Result, StoredSample, TargetId,
+};
 use crate::exchange::{self, FixFormat, Format, RowRules};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::PairingSettings;
@@ -26,6 +28,8 @@ pub struct PairedImport<D, F> {
     pub target_id: Option<TargetId>,
     /// The receiver of fixes that name none.
     pub receiver_id: Option<ReceiverId>,
+    /// Whether boxes that find no fix are stored as samples without one.
+    pub keeps_unpaired: bool,
     /// When the samples are acknowledged.
     pub durability: Durability,
     /// Whether the clock offsets are estimated, too. They are reported, never applied.
@@ -49,7 +53,7 @@ pub struct PairedReport {
 
 /// What was paired, before it is stored.
 struct Work {
-    samples: Vec<Sample>,
+    samples: Vec<StoredSample>,
     report: PairedReport,
 }
 
@@ -101,6 +105,6 @@ impl<D: Read, F: Read> PairedImport<D, F> {
         let (paired, counts, rejected) = recording.paired(receivers, &self.settings);
         let samples = ImportReport::default();
         let report = PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets };
-        Ok(Work { samples: paired.samples, report })
+        Ok(Work { samples: paired.into_samples(self.keeps_unpaired), report })
     }
 }

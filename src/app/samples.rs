@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use tokio::sync::mpsc;
 
 use super::{App, Page, page_of};
-use crate::domain::{CameraId, Durability, Error, Result, Sample, TargetId};
+use crate::domain::{CameraId, Durability, Error, Result, SampleCount, StoredSample, TargetId};
 use crate::exchange::{self, Cursor, Format, RowError, RowRules};
 use crate::store::{SampleFilter, SampleKey};
 
@@ -21,6 +21,8 @@ const BATCHES_AHEAD: usize = 8;
 pub struct ImportReport {
     /// Stored now.
     pub accepted: u64,
+    /// Of the accepted ones, those without a fix.
+    pub without_fix: u64,
     /// The same camera, target and time were stored before, or stand twice in the import.
     pub duplicate: u64,
     /// Not stored for a fault of their own.
@@ -85,7 +87,7 @@ impl App {
     pub async fn import_rows(
         &self,
         id: &CameraId,
-        rows: impl Stream<Item = Result<Result<Sample, RowError>>> + Send,
+        rows: impl Stream<Item = Result<Result<StoredSample, RowError>>> + Send,
         durability: Durability,
     ) -> Result<ImportReport> {
         self.active_camera(id).await?;
@@ -132,20 +134,26 @@ impl App {
         filter: &SampleFilter,
         after: Option<SampleKey>,
         limit: u32,
-    ) -> Result<Page<Sample, SampleKey>> {
+    ) -> Result<Page<StoredSample, SampleKey>> {
         let samples = self.store.samples(id, filter, after, limit + 1).await?;
-        Ok(page_of(samples, limit, |sample| SampleKey {
-            time: sample.time,
-            target_id: sample.target_id.clone(),
-        }))
+        Ok(page_of(samples, limit, SampleKey::of))
     }
 
     /// How many samples there are.
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
-        self.store.count_samples(id, filter).await
+    pub async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<SampleCount> {
+        let mut count = SampleCount::default();
+        for has_fix in
+            [true, false].into_iter().filter(|has_fix| filter.has_fix.is_none_or(|it| it == *has_fix))
+        {
+            let filter = SampleFilter { has_fix: Some(has_fix), ..filter.clone() };
+            let rows = self.store.count_samples(id, &filter).await?;
+            count.all += rows;
+            count.without_fix += if has_fix { 0 } else { rows };
+        }
+        Ok(count)
     }
 
     /// Deletes samples and tells how many.
@@ -159,7 +167,7 @@ impl App {
     pub(super) async fn store_batch(
         &self,
         id: &CameraId,
-        batch: Vec<Result<Sample, RowError>>,
+        batch: Vec<Result<StoredSample, RowError>>,
         durability: Durability,
         report: &mut ImportReport,
     ) -> Result<()> {
@@ -174,6 +182,7 @@ impl App {
             let inserted = self.store.insert_samples(id, samples, durability).await?;
             report.accepted += inserted.accepted;
             report.duplicate += inserted.duplicate;
+            report.without_fix += inserted.without_fix;
         }
         Ok(())
     }
@@ -196,7 +205,7 @@ impl Cursor for SampleKey {
     }
 }
 
-type Batch = Vec<Result<Sample, RowError>>;
+type Batch = Vec<Result<StoredSample, RowError>>;
 
 fn read_batches(
     file: impl Read,

@@ -6,15 +6,18 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::Args;
 
-use super::import::image_size;
+use super::import::{gnss_bias_sigma, image_size};
 use super::progress::Progress;
 use super::recordings;
 use super::{format_of, open_file};
 use crate::clock::{Clock, process_cpu_s};
-use crate::domain::{ImageSize, Recipe, Sample, SigmaM, TargetId, TimeBounds};
+use crate::domain::{
+    Detection, GnssBiasSigma, ImageSize, Recipe, Sample, SigmaM, StoredSample, TargetId, TimeBounds,
+};
 use crate::evaluation::{EvaluateOptions, Evaluation, Method, TestRow, Truth, evaluate, plots};
 use crate::exchange::{self, ObservedRow, RowRules};
 use crate::geo::Position;
+use crate::model::FitInput;
 use crate::paper_experiments::{self, RealRecording, Recordings, Worlds};
 
 /// Invalid rows that are reported individually.
@@ -25,7 +28,7 @@ const MAX_SEEDS: u64 = 100;
 /// Compare methods on a test file, without a server
 #[derive(Args)]
 pub(super) struct Evaluate {
-    /// Training rows, as CSV, NDJSON or JSON
+    /// Training rows, as CSV, NDJSON or JSON; boxes without a fix serve the geometry of the camera
     #[arg(long, value_name = "FILE", required_unless_present = "paper")]
     train: Option<PathBuf>,
     /// Test rows; boxes and fixes may be empty
@@ -43,6 +46,10 @@ pub(super) struct Evaluate {
     /// Standard deviation per axis of the receiver, m [default: estimated]
     #[arg(long, value_name = "S", value_parser = sigma)]
     gnss_sigma_m: Option<SigmaM>,
+    /// Standard deviation per axis of the bias that all fixes have in common, m [default: the model's own
+    /// prior]
+    #[arg(long, value_name = "S", value_parser = gnss_bias_sigma)]
+    gnss_bias_sigma_m: Option<GnssBiasSigma>,
     /// Comma-separated methods, or all
     #[arg(long, value_name = "LIST", default_value = "all", value_parser = methods)]
     methods: Methods,
@@ -100,10 +107,12 @@ impl Evaluate {
             epochs: None,
             image_size: self.image_size,
             gnss_sigma: self.gnss_sigma_m,
+            gnss_bias_sigma: self.gnss_bias_sigma_m,
             box_shift_px: self.box_shift_px,
             cpu_s: process_cpu_s,
         };
-        let evaluation = evaluate_with_progress(&train, &test, &truth, &options)?;
+        let input = FitInput { samples: &train.samples, unpaired: &train.unpaired };
+        let evaluation = evaluate_with_progress(input, &test, &truth, &options)?;
         print!("{}", evaluation.report.table());
         if let Some(path) = &self.json {
             write(path, &evaluation.report.to_json()?)?;
@@ -122,7 +131,7 @@ impl Evaluate {
         let recordings = match &self.shared_data {
             Some(folder) => Recordings {
                 square: Some(RealRecording {
-                    samples: read_train(&folder.join("square/training.csv"), None)?,
+                    samples: read_train(&folder.join("square/training.csv"), None)?.samples,
                     truth: truth_line(&folder.join("square/truth_line.geojson"))?,
                 }),
                 plaza: recordings::plaza(&folder.join("plaza"))?,
@@ -169,7 +178,7 @@ struct PaperRunner;
 impl paper_experiments::Runner for PaperRunner {
     fn evaluate(
         &mut self,
-        train: &[Sample],
+        train: FitInput<'_>,
         test: &[TestRow],
         truth: &Truth,
         options: &EvaluateOptions,
@@ -192,7 +201,7 @@ const DEFAULT_RECIPE: Recipe = Recipe::Auto;
 
 /// Evaluates and shows the progress on standard error.
 fn evaluate_with_progress(
-    train: &[Sample],
+    train: FitInput<'_>,
     test: &[TestRow],
     truth: &Truth,
     options: &EvaluateOptions,
@@ -206,24 +215,39 @@ fn evaluate_with_progress(
     Ok(evaluation?)
 }
 
-/// The rows with box and fix; the number of others is reported on standard error.
-fn read_train(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<Sample>> {
-    let rows = read(path, image_size)?;
-    let all = rows.len();
-    let samples: Vec<Sample> = rows.into_iter().filter_map(sample).collect();
-    if samples.len() < all {
-        eprintln!("{}: {} rows without box or fix are ignored", path.display(), all - samples.len());
-    }
-    Ok(samples)
+/// The training rows of a file.
+struct TrainingFile {
+    samples: Vec<Sample>,
+    unpaired: Vec<Detection>,
 }
 
-fn sample(row: ObservedRow) -> Option<Sample> {
+/// The rows with a box, by whether they have a fix; the number of others is reported on standard error.
+fn read_train(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<TrainingFile> {
+    let mut file = TrainingFile { samples: Vec::new(), unpaired: Vec::new() };
+    let mut ignored = 0_u64;
+    for row in read(path, image_size)? {
+        match stored_sample(row) {
+            Some(sample) if sample.fix.is_some() => file.samples.extend(sample.with_fix()),
+            Some(sample) => file.unpaired.push(sample.into()),
+            None => ignored += 1,
+        }
+    }
+    if ignored > 0 {
+        eprintln!("{}: {ignored} rows without a box are ignored", path.display());
+    }
+    if !file.unpaired.is_empty() {
+        eprintln!("{}: {} rows are boxes without a fix", path.display(), file.unpaired.len());
+    }
+    Ok(file)
+}
+
+fn stored_sample(row: ObservedRow) -> Option<StoredSample> {
     let ObservedRow { observation, class, score, truth } = row;
-    Some(Sample {
+    Some(StoredSample {
         time: observation.time(),
         target_id: observation.target_id().cloned().or_else(|| TargetId::new("target").ok())?,
         bounding_box: observation.bounding_box()?,
-        fix: observation.fix()?,
+        fix: observation.fix(),
         class,
         score,
         truth,

@@ -8,12 +8,13 @@ use clap::Args;
 use super::progress::Progress;
 use super::{DataFolder, camera_id, format_of, open_app, open_file, runtime};
 use crate::app::ImportReport;
-use crate::domain::{CameraId, Durability, Error, ErrorKind, ImageSize, NewCamera};
+use crate::domain::{CameraId, Durability, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera};
 
 /// Import samples from a file into a camera
 #[derive(Args)]
 pub(super) struct Import {
-    /// Samples as CSV, NDJSON or JSON, by file extension
+    /// Samples as CSV, NDJSON or JSON, by file extension; longitude and latitude may be empty together: a box
+    /// without a fix
     #[arg(value_name = "FILE")]
     file: PathBuf,
     /// The camera's id
@@ -25,6 +26,10 @@ pub(super) struct Import {
     /// Size of the camera's image, for --create
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size, requires = "create")]
     image_size: Option<ImageSize>,
+    /// Standard deviation per axis of the bias that all fixes have in common, m, for --create [default: the
+    /// model's own prior]
+    #[arg(long, value_name = "S", value_parser = gnss_bias_sigma, requires = "create")]
+    gnss_bias_sigma_m: Option<GnssBiasSigma>,
     #[command(flatten)]
     folder: DataFolder,
 }
@@ -44,8 +49,11 @@ impl Import {
         let report = runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix import").await?;
             if self.create {
-                let profile =
-                    NewCamera { image_size: self.image_size, ..NewCamera::named(self.camera.clone()) };
+                let profile = NewCamera {
+                    image_size: self.image_size,
+                    gnss_bias_sigma: self.gnss_bias_sigma_m,
+                    ..NewCamera::named(self.camera.clone())
+                };
                 match app.create_camera(profile).await {
                     Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {}
                     created => drop(created?),
@@ -65,8 +73,8 @@ impl Import {
 }
 
 fn print(report: &ImportReport) {
-    let ImportReport { accepted, duplicate, rejected, rejected_rows } = report;
-    println!("accepted {accepted}, duplicate {duplicate}, rejected {rejected}");
+    let ImportReport { accepted, without_fix, duplicate, rejected, rejected_rows } = report;
+    println!("accepted {accepted} (without a fix {without_fix}), duplicate {duplicate}, rejected {rejected}");
     for row in rejected_rows {
         println!("line {}: {}: {}", row.line, row.field, row.reason);
     }
@@ -82,6 +90,12 @@ pub(super) fn image_size(text: &str) -> Result<ImageSize, String> {
         .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
     let (width_px, height_px) = sides.ok_or("must be WIDTHxHEIGHT in pixels, such as 1920x1080")?;
     ImageSize::new(width_px, height_px).map_err(|error| error.to_string())
+}
+
+/// A standard deviation in metres.
+pub(super) fn gnss_bias_sigma(text: &str) -> Result<GnssBiasSigma, String> {
+    let sigma_m = text.parse().map_err(|_| "must be a number of metres".to_owned())?;
+    GnssBiasSigma::new(sigma_m).map_err(|error| error.to_string())
 }
 
 /// A reader that shows the progress of reading.

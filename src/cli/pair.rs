@@ -59,6 +59,9 @@ pub(super) struct Pair {
     /// Pair with the estimated offsets instead of the given ones
     #[arg(long, requires = "estimate_offset")]
     apply_offset: bool,
+    /// Write the boxes that find no fix, too, with empty longitude and latitude
+    #[arg(long)]
+    keep_unpaired: bool,
 }
 
 impl Pair {
@@ -84,7 +87,14 @@ impl Pair {
         print_counts(&counts);
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
         let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
-        exchange::write_samples(BufWriter::new(file), format_of(out)?, &paired.samples)?;
+        if self.keep_unpaired {
+            println!("boxes kept without a fix {}", paired.unpaired_detections.len());
+        }
+        exchange::write_samples(
+            BufWriter::new(file),
+            format_of(out)?,
+            &paired.into_samples(self.keep_unpaired),
+        )?;
         Ok(())
     }
 

@@ -49,6 +49,9 @@ impl Train {
             let outcome = ended.outcome.as_deref().unwrap_or("no outcome was recorded");
             anyhow::ensure!(ended.state == JobState::Succeeded, "{}: {outcome}", ended.state.as_str());
             println!("version {} {outcome}", ended.model_version.unwrap_or_default());
+            if let Some(report) = &ended.report {
+                println!("{report}");
+            }
             Ok(())
         })
     }

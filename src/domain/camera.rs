@@ -6,10 +6,11 @@ use jiff::Timestamp;
 
 use super::bounding_box::ImageSize;
 use super::error::{Error, Result};
-use super::gnss_error::GnssError;
+use super::gnss_error::{GnssBiasSigma, GnssError};
 use super::names::{CameraId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
 use super::recipe::Recipe;
+use super::sample::SampleCount;
 
 /// Revision number of a profile, from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -26,6 +27,8 @@ pub struct NewCamera {
     pub image_size: Option<ImageSize>,
     /// The receiver's error.
     pub gnss_error: GnssError,
+    /// The bias that all fixes have in common; `None` for the model's own prior.
+    pub gnss_bias_sigma: Option<GnssBiasSigma>,
     /// Recipe of training runs.
     pub recipe: Recipe,
     /// Classes of targets that the camera is used for; empty for all.
@@ -47,6 +50,7 @@ impl NewCamera {
             id,
             image_size: None,
             gnss_error: GnssError::default(),
+            gnss_bias_sigma: None,
             recipe: Recipe::default(),
             target_classes: Vec::new(),
             labels: BTreeMap::new(),
@@ -106,6 +110,8 @@ pub struct CameraChange {
     pub image_size: Option<Option<ImageSize>>,
     /// New receiver error.
     pub gnss_error: Option<GnssError>,
+    /// New common bias of all fixes; `Some(None)` removes it.
+    pub gnss_bias_sigma: Option<Option<GnssBiasSigma>>,
     /// New recipe, for future runs.
     pub recipe: Option<Recipe>,
     /// New classes.
@@ -129,6 +135,7 @@ impl CameraChange {
             display_name: self.display_name.unwrap_or(profile.display_name),
             image_size: self.image_size.unwrap_or(profile.image_size),
             gnss_error: self.gnss_error.unwrap_or(profile.gnss_error),
+            gnss_bias_sigma: self.gnss_bias_sigma.unwrap_or(profile.gnss_bias_sigma),
             recipe: self.recipe.unwrap_or(profile.recipe),
             target_classes: self.target_classes.unwrap_or(profile.target_classes),
             labels: self.labels.unwrap_or(profile.labels),
@@ -159,6 +166,8 @@ pub struct Camera {
     pub updated_at: Timestamp,
     /// Number of the active model version, if any.
     pub active_model: Option<u32>,
+    /// Stored samples.
+    pub samples: SampleCount,
 }
 
 impl Camera {

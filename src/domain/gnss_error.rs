@@ -30,6 +30,32 @@ impl SigmaM {
     }
 }
 
+/// Standard deviation per horizontal axis of the bias that all fixes of a camera's training have in common
+/// (the session bias of the only receiver, or what several receivers share), m. No sample shows it.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct GnssBiasSigma(f64);
+
+impl GnssBiasSigma {
+    /// # Errors
+    /// Refuses what is not a finite number above 0 and up to 100 m; the field is named `gnss_bias_sigma_m`.
+    pub fn new(sigma_m: f64) -> Result<Self> {
+        if sigma_m > 0.0 && sigma_m <= 100.0 {
+            Ok(Self(sigma_m))
+        } else {
+            Err(Error::invalid(
+                "gnss_bias_sigma_m",
+                "must be a standard deviation above 0 and up to 100 metres per axis",
+            ))
+        }
+    }
+
+    /// The standard deviation, m.
+    #[must_use]
+    pub const fn metres(self) -> f64 {
+        self.0
+    }
+}
+
 /// The receivers' error in a camera's profile.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum GnssError {

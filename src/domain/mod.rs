@@ -29,7 +29,7 @@ pub use checksum::model_sha256;
 pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
-pub use gnss_error::{GnssError, SigmaM};
+pub use gnss_error::{GnssBiasSigma, GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};
 pub use method::{InferenceMode, Method};
 pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
@@ -37,10 +37,11 @@ pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
-pub use sample::Sample;
+pub use sample::{Sample, SampleCount, StoredSample};
 pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{
-    CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError, HeldOutSampleError,
-    ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingRun,
+    CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
+    HeldOutSampleError, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingReport,
+    TrainingRun,
 };

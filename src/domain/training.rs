@@ -1,5 +1,7 @@
 //! Training runs and the model versions they produce.
 
+use std::fmt;
+
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -74,6 +76,8 @@ pub struct TrainingRun {
     pub attempt: u32,
     /// The model version it produced.
     pub model_version: Option<u32>,
+    /// What the run found out, while the version that it produced is stored.
+    pub report: Option<TrainingReport>,
     /// Whether that version was activated and why, or why the run failed.
     pub outcome: Option<String>,
     /// Time of creation.
@@ -151,6 +155,50 @@ pub struct CandidateReport {
     pub held_out: HeldOutError,
 }
 
+/// What a run found out about one candidate.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CandidateFinding {
+    /// Name of the candidate.
+    pub candidate: String,
+    /// Share of the model's answers that it has, 0 to 1; all candidates together have 1.
+    pub weight: f64,
+    /// Mean distance of the held-out fixes from the regressed positions, m.
+    pub held_out_miss_m: f64,
+    /// Share of the held-out fixes inside the 95 % radius stated for regression and receiver together.
+    pub coverage95_of_fixes: f64,
+    /// Why it has its weight, in words.
+    pub summary: String,
+}
+
+/// What a training run kept, how sure it is, and what would make it surer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingReport {
+    /// One per candidate, in the order in which they were tried.
+    pub candidates: Vec<CandidateFinding>,
+    /// What would help, one sentence each.
+    pub advice: Vec<String>,
+}
+
+impl fmt::Display for TrainingReport {
+    /// Lines of text, the last without an end.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for CandidateFinding { candidate, held_out_miss_m, coverage95_of_fixes, summary, .. } in
+            &self.candidates
+        {
+            let percent = 100.0 * coverage95_of_fixes;
+            writeln!(
+                f,
+                "{candidate}: {held_out_miss_m:.2} m from held-out fixes, {percent:.1} % of them inside the \
+                 stated radius; {summary}"
+            )?;
+        }
+        write!(f, "What would help:")?;
+        self.advice.iter().try_for_each(|line| write!(f, "\n- {line}"))
+    }
+}
+
 /// Metadata of a model version: all but its weights. This is a document format: it is stored,
 /// downloaded and imported as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -188,6 +236,9 @@ pub struct ModelMetadata {
     pub held_out: Option<HeldOutError>,
     /// The candidates of the model selection.
     pub candidates: Vec<CandidateReport>,
+    /// What the run found out; `None` for models of earlier releases.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub report: Option<TrainingReport>,
     /// Names and values of the recipe's scalar parameters (noise floors, calibration factors).
     pub parameters: std::collections::BTreeMap<String, f64>,
 }

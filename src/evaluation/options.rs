@@ -1,6 +1,6 @@
 //! What an evaluation is asked to do, and how far it has come.
 
-use crate::domain::{ImageSize, Method, Observation, Recipe, SigmaM};
+use crate::domain::{GnssBiasSigma, ImageSize, Method, Observation, Recipe, SigmaM};
 use crate::geo::Position;
 
 /// One row of the test file, for which every method predicts a position.
@@ -27,6 +27,8 @@ pub struct EvaluateOptions {
     pub image_size: Option<ImageSize>,
     /// Standard deviation per axis of the receiver, if known.
     pub gnss_sigma: Option<SigmaM>,
+    /// The bias that all fixes have in common, if known.
+    pub gnss_bias_sigma: Option<GnssBiasSigma>,
     /// The test boxes' left and top edges are moved outwards by this many px, as in the paper's test
     /// of inaccurate boxes.
     pub box_shift_px: f64,

@@ -3,7 +3,7 @@
 use super::baselines::{dnn, homography, imm_ukf};
 use super::options::{EvaluateOptions, TestRow};
 use super::training::RecipeModel;
-use crate::domain::{BoundingBox, InferenceMode, Method, Observation, Sample, SigmaM};
+use crate::domain::{BoundingBox, InferenceMode, Method, Observation, SigmaM};
 use crate::filters::ImmUkf;
 use crate::fusion::PlaneCovariance;
 use crate::fusion::observed::{ObservedPositions, UNKNOWN_RECEIVER_M2};
@@ -11,7 +11,7 @@ use crate::fusion::target_track::TargetTrack;
 use crate::fusion::track::TrackSettings;
 use crate::fusion::two_step::fuse;
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::{FEWEST_SAMPLES, R95_PER_SIGMA, Regressor, fix_sequences};
+use crate::model::{FEWEST_SAMPLES, FitInput, R95_PER_SIGMA, Regressor, fix_sequences};
 
 /// A predicted position with its stated 95 % radius.
 #[derive(Debug, Clone, Copy)]
@@ -39,7 +39,7 @@ pub(super) type Predictor<'a> = Box<dyn FnMut(&TargetRows) -> Vec<Option<Predict
 /// What the predictors of one evaluation have in common.
 #[derive(Clone, Copy)]
 pub(super) struct Predictors<'a> {
-    pub(super) train: &'a [Sample],
+    pub(super) train: FitInput<'a>,
     pub(super) test: &'a [TestRow],
     pub(super) options: &'a EvaluateOptions,
     /// The plane in which the baselines work.
@@ -98,12 +98,12 @@ impl<'a> Predictors<'a> {
         'a: 'b,
     {
         // The recipes check the number of samples themselves; the network does not.
-        if (self.train.len() as u64) < FEWEST_SAMPLES {
-            let count = self.train.len();
+        if (self.train.samples.len() as u64) < FEWEST_SAMPLES {
+            let count = self.train.samples.len();
             return Err(format!("needs at least {FEWEST_SAMPLES} training samples, has {count}"));
         }
         let plane = self.plane;
-        let network = dnn::fit(self.train, &plane, with_fix, seed);
+        let network = dnn::fit(self.train.samples, &plane, with_fix, seed);
         Ok(self.per_row(move |observation| {
             let bounding_box = &observation.bounding_box()?;
             let fix = observation.fix().filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
@@ -119,6 +119,7 @@ impl<'a> Predictors<'a> {
         let plane = self.plane;
         let pairs: Vec<(BoundingBox, EastNorth)> = self
             .train
+            .samples
             .iter()
             .map(|sample| (sample.bounding_box, plane.to_plane(sample.fix.position)))
             .collect();
@@ -135,7 +136,7 @@ impl<'a> Predictors<'a> {
         'a: 'b,
     {
         let variance_m2 = self.gnss_variance_m2(None);
-        let tuned = imm_ukf::tune(&fix_sequences(self.train, &self.plane), variance_m2);
+        let tuned = imm_ukf::tune(&fix_sequences(self.train.samples, &self.plane), variance_m2);
         let (plane, test) = (self.plane, self.test);
         Box::new(move |target| {
             let mut filter = ImmUkf::new(tuned);

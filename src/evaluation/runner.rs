@@ -12,21 +12,24 @@ use super::traces::{Curve, Evaluation, Trace, TracePoint};
 use super::training::{RecipeModel, Timed, fit_recipe, recipes_of};
 use crate::domain::{Method, Result, Sample, Truth};
 use crate::geo::{LocalPlane, Position};
+use crate::model::FitInput;
 
-/// Fits what the methods need on the training samples and scores every method on the test rows.
+/// Fits what the methods need on the training samples and scores every method on the test rows. Boxes
+/// without a fix serve the recipes alone.
 ///
 /// `progress` is called before every step; breaking ends the evaluation with the methods and seeds
 /// that were complete by then.
 ///
 /// # Errors
 /// A box shift that makes boxes invalid. A method that cannot run is named in the report instead.
-pub fn evaluate(
-    train: &[Sample],
+pub fn evaluate<'a>(
+    train: impl Into<FitInput<'a>>,
     test: &[TestRow],
     truth: &Truth,
     options: &EvaluateOptions,
     progress: &mut dyn FnMut(&Progress<'_>) -> ControlFlow<()>,
 ) -> Result<Evaluation> {
+    let train = train.into();
     let mut test = test.to_vec();
     for row in &mut test {
         row.observation = row
@@ -34,7 +37,7 @@ pub fn evaluate(
             .clone()
             .try_map_box(|bounding_box| bounding_box.grown_to_upper_left(options.box_shift_px))?;
     }
-    let plane = LocalPlane::new(first_fix(train, &test));
+    let plane = LocalPlane::new(first_fix(train.samples, &test));
     let mut run = Run {
         predictors: Predictors { train, test: &test, options, plane },
         truth,

@@ -12,6 +12,7 @@ fn options(methods: &str) -> EvaluateOptions {
         epochs: Some(40),
         image_size: None,
         gnss_sigma: Some(SigmaM::new(2.2).expect("valid")),
+        gnss_bias_sigma: None,
         box_shift_px: 0.0,
         cpu_s: || 0.0,
     }
@@ -90,7 +91,7 @@ fn a_method_that_cannot_run_is_named_and_the_others_run() {
     let mut rows = test_rows(&test);
     rows.iter_mut().for_each(|row| row.truth = None);
     let unscored =
-        evaluate(&[], &rows, &Truth::Columns, &options("gnss"), &mut |_| ControlFlow::Continue(()))
+        evaluate(&Vec::new(), &rows, &Truth::Columns, &options("gnss"), &mut |_| ControlFlow::Continue(()))
             .expect("valid boxes");
     assert!(unscored.report.failed.contains_key("gnss"));
 }

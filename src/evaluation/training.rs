@@ -3,8 +3,8 @@
 use std::ops::ControlFlow;
 
 use super::options::EvaluateOptions;
-use crate::domain::{EpochReport, GnssError, Method, Recipe, Sample};
-use crate::model::{FitEvent, FitOptions, Regressor, fit};
+use crate::domain::{EpochReport, GnssBiasSigma, GnssError, Method, Recipe};
+use crate::model::{FitEvent, FitInput, FitOptions, Regressor, fit};
 
 /// The result of a computation, or the reason why it failed, with the CPU time that it took.
 pub(super) struct Timed<T> {
@@ -40,7 +40,7 @@ pub(super) fn recipes_of(methods: &[Method], default: Recipe) -> Vec<Recipe> {
 pub(super) fn fit_recipe(
     recipe: Recipe,
     seed: u64,
-    train: &[Sample],
+    train: FitInput<'_>,
     options: &EvaluateOptions,
     progress: &mut dyn FnMut(&str) -> ControlFlow<()>,
 ) -> Timed<RecipeModel> {
@@ -50,6 +50,7 @@ pub(super) fn fit_recipe(
         epochs: options.epochs,
         image_size: options.image_size,
         gnss_error: options.gnss_sigma.map_or(GnssError::Unknown, GnssError::Known),
+        gnss_bias_sigma_m: options.gnss_bias_sigma.map(GnssBiasSigma::metres),
     };
     Timed::run(options, || {
         let mut curve = Vec::new();

@@ -2,7 +2,7 @@
 
 use std::io::Read;
 
-use super::columns::{HEIGHT, LATITUDE, LEFT, LONGITUDE, TARGET_ID, TIME};
+use super::columns::{HEIGHT, LEFT, TARGET_ID, TIME};
 use super::csv_rows::CsvRows;
 use super::elements::Elements;
 use super::file_row::{FileRow, RowError, shared};
@@ -10,8 +10,8 @@ use super::format::Format;
 use super::lines::{Line, Lines};
 use super::wire::{self, box_within};
 use crate::domain::{
-    Detection, Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, TargetClass, TargetId,
-    TimeBounds, parse_time,
+    Detection, Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, StoredSample, TargetClass,
+    TargetId, TimeBounds, parse_time,
 };
 use crate::geo::Position;
 
@@ -39,10 +39,14 @@ pub struct ObservedRow {
 
 /// Samples of a file, in the order of the file.
 ///
-/// CSV has the columns `time`, `target_id`, `left`, `top`, `width`, `height`, `longitude`,
-/// `latitude` in any order, also with their units (`left_px`, `longitude_deg`), and optionally
-/// `sigma_m`, `class`, `score`, `truth_longitude` and `truth_latitude`. NDJSON has a [`wire::Sample`]
-/// per line; JSON is an array of them, or an object `{"samples": [...]}`.
+/// CSV has the columns `time`, `target_id`, `left`, `top`, `width`, `height` in any order, also with their
+/// units (`left_px`), and optionally `longitude` and `latitude` (`longitude_deg`), `sigma_m`, `class`,
+/// `score`, `truth_longitude` and `truth_latitude`. NDJSON has a [`wire::Sample`] per line; JSON is an array
+/// of them, or an object `{"samples": [...]}`.
+///
+/// A row whose longitude and latitude are both empty (in JSON: without `fix`, or with null) is a sample
+/// without a fix; its `sigma_m` is ignored. One of the two alone is invalid, as is a file with one of the two
+/// columns alone.
 ///
 /// # Errors
 /// The outer error: the file cannot be read at all (no header, a column missing or unknown, not JSON, a
@@ -52,8 +56,8 @@ pub fn read_samples<R: Read>(
     reader: R,
     format: Format,
     rules: &RowRules,
-) -> Result<impl Iterator<Item = Result<Result<Sample, RowError>>> + use<R>> {
-    let required = [TIME, TARGET_ID, LEFT, LEFT + 1, LEFT + 2, HEIGHT, LONGITUDE, LATITUDE];
+) -> Result<impl Iterator<Item = Result<Result<StoredSample, RowError>>> + use<R>> {
+    let required = [TIME, TARGET_ID, LEFT, LEFT + 1, LEFT + 2, HEIGHT];
     let mut rows = Rows::new(reader, format, &required)?;
     let mut converter = RowConverter::new(*rules);
     Ok(std::iter::from_fn(move || rows.next_row(|row| converter.sample(&row))))
@@ -74,8 +78,8 @@ pub fn read_observations<R: Read>(
     Ok(std::iter::from_fn(move || rows.next_row(|row| converter.observed(&row))))
 }
 
-/// Detections of a file: rows as those of [`read_samples`] without a fix. `target_id` is the target of
-/// rows that name none. Other values of a row are ignored.
+/// Detections of a file: rows as those of [`read_samples`], whose fixes and true positions are ignored.
+/// `target_id` is the target of rows that name none.
 ///
 /// # Errors
 /// As [`read_samples`].
@@ -104,14 +108,14 @@ impl RowConverter {
         Self { rules, target_id: None, class: None }
     }
 
-    fn sample(&mut self, row: &FileRow<'_>) -> Result<Sample> {
+    fn sample(&mut self, row: &FileRow<'_>) -> Result<StoredSample> {
         let ObservedRow { observation, class, score, truth } = self.observed(row)?;
         let (time, target_id, bounding_box, fix) = observation.into_parts();
         Ok(Sample {
             time,
             target_id: target_id.ok_or_else(|| missing("target_id"))?,
             bounding_box: bounding_box.ok_or_else(|| missing("bounding_box"))?,
-            fix: fix.ok_or_else(|| missing("fix"))?,
+            fix,
             class,
             score,
             truth,

@@ -10,8 +10,8 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::domain::{
-    BoundingBox, Confidences, ErrorKind, Fix, Flag, FusedFix, ImageSize, Sample, Score, SigmaM, TargetClass,
-    TargetId, TimeBounds,
+    BoundingBox, Confidences, ErrorKind, Fix, Flag, FusedFix, ImageSize, Score, SigmaM, StoredSample,
+    TargetClass, TargetId, TimeBounds,
 };
 use crate::geo::Position;
 
@@ -20,7 +20,7 @@ fn rules() -> RowRules {
     RowRules { time_bounds: TimeBounds::at(now), image_size: None }
 }
 
-type Rows = Vec<Result<Sample, RowError>>;
+type Rows = Vec<Result<StoredSample, RowError>>;
 
 fn read(text: &[u8], format: Format) -> crate::domain::Result<Rows> {
     read_samples(text, format, &rules())?.collect()
@@ -70,17 +70,20 @@ prop_compose! {
         target in "[a-zé,\"][a-z \",]{0,6}[a-z\",]",
         (left, top) in (pixels(-100..9000), pixels(-100..9000)),
         (width, height) in (pixels(1..9000), pixels(1..9000)),
-        place in position(),
+        place in prop::option::of(position()),
         sigma in prop::option::of(0.001..10_000.0),
         class in prop::option::of("[a-z]{1,9}"),
         score in prop::option::of(0.0..=1.0),
         truth in prop::option::of(position()),
-    ) -> Sample {
-        Sample {
+    ) -> StoredSample {
+        StoredSample {
             time: Timestamp::from_microsecond(microsecond).expect("within range"),
             target_id: TargetId::new(&target).expect("a name"),
             bounding_box: BoundingBox::new(left, top, width, height).expect("a box"),
-            fix: Fix { position: place, sigma_m: sigma.map(|s| SigmaM::new(decimal(s)).expect("a sigma")) },
+            fix: place.map(|position| Fix {
+                position,
+                sigma_m: sigma.map(|s| SigmaM::new(decimal(s)).expect("a sigma")),
+            }),
             class: class.map(|name| TargetClass::new(&name).expect("a name")),
             score: score.map(|score| Score::new(decimal(score)).expect("a score")),
             truth,
@@ -99,7 +102,7 @@ proptest! {
         for format in [Format::Csv, Format::Ndjson, Format::Json] {
             let file = write_samples(Vec::new(), format, &samples).expect("memory");
             let back = read(&file, format).expect("own writing");
-            let back: Result<Vec<Sample>, RowError> = back.into_iter().collect();
+            let back: Result<Vec<StoredSample>, RowError> = back.into_iter().collect();
             prop_assert_eq!(back.as_ref(), Ok(&samples), "{:?}", format);
         }
     }
@@ -112,12 +115,16 @@ proptest! {
             .try_into().expect("a collection");
         prop_assert_eq!(collection.features.len(), samples.len());
         for (feature, sample) in collection.features.iter().zip(&samples) {
+            prop_assert_eq!(feature.property("target_id").and_then(|id| id.as_str()), Some(sample.target_id.as_str()));
+            let Some(fix) = sample.fix else {
+                prop_assert!(feature.geometry.is_none());
+                continue;
+            };
             let geometry = feature.geometry.as_ref().expect("a geometry");
             let geojson::GeometryValue::Point { coordinates: place } = &geometry.value else { panic!("{geometry:?}") };
-            let at = sample.fix.position;
+            let at = fix.position;
             prop_assert!((place[0] - at.longitude_deg()).abs() < 1e-9);
             prop_assert!((place[1] - at.latitude_deg()).abs() < 1e-9);
-            prop_assert_eq!(feature.property("target_id").and_then(|id| id.as_str()), Some(sample.target_id.as_str()));
         }
     }
 
@@ -177,7 +184,8 @@ fn invalid_fields_are_named() {
         ("2020-12-14T14:41:48Z,,475,11,28,77,103,30", 2, "target_id"),
         ("2020-12-14T14:41:48Z,person-1,475,,28,77,103,30", 2, "top"),
         ("2020-12-14T14:41:48Z,person-1,,,,,103,30", 2, "left"),
-        ("2020-12-14T14:41:48Z,person-1,475,11,28,77,,", 2, "longitude"),
+        ("2020-12-14T14:41:48Z,person-1,475,11,28,77,103,", 2, "latitude"),
+        ("2020-12-14T14:41:48Z,person-1,475,11,28,77,,30", 2, "longitude"),
         ("2020-12-14T14:41:48Z,person-1,475,11,28,77,103", 2, ""),
         ("2020-12-14T14:41:48Z,person-1,475,11,28,77,103,30,5", 2, ""),
     ] {
@@ -193,7 +201,8 @@ fn invalid_fields_are_named() {
         ("\"target_id\"", "\"target\"", "target"),
         ("\"target_id\":\"person-1\",", "", "target_id"),
         ("\"person-1\"", "7", "target_id"),
-        (",\"fix\":{\"longitude_deg\":103.98678,\"latitude_deg\":30.6280135}", "", "fix"),
+        ("\"longitude_deg\":103.98678,", "", "fix.longitude_deg"),
+        ("\"longitude_deg\":103.98678,\"latitude_deg\":30.6280135", "", "fix.longitude_deg"),
         ("2020-12-14T14:41:48+08:00", "2020-12-14T14:41:48", "time"),
     ] {
         let bad = GOOD_JSON.replace(from, to);
@@ -205,6 +214,25 @@ fn invalid_fields_are_named() {
             let error = row_error(&text, format);
             assert_eq!((error.line, error.field.as_str()), (2, field), "{bad}: {error:?}");
         }
+    }
+}
+
+#[test]
+fn a_row_without_longitude_and_latitude_is_a_sample_without_a_fix() {
+    let (before, after) = ("2020-12-14T14:41:48+08:00,person-1,475,11,28,77", "\n");
+    let bare = GOOD_JSON.replace(",\"fix\":{\"longitude_deg\":103.98678,\"latitude_deg\":30.6280135}", "");
+    let null = bare.replace("\"bounding_box\"", "\"fix\":null,\"bounding_box\"");
+    let documents = [
+        (format!("{HEADER}\n{before},,{after}"), Format::Csv),
+        (format!("{HEADER},sigma_m\n{before},,,2.5{after}"), Format::Csv),
+        (format!("time,target_id,left,top,width,height\n{before}{after}"), Format::Csv),
+        (bare.clone(), Format::Ndjson),
+        (format!("[{null}]"), Format::Json),
+    ];
+    let with_fix = rows(GOOD_JSON, Format::Ndjson).remove(0).expect("a sample");
+    for (text, format) in documents {
+        let read = rows(&text, format);
+        assert_eq!(read, [Ok(StoredSample { fix: None, ..with_fix.clone() })], "{text}");
     }
 }
 
@@ -240,11 +268,11 @@ fn columns_are_accepted_in_any_order_and_with_units() {
                 sigma_m,truth_latitude,truth_longitude\r\n\
                 30.6280135,103.98678,0.9,person,77,28,11,475,\"a, \"\"b\"\"\",2020-12-14T14:41:48+08:00,2.5,,\r\n\r\n\
                 30.6280135,103.98678,,,77,28,11,475,c,2020-12-14T06:41:48Z,,30.6,103.9";
-    let samples: Vec<Sample> =
+    let samples: Vec<StoredSample> =
         rows(text, Format::Csv).into_iter().map(|row| row.expect("a sample")).collect();
     assert_eq!(samples.len(), 2);
     assert_eq!(samples[0].target_id.as_str(), "a, \"b\"");
-    assert_eq!(samples[0].fix.sigma_m, Some(SigmaM::new(2.5).expect("a sigma")));
+    assert_eq!(samples[0].fix.expect("a fix").sigma_m, Some(SigmaM::new(2.5).expect("a sigma")));
     assert_eq!(samples[0].truth, None);
     assert_eq!(samples[1].truth, Some(Position::new(103.9, 30.6).expect("a position")));
     assert_eq!(samples[1].class, None);
@@ -363,13 +391,13 @@ fn shared_file(name: &str) -> File {
 #[ignore = "needs ../shared/data"]
 fn shared_samples_are_read_and_written() {
     let file = shared_file("training.csv");
-    let samples: Result<Vec<Sample>, RowError> =
+    let samples: Result<Vec<StoredSample>, RowError> =
         read_samples(file, Format::Csv, &rules()).expect("a file").map(|row| row.expect("a line")).collect();
     let samples = samples.expect("only valid rows");
     assert_eq!(samples.len(), 10_078);
     for format in [Format::Csv, Format::Ndjson, Format::Json] {
         let written = write_samples(Vec::new(), format, &samples).expect("memory");
-        let back: Result<Vec<Sample>, RowError> =
+        let back: Result<Vec<StoredSample>, RowError> =
             read(&written, format).expect("own writing").into_iter().collect();
         assert!(back.as_ref() == Ok(&samples), "{format:?}");
     }

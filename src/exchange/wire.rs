@@ -90,6 +90,12 @@ impl Fix {
             sigma_m: sigma_m.map(SigmaM::new).transpose()?,
         })
     }
+
+    /// The position alone.
+    #[must_use]
+    pub const fn position(self) -> Position {
+        Position { longitude_deg: self.longitude_deg, latitude_deg: self.latitude_deg }
+    }
 }
 
 impl From<domain::Fix> for Fix {
@@ -135,7 +141,8 @@ impl From<domain::BoundingBox> for BoundingBox {
     }
 }
 
-/// A box and a fix of one target at one instant, stored for training. Unique by target and time.
+/// A box of one target at one instant and its fix, if it has one, stored for training. Unique by target and
+/// time.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct Sample<'a> {
     /// RFC 3339 with an offset; stored to the microsecond.
@@ -146,8 +153,9 @@ pub struct Sample<'a> {
     pub target_id: &'a str,
     /// The detection.
     pub bounding_box: BoundingBox,
-    /// The fix.
-    pub fix: Fix,
+    /// The fix. A box without one contributes to the geometry of the camera, not to its place.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fix: Option<Fix>,
     /// Class reported by the detector.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, example = "person")]
@@ -161,13 +169,13 @@ pub struct Sample<'a> {
     pub truth: Option<Position>,
 }
 
-impl<'a> From<&'a domain::Sample> for Sample<'a> {
-    fn from(sample: &'a domain::Sample) -> Self {
+impl<'a, F: Copy + Into<Option<domain::Fix>>> From<&'a domain::Sample<F>> for Sample<'a> {
+    fn from(sample: &'a domain::Sample<F>) -> Self {
         Self {
             time: sample.time,
             target_id: sample.target_id.as_str(),
             bounding_box: sample.bounding_box.into(),
-            fix: sample.fix.into(),
+            fix: sample.fix.into().map(Fix::from),
             class: sample.class.as_ref().map(domain::TargetClass::as_str),
             score: sample.score.map(domain::Score::value),
             truth: sample.truth.map(Position::from),

@@ -13,7 +13,7 @@ use super::columns::{COLUMNS, OF_SAMPLES};
 use super::format::Format;
 use super::formula_guard::guarded;
 use super::wire;
-use crate::domain::{FusedFix, Sample};
+use crate::domain::{Fix, FusedFix, Sample};
 
 /// Writes samples one by one. Between two of them the output can be drained (`get_mut`), so an export of
 /// any length needs the memory of one page.
@@ -25,17 +25,17 @@ impl<W: Write> SampleWriter<W> {
         Self(Document::new(out, format, "samples"))
     }
 
-    /// Writes one sample.
+    /// Writes one sample. Without a fix its columns are empty, and its GeoJSON feature has no geometry.
     ///
     /// # Errors
     /// An I/O error of the output.
-    pub fn write(&mut self, sample: &Sample) -> io::Result<()> {
+    pub fn write<F: Copy + Into<Option<Fix>>>(&mut self, sample: &Sample<F>) -> io::Result<()> {
         let row = wire::Sample::from(sample);
         match self.0.format {
             Format::Csv => self.0.csv_row(sample_header, |out| sample_cells(out, &row)),
             Format::Ndjson | Format::Json => self.0.json_row(&row),
             Format::GeoJson => {
-                let position = wire::Position::from(sample.fix.position);
+                let position = row.fix.map(|fix| fix.position());
                 self.0.json_row(&Feature::new(position, &row))
             }
         }
@@ -73,7 +73,7 @@ impl<W: Write> FusedWriter<W> {
         match self.0.format {
             Format::Csv => self.0.csv_row(fused_header, |out| fused_cells(out, &row)),
             Format::Ndjson | Format::Json => self.0.json_row(&row),
-            Format::GeoJson => self.0.json_row(&Feature::new(row.fused, &row)),
+            Format::GeoJson => self.0.json_row(&Feature::new(Some(row.fused), &row)),
         }
     }
 
@@ -95,10 +95,10 @@ impl<W: Write> FusedWriter<W> {
 ///
 /// # Errors
 /// An I/O error of the output.
-pub fn write_samples<'a, W: Write>(
+pub fn write_samples<'a, W: Write, F: Copy + Into<Option<Fix>> + 'a>(
     out: W,
     format: Format,
-    samples: impl IntoIterator<Item = &'a Sample>,
+    samples: impl IntoIterator<Item = &'a Sample<F>>,
 ) -> io::Result<W> {
     let mut writer = SampleWriter::new(out, format);
     for sample in samples {
@@ -196,8 +196,8 @@ fn sample_cells<W: Write>(out: &mut W, row: &wire::Sample<'_>) -> io::Result<()>
     let wire::BoundingBox { left_px, top_px, width_px, height_px } = row.bounding_box;
     write!(out, "{},{},", row.time, text_cell(row.target_id))?;
     write!(out, "{left_px},{top_px},{width_px},{height_px},")?;
-    write!(out, "{:.8},{:.8},", row.fix.longitude_deg, row.fix.latitude_deg)?;
-    cell(out, row.fix.sigma_m)?;
+    degrees(out, row.fix.map(|fix| fix.position()))?;
+    cell(out, row.fix.and_then(|fix| fix.sigma_m))?;
     cell(out, row.class.map(text_cell))?;
     cell(out, row.score)?;
     match row.truth {
@@ -221,13 +221,7 @@ fn fused_cells<W: Write>(out: &mut W, row: &wire::FusedFix<'_>) -> io::Result<()
     write!(out, "{},", row.r95_m)?;
     degrees(out, row.regressed)?;
     let fix = row.gnss;
-    degrees(
-        out,
-        fix.map(|wire::Fix { longitude_deg, latitude_deg, .. }| wire::Position {
-            longitude_deg,
-            latitude_deg,
-        }),
-    )?;
+    degrees(out, fix.map(|fix| fix.position()))?;
     cell(out, fix.and_then(|fix| fix.sigma_m))?;
     write!(out, "{},{},", row.confidence_regression, row.confidence_gnss)?;
     cell(out, row.e_regression_m2)?;
@@ -258,11 +252,12 @@ fn text_cell(name: &str) -> Cow<'_, str> {
     if name.contains([',', '"']) { Cow::Owned(format!("\"{}\"", name.replace('"', "\"\""))) } else { name }
 }
 
-/// A GeoJSON feature: a point with properties.
+/// A GeoJSON feature: a point with properties; the geometry is null where there is no position (RFC 7946,
+/// 3.2).
 #[derive(Serialize)]
 struct Feature<P> {
     r#type: &'static str,
-    geometry: PointGeometry,
+    geometry: Option<PointGeometry>,
     properties: P,
 }
 
@@ -273,8 +268,11 @@ struct PointGeometry {
 }
 
 impl<P> Feature<P> {
-    const fn new(position: wire::Position, properties: P) -> Self {
-        let coordinates = [position.longitude_deg, position.latitude_deg];
-        Self { r#type: "Feature", geometry: PointGeometry { r#type: "Point", coordinates }, properties }
+    fn new(position: Option<wire::Position>, properties: P) -> Self {
+        let geometry = position.map(|wire::Position { longitude_deg, latitude_deg }| PointGeometry {
+            r#type: "Point",
+            coordinates: [longitude_deg, latitude_deg],
+        });
+        Self { r#type: "Feature", geometry, properties }
     }
 }

@@ -14,10 +14,10 @@ use std::str::FromStr;
 
 use jiff::SignedDuration;
 
-use crate::domain::{Detection, Error, Receivers, Result, Sample};
+use crate::domain::{Detection, Error, Receivers, Result, Sample, StoredSample};
 
-pub use self::outcome::{ItemOutcome, Released};
-pub use self::stream::{PairedItems, Pairer};
+pub use self::outcome::{ItemOutcome, PairedItems, Released};
+pub use self::stream::Pairer;
 pub use crate::domain::ReceivedFix;
 
 /// How a box finds its fix.
@@ -132,12 +132,27 @@ pub struct Unpaired {
 pub struct Paired {
     /// In order of time, then target.
     pub samples: Vec<Sample>,
-    /// The rest, counted.
+    /// Boxes without a partner, in order of time, then target.
+    pub unpaired_detections: Vec<Detection>,
+    /// All that is part of no sample, counted.
     pub unpaired: Unpaired,
     /// Of the boxes without a partner, those of targets that no fix belongs to.
     pub detections_without_fixes: u64,
     /// Of the fixes without a partner, those of targets that no box shows.
     pub fixes_without_detections: u64,
+}
+
+impl Paired {
+    /// The samples in order of time, then target; with the boxes that found no fix, if they are kept.
+    #[must_use]
+    pub fn into_samples(self, keeps_unpaired: bool) -> Vec<StoredSample> {
+        let mut samples: Vec<StoredSample> = self.samples.into_iter().map(Into::into).collect();
+        if keeps_unpaired {
+            samples.extend(self.unpaired_detections.into_iter().map(StoredSample::from));
+            samples.sort_by(|one, other| (one.time, &one.target_id).cmp(&(other.time, &other.target_id)));
+        }
+        samples
+    }
 }
 
 /// Pairs two recorded lists, in any order.
@@ -164,9 +179,10 @@ pub fn pair(
         pairer.insert_fix(&target_id, time, received.fix, ());
     }
     let (detections, fixes) = pairer.items_of_lone_sources();
-    let samples = pairer.finish();
+    let PairedItems { samples, unpaired_detections, .. } = pairer.finish();
     Paired {
         samples,
+        unpaired_detections,
         unpaired: pairer.unpaired,
         detections_without_fixes: detections as u64,
         fixes_without_detections: fixes as u64,

@@ -7,8 +7,8 @@ use super::proto::camera_service_server::CameraService;
 use super::statuses::{Reply, answer};
 use crate::app::App;
 use crate::domain::{
-    Camera, CameraChange, CameraId, ClockOffset, Error, GnssError, ImageSize, NewCamera, Receiver,
-    ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, NewCamera,
+    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
 };
 
 pub(super) struct Cameras {
@@ -105,6 +105,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
             .unwrap_or(named.display_name),
         image_size: profile.image_size.map(image_size).transpose()?,
         gnss_error: gnss_error(profile.gnss_error)?,
+        gnss_bias_sigma: profile.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
         recipe: recipe(profile.recipe)?.unwrap_or_default(),
         target_classes: classes.collect::<Result<_>>()?,
         labels: profile.labels.into_iter().collect(),
@@ -156,7 +157,7 @@ fn gnss_error(error: Option<proto::GnssError>) -> Result<GnssError> {
 }
 
 /// The fields of a profile, as a mask names them.
-const FIELDS: [&str; 8] = [
+const FIELDS: [&str; 9] = [
     "display_name",
     "image_size",
     "gnss_error",
@@ -165,6 +166,7 @@ const FIELDS: [&str; 8] = [
     "labels",
     "receivers",
     "retrain_when_moved",
+    "gnss_bias_sigma_m",
 ];
 
 /// The fields that the mask names, or those that the profile has.
@@ -191,6 +193,7 @@ fn camera_change(
         display_name: named("display_name").then_some(profile.display_name),
         image_size: named("image_size").then_some(profile.image_size),
         gnss_error: named("gnss_error").then_some(profile.gnss_error),
+        gnss_bias_sigma: named("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
         recipe: named("recipe").then_some(profile.recipe),
         target_classes: named("target_classes").then_some(profile.target_classes),
         labels: named("labels").then_some(profile.labels),
@@ -210,6 +213,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         !profile.labels.is_empty(),
         !profile.receivers.is_empty(),
         profile.retrain_when_moved.is_some(),
+        profile.gnss_bias_sigma_m.is_some(),
     ];
     FIELDS.into_iter().zip(has).filter_map(|(field, has)| has.then_some(field)).collect()
 }
@@ -226,6 +230,8 @@ impl proto::Camera {
             created_at: Some(timestamp(camera.created_at)),
             updated_at: Some(timestamp(camera.updated_at)),
             active_model: camera.active_model,
+            samples: camera.samples.all,
+            samples_without_fix: camera.samples.without_fix,
         }
     }
 }
@@ -247,6 +253,7 @@ impl From<NewCamera> for proto::CameraProfile {
             labels: profile.labels.into_iter().collect(),
             receivers: profile.receivers.iter().map(Into::into).collect(),
             retrain_when_moved: Some(profile.retrain_when_moved),
+            gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
         }
     }
 }

@@ -5,8 +5,8 @@ use jiff::Timestamp;
 
 use super::proto;
 use crate::domain::{
-    self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Sample,
-    Score, TargetClass, TargetId, TimeRange,
+    self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Score,
+    StoredSample, TargetClass, TargetId, TimeRange,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -142,12 +142,12 @@ fn target_id(id: Option<&str>) -> Result<Option<TargetId>> {
 }
 
 /// A sample that keeps the rules of its camera.
-pub(super) fn sample(sample: proto::Sample, rules: &RowRules) -> Result<Sample> {
-    Ok(Sample {
+pub(super) fn sample(sample: proto::Sample, rules: &RowRules) -> Result<StoredSample> {
+    Ok(StoredSample {
         time: checked_time(sample.time, rules)?,
         target_id: TargetId::new(required_text(&sample.target_id, "target_id")?)?,
         bounding_box: bounding_box(required(sample.bounding_box, "bounding_box")?, rules)?,
-        fix: fix(required(sample.fix, "fix")?).map_err(|error| error.under("fix"))?,
+        fix: sample.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,
         class: sample.class.as_deref().map(TargetClass::new).transpose()?,
         score: sample.score.map(Score::new).transpose()?,
         truth: sample.truth.map(position).transpose().map_err(|error| error.under("truth"))?,
@@ -183,7 +183,7 @@ pub(super) fn sample_filter(filter: Option<proto::SampleFilter>) -> Result<Sampl
     let read = || {
         let range = TimeRange::new(instant(filter.from, "from")?, instant(filter.until, "until")?)?;
         let target_id = target_id(filter.target_id.as_deref())?;
-        Ok(SampleFilter { target_id, ..SampleFilter::within(range) })
+        Ok(SampleFilter { target_id, has_fix: filter.has_fix, ..SampleFilter::within(range) })
     };
     read().map_err(|error: Error| error.under("filter"))
 }
@@ -225,13 +225,13 @@ impl From<RowError> for proto::RejectedRow {
     }
 }
 
-impl From<Sample> for proto::Sample {
-    fn from(sample: Sample) -> Self {
+impl From<StoredSample> for proto::Sample {
+    fn from(sample: StoredSample) -> Self {
         Self {
             time: Some(timestamp(sample.time)),
             target_id: sample.target_id.as_str().to_owned(),
             bounding_box: Some(sample.bounding_box.into()),
-            fix: Some(sample.fix.into()),
+            fix: sample.fix.map(Into::into),
             class: sample.class.map(|class| class.as_str().to_owned()),
             score: sample.score.map(Score::value),
             truth: sample.truth.map(Into::into),
@@ -276,8 +276,9 @@ mod tests {
 
     #[test]
     fn a_sample_comes_back_as_it_went() {
-        let sent = good();
-        assert_eq!(proto::Sample::from(sample(sent.clone(), &rules()).expect("good")), sent);
+        for sent in [good(), proto::Sample { fix: None, ..good() }] {
+            assert_eq!(proto::Sample::from(sample(sent.clone(), &rules()).expect("good")), sent);
+        }
     }
 
     #[test]
@@ -292,7 +293,6 @@ mod tests {
         assert_eq!(without(|sample| sample.time = None), "time");
         assert_eq!(without(|sample| sample.target_id.clear()), "target_id");
         assert_eq!(without(|sample| sample.bounding_box = None), "bounding_box");
-        assert_eq!(without(|sample| sample.fix = None), "fix");
         let fix = |sample: &mut proto::Sample| sample.fix = Some(proto::Fix::default());
         assert_eq!(without(fix), "fix.longitude_deg");
         let sides = |sample: &mut proto::Sample| sample.bounding_box.as_mut().expect("set").top_px = None;

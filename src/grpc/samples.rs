@@ -10,7 +10,7 @@ use super::proto::sample_service_server::SampleService;
 use super::statuses::{Reply, answer, broken};
 use crate::admission::BodyRefusal;
 use crate::app::{App, ImportReport, RejectedRow};
-use crate::domain::{Durability, Error, ErrorKind, Result, Sample};
+use crate::domain::{Durability, Error, ErrorKind, Result, SampleCount, StoredSample};
 use crate::exchange::RowRules;
 use crate::shutdown::Shutdown;
 use crate::store::{SampleFilter, SampleKey};
@@ -75,7 +75,8 @@ impl SampleService for Samples {
         answer(request, |asked| async move {
             let filter = sample_filter(asked.filter)?;
             let count = self.app.count_samples(&camera_id(&asked.camera_id)?, &filter).await?;
-            Ok(proto::CountSamplesResponse { count })
+            let SampleCount { all, without_fix } = count;
+            Ok(proto::CountSamplesResponse { count: all, without_fix })
         })
         .await
     }
@@ -90,7 +91,7 @@ impl SampleService for Samples {
             if filter == SampleFilter::default() {
                 return Err(Error::invalid(
                     "filter",
-                    "must have from, until or target_id, so that not all samples go by an oversight",
+                    "must have from, until, target_id or has_fix, so that not all samples go by an oversight",
                 ));
             }
             let deleted = self.app.delete_samples(&camera, &filter).await?;
@@ -140,7 +141,7 @@ fn rows(
     first: Vec<proto::Sample>,
     batches: Batches,
     rules: RowRules,
-) -> impl Stream<Item = Result<Result<Sample, RejectedRow>>> + Send {
+) -> impl Stream<Item = Result<Result<StoredSample, RejectedRow>>> + Send {
     let later = stream::try_unfold(batches, |mut batches| async move {
         Ok(batches.samples().await?.map(|samples| (samples, batches)))
     });
@@ -160,6 +161,7 @@ fn rows(
 fn imported(report: ImportReport, durability: Durability) -> proto::ImportSamplesResponse {
     proto::ImportSamplesResponse {
         accepted: report.accepted,
+        accepted_without_fix: report.without_fix,
         duplicate: report.duplicate,
         rejected: report.rejected,
         rejected_rows: report.rejected_rows.into_iter().map(Into::into).collect(),

@@ -12,7 +12,10 @@ use super::proto::training_service_server::TrainingService;
 use super::statuses::{Reply, answer, client_address, request_id, to_status};
 use crate::admission::Lease;
 use crate::app::{App, RunRequest};
-use crate::domain::{EpochReport, Error, ErrorKind, JobState, Result, RunId, RunProgress, TrainingRun};
+use crate::domain::{
+    CandidateFinding, EpochReport, Error, ErrorKind, JobState, Result, RunId, RunProgress, TrainingReport,
+    TrainingRun,
+};
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -188,10 +191,34 @@ impl From<TrainingRun> for proto::TrainingRun {
             progress: Some(run.progress.into()),
             attempt: run.attempt,
             model_version: run.model_version,
+            report: run.report.map(Into::into),
             outcome: run.outcome,
             created_at: Some(timestamp(run.created_at)),
             started_at: run.started_at.map(timestamp),
             ended_at: run.ended_at.map(timestamp),
+        }
+    }
+}
+
+impl From<TrainingReport> for proto::TrainingReport {
+    fn from(report: TrainingReport) -> Self {
+        let text = report.to_string();
+        Self {
+            candidates: report.candidates.into_iter().map(Into::into).collect(),
+            advice: report.advice,
+            text,
+        }
+    }
+}
+
+impl From<CandidateFinding> for proto::CandidateFinding {
+    fn from(finding: CandidateFinding) -> Self {
+        Self {
+            candidate: finding.candidate,
+            weight: finding.weight,
+            held_out_miss_m: finding.held_out_miss_m,
+            coverage95_of_fixes: finding.coverage95_of_fixes,
+            summary: finding.summary,
         }
     }
 }

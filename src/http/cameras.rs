@@ -17,7 +17,9 @@ use super::problem::{ApiResult, Problem};
 use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, created, empty, json, nullable, with_etag};
 use crate::app::App;
-use crate::domain::{self, CameraId, Error, ErrorKind, NewCamera, Result, Revision, SigmaM, TargetClass};
+use crate::domain::{
+    self, CameraId, Error, ErrorKind, GnssBiasSigma, NewCamera, Result, Revision, SigmaM, TargetClass,
+};
 use crate::exchange::write_cursor;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -91,6 +93,10 @@ struct CameraDraft {
     image_size: Option<ImageSize>,
     /// `"unknown"` if left out.
     gnss_error: Option<GnssError>,
+    /// Standard deviation per axis, m, of the bias that all fixes have in common, which no sample can show;
+    /// without it, the model has a prior of its own.
+    #[schema(exclusive_minimum = 0.0, maximum = 100.0, example = 1.5)]
+    gnss_bias_sigma_m: Option<f64>,
     /// The server's default if left out.
     recipe: Option<Recipe>,
     /// Classes that the camera is used for; none means all.
@@ -116,6 +122,7 @@ impl CameraDraft {
             display_name: self.display_name.unwrap_or(blank.display_name),
             image_size: self.image_size.map(ImageSize::to_domain).transpose()?,
             gnss_error: self.gnss_error.map_or(Ok(blank.gnss_error), GnssError::to_domain)?,
+            gnss_bias_sigma: self.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
             recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
             target_classes: classes(&self.target_classes)?,
             labels: self.labels,
@@ -151,6 +158,11 @@ struct CameraChange {
     #[serde(default, deserialize_with = "nullable")]
     #[schema(value_type = Option<GnssError>)]
     gnss_error: Option<Option<GnssError>>,
+    /// New standard deviation per axis, m, of the bias that all fixes have in common; null is the model's own
+    /// prior.
+    #[serde(default, deserialize_with = "nullable")]
+    #[schema(value_type = Option<f64>, exclusive_minimum = 0.0, maximum = 100.0)]
+    gnss_bias_sigma_m: Option<Option<f64>>,
     /// New recipe, for runs to come.
     recipe: Option<Recipe>,
     /// New classes, all of them.
@@ -172,6 +184,10 @@ impl CameraChange {
             gnss_error: self
                 .gnss_error
                 .map(|error| error.map_or(Ok(domain::GnssError::Unknown), GnssError::to_domain))
+                .transpose()?,
+            gnss_bias_sigma: self
+                .gnss_bias_sigma_m
+                .map(|sigma_m| sigma_m.map(GnssBiasSigma::new).transpose())
                 .transpose()?,
             recipe: self.recipe.map(domain::Recipe::from),
             target_classes: self.target_classes.as_deref().map(classes).transpose()?,
@@ -195,6 +211,9 @@ pub(super) struct Camera {
     image_size: Option<ImageSize>,
     /// The receiver's error.
     gnss_error: GnssError,
+    /// Standard deviation per axis, m, of the bias that all fixes have in common, if stated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    gnss_bias_sigma_m: Option<f64>,
     /// How the camera is learnt.
     recipe: Recipe,
     /// Classes that the camera is used for; none means all.
@@ -222,6 +241,10 @@ pub(super) struct Camera {
     /// Set if the camera no longer looks where it looked when its active model was trained.
     #[serde(skip_serializing_if = "Option::is_none")]
     moved: Option<CameraMoved>,
+    /// Number of stored samples.
+    samples: u64,
+    /// Of these, those without a fix.
+    samples_without_fix: u64,
     /// What is lost by what was left out.
     warnings: Vec<String>,
 }
@@ -231,7 +254,8 @@ impl Camera {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
         let warnings = camera.profile.warnings();
-        let domain::Camera { profile, revision, created_at, updated_at, active_model, key: _ } = camera;
+        let domain::Camera { profile, revision, created_at, updated_at, active_model, samples, key: _ } =
+            camera;
         Self {
             id: profile.id.as_str().to_owned(),
             display_name: profile.display_name,
@@ -239,6 +263,7 @@ impl Camera {
                 .image_size
                 .map(|size| ImageSize { width_px: size.width_px(), height_px: size.height_px() }),
             gnss_error: profile.gnss_error.into(),
+            gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             recipe: profile.recipe.into(),
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels,
@@ -250,6 +275,8 @@ impl Camera {
             active_model,
             model_fault,
             moved,
+            samples: samples.all,
+            samples_without_fix: samples.without_fix,
             warnings,
         }
     }

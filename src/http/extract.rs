@@ -180,6 +180,11 @@ impl Params {
         Ok(limit.unwrap_or(PAGE_ITEMS.min(most)))
     }
 
+    /// `true` or `false`; its refusal names the parameter.
+    pub(super) fn flag(&mut self, name: &str) -> Result<Option<bool>> {
+        self.take(name, |text| text.parse().map_err(|_| Error::invalid(name, "must be true or false")))
+    }
+
     /// `durability`: when stored samples are acknowledged.
     pub(super) fn durability(&mut self) -> Result<Durability> {
         Ok(self.take("durability", str::parse)?.unwrap_or_default())

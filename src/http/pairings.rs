@@ -41,6 +41,8 @@ struct PairingParts {
 struct PairedSamples {
     /// Samples stored now.
     accepted: u64,
+    /// Of the accepted ones, those without a fix.
+    accepted_without_fix: u64,
     /// Samples of which the same camera, target and time were stored before.
     duplicate: u64,
     /// Rows of both parts that are none.
@@ -145,6 +147,9 @@ struct ClockOffsetEstimate {
 /// receiver; else of the only target among the detections. The device that a report of gpsd names is
 /// a receiver if it is among the camera's, and no name else.
 ///
+/// With `keep_unpaired` the boxes that find no fix, other than duplicates, are stored as samples without a
+/// fix, whose boxes training uses for the geometry of the camera.
+///
 /// One bad row never loses the others. Sending the same again does no harm.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/samples/pairings", tag = "samples",
@@ -155,6 +160,7 @@ struct ClockOffsetEstimate {
         ("longest_gap_s" = Option<f64>, Query, description = "Fixes are joined over at most this long a gap (interpolate), 2.5 if left out"),
         ("target_id" = Option<String>, Query, description = "The target of boxes that name none"),
         ("receiver_id" = Option<String>, Query, description = "The receiver of fixes that name none"),
+        ("keep_unpaired" = Option<bool>, Query, description = "Store the boxes that find no fix as samples without one"),
         ("durability" = Option<String>, Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
         ("estimate_offset" = Option<bool>, Query, description = "Tell the receivers' clock offsets as the files show them; they are not applied"),
     ),
@@ -170,7 +176,8 @@ async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, reques
     let settings = settings(&mut params)?;
     let target_id = params.take("target_id", TargetId::new)?;
     let receiver_id = params.take("receiver_id", ReceiverId::new)?;
-    let estimates_offsets = params.take("estimate_offset", truth)?.unwrap_or(false);
+    let estimates_offsets = params.flag("estimate_offset")?.unwrap_or(false);
+    let keeps_unpaired = params.flag("keep_unpaired")?.unwrap_or(false);
     let durability = params.durability()?;
     params.end()?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
@@ -197,6 +204,7 @@ async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, reques
         settings,
         target_id,
         receiver_id,
+        keeps_unpaired,
         durability,
         estimates_offsets,
     };
@@ -214,15 +222,12 @@ fn settings(params: &mut Params) -> Result<PairingSettings> {
     PairingSettings::new(method, window_s, longest_gap_s)
 }
 
-fn truth(text: &str) -> Result<bool> {
-    text.parse().map_err(|_| Error::invalid("estimate_offset", "must be true or false"))
-}
-
 fn paired_samples(report: PairedReport, durability: domain::Durability, with_offsets: bool) -> PairedSamples {
     let PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets } = report;
     let estimates = clock_offsets.iter().map(|(receiver, found)| offset(receiver, found.as_ref()));
     PairedSamples {
         accepted: samples.accepted,
+        accepted_without_fix: samples.without_fix,
         duplicate: samples.duplicate,
         rejected: rejected.count,
         rejected_rows: rejected.rows.into_iter().map(|(part, row)| rejected_row(part, row)).collect(),

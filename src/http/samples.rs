@@ -18,7 +18,7 @@ use super::problem::{ApiResult, Problem};
 use super::wire::{Durability, json};
 use super::{Rest, body};
 use crate::app::{App, ImportReport};
-use crate::domain::{self, CameraId, Error, Result, Sample, TargetId, TimeRange};
+use crate::domain::{self, CameraId, Error, Result, StoredSample, TargetId, TimeRange};
 use crate::exchange::wire;
 use crate::exchange::{Format, SampleWriter, write_cursor};
 use crate::store::{SampleFilter, SampleKey};
@@ -37,6 +37,8 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 pub(super) struct Imported {
     /// Stored now.
     accepted: u64,
+    /// Of the accepted ones, those without a fix.
+    accepted_without_fix: u64,
     /// The same camera, target and time were stored before, or appear twice in the import.
     duplicate: u64,
     /// Not stored for a fault of their own.
@@ -67,9 +69,10 @@ impl From<crate::app::RejectedRow> for RejectedRow {
 
 impl Imported {
     fn new(report: ImportReport, durability: domain::Durability) -> Self {
-        let ImportReport { accepted, duplicate, rejected, rejected_rows } = report;
+        let ImportReport { accepted, without_fix, duplicate, rejected, rejected_rows } = report;
         let rejected_rows = rejected_rows.into_iter().map(RejectedRow::from).collect();
-        Self { accepted, duplicate, rejected, rejected_rows, durability: durability.into() }
+        let durability = durability.into();
+        Self { accepted, accepted_without_fix: without_fix, duplicate, rejected, rejected_rows, durability }
     }
 }
 
@@ -88,6 +91,8 @@ struct SamplePage<'a> {
 struct SampleCount {
     /// Their number.
     count: u64,
+    /// Of these, those without a fix.
+    without_fix: u64,
 }
 
 /// How many samples were deleted.
@@ -99,13 +104,16 @@ struct DeletedSamples {
 
 /// Import samples
 ///
-/// CSV has a header naming the columns `time`, `target_id`, `left`, `top`, `width`, `height`,
-/// `longitude`, `latitude` in any order (also with their units: `left_px`, `longitude_deg`), and
-/// optional `sigma_m`, `class`, `score`, `truth_longitude`, `truth_latitude`. NDJSON has one sample
-/// a line. JSON is an array of samples, or an object with the array `samples`.
+/// CSV has a header naming the columns `time`, `target_id`, `left`, `top`, `width`, `height` in any order
+/// (also with their units: `left_px`), and optional `longitude` and `latitude` (`longitude_deg`), `sigma_m`,
+/// `class`, `score`, `truth_longitude`, `truth_latitude`. NDJSON has one sample a line. JSON is an array of
+/// samples, or an object with the array `samples`.
 ///
-/// One bad row never loses the others. Samples that are stored already are counted, not stored
-/// again, so an import that broke off can be sent again as it is.
+/// A row whose longitude and latitude are both empty, or in JSON one without `fix`, is a sample without a
+/// fix. Training uses its box for the geometry of the camera. One of the two alone is rejected.
+///
+/// One bad row never loses the others. Samples that are stored already are counted, not stored again, so an
+/// import that broke off can be sent again as it is; but a sample with a fix takes the place of one without.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/samples", tag = "samples",
     params(
@@ -151,6 +159,7 @@ fn import_format(headers: &HeaderMap) -> Result<Format> {
         ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
         ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
         ("target_id" = Option<String>, Query, description = "Of this target alone"),
+        ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
         ("limit" = Option<u32>, Query, description = "Items on a page of JSON, 100 if left out"),
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page of JSON before"),
     ),
@@ -205,7 +214,7 @@ struct Export {
     id: CameraId,
     filter: SampleFilter,
     writer: SampleWriter<Vec<u8>>,
-    page: Vec<Sample>,
+    page: Vec<StoredSample>,
     next: Option<SampleKey>,
 }
 
@@ -262,6 +271,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
         ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
         ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
         ("target_id" = Option<String>, Query, description = "Of this target alone"),
+        ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
     ),
     responses((status = 200, description = "Their number", body = SampleCount))
 )]
@@ -269,7 +279,8 @@ async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: 
     let mut params = Params::of(&uri)?;
     let filter = filter(&mut params)?;
     params.end()?;
-    Ok(json(&SampleCount { count: app.count_samples(&id, &filter).await? })?)
+    let domain::SampleCount { all, without_fix } = app.count_samples(&id, &filter).await?;
+    Ok(json(&SampleCount { count: all, without_fix })?)
 }
 
 /// Delete samples
@@ -282,6 +293,7 @@ async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: 
         ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
         ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
         ("target_id" = Option<String>, Query, description = "Of this target alone"),
+        ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
     ),
     responses((status = 200, description = "How many were deleted", body = DeletedSamples))
 )]
@@ -290,12 +302,18 @@ async fn delete_samples(State(app): State<App>, CameraPath(id): CameraPath, uri:
     let filter = filter(&mut params)?;
     params.end()?;
     if filter == SampleFilter::default() {
-        return Err(Error::invalid("from", "give from, until or target_id: which samples to delete").into());
+        return Err(Error::invalid(
+            "from",
+            "give from, until, target_id or has_fix: which samples to delete",
+        )
+        .into());
     }
     Ok(json(&DeletedSamples { deleted: app.delete_samples(&id, &filter).await? })?)
 }
 
 fn filter(params: &mut Params) -> Result<SampleFilter> {
     let range = TimeRange::new(params.time("from")?, params.time("until")?)?;
-    Ok(SampleFilter { target_id: params.take("target_id", TargetId::new)?, ..SampleFilter::within(range) })
+    let target_id = params.take("target_id", TargetId::new)?;
+    let has_fix = params.flag("has_fix")?;
+    Ok(SampleFilter { target_id, has_fix, ..SampleFilter::within(range) })
 }

@@ -19,7 +19,7 @@ use super::extract::{CameraPath, Client, JsonBody, Params, RunPath};
 use super::problem::{ApiResult, Problem};
 use super::wire::{JobState, Recipe, created, empty, instant, json};
 use crate::app::{App, RunRequest};
-use crate::domain::{self, EpochReport, Error, Result, RunProgress};
+use crate::domain::{self, EpochReport, Error, Result, RunProgress, TrainingReport};
 use crate::exchange::write_cursor;
 
 /// How often a silent event stream says that it is still there.
@@ -100,6 +100,12 @@ struct TrainingRun {
     /// The version it yielded.
     #[serde(skip_serializing_if = "Option::is_none")]
     model_version: Option<u32>,
+    /// What the run found out: its candidates, and what would help.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    report: Option<TrainingReport>,
+    /// The report as lines of text.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    report_text: Option<String>,
     /// Whether that version became active, and why or why not, or why the run failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     outcome: Option<String>,
@@ -130,6 +136,8 @@ impl From<domain::TrainingRun> for TrainingRun {
             progress: run.progress,
             attempt: run.attempt,
             model_version: run.model_version,
+            report_text: run.report.as_ref().map(ToString::to_string),
+            report: run.report,
             outcome: run.outcome,
             created_at: run.created_at,
             started_at: run.started_at,

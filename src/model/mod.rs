@@ -20,7 +20,7 @@ pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackNoiseModel};
 pub use encoder::gaussian_process::RecentBoxes;
 pub use encoder::projection::Projection;
 pub use encoder::projection_fit::fit_foot_points;
-pub use fitting::{FitOptions, FitOverrides, TimedResidual, estimate_gnss_noise, fit, fit_with};
+pub use fitting::{FitInput, FitOptions, FitOverrides, TimedResidual, estimate_gnss_noise, fit, fit_with};
 pub use progress::{FitError, FitEvent};
 pub use regressor::{Regression, Regressor};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use rand_chacha::ChaCha8Rng;
 
-use crate::domain::{EpochReport, Error, RunProgress};
+use crate::domain::{EpochReport, Error, HeldOutSampleError, RunProgress};
 use crate::model::network::{LossSums, LossWeights, NetShape, Schedule, TrainError, TrainingSet, train};
 
 /// What the observer of a fit receives.
@@ -17,9 +17,8 @@ pub enum FitEvent<'a> {
     Progress(&'a RunProgress),
     /// One epoch of the final fit.
     Epoch(&'a EpochReport),
-    /// Distance of each sample (in the order of target and time) from its held-out prediction by the chosen
-    /// candidate, m.
-    HeldOut(&'a [f64]),
+    /// Distance of each sample that the fit uses from its held-out prediction by the chosen candidate.
+    HeldOut(&'a [HeldOutSampleError]),
     /// A line for the run's log.
     Note(&'a str),
 }

@@ -2,10 +2,10 @@
 
 use super::artifact::{ModelParts, TrackNoiseModel};
 use super::encoder::Encoder;
-use super::encoder::features::Encoded;
+use super::encoder::features::{Encoded, reconstruction_error};
 use super::encoder::gaussian_process::RecentBoxes;
 use super::uncertainty::coverage::CoverageLookup;
-use super::uncertainty::error_model::{BoxError, ErrorModel, NOMINAL_RATIO, reconstruction_error};
+use super::uncertainty::error_model::{BoxError, ErrorModel};
 use crate::domain::{BoundingBox, ImageSize, Result};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::statistics::R95_PER_SIGMA;
@@ -172,7 +172,7 @@ impl Regressor {
             reconstruction_error: error.reconstruction_error,
             e_regression_m2: (error.variance_m2 + self.added_m2)
                 .clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]),
-            outside_training: lookup.extrapolation_ratio > NOMINAL_RATIO,
+            outside_training: self.error_model.is_outside_training(&lookup, error.reconstruction_error),
             r95_scale,
         }
     }

@@ -155,6 +155,7 @@ fn train(
         epochs: None,
         image_size: split.image_size,
         gnss_error: GnssError::Known(SigmaM::new(base.gnss_sigma_m)?),
+        gnss_bias_sigma_m: None,
     };
     fit_with(&split.train, &options, overrides, &mut |_| ControlFlow::Continue(()))
         .map_err(|error| anyhow::anyhow!("{error}"))

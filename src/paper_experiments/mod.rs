@@ -16,8 +16,9 @@ mod tables;
 mod walks;
 
 use crate::clock::process_cpu_s;
-use crate::domain::{ImageSize, Sample};
+use crate::domain::{Detection, ImageSize, Sample};
 use crate::evaluation::{EvaluateOptions, Evaluation, TestRow, Truth};
+use crate::model::FitInput;
 use crate::simulation::Scene;
 use cases::Experiment;
 use page::{Made, Picture};
@@ -42,6 +43,8 @@ pub struct RealCamera {
     pub name: String,
     /// Boxes and fixes of targets with a receiver.
     pub train: Vec<Sample>,
+    /// Boxes of these targets at other instants.
+    pub unpaired: Vec<Detection>,
     /// Boxes of the other targets.
     pub test: Vec<TestRow>,
     /// Size of the image.
@@ -79,7 +82,7 @@ pub trait Runner {
     /// The evaluation's own.
     fn evaluate(
         &mut self,
-        train: &[Sample],
+        train: FitInput<'_>,
         test: &[TestRow],
         truth: &Truth,
         options: &EvaluateOptions,

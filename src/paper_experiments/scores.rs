@@ -71,7 +71,7 @@ pub(super) fn evaluate(
         let split = split()?;
         let (test, begins) = split.joined_tests()?;
         let options = options(&experiment, &split);
-        let evaluation = runner.evaluate(&split.train, &test, &experiment.truth, &options)?;
+        let evaluation = runner.evaluate(split.input(), &test, &experiment.truth, &options)?;
         for (at, scores) in worlds.iter_mut().enumerate() {
             let end = begins.get(at + 1).copied().unwrap_or(test.len());
             scores.push(WorldScore::of(&evaluation, &split, &test, begins[at]..end));
@@ -96,6 +96,7 @@ fn options(experiment: &Experiment, split: &Split) -> EvaluateOptions {
         epochs: None,
         image_size: split.image_size,
         gnss_sigma: Some(experiment.gnss_sigma),
+        gnss_bias_sigma: None,
         box_shift_px: 0.0,
         cpu_s: process_cpu_s,
     }

@@ -46,6 +46,7 @@ impl WalkCurves {
                 epochs: None,
                 image_size: split.image_size,
                 gnss_sigma: Some(SigmaM::new(world.gnss_sigma_m)?),
+                gnss_bias_sigma: None,
                 box_shift_px: 0.0,
                 cpu_s: process_cpu_s,
             };
@@ -55,7 +56,7 @@ impl WalkCurves {
                     rows.push(train.len());
                 }
                 let evaluation =
-                    runner.evaluate(&train, &split.tests[0], &Truth::Columns, &evaluate_options)?;
+                    runner.evaluate((&train).into(), &split.tests[0], &Truth::Columns, &evaluate_options)?;
                 for (name, report) in evaluation.report.methods {
                     figures.entry((name, at)).or_default().push(report.metrics);
                 }

@@ -11,14 +11,16 @@ use super::Store;
 use super::errors::{failed, no_camera};
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssError, ImageSize, NewCamera, Receiver,
-    ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssBiasSigma, GnssError, ImageSize,
+    NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SampleCount, SigmaM, TargetClass, TargetId,
 };
 
 macro_rules! columns {
     () => {
-        "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, target_classes, \
-         labels, receivers, retrain_when_moved, revision, created_at_us, updated_at_us, active_model"
+        "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, gnss_bias_sigma_m, recipe, \
+         target_classes, labels, receivers, retrain_when_moved, revision, created_at_us, updated_at_us, \
+         active_model, (SELECT samples FROM sample_counts WHERE camera_key = key) AS samples_with_fix, \
+         (SELECT without_fix FROM sample_counts WHERE camera_key = key) AS samples_without_fix"
     };
 }
 
@@ -33,9 +35,9 @@ impl Store {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
         let insert = sqlx::query(concat!(
-            "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, recipe, \
-             target_classes, labels, receivers, retrain_when_moved, updated_at_us, id, created_at_us, revision) \
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
+            "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, \
+             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, updated_at_us, \
+             id, created_at_us, revision) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
         let row = bind_profile(insert, profile, now)?
@@ -112,9 +114,8 @@ impl Store {
         check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
-             gnss_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, retrain_when_moved = ?, \
-             updated_at_us = ?, \
-             revision = revision + 1 WHERE id = ? RETURNING ",
+             gnss_sigma_m = ?, gnss_bias_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, \
+             retrain_when_moved = ?, updated_at_us = ?, revision = revision + 1 WHERE id = ? RETURNING ",
             columns!()
         ));
         let row = bind_profile(update, profile, now)?
@@ -221,6 +222,7 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
         .bind(profile.image_size.map(ImageSize::width_px))
         .bind(profile.image_size.map(ImageSize::height_px))
         .bind(sigma_m)
+        .bind(profile.gnss_bias_sigma.map(GnssBiasSigma::metres))
         .bind(profile.recipe.as_str())
         .bind(serde_json::to_string(&classes).map_err(Error::fault)?)
         .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
@@ -239,6 +241,7 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
     let image_size = width_px.zip(height_px).map(|(width, height)| ImageSize::new(width, height)).transpose();
     let image_size = fields.checked(image_size)?;
     let gnss_error = fields.parse_optional(SigmaM::new)?.map_or(GnssError::Unknown, GnssError::Known);
+    let gnss_bias_sigma = fields.parse_optional(GnssBiasSigma::new)?;
     let recipe = fields.parse(|name: &str| name.parse())?;
     let target_classes = fields.parse(read_classes)?;
     let labels = fields.parse(serde_json::from_str::<BTreeMap<String, String>>)?;
@@ -247,18 +250,22 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
     let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
     let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
     let active_model = fields.optional_count()?;
+    let mut samples = || fields.parse(|stored: Option<i64>| u64::try_from(stored.unwrap_or_default()));
+    let (with_fix, without_fix) = (samples()?, samples()?);
+    let samples = SampleCount { all: with_fix + without_fix, without_fix };
     let profile = NewCamera {
         id,
         display_name,
         image_size,
         gnss_error,
+        gnss_bias_sigma,
         recipe,
         target_classes,
         labels,
         receivers,
         retrain_when_moved,
     };
-    Ok(Camera { key, profile, revision, created_at, updated_at, active_model })
+    Ok(Camera { key, profile, revision, created_at, updated_at, active_model, samples })
 }
 
 fn read_classes(json: &str) -> Result<Vec<TargetClass>> {

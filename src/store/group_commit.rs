@@ -6,17 +6,16 @@
 //! cancelled caller disturbs the others.
 
 use std::collections::HashMap;
-use std::ops::Range;
-use std::sync::{Arc, LazyLock};
+use std::sync::Arc;
 
-use sqlx::sqlite::SqliteArguments;
-use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
+use sqlx::SqliteConnection;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::errors::{closed, copy_of, failed, no_camera};
+use super::sample_table::{Insert, Row, SampleTable, delete_replaced, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
-use crate::domain::{CameraId, CameraKey, Durability, Error, Result, Sample};
+use crate::domain::{CameraId, CameraKey, Durability, Error, Result, StoredSample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -34,6 +33,8 @@ pub struct Inserted {
     pub accepted: u64,
     /// Stored before, under the same camera, target and time.
     pub duplicate: u64,
+    /// Of the accepted ones, those without a fix.
+    pub without_fix: u64,
 }
 
 /// Queues batches for the task.
@@ -52,7 +53,7 @@ struct Batch {
     camera: CameraId,
     /// The camera must still be this one; `None` for whichever has the id.
     key: Option<CameraKey>,
-    samples: Vec<Sample>,
+    samples: Vec<StoredSample>,
     durability: Durability,
     reply: oneshot::Sender<Result<Inserted>>,
     /// Limits the rows in flight; released when the batch is done.
@@ -70,7 +71,7 @@ impl GroupCommit {
         &self,
         camera: CameraId,
         key: Option<CameraKey>,
-        samples: Vec<Sample>,
+        samples: Vec<StoredSample>,
         durability: Durability,
     ) -> Result<Inserted> {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
@@ -229,13 +230,6 @@ enum Counting {
     Apart,
 }
 
-/// A row with the batch it came from and the key of its camera.
-struct Row<'a> {
-    batch: usize,
-    camera_key: i64,
-    sample: &'a Sample,
-}
-
 /// `None` if a statement over several batches met duplicates, so that they cannot be attributed.
 async fn store(
     connection: &mut SqliteConnection,
@@ -244,43 +238,83 @@ async fn store(
     counting: Counting,
 ) -> Result<Option<Vec<Result<Inserted>>>> {
     let mut cameras = cameras_of(connection, group).await?;
+    let admitted = admit(&mut cameras, space, group);
+    let mut outcomes: Vec<Result<Inserted>> =
+        admitted.iter().map(|camera| camera.as_ref().map(|_| Inserted::default()).map_err(copy_of)).collect();
+    // Those with a fix first: of two rows of one key, the one with a fix is stored.
+    for table in [SampleTable::WithFix, SampleTable::WithoutFix] {
+        let (rows, borders) = rows_of(table, group, &admitted, counting);
+        if !insert(connection, table, (&rows, &borders), &mut outcomes).await? {
+            return Ok(None);
+        }
+        if table == SampleTable::WithFix {
+            let has_boxes = |key| cameras.values().any(|camera| camera.key == key && camera.without_fix > 0);
+            let replaced = delete_replaced(connection, &rows, has_boxes).await?;
+            for camera in cameras.values_mut() {
+                camera.replaced = replaced.get(&camera.key).copied().unwrap_or_default();
+            }
+        }
+    }
+    count_stored(connection, &cameras, group, &outcomes).await?;
+    Ok(Some(outcomes))
+}
+
+/// The key of each batch's camera, or why the batch is not stored.
+fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[Batch]) -> Vec<Result<i64>> {
     let mut quota = space.quota();
-    let mut outcomes: Vec<Result<Inserted>> = Vec::with_capacity(group.len());
-    let mut rows = Vec::with_capacity(group.iter().map(|batch| batch.samples.len()).sum());
-    let mut borders = Vec::new();
-    for (index, batch) in group.iter().enumerate() {
+    let admitted = group.iter().map(|batch| {
         let camera = cameras
             .get_mut(batch.camera.as_str())
             .filter(|camera| batch.key.is_none_or(|key| key == CameraKey(camera.key)));
-        let admitted = match camera {
-            Some(camera) => quota
-                .admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64)
-                .map(|()| camera.key),
-            None => Err(no_camera(&batch.camera)),
-        };
-        if let Ok(camera_key) = admitted {
-            rows.extend(batch.samples.iter().map(|sample| Row { batch: index, camera_key, sample }));
+        let camera = camera.ok_or_else(|| no_camera(&batch.camera))?;
+        quota.admit(&batch.camera, &mut camera.samples, batch.samples.len() as u64)?;
+        Ok(camera.key)
+    });
+    admitted.collect()
+}
+
+/// The rows of admitted batches that a table takes, and where statements must end.
+fn rows_of<'a>(
+    table: SampleTable,
+    group: &'a [Batch],
+    admitted: &[Result<i64>],
+    counting: Counting,
+) -> (Vec<Row<'a>>, Vec<usize>) {
+    let (mut rows, mut borders) = (Vec::new(), Vec::new());
+    for (index, (batch, camera_key)) in group.iter().zip(admitted).enumerate() {
+        if let Ok(camera_key) = *camera_key {
+            let of_table = batch.samples.iter().filter(|sample| SampleTable::of(sample) == table);
+            rows.extend(of_table.map(|sample| Row { batch: index, camera_key, sample }));
         }
-        outcomes.push(admitted.map(|_| Inserted::default()));
         if counting == Counting::Apart {
             borders.push(rows.len());
         }
     }
     borders.push(rows.len());
-    let statements = statements(&borders);
-    let mut next = statements.first().map(|range| Insert::of(&rows[range.clone()])).transpose()?;
+    (rows, borders)
+}
+
+/// Inserts rows into a table and counts them; false if duplicates cannot be attributed to their batches.
+async fn insert(
+    connection: &mut SqliteConnection,
+    table: SampleTable,
+    (rows, borders): (&[Row<'_>], &[usize]),
+    outcomes: &mut [Result<Inserted>],
+) -> Result<bool> {
+    let statements = statements(borders);
+    let mut next = statements.first().map(|range| Insert::of(table, &rows[range.clone()])).transpose()?;
     for (index, range) in statements.iter().enumerate() {
         let Some(insert) = next.take() else { break };
         // The next statement's values are bound while the database executes this one.
-        let following = async { statements.get(index + 1).map(|range| Insert::of(&rows[range.clone()])) };
+        let following =
+            async { statements.get(index + 1).map(|range| Insert::of(table, &rows[range.clone()])) };
         let (accepted, following) = tokio::join!(insert.execute(connection), following);
-        if !count(&mut outcomes, &rows[range.clone()], accepted?) {
-            return Ok(None);
+        if !count(outcomes, &rows[range.clone()], accepted?) {
+            return Ok(false);
         }
         next = following.transpose()?;
     }
-    count_stored(connection, &cameras, group, &outcomes).await?;
-    Ok(Some(outcomes))
+    Ok(true)
 }
 
 /// Adds a statement's count to its batches; false if its duplicates cannot be attributed to one.
@@ -305,6 +339,7 @@ fn add(outcomes: &mut [Result<Inserted>], row: &Row<'_>, accepted: u64, duplicat
     if let Some(Ok(inserted)) = outcomes.get_mut(row.batch) {
         inserted.accepted += accepted;
         inserted.duplicate += duplicate;
+        inserted.without_fix += if row.sample.fix.is_none() { accepted } else { 0 };
     }
 }
 
@@ -313,6 +348,10 @@ struct Known {
     key: i64,
     /// Samples stored, and those of the group that are admitted.
     samples: u64,
+    /// Samples without a fix that are stored.
+    without_fix: u64,
+    /// Of these, those whose place samples of the group have taken.
+    replaced: u64,
 }
 
 /// The cameras of a group by their ids, read in its own transaction, so that none can vanish before
@@ -322,16 +361,23 @@ async fn cameras_of(connection: &mut SqliteConnection, group: &[Batch]) -> Resul
     ids.sort_unstable();
     ids.dedup();
     let ids = serde_json::to_string(&ids).map_err(Error::fault)?;
-    let cameras: Vec<(String, i64, i64)> = sqlx::query_as(
-        "SELECT id, key, coalesce(samples, 0) FROM cameras LEFT JOIN sample_counts ON camera_key = key \
-         WHERE id IN (SELECT value FROM json_each(?))",
+    let cameras: Vec<(String, i64, i64, i64)> = sqlx::query_as(
+        "SELECT id, key, coalesce(samples, 0), coalesce(without_fix, 0) \
+         FROM cameras LEFT JOIN sample_counts ON camera_key = key WHERE id IN (SELECT value FROM json_each(?))",
     )
     .bind(ids)
     .fetch_all(connection)
     .await
     .map_err(failed)?;
-    let known = |(id, key, samples)| (id, Known { key, samples: u64::try_from(samples).unwrap_or_default() });
+    let known = |(id, key, with_fix, without_fix)| {
+        let (with_fix, without_fix) = (as_count(with_fix), as_count(without_fix));
+        (id, Known { key, samples: with_fix + without_fix, without_fix, replaced: 0 })
+    };
     Ok(cameras.into_iter().map(known).collect())
+}
+
+fn as_count(stored: i64) -> u64 {
+    u64::try_from(stored).unwrap_or_default()
 }
 
 /// Adds what a group has stored to the counts of its cameras, in one statement.
@@ -341,101 +387,31 @@ async fn count_stored(
     group: &[Batch],
     outcomes: &[Result<Inserted>],
 ) -> Result<()> {
-    let mut accepted: HashMap<i64, u64> = HashMap::new();
+    // Per camera: added with a fix, added without, replaced.
+    let mut changes: HashMap<i64, [u64; 3]> = HashMap::new();
     for (batch, outcome) in group.iter().zip(outcomes) {
         if let (Ok(inserted), Some(camera)) = (outcome, cameras.get(batch.camera.as_str()))
             && inserted.accepted > 0
         {
-            *accepted.entry(camera.key).or_default() += inserted.accepted;
+            let [with_fix, without_fix, replaced] = changes.entry(camera.key).or_default();
+            *with_fix += inserted.accepted - inserted.without_fix;
+            *without_fix += inserted.without_fix;
+            *replaced = camera.replaced;
         }
     }
-    if accepted.is_empty() {
+    if changes.is_empty() {
         return Ok(());
     }
     // WHERE true: without it the grammar takes ON CONFLICT for the condition of a join.
     sqlx::query(
-        "INSERT INTO sample_counts (camera_key, samples) SELECT CAST(key AS INTEGER), value FROM json_each(?) \
-         WHERE true ON CONFLICT (camera_key) DO UPDATE SET samples = samples + excluded.samples",
+        "INSERT INTO sample_counts (camera_key, samples, without_fix) \
+         SELECT CAST(key AS INTEGER), value ->> 0, (value ->> 1) - (value ->> 2) FROM json_each(?) WHERE true \
+         ON CONFLICT (camera_key) DO UPDATE SET samples = samples + excluded.samples, \
+         without_fix = max(without_fix + excluded.without_fix, 0)",
     )
-    .bind(serde_json::to_string(&accepted).map_err(Error::fault)?)
+    .bind(serde_json::to_string(&changes).map_err(Error::fault)?)
     .execute(connection)
     .await
     .map_err(failed)?;
     Ok(())
-}
-
-/// Columns bound per row.
-const COLUMNS: usize = 14;
-
-/// Rows per statement, largest first. Few sizes, so that each stays prepared.
-const SIZES: [usize; 6] = [1000, 250, 50, 10, 3, 1];
-
-static INSERTS: LazyLock<[Arc<str>; SIZES.len()]> = LazyLock::new(|| {
-    SIZES.map(|rows| {
-        let row = format!("({})", vec!["?"; COLUMNS].join(","));
-        let sql = format!(
-            "INSERT INTO samples (camera_key, time_us, target_id, left_px, top_px, width_px, height_px, \
-             longitude_deg, latitude_deg, sigma_m, class, score, truth_longitude_deg, truth_latitude_deg) \
-             VALUES {} ON CONFLICT DO NOTHING",
-            vec![row; rows].join(",")
-        );
-        sql.into()
-    })
-});
-
-/// Splits the ranges between borders into statements of the available sizes.
-fn statements(borders: &[usize]) -> Vec<Range<usize>> {
-    let mut ranges = Vec::new();
-    let mut start = 0;
-    for &border in borders {
-        for size in SIZES {
-            while border - start >= size {
-                ranges.push(start..start + size);
-                start += size;
-            }
-        }
-    }
-    ranges
-}
-
-/// One statement for as many rows as one of the sizes, with its values.
-struct Insert {
-    sql: Arc<str>,
-    arguments: SqliteArguments,
-}
-
-impl Insert {
-    fn of(rows: &[Row<'_>]) -> Result<Self> {
-        let size = SIZES.iter().position(|&size| size == rows.len());
-        let size = size.ok_or_else(|| Error::fault("a statement of an unknown size"))?;
-        let mut arguments = SqliteArguments::default();
-        arguments.reserve(rows.len() * COLUMNS, 0);
-        for row in rows {
-            bind(&mut arguments, row).map_err(Error::fault)?;
-        }
-        Ok(Self { sql: Arc::clone(&INSERTS[size]), arguments })
-    }
-
-    /// Returns how many rows were new.
-    async fn execute(self, connection: &mut SqliteConnection) -> Result<u64> {
-        let query = sqlx::query_with(AssertSqlSafe(self.sql), self.arguments);
-        Ok(query.execute(connection).await.map_err(failed)?.rows_affected())
-    }
-}
-
-fn bind(arguments: &mut SqliteArguments, row: &Row<'_>) -> Result<(), sqlx::error::BoxDynError> {
-    let sample = row.sample;
-    arguments.add(row.camera_key)?;
-    arguments.add(sample.time.as_microsecond())?;
-    arguments.add(sample.target_id.as_str())?;
-    for side_px in sample.bounding_box.sides_px() {
-        arguments.add(side_px)?;
-    }
-    arguments.add(sample.fix.position.longitude_deg())?;
-    arguments.add(sample.fix.position.latitude_deg())?;
-    arguments.add(sample.fix.sigma_m.map(crate::domain::SigmaM::metres))?;
-    arguments.add(sample.class.as_ref().map(crate::domain::TargetClass::as_str))?;
-    arguments.add(sample.score.map(crate::domain::Score::value))?;
-    arguments.add(sample.truth.map(crate::geo::Position::longitude_deg))?;
-    arguments.add(sample.truth.map(crate::geo::Position::latitude_deg))
 }

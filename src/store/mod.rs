@@ -24,6 +24,7 @@ mod reserve;
 mod retention;
 mod row_decoder;
 mod runs;
+mod sample_table;
 mod samples;
 mod space;
 #[cfg(test)]

@@ -42,7 +42,9 @@ macro_rules! select {
             "SELECT runs.id, cameras.id, runs.recipe, runs.seed, runs.epochs, runs.from_us, runs.until_us, \
              runs.state, runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
              runs.reconstruction_error, runs.regression_error, runs.error_scale, runs.remaining_s, \
-             runs.model_version, runs.outcome, runs.created_at_us, runs.started_at_us, runs.ended_at_us \
+             runs.model_version, (SELECT json_extract(models.metadata, '$.report') FROM models \
+             WHERE models.camera_key = runs.camera_key AND models.number = runs.model_version \
+             AND json_valid(models.metadata)), runs.outcome, runs.created_at_us, runs.started_at_us, runs.ended_at_us \
              FROM training_runs AS runs JOIN cameras ON cameras.key = runs.camera_key ",
             $rest
         )
@@ -293,6 +295,8 @@ fn read_run(row: &SqliteRow) -> Result<TrainingRun> {
             remaining_s: fields.get()?,
         },
         model_version: fields.optional_count()?,
+        // A model whose metadata are damaged is reported where the model is read.
+        report: fields.get::<Option<String>>()?.and_then(|report| serde_json::from_str(&report).ok()),
         outcome: fields.get()?,
         created_at: fields.timestamp()?,
         started_at: fields.optional_timestamp()?,

@@ -2,16 +2,17 @@
 
 use jiff::Timestamp;
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
-use sqlx::{AssertSqlSafe, Sqlite};
+use sqlx::{AssertSqlSafe, Row as _, Sqlite};
 
 use super::Store;
 use super::cameras::camera_key;
 use super::errors::failed;
 use super::group_commit::Inserted;
 use super::row_decoder::RowDecoder;
+use super::sample_table::SampleTable;
 use crate::domain::{
-    BoundingBox, CameraId, CameraKey, Durability, Fix, Result, Sample, Score, SigmaM, TargetClass, TargetId,
-    TimeRange,
+    BoundingBox, CameraId, CameraKey, Detection, Durability, Fix, Result, Sample, Score, SigmaM,
+    StoredSample, TargetClass, TargetId, TimeRange,
 };
 use crate::geo::Position;
 
@@ -24,13 +25,23 @@ pub struct SampleFilter {
     pub until: Option<Timestamp>,
     /// Of this target alone.
     pub target_id: Option<TargetId>,
+    /// Only samples that have a fix, or only those that have none.
+    pub has_fix: Option<bool>,
 }
 
 impl SampleFilter {
     /// All samples of a stretch of time.
     #[must_use]
     pub fn within(range: TimeRange) -> Self {
-        Self { from: range.from(), until: range.until(), target_id: None }
+        Self { from: range.from(), until: range.until(), ..Self::default() }
+    }
+
+    fn tables(&self) -> &'static [SampleTable] {
+        match self.has_fix {
+            None => &[SampleTable::WithFix, SampleTable::WithoutFix],
+            Some(true) => &[SampleTable::WithFix],
+            Some(false) => &[SampleTable::WithoutFix],
+        }
     }
 }
 
@@ -46,26 +57,27 @@ pub struct SampleKey {
 impl SampleKey {
     /// The key of a sample, to go on after it.
     #[must_use]
-    pub fn of(sample: &Sample) -> Self {
+    pub fn of<F>(sample: &Sample<F>) -> Self {
         Self { time: sample.time, target_id: sample.target_id.clone() }
     }
 }
 
 impl Store {
     /// Stores samples of a camera and returns after their commit, and with [`Durability::Synced`] after
-    /// they have been flushed to the disk; all of them are stored, or none. A
-    /// sample whose camera, target and time are stored already is left as it is and counted as a
-    /// duplicate. Many callers at once share a transaction; a caller who goes away does not stop it.
+    /// they have been flushed to the disk; all of them are stored, or none. A sample whose camera, target
+    /// and time are stored already is left as it is and counted as a duplicate, but a sample with a fix
+    /// takes the place of one without. Many callers at once share a transaction; a caller who goes away
+    /// does not stop it.
     ///
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`], [`crate::domain::ErrorKind::InsufficientStorage`].
     pub async fn insert_samples(
         &self,
         id: &CameraId,
-        samples: Vec<Sample>,
+        samples: Vec<impl Into<StoredSample>>,
         durability: Durability,
     ) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), None, samples, durability).await
+        self.inner.samples.insert(id.clone(), None, stored(samples), durability).await
     }
 
     /// As [`Store::insert_samples`], for the camera of that key alone: if it was deleted and created again
@@ -77,10 +89,10 @@ impl Store {
         &self,
         id: &CameraId,
         key: CameraKey,
-        samples: Vec<Sample>,
+        samples: Vec<impl Into<StoredSample>>,
         durability: Durability,
     ) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), Some(key), samples, durability).await
+        self.inner.samples.insert(id.clone(), Some(key), stored(samples), durability).await
     }
 
     /// A page of samples ordered by time and target, after a key.
@@ -93,15 +105,44 @@ impl Store {
         filter: &SampleFilter,
         after: Option<SampleKey>,
         limit: u32,
-    ) -> Result<Vec<Sample>> {
+    ) -> Result<Vec<StoredSample>> {
         let range = Range::of(camera_key(self.readers(), id).await?, filter, after);
-        let sql = range.sql(
-            "SELECT camera_key, time_us, target_id, left_px, top_px, width_px, height_px, longitude_deg, \
-             latitude_deg, sigma_m, class, score, truth_longitude_deg, truth_latitude_deg FROM samples",
-            " ORDER BY time_us, target_id LIMIT ?",
-        );
-        let rows = range.bind(&sql).bind(limit).fetch_all(self.readers()).await.map_err(failed)?;
+        let select = |table: &SampleTable| range.sql(&format!("SELECT {} FROM {table}", table.columns()));
+        let tables: Vec<String> = filter.tables().iter().map(select).collect();
+        let sql = format!("{} ORDER BY time_us, target_id LIMIT ?", tables.join(" UNION ALL "));
+        let query = filter.tables().iter().fold(query(&sql), |query, _| range.bind(query));
+        let rows = query.bind(limit).fetch_all(self.readers()).await.map_err(failed)?;
         rows.iter().map(read_sample).collect()
+    }
+
+    /// At most so many of the boxes without a fix that a filter selects, in order of time and target. Of
+    /// more, one of every few consecutive ones is taken, at a place that changes from few to few, so that
+    /// none of several simultaneous targets is preferred.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`].
+    pub async fn thinned_detections(
+        &self,
+        id: &CameraId,
+        filter: &SampleFilter,
+        most: u32,
+    ) -> Result<Vec<Detection>> {
+        let filter = SampleFilter { has_fix: Some(false), ..filter.clone() };
+        let count = self.count_samples(id, &filter).await?;
+        let stride = i64::try_from(count.div_ceil(most.max(1).into()).max(1)).unwrap_or(i64::MAX);
+        let (table, range) =
+            (SampleTable::WithoutFix, Range::of(camera_key(self.readers(), id).await?, &filter, None));
+        let numbered = range.sql(&format!(
+            "SELECT {}, row_number() OVER (ORDER BY time_us, target_id) - 1 AS ordinal FROM {table}",
+            table.columns()
+        ));
+        // The place within each stride is a multiplicative hash of the stride's number.
+        let sql = format!(
+            "SELECT * FROM ({numbered}) WHERE ordinal % {stride} = \
+             (ordinal / {stride} * 2654435761 / 65536) % {stride} ORDER BY time_us, target_id"
+        );
+        let rows = range.bind(query(&sql)).fetch_all(self.readers()).await.map_err(failed)?;
+        rows.iter().map(|row| read_sample(row).map(Detection::from)).collect()
     }
 
     /// How many samples a filter selects.
@@ -109,10 +150,14 @@ impl Store {
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
     pub async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
-        self.count(id, filter, "SELECT count(*) FROM samples").await
+        let mut count = 0;
+        for table in filter.tables() {
+            count += self.count(id, filter, &format!("SELECT count(*) FROM {table}")).await?;
+        }
+        Ok(count)
     }
 
-    /// How many of the samples that a filter selects state the truth.
+    /// How many of the samples with a fix that a filter selects state the truth.
     ///
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
@@ -120,26 +165,30 @@ impl Store {
         self.count(id, filter, "SELECT count(truth_longitude_deg) FROM samples").await
     }
 
-    async fn count(&self, id: &CameraId, filter: &SampleFilter, head: &'static str) -> Result<u64> {
+    async fn count(&self, id: &CameraId, filter: &SampleFilter, select: &str) -> Result<u64> {
         let range = Range::of(camera_key(self.readers(), id).await?, filter, None);
-        let sql = range.sql(head, "");
-        let row = range.bind(&sql).fetch_one(self.readers()).await.map_err(failed)?;
+        let sql = range.sql(select);
+        let row = range.bind(query(&sql)).fetch_one(self.readers()).await.map_err(failed)?;
         RowDecoder::new("samples", &row).parse(|stored: i64| u64::try_from(stored))
     }
 
-    /// Time of the sample that has so many before it, in order of time; `None` behind the last.
+    /// Time of the sample with a fix that has so many before it, in order of time; `None` behind the last.
     ///
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
     pub async fn sample_time(&self, id: &CameraId, before: u64) -> Result<Option<Timestamp>> {
         let range = Range::of(camera_key(self.readers(), id).await?, &SampleFilter::default(), None);
-        let sql = range.sql("SELECT time_us FROM samples", " ORDER BY time_us, target_id LIMIT 1 OFFSET ?");
+        let sql = format!(
+            "{} ORDER BY time_us, target_id LIMIT 1 OFFSET ?",
+            range.sql("SELECT time_us FROM samples")
+        );
         let offset = i64::try_from(before).unwrap_or(i64::MAX);
-        let row = range.bind(&sql).bind(offset).fetch_optional(self.readers()).await.map_err(failed)?;
+        let row =
+            range.bind(query(&sql)).bind(offset).fetch_optional(self.readers()).await.map_err(failed)?;
         row.map(|row| RowDecoder::new("samples", &row).timestamp()).transpose()
     }
 
-    /// How many samples a filter selects, and the corners of the ground they cover (south-west,
+    /// How many samples with a fix a filter selects, and the corners of the ground they cover (south-west,
     /// north-east in degrees; across the antimeridian, of the whole parallel).
     ///
     /// # Errors
@@ -153,9 +202,8 @@ impl Store {
         let sql = range.sql(
             "SELECT count(*), min(longitude_deg), min(latitude_deg), max(longitude_deg), max(latitude_deg) \
              FROM samples",
-            "",
         );
-        let row = range.bind(&sql).fetch_one(self.readers()).await.map_err(failed)?;
+        let row = range.bind(query(&sql)).fetch_one(self.readers()).await.map_err(failed)?;
         let mut fields = RowDecoder::new("samples", &row);
         let count = fields.parse(|stored: i64| u64::try_from(stored))?;
         if count == 0 {
@@ -176,18 +224,37 @@ impl Store {
         let mut transaction = deletion.begin().await?;
         let key = camera_key(&mut *transaction, id).await?;
         let range = Range::of(key, filter, None);
-        let sql = range.sql("DELETE FROM samples", "");
-        let deleted = range.bind(&sql).execute(&mut *transaction).await.map_err(failed)?.rows_affected();
-        sqlx::query("UPDATE sample_counts SET samples = max(samples - ?, 0) WHERE camera_key = ?")
-            .bind(i64::try_from(deleted).unwrap_or(i64::MAX))
+        let mut deleted = 0;
+        for table in filter.tables() {
+            let sql = range.sql(&format!("DELETE FROM {table}"));
+            let rows =
+                range.bind(query(&sql)).execute(&mut *transaction).await.map_err(failed)?.rows_affected();
+            let counter = table.counter();
+            query(&format!(
+                "UPDATE sample_counts SET {counter} = max({counter} - ?, 0) WHERE camera_key = ?"
+            ))
+            .bind(i64::try_from(rows).unwrap_or(i64::MAX))
             .bind(key)
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+            deleted += rows;
+        }
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
         Ok(deleted)
     }
+}
+
+fn stored(samples: Vec<impl Into<StoredSample>>) -> Vec<StoredSample> {
+    samples.into_iter().map(Into::into).collect()
+}
+
+type Query = sqlx::query::Query<'static, Sqlite, SqliteArguments>;
+
+/// Only fixed text goes into statements; values are bound.
+fn query(sql: &str) -> Query {
+    sqlx::query(AssertSqlSafe(sql.to_owned()))
 }
 
 /// A stretch of one camera's samples in key order, in the form that the primary key can seek.
@@ -211,45 +278,49 @@ impl Range {
         }
     }
 
-    /// Only fixed text goes in; values are bound.
-    fn sql(&self, head: &str, tail: &str) -> String {
+    /// The statement with its condition; only fixed text goes in, the values are for [`Range::bind`].
+    fn sql(&self, statement: &str) -> String {
         let until = if self.until_us.is_some() { " AND time_us < ?" } else { "" };
         let target = if self.target_id.is_some() { " AND target_id = ?" } else { "" };
-        format!("{head} WHERE camera_key = ? AND (time_us, target_id) > (?, ?){until}{target}{tail}")
+        format!("{statement} WHERE camera_key = ? AND (time_us, target_id) > (?, ?){until}{target}")
     }
 
-    fn bind(self, sql: &str) -> sqlx::query::Query<'static, Sqlite, SqliteArguments> {
-        let (after_us, after_target) = self.after;
-        let query = sqlx::query(AssertSqlSafe(sql.to_owned()))
-            .bind(self.camera_key)
-            .bind(after_us)
-            .bind(after_target);
+    fn bind(&self, query: Query) -> Query {
+        let (after_us, after_target) = self.after.clone();
+        let query = query.bind(self.camera_key).bind(after_us).bind(after_target);
         let query = match self.until_us {
             Some(until_us) => query.bind(until_us),
             None => query,
         };
-        match self.target_id {
+        match self.target_id.clone() {
             Some(target) => query.bind(target),
             None => query,
         }
     }
 }
 
-fn read_sample(row: &SqliteRow) -> Result<Sample> {
-    let mut fields = RowDecoder::new("samples", row).skip(1);
+/// A row of [`SampleTable::columns`].
+fn read_sample(row: &SqliteRow) -> Result<StoredSample> {
+    let longitude_deg: Option<f64> = row.try_get(7).unwrap_or_default();
+    let table = if longitude_deg.is_some() { "samples" } else { "samples_without_fix" };
+    let mut fields = RowDecoder::new(table, row).skip(1);
     let time = fields.timestamp()?;
     let target_id = fields.parse(TargetId::new)?;
     let (left_px, top_px) = (fields.get()?, fields.get()?);
     let (width_px, height_px) = (fields.get()?, fields.get()?);
     let bounding_box = fields.checked(BoundingBox::new(left_px, top_px, width_px, height_px))?;
-    let (longitude_deg, latitude_deg) = (fields.get()?, fields.get()?);
-    let position = fields.checked(Position::new(longitude_deg, latitude_deg))?;
+    let fix_position = position(&mut fields)?;
     let sigma_m = fields.parse_optional(SigmaM::new)?;
+    let fix = fix_position.map(|position| Fix { position, sigma_m });
     let class = fields.parse_optional(TargetClass::new)?;
     let score = fields.parse_optional(Score::new)?;
-    let truth: (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
-    let truth =
-        truth.0.zip(truth.1).map(|(longitude, latitude)| Position::new(longitude, latitude)).transpose();
-    let truth = fields.checked(truth)?;
-    Ok(Sample { time, target_id, bounding_box, fix: Fix { position, sigma_m }, class, score, truth })
+    let truth = position(&mut fields)?;
+    Ok(Sample { time, target_id, bounding_box, fix, class, score, truth })
+}
+
+/// The next two columns.
+fn position(fields: &mut RowDecoder<'_>) -> Result<Option<Position>> {
+    let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
+    let position = longitude_deg.zip(latitude_deg);
+    fields.checked(position.map(|(longitude, latitude)| Position::new(longitude, latitude)).transpose())
 }

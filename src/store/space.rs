@@ -260,10 +260,11 @@ impl Store {
     }
 
     pub(super) async fn count_all_samples(&self) -> Result<()> {
-        let samples: i64 = sqlx::query_scalar("SELECT coalesce(sum(samples), 0) FROM sample_counts")
-            .fetch_one(self.readers())
-            .await
-            .map_err(failed)?;
+        let samples: i64 =
+            sqlx::query_scalar("SELECT coalesce(sum(samples + without_fix), 0) FROM sample_counts")
+                .fetch_one(self.readers())
+                .await
+                .map_err(failed)?;
         self.inner.space.samples.store(u64::try_from(samples).unwrap_or_default(), Ordering::Relaxed);
         Ok(())
     }

@@ -3,11 +3,12 @@
 use std::time::Duration;
 
 use super::job_thread::JobProgress;
-use super::{Ended, Job, JobIdentity, Work, load_samples};
+use super::{Ended, Job, JobIdentity, Work, load_samples, load_unpaired};
 use crate::app::{App, JobQueue};
 use crate::clock::thread_cpu_s;
 use crate::domain::{Error, EvaluationJob, EvaluationProgress, JobState, Observation, Result, Sample};
 use crate::evaluation::{self, EvaluateOptions, Report, TestRow, evaluate};
+use crate::model::FitInput;
 use crate::store::{Claim, Heartbeat, JobEnd, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
 
@@ -48,7 +49,9 @@ impl Job for EvaluationJob {
         let EvaluationJob { camera_id, plan, .. } = &claim.job;
         let camera = app.store.camera(camera_id).await?;
         let most = app.limits.rows_per_evaluation;
-        let train = load_samples(app, camera_id, &SampleFilter::within(plan.train), most).await?;
+        let train_filter = SampleFilter::within(plan.train);
+        let train = load_samples(app, camera_id, &train_filter, most).await?;
+        let unpaired = load_unpaired(app, camera_id, &train_filter).await?;
         let test = load_samples(app, camera_id, &SampleFilter::within(plan.test), most).await?;
         let test: Vec<TestRow> = test.into_iter().map(test_row).collect();
         let truth = plan.truth.clone();
@@ -59,13 +62,18 @@ impl Job for EvaluationJob {
             epochs: None,
             image_size: camera.profile.image_size,
             gnss_sigma: plan.gnss_sigma,
+            gnss_bias_sigma: camera.profile.gnss_bias_sigma,
             box_shift_px: plan.box_shift_px,
             cpu_s: thread_cpu_s,
         };
         Ok(Box::new(move |sink| {
             let mut cancelled = false;
-            let evaluated =
-                evaluate(&train, &test, &truth, &options, &mut |step: &evaluation::Progress<'_>| {
+            let evaluated = evaluate(
+                FitInput { samples: &train, unpaired: &unpaired },
+                &test,
+                &truth,
+                &options,
+                &mut |step: &evaluation::Progress<'_>| {
                     let flow = sink.update(|progress| {
                         *progress = EvaluationProgress {
                             phase: step.phase.to_owned(),
@@ -76,7 +84,8 @@ impl Job for EvaluationJob {
                     });
                     cancelled |= flow.is_break();
                     flow
-                });
+                },
+            );
             if cancelled { Evaluated::Cancelled } else { Evaluated::Completed(evaluated.map(|it| it.report)) }
         }))
     }

@@ -18,7 +18,9 @@ use uuid::Uuid;
 
 use crate::app::{App, JobQueue};
 use crate::config::Workers;
-use crate::domain::{CameraId, Error, EvaluationJob, JobState, Result, Sample, TrainingRun};
+use crate::domain::{
+    CameraId, Detection, Error, EvaluationJob, JobState, Result, Sample, StoredSample, TrainingRun,
+};
 use crate::shutdown::Shutdown;
 use crate::store::{Claim, Heartbeat, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
@@ -200,14 +202,15 @@ async fn run_attempt<J: Job>(
     J::end(app, claim, Ended { output, progress, shutting_down }, lease).await
 }
 
-/// Stored samples by time and target; where there are too many, the latest.
+/// Stored samples with a fix by time and target; where there are too many, the latest.
 async fn load_samples(app: &App, camera: &CameraId, filter: &SampleFilter, most: u32) -> Result<Vec<Sample>> {
+    let filter = SampleFilter { has_fix: Some(true), ..filter.clone() };
     let most = most as usize;
     let mut samples = Vec::new();
     let mut after = None;
     loop {
-        let page = app.samples(camera, filter, after, PAGE_SAMPLES).await?;
-        samples.extend(page.items);
+        let page = app.samples(camera, &filter, after, PAGE_SAMPLES).await?;
+        samples.extend(page.items.into_iter().filter_map(StoredSample::with_fix));
         if samples.len() > 2 * most {
             samples.drain(..samples.len() - most);
         }
@@ -220,4 +223,9 @@ async fn load_samples(app: &App, camera: &CameraId, filter: &SampleFilter, most:
         samples.drain(..samples.len() - most);
     }
     Ok(samples)
+}
+
+/// Stored boxes without a fix for a fit, thinned to the limit.
+async fn load_unpaired(app: &App, camera: &CameraId, filter: &SampleFilter) -> Result<Vec<Detection>> {
+    app.store.thinned_detections(camera, filter, app.limits.boxes_without_fix_per_run).await
 }

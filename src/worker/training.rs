@@ -4,12 +4,13 @@ use std::time::Duration;
 
 use super::job_thread::{JobProgress, ProgressSink};
 use super::promotion::{self, PromotionCandidate};
-use super::{Ended, Job, JobIdentity, Work, load_samples};
+use super::{Ended, Job, JobIdentity, Work, load_samples, load_unpaired};
 use crate::app::{App, JobQueue};
 use crate::domain::{
-    EpochReport, Error, HeldOutSampleError, JobState, Result, RunProgress, Sample, TimeRange, TrainingRun,
+    EpochReport, Error, GnssBiasSigma, HeldOutSampleError, JobState, Result, RunProgress, Sample, TimeRange,
+    TrainingRun,
 };
-use crate::model::{self, Artifact, FitError, FitEvent, FitOptions};
+use crate::model::{self, Artifact, FitError, FitEvent, FitInput, FitOptions};
 use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
 
@@ -28,7 +29,7 @@ impl JobProgress for Update {
     }
 }
 
-/// How a fit ended, and its samples in the order of target and time.
+/// How a fit ended, and its samples.
 pub(super) struct Fitted {
     outcome: std::result::Result<Model, FitError>,
     samples: Vec<Sample>,
@@ -64,28 +65,36 @@ impl Job for TrainingRun {
     async fn prepare(app: &App, claim: &Claim<Self>) -> Result<Work<Self>> {
         let run = &claim.job;
         let camera = app.store.camera(&run.camera_id).await?;
-        let filter = SampleFilter { from: run.options.from, until: run.options.until, target_id: None };
-        let mut samples = load_samples(app, &run.camera_id, &filter, app.limits.samples_per_run).await?;
+        let filter =
+            SampleFilter { from: run.options.from, until: run.options.until, ..SampleFilter::default() };
+        let samples = load_samples(app, &run.camera_id, &filter, app.limits.samples_per_run).await?;
+        let unpaired = load_unpaired(app, &run.camera_id, &filter).await?;
         let options = FitOptions {
             recipe: run.options.recipe,
             seed: run.options.seed,
             epochs: run.options.epochs,
             image_size: camera.profile.image_size,
             gnss_error: camera.profile.gnss_error,
+            gnss_bias_sigma_m: camera.profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
         };
-        let line = format!("{} samples, recipe {}, seed {}", samples.len(), options.recipe, options.seed);
+        let line = format!(
+            "{} samples and {} boxes without a fix, recipe {}, seed {}",
+            samples.len(),
+            unpaired.len(),
+            options.recipe,
+            options.seed
+        );
         app.store.append_log(run.id, claim.fence, app.clock.now(), &line).await?;
         Ok(Box::new(move |sink| {
-            let mut distances_m = Vec::new();
-            let fitted = model::fit(&samples, &options, &mut |event| {
-                if let FitEvent::HeldOut(distances) = event {
-                    distances_m = distances.to_vec();
+            let mut held_out = Vec::new();
+            let input = FitInput { samples: &samples, unpaired: &unpaired };
+            let fitted = model::fit(input, &options, &mut |event| {
+                if let FitEvent::HeldOut(errors) = event {
+                    held_out = errors.to_vec();
                 }
                 report(sink, event)
             });
-            samples.sort_by(|one, other| (&one.target_id, one.time).cmp(&(&other.target_id, other.time)));
-            let outcome =
-                fitted.map(|artifact| Model { artifact, held_out: errors_of(&samples, &distances_m) });
+            let outcome = fitted.map(|artifact| Model { artifact, held_out });
             Fitted { outcome, samples }
         }))
     }
@@ -135,21 +144,6 @@ impl Job for TrainingRun {
         let ended = app.store.finish_run(claim.job.id, claim.fence, end, app.clock.now()).await?;
         Ok(ended.map(|run| run.state))
     }
-}
-
-/// The model with the noise parameters that its samples show, for the tracks that it will serve.
-///
-/// # Errors
-/// Pairs samples in the order of target and time with their distances, m.
-fn errors_of(samples: &[Sample], distances_m: &[f64]) -> Vec<HeldOutSampleError> {
-    let pairs = samples.iter().zip(distances_m);
-    pairs
-        .map(|(sample, distance_m)| HeldOutSampleError {
-            time: sample.time,
-            target_id: sample.target_id.clone(),
-            distance_m: *distance_m,
-        })
-        .collect()
 }
 
 fn report(sink: &ProgressSink<Update>, event: FitEvent<'_>) -> std::ops::ControlFlow<()> {

@@ -1,9 +1,11 @@
 //! The one integration test binary: everything from the outside, through real ports and files.
 
 mod bad_input;
+mod boxes_without_fix;
 mod connections;
 mod cross_site;
 mod evaluations;
+mod few_receivers;
 mod gaussian_process;
 mod grpc;
 mod harness;

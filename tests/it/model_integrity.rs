@@ -18,8 +18,14 @@ use crate::harness::{Answer, TestServer, data_folder};
 const FUSIONS: &str = "/v1/cameras/c/fusions";
 
 fn artifact(recipe: Recipe) -> Artifact {
-    let options =
-        FitOptions { recipe, seed: 1, epochs: Some(2), image_size: None, gnss_error: GnssError::Unknown };
+    let options = FitOptions {
+        recipe,
+        seed: 1,
+        epochs: Some(2),
+        image_size: None,
+        gnss_error: GnssError::Unknown,
+        gnss_bias_sigma_m: None,
+    };
     let samples = simulate(&Options::demo()).training_samples();
     fit(&samples, &options, &mut |_| ControlFlow::Continue(())).expect("a fit")
 }

@@ -222,7 +222,7 @@ async fn samples_are_listed_and_refused_alike() {
 
     let at = |seconds| Some(prost_types::Timestamp { seconds, nanos: 0 });
     let backwards =
-        proto::SampleFilter { from: at(1_000_000_000), until: at(1_000_000_000), target_id: None };
+        proto::SampleFilter { from: at(1_000_000_000), until: at(1_000_000_000), ..Default::default() };
     let query = "from=2001-09-09T01:46:40Z&until=2001-09-09T01:46:40Z";
     let rest = both.server.get(&format!("/v1/cameras/c/samples?{query}")).await;
     let grpc = list("", Some(backwards), 1).await.expect_err("no time is between");

@@ -51,7 +51,7 @@ pub(super) async fn commit_all(
 
 impl SampleSink {
     async fn store(&self, commit: Commit) -> Result<()> {
-        let Commit { samples, released } = commit;
+        let Commit { samples, released, .. } = commit;
         if !samples.is_empty() {
             // Streams share a commit: the strongest durability that one of them asks for holds for all of it.
             let durability = released.iter().map(|item| item.tag.durability()).max().unwrap_or_default();

@@ -78,7 +78,7 @@ impl SampleRecorder {
     ) -> Result<()> {
         let room = self.commits.reserve().await.map_err(|_| stopped(tracker))?;
         let released = Released { tag: tracker.pending(seq), outcome: ItemOutcome::Paired };
-        room.send(Commit { samples: vec![sample], released: vec![released] });
+        room.send(Commit { samples: vec![sample], released: vec![released], ..Commit::default() });
         Ok(())
     }
 

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::outcome::{ItemOutcome, Released};
+use super::outcome::{ItemOutcome, PairedItems, Released};
 use super::{PairingRule, PairingSettings, Unpaired};
 use crate::domain::{Detection, Fix, Sample};
 use crate::geo::{EastNorth, LocalPlane};
@@ -122,7 +122,7 @@ impl<T> TargetBuffer<T> {
         &mut self,
         settings: &PairingSettings,
         unpaired: &mut Unpaired,
-    ) -> Option<(Vec<Sample>, Vec<Released<T>>)> {
+    ) -> Option<PairedItems<T>> {
         let lookahead = lookahead(settings);
         let until = self.watermark.reached()?.checked_sub(lookahead + settings.allowed_lateness).ok()?;
         if self.is_decided(until) {
@@ -131,7 +131,7 @@ impl<T> TargetBuffer<T> {
         let samples = self.decide(settings, Some(until));
         self.decided = Some(until);
         let released = self.release(Some(until.checked_sub(lookahead).ok()?), unpaired);
-        Some((samples, released))
+        Some(PairedItems { samples, ..released })
     }
 
     /// Decides everything and releases it.
@@ -139,9 +139,9 @@ impl<T> TargetBuffer<T> {
         &mut self,
         settings: &PairingSettings,
         unpaired: &mut Unpaired,
-    ) -> (Vec<Sample>, Vec<Released<T>>) {
+    ) -> PairedItems<T> {
         let samples = self.decide(settings, None);
-        (samples, self.release(None, unpaired))
+        PairedItems { samples, ..self.release(None, unpaired) }
     }
 
     /// The samples of the boxes up to an instant; of all of them for `None`.
@@ -203,19 +203,21 @@ impl<T> TargetBuffer<T> {
     }
 
     /// Removes what lies before an instant (all for `None`), and counts what found no partner.
-    fn release(&mut self, until: Option<Timestamp>, unpaired: &mut Unpaired) -> Vec<Released<T>> {
-        let mut released = Vec::new();
+    fn release(&mut self, until: Option<Timestamp>, unpaired: &mut Unpaired) -> PairedItems<T> {
+        let mut items = PairedItems::default();
         let is_old = |time: Timestamp| until.is_none_or(|until| time < until);
         while let Some(it) = self.detections.pop_front_if(|it| is_old(it.time)) {
             unpaired.detections += u64::from(!it.is_paired);
             unpaired.fix_claimed_by_nearer_box += u64::from(!it.is_paired && it.is_fix_claimed);
-            it.release_into(&mut released);
+            let is_paired = it.is_paired;
+            let detection = it.release_into(&mut items.released);
+            items.unpaired_detections.extend((!is_paired).then_some(detection));
         }
         while let Some(it) = self.fixes.pop_front_if(|it| is_old(it.time)) {
             unpaired.fixes += u64::from(!it.is_paired);
-            it.release_into(&mut released);
+            it.release_into(&mut items.released);
         }
-        released
+        items
     }
 }
 
@@ -224,11 +226,13 @@ impl<I, T> Buffered<I, T> {
         std::iter::once(&self.tag).chain(&self.duplicates)
     }
 
-    fn release_into(self, released: &mut Vec<Released<T>>) {
+    /// Returns the item.
+    fn release_into(self, released: &mut Vec<Released<T>>) -> I {
         let outcome = if self.is_paired { ItemOutcome::Paired } else { ItemOutcome::Unpaired };
         released.push(Released { tag: self.tag, outcome });
         let duplicate = |tag| Released { tag, outcome: ItemOutcome::Duplicate };
         released.extend(self.duplicates.into_iter().map(duplicate));
+        self.item
     }
 }
 

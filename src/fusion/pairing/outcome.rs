@@ -1,5 +1,7 @@
 //! What became of the items of a stream.
 
+use crate::domain::{Detection, Sample};
+
 /// What became of an item.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum ItemOutcome {
@@ -20,4 +22,36 @@ pub struct Released<T> {
     pub tag: T,
     /// What became of it.
     pub outcome: ItemOutcome,
+}
+
+/// What one push has decided. A sample never comes after the release of its items.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PairedItems<T> {
+    /// New samples, per target in order of time.
+    pub samples: Vec<Sample>,
+    /// Boxes released without a partner, per target in order of time.
+    pub unpaired_detections: Vec<Detection>,
+    /// Items released.
+    pub released: Vec<Released<T>>,
+}
+
+impl<T> Default for PairedItems<T> {
+    fn default() -> Self {
+        Self { samples: Vec::new(), unpaired_detections: Vec::new(), released: Vec::new() }
+    }
+}
+
+impl<T> PairedItems<T> {
+    /// Whether nothing was decided.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.samples.is_empty() && self.released.is_empty()
+    }
+
+    /// Adds what was decided after this.
+    pub fn append(&mut self, later: Self) {
+        self.samples.extend(later.samples);
+        self.unpaired_detections.extend(later.unpaired_detections);
+        self.released.extend(later.released);
+    }
 }

@@ -5,38 +5,9 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 
 use super::buffer::{TargetBuffer, insert};
-use super::outcome::{ItemOutcome, Released};
+use super::outcome::{ItemOutcome, PairedItems, Released};
 use super::{PairingSettings, Unpaired};
-use crate::domain::{Detection, Fix, Sample, TargetId};
-
-/// What one push has decided. A sample never comes after the release of its items.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PairedItems<T> {
-    /// New samples, per target in order of time.
-    pub samples: Vec<Sample>,
-    /// Items released.
-    pub released: Vec<Released<T>>,
-}
-
-impl<T> Default for PairedItems<T> {
-    fn default() -> Self {
-        Self { samples: Vec::new(), released: Vec::new() }
-    }
-}
-
-impl<T> PairedItems<T> {
-    /// Whether nothing was decided.
-    #[must_use]
-    pub const fn is_empty(&self) -> bool {
-        self.samples.is_empty() && self.released.is_empty()
-    }
-
-    /// Adds what was decided after this.
-    pub fn append(&mut self, later: Self) {
-        self.samples.extend(later.samples);
-        self.released.extend(later.released);
-    }
-}
+use crate::domain::{Detection, Fix, TargetId};
 
 /// Pairs a live stream in bounded memory. A sample comes out once no item within the allowed lateness
 /// could change it; [`Pairer::finish`] gives the rest. Where memory is short, targets are decided early
@@ -90,17 +61,19 @@ impl<T> Pairer<T> {
     /// Decides all that is buffered of a target, as if its stream had ended.
     pub fn end(&mut self, target_id: &TargetId) -> PairedItems<T> {
         let Some(mut buffer) = self.targets.remove(target_id) else { return PairedItems::default() };
-        let (samples, released) = buffer.decide_all(&self.settings, &mut self.unpaired);
-        PairedItems { samples, released }
+        buffer.decide_all(&self.settings, &mut self.unpaired)
     }
 
     /// Decides everything buffered, as if the stream had ended. In order of time, then target.
-    pub fn finish(&mut self) -> Vec<Sample> {
+    pub fn finish(&mut self) -> PairedItems<T> {
         let targets: Vec<TargetId> = self.targets.keys().cloned().collect();
-        let mut samples: Vec<Sample> =
-            targets.iter().flat_map(|target_id| self.end(target_id).samples).collect();
-        samples.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
-        samples
+        let mut items = PairedItems::default();
+        for target_id in targets {
+            items.append(self.end(&target_id));
+        }
+        items.samples.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
+        items.unpaired_detections.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
+        items
     }
 
     /// Buffered boxes of targets without a fix, and fixes of targets without a box.
@@ -165,8 +138,8 @@ impl<T> Pairer<T> {
 
     fn decide(&mut self, target_id: &TargetId, decided: &mut PairedItems<T>) {
         let Some(buffer) = self.targets.get_mut(target_id) else { return };
-        if let Some((samples, released)) = buffer.decide_by_watermark(&self.settings, &mut self.unpaired) {
-            decided.append(PairedItems { samples, released });
+        if let Some(items) = buffer.decide_by_watermark(&self.settings, &mut self.unpaired) {
+            decided.append(items);
         }
     }
 

@@ -328,7 +328,7 @@ proptest! {
             samples.extend(decided.samples);
         }
         let early = samples.len();
-        samples.extend(pairer.finish());
+        samples.extend(pairer.finish().samples);
         samples.sort_by(|a, b| (a.time, &a.target_id).cmp(&(b.time, &b.target_id)));
         prop_assert!(early > samples.len() / 2, "{early} of {} came out in time", samples.len());
         prop_assert_eq!(&samples, &batch.samples);

@@ -393,6 +393,7 @@ fn settings_are_those_of_the_model_and_the_defaults_for_an_earlier_format() {
         epochs: Some(5),
         image_size: None,
         gnss_error: GnssError::Unknown,
+        gnss_bias_sigma_m: None,
     };
     let mut artifact =
         fit(&train, &options, &mut |_| std::ops::ControlFlow::Continue(())).expect("usable samples");

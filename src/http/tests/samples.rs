@@ -16,7 +16,10 @@ async fn every_format_is_imported_and_exported() {
     let imported = rest.csv(SAMPLES, rows(2_500)).await.expect(200).json();
     assert_eq!(
         imported,
-        json!({"accepted": 2500, "duplicate": 0, "rejected": 0, "rejected_rows": [], "durability": "synced"})
+        json!({
+            "accepted": 2500, "accepted_without_fix": 0, "duplicate": 0, "rejected": 0, "rejected_rows": [],
+            "durability": "synced",
+        })
     );
     for (media_type, lines) in [("text/csv", 2_501), ("application/x-ndjson", 2_500)] {
         let export = rest.send("GET", SAMPLES, &[("accept", media_type)], Body::empty()).await.expect(200);
@@ -48,11 +51,14 @@ async fn samples_are_counted_and_deleted_by_time() {
     rest.csv(SAMPLES, rows(100)).await.expect(200);
     let early = "from=2025-01-01T00:00:00Z&until=2025-01-01T08:00:10%2B08:00";
     let count = rest.get(&format!("{SAMPLES}/count?{early}")).await.expect(200).json();
-    assert_eq!(count, json!({"count": 10}));
+    assert_eq!(count, json!({"count": 10, "without_fix": 0}));
     let unescaped = early.replace("%2B", "+");
     let deleted = rest.send("DELETE", &format!("{SAMPLES}?{unescaped}"), &[], Body::empty()).await;
     assert_eq!(deleted.expect(200).json(), json!({"deleted": 10}));
-    assert_eq!(rest.get(&format!("{SAMPLES}/count")).await.expect(200).json(), json!({"count": 90}));
+    assert_eq!(
+        rest.get(&format!("{SAMPLES}/count")).await.expect(200).json(),
+        json!({"count": 90, "without_fix": 0})
+    );
     for (query, field) in [
         ("", "from"),
         ("from=yesterday", "from"),
@@ -64,7 +70,10 @@ async fn samples_are_counted_and_deleted_by_time() {
         let answer = rest.send("DELETE", &format!("{SAMPLES}?{query}"), &[], Body::empty()).await;
         assert_eq!(answer.problem(422, "invalid-argument"), [field], "{query}");
     }
-    assert_eq!(rest.get(&format!("{SAMPLES}/count")).await.expect(200).json(), json!({"count": 90}));
+    assert_eq!(
+        rest.get(&format!("{SAMPLES}/count")).await.expect(200).json(),
+        json!({"count": 90, "without_fix": 0})
+    );
 }
 
 #[tokio::test]
@@ -109,5 +118,8 @@ async fn long_imports_go_through_a_file_and_too_long_ones_nowhere() {
     assert_eq!(response["accepted"], 1_000);
     rest.csv(SAMPLES, parts(rows(5_000))).await.problem(413, "too-large");
     rest.csv(SAMPLES, rows(5_000)).await.problem(413, "too-large");
-    assert_eq!(rest.get(&format!("{SAMPLES}/count")).await.expect(200).json(), json!({"count": 1_000}));
+    assert_eq!(
+        rest.get(&format!("{SAMPLES}/count")).await.expect(200).json(),
+        json!({"count": 1_000, "without_fix": 0})
+    );
 }

@@ -16,6 +16,16 @@ pub(crate) fn features_of(bounding_box: &BoundingBox) -> [f64; FEATURE_COUNT] {
     [foot_x, foot_y, bounding_box.width_px(), bounding_box.height_px()]
 }
 
+/// eX of (2) in squared box heights: the mean square of the decoder's error in foot x, foot y, width and
+/// height, divided by the squared height.
+#[inline]
+pub(crate) fn reconstruction_error(bounding_box: &BoundingBox, encoded: &Encoded) -> f64 {
+    let features = features_of(bounding_box);
+    let squares =
+        features.iter().zip(&encoded.reconstruction_px).map(|(one, other)| (one - other) * (one - other));
+    squares.sum::<f64>() / (FEATURE_COUNT as f64 * bounding_box.height_px() * bounding_box.height_px())
+}
+
 /// The position that an encoder gives to a box, and the box that its decoder gives to the position.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Encoded {

@@ -1,5 +1,6 @@
 //! The encoders of the recipes: from a box to a position, and back to the box that belongs to it.
 
+mod auto_encoder;
 pub(crate) mod features;
 pub(crate) mod gaussian_process;
 pub(crate) mod hybrid;

@@ -100,6 +100,7 @@ pub fn fit_foot_points(pairs: &[(BoundingBox, EastNorth)], rng: &mut ChaCha8Rng)
         .iter()
         .enumerate()
         .map(|(at, (bounding_box, label))| TrainingRow {
+            sample: 0,
             time_s: 0.0,
             target: at as u32,
             traverse: at as u32,

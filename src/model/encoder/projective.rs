@@ -9,8 +9,8 @@
 use std::sync::Arc;
 
 use super::FittedEncoder;
+use super::auto_encoder::batch_size;
 use super::features::{Encoded, FEATURE_COUNT, FEATURES};
-use super::hybrid::batch_size;
 use super::initial_projection::subset_rng;
 use super::inverse_camera::InverseCamera;
 use super::projection::{COEFFICIENTS, Projection};

@@ -6,6 +6,7 @@ use crate::model::encoder::{FittedEncoder, gaussian_process, hybrid, paper, proj
 use crate::model::network::LossWeights;
 use crate::model::progress::{FitError, Phase};
 use crate::model::samples::rows::TrainingRows;
+use crate::model::samples::unpaired::TargetBox;
 use crate::model::uncertainty::coverage::Coverage;
 use crate::model::uncertainty::error_model::set_uncalibrated;
 
@@ -62,11 +63,15 @@ pub(super) const fn of_recipe(recipe: Recipe) -> &'static [Candidate] {
 
 /// What all fits of a run have in common.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct FitContext {
+pub(super) struct FitContext<'a> {
     /// Error variance per axis of the receiver, m2.
     pub(super) e_gnss_m2: f64,
     pub(super) e_gnss_is_estimated: bool,
+    /// Standard deviation per axis of what all fixes have in common, m, if known.
+    pub(super) gnss_bias_sigma_m: Option<f64>,
     pub(super) image_size: Option<ImageSize>,
+    /// Boxes without a fix, in the order of target and time.
+    pub(super) unpaired: &'a [TargetBox],
     /// Median height of the targets, m, and the standard deviation of its logarithm.
     pub(super) target_height_m: (f64, f64),
     /// Noise of the fixes about the geometric map.
@@ -78,10 +83,18 @@ pub(super) struct FitContext {
     pub(super) loss_weights: Option<LossWeights>,
 }
 
-impl FitContext {
-    fn map_settings(&self) -> gaussian_process::Settings {
-        let Self { e_gnss_m2, e_gnss_is_estimated, image_size, target_height_m, seed, .. } = *self;
-        gaussian_process::Settings { e_gnss_m2, e_gnss_is_estimated, image_size, target_height_m, seed }
+impl FitContext<'_> {
+    fn map_settings(&self) -> gaussian_process::Settings<'_> {
+        gaussian_process::Settings {
+            e_gnss_m2: self.e_gnss_m2,
+            e_gnss_is_estimated: self.e_gnss_is_estimated,
+            gnss_bias_sigma_m: self.gnss_bias_sigma_m,
+            white_share: self.noise.correlation.white_share,
+            image_size: self.image_size,
+            unpaired: self.unpaired,
+            target_height_m: self.target_height_m,
+            seed: self.seed,
+        }
     }
 }
 
@@ -92,23 +105,23 @@ impl Candidate {
     }
 
     /// Epochs of the training of one network.
-    pub(super) fn epochs(&self, context: &FitContext) -> u32 {
+    pub(super) fn epochs(&self, context: &FitContext<'_>) -> u32 {
         let default = match self.estimator {
             Estimator::Paper => paper::EPOCHS,
             Estimator::Hybrid => hybrid::EPOCHS,
             Estimator::Projective(_) => projective::EPOCHS,
-            Estimator::GaussianProcess => 1,
+            Estimator::GaussianProcess => gaussian_process::EPOCHS,
         };
         context.epochs.unwrap_or(default).max(1)
     }
 
-    /// Epochs of one fit, over all of its networks.
-    pub(super) fn total_epochs(&self, context: &FitContext) -> u32 {
+    /// Epochs of one fit, over all of its networks; the final one of `gaussian_process` has one.
+    pub(super) fn total_epochs(&self, context: &FitContext<'_>, is_final: bool) -> u32 {
         let networks = match self.estimator {
             Estimator::Paper => 2,
             Estimator::Hybrid => 1,
             Estimator::Projective(variant) => u32::from(variant.residual),
-            Estimator::GaussianProcess => 0,
+            Estimator::GaussianProcess => u32::from(is_final),
         };
         networks.saturating_mul(self.epochs(context))
     }
@@ -117,7 +130,7 @@ impl Candidate {
     pub(super) fn fit(
         &self,
         rows: &TrainingRows,
-        context: &FitContext,
+        context: &FitContext<'_>,
         phase: &mut Phase<'_, '_>,
     ) -> Result<FittedEncoder, FitError> {
         let smoothed = self.smoothed.then(|| rows.smoothed(&context.noise));
@@ -127,7 +140,7 @@ impl Candidate {
             Estimator::Paper => paper::fit(rows, e_gnss_m2, epochs, phase),
             Estimator::Hybrid => hybrid::fit(rows, e_gnss_m2, epochs, phase),
             Estimator::Projective(variant) => projective::fit(rows, variant, e_gnss_m2, epochs, phase),
-            Estimator::GaussianProcess => gaussian_process::fit(rows, &context.map_settings(), phase),
+            Estimator::GaussianProcess => gaussian_process::fit(rows, &context.map_settings(), epochs, phase),
         }?;
         let coverage = Coverage::new(rows.rows.iter().map(|row| row.bounding_box));
         match self.estimator {

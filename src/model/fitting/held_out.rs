@@ -11,13 +11,13 @@ use rand_chacha::ChaCha8Rng;
 use super::candidates::{Candidate, FitContext};
 use crate::model::progress::{FitError, FitRun, Phase};
 use crate::model::regressor::Regressor;
-use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRows, traverses};
+use crate::model::samples::rows::{TrainingRows, traverses};
 use crate::statistics::median;
 
 /// A squared residual counts at most this many times the median of the simplest candidate's.
 const LARGEST_SQUARE_RATIO: f64 = 10.0;
 
-/// Predictions of every row by a fit without the row's block of time.
+/// Predictions of every row by a fit without the row's group.
 pub(super) struct HeldOutResiduals {
     /// Regressed position less fix, east and north, m.
     pub(super) residuals: Vec<[f64; 2]>,
@@ -25,26 +25,27 @@ pub(super) struct HeldOutResiduals {
     pub(super) predicted_m2: Vec<f64>,
 }
 
-/// Fits a candidate once per block of time, without that block, and predicts the block's rows.
+/// Fits a candidate once per group of rows (given by its index per row, and the number of groups), without
+/// that group, and predicts the group's rows.
 pub(super) fn cross_validate(
     candidate: &Candidate,
     rows: &TrainingRows,
-    blocks: &[u32],
-    context: &FitContext,
+    (groups, count): (&[u32], u32),
+    context: &FitContext<'_>,
     run: &mut FitRun<'_>,
 ) -> Result<HeldOutResiduals, FitError> {
     let mut residuals = vec![[0.0; 2]; rows.rows.len()];
     let mut predicted_m2 = vec![0.0; rows.rows.len()];
-    for block in 0..HELD_OUT_BLOCKS {
-        let train = rows.filtered(|at| blocks[at] != block);
+    for group in 0..count {
+        let train = rows.filtered(|at| groups[at] != group);
         let mut rng = ChaCha8Rng::seed_from_u64(context.seed);
-        rng.set_stream(u64::from(block) + 1);
-        let name = format!("{}: held-out block {} of {HELD_OUT_BLOCKS}", candidate.name, block + 1);
+        rng.set_stream(u64::from(group) + 1);
+        let name = format!("{}: held-out group {} of {count}", candidate.name, group + 1);
         let loss_weights = context.loss_weights;
         let mut phase = Phase { run, name, rng, is_final: false, loss_weights };
         let fitted = candidate.fit(&train, context, &mut phase)?;
         let regressor = Regressor::build(fitted.parts).map_err(FitError::fault)?;
-        for (at, row) in rows.rows.iter().enumerate().filter(|(at, _)| blocks[*at] == block) {
+        for (at, row) in rows.rows.iter().enumerate().filter(|(at, _)| groups[*at] == group) {
             let fix = regressor.plane().to_plane(row.position);
             // From the box alone: a network with the fix among its inputs would only reproduce it.
             let regression = regressor.regress(&row.bounding_box, None);

@@ -8,14 +8,16 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::candidates::{self, Candidate, Estimator, FitContext};
+use super::findings::{Selection, training_report};
 use super::held_out::{choose, cross_validate};
 use super::report::{
     coverage_of_fixes, held_out_error, mean_variance_m2, note_choice, note_errors, note_samples,
 };
 use super::track_noise::estimate_track_noise;
+use super::widening::widen_radius;
 use crate::domain::{
-    CandidateReport, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError, ImageSize,
-    ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
+    CandidateReport, Detection, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError,
+    HeldOutSampleError, ImageSize, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
 };
 use crate::model::artifact::{Artifact, FORMAT, ModelParts};
 use crate::model::encoder::gaussian_process::target_height_m;
@@ -24,12 +26,37 @@ use crate::model::encoder::projective::{GeometricCovariance, fit_geometry};
 use crate::model::network::LossWeights;
 use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
 use crate::model::regressor::Regressor;
-use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRows, sha256_of};
-use crate::model::uncertainty::calibration::{HeldOut, calibrate};
+use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
+use crate::model::samples::unpaired::unpaired_boxes;
+use crate::model::uncertainty::calibration::{HeldOut, calibrate, calibrate_reconstruction};
 use crate::model::uncertainty::error_model::set_image_size;
 
+/// Rows that a fit uses at most: neighbours repeat each other, and time and memory stay bounded.
+const MAX_ROWS: usize = 20_000;
 /// Least error variance of a receiver that is estimated, m2.
 const LEAST_GNSS_VARIANCE_M2: f64 = 1e-4;
+
+/// What a fit learns from.
+#[derive(Debug, Clone, Copy)]
+pub struct FitInput<'a> {
+    /// Boxes with the fix of the same instant.
+    pub samples: &'a [Sample],
+    /// Boxes without a fix. They tell the geometry of a camera whose image size is known; recipes
+    /// `gaussian_process` and `auto` use those of the class that most samples have.
+    pub unpaired: &'a [Detection],
+}
+
+impl<'a> From<&'a [Sample]> for FitInput<'a> {
+    fn from(samples: &'a [Sample]) -> Self {
+        Self { samples, unpaired: &[] }
+    }
+}
+
+impl<'a> From<&'a Vec<Sample>> for FitInput<'a> {
+    fn from(samples: &'a Vec<Sample>) -> Self {
+        Self::from(samples.as_slice())
+    }
+}
 
 /// What a fit is asked to do.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,6 +71,10 @@ pub struct FitOptions {
     pub image_size: Option<ImageSize>,
     /// The receiver's error, if known.
     pub gnss_error: GnssError,
+    /// Standard deviation per axis, m, of the bias that all fixes of the training have in common and that
+    /// no sample can show: that of the one session of the one receiver, or what several receivers share.
+    /// `None` for a share of the estimated receiver error.
+    pub gnss_bias_sigma_m: Option<f64>,
 }
 
 /// Changes to a fit for an evaluation; operators have no access to them.
@@ -62,31 +93,35 @@ pub struct FitOverrides<'a> {
 /// # Errors
 /// [`FitError::Cancelled`] when the observer breaks, [`FitError::Unusable`] where the samples cannot
 /// support a fit.
-pub fn fit(
-    samples: &[Sample],
+pub fn fit<'a>(
+    input: impl Into<FitInput<'a>>,
     options: &FitOptions,
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
-    fit_with(samples, options, FitOverrides::default(), observer)
+    fit_with(input, options, FitOverrides::default(), observer)
 }
 
 /// Fits a model with some overrides.
 ///
 /// # Errors
 /// As [`fit`], and [`FitError::Fault`] where the recipe has no such candidate.
-pub fn fit_with(
-    samples: &[Sample],
+pub fn fit_with<'a>(
+    input: impl Into<FitInput<'a>>,
     options: &FitOptions,
     overrides: FitOverrides<'_>,
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
-    let rows = TrainingRows::new(samples).map_err(FitError::Unusable)?;
+    let FitInput { samples, unpaired } = input.into();
+    let rows = TrainingRows::new(samples).map_err(FitError::Unusable)?.thinned(MAX_ROWS);
+    let unpaired = unpaired_boxes(samples, unpaired);
     let geometry = fit_geometry(&rows);
     let (e_gnss_m2, e_gnss_source) = receiver_variance(&rows, options.gnss_error, &geometry.noise);
     let context = FitContext {
         e_gnss_m2,
         e_gnss_is_estimated: e_gnss_source == GnssErrorSource::Estimated,
         image_size: options.image_size,
+        gnss_bias_sigma_m: options.gnss_bias_sigma_m,
+        unpaired: &unpaired,
         target_height_m: target_height_m(samples.iter().map(|sample| sample.class.as_ref())),
         noise: geometry.noise,
         epochs: options.epochs,
@@ -94,7 +129,8 @@ pub fn fit_with(
         loss_weights: overrides.loss_weights,
     };
     let mut run = FitRun { observer, progress: RunProgress::default() };
-    let chosen = select(&rows, &context, &selected(options.recipe, overrides.candidate)?, &mut run)?;
+    let candidates = selected(options.recipe, overrides.candidate)?;
+    let chosen = select(samples, &rows, &context, &candidates, &mut run)?;
     let fit = FinalFit { samples, rows: &rows, context: &context, options, e_gnss_source };
     let (parts, held_out) = fit.run(&chosen, geometry.covariance, &mut run)?;
     note_errors(&held_out, &parts, &mut run)?;
@@ -137,28 +173,35 @@ fn receiver_variance(
 struct Chosen {
     candidate: Candidate,
     residuals: Vec<[f64; 2]>,
+    /// Held-out group of each row.
+    groups: Vec<u32>,
     held_out: HeldOutError,
+    /// The candidates that could be fitted, their errors and scores, and the index of the chosen one.
+    usable: Vec<&'static Candidate>,
     reports: Vec<CandidateReport>,
+    scores: Vec<f64>,
+    index: usize,
 }
 
 /// Cross-validates the candidates and chooses one.
 fn select(
+    samples: &[Sample],
     rows: &TrainingRows,
-    context: &FitContext,
-    candidates: &[&Candidate],
+    context: &FitContext<'_>,
+    candidates: &[&'static Candidate],
     run: &mut FitRun<'_>,
 ) -> Result<Chosen, FitError> {
-    let longest = candidates.iter().map(|candidate| candidate.total_epochs(context)).max().unwrap_or(1);
+    let longest = candidates.iter().map(|candidate| candidate.total_epochs(context, true)).max().unwrap_or(1);
+    let (groups, count) = rows.held_out_groups(HELD_OUT_BLOCKS);
     let in_blocks: u32 =
-        candidates.iter().map(|candidate| HELD_OUT_BLOCKS * candidate.total_epochs(context)).sum();
+        candidates.iter().map(|candidate| count * candidate.total_epochs(context, false)).sum();
     run.progress.epochs = in_blocks + longest;
     note_samples(rows, context, run)?;
-    let blocks = rows.held_out_groups(HELD_OUT_BLOCKS);
     let mut usable = Vec::with_capacity(candidates.len());
     let mut validated = Vec::with_capacity(candidates.len());
     let mut reports = Vec::with_capacity(candidates.len());
     for (at, candidate) in candidates.iter().enumerate() {
-        let held_out = match cross_validate(candidate, rows, &blocks, context, run) {
+        let held_out = match cross_validate(candidate, rows, (&groups, count), context, run) {
             // Another candidate may do with these samples.
             Err(FitError::Unusable(reason)) if at + 1 < candidates.len() || !usable.is_empty() => {
                 run.note(&format!("{}: left out, {reason}", candidate.name))?;
@@ -167,7 +210,7 @@ fn select(
             held_out => held_out?,
         };
         usable.push(*candidate);
-        let report = held_out_error(&held_out, context.e_gnss_m2);
+        let report = held_out_error(&held_out, count, context.e_gnss_m2);
         run.note(&format!("{}: {:.3} m from the held-out fixes", candidate.name, report.mean_to_fix_m))?;
         reports.push(CandidateReport { candidate: candidate.name.to_owned(), held_out: report });
         validated.push(held_out);
@@ -175,15 +218,23 @@ fn select(
     let residuals: Vec<&[[f64; 2]]> = validated.iter().map(|it| it.residuals.as_slice()).collect();
     let (chosen, scores) = choose(rows, &residuals);
     note_choice(&usable, chosen, &scores, run)?;
-    let distances_m: Vec<f64> = residuals[chosen].iter().map(|[east, north]| east.hypot(*north)).collect();
-    run.notify(FitEvent::HeldOut(&distances_m))?;
+    let error_of = |(row, [east, north]): (&TrainingRow, &[f64; 2])| {
+        let Sample { time, target_id, .. } = &samples[row.sample as usize];
+        HeldOutSampleError { time: *time, target_id: target_id.clone(), distance_m: east.hypot(*north) }
+    };
+    let errors: Vec<HeldOutSampleError> = rows.rows.iter().zip(residuals[chosen]).map(error_of).collect();
+    run.notify(FitEvent::HeldOut(&errors))?;
     // The final fit may be shorter than the longest candidate's.
-    run.progress.epochs = in_blocks + usable[chosen].total_epochs(context);
+    run.progress.epochs = in_blocks + usable[chosen].total_epochs(context, true);
     Ok(Chosen {
         candidate: *usable[chosen],
         residuals: validated.swap_remove(chosen).residuals,
+        groups,
         held_out: reports[chosen].held_out.clone(),
+        usable,
         reports,
+        scores,
+        index: chosen,
     })
 }
 
@@ -191,7 +242,7 @@ fn select(
 struct FinalFit<'a> {
     samples: &'a [Sample],
     rows: &'a TrainingRows,
-    context: &'a FitContext,
+    context: &'a FitContext<'a>,
     options: &'a FitOptions,
     e_gnss_source: GnssErrorSource,
 }
@@ -200,7 +251,7 @@ impl FinalFit<'_> {
     /// The complete parts of the model, and its error on the held-out rows.
     fn run(
         &self,
-        Chosen { candidate, residuals, held_out, .. }: &Chosen,
+        Chosen { candidate, residuals, groups, held_out, .. }: &Chosen,
         geometry: ParameterCovariance,
         run: &mut FitRun<'_>,
     ) -> Result<(ModelParts, HeldOutError), FitError> {
@@ -213,6 +264,7 @@ impl FinalFit<'_> {
         let mut held_out = held_out.clone();
         if candidate.estimator == Estimator::GaussianProcess {
             // It has been calibrated on left-out targets of its own.
+            calibrate_reconstruction(&mut fitted.parts, &rows.rows)?;
             held_out.e_regression_m2 = mean_variance_m2(&fitted.parts, rows)?;
             held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
         } else if candidate.estimator != Estimator::Paper {
@@ -220,6 +272,7 @@ impl FinalFit<'_> {
             let validation = HeldOut { rows: &rows.rows, residuals, noise: &context.noise };
             let calibration = calibrate(&mut fitted, geometry, &validation, options.image_size)?;
             held_out.e_regression_m2 = calibration.error_m2;
+            widen_radius(&mut fitted.parts, rows, groups, residuals, &context.noise)?;
             if *e_gnss_source == GnssErrorSource::Estimated {
                 fitted.parts.e_gnss_m2 = calibration.receiver_m2.max(LEAST_GNSS_VARIANCE_M2);
             }
@@ -239,9 +292,11 @@ impl FinalFit<'_> {
 fn artifact_of(
     parts: ModelParts,
     FinalFit { samples, rows, context, options, e_gnss_source }: &FinalFit<'_>,
-    Chosen { candidate, reports, .. }: Chosen,
+    Chosen { candidate, usable, reports, scores, index, .. }: Chosen,
     held_out: HeldOutError,
 ) -> Result<Artifact, FitError> {
+    let selection = Selection { candidates: &usable, reports: &reports, scores: &scores, chosen: index };
+    let report = training_report(&selection, &held_out, rows, &parts, options.image_size);
     let weights = parts.tensors.to_bytes().map_err(FitError::fault)?;
     let origin = parts.plane.origin();
     Ok(Artifact {
@@ -253,7 +308,7 @@ fn artifact_of(
             origin: OriginDeg { longitude_deg: origin.longitude_deg(), latitude_deg: origin.latitude_deg() },
             seed: context.seed,
             epochs: candidate.epochs(context),
-            training_rows_sha256: sha256_of(samples),
+            training_rows_sha256: sha256_of(samples, context.unpaired),
             samples: rows.rows.len() as u32,
             targets: rows.targets,
             passes: rows.traverses,
@@ -262,6 +317,7 @@ fn artifact_of(
             e_gnss_source: *e_gnss_source,
             held_out: Some(held_out),
             candidates: reports,
+            report: Some(report),
             parameters: parts.parameters,
         },
         weights,

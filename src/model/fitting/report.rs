@@ -6,14 +6,14 @@ use crate::domain::{GaussMarkovNoise, HeldOutError, NoiseCorrelation};
 use crate::model::artifact::ModelParts;
 use crate::model::progress::{FitError, FitRun};
 use crate::model::regressor::Regressor;
-use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRows};
+use crate::model::samples::rows::TrainingRows;
 use crate::model::samples::whitening::effective_sample_size;
 use crate::statistics::R95_PER_SIGMA;
 
 /// Logs the samples and the noise of their fixes.
 pub(super) fn note_samples(
     rows: &TrainingRows,
-    context: &FitContext,
+    context: &FitContext<'_>,
     run: &mut FitRun<'_>,
 ) -> Result<(), FitError> {
     let GaussMarkovNoise { variance_m2, correlation } = context.noise;
@@ -78,6 +78,7 @@ pub(super) fn note_errors(
 /// The error of a candidate on its held-out rows.
 pub(super) fn held_out_error(
     HeldOutResiduals { residuals, predicted_m2 }: &HeldOutResiduals,
+    groups: u32,
     e_gnss_m2: f64,
 ) -> HeldOutError {
     let count = residuals.len() as f64;
@@ -90,7 +91,7 @@ pub(super) fn held_out_error(
     }
     let error_to_fix_m2 = square_m2 / count;
     HeldOutError {
-        blocks: HELD_OUT_BLOCKS,
+        blocks: groups,
         samples: residuals.len() as u32,
         mean_to_fix_m: distance_m / count,
         error_to_fix_m2,

@@ -4,4 +4,5 @@ pub(crate) mod rows;
 pub(crate) mod second_differences;
 pub(crate) mod sequences;
 pub(crate) mod target_groups;
+pub(crate) mod unpaired;
 pub(crate) mod whitening;

@@ -9,7 +9,8 @@ use std::collections::HashMap;
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
-use super::target_groups::{MIN_TARGETS, groups_of_targets};
+use super::target_groups::groups_of_targets;
+use super::unpaired::TargetBox;
 use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, Result, Sample};
 use crate::filters::{Traverse, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
@@ -19,6 +20,10 @@ use crate::statistics::{median, std_dev};
 pub const FEWEST_SAMPLES: u64 = 20;
 /// Fixes within this distance of each other are all at one position, m.
 pub const SMALLEST_SPREAD_M: f64 = 1.0;
+/// Half an hour without any row ends a session.
+pub(crate) const SESSION_GAP_S: f64 = 1800.0;
+/// Neighbouring rows that thinning keeps together.
+const NEIGHBOURS: usize = 8;
 /// Blocks of time that are held out in turn.
 pub(crate) const HELD_OUT_BLOCKS: u32 = 4;
 /// A gap in a target's samples ends a traverse if it exceeds both this, s, and [`GAP_INTERVALS`].
@@ -29,6 +34,8 @@ const GAP_INTERVALS: f64 = 10.0;
 /// One training sample.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TrainingRow {
+    /// Index of the sample that it is made of.
+    pub(crate) sample: u32,
     /// Time since the first sample, s.
     pub(crate) time_s: f64,
     /// Index of the target, from 0.
@@ -61,15 +68,18 @@ impl TrainingRows {
     /// at one position in the image or on the ground.
     pub(crate) fn new(samples: &[Sample]) -> Result<Self> {
         check_count(samples.len())?;
-        let mut sorted: Vec<&Sample> = samples.iter().collect();
-        sorted.sort_by(|left, right| (&left.target_id, left.time).cmp(&(&right.target_id, right.time)));
-        let plane = central_plane(&sorted);
-        let first = sorted.iter().map(|sample| sample.time).min().unwrap_or(Timestamp::UNIX_EPOCH);
+        let mut sorted: Vec<(u32, &Sample)> = (0..).zip(samples).collect();
+        sorted.sort_by(|(_, left), (_, right)| {
+            (&left.target_id, left.time).cmp(&(&right.target_id, right.time))
+        });
+        let plane = central_plane(samples);
+        let first = samples.iter().map(|sample| sample.time).min().unwrap_or(Timestamp::UNIX_EPOCH);
         let mut rows = Vec::with_capacity(sorted.len());
         let mut target = 0;
-        for (at, sample) in sorted.iter().enumerate() {
-            target += u32::from(at > 0 && sorted[at - 1].target_id != sample.target_id);
+        for (at, (index, sample)) in sorted.iter().enumerate() {
+            target += u32::from(at > 0 && sorted[at - 1].1.target_id != sample.target_id);
             rows.push(TrainingRow {
+                sample: *index,
                 time_s: (sample.time.as_microsecond() - first.as_microsecond()) as f64 * 1e-6,
                 target,
                 traverse: 0,
@@ -131,16 +141,25 @@ impl TrainingRows {
         Ok(())
     }
 
-    /// Index of the held-out group of each row, 0 to `count - 1`: whole targets where there are enough of
-    /// them, because the error of a target's receiver outlasts its rows; else blocks of time.
-    pub(crate) fn held_out_groups(&self, count: u32) -> Vec<u32> {
-        if (self.targets as usize) < MIN_TARGETS {
-            return self.blocks(count);
-        }
+    /// Index of the held-out group of each row, from 0, and the number of groups, at most `most`: whole
+    /// targets, because the error of a target's receiver outlasts its rows; blocks of time where one
+    /// receiver has nearly all fixes.
+    pub(crate) fn held_out_groups(&self, most: u32) -> (Vec<u32>, u32) {
         let mut rows_of_target = vec![0; self.targets as usize];
         self.rows.iter().for_each(|row| rows_of_target[row.target as usize] += 1);
-        let groups = groups_of_targets(&rows_of_target, count as usize);
-        self.rows.iter().map(|row| groups[row.target as usize] as u32).collect()
+        match groups_of_targets(&rows_of_target, most as usize) {
+            Some((groups, count)) => {
+                (self.rows.iter().map(|row| groups[row.target as usize] as u32).collect(), count as u32)
+            }
+            None => (self.blocks(most), most),
+        }
+    }
+
+    /// Number of sessions: half an hour without any row ends one.
+    pub(crate) fn sessions(&self) -> usize {
+        let mut times_s: Vec<f64> = self.rows.iter().map(|row| row.time_s).collect();
+        times_s.sort_by(f64::total_cmp);
+        1 + times_s.windows(2).filter(|pair| pair[1] - pair[0] > SESSION_GAP_S).count()
     }
 
     /// Index of the block of time of each row, 0 to `count - 1`: blocks of about equal size, cut at the
@@ -170,6 +189,13 @@ impl TrainingRows {
             blocks[at] = (rank * count as usize / self.rows.len()) as u32;
         }
         blocks
+    }
+
+    /// At most about so many of the rows: runs of neighbours in time, evenly spaced, since the noise of
+    /// receivers and detectors shows between neighbours.
+    pub(crate) fn thinned(self, most: usize) -> Self {
+        let stride = self.rows.len().div_ceil(most).max(1);
+        if stride == 1 { self } else { self.filtered(|row| (row / NEIGHBOURS).is_multiple_of(stride)) }
     }
 
     /// Some of the rows, in the same plane.
@@ -218,8 +244,9 @@ fn cut_near(times: &[f64], rank: usize, reach: usize) -> f64 {
     times[at]
 }
 
-/// SHA-256 of time, target, box and fix of each sample, in their order, hexadecimal.
-pub(crate) fn sha256_of(samples: &[Sample]) -> String {
+/// SHA-256 of time, target, box and fix of each sample, then of target and box of each box without a fix, in
+/// their order, hexadecimal.
+pub(crate) fn sha256_of(samples: &[Sample], unpaired: &[TargetBox]) -> String {
     let mut hash = Sha256::new();
     for sample in samples {
         hash.update(sample.time.as_microsecond().to_le_bytes());
@@ -232,6 +259,12 @@ pub(crate) fn sha256_of(samples: &[Sample]) -> String {
         hash.update(fix.position.longitude_deg().to_le_bytes());
         hash.update(fix.position.latitude_deg().to_le_bytes());
         hash.update(fix.sigma_m.map_or(0.0, |sigma| sigma.metres()).to_le_bytes());
+    }
+    for own in unpaired {
+        hash.update(own.target.to_le_bytes());
+        for side in own.bounding_box.sides_px() {
+            hash.update(side.to_le_bytes());
+        }
     }
     hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
@@ -255,7 +288,7 @@ fn unusable(message: String) -> Error {
 
 /// The plane about the median fix. The medians are taken in a plane about the first fix, so that fixes
 /// on both sides of the antimeridian are handled.
-fn central_plane(samples: &[&Sample]) -> LocalPlane {
+fn central_plane(samples: &[Sample]) -> LocalPlane {
     let Some(first) = samples.first() else {
         unreachable!("the samples have been counted");
     };

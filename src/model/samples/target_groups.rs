@@ -3,12 +3,19 @@
 //! Each target carries a receiver of its own, whose error outlasts its rows. Rows of one receiver on both
 //! sides of a split would let a model be praised for having learned that error.
 
-/// Number of targets from which whole targets are held out.
-pub(crate) const MIN_TARGETS: usize = 5;
+/// Share of the rows that the targets beside the largest one have at least; with fewer, one receiver has
+/// nearly all fixes, and without it there is next to nothing to fit.
+const MIN_OTHER_SHARE: f64 = 0.2;
 
-/// Group of each target, 0 to `count - 1`, from the targets' numbers of rows: the largest first, each into
-/// the group that is the smallest so far.
-pub(crate) fn groups_of_targets(rows_of_target: &[usize], count: usize) -> Vec<usize> {
+/// Group of each target, from 0, and the number of groups (at most `most`), from the targets' numbers of
+/// rows: the largest first, each into the group that is the smallest so far. `None` where one target has
+/// nearly all rows.
+pub(crate) fn groups_of_targets(rows_of_target: &[usize], most: usize) -> Option<(Vec<usize>, usize)> {
+    let (largest, all) = (rows_of_target.iter().max()?, rows_of_target.iter().sum::<usize>());
+    if ((all - largest) as f64) < MIN_OTHER_SHARE * all as f64 {
+        return None;
+    }
+    let count = rows_of_target.len().min(most);
     let mut order: Vec<usize> = (0..rows_of_target.len()).collect();
     order.sort_by_key(|target| std::cmp::Reverse(rows_of_target[*target]));
     let mut sizes = vec![0; count];
@@ -18,5 +25,5 @@ pub(crate) fn groups_of_targets(rows_of_target: &[usize], count: usize) -> Vec<u
         sizes[smallest] += rows_of_target[target];
         group_of[target] = smallest;
     }
-    group_of
+    Some((group_of, count))
 }

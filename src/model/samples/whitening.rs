@@ -146,6 +146,7 @@ mod tests {
     /// Rows of targets with 2,000 s each.
     fn rows(count: usize) -> Vec<TrainingRow> {
         let row = |at: usize| TrainingRow {
+            sample: 0,
             time_s: at as f64,
             target: (at / 2000) as u32,
             traverse: (at / 2000) as u32,

@@ -192,6 +192,7 @@ pub(super) fn options(recipe: Recipe) -> FitOptions {
         epochs: Some(30),
         image_size: None,
         gnss_error: GnssError::Known(SigmaM::new(2.0).expect("valid")),
+        gnss_bias_sigma_m: None,
     }
 }
 

@@ -3,7 +3,6 @@
 
 use super::centre_statistics::CentreStatistics;
 use super::coverage::Coverage;
-use super::error_model::reconstruction_error;
 use super::excess_calibration::calibrate_excess;
 use super::local_boxes::LocalBoxModel;
 use super::variance_components::{
@@ -12,7 +11,7 @@ use super::variance_components::{
 use crate::domain::{BoundingBox, GaussMarkovNoise, ImageSize};
 use crate::geo::EastNorth;
 use crate::model::artifact::ModelParts;
-use crate::model::encoder::features::Encoded;
+use crate::model::encoder::features::{Encoded, reconstruction_error};
 use crate::model::encoder::projective::GeometricCovariance;
 use crate::model::encoder::{Encoder, FittedEncoder};
 use crate::model::progress::FitError;
@@ -174,6 +173,19 @@ fn border_factor(rows: &[TrainingRow], image_size: Option<ImageSize>) -> f64 {
     let at_border = rows.iter().filter(|row| row.bounding_box.touches_border(image_size)).count();
     let is_rare = (at_border as f64) < RARE_BORDER_SHARE * rows.len() as f64;
     if is_rare { RARE_BORDER_FACTOR } else { 1.0 }
+}
+
+/// Stores the reconstruction error above which a box is unlike those of training, for a recipe whose error
+/// variance is calibrated by itself.
+///
+/// # Errors
+/// [`FitError::Fault`] if the fitted encoder cannot be used.
+pub(crate) fn calibrate_reconstruction(parts: &mut ModelParts, rows: &[TrainingRow]) -> Result<(), FitError> {
+    let encoder = Encoder::build(&mut parts.clone()).map_err(FitError::fault)?;
+    let encoded: Vec<Encoded> =
+        rows.iter().map(|row| encoder.encode(&parts.plane, &row.bounding_box)).collect();
+    parts.set("reconstruction_usual", nominal_reconstruction_error(rows, &encoded));
+    Ok(())
 }
 
 /// Reconstruction error up to which a box is as consistent as those of the training.

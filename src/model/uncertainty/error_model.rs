@@ -14,12 +14,12 @@ use super::coverage::{Coverage, CoverageLookup, CoverageTable};
 use super::local_boxes::LocalBoxModel;
 use crate::domain::{BoundingBox, ImageSize, Recipe, Result};
 use crate::model::artifact::ModelParts;
-use crate::model::encoder::features::{Encoded, FEATURE_COUNT, features_of};
+use crate::model::encoder::features::{Encoded, reconstruction_error};
 use crate::statistics::R95_PER_SIGMA;
 
 /// Distance to the nearest centre, in covering radii, up to which the nominal error holds; a box beyond it
 /// is outside of the training.
-pub(crate) const NOMINAL_RATIO: f64 = 1.5;
+const NOMINAL_RATIO: f64 = 1.5;
 
 /// A box in full view (0) or cut by the image's border (1): the excess variance of the two is calibrated
 /// separately.
@@ -105,6 +105,14 @@ impl ErrorModel {
         self.coverage.look_up(bounding_box)
     }
 
+    /// Whether a box is unlike those of training: far from all of them, or with edges that the decoder does
+    /// not reconstruct. For `paper` the first alone, as its error is Es eX at any eX.
+    #[inline]
+    pub(crate) fn is_outside_training(&self, lookup: &CoverageLookup, reconstruction_error: f64) -> bool {
+        let limit = self.nominal_reconstruction_error;
+        lookup.extrapolation_ratio > NOMINAL_RATIO || (limit > 0.0 && reconstruction_error > limit)
+    }
+
     /// Reconstruction error and error variance of a box.
     #[inline]
     pub(crate) fn error_of(
@@ -153,16 +161,6 @@ impl ErrorModel {
         let lookup = self.look_up(bounding_box);
         self.excess_m2(bounding_box, &lookup, reconstruction_error(bounding_box, encoded))
     }
-}
-
-/// eX of (2) in squared box heights: the mean square of the decoder's error in foot x, foot y, width and
-/// height, divided by the squared height.
-#[inline]
-pub(crate) fn reconstruction_error(bounding_box: &BoundingBox, encoded: &Encoded) -> f64 {
-    let features = features_of(bounding_box);
-    let squares =
-        features.iter().zip(&encoded.reconstruction_px).map(|(one, other)| (one - other) * (one - other));
-    squares.sum::<f64>() / (FEATURE_COUNT as f64 * bounding_box.height_px() * bounding_box.height_px())
 }
 
 /// Parameters with which an encoder can be used before its error is calibrated.

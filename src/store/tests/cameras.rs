@@ -1,6 +1,7 @@
 use super::*;
 use crate::domain::{
-    Camera, ClockOffset, GnssError, ImageSize, Receiver, ReceiverId, Receivers, Revision, SigmaM, TargetClass,
+    Camera, ClockOffset, GnssBiasSigma, GnssError, ImageSize, Receiver, ReceiverId, Receivers, Revision,
+    SampleCount, SigmaM, TargetClass,
 };
 use crate::store::SampleFilter;
 
@@ -11,6 +12,7 @@ fn full(name: &str) -> NewCamera {
         display_name: "North \"gate\" – 2".to_owned(),
         image_size: Some(ImageSize::new(1920, 1080).expect("a size")),
         gnss_error: GnssError::Known(SigmaM::new(2.7).expect("a sigma")),
+        gnss_bias_sigma: Some(GnssBiasSigma::new(1.3).expect("a sigma")),
         recipe: Recipe::Projective,
         target_classes: vec![
             TargetClass::new("person").expect("a class"),
@@ -41,6 +43,7 @@ async fn a_profile_is_read_as_it_was_stored() {
         created_at: at(5),
         updated_at: at(5),
         active_model: None,
+        samples: SampleCount::default(),
     };
     assert_eq!(made, expected);
     assert_eq!(store.camera(&id("gate")).await.expect("known"), expected);

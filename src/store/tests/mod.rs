@@ -103,6 +103,7 @@ fn metadata() -> ModelMetadata {
         e_gnss_source: GnssErrorSource::Estimated,
         held_out: None,
         candidates: Vec::new(),
+        report: None,
         parameters: std::collections::BTreeMap::new(),
     }
 }
@@ -122,7 +123,7 @@ async fn futures_can_move_between_threads() {
     movable(store.ping());
     movable(store.cameras(Some(&camera), 1));
     movable(store.delete_camera(&camera, None));
-    movable(store.insert_samples(&camera, Vec::new(), Durability::Synced));
+    movable(store.insert_samples(&camera, Vec::<Sample>::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));
     movable(store.delete_samples(&camera, &filter));
     movable(store.insert_run(run, &camera, &options(), 1, at(0)));

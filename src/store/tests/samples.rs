@@ -1,5 +1,5 @@
 use super::*;
-use crate::domain::{Score, SigmaM, TargetClass};
+use crate::domain::{Detection, SampleCount, Score, SigmaM, StoredSample, TargetClass};
 use crate::store::{Inserted, SampleFilter, SampleKey};
 use proptest::prelude::*;
 
@@ -11,8 +11,16 @@ async fn samples_come_back_bit_for_bit_and_in_order() {
     full.class = Some(TargetClass::new("ö").expect("a class"));
     full.score = Some(Score::new(1.0 / 3.0).expect("a score"));
     full.truth = Some(Position::new(-179.999_999_9, -1e-300).expect("a place"));
-    let ordered =
-        vec![sample(-5, "z"), sample(1, "B"), sample(1, "a"), sample(1, "é"), full, sample(40, "a")];
+    let without_fix = StoredSample { fix: None, ..full.clone().into() };
+    let ordered: Vec<StoredSample> = vec![
+        sample(-5, "z").into(),
+        sample(1, "B").into(),
+        StoredSample { target_id: target("a"), time: at(1), ..without_fix.clone() },
+        sample(1, "é").into(),
+        StoredSample { target_id: target("a"), ..without_fix },
+        full.into(),
+        sample(40, "a").into(),
+    ];
     let mut shuffled = ordered.clone();
     shuffled.reverse();
     shuffled.swap(1, 4);
@@ -31,16 +39,16 @@ async fn a_key_is_stored_once_and_the_first_stays() {
     let first = store
         .insert_samples(&camera, vec![sample(1, "a"), twin.clone(), sample(1, "b")], Durability::Synced)
         .await;
-    assert_eq!(first.expect("stored"), Inserted { accepted: 2, duplicate: 1 });
+    assert_eq!(first.expect("stored"), Inserted { accepted: 2, duplicate: 1, without_fix: 0 });
     let again = store.insert_samples(&camera, vec![twin.clone(), sample(2, "a")], Durability::Synced).await;
-    assert_eq!(again.expect("stored"), Inserted { accepted: 1, duplicate: 1 });
+    assert_eq!(again.expect("stored"), Inserted { accepted: 1, duplicate: 1, without_fix: 0 });
     let elsewhere = store.insert_samples(&other, vec![twin], Durability::Synced).await;
-    assert_eq!(elsewhere.expect("stored"), Inserted { accepted: 1, duplicate: 0 });
+    assert_eq!(elsewhere.expect("stored"), Inserted { accepted: 1, duplicate: 0, without_fix: 0 });
     assert_eq!(
-        store.insert_samples(&camera, Vec::new(), Durability::Synced).await.expect("empty"),
+        store.insert_samples(&camera, Vec::<Sample>::new(), Durability::Synced).await.expect("empty"),
         Inserted::default()
     );
-    let kept = store.samples(&camera, &SampleFilter::default(), None, 9).await.expect("read");
+    let kept = with_fix(&store, &camera).await;
     assert_eq!(kept, [sample(1, "a"), sample(1, "b"), sample(2, "a")]);
 }
 
@@ -52,7 +60,8 @@ async fn many_rows_of_any_number_are_counted_right() {
     for count in [1, 3, 5, 17, 1023, 1025, 4097, 10_000] {
         let inserted =
             store.insert_samples(&camera, rows(0..count), Durability::Synced).await.expect("stored");
-        assert_eq!(inserted, Inserted { accepted: (count - stored) as u64, duplicate: stored as u64 });
+        let (accepted, duplicate) = ((count - stored) as u64, stored as u64);
+        assert_eq!(inserted, Inserted { accepted, duplicate, without_fix: 0 });
         stored = count;
     }
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 10_000);
@@ -68,7 +77,7 @@ async fn a_cursor_from_before_the_filter_does_not_widen_it() {
     let filter = SampleFilter { from: Some(at(3)), ..SampleFilter::default() };
     let page =
         store.samples(&camera, &filter, Some(SampleKey::of(&sample(1, "a"))), 2).await.expect("a page");
-    assert_eq!(page, [sample(3, "a"), sample(4, "a")]);
+    assert_eq!(page, [sample(3, "a"), sample(4, "a")].map(StoredSample::from));
 }
 
 #[tokio::test]
@@ -76,7 +85,8 @@ async fn deleting_takes_what_the_filter_selects() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     let all = (0..10).flat_map(|second| [sample(second, "a"), sample(second, "b")]).collect();
     store.insert_samples(&camera, all, Durability::Synced).await.expect("stored");
-    let filter = SampleFilter { from: Some(at(3)), until: Some(at(5)), target_id: Some(target("b")) };
+    let filter =
+        SampleFilter { from: Some(at(3)), until: Some(at(5)), target_id: Some(target("b")), has_fix: None };
     assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 2);
     let filter = SampleFilter { from: Some(at(8)), ..SampleFilter::default() };
     assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 4);
@@ -104,33 +114,114 @@ async fn a_corrupt_sample_names_its_row() {
     }
 }
 
+/// All samples of a camera that have a fix.
+async fn with_fix(store: &Store, camera: &CameraId) -> Vec<Sample> {
+    let filter = SampleFilter { has_fix: Some(true), ..SampleFilter::default() };
+    let samples = store.samples(camera, &filter, None, 1_000).await.expect("read");
+    samples.into_iter().filter_map(StoredSample::with_fix).collect()
+}
+
+fn without_fix(second: i64, target_id: &str) -> StoredSample {
+    StoredSample { fix: None, ..sample(second, target_id).into() }
+}
+
+#[tokio::test]
+async fn a_sample_with_a_fix_takes_the_place_of_one_without_and_never_the_reverse() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    let boxes = || (0..10).map(|second| without_fix(second, "a")).collect::<Vec<_>>();
+    let inserted = store.insert_samples(&camera, boxes(), Durability::Synced).await.expect("stored");
+    assert_eq!(inserted, Inserted { accepted: 10, duplicate: 0, without_fix: 10 });
+    let again = store.insert_samples(&camera, boxes(), Durability::Synced).await.expect("stored");
+    assert_eq!(again, Inserted { accepted: 0, duplicate: 10, without_fix: 0 });
+    let count = async || store.camera(&camera).await.expect("known").samples;
+    assert_eq!(count().await, SampleCount { all: 10, without_fix: 10 });
+
+    // In one batch, whatever the order of its rows.
+    let mixed =
+        vec![without_fix(20, "a"), sample(20, "a").into(), sample(3, "a").into(), sample(4, "b").into()];
+    let inserted = store.insert_samples(&camera, mixed, Durability::Synced).await.expect("stored");
+    assert_eq!(inserted, Inserted { accepted: 3, duplicate: 1, without_fix: 0 });
+    assert_eq!(count().await, SampleCount { all: 12, without_fix: 9 });
+    assert_eq!(with_fix(&store, &camera).await, [sample(3, "a"), sample(4, "b"), sample(20, "a")]);
+    let late = store.insert_samples(&camera, vec![without_fix(3, "a")], Durability::Synced).await;
+    assert_eq!(late.expect("stored"), Inserted { accepted: 0, duplicate: 1, without_fix: 0 });
+
+    let all = store.samples(&camera, &SampleFilter::default(), None, 100).await.expect("read");
+    let fixes: Vec<bool> = all.iter().take(6).map(|sample| sample.fix.is_some()).collect();
+    assert_eq!((all.len(), fixes), (12, vec![false, false, false, true, false, true]));
+    let filter = SampleFilter { has_fix: Some(false), until: Some(at(5)), ..SampleFilter::default() };
+    assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 4);
+    assert_eq!(count().await, SampleCount { all: 8, without_fix: 5 });
+    let rest = SampleFilter { until: Some(at(100)), ..SampleFilter::default() };
+    assert_eq!(store.delete_samples(&camera, &rest).await.expect("deleted"), 8);
+    assert_eq!(count().await, SampleCount::default());
+    assert_eq!(store.maintain().await.expect("works").samples, 0);
+}
+
+#[tokio::test]
+async fn boxes_without_a_fix_are_thinned_evenly_and_alike_each_time() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    let targets = ["a", "b", "c", "d", "e"];
+    let boxes: Vec<StoredSample> =
+        (0..400).flat_map(|second| targets.map(|target| without_fix(second, target))).collect();
+    store.insert_samples(&camera, boxes.clone(), Durability::Synced).await.expect("stored");
+    store.insert_samples(&camera, vec![sample(500, "a")], Durability::Synced).await.expect("stored");
+    let thinned = async |most| {
+        let filter = SampleFilter { until: Some(at(400)), ..SampleFilter::default() };
+        store.thinned_detections(&camera, &filter, most).await.expect("read")
+    };
+    let expected: Vec<Detection> = boxes.into_iter().map(Detection::from).collect();
+    assert_eq!(thinned(2_000).await, expected, "not more than asked for: all of them");
+    let few = thinned(200).await;
+    assert_eq!((few.len(), &few), (200, &thinned(200).await));
+    for target_id in targets {
+        let own: Vec<i64> = few
+            .iter()
+            .filter(|detection| detection.target_id.as_str() == target_id)
+            .map(|detection| detection.time.as_second() - at(0).as_second())
+            .collect();
+        // One of every ten rows, whose places do not repeat with the five targets.
+        assert!((25..=55).contains(&own.len()), "{target_id} {own:?}");
+        assert!(own.windows(2).all(|pair| pair[1] - pair[0] < 100), "{target_id} {own:?}");
+    }
+    assert!(few.windows(10).all(|ten| (ten[9].time.duration_since(ten[0].time).as_secs() - 18).abs() <= 4));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     /// Pages of any size show exactly what a filter over a plain sorted list selects.
     #[test]
     fn pages_agree_with_a_sorted_list(
-        keys in prop::collection::btree_set((0_i64..12, "[a-c]"), 0..30),
+        keys in prop::collection::btree_map((0_i64..12, "[a-c]"), any::<bool>(), 0..30),
         from in prop::option::of(0_i64..12),
         until in prop::option::of(0_i64..12),
         only in prop::option::of("[a-c]"),
+        has_fix in prop::option::of(any::<bool>()),
         limit in 1_u32..7,
     ) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
         runtime.block_on(async {
             let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-            let all: Vec<Sample> = keys.iter().map(|(second, target)| sample(*second, target)).collect();
+            let all: Vec<StoredSample> = keys
+                .iter()
+                .map(|((second, target), has_fix)| {
+                    let sample = sample(*second, target);
+                    StoredSample { fix: has_fix.then_some(sample.fix), ..sample.into() }
+                })
+                .collect();
             store.insert_samples(&camera, all.clone(), Durability::Synced).await.expect("stored");
-            let filter = SampleFilter { from: from.map(at), until: until.map(at), target_id: only.as_deref().map(target) };
-            let expected: Vec<Sample> = all
+            let filter = SampleFilter { from: from.map(at), until: until.map(at), target_id: only.as_deref().map(target), has_fix };
+            let expected: Vec<StoredSample> = all
                 .into_iter()
+                .filter(|it| has_fix.is_none_or(|has_fix| it.fix.is_some() == has_fix))
                 .filter(|it| from.is_none_or(|from| it.time >= at(from)))
                 .filter(|it| until.is_none_or(|until| it.time < at(until)))
                 .filter(|it| only.as_ref().is_none_or(|only| it.target_id.as_str() == only))
                 .collect();
             let counted = store.count_samples(&camera, &filter).await.expect("counted");
             prop_assert_eq!(counted, expected.len() as u64);
-            let mut seen: Vec<Sample> = Vec::new();
+            let mut seen: Vec<StoredSample> = Vec::new();
             loop {
                 let after = seen.last().map(SampleKey::of);
                 let page = store.samples(&camera, &filter, after, limit).await.expect("a page");

@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use sightfix::domain::{CameraId, GnssError, Observation, Recipe};
+use sightfix::domain::{CameraId, GnssError, Observation, Recipe, StoredSample};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::model_service_client::ModelServiceClient;
 use sightfix::model::{FitOptions, fit};
@@ -20,6 +20,7 @@ fn file(seed: u64) -> bytes::Bytes {
         epochs: Some(3),
         image_size: None,
         gnss_error: GnssError::Unknown,
+        gnss_bias_sigma_m: None,
     };
     let samples = simulate(&Options::demo()).training_samples();
     let fitted = fit(&samples, &options, &mut |_| ControlFlow::Continue(()));
@@ -71,7 +72,7 @@ async fn fuses_as_the_application_does(server: &Server) {
     let mut observations = Vec::new();
     let mut messages = Vec::new();
     for (index, sample) in samples.into_iter().take(100).enumerate() {
-        let message = proto::Sample::from(sample.clone());
+        let message = proto::Sample::from(StoredSample::from(sample.clone()));
         let fix = Some(sample.fix).filter(|_| index % 3 > 0);
         messages.push(proto::Observation {
             time: message.time,

@@ -65,7 +65,7 @@ fn samples(csv: &[u8]) -> Vec<Sample> {
     let bounds = TimeBounds::at("2027-01-01T00:00:00Z".parse().expect("a time"));
     let rules = RowRules { time_bounds: bounds, image_size: None };
     let rows = read_samples(csv, Format::Csv, &rules).expect("a header");
-    rows.map(|row| row.expect("a file").expect("a row")).collect()
+    rows.map(|row| row.expect("a file").expect("a row").with_fix().expect("a fix")).collect()
 }
 
 /// Number of stored samples; asserts that each is stored once and as it was sent.

@@ -158,7 +158,9 @@ impl<'a> Draft<'a> {
 
     fn maximize(&self, start: &Hyperparameters, priors: &Priors, noise_frozen: bool) -> Hyperparameters {
         let stride = self.inputs.len().div_ceil(MAX_LIKELIHOOD_ROWS).max(1);
-        let picked: Vec<usize> = (0..self.inputs.len()).step_by(stride).collect();
+        // Pairs of neighbours: what is white and what lasts until the next fix shows between these.
+        let picked: Vec<usize> =
+            (0..self.inputs.len()).filter(|row| (row / 2).is_multiple_of(stride)).collect();
         let rows = self.rows.picked(&picked);
         let (tangent, labels_m) = linearize(&rows, &self.mean);
         let inputs: Vec<[f64; 4]> = picked.iter().map(|row| self.inputs[*row]).collect();

@@ -13,11 +13,21 @@ use super::predictor::{Map, Predictor, Stated};
 use super::projective_mean::ProjectiveMean;
 use super::sessions::Sessions;
 use super::upright_camera::UprightCamera;
+use crate::model::samples::rows::SESSION_GAP_S;
+use crate::statistics::median;
 
 /// Rows that a fit uses at most; more are thinned evenly.
 const MAX_ROWS: usize = 20_000;
 /// A candidate of less weight is left out of the mixture.
 const MIN_WEIGHT: f64 = 0.02;
+/// Standard deviation of a bias that all receivers share, as a share of that of the coloured part of their
+/// error: no training sample can show it, so it is a prior.
+const SHARED_BIAS_SHARE: f64 = 0.1;
+/// Degrees of freedom that the prior of the slow part is worth: a logarithm with a standard deviation of 0.5
+/// has about the tails of an inverse chi-square with four.
+const PRIOR_FREEDOM: f64 = 4.0;
+/// Of the normal distribution.
+const MIN_INVERSE_FREEDOM: f64 = 1e-6;
 /// Least variance of the fixes about the homography, m2.
 const MIN_SCATTER_M2: f64 = 1e-6;
 
@@ -50,8 +60,11 @@ pub(crate) struct FitReport {
 /// What is known beside the rows.
 #[derive(Debug, Clone)]
 pub(crate) struct FitSettings {
-    /// Variance per axis of a bias that all receivers share, which no training row can show, m2.
-    pub(crate) shared_bias_m2: f64,
+    /// Standard deviation per axis of the bias that all fixes have in common, which no training row can show,
+    /// m; `None` for a share of the coloured part of the receivers' error.
+    pub(crate) bias_sigma_m: Option<f64>,
+    /// White share of the variance of the fixes about a geometric map.
+    pub(crate) white_share: f64,
     /// Of the bootstrap that weighs the candidates.
     pub(crate) seed: u64,
     /// Geometry by the heights of boxes, if the image size is known.
@@ -68,8 +81,9 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     let input_scales = InputScales::of_rows(&rows.boxes);
     let inputs: Vec<[f64; 4]> = rows.boxes.iter().map(|sides| input_scales.input(sides)).collect();
     let grouping = groups(&rows.epochs);
+    let bias = BiasPrior::new(&rows.epochs, settings.bias_sigma_m);
     let Solutions { parameters, receiver, candidates } =
-        solve(&rows, &inputs, mean, settings.upright.as_ref(), &grouping)?;
+        solve(&rows, &inputs, mean, settings, &bias, &grouping)?;
 
     let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, settings.seed);
     let kept = without_negligible(&weights);
@@ -81,10 +95,10 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
         .filter(|(_, weight)| **weight > 0.0)
         .map(|((candidate, (_, deviations)), weight)| Map::new(candidate, deviations, *weight))
         .collect::<Option<Vec<Map>>>()?;
-    let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise);
+    let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise, &bias);
     let stated = Stated {
         edge_px2: edge_covariance_px2(&all.epochs, &all.boxes),
-        shared_bias_m2: settings.shared_bias_m2,
+        shared_bias_m2: bias.shared_m2(&receiver),
         freedom,
         plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes),
     };
@@ -126,7 +140,8 @@ fn solve(
     rows: &MapRows,
     inputs: &[[f64; 4]],
     mean: ProjectiveMean,
-    upright: Option<&UprightCamera>,
+    settings: &FitSettings,
+    bias: &BiasPrior,
     grouping: &Grouping,
 ) -> Option<Solutions> {
     let residuals_m = rows.misses_m(&mean);
@@ -135,10 +150,15 @@ fn solve(
     let inflation_m2 = white.inflation_m2(&residuals_m);
     let mut residual = Draft { form: Form::Residual, rows, inputs, mean, inflation_m2, upright: None };
     let mut homography = Draft { form: Form::Homography, ..residual.clone() };
-    let priors = Priors::new(scatter_m2.sqrt(), residual.mean.spread_m);
+    let spread_m = residual.mean.spread_m;
+    let mut priors = Priors::new(scatter_m2.sqrt(), settings.white_share, spread_m, interval_s(&rows.epochs));
+    if let BiasPrior::OfSession { sigma_m } = bias {
+        priors = priors.with_session(*sigma_m);
+    }
     let (parameters, receiver) = residual.estimate(&priors)?;
     homography.relinearize(&parameters)?;
-    let upright = upright.and_then(|camera| homography.clone().into_upright(camera, &parameters));
+    let upright =
+        settings.upright.as_ref().and_then(|camera| homography.clone().into_upright(camera, &parameters));
     let mut candidates = vec![homography.solve(&parameters, grouping)?];
     candidates.extend(upright.and_then(|draft| draft.solve(&parameters, grouping)));
     candidates.push(residual.solve(&parameters, grouping)?);
@@ -161,9 +181,63 @@ fn mixed_residual(candidates: &[Candidate], weights: &[f64], row: usize) -> [f64
     sum_m
 }
 
-/// Degrees of freedom of the stated variance, by Welch and Satterthwaite: what differs between receivers
-/// has two per receiver beyond the first, what differs within them two per independent fix.
-fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
+/// What is known of the bias that all fixes have in common, which is part of every answer's error whatever
+/// the number of rows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum BiasPrior {
+    /// Nothing: a share of the coloured part of the receivers' error.
+    Unknown,
+    /// That of several receivers or sessions, m per axis: it is added to the error of the map.
+    Common { sigma_m: f64 },
+    /// That of the only receiver in its only session, m per axis: it replaces the prior of the slow part.
+    OfSession { sigma_m: f64 },
+}
+
+impl BiasPrior {
+    fn new(epochs: &[Epoch], stated_sigma_m: Option<f64>) -> Self {
+        match stated_sigma_m {
+            None => Self::Unknown,
+            Some(sigma_m) if sessions_of_receivers(epochs).count() == 1 => Self::OfSession { sigma_m },
+            Some(sigma_m) => Self::Common { sigma_m },
+        }
+    }
+
+    /// Variance per axis of what all receivers have in common, m2.
+    fn shared_m2(&self, receiver: &ReceiverNoise) -> f64 {
+        match self {
+            Self::Unknown => SHARED_BIAS_SHARE.powi(2) * (receiver.short_m2 + receiver.session_m2),
+            Self::Common { sigma_m } => sigma_m * sigma_m,
+            Self::OfSession { .. } => 0.0,
+        }
+    }
+}
+
+/// Rows of each receiver in each of its sessions.
+fn sessions_of_receivers(epochs: &[Epoch]) -> impl Iterator<Item = &[Epoch]> {
+    epochs.chunk_by(|one, next| one.sequence == next.sequence && next.time_s - one.time_s <= SESSION_GAP_S)
+}
+
+/// Median interval between neighbouring rows of a receiver, s; 0 where there are none.
+fn interval_s(epochs: &[Epoch]) -> f64 {
+    let neighbours = epochs.windows(2).filter(|pair| pair[0].sequence == pair[1].sequence);
+    let intervals_s: Vec<f64> = neighbours.map(|pair| pair[1].time_s - pair[0].time_s).collect();
+    if intervals_s.is_empty() { 0.0 } else { median(intervals_s) }
+}
+
+/// Number of independent values that the slow process has taken: one per receiver and session, and one more
+/// per two time constants of the session's length.
+fn independent_biases(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
+    let of_session = |session: &[Epoch]| {
+        let length_s = session.last().map_or(0.0, |last| last.time_s) - session[0].time_s;
+        1.0 + 0.5 * length_s / noise.session_time_s
+    };
+    sessions_of_receivers(epochs).map(of_session).sum()
+}
+
+/// Degrees of freedom of the stated variance, by Welch and Satterthwaite: what differs between receivers and
+/// sessions has those of its prior and two per independent bias beyond the first, what differs within them
+/// two per independent fix. A stated bias is known, not estimated.
+fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise, bias: &BiasPrior) -> f64 {
     let information = |noise: &ReceiverNoise| {
         let mut ones = vec![1.0; epochs.len()];
         Whitener::new(epochs, noise, &vec![0.0; epochs.len()]).apply(&mut ones);
@@ -172,9 +246,10 @@ fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
     let within = ReceiverNoise { session_m2: 0.0, ..*noise };
     let (of_all, of_within) = (information(noise), information(&within));
     let between_share = (1.0 - of_all / of_within).clamp(0.0, 1.0);
-    // One or two receivers say nothing of how receivers differ: the prior does, for four degrees.
-    let receivers = epochs.chunk_by(|one, next| one.sequence == next.sequence).count() as f64;
-    let between = (2.0 * (receivers - 1.0)).max(4.0);
+    let between = match bias {
+        BiasPrior::OfSession { .. } => f64::INFINITY,
+        _ => PRIOR_FREEDOM + 2.0 * (independent_biases(epochs, noise) - 1.0),
+    };
     let within = 2.0 * (within.variance_m2() * of_within - 1.0).max(2.0);
-    1.0 / (between_share.powi(2) / between + (1.0 - between_share).powi(2) / within)
+    1.0 / (between_share.powi(2) / between + (1.0 - between_share).powi(2) / within).max(MIN_INVERSE_FREEDOM)
 }

@@ -1,13 +1,12 @@
-//! Which rows are left out together: whole targets where there are enough of them, else whole sessions,
+//! Which rows are left out together: whole targets; where one target has nearly all rows whole sessions,
 //! else spells.
 
 use super::noise::Epoch;
-use crate::model::samples::target_groups::{MIN_TARGETS, groups_of_targets};
+use crate::model::samples::rows::SESSION_GAP_S;
+use crate::model::samples::target_groups::groups_of_targets;
 
 /// Groups at most.
 pub(crate) const GROUPS: usize = 8;
-/// Half an hour without any row ends a session.
-pub(crate) const SESSION_GAP_S: f64 = 1800.0;
 /// Share of the rows that a session of its own has at least.
 const MIN_SESSION_SHARE: f64 = 0.1;
 
@@ -34,10 +33,7 @@ impl Grouping {
 pub(crate) fn groups(epochs: &[Epoch]) -> Grouping {
     let targets: Vec<usize> =
         epochs.chunk_by(|one, next| one.sequence == next.sequence).map(<[Epoch]>::len).collect();
-    if targets.len() >= MIN_TARGETS {
-        return whole_targets(&targets);
-    }
-    sessions(epochs).unwrap_or_else(|| spells(epochs, &targets))
+    whole_targets(&targets).or_else(|| sessions(epochs)).unwrap_or_else(|| spells(epochs, &targets))
 }
 
 /// Whole sessions, where there are at least two: what they contradict each other by is in no spell's
@@ -60,11 +56,10 @@ fn sessions(epochs: &[Epoch]) -> Option<Grouping> {
     (count > 1).then_some(Grouping { of_row, count })
 }
 
-fn whole_targets(targets: &[usize]) -> Grouping {
-    let count = targets.len().min(GROUPS);
-    let group_of = groups_of_targets(targets, count);
+fn whole_targets(targets: &[usize]) -> Option<Grouping> {
+    let (group_of, count) = groups_of_targets(targets, GROUPS)?;
     let of_row = targets.iter().zip(&group_of).flat_map(|(rows, group)| vec![*group; *rows]).collect();
-    Grouping { of_row, count }
+    Some(Grouping { of_row, count })
 }
 
 /// Spells of each target, cut at the largest gaps near equal shares.

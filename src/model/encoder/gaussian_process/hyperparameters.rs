@@ -18,6 +18,10 @@ const NOISE: usize = 5;
 const MIN_WHITE_SHARE: f64 = 0.3;
 /// Median of the slow part's standard deviation, as a share of the short one's.
 const SESSION_SHARE: f64 = 0.5;
+/// Range of the white share that the priors are built on: an estimate is never exactly 0 or 1.
+const WHITE_SHARES: [f64; 2] = [0.02, 0.999];
+/// Standard deviation of the logarithm of a slow part that is stated from outside.
+const STATED_SESSION_SIGMA: f64 = 0.02;
 const MAX_ITERATIONS: usize = 12;
 const DIFFERENCE: f64 = 0.02;
 const CONVERGED: f64 = 0.02;
@@ -79,16 +83,23 @@ impl Hyperparameters {
 pub(crate) struct Priors {
     medians: Logs,
     sigmas: Logs,
+    /// Median interval between neighbouring fixes of a receiver, s.
+    interval_s: f64,
+    /// Whether the slow part is stated from outside, not derived from the short one.
+    session_is_stated: bool,
 }
 
 impl Priors {
-    /// `scatter_m` is the robust standard deviation per axis about the geometric map; `spread_m` that of
-    /// the positions.
-    pub(crate) fn new(scatter_m: f64, spread_m: f64) -> Self {
+    /// `scatter_m` is the robust standard deviation per axis about the geometric map and `white_share` the
+    /// share of its square that is white by the autocorrelation of all rows; `spread_m` is the standard
+    /// deviation of the positions, `interval_s` the median interval between neighbouring fixes.
+    pub(crate) fn new(scatter_m: f64, white_share: f64, spread_m: f64, interval_s: f64) -> Self {
+        let white_share = white_share.clamp(WHITE_SHARES[0], WHITE_SHARES[1]);
+        let short_m = (1.0 - white_share).sqrt() * scatter_m;
         let medians = [
-            0.3 * scatter_m,
-            0.7 * scatter_m,
-            SESSION_SHARE * 0.7 * scatter_m,
+            white_share.sqrt() * scatter_m,
+            short_m,
+            SESSION_SHARE * short_m,
             30.0,
             3600.0,
             0.02 * spread_m,
@@ -99,7 +110,17 @@ impl Priors {
         Self {
             medians: Logs::from_column_slice(&medians.map(f64::ln)),
             sigmas: Logs::from_column_slice(&[1.0, 1.0, 0.5, 0.4, 1.0, 1.2, 0.7, 0.7, 1.2]),
+            interval_s,
+            session_is_stated: false,
         }
+    }
+
+    /// The same with a slow part of that standard deviation, m, which samples hardly change.
+    pub(crate) fn with_session(mut self, sigma_m: f64) -> Self {
+        self.medians[2] = sigma_m.ln();
+        self.sigmas[2] = STATED_SESSION_SIGMA;
+        self.session_is_stated = true;
+        self
     }
 
     pub(crate) fn start(&self) -> Hyperparameters {
@@ -109,8 +130,12 @@ impl Priors {
     fn penalty(&self, logs: &Logs) -> f64 {
         let mut centre = self.medians;
         // The slow part continues the short one's spectrum: its prior is a share of the short part as far
-        // as that is low in frequency, and nearly none for a receiver whose error is white.
-        centre[2] = SESSION_SHARE.ln() + logs[1] + 0.5 * (logs[3] - self.medians[3]).min(0.0);
+        // as that is low in frequency and lasts until the next fix, and nearly none for a receiver whose
+        // error is white.
+        if !self.session_is_stated {
+            let visible = -0.5 * self.interval_s / logs[3].exp();
+            centre[2] = SESSION_SHARE.ln() + logs[1] + visible + 0.5 * (logs[3] - self.medians[3]).min(0.0);
+        }
         (logs - centre).component_div(&self.sigmas).norm_squared()
     }
 }

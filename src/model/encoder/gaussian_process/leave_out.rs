@@ -138,17 +138,17 @@ fn mixed(candidates: &[Candidate], weights: &[f64], group: usize, row: usize) ->
 }
 
 /// The mean residual of one left-out sequence.
-struct SequenceMean {
+pub(crate) struct SequenceMean {
     /// Its square per axis, m2.
-    square_m2: f64,
+    pub(crate) square_m2: f64,
     /// Its variance by the receiver's noise, m2.
-    noise_m2: f64,
+    pub(crate) noise_m2: f64,
     /// Its variance by the map, taken for fully correlated along the sequence, m2.
-    map_m2: f64,
+    pub(crate) map_m2: f64,
 }
 
 /// The factor, at least 1, at which the sequences' mean squares agree with what is stated.
-fn widening(means: &[SequenceMean]) -> f64 {
+pub(crate) fn widening(means: &[SequenceMean]) -> f64 {
     let ratio = |factor: f64| {
         let own = |mean: &SequenceMean| mean.square_m2 / (mean.noise_m2 + factor * mean.map_m2);
         means.iter().map(own).sum::<f64>() / means.len() as f64

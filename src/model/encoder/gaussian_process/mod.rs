@@ -3,11 +3,12 @@
 //!
 //! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
 //! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
-//! `candidate`, `leave_out`, `sessions`, `fit`; of an answer: `predictor`, `box_plausibility`; `recipe` and
-//! `stored` connect both to the rest of the module. Random starts have a seed of their own.
+//! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; of an answer: `predictor`, `box_plausibility`;
+//! `recipe` and `stored` connect both to the rest of the module. Random starts have a seed of their own.
 
 mod box_plausibility;
 mod candidate;
+mod companion;
 mod edge_noise;
 mod f_distribution;
 mod fit;
@@ -26,7 +27,11 @@ mod stored;
 mod upright_camera;
 
 pub use box_plausibility::RecentBoxes;
+pub(crate) use companion::EPOCHS;
+pub(crate) use leave_out::{SequenceMean, widening};
+pub(crate) use noise::{Epoch, ReceiverNoise};
 pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, target_height_m};
+pub(crate) use sessions::weighted_mean;
 
 #[cfg(test)]
 mod tests;

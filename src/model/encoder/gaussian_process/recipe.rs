@@ -1,6 +1,7 @@
 //! The recipe `gaussian_process`: from training samples to the parts of a model.
 
 use super::box_plausibility::RecentBoxes;
+use super::companion;
 use super::fit::{FitReport, FitSettings, fit as fit_map};
 use super::map_rows::MapRows;
 use super::noise::Epoch;
@@ -10,13 +11,12 @@ use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, Recipe, TargetClas
 use crate::geo::EastNorth;
 use crate::model::artifact::ModelParts;
 use crate::model::encoder::FittedEncoder;
+use crate::model::encoder::auto_encoder::AutoEncoder;
 use crate::model::encoder::features::{Encoded, features_of};
 use crate::model::progress::{FitError, Phase};
 use crate::model::samples::rows::TrainingRows;
+use crate::model::samples::unpaired::TargetBox;
 
-/// Standard deviation of a bias that all receivers share, as a share of the receiver's standard deviation:
-/// no training sample can show it, so it is a prior.
-const SHARED_BIAS_SHARE: f64 = 0.1;
 /// Median height of a target in m, and the standard deviation of its logarithm, by class; the last is for
 /// all other classes, whose heights only have to agree with each other.
 const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
@@ -24,12 +24,18 @@ const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
 
 /// Input of the recipe besides the samples.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Settings {
+pub(crate) struct Settings<'a> {
     /// Error variance per axis of the receiver, m2.
     pub(crate) e_gnss_m2: f64,
     /// Whether that was estimated, and may be replaced by the estimate of this recipe.
     pub(crate) e_gnss_is_estimated: bool,
+    /// Standard deviation per axis of the bias that all fixes have in common, m, if known.
+    pub(crate) gnss_bias_sigma_m: Option<f64>,
+    /// White share of the variance of the fixes about a geometric map.
+    pub(crate) white_share: f64,
     pub(crate) image_size: Option<ImageSize>,
+    /// Boxes without a fix, in the order of target and time.
+    pub(crate) unpaired: &'a [TargetBox],
     /// Median height of the targets, m, and the standard deviation of its logarithm.
     pub(crate) target_height_m: (f64, f64),
     pub(crate) seed: u64,
@@ -53,13 +59,14 @@ pub(crate) fn target_height_m<'a>(classes: impl Iterator<Item = Option<&'a Targe
     }
 }
 
-/// Fits the recipe to rows.
+/// Fits the recipe to rows; the final fit also trains the auto-encoder, by that number of epochs.
 ///
 /// # Errors
 /// [`FitError::Unusable`] where the rows determine no map.
 pub(crate) fn fit(
     rows: &TrainingRows,
-    settings: &Settings,
+    settings: &Settings<'_>,
+    epochs: u32,
     phase: &mut Phase<'_, '_>,
 ) -> Result<FittedEncoder, FitError> {
     let map_rows = MapRows {
@@ -67,14 +74,18 @@ pub(crate) fn fit(
         boxes: rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect(),
         labels_m: rows.rows.iter().map(|row| [row.label.east_m, row.label.north_m]).collect(),
     };
-    let boxes: Vec<(u32, [f64; 4])> =
-        rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides)).collect();
+    let unpaired =
+        settings.unpaired.iter().map(|own| (rows.targets + own.target, features_of(&own.bounding_box)));
+    let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
+    let boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
     let upright = settings.image_size.and_then(|size| {
         let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
         UprightCamera::new(&boxes, size_px, settings.target_height_m)
     });
-    let shared_bias_m2 = SHARED_BIAS_SHARE * SHARED_BIAS_SHARE * settings.e_gnss_m2;
-    let fitted = fit_map(&map_rows, &FitSettings { shared_bias_m2, seed: settings.seed, upright });
+    let bias_sigma_m = settings.gnss_bias_sigma_m;
+    let map_settings =
+        FitSettings { bias_sigma_m, white_share: settings.white_share, seed: settings.seed, upright };
+    let fitted = fit_map(&map_rows, &map_settings);
     let Some((predictor, report)) = fitted else {
         return Err(FitError::Unusable(Error::field(
             ErrorKind::UnusableSamples,
@@ -90,7 +101,11 @@ pub(crate) fn fit(
     let mut parts = ModelParts::new(Recipe::GaussianProcess, rows.plane, predictor.features(), e_gnss_m2);
     predictor.put(&mut parts);
     put_report(&report, &mut parts);
+    parts.set("boxes_without_fix", settings.unpaired.len() as f64);
     parts.set("unrest_share", white_share(&predictor, &map_rows));
+    if phase.is_final {
+        companion::fit(rows, epochs, &mut parts, phase)?;
+    }
     Ok(FittedEncoder { parts, covariance: None })
 }
 
@@ -176,7 +191,11 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
 
 /// The encoder of a loaded model.
 #[derive(Debug, Clone)]
-pub(crate) struct GaussianProcessEncoder(Predictor);
+pub(crate) struct GaussianProcessEncoder {
+    predictor: Predictor,
+    /// Models of earlier releases have none.
+    auto_encoder: Option<AutoEncoder>,
+}
 
 /// Position, error and reconstruction of a box.
 #[derive(Debug, Clone, Copy)]
@@ -192,7 +211,7 @@ impl GaussianProcessEncoder {
     /// # Errors
     /// Names the tensor or scalar that is missing or cannot be used.
     pub(crate) fn build(parts: &mut ModelParts) -> crate::domain::Result<Self> {
-        Predictor::take(parts).map(Self)
+        Ok(Self { predictor: Predictor::take(parts)?, auto_encoder: companion::take(parts)? })
     }
 
     /// Position and error of a box. `recent` holds the earlier boxes of its target, and takes this one in.
@@ -200,16 +219,17 @@ impl GaussianProcessEncoder {
     pub(crate) fn estimate(&self, bounding_box: &BoundingBox, recent: Option<&mut RecentBoxes>) -> Estimate {
         let sides = features_of(bounding_box);
         let recent = recent.map(|recent| {
-            recent.push(&self.0.plausibility.deviation(&sides, None));
+            recent.push(&self.predictor.plausibility.deviation(&sides, None));
             &*recent
         });
-        let prediction = self.0.predict(&sides, recent);
+        let prediction = self.predictor.predict(&sides, recent);
         let [east_m, north_m] = prediction.position_m;
+        let reconstruction_px = match &self.auto_encoder {
+            Some(auto_encoder) => auto_encoder.encode(bounding_box).reconstruction_px,
+            None => self.predictor.reconstruct(&sides, &prediction.deviation),
+        };
         Estimate {
-            encoded: Encoded {
-                position: EastNorth { east_m, north_m },
-                reconstruction_px: self.0.reconstruct(&sides, &prediction.deviation),
-            },
+            encoded: Encoded { position: EastNorth { east_m, north_m }, reconstruction_px },
             variance_m2: prediction.variance_m2(),
             r95_scale: prediction.r95_scale,
         }

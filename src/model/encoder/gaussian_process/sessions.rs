@@ -3,8 +3,8 @@
 //! Half an hour without any row ends a session. Within one, no filter can tell a receiver's lasting bias
 //! from the map; between them, the means of their residuals about one map scatter by it.
 
-use super::groups::SESSION_GAP_S;
 use super::noise::{Epoch, ReceiverNoise, Whitener};
+use crate::model::samples::rows::SESSION_GAP_S;
 
 /// Sessions with fewer rows say nothing.
 const MIN_ROWS: usize = 20;

@@ -61,7 +61,11 @@ fn fitted(rows: &MapRows) -> (Predictor, FitReport) {
     let boxes: Vec<(u32, Box4)> =
         rows.epochs.iter().zip(&rows.boxes).map(|(epoch, sides)| (epoch.sequence, *sides)).collect();
     let upright = UprightCamera::new(&boxes, IMAGE_PX, PERSON_M);
-    fit(rows, &FitSettings { shared_bias_m2: 0.0, seed: 1, upright }).expect("rows that determine a map")
+    fit(rows, &settings(upright)).expect("rows that determine a map")
+}
+
+fn settings(upright: Option<UprightCamera>) -> FitSettings {
+    FitSettings { bias_sigma_m: None, white_share: 0.15, seed: 1, upright }
 }
 
 /// Mean error, m, and share of the truths inside the stated radius.

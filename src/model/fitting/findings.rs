@@ -1,0 +1,138 @@
+//! What a run found out, in words: each candidate's held-out error, why it was kept or not, and what would
+//! make the model surer.
+
+use super::candidates::Candidate;
+use crate::domain::{CandidateFinding, CandidateReport, HeldOutError, ImageSize, TrainingReport};
+use crate::model::artifact::ModelParts;
+use crate::model::samples::rows::TrainingRows;
+
+/// Below this share of held-out fixes inside the stated radius the report says so.
+const LEAST_COVERAGE: f64 = 0.9;
+/// Below so many traverses more of them help.
+const FEW_TRAVERSES: u32 = 8;
+/// Sessions disagree if their bias per axis exceeds this share of the receiver's standard deviation.
+const DISAGREEMENT: f64 = 0.5;
+
+/// The outcome of a selection.
+pub(super) struct Selection<'a> {
+    /// The candidates that could be fitted, with their held-out errors.
+    pub(super) candidates: &'a [&'a Candidate],
+    pub(super) reports: &'a [CandidateReport],
+    /// Mean squared held-out residual per axis of each, with outliers bounded, m2.
+    pub(super) scores: &'a [f64],
+    pub(super) chosen: usize,
+}
+
+/// The report of a run. `held_out` is the chosen candidate's error after its calibration.
+pub(super) fn training_report(
+    selection: &Selection<'_>,
+    held_out: &HeldOutError,
+    rows: &TrainingRows,
+    parts: &ModelParts,
+    image_size: Option<ImageSize>,
+) -> TrainingReport {
+    let Selection { candidates, reports, chosen, .. } = *selection;
+    let finding = |at: usize| {
+        let is_chosen = at == chosen;
+        let HeldOutError { mean_to_fix_m, coverage95_of_fixes, .. } =
+            if is_chosen { held_out } else { &reports[at].held_out };
+        CandidateFinding {
+            candidate: candidates[at].name.to_owned(),
+            weight: if is_chosen { 1.0 } else { 0.0 },
+            held_out_miss_m: *mean_to_fix_m,
+            coverage95_of_fixes: *coverage95_of_fixes,
+            summary: if is_chosen { reason_to_keep(selection, parts) } else { reason_to_drop(selection, at) },
+        }
+    };
+    TrainingReport {
+        candidates: (0..candidates.len()).map(finding).collect(),
+        advice: advice(held_out, rows, parts, image_size),
+    }
+}
+
+fn reason_to_keep(selection: &Selection<'_>, parts: &ModelParts) -> String {
+    let maps: Vec<String> = parts
+        .parameters
+        .iter()
+        .filter_map(|(name, weight)| Some((name.strip_prefix("weight.")?, *weight)))
+        .filter(|(_, weight)| *weight >= 0.01)
+        .map(|(map, weight)| format!("{map} {weight:.2}"))
+        .collect();
+    let mixture = if maps.is_empty() { String::new() } else { format!("; mixture of {}", maps.join(", ")) };
+    match selection.chosen {
+        _ if selection.candidates.len() == 1 => format!("kept, the only candidate{mixture}"),
+        0 => format!("kept, no other candidate is better by more than a standard error{mixture}"),
+        chosen => format!(
+            "kept, its squared misses are {:.1} % smaller than those of {}, by more than a standard error{mixture}",
+            100.0 * (1.0 - selection.scores[chosen] / selection.scores[0]),
+            selection.candidates[0].name
+        ),
+    }
+}
+
+fn reason_to_drop(selection: &Selection<'_>, at: usize) -> String {
+    let Selection { candidates, scores, chosen, .. } = *selection;
+    let larger = 100.0 * (scores[at] / scores[chosen] - 1.0);
+    let kept = candidates[chosen].name;
+    if larger > 0.0 {
+        format!("not kept, its squared misses are {larger:.1} % larger than those of {kept}")
+    } else {
+        format!(
+            "not kept, its squared misses are {:.1} % smaller than those of {kept}, within a standard error",
+            -larger
+        )
+    }
+}
+
+fn advice(
+    held_out: &HeldOutError,
+    rows: &TrainingRows,
+    parts: &ModelParts,
+    image_size: Option<ImageSize>,
+) -> Vec<String> {
+    let mut advice = Vec::new();
+    if rows.targets == 1 {
+        advice.push(
+            "let a second receiver walk: all fixes are of one receiver, and its lasting bias cannot be seen; \
+             or state gnss_bias_sigma_m in the camera's profile"
+                .to_owned(),
+        );
+    }
+    let sigma_m = |name: &str| parts.parameters.get(name).map_or(0.0, |variance_m2| variance_m2.sqrt());
+    let between_m = sigma_m("between_sessions_m2").max(sigma_m("error_session_m2"));
+    let sessions = rows.sessions();
+    if sessions == 1 {
+        advice.push(
+            "walk once more on another day: all samples are of one session, and a bias of that day cannot be seen"
+                .to_owned(),
+        );
+    } else if between_m > DISAGREEMENT * parts.e_gnss_m2.sqrt() {
+        // Per axis; the distance of two sessions has two axes of twice the variance.
+        advice.push(format!(
+            "walk once more on another day: the {sessions} sessions disagree by {:.1} m",
+            2.0 * between_m
+        ));
+    }
+    if rows.traverses < FEW_TRAVERSES {
+        advice.push(format!(
+            "let targets cross the view on more lines: there are only {} passes",
+            rows.traverses
+        ));
+    }
+    if image_size.is_none() {
+        advice.push(
+            "state image_size in the camera's profile: the heights of boxes then tell the camera's geometry"
+                .to_owned(),
+        );
+    }
+    if held_out.coverage95_of_fixes < LEAST_COVERAGE {
+        advice.push(format!(
+            "check the pairing of boxes and fixes: only {:.0} % of the held-out fixes are inside the stated radius",
+            100.0 * held_out.coverage95_of_fixes
+        ));
+    }
+    if advice.is_empty() {
+        advice.push("nothing in particular: receivers, sessions and passes are sufficient".to_owned());
+    }
+    advice
+}

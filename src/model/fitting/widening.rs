@@ -1,0 +1,53 @@
+//! Whether the error that a recipe states holds on the targets that its fits had not seen.
+
+use crate::domain::GaussMarkovNoise;
+use crate::model::artifact::ModelParts;
+use crate::model::encoder::gaussian_process::{Epoch, ReceiverNoise, SequenceMean, weighted_mean, widening};
+use crate::model::progress::FitError;
+use crate::model::regressor::Regressor;
+use crate::model::samples::rows::{TrainingRow, TrainingRows};
+
+/// Widens the stated radius of a calibrated model by one factor, at least 1, at which the mean residuals of
+/// the left-out sequences (the rows of one target within one group) are as large as receiver and map
+/// state together, beyond chance.
+///
+/// # Errors
+/// [`FitError::Fault`] if the model cannot be used.
+pub(super) fn widen_radius(
+    parts: &mut ModelParts,
+    rows: &TrainingRows,
+    groups: &[u32],
+    residuals_m: &[[f64; 2]],
+    noise: &GaussMarkovNoise,
+) -> Result<(), FitError> {
+    let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
+    let coloured_share = 1.0 - noise.correlation.white_share;
+    let receiver = ReceiverNoise {
+        short_m2: coloured_share * noise.variance_m2,
+        short_time_s: noise.correlation.time_constant_s,
+        ..ReceiverNoise::white(noise.correlation.white_share * noise.variance_m2)
+    };
+    let mut means = Vec::new();
+    for group in 0..=groups.iter().copied().max().unwrap_or(0) {
+        let members: Vec<usize> = (0..groups.len()).filter(|row| groups[*row] == group).collect();
+        for own in members.chunk_by(|one, next| rows.rows[*one].target == rows.rows[*next].target) {
+            let of = |row: &usize| -> &TrainingRow { &rows.rows[*row] };
+            let epochs: Vec<Epoch> =
+                own.iter().map(|row| Epoch { time_s: of(row).time_s, sequence: of(row).target }).collect();
+            let residuals_m: Vec<[f64; 2]> = own.iter().map(|row| residuals_m[*row]).collect();
+            let (mean_m, noise_m2) = weighted_mean(&epochs, &receiver, &residuals_m);
+            let stated_m2 = |row: &usize| regressor.regress(&of(row).bounding_box, None).variance_m2();
+            let map_m2 = own.iter().map(stated_m2).sum::<f64>() / own.len() as f64;
+            means.push(SequenceMean {
+                square_m2: 0.5 * (mean_m[0].powi(2) + mean_m[1].powi(2)),
+                noise_m2,
+                map_m2,
+            });
+        }
+    }
+    let factor = widening(&means);
+    let r95_scale = parts.positive_parameter("r95_scale").map_err(FitError::fault)?;
+    parts.set("r95_scale", factor.sqrt() * r95_scale);
+    parts.set("held_out_widening", factor);
+    Ok(())
+}

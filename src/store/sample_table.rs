@@ -1,0 +1,192 @@
+//! The two tables of samples and the statements that fill them.
+
+use std::collections::HashMap;
+use std::fmt;
+use std::ops::Range;
+use std::sync::{Arc, LazyLock};
+
+use sqlx::sqlite::SqliteArguments;
+use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
+
+use super::errors::failed;
+use crate::domain::{Error, Result, Score, SigmaM, StoredSample, TargetClass};
+use crate::geo::Position;
+
+/// A table of samples. A key is in one of them only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum SampleTable {
+    /// Samples with a fix.
+    WithFix,
+    /// Samples without one.
+    WithoutFix,
+}
+
+impl fmt::Display for SampleTable {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::WithFix => "samples",
+            Self::WithoutFix => "samples_without_fix",
+        })
+    }
+}
+
+impl SampleTable {
+    /// The table of a sample.
+    pub(super) const fn of(sample: &StoredSample) -> Self {
+        if sample.fix.is_some() { Self::WithFix } else { Self::WithoutFix }
+    }
+
+    /// Columns to select, the same for both tables.
+    pub(super) const fn columns(self) -> &'static str {
+        match self {
+            Self::WithFix => {
+                "camera_key, time_us, target_id, left_px, top_px, width_px, height_px, longitude_deg, \
+                 latitude_deg, sigma_m, class, score, truth_longitude_deg, truth_latitude_deg"
+            }
+            Self::WithoutFix => {
+                "camera_key, time_us, target_id, left_px, top_px, width_px, height_px, NULL, NULL, NULL, class, \
+                 score, truth_longitude_deg, truth_latitude_deg"
+            }
+        }
+    }
+
+    /// Column of `sample_counts` that counts the rows of the table.
+    pub(super) const fn counter(self) -> &'static str {
+        match self {
+            Self::WithFix => "samples",
+            Self::WithoutFix => "without_fix",
+        }
+    }
+
+    /// Columns bound per row.
+    const fn width(self) -> usize {
+        match self {
+            Self::WithFix => 14,
+            Self::WithoutFix => 11,
+        }
+    }
+
+    fn insert_sql(self, rows: usize) -> String {
+        let row = format!("({})", vec!["?"; self.width()].join(","));
+        let rows = vec![row; rows].join(",");
+        match self {
+            Self::WithFix => format!(
+                "INSERT INTO samples (camera_key, time_us, target_id, left_px, top_px, width_px, height_px, \
+                 longitude_deg, latitude_deg, sigma_m, class, score, truth_longitude_deg, truth_latitude_deg) \
+                 VALUES {rows} ON CONFLICT DO NOTHING"
+            ),
+            Self::WithoutFix => format!(
+                "WITH new (camera_key, time_us, target_id, left_px, top_px, width_px, height_px, class, score, \
+                 truth_longitude_deg, truth_latitude_deg) AS (VALUES {rows}) \
+                 INSERT INTO samples_without_fix SELECT * FROM new WHERE NOT EXISTS (SELECT 1 FROM samples \
+                 WHERE samples.camera_key = new.camera_key AND samples.time_us = new.time_us \
+                 AND samples.target_id = new.target_id) ON CONFLICT DO NOTHING"
+            ),
+        }
+    }
+
+    fn inserts(self) -> &'static [Arc<str>; SIZES.len()] {
+        static WITH_FIX: LazyLock<[Arc<str>; SIZES.len()]> =
+            LazyLock::new(|| SIZES.map(|rows| SampleTable::WithFix.insert_sql(rows).into()));
+        static WITHOUT_FIX: LazyLock<[Arc<str>; SIZES.len()]> =
+            LazyLock::new(|| SIZES.map(|rows| SampleTable::WithoutFix.insert_sql(rows).into()));
+        match self {
+            Self::WithFix => &WITH_FIX,
+            Self::WithoutFix => &WITHOUT_FIX,
+        }
+    }
+}
+
+/// Rows per statement, largest first. Few sizes, so that each stays prepared.
+const SIZES: [usize; 6] = [1000, 250, 50, 10, 3, 1];
+
+/// A row with the batch it came from and the key of its camera.
+pub(super) struct Row<'a> {
+    pub(super) batch: usize,
+    pub(super) camera_key: i64,
+    pub(super) sample: &'a StoredSample,
+}
+
+/// Splits the ranges between borders into statements of the available sizes.
+pub(super) fn statements(borders: &[usize]) -> Vec<Range<usize>> {
+    let mut ranges = Vec::new();
+    let mut start = 0;
+    for &border in borders {
+        for size in SIZES {
+            while border - start >= size {
+                ranges.push(start..start + size);
+                start += size;
+            }
+        }
+    }
+    ranges
+}
+
+/// One statement for as many rows as one of the sizes, with its values.
+pub(super) struct Insert {
+    sql: Arc<str>,
+    arguments: SqliteArguments,
+}
+
+impl Insert {
+    pub(super) fn of(table: SampleTable, rows: &[Row<'_>]) -> Result<Self> {
+        let size = SIZES.iter().position(|&size| size == rows.len());
+        let size = size.ok_or_else(|| Error::fault("a statement of an unknown size"))?;
+        let mut arguments = SqliteArguments::default();
+        arguments.reserve(rows.len() * table.width(), 0);
+        for row in rows {
+            bind(&mut arguments, row).map_err(Error::fault)?;
+        }
+        Ok(Self { sql: Arc::clone(&table.inserts()[size]), arguments })
+    }
+
+    /// Returns how many rows were new.
+    pub(super) async fn execute(self, connection: &mut SqliteConnection) -> Result<u64> {
+        let query = sqlx::query_with(AssertSqlSafe(self.sql), self.arguments);
+        Ok(query.execute(connection).await.map_err(failed)?.rows_affected())
+    }
+}
+
+fn bind(arguments: &mut SqliteArguments, row: &Row<'_>) -> Result<(), sqlx::error::BoxDynError> {
+    let sample = row.sample;
+    arguments.add(row.camera_key)?;
+    arguments.add(sample.time.as_microsecond())?;
+    arguments.add(sample.target_id.as_str())?;
+    for side_px in sample.bounding_box.sides_px() {
+        arguments.add(side_px)?;
+    }
+    if let Some(fix) = sample.fix {
+        arguments.add(fix.position.longitude_deg())?;
+        arguments.add(fix.position.latitude_deg())?;
+        arguments.add(fix.sigma_m.map(SigmaM::metres))?;
+    }
+    arguments.add(sample.class.as_ref().map(TargetClass::as_str))?;
+    arguments.add(sample.score.map(Score::value))?;
+    arguments.add(sample.truth.map(Position::longitude_deg))?;
+    arguments.add(sample.truth.map(Position::latitude_deg))
+}
+
+/// Deletes the samples without a fix whose keys are those of stored samples with one; returns how many, by
+/// camera. Only cameras that `has_boxes` names can have any.
+pub(super) async fn delete_replaced(
+    connection: &mut SqliteConnection,
+    stored: &[Row<'_>],
+    has_boxes: impl Fn(i64) -> bool,
+) -> Result<HashMap<i64, u64>> {
+    let mut keys: HashMap<i64, Vec<(i64, &str)>> = HashMap::new();
+    for Row { camera_key, sample, .. } in stored.iter().filter(|row| has_boxes(row.camera_key)) {
+        let key = (sample.time.as_microsecond(), sample.target_id.as_str());
+        keys.entry(*camera_key).or_default().push(key);
+    }
+    let mut deleted = HashMap::new();
+    for (camera_key, keys) in keys {
+        let query = sqlx::query(
+            "DELETE FROM samples_without_fix WHERE camera_key = ? AND (time_us, target_id) IN \
+             (SELECT json_extract(value, '$[0]'), json_extract(value, '$[1]') FROM json_each(?))",
+        );
+        let query = query.bind(camera_key).bind(serde_json::to_string(&keys).map_err(Error::fault)?);
+        let rows = query.execute(&mut *connection).await.map_err(failed)?.rows_affected();
+        deleted.insert(camera_key, rows);
+    }
+    Ok(deleted)
+}

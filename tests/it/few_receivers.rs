@@ -1,0 +1,205 @@
+//! Error of the recipe `gaussian_process` against the number of receivers, with and without boxes that have
+//! no fix: the table of docs/method.md. One walk is one receiver on one way through the picture.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use rand::SeedableRng as _;
+use rand::seq::SliceRandom as _;
+use rand_chacha::ChaCha8Rng;
+use sightfix::domain::{
+    BoundingBox, Detection, GnssError, ImageSize, ReceivedFix, Receivers, Recipe, Sample, TargetClass,
+    TargetId, TimeBounds,
+};
+use sightfix::exchange::{FixFormat, Format, RowRules, read_detections, read_received_fixes};
+use sightfix::fusion::pairing::{PairingRule, PairingSettings, pair};
+use sightfix::geo::{Position, distance_m};
+use sightfix::model::{FitInput, FitOptions, fit};
+use sightfix::simulation::{Options, Scene, simulate_split};
+
+const RECEIVERS: [usize; 5] = [2, 3, 5, 10, 20];
+
+/// A camera whose targets partly carry receivers.
+struct Recording {
+    image_size: ImageSize,
+    /// Boxes with their fixes, by the target that carries the receiver.
+    samples: BTreeMap<TargetId, Vec<Sample>>,
+    /// All boxes.
+    boxes: Vec<Detection>,
+    /// Boxes of targets without a receiver, and where they were.
+    tests: Vec<(BoundingBox, Position)>,
+}
+
+/// Mean error, m, and share of the true positions within the stated 95 % radius.
+#[derive(Default, Clone, Copy)]
+struct Score {
+    mean_m: f64,
+    coverage: f64,
+}
+
+impl Recording {
+    /// Fits a model with the fixes of so many receivers, chosen by the seed; `None` if they do not suffice.
+    fn score(&self, receivers: usize, seed: u64, with_boxes: bool) -> Option<Score> {
+        let mut carriers: Vec<&TargetId> = self.samples.keys().collect();
+        carriers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
+        let samples: Vec<Sample> =
+            carriers.iter().take(receivers).flat_map(|carrier| self.samples[*carrier].clone()).collect();
+        let paired: BTreeSet<_> = samples.iter().map(|sample| (sample.time, &sample.target_id)).collect();
+        let is_unpaired = |own: &&Detection| with_boxes && !paired.contains(&(own.time, &own.target_id));
+        let unpaired: Vec<Detection> = self.boxes.iter().filter(is_unpaired).cloned().collect();
+        let options = FitOptions {
+            recipe: Recipe::GaussianProcess,
+            seed: 1,
+            epochs: None,
+            image_size: Some(self.image_size),
+            gnss_error: GnssError::Unknown,
+            gnss_bias_sigma_m: None,
+        };
+        let input = FitInput { samples: &samples, unpaired: &unpaired };
+        let model = fit(input, &options, &mut |_| ControlFlow::Continue(())).ok()?.load().ok()?;
+        let mut score = Score::default();
+        for (bounding_box, truth) in &self.tests {
+            let regression = model.regress(bounding_box, None);
+            let error_m = distance_m(model.plane().to_position(regression.regressed), *truth);
+            let r95_m = regression.r95_scale * regression.e_regression_m2.sqrt();
+            score.mean_m += error_m / self.tests.len() as f64;
+            score.coverage += f64::from(u8::from(error_m <= r95_m)) / self.tests.len() as f64;
+        }
+        Some(score)
+    }
+
+    /// A simulated square with 40 walkers, each of whom passes for a minute.
+    fn simulated(seed: u64) -> Self {
+        let options =
+            Options { seed, camera_seed: seed, targets: 40, samples: 2_400, ..Options::new(Scene::Square) };
+        let (train, test) = simulate_split(&options, 1_000);
+        let mut samples: BTreeMap<TargetId, Vec<Sample>> = BTreeMap::new();
+        let mut boxes = Vec::new();
+        for sample in train.training_samples() {
+            boxes.push(Detection {
+                time: sample.time,
+                target_id: sample.target_id.clone(),
+                bounding_box: sample.bounding_box,
+                class: sample.class.clone(),
+                score: None,
+            });
+            samples.entry(sample.target_id.clone()).or_default().push(sample);
+        }
+        let tests = test.rows.iter().filter_map(|row| Some((row.bounding_box?, row.truth))).collect();
+        Self { image_size: train.image_size, samples, boxes, tests }
+    }
+
+    /// One camera of the plaza. Whose a phone is, is known; other targets have the tracker's ids.
+    fn plaza(camera: &str) -> Self {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/plaza");
+        let table = |name: &str| {
+            let mut reader = csv::Reader::from_path(folder.join(name)).expect("the file");
+            reader.records().map(|row| row.expect("a row")).collect::<Vec<_>>()
+        };
+        let persons: BTreeMap<String, String> = table("identity.csv")
+            .iter()
+            .filter(|row| &row[0] == camera)
+            .map(|row| (row[1].to_owned(), row[2].to_owned()))
+            .collect();
+        let truths: BTreeMap<(jiff::Timestamp, String), Position> = table("truth.csv")
+            .iter()
+            .map(|row| {
+                let degrees = |at: usize| row[at].parse::<f64>().expect("degrees");
+                let key = (row[0].parse().expect("a time"), row[1].to_owned());
+                (key, Position::new(degrees(2), degrees(3)).expect("a position"))
+            })
+            .collect();
+        let fixes = plaza_fixes(&folder.join("fixes.csv"));
+        let carriers: BTreeSet<String> = fixes
+            .iter()
+            .filter_map(|fix| fix.receiver_id.as_ref())
+            .map(|id| id.as_str().to_owned())
+            .collect();
+        let (mut boxes, mut tests) =
+            (plaza_boxes(&folder.join(format!("detections_{camera}.csv"))), Vec::new());
+        for (number, own) in boxes.iter_mut().enumerate() {
+            own.class = TargetClass::new("person").ok();
+            let person = &persons[own.target_id.as_str()];
+            if carriers.contains(person) {
+                own.target_id = TargetId::new(person).expect("a name");
+            } else if number % 4 == 0 {
+                tests.extend(truths.get(&(own.time, person.clone())).map(|truth| (own.bounding_box, *truth)));
+            }
+        }
+        let settings = PairingSettings { rule: PairingRule::Interpolated, ..PairingSettings::default() };
+        let mut samples: BTreeMap<TargetId, Vec<Sample>> = BTreeMap::new();
+        for sample in pair(boxes.clone(), fixes, &Receivers::default(), &settings).samples {
+            samples.entry(sample.target_id.clone()).or_default().push(sample);
+        }
+        Self { image_size: ImageSize::new(1920, 1080).expect("a size"), samples, boxes, tests }
+    }
+}
+
+fn rules() -> RowRules {
+    RowRules {
+        time_bounds: TimeBounds::at("2026-01-01T00:00:00Z".parse().expect("a time")),
+        image_size: None,
+    }
+}
+
+fn plaza_boxes(path: &PathBuf) -> Vec<Detection> {
+    let file = std::fs::File::open(path).expect("the file");
+    let rows = read_detections(file, Format::Csv, &rules(), None).expect("a header");
+    rows.map(|row| row.expect("a file").expect("a row")).collect()
+}
+
+/// The fixes; a phone's receiver has the id of the person who carries it.
+fn plaza_fixes(path: &Path) -> Vec<ReceivedFix> {
+    let text = std::fs::read_to_string(path).expect("the file").replace("phone-", "person-");
+    let rows = read_received_fixes(text.as_bytes(), FixFormat::Csv, rules().time_bounds).expect("a header");
+    rows.map(|row| row.expect("a file").expect("a row")).collect()
+}
+
+/// A line of the table: mean errors of all recordings and draws with that many receivers.
+fn compare(name: &str, recordings: &[Recording], receivers: usize, draws: u64) -> String {
+    let mut cells = format!("| {name} | {receivers} |");
+    for with_boxes in [false, true] {
+        let scores: Vec<Score> = recordings
+            .iter()
+            .filter(|recording| recording.samples.len() >= receivers)
+            .flat_map(|recording| (1..=draws).filter_map(|draw| recording.score(receivers, draw, with_boxes)))
+            .collect();
+        let mean = |of: fn(&Score) -> f64| scores.iter().map(of).sum::<f64>() / scores.len() as f64;
+        let (mean_m, coverage) = (mean(|score| score.mean_m), mean(|score| score.coverage));
+        write!(cells, " {mean_m:.2} m | {coverage:.2} |").expect("memory");
+    }
+    cells
+}
+
+const HEADER: &str = "| case | receivers | without boxes: mean | coverage | with boxes: mean | coverage |\n\
+                      |---|---:|---:|---:|---:|---:|";
+
+#[test]
+#[ignore = "fits 24 models"]
+fn boxes_without_a_fix_help_where_few_walkers_carry_a_receiver() {
+    println!("{HEADER}");
+    let worlds: Vec<Recording> = (1..=3).map(|world| Recording::simulated(4_100 + world)).collect();
+    for receivers in [2, 3, 5, 10] {
+        println!("{}", compare("simulated square", &worlds, receivers, 1));
+    }
+}
+
+#[test]
+#[ignore = "needs ../shared/data"]
+fn shared_boxes_without_a_fix_by_number_of_receivers() {
+    println!("{HEADER}");
+    for camera in ["c1", "c2", "c3"] {
+        let recording = [Recording::plaza(camera)];
+        println!(
+            "{camera}: {} receivers seen, {} test boxes",
+            recording[0].samples.len(),
+            recording[0].tests.len()
+        );
+        for receivers in RECEIVERS {
+            let draws = if receivers < 10 { 3 } else { 1 };
+            println!("{}", compare(&format!("plaza {camera}"), &recording, receivers, draws));
+        }
+    }
+}

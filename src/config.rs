@@ -38,6 +38,8 @@ pub struct Config {
     pub training: Workers,
     /// Workers of evaluations.
     pub evaluation: Workers,
+    /// The operator's console.
+    pub console: Console,
     /// What an outside client may make large.
     pub limits: Limits,
 }
@@ -131,6 +133,17 @@ pub struct Workers {
     pub workers: usize,
     /// Seconds after which another worker claims the job of a silent one.
     pub lease_s: u32,
+}
+
+/// What the operator's console shows beside the server's own values.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Console {
+    /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
+    /// console asks no other server.
+    pub tile_url: Option<String>,
+    /// What the provider of the tiles asks to be shown on the map.
+    pub tile_attribution: Option<String>,
 }
 
 /// Everything that an outside client can make large has its limit here.
@@ -250,6 +263,28 @@ pub struct Limits {
     pub drain_s: u64,
 }
 
+impl Console {
+    /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
+    /// `None` for tiles of this server.
+    #[must_use]
+    pub fn tile_origin(&self) -> Option<&str> {
+        self.tile_url.as_deref().and_then(tile_origin).filter(|origin| !origin.is_empty())
+    }
+}
+
+/// Scheme and host of a URL, which end up in a header; empty for a path of this server.
+fn tile_origin(url: &str) -> Option<&str> {
+    if url.starts_with('/') && !url.starts_with("//") {
+        return Some("");
+    }
+    let host_at = url.find("://")? + 3;
+    let host = url[host_at..].split('/').next()?;
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b".-:[]".contains(&byte);
+    let is_usable =
+        matches!(&url[..host_at], "http://" | "https://") && !host.is_empty() && host.bytes().all(is_plain);
+    is_usable.then(|| &url[..host_at + host.len()])
+}
+
 impl Default for Config {
     fn default() -> Self {
         Self {
@@ -265,6 +300,7 @@ impl Default for Config {
             log_filter: "info".to_owned(),
             training: Workers::default(),
             evaluation: Workers::default(),
+            console: Console::default(),
             limits: Limits::default(),
         }
     }
@@ -449,6 +485,12 @@ impl Config {
         self.tls.certificate_and_key()?;
         self.tls.client_scope()?;
         anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
+        if let Some(url) = &self.console.tile_url {
+            anyhow::ensure!(
+                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
+                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
+            );
+        }
         anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(
             limits.reserved_requests < limits.requests,

@@ -136,7 +136,7 @@ impl Server {
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
-        let pipeline = Arc::new(RequestPipeline::new(app.clone(), hosts, &shutdown));
+        let pipeline = Arc::new(RequestPipeline::new(app.clone(), config.console, hosts, &shutdown));
         connection::accept(listener, pipeline, tls, &config.limits, &shutdown).await;
         tracing::info!("shutting down");
         if !shutdown.drain_with_timeout(config.limits.drain_time()).await {

@@ -34,7 +34,7 @@ impl App {
             .iter()
             .map(|observation| {
                 let (image_size, e_gnss_m2) = (camera.image_size, camera.e_gnss_m2);
-                (observation, ObservedPositions::of(observation, regressor, image_size, e_gnss_m2))
+                (observation, ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None))
             })
             .collect();
         let fused = observed

@@ -4,6 +4,7 @@
 
 pub mod access;
 mod audit;
+mod camera_statuses;
 mod cameras;
 mod evaluations;
 mod fusion;
@@ -29,15 +30,16 @@ use crate::config::Limits;
 use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
+pub use camera_statuses::CameraStatus;
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use live::{
-    Acknowledgement, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream, LostEvents, NotStored,
-    NotStoredReason, TrackPoint,
+    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream,
+    LostEvents, NotStored, NotStoredReason, TargetUpdate, TrackPoint,
 };
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
-pub use registry::{ActiveCamera, ModelFault, Registry};
+pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use samples::{ImportReport, RejectedRow};
 pub use training::RunRequest;
 

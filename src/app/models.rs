@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 
-use super::registry::{ModelFault, load_regressor};
+use super::registry::{ModelFault, load_model};
 use super::{App, Page, page_of};
 use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelVersion, Result};
 use crate::exchange::{RowError, TimedFix};
@@ -179,7 +179,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`; `ModelUnusable` if the stored version cannot be loaded.
     pub async fn activate_model(&self, id: &CameraId, number: u32) -> Result<Camera> {
-        load_regressor(&self.store, id, number).await?;
+        load_model(&self.store, id, number).await?;
         let camera = self.store.activate_model(id, number, self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;
         Ok(camera)

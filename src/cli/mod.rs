@@ -14,6 +14,7 @@ mod openapi;
 mod output;
 mod pair;
 mod progress;
+mod recordings;
 mod replay;
 mod serve;
 mod simulate;

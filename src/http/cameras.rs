@@ -291,7 +291,7 @@ pub(super) struct Camera {
 }
 
 impl Camera {
-    fn of(app: &App, camera: domain::Camera) -> Self {
+    pub(super) fn of(app: &App, camera: domain::Camera) -> Self {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
         let warnings = app.camera_warnings(&camera);

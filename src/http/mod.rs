@@ -7,7 +7,9 @@
 mod access;
 mod audit;
 mod body;
+mod camera_statuses;
 mod cameras;
+mod console;
 mod description;
 mod evaluations;
 mod extract;
@@ -20,6 +22,7 @@ mod parts;
 mod problem;
 mod receivers;
 mod samples;
+mod server_info;
 mod service;
 mod session;
 #[cfg(test)]
@@ -44,6 +47,7 @@ use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use crate::admission::RequestClass;
 use crate::app::App;
+use crate::config::Console;
 use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
@@ -54,14 +58,16 @@ pub use session::session_token;
 #[derive(Clone)]
 struct Rest {
     app: App,
+    console: Arc<Console>,
     shutdown: Shutdown,
 }
 
-/// All REST routes, the description at `/openapi.json` and its page at `/docs`.
+/// All REST routes, the description at `/openapi.json` and its page at `/docs`, the operator's console at `/`.
 ///
 /// Requests carry their [`RequestId`] and their [`Caller`](crate::app::access::Caller) as extensions.
-pub fn router(app: App, shutdown: Shutdown) -> Router {
-    let rest = Rest { app, shutdown };
+pub fn router(app: App, console: Console, shutdown: Shutdown) -> Router {
+    let console_routes = console::routes(&console);
+    let rest = Rest { app, console: Arc::new(console), shutdown };
     let (routes, described) = described().split_for_parts();
     let parameters = Arc::new(access::QueryParameters::of(&described));
     // The page would otherwise ask a server on the internet whether the description is well formed.
@@ -72,6 +78,7 @@ pub fn router(app: App, shutdown: Shutdown) -> Router {
     routes
         .route_layer(from_fn_with_state(parameters, access::authorize))
         .merge(page)
+        .merge(console_routes)
         .with_state(rest)
         // As one layer: axum boxes every request again for each.
         .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
@@ -79,14 +86,16 @@ pub fn router(app: App, shutdown: Shutdown) -> Router {
 
 /// What the page of the description may do: run its own scripts and ask its own server, nothing else.
 /// Swagger UI sets styles by attribute and shows images that it holds itself.
-const PAGE_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
+const DESCRIPTION_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
      img-src 'self' data:; font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
 
 async fn contain_page(mut response: Response) -> Response {
-    for (name, value) in
-        [(CONTENT_SECURITY_POLICY, PAGE_POLICY), (X_FRAME_OPTIONS, "DENY"), (REFERRER_POLICY, "no-referrer")]
-    {
+    for (name, value) in [
+        (CONTENT_SECURITY_POLICY, DESCRIPTION_POLICY),
+        (X_FRAME_OPTIONS, "DENY"),
+        (REFERRER_POLICY, "no-referrer"),
+    ] {
         response.headers_mut().insert(name, HeaderValue::from_static(value));
     }
     response
@@ -122,6 +131,7 @@ pub fn refusal(error: &Error, id: &RequestId) -> Response<Body> {
 fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
+        .merge(camera_statuses::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())
@@ -133,6 +143,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(keys::routes())
         .merge(audit::routes())
         .merge(session::routes())
+        .merge(server_info::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
     description::add_security(router.get_openapi_mut());

@@ -19,7 +19,7 @@ use tower::ServiceExt as _;
 use crate::app::App;
 use crate::app::access::{Caller, Principal};
 use crate::clock::{Clock, Randomness};
-use crate::config::Limits;
+use crate::config::{Console, Limits};
 use crate::shutdown::Shutdown;
 use crate::store::Store;
 use crate::telemetry::{Metrics, RequestId};
@@ -86,7 +86,7 @@ impl Rest {
         let app =
             App::new(store, clock, Randomness::seeded(1), limits, Metrics::new()).await.expect("an app");
         let shutdown = Shutdown::new();
-        Self { router: super::router(app, shutdown.clone()), shutdown, _folder: folder }
+        Self { router: super::router(app, Console::default(), shutdown.clone()), shutdown, _folder: folder }
     }
 
     /// With a camera `c` of 640 x 480 px.

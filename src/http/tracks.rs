@@ -23,7 +23,7 @@ use super::extract::{CameraPath, Client, JsonBody, TargetPath};
 use super::fusions::{FusionRequest, observations};
 use super::problem::{ApiResult, Problem};
 use super::wire::{json, json_of_about};
-use crate::app::{CameraEvent, ItemResult, LostEvents, TrackPoint};
+use crate::app::{CameraEvent, ItemResult, LostEvents, TargetUpdate, TrackPoint};
 use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
@@ -238,6 +238,29 @@ impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
     }
 }
 
+/// A measured target: the GeoJSON feature of its track, and the observation that updated it.
+#[derive(Serialize, ToSchema)]
+struct TrackUpdate<'a> {
+    #[serde(flatten)]
+    feature: TrackFeature,
+    /// The observation's box.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    bounding_box: Option<wire::BoundingBox>,
+    /// The observation's own position; missing for a box while the camera has no model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fused: Option<wire::FusedFix<'a>>,
+}
+
+impl<'a> From<&'a TargetUpdate> for TrackUpdate<'a> {
+    fn from(update: &'a TargetUpdate) -> Self {
+        Self {
+            feature: update.point.as_ref().into(),
+            bounding_box: update.bounding_box.map(Into::into),
+            fused: update.fused.as_ref().map(Into::into),
+        }
+    }
+}
+
 /// One answer per observation, in their order.
 #[derive(Serialize, ToSchema)]
 struct FollowedObservations<'a> {
@@ -278,7 +301,7 @@ async fn follow(CallerApp(app): CallerApp, CameraPath(id): CameraPath, body: Jso
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/events", tag = "tracks",
     params(("camera" = String, Path, description = "The camera's id")),
-    responses((status = 200, description = "Events", body = TrackFeature, content_type = "text/event-stream"))
+    responses((status = 200, description = "Events", body = TrackUpdate<'static>, content_type = "text/event-stream"))
 )]
 async fn watch_camera(
     State(rest): State<Rest>,
@@ -291,7 +314,7 @@ async fn watch_camera(
     let shutdown = rest.shutdown.clone();
     let sent = stream::unfold(events, |mut events| async move {
         let event = match events.next().await? {
-            Ok(CameraEvent::Track(point)) => event_of("track", &TrackFeature::from(&*point)),
+            Ok(CameraEvent::Track(update)) => event_of("track", &TrackUpdate::from(&*update)),
             Ok(CameraEvent::Moved(moved)) => event_of("camera_moved", &CameraMoved::from(&*moved)),
             Err(LostEvents(lost)) => event_of("lost", &lost),
         };

@@ -25,6 +25,7 @@ use super::revocable_body::RevocableBody;
 use crate::admission::{BodyRefusal, ClientAddress, RequestClass};
 use crate::app::App;
 use crate::app::access::{Caller, CertificateHolder, Credential, Permission, Principal};
+use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
 use crate::telemetry::{Metrics, REQUEST_ID, RequestId};
@@ -70,9 +71,9 @@ struct Granted {
 pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
 
 impl RequestPipeline {
-    pub(super) fn new(app: App, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+    pub(super) fn new(app: App, console: Console, hosts: HostCheck, shutdown: &Shutdown) -> Self {
         Self {
-            http: http::router(app.clone(), shutdown.clone()),
+            http: http::router(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
             shutdown: shutdown.clone(),

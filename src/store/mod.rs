@@ -19,6 +19,7 @@ mod folder;
 mod group_commit;
 mod jobs;
 mod keys;
+mod latest_runs;
 mod models;
 mod occupants;
 mod reserve;

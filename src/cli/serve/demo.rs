@@ -75,7 +75,8 @@ fn requests_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
          2. The same over gRPC:\n\n   \
          grpcurl -plaintext -d '{{\"camera_id\":\"{CAMERA}\",\"observations\":[{observation}]}}' {address} \
          sightfix.v1.FusionService/Fuse\n\n\
-         3. Explore the whole interface in a browser:\n\n   \
+         3. Open the operator's console, and the description of the whole interface, in a browser:\n\n   \
+         http://{address}/\n   \
          http://{address}/docs\n"
     )
 }

@@ -75,6 +75,8 @@ impl App {
     /// `KeyNotFound`.
     pub async fn revoke_key(&self, id: KeyId) -> Result<ApiKey> {
         let now = self.clock.now();
+        // Its last use is known in memory, which forgets the key now.
+        self.access.store_last_uses(&self.store).await?;
         let key = self.store.revoke_key(id, now).await?;
         self.access.refresh(&self.store, now).await?;
         Ok(key)

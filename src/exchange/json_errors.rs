@@ -39,9 +39,12 @@ fn field_and_reason(path: &str, what: &str) -> (String, String) {
 
 /// `invalid type: integer `5`, expected f64` in words of JSON.
 fn type_mismatch(what: &str) -> Option<String> {
-    let kinds = ["invalid type: ", "invalid value: ", "invalid length "];
-    let rest = kinds.iter().find_map(|kind| what.strip_prefix(kind))?;
-    let (found, expected) = rest.split_once(", expected ")?;
+    if let Some(rest) = what.strip_prefix("invalid value: ").or_else(|| what.strip_prefix("invalid length "))
+    {
+        let (_, expected) = rest.split_once(", expected ")?;
+        return Some(format!("must be {}", json_type(expected)));
+    }
+    let (found, expected) = what.strip_prefix("invalid type: ")?.split_once(", expected ")?;
     let wanted = json_type(expected);
     let given = json_type(found);
     Some(if wanted == given {
@@ -55,7 +58,8 @@ fn type_mismatch(what: &str) -> Option<String> {
 fn json_type(described: &str) -> String {
     let first = described.split([' ', '`', '"']).next().unwrap_or_default();
     let name = match first {
-        "f32" | "f64" | "floating" | "integer" => "a number",
+        "f32" | "f64" | "integer" => "a number",
+        "floating" => "a number with a fraction",
         "i8" | "i16" | "i32" | "i64" | "isize" => "a whole number",
         "u8" | "u16" | "u32" | "u64" | "usize" => "a whole number from 0 on",
         "string" | "character" => "text",
@@ -87,7 +91,7 @@ mod tests {
             ("invalid type: null, expected f64", "must be a number, not null"),
             ("invalid type: sequence, expected struct CameraDraft", "must be an object, not an array"),
             ("invalid type: map, expected a sequence", "must be an array, not an object"),
-            ("invalid value: integer `-1`, expected u32", "must be a whole number from 0 on, not a number"),
+            ("invalid value: integer `-1`, expected u32", "must be a whole number from 0 on"),
             (
                 "invalid type: boolean `true`, expected u64",
                 "must be a whole number from 0 on, not true or false",

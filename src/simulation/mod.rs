@@ -13,13 +13,15 @@ mod path;
 mod positions;
 mod row;
 mod scene;
+mod shape;
 mod target;
 mod tracker;
 mod world;
 
-pub use options::{Options, Route, TargetShape};
+pub use options::{Options, Route};
 pub use row::SimulatedRow;
 pub use scene::Scene;
+pub use shape::TargetShape;
 pub use world::{World, simulate, simulate_split};
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use jiff::{SignedDuration, Timestamp};
 
 use super::scene::Scene;
+use super::shape::TargetShape;
 
 /// Default time of the first row: 2026-01-05T08:00:00Z, in seconds since 1970.
 const START_S: i64 = 1_767_600_000;
@@ -18,22 +19,6 @@ pub enum Route {
     Area,
     /// Each target stays at one point of a line.
     Standing,
-}
-
-/// Extents of a target and the place of its receiver's antenna, m. The scene's outline is stretched to
-/// these extents, so the antenna's distance from the foot of the box depends on the aspect.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TargetShape {
-    /// Extent along the heading.
-    pub length_m: f64,
-    /// Extent across the heading.
-    pub width_m: f64,
-    /// Extent above the ground.
-    pub height_m: f64,
-    /// Antenna ahead of the middle of the length.
-    pub antenna_ahead_m: f64,
-    /// Antenna to the left of the middle of the width.
-    pub antenna_left_m: f64,
 }
 
 /// Parameters of a world. Shares are of rows, 0 to 0.95.

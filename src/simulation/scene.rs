@@ -7,8 +7,8 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::camera::{PinholeCamera, Point};
 use super::noise::ReceiverError;
-use super::options::TargetShape;
 use super::path::{MotionProfile, Polyline, Pose};
+use super::shape::TargetShape;
 use crate::domain::{Error, ImageSize};
 use crate::geo::{EastNorth, Position};
 

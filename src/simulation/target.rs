@@ -6,9 +6,10 @@ use rand_chacha::ChaCha8Rng;
 
 use super::camera::PinholeCamera;
 use super::noise::{Episodes, SimulatedReceiver, standard_normal, stream};
-use super::options::{Options, Route, TargetShape};
+use super::options::{Options, Route};
 use super::path::{Polyline, Pose};
 use super::row::SimulatedRow;
+use super::shape::TargetShape;
 use crate::domain::{BoundingBox, Fix, TargetClass, TargetId};
 use crate::geo::{EastNorth, LocalPlane};
 

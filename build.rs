@@ -8,13 +8,15 @@ use std::{env, fs};
 use protox::prost::Message as _;
 
 const FOLDER: &str = "proto";
-const FILES: [&str; 6] = [
+const FILES: [&str; 8] = [
     "sightfix/v1/values.proto",
     "sightfix/v1/camera_service.proto",
     "sightfix/v1/sample_service.proto",
     "sightfix/v1/training_service.proto",
     "sightfix/v1/model_service.proto",
     "sightfix/v1/fusion_service.proto",
+    "sightfix/v1/key_service.proto",
+    "sightfix/v1/audit_service.proto",
 ];
 
 /// What `npm run build` in `console/` writes.

@@ -7,6 +7,8 @@ use std::time::Duration;
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
+use crate::domain::{CameraId, Role, Scope};
+
 /// Everything that can be set.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -18,6 +20,16 @@ pub struct Config {
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
     pub allowed_hosts: Vec<String>,
+    /// Serve everybody on an address that other machines reach, while no key exists.
+    pub insecure: bool,
+    /// Secret of an administrator's key (`sightfix keys generate`), for the first start of a container.
+    pub admin_key: Option<Secret>,
+    /// File that contains that secret instead.
+    pub admin_key_file: Option<PathBuf>,
+    /// Encryption of the port.
+    pub tls: TlsSettings,
+    /// Secret of the key that `replay` sends to a server.
+    pub api_key: Option<Secret>,
     /// `text` or `json` lines in the log.
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
@@ -30,6 +42,77 @@ pub struct Config {
     pub console: Console,
     /// What an outside client may make large.
     pub limits: Limits,
+}
+
+/// Encryption of the port.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TlsSettings {
+    /// File with the server's certificate chain (PEM); plain HTTP without.
+    pub certificate: Option<PathBuf>,
+    /// File with its private key (PEM).
+    pub key: Option<PathBuf>,
+    /// File with the authority of client certificates (PEM); none are asked for without.
+    pub client_ca: Option<PathBuf>,
+    /// What holders of client certificates may do: `viewer` if left out, `edge`, `operator`, `admin`.
+    pub client_role: Option<String>,
+    /// The cameras that the role `edge` is restricted to.
+    pub client_camera_ids: Vec<String>,
+}
+
+impl TlsSettings {
+    /// The files of the certificate and of its key; `None` for plain HTTP.
+    ///
+    /// # Errors
+    /// Names the setting that is missing.
+    pub fn certificate_and_key(&self) -> anyhow::Result<Option<(&Path, &Path)>> {
+        match (&self.certificate, &self.key) {
+            (Some(certificate), Some(key)) => Ok(Some((certificate, key))),
+            (None, None) if self.client_ca.is_none() => Ok(None),
+            _ => anyhow::bail!(
+                "tls.certificate and tls.key must be given together, tls.client_ca only with them"
+            ),
+        }
+    }
+
+    /// What holders of client certificates may do.
+    ///
+    /// # Errors
+    /// Names the setting that cannot be used.
+    pub fn client_scope(&self) -> anyhow::Result<Scope> {
+        let role = self.client_role.as_deref().map_or(Ok(Role::Viewer), str::parse);
+        let role = role.context("the setting tls.client_role")?;
+        let cameras = self.client_camera_ids.iter().map(|id| CameraId::new(id));
+        let cameras = cameras.collect::<Result<_, _>>().context("the setting tls.client_camera_ids")?;
+        Scope::new(role, cameras).context("the setting tls.client_camera_ids")
+    }
+}
+
+/// A setting that is never shown.
+#[derive(Clone, PartialEq, Eq, Deserialize)]
+#[serde(transparent)]
+pub struct Secret(String);
+
+impl Secret {
+    /// The text.
+    #[must_use]
+    pub fn reveal(&self) -> &str {
+        &self.0
+    }
+}
+
+const HIDDEN: &str = "(hidden)";
+
+impl std::fmt::Debug for Secret {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        out.write_str(HIDDEN)
+    }
+}
+
+impl Serialize for Secret {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(HIDDEN)
+    }
 }
 
 /// Form of the log lines.
@@ -168,6 +251,10 @@ pub struct Limits {
     pub ended_runs_per_camera: u32,
     /// Ended evaluations of all cameras; beyond, the oldest is deleted.
     pub ended_evaluations: u32,
+    /// Keys; those that no longer work make room for new ones, else more are refused.
+    pub keys: u32,
+    /// Entries of the audit log; beyond, the oldest is deleted.
+    pub audit_entries: u32,
     /// Bytes of the database, beyond which nothing is stored; 0 is no limit but the disk's.
     pub database_bytes: u64,
     /// Bytes on the disk that are reserved for deletions when it is full; 0 reserves none.
@@ -204,6 +291,11 @@ impl Default for Config {
             data: PathBuf::from("data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             allowed_hosts: Vec::new(),
+            insecure: false,
+            admin_key: None,
+            admin_key_file: None,
+            tls: TlsSettings::default(),
+            api_key: None,
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
             training: Workers::default(),
@@ -272,6 +364,8 @@ impl Default for Limits {
             models_per_camera: 100,
             ended_runs_per_camera: 100,
             ended_evaluations: 1_000,
+            keys: 1_000,
+            audit_entries: 100_000,
             database_bytes: 0,
             reserve_bytes: 32 << 20,
             drain_s: 8,
@@ -312,6 +406,16 @@ pub struct Overrides {
     pub data: Option<PathBuf>,
     /// `--listen`
     pub listen: Option<SocketAddr>,
+    /// `--insecure`
+    pub insecure: bool,
+    /// `--admin-key-file`
+    pub admin_key_file: Option<PathBuf>,
+    /// `--tls-cert`
+    pub tls_certificate: Option<PathBuf>,
+    /// `--tls-key`
+    pub tls_key: Option<PathBuf>,
+    /// `--tls-client-ca`
+    pub tls_client_ca: Option<PathBuf>,
 }
 
 impl Config {
@@ -332,6 +436,7 @@ impl Config {
             .separator("__")
             .list_separator(",")
             .with_list_parse_key("allowed_hosts")
+            .with_list_parse_key("tls.client_camera_ids")
             .try_parsing(true);
         let mut loaded: Self = config::Config::builder()
             .add_source(source)
@@ -345,8 +450,30 @@ impl Config {
         if let Some(listen) = overrides.listen {
             loaded.listen = listen;
         }
+        for (setting, flag) in [
+            (&mut loaded.admin_key_file, overrides.admin_key_file),
+            (&mut loaded.tls.certificate, overrides.tls_certificate),
+            (&mut loaded.tls.key, overrides.tls_key),
+            (&mut loaded.tls.client_ca, overrides.tls_client_ca),
+        ] {
+            if flag.is_some() {
+                *setting = flag;
+            }
+        }
+        loaded.insecure |= overrides.insecure;
         loaded.check()?;
         Ok(loaded)
+    }
+
+    /// The secret of the administrator's key, from the setting itself or the file that it names.
+    ///
+    /// # Errors
+    /// Names the file that cannot be read.
+    pub fn admin_key(&self) -> anyhow::Result<Option<Secret>> {
+        let Some(path) = &self.admin_key_file else { return Ok(self.admin_key.clone()) };
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the admin key from {}", path.display()))?;
+        Ok(Some(Secret(text.trim().to_owned())))
     }
 
     fn check(&self) -> anyhow::Result<()> {
@@ -357,6 +484,13 @@ impl Config {
                 "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
             );
         }
+        anyhow::ensure!(
+            self.admin_key.is_none() || self.admin_key_file.is_none(),
+            "give admin_key or admin_key_file, not both"
+        );
+        self.tls.certificate_and_key()?;
+        self.tls.client_scope()?;
+        anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
         anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(
             limits.reserved_requests < limits.requests,

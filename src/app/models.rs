@@ -171,7 +171,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`, `ModelActive`.
     pub async fn delete_model(&self, id: &CameraId, number: u32) -> Result<()> {
-        self.store.delete_model(id, number).await
+        self.store.delete_model(id, number, self.clock.now()).await
     }
 
     /// Makes a version the active one, which answers from now on.
@@ -188,7 +188,7 @@ impl App {
     /// Makes the version active that was before the active one.
     ///
     /// # Errors
-    /// `CameraNotFound`; `NoModel` if there is none before it.
+    /// `CameraNotFound`; `NoModel` if none is active, `NoEarlierModel` if none was before it.
     pub async fn roll_back_model(&self, id: &CameraId) -> Result<Camera> {
         let camera = self.store.roll_back(id, self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;

@@ -306,7 +306,7 @@ mod tests {
             let changed = NewCamera { display_name: "gate".to_owned(), ..NewCamera::named(id.clone()) };
             store.replace_camera(&changed, None, Timestamp::UNIX_EPOCH).await.expect("changed");
             let delete = async {
-                store.delete_camera(&id, None).await.expect("deleted");
+                store.delete_camera(&id, None, Timestamp::UNIX_EPOCH).await.expect("deleted");
                 registry.forget(&id).await;
             };
             let (refreshed, ()) = tokio::join!(registry.refresh(&store), delete);

@@ -7,7 +7,9 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::import::{gnss_bias_sigma, image_size};
+use super::output::print_line;
 use super::progress::Progress;
+use super::recordings;
 use super::{format_of, open_file};
 use crate::clock::{Clock, process_cpu_s};
 use crate::domain::{
@@ -17,10 +19,8 @@ use crate::evaluation::{EvaluateOptions, Evaluation, Method, TestRow, Truth, eva
 use crate::exchange::{self, ObservedRow, RowRules};
 use crate::geo::Position;
 use crate::model::FitInput;
-use crate::paper_experiments::{self, RealRecording, Worlds};
+use crate::paper_experiments::{self, RealRecording, Recordings, Worlds};
 
-/// Smallest number of simulated worlds per experiment of the paper.
-const MIN_PAPER_WORLDS: u64 = 3;
 /// Invalid rows that are reported individually.
 const MAX_REPORTED_ROWS: u64 = 20;
 /// Largest number of seeds of one evaluation.
@@ -54,8 +54,8 @@ pub(super) struct Evaluate {
     /// Comma-separated methods, or all
     #[arg(long, value_name = "LIST", default_value = "all", value_parser = methods)]
     methods: Methods,
-    /// Number of training seeds; with --paper, number of simulated worlds per experiment
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MAX_SEEDS))]
+    /// Number of training seeds; with --paper, number of simulated worlds per case [default: 1, or 3 with --paper]
+    #[arg(long, value_name = "N", default_value_t = 1, default_value_if("paper", "true", "3"), hide_default_value = true, value_parser = clap::value_parser!(u64).range(1..=MAX_SEEDS))]
     seeds: u64,
     /// Enlarge the test boxes to the upper left by this, px
     #[arg(long, value_name = "N", default_value_t = 0.0)]
@@ -66,13 +66,14 @@ pub(super) struct Evaluate {
     /// Write plots to this folder, as SVG
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Run the experiments of the paper on simulated worlds instead, and print the page of results
+    /// Run the experiments of the paper on simulated worlds instead, and print the page of results; its pictures
+    /// and its long tables are written beside it
     #[arg(long, conflicts_with_all = ["train", "test"])]
     paper: bool,
     /// Seed of the first simulated world, for --paper; 1000 to 1099 were used during development
     #[arg(long, value_name = "N", requires = "paper", default_value_t = 2001)]
     first_world: u64,
-    /// Folder of the real recordings, for --paper
+    /// Folder of the real recordings, with the folders square and plaza, for --paper
     #[arg(long, value_name = "DIR", requires = "paper")]
     shared_data: Option<PathBuf>,
     /// Write the page to this file, for --paper
@@ -113,15 +114,13 @@ impl Evaluate {
         };
         let input = FitInput { samples: &train.samples, unpaired: &train.unpaired };
         let evaluation = evaluate_with_progress(input, &test, &truth, &options)?;
-        print!("{}", evaluation.report.table());
+        print_line(&format_args!("{}", evaluation.report.table().trim_end()))?;
         if let Some(path) = &self.json {
-            std::fs::write(path, evaluation.report.to_json()?)
-                .with_context(|| format!("cannot write {}", path.display()))?;
+            write(path, &evaluation.report.to_json()?)?;
         }
         if let Some(folder) = &self.plots {
-            std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
             for (name, picture) in plots(&evaluation, &test, &truth) {
-                std::fs::write(folder.join(name), picture)?;
+                write(&folder.join(name), &picture)?;
             }
         }
         anyhow::ensure!(!evaluation.report.methods.is_empty(), "no method could run");
@@ -130,20 +129,26 @@ impl Evaluate {
 
     /// Runs the experiments of the paper; writes the page and prints it.
     fn write_paper_page(&self) -> anyhow::Result<()> {
-        let recording = match &self.shared_data {
-            Some(folder) => Some(RealRecording {
-                samples: read_train(&folder.join("square/training.csv"), None)?.samples,
-                truth: truth_line(&folder.join("square/truth_line.geojson"))?,
-            }),
-            None => None,
+        let recordings = match &self.shared_data {
+            Some(folder) => Recordings {
+                square: Some(RealRecording {
+                    samples: read_train(&folder.join("square/training.csv"), None)?.samples,
+                    truth: truth_line(&folder.join("square/truth_line.geojson"))?,
+                }),
+                plaza: recordings::plaza(&folder.join("plaza"))?,
+            },
+            None => Recordings::default(),
         };
-        let worlds = Worlds { first: self.first_world, count: self.seeds.max(MIN_PAPER_WORLDS) };
-        let page = paper_experiments::page(worlds, recording.as_ref(), &mut PaperRunner)?;
-        if let Some(folder) = self.out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-            std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        let stem = self.out.file_stem().and_then(|stem| stem.to_str()).context("--out must name a file")?;
+        let folder = self.out.parent().unwrap_or(Path::new(""));
+        let worlds = Worlds { first: self.first_world, count: self.seeds };
+        let started_s = process_cpu_s();
+        let documents = paper_experiments::run(worlds, &recordings, stem, &mut PaperRunner)?;
+        for document in &documents {
+            write(&folder.join(&document.path), &document.text)?;
         }
-        std::fs::write(&self.out, &page).with_context(|| format!("cannot write {}", self.out.display()))?;
-        println!("{page}");
+        eprintln!("{:.0} CPU s", process_cpu_s() - started_s);
+        print_line(&format_args!("{}", documents.first().map_or("", |page| page.text.trim_end())))?;
         Ok(())
     }
 
@@ -160,6 +165,14 @@ impl Evaluate {
         );
         Ok(Truth::Columns)
     }
+}
+
+/// Writes a file, and the folder that it is in.
+fn write(path: &Path, text: &str) -> anyhow::Result<()> {
+    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    }
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Evaluates the experiments of the paper, with progress on standard error.

@@ -8,7 +8,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use crate::exchange::{self, Format};
-use crate::simulation::{Options, Route, Scene, World, simulate};
+use crate::simulation::{Options, Route, Scene, TargetShape, World, simulate};
 
 /// Write a simulated world with its truth, as CSV
 #[derive(Args)]
@@ -28,21 +28,39 @@ pub(super) struct Simulate {
     /// Number of test rows
     #[arg(long, value_name = "N", default_value_t = 400, requires = "test_out")]
     test_samples: usize,
-    /// Route of the test targets: lines, new-line or standing
-    #[arg(long, value_name = "ROUTE", default_value = "lines", value_parser = route, requires = "test_out")]
-    test_route: Route,
+    /// Route of the targets: lines, new-line (parallel to them), area (between random points) or standing
+    #[arg(long, value_name = "ROUTE", default_value = "lines", value_parser = route)]
+    route: Route,
+    /// Route of the test targets [default: that of the training targets]
+    #[arg(long, value_name = "ROUTE", value_parser = route, requires = "test_out")]
+    test_route: Option<Route>,
+    /// Offset of new-line to the left of the lines, m [default: that of the scene]
+    #[arg(long, value_name = "M", allow_negative_numbers = true)]
+    new_line_offset_m: Option<f64>,
     /// Seed of everything but the camera
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
     /// Seed of the camera's height, focal length and orientation
     #[arg(long, value_name = "N", default_value_t = 1)]
     camera_seed: u64,
-    /// Number of targets; their rows are interleaved
+    /// Number of targets, each with its own receiver; their rows are interleaved
     #[arg(long, value_name = "N", default_value_t = 1)]
     targets: usize,
+    /// Number of sessions of the training rows, a day apart; the test rows are one session a week later
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    sessions: usize,
+    /// Extents of the targets, m: their outline is stretched to them [default: those of the scene]
+    #[arg(long, value_name = "LENGTHxWIDTHxHEIGHT", value_parser = extents)]
+    target_size_m: Option<[f64; 3]>,
+    /// Place of the antenna ahead and to the left of the target's middle, m [default: that of the scene]
+    #[arg(long, value_name = "AHEAD,LEFT", value_parser = antenna, allow_hyphen_values = true)]
+    antenna_m: Option<[f64; 2]>,
     /// Standard deviation per axis of the receivers, m [default: that of the scene]
     #[arg(long, value_name = "S")]
     gnss_sigma_m: Option<f64>,
+    /// Standard deviation per axis of an additional error that each receiver keeps for a session, m
+    #[arg(long, value_name = "S", default_value_t = 0.0)]
+    gnss_bias_sigma_m: f64,
     /// Standard deviation of each edge of a box, px
     #[arg(long, value_name = "N", default_value_t = 1.0)]
     box_noise_px: f64,
@@ -52,42 +70,78 @@ pub(super) struct Simulate {
     /// Keep boxes truncated by the image border [default: depends on the scene]
     #[arg(long, value_name = "BOOL")]
     border_cuts: Option<bool>,
+    /// Leave truncated boxes out of the training rows, but not out of the test rows
+    #[arg(long)]
+    train_without_cut_boxes: bool,
     /// Share of rows in which the target is occluded
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     occlusion: f64,
     /// Share of rows whose fix or box is an outlier
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     outliers: f64,
+    /// Share of rows whose fix is wrong by --gross-fix-error-m
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
+    gross_fixes: f64,
+    /// Size of those errors, m
+    #[arg(long, value_name = "M", default_value_t = 1_000.0)]
+    gross_fix_error_m: f64,
     /// Share of rows without a fix
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     gnss_gaps: f64,
+    /// Mean time after which the tracker loses a target and gives it the id of another one that it lost, s
+    /// [default: ids never change]
+    #[arg(long, value_name = "S")]
+    tracker_id_lifetime_s: Option<f64>,
 }
 
 impl Simulate {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let base = Options::new(self.scene);
+        let target_shape = self.target_shape();
         let options = Options {
             seed: self.seed,
             camera_seed: self.camera_seed,
             samples: self.samples,
+            route: self.route,
+            new_line_offset_m: self.new_line_offset_m,
             targets: self.targets,
+            sessions: self.sessions,
+            target_shape,
             gnss_sigma_m: self.gnss_sigma_m.unwrap_or(base.gnss_sigma_m),
+            gnss_bias_sigma_m: self.gnss_bias_sigma_m,
             box_noise_px: self.box_noise_px,
             lens_distortion: self.lens_distortion,
             border_cuts: self.border_cuts.unwrap_or(base.border_cuts),
+            without_cut_boxes: self.train_without_cut_boxes,
             occlusion: self.occlusion,
             outliers: self.outliers,
+            gross_fixes: self.gross_fixes,
+            gross_fix_error_m: self.gross_fix_error_m,
             gnss_gaps: self.gnss_gaps,
+            tracker_id_lifetime_s: self.tracker_id_lifetime_s,
             ..base
         };
         check(&options)?;
         let out = create(&self.out)?;
         exchange::write_samples(out, Format::Csv, &simulate(&options).training_samples())?;
         if let Some(path) = &self.test_out {
-            let test = Options { route: self.test_route, ..options.test(self.test_samples) };
+            let test =
+                Options { route: self.test_route.unwrap_or(self.route), ..options.test(self.test_samples) };
             write_test(&simulate(&test), create(path)?)?;
         }
         Ok(())
+    }
+
+    /// The scene's shape with the extents and the antenna that were given; `None` for neither.
+    fn target_shape(&self) -> Option<TargetShape> {
+        let nominal = self.scene.nominal_shape();
+        let TargetShape { length_m, width_m, height_m, antenna_ahead_m, antenna_left_m } = nominal;
+        (self.target_size_m.is_some() || self.antenna_m.is_some()).then(|| {
+            let [length_m, width_m, height_m] = self.target_size_m.unwrap_or([length_m, width_m, height_m]);
+            let [antenna_ahead_m, antenna_left_m] =
+                self.antenna_m.unwrap_or([antenna_ahead_m, antenna_left_m]);
+            TargetShape { length_m, width_m, height_m, antenna_ahead_m, antenna_left_m }
+        })
     }
 }
 
@@ -120,25 +174,72 @@ fn write_test(world: &World, mut out: impl io::Write) -> io::Result<()> {
 
 /// Checks the ranges of the options.
 fn check(options: &Options) -> anyhow::Result<()> {
-    let Options { samples, targets, gnss_sigma_m, box_noise_px, lens_distortion, .. } = options;
+    let Options { samples, targets, sessions, gnss_sigma_m, box_noise_px, lens_distortion, .. } = options;
     anyhow::ensure!((1..=10_000_000).contains(samples), "--samples must be from 1 to 10,000,000");
     anyhow::ensure!((1..=1_000).contains(targets), "--targets must be from 1 to 1,000");
+    anyhow::ensure!((1..=7).contains(sessions), "--sessions must be from 1 to 7");
     anyhow::ensure!((0.001..=1e4).contains(gnss_sigma_m), "--gnss-sigma-m must be from 0.001 to 10,000 m");
     anyhow::ensure!((0.0..=100.0).contains(box_noise_px), "--box-noise-px must be from 0 to 100");
     anyhow::ensure!((-0.3..=0.3).contains(lens_distortion), "--lens-distortion must be from -0.3 to 0.3");
-    for (name, share) in
-        [("occlusion", options.occlusion), ("outliers", options.outliers), ("gnss-gaps", options.gnss_gaps)]
-    {
+    anyhow::ensure!(
+        (0.0..=1e4).contains(&options.gnss_bias_sigma_m),
+        "--gnss-bias-sigma-m must be from 0 to 10,000 m"
+    );
+    anyhow::ensure!(
+        options.new_line_offset_m.is_none_or(|offset_m| offset_m.abs() <= 1_000.0),
+        "--new-line-offset-m must be from -1,000 to 1,000 m"
+    );
+    anyhow::ensure!(
+        (0.0..=1e7).contains(&options.gross_fix_error_m),
+        "--gross-fix-error-m must be from 0 to 10,000,000 m"
+    );
+    anyhow::ensure!(
+        options.tracker_id_lifetime_s.is_none_or(|lifetime_s| (1.0..=1e6).contains(&lifetime_s)),
+        "--tracker-id-lifetime-s must be from 1 to 1,000,000 s"
+    );
+    for (name, share) in [
+        ("occlusion", options.occlusion),
+        ("outliers", options.outliers),
+        ("gross-fixes", options.gross_fixes),
+        ("gnss-gaps", options.gnss_gaps),
+    ] {
         anyhow::ensure!((0.0..=0.95).contains(&share), "--{name} must be a share from 0 to 0.95");
     }
+    options.target_shape.as_ref().map_or(Ok(()), check_shape)
+}
+
+fn check_shape(shape: &TargetShape) -> anyhow::Result<()> {
+    let TargetShape { length_m, width_m, height_m, antenna_ahead_m, antenna_left_m } = *shape;
+    anyhow::ensure!(
+        [length_m, width_m, height_m].iter().all(|extent_m| (0.1..=500.0).contains(extent_m)),
+        "--target-size-m must be from 0.1 to 500 m each way"
+    );
+    anyhow::ensure!(
+        antenna_ahead_m.abs() <= 0.5 * length_m && antenna_left_m.abs() <= 0.5 * width_m,
+        "--antenna-m must be within the target: {length_m} m long and {width_m} m wide"
+    );
     Ok(())
+}
+
+fn extents(text: &str) -> Result<[f64; 3], String> {
+    numbers(text, 'x').ok_or_else(|| "must be three lengths in m, such as 37x34x12".to_owned())
+}
+
+fn antenna(text: &str) -> Result<[f64; 2], String> {
+    numbers(text, ',').ok_or_else(|| "must be two distances in m, such as 14,0".to_owned())
+}
+
+fn numbers<const N: usize>(text: &str, separator: char) -> Option<[f64; N]> {
+    let numbers: Option<Vec<f64>> = text.split(separator).map(|part| part.trim().parse().ok()).collect();
+    numbers?.try_into().ok()
 }
 
 fn route(name: &str) -> Result<Route, String> {
     match name {
         "lines" => Ok(Route::Lines),
         "new-line" => Ok(Route::NewLine),
+        "area" => Ok(Route::Area),
         "standing" => Ok(Route::Standing),
-        _ => Err("must be lines, new-line or standing".to_owned()),
+        _ => Err("must be lines, new-line, area or standing".to_owned()),
     }
 }

@@ -130,6 +130,14 @@ impl BoundingBox {
         [self.left_px, self.top_px, self.width_px, self.height_px]
     }
 
+    /// The box with its left and top edges moved outwards, as by an inaccurate detector.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn grown_to_upper_left(self, by_px: f64) -> Result<Self> {
+        Self::new(self.left_px - by_px, self.top_px - by_px, self.width_px + by_px, self.height_px + by_px)
+    }
+
     /// The foot point (x, y), px: the centre of the lower edge, where the target touches the ground.
     #[must_use]
     pub fn foot_px(self) -> [f64; 2] {

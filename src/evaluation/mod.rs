@@ -3,10 +3,12 @@
 //! Whatever is fitted or tuned is fitted on the training samples alone; no choice depends on a test
 //! row.
 
+pub(crate) mod axis;
 pub mod baselines;
+pub(crate) mod chart;
 mod metrics;
 mod options;
-mod plots;
+pub(crate) mod plots;
 mod predictors;
 mod report;
 mod runner;

@@ -1,300 +1,228 @@
-//! Plots of an evaluation as self-contained SVG documents, without scripts or embedded fonts.
+//! Plots of an evaluation: errors over time and their distribution, stated against found error, and the
+//! positions in the plane.
 
-use std::fmt::Write as _;
-
+use super::axis::{Axes, AxisSpec};
+use super::chart::{Panel, Series, Shape, chart, panels};
 use super::options::TestRow;
 use super::traces::{Curve, Evaluation, Trace, TracePoint};
 use crate::domain::Truth;
 use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::statistics::R95_PER_SIGMA;
 
-/// Size of a plot: width, height, px.
-const SIZE_PX: [f64; 2] = [900.0, 520.0];
-/// Frame of the axes within the plot: left, top, right, bottom, px.
-const FRAME_PX: [f64; 4] = [70.0, 40.0, 690.0, 465.0];
-/// Colours that are distinct under colour blindness (after Okabe and Ito), then darker ones.
-const COLOURS: [&str; 10] = [
-    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b", "#4b0092",
-    "#1a1a1a",
-];
-/// A series with more points than this is thinned.
-const MOST_POINTS: usize = 3_000;
+/// Vertices of a line that shows a distribution.
+const DISTRIBUTION_POINTS: usize = 200;
+/// Ellipses per panel of the plane.
+const ELLIPSES: usize = 24;
+/// Vertices of an ellipse.
+const ELLIPSE_POINTS: usize = 28;
+/// Gaps between test rows are shown as this, s, so that traverses are adjacent.
+const SHOWN_GAP_S: f64 = 5.0;
 
-/// The plots by file name: error over time, cumulative share, the plane, and Es per epoch.
+/// The plots by file name. Those for which there is nothing to show are left out: Es per epoch without
+/// a recipe that has epochs, the calibration without a method that states its error.
 #[must_use]
 pub fn plots(evaluation: &Evaluation, test: &[TestRow], truth: &Truth) -> Vec<(String, String)> {
-    let mut documents = vec![
-        ("error_over_time.svg".to_owned(), error_over_time(&evaluation.traces, test)),
-        ("cumulative_share.svg".to_owned(), cumulative_share(&evaluation.traces)),
-        ("plane.svg".to_owned(), plane(&evaluation.traces, test, truth)),
+    let traces: Vec<&Trace> = evaluation.traces.iter().collect();
+    let documents = [
+        ("error_over_time.svg", error_over_time(&traces, test)),
+        ("cumulative_share.svg", cumulative_share("Share of errors below a bound", &traces)),
+        ("calibration.svg", calibration("Share of true positions inside the stated radius", &traces)),
+        ("plane.svg", plane("Positions", &traces, test, truth)),
+        ("error_scale.svg", error_scale(&evaluation.curves)),
     ];
-    if !evaluation.curves.is_empty() {
-        let curve = |curve: &Curve| Series {
-            name: curve.recipe.to_string(),
-            points: curve
-                .epochs
-                .iter()
-                .map(|one| [f64::from(one.epoch), one.error_scale.max(1e-12).log10()])
-                .collect(),
-            shape: Shape::Line,
-        };
-        let series: Vec<Series> = evaluation.curves.iter().map(curve).collect();
-        documents
-            .push(("error_scale.svg".to_owned(), chart("Es per epoch", "epoch", "log10 Es", &series, false)));
-    }
-    documents
+    documents.into_iter().filter_map(|(name, svg)| Some((name.to_owned(), svg?))).collect()
 }
 
-#[derive(Clone, Copy, PartialEq)]
-enum Shape {
-    Line,
-    Dots,
-}
-
-struct Series {
-    name: String,
-    points: Vec<[f64; 2]>,
-    shape: Shape,
-}
-
-/// Errors over test time, with gaps shortened to 5 s so that passes are adjacent.
-fn error_over_time(traces: &[Trace], test: &[TestRow]) -> String {
-    let mut times_s: Vec<f64> =
-        test.iter().map(|row| row.observation.time().as_microsecond() as f64 * 1e-6).collect();
+/// Errors over test time, a panel per method.
+fn error_over_time(traces: &[&Trace], test: &[TestRow]) -> Option<String> {
+    let mut times_s: Vec<f64> = test.iter().map(time_s).collect();
     times_s.sort_by(f64::total_cmp);
     times_s.dedup();
     let mut shown_s = vec![0.0];
     for pair in times_s.windows(2) {
         let last_s = shown_s[shown_s.len() - 1];
-        shown_s.push(last_s + (pair[1] - pair[0]).min(5.0));
+        shown_s.push(last_s + (pair[1] - pair[0]).min(SHOWN_GAP_S));
     }
     let elapsed_s = |row: usize| {
-        let time_s = test[row].observation.time().as_microsecond() as f64 * 1e-6;
-        shown_s[times_s.partition_point(|&other_s| other_s < time_s).min(shown_s.len() - 1)]
+        let at = times_s.partition_point(|&other_s| other_s < time_s(&test[row]));
+        shown_s[at.min(shown_s.len() - 1)]
     };
     let points = |point: &TracePoint| Some([elapsed_s(point.row), point.error_m?]);
-    let series = of_traces(traces, Shape::Dots, &points);
-    chart("Error over time", "seconds of test rows, gaps shortened", "error, m", &series, false)
-}
-
-fn cumulative_share(traces: &[Trace]) -> String {
-    let share = |trace: &Trace| {
-        let mut errors_m: Vec<f64> = trace.points.iter().filter_map(|point| point.error_m).collect();
-        errors_m.sort_by(f64::total_cmp);
-        let count = errors_m.len().max(1) as f64;
-        let points =
-            errors_m.iter().enumerate().map(|(index, &error_m)| [error_m, (index + 1) as f64 / count]);
-        Series { name: trace.method.clone(), points: thin(points.collect()), shape: Shape::Line }
+    let series = dots(traces, &points);
+    let axes = Axes {
+        across: AxisSpec::linear("seconds of test rows, gaps shortened", 0.0, shown_s[shown_s.len() - 1]),
+        upward: AxisSpec::logarithmic("error, m", errors_m(traces)),
+        equal_scale: false,
     };
-    let series: Vec<Series> = traces.iter().map(share).collect();
-    chart("Share of errors below a bound", "error, m", "share", &series, false)
+    let each =
+        series.into_iter().map(|series| Panel { background: Vec::new(), foreground: Vec::new(), series });
+    Some(panels("Error over time", &axes, (1, 92.0), &each.collect::<Vec<_>>()))
 }
 
-fn plane(traces: &[Trace], test: &[TestRow], truth: &Truth) -> String {
-    let first = traces.iter().find_map(|trace| trace.points.first());
-    let Some(first) = first else { return chart("Positions", "east, m", "north, m", &[], true) };
-    let plane = LocalPlane::new(first.position);
+fn time_s(row: &TestRow) -> f64 {
+    row.observation.time().as_microsecond() as f64 * 1e-6
+}
+
+fn errors_m<'a>(traces: &'a [&Trace]) -> impl Iterator<Item = f64> + 'a {
+    traces.iter().flat_map(|trace| &trace.points).filter_map(|point| point.error_m)
+}
+
+/// The cumulative distribution of every method's errors; `None` without any error.
+pub(crate) fn cumulative_share(title: &str, traces: &[&Trace]) -> Option<String> {
+    errors_m(traces).next()?;
+    let distribution = |(number, trace): (usize, &&Trace)| {
+        let errors_m: Vec<f64> = trace.points.iter().filter_map(|point| point.error_m).collect();
+        Series::new(&trace.method, number, cumulative(errors_m), Shape::Line)
+    };
+    let series: Vec<Series> = traces.iter().enumerate().map(distribution).collect();
+    let axes = Axes {
+        across: AxisSpec::logarithmic("error, m", errors_m(traces)),
+        upward: AxisSpec::linear("share of errors at most as large", 0.0, 1.0),
+        equal_scale: false,
+    };
+    Some(chart(title, &axes, &series))
+}
+
+/// Found against stated share of true positions inside the radius, for the methods that state one; on the
+/// diagonal the stated error is right, below it too small. `None` if no method states a radius.
+///
+/// The radius of a share p of an isotropic normal distribution is `r95 sqrt(ln(1 - p) / ln 0.05)`, so a
+/// point is inside from the share `1 - exp(ln 0.05 (error / r95)^2)` on.
+pub(crate) fn calibration(title: &str, traces: &[&Trace]) -> Option<String> {
+    let curve = |(number, trace): (usize, &&Trace)| {
+        let share = |point: &TracePoint| {
+            let ratio = point.error_m? / point.r95_m?;
+            Some(1.0 - (0.05_f64.ln() * ratio * ratio).exp())
+        };
+        let shares: Vec<f64> = trace.points.iter().filter_map(share).collect();
+        (!shares.is_empty()).then(|| Series::new(&trace.method, number, cumulative(shares), Shape::Line))
+    };
+    let mut series: Vec<Series> = traces.iter().enumerate().filter_map(curve).collect();
+    if series.is_empty() {
+        return None;
+    }
+    series.push(Series::truth("a radius that is right", vec![[0.0, 0.0], [1.0, 1.0]], Shape::Line));
+    let axes = Axes {
+        across: AxisSpec::linear("stated share", 0.0, 1.0),
+        upward: AxisSpec::linear("found share", 0.0, 1.0),
+        equal_scale: false,
+    };
+    Some(chart(title, &axes, &series))
+}
+
+/// Vertices of the cumulative distribution of some values, from (lowest, 0) on.
+fn cumulative(mut values: Vec<f64>) -> Vec<[f64; 2]> {
+    values.sort_by(f64::total_cmp);
+    let count = values.len();
+    let steps = count.min(DISTRIBUTION_POINTS).max(1);
+    let vertex = |step: usize| {
+        let rank = step * count / steps;
+        Some([*values.get(rank.saturating_sub(1))?, rank as f64 / count as f64])
+    };
+    (0..=steps).filter_map(vertex).collect()
+}
+
+/// The positions of every method in a panel of their own, with some of their stated 95 % ellipses, under
+/// the truth; `None` without any position.
+pub(crate) fn plane(title: &str, traces: &[&Trace], test: &[TestRow], truth: &Truth) -> Option<String> {
+    let plane = LocalPlane::new(traces.iter().find_map(|trace| trace.points.first())?.position);
     let in_plane = |position: Position| {
         let EastNorth { east_m, north_m } = plane.to_plane(position);
         [east_m, north_m]
     };
-    let mut series = of_traces(traces, Shape::Dots, &|point| Some(in_plane(point.position)));
-    let mut known = |points: Vec<[f64; 2]>, shape| {
-        series.push(Series { name: "truth".to_owned(), points, shape });
-    };
-    match truth {
+    let known = match truth {
         Truth::Columns => {
-            known(thin(test.iter().filter_map(|row| row.truth.map(in_plane)).collect()), Shape::Dots);
+            let points: Vec<[f64; 2]> = test.iter().filter_map(|row| row.truth.map(in_plane)).collect();
+            vec![Series::truth("truth", points, Shape::Dots)]
         }
-        Truth::Point(point) => known(vec![in_plane(*point)], Shape::Dots),
-        Truth::Lines(lines) => {
-            for line in lines {
-                known(line.iter().map(|&point| in_plane(point)).collect(), Shape::Line);
-            }
-        }
-    }
-    chart("Positions", "east, m", "north, m", &series, true)
-}
-
-fn of_traces(traces: &[Trace], shape: Shape, point: &dyn Fn(&TracePoint) -> Option<[f64; 2]>) -> Vec<Series> {
-    let one = |trace: &Trace| Series {
-        name: trace.method.clone(),
-        points: thin(trace.points.iter().filter_map(point).collect()),
-        shape,
+        Truth::Point(point) => vec![Series::truth("truth", vec![in_plane(*point)], Shape::Dots)],
+        Truth::Lines(lines) => lines
+            .iter()
+            .map(|line| line.iter().map(|&point| in_plane(point)).collect())
+            .map(|line| Series::truth("truth", line, Shape::Outline))
+            .collect(),
     };
-    traces.iter().map(one).collect()
+    let series = dots(traces, &|point| Some(in_plane(point.position)));
+    let truths = known.iter().flat_map(Series::points).copied();
+    let range = |axis: usize| extent(truths.clone(), series.iter().flat_map(Series::points).copied(), axis);
+    let ([west_m, east_m], [south_m, north_m]) = (range(0), range(1));
+    let axes = Axes {
+        across: AxisSpec::linear("east, m", west_m, east_m),
+        upward: AxisSpec::linear("north, m", south_m, north_m),
+        equal_scale: true,
+    };
+    let each = series.into_iter().zip(traces).enumerate().map(|(number, (series, trace))| {
+        let background = vec![Series::new("", number, ellipses(trace, &in_plane), Shape::Outline)];
+        Panel { background, foreground: known.clone(), series }
+    });
+    Some(panels(title, &axes, (4, 260.0), &each.collect::<Vec<_>>()))
 }
 
-fn thin(points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
-    let step = points.len().div_ceil(MOST_POINTS).max(1);
-    points.into_iter().step_by(step).collect()
+/// The truth's range and the central 90 % of all positions along an axis, with a margin.
+fn extent(
+    truths: impl Iterator<Item = [f64; 2]>,
+    positions: impl Iterator<Item = [f64; 2]>,
+    axis: usize,
+) -> [f64; 2] {
+    let mut values: Vec<f64> = positions.map(|point| point[axis]).collect();
+    values.sort_by(f64::total_cmp);
+    let tail = values.len() / 20;
+    let central = values.get(tail).into_iter().chain(values.iter().rev().nth(tail)).copied();
+    let (low, high) = truths
+        .map(|point| point[axis])
+        .chain(central)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)));
+    let margin = 0.06 * (high - low).max(1.0);
+    [low - margin, high + margin]
 }
 
-/// Maps values to px and places ticks at round values.
-struct Axis {
-    low: f64,
-    high: f64,
-    from_px: f64,
-    to_px: f64,
-}
-
-impl Axis {
-    /// Spans the values except for the uppermost 0.5 %, so that one outlier does not compress all
-    /// others.
-    fn over(mut values: Vec<f64>, from_px: f64, to_px: f64) -> Self {
-        values.retain(|value| value.is_finite());
-        values.sort_by(f64::total_cmp);
-        let last = values.len().saturating_sub(1);
-        let low = values.first().copied().unwrap_or(0.0);
-        let high = values.get(last - last / 200).copied().unwrap_or(1.0);
-        let margin = if high > low { 0.03 * (high - low) } else { 0.5 };
-        Self { low: low - margin, high: high + margin, from_px, to_px }
-    }
-
-    fn at(&self, value: f64) -> f64 {
-        let part = (value - self.low) / (self.high - self.low);
-        self.from_px + part.clamp(-0.02, 1.02) * (self.to_px - self.from_px)
-    }
-
-    fn ticks(&self) -> Vec<f64> {
-        let raw = (self.high - self.low) / 6.0;
-        let power = 10.0_f64.powf(raw.log10().floor());
-        let step = [1.0, 2.0, 5.0, 10.0].into_iter().map(|one| one * power).find(|&one| one >= raw);
-        let step = step.unwrap_or(raw);
-        let first = (self.low / step).ceil() as i64;
-        (first..first + 12).map(|index| index as f64 * step).take_while(|&tick| tick <= self.high).collect()
-    }
-
-    fn per_px(&self) -> f64 {
-        (self.high - self.low) / (self.to_px - self.from_px).abs()
-    }
-
-    /// Widens the axis about its centre to a given value per px.
-    fn widen(&mut self, per_px: f64) {
-        let half = 0.5 * per_px * (self.to_px - self.from_px).abs();
-        let centre = 0.5 * (self.low + self.high);
-        (self.low, self.high) = (centre - half, centre + half);
-    }
-}
-
-/// A chart with its legend; `equal_scale` gives both axes the same scale.
-fn chart(title: &str, across: &str, upward: &str, series: &[Series], equal_scale: bool) -> String {
-    let [left, top, right, bottom] = FRAME_PX;
-    let values = |axis: usize| series.iter().flat_map(|one| &one.points).map(|point| point[axis]).collect();
-    let mut x = Axis::over(values(0), left, right);
-    let mut y = Axis::over(values(1), bottom, top);
-    if equal_scale {
-        let per_px = x.per_px().max(y.per_px());
-        x.widen(per_px);
-        y.widen(per_px);
-    }
-    let mut svg = String::new();
-    // Writing to a string cannot fail.
-    let _ = write!(
-        svg,
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {} {}\" font-family=\"sans-serif\" \
-         font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n\
-         <text x=\"{left}\" y=\"24\" font-size=\"16\">{title}</text>\n",
-        SIZE_PX[0], SIZE_PX[1]
-    );
-    axes(&mut svg, &x, &y, across, upward);
-    for (index, one) in series.iter().enumerate() {
-        let colour = if one.name == "truth" { "#000000" } else { COLOURS[index % COLOURS.len()] };
-        draw(&mut svg, one, colour, &x, &y);
-        let line_px = top + 8.0 + 18.0 * index as f64;
-        let _ = writeln!(
-            svg,
-            "<rect x=\"{}\" y=\"{}\" width=\"12\" height=\"4\" fill=\"{colour}\"/>\
-             <text x=\"{}\" y=\"{}\">{}</text>",
-            right + 15.0,
-            line_px,
-            right + 33.0,
-            line_px + 6.0,
-            one.name
-        );
-    }
-    svg.push_str("</svg>\n");
-    svg
-}
-
-fn axes(svg: &mut String, x: &Axis, y: &Axis, across: &str, upward: &str) {
-    let [left, top, right, bottom] = FRAME_PX;
-    for tick in x.ticks() {
-        let at = x.at(tick);
-        let _ = writeln!(
-            svg,
-            "<path d=\"M{at:.1} {top}V{bottom}\" stroke=\"#dddddd\"/>\
-             <text x=\"{at:.1}\" y=\"{}\" text-anchor=\"middle\">{}</text>",
-            bottom + 17.0,
-            number(tick)
-        );
-    }
-    for tick in y.ticks() {
-        let at = y.at(tick);
-        let _ = writeln!(
-            svg,
-            "<path d=\"M{left} {at:.1}H{right}\" stroke=\"#dddddd\"/>\
-             <text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
-            left - 6.0,
-            at + 4.0,
-            number(tick)
-        );
-    }
-    let _ = writeln!(
-        svg,
-        "<path d=\"M{left} {top}V{bottom}H{right}\" stroke=\"black\" fill=\"none\"/>\
-         <text x=\"{}\" y=\"{}\" text-anchor=\"middle\">{across}</text>\
-         <text transform=\"translate(18 {}) rotate(-90)\" text-anchor=\"middle\">{upward}</text>",
-        0.5 * (left + right),
-        bottom + 38.0,
-        0.5 * (top + bottom)
-    );
-}
-
-fn draw(svg: &mut String, series: &Series, colour: &str, x: &Axis, y: &Axis) {
-    let mut path = String::new();
-    for (index, [across, upward]) in series.points.iter().enumerate() {
-        let (at_x, at_y) = (x.at(*across), y.at(*upward));
-        let _ = match (series.shape, index) {
-            (Shape::Dots, _) => write!(path, "M{at_x:.1} {at_y:.1}h0"),
-            (Shape::Line, 0) => write!(path, "M{at_x:.1} {at_y:.1}"),
-            (Shape::Line, _) => write!(path, "L{at_x:.1} {at_y:.1}"),
+/// Evenly chosen 95 % ellipses of a trace's stated covariances, or circles of its radii.
+fn ellipses(trace: &Trace, in_plane: &dyn Fn(Position) -> [f64; 2]) -> Vec<[f64; 2]> {
+    let step = trace.points.len().div_ceil(ELLIPSES).max(1);
+    let mut vertices = Vec::new();
+    for point in trace.points.iter().step_by(step) {
+        let root_m = match (point.covariance, point.r95_m) {
+            (Some(covariance), _) => covariance.square_root_m(),
+            (None, Some(r95_m)) => [r95_m / R95_PER_SIGMA, r95_m / R95_PER_SIGMA, 0.0],
+            (None, None) => continue,
         };
+        let [east_m, north_m] = in_plane(point.position);
+        vertices.extend((0..=ELLIPSE_POINTS).map(|vertex| {
+            let angle = std::f64::consts::TAU * vertex as f64 / ELLIPSE_POINTS as f64;
+            let (sine, cosine) = (R95_PER_SIGMA * angle.sin(), R95_PER_SIGMA * angle.cos());
+            [east_m + root_m[0] * cosine + root_m[2] * sine, north_m + root_m[2] * cosine + root_m[1] * sine]
+        }));
+        vertices.push([f64::NAN; 2]);
     }
-    let style = match series.shape {
-        Shape::Dots => "stroke-width=\"3\" stroke-linecap=\"round\" stroke-opacity=\"0.6\"",
-        Shape::Line => "stroke-width=\"1.6\" fill=\"none\"",
+    vertices
+}
+
+/// Es per epoch of the recipes that are fitted by epochs.
+fn error_scale(curves: &[Curve]) -> Option<String> {
+    let points = |curve: &Curve| -> Vec<[f64; 2]> {
+        let positive = curve.epochs.iter().filter(|one| one.error_scale > 0.0);
+        positive.map(|one| [f64::from(one.epoch), one.error_scale]).collect()
     };
-    let _ = writeln!(svg, "<path d=\"{path}\" stroke=\"{colour}\" {style}/>");
+    let series: Vec<Series> = curves
+        .iter()
+        .enumerate()
+        .map(|(number, curve)| Series::new(curve.recipe.as_str(), number, points(curve), Shape::Line))
+        .filter(|series| !series.points().is_empty())
+        .collect();
+    let vertices = || series.iter().flat_map(Series::points);
+    let last_epoch = vertices().map(|point| point[0]).reduce(f64::max)?;
+    let axes = Axes {
+        across: AxisSpec::linear("epoch", 1.0, last_epoch),
+        upward: AxisSpec::logarithmic("Es", vertices().map(|point| point[1])),
+        equal_scale: false,
+    };
+    Some(chart("Es per epoch", &axes, &series))
 }
 
-/// A tick's label, rounded to 6 decimals.
-fn number(tick: f64) -> String {
-    format!("{}", (tick * 1e6).round() / 1e6)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn ticks_are_round_and_within() {
-        let axis = Axis::over(vec![0.0, 7.3], 0.0, 100.0);
-        let ticks = axis.ticks();
-        assert!(
-            ticks.len() >= 3 && ticks.iter().all(|tick| (axis.low..=axis.high).contains(tick)),
-            "{ticks:?}"
-        );
-        assert!(ticks.iter().all(|tick| (tick - tick.round()).abs() < 1e-9), "{ticks:?}");
-    }
-
-    #[test]
-    fn a_chart_of_nothing_and_of_one_point_is_whole() {
-        for series in
-            [vec![], vec![Series { name: "a".to_owned(), points: vec![[1.0, 1.0]], shape: Shape::Dots }]]
-        {
-            let svg = chart("t", "x", "y", &series, true);
-            assert!(svg.starts_with("<svg") && svg.ends_with("</svg>\n"));
-            assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
-        }
-    }
+fn dots(traces: &[&Trace], point: &dyn Fn(&TracePoint) -> Option<[f64; 2]>) -> Vec<Series> {
+    let one = |(number, trace): (usize, &&Trace)| {
+        let points = trace.points.iter().filter_map(point).collect();
+        Series::new(&trace.method, number, points, Shape::Dots)
+    };
+    traces.iter().enumerate().map(one).collect()
 }

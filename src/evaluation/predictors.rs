@@ -5,11 +5,11 @@ use super::options::{EvaluateOptions, TestRow};
 use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, SigmaM};
 use crate::filters::ImmUkf;
-use crate::fusion::observed::{ObservedPositions, UNKNOWN_RECEIVER_M2};
+use crate::fusion::observed::UNKNOWN_RECEIVER_M2;
 use crate::fusion::target_track::TargetTrack;
 use crate::fusion::track::TrackSettings;
 use crate::fusion::two_step::fuse;
-use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::geo::{EastNorth, LocalPlane, PlaneCovariance, Position};
 use crate::model::{FEWEST_SAMPLES, FitInput, R95_PER_SIGMA, Regressor, fix_sequences};
 
 /// A predicted position with its stated 95 % radius.
@@ -19,6 +19,14 @@ pub(super) struct Prediction {
     /// Radius that contains the true position with 95 % probability, m; `None` where the method states
     /// none.
     pub(super) r95_m: Option<f64>,
+    /// Covariance of its error, where the method states one.
+    pub(super) covariance: Option<PlaneCovariance>,
+}
+
+impl Prediction {
+    const fn new(position: Position, r95_m: Option<f64>) -> Self {
+        Self { position, r95_m, covariance: None }
+    }
 }
 
 /// Indexes of the test rows of one target, in order of time.
@@ -79,7 +87,7 @@ impl<'a> Predictors<'a> {
         self.per_row(move |observation| {
             let fix = observation.fix()?;
             let sigma_m = fix.sigma_m.map(SigmaM::metres).or(known_sigma_m);
-            Some(Prediction { position: fix.position, r95_m: sigma_m.map(|sigma_m| R95_PER_SIGMA * sigma_m) })
+            Some(Prediction::new(fix.position, sigma_m.map(|sigma_m| R95_PER_SIGMA * sigma_m)))
         })
     }
 
@@ -99,7 +107,7 @@ impl<'a> Predictors<'a> {
             let bounding_box = &observation.bounding_box()?;
             let fix = observation.fix().filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
             let point = (fix.is_some() == with_fix).then(|| network.regress(bounding_box, fix))?;
-            Some(Prediction { position: plane.to_position(point), r95_m: None })
+            Some(Prediction::new(plane.to_position(point), None))
         }))
     }
 
@@ -118,7 +126,7 @@ impl<'a> Predictors<'a> {
             .ok_or("fewer than 8 training samples, or all of them at one position")?;
         Ok(self.per_row(move |observation| {
             let point = homography.project(&observation.bounding_box()?)?;
-            Some(Prediction { position: plane.to_position(point), r95_m: None })
+            Some(Prediction::new(plane.to_position(point), None))
         }))
     }
 
@@ -140,10 +148,8 @@ impl<'a> Predictors<'a> {
                     (plane.to_plane(fix.position), stated_m2)
                 });
                 let estimate = filter.step(seconds, fix)?;
-                Some(Prediction {
-                    position: plane.to_position(estimate.position),
-                    r95_m: Some(R95_PER_SIGMA * estimate.variance_m2.sqrt()),
-                })
+                let r95_m = R95_PER_SIGMA * estimate.variance_m2.sqrt();
+                Some(Prediction::new(plane.to_position(estimate.position), Some(r95_m)))
             };
             target.iter().map(predict).collect()
         })
@@ -164,7 +170,7 @@ impl<'a> Predictors<'a> {
                 let image_size = self.options.image_size;
                 Ok(self.per_row(move |observation| {
                     let fused = fuse(observation, Some((regressor, 0)), image_size, Some(e_gnss_m2))?;
-                    Some(Prediction { position: fused.fused, r95_m: Some(fused.r95_m) })
+                    Some(Prediction::new(fused.fused, Some(fused.r95_m)))
                 }))
             }
             Method::Recipe(_, mode) => Ok(self.regressed(mode == InferenceMode::OneStep, regressor)),
@@ -183,10 +189,8 @@ impl<'a> Predictors<'a> {
         self.per_row(move |observation| {
             let fix = observation.fix().filter(|_| with_fix).map(|fix| plane.to_plane(fix.position));
             let regression = regressor.regress(&observation.bounding_box()?, fix);
-            Some(Prediction {
-                position: plane.to_position(regression.regressed),
-                r95_m: Some(regression.r95_scale * regression.e_regression_m2.sqrt()),
-            })
+            let r95_m = regression.r95_scale * regression.e_regression_m2.sqrt();
+            Some(Prediction::new(plane.to_position(regression.regressed), Some(r95_m)))
         })
     }
 
@@ -203,13 +207,17 @@ impl<'a> Predictors<'a> {
                 let given = &test[row].observation;
                 let used = if with_fix { Some(given.clone()) } else { given.without_fix() };
                 let observed = used.as_ref().map(|observation| {
-                    ObservedPositions::of(observation, Some(regressor), image_size, Some(e_gnss_m2))
+                    track.observe(observation, Some(regressor), image_size, Some(e_gnss_m2))
                 });
                 let estimate = match observed.filter(|observed| !observed.is_empty()) {
                     Some(observed) => track.update(&observed, || settings),
                     None => track.at(given.time()),
                 }?;
-                Some(Prediction { position: estimate.position, r95_m: Some(estimate.state.r95_m) })
+                Some(Prediction {
+                    position: estimate.position,
+                    r95_m: Some(estimate.state.r95_m),
+                    covariance: Some(estimate.state.covariance),
+                })
             };
             target.iter().map(predict).collect()
         })

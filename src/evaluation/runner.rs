@@ -10,7 +10,7 @@ use super::predictors::{Prediction, Predictor, Predictors, TargetRows};
 use super::report::MethodReport;
 use super::traces::{Curve, Evaluation, Trace, TracePoint};
 use super::training::{RecipeModel, Timed, fit_recipe, recipes_of};
-use crate::domain::{BoundingBox, Method, Result, Sample, Truth};
+use crate::domain::{Method, Result, Sample, Truth};
 use crate::geo::{LocalPlane, Position};
 use crate::model::FitInput;
 
@@ -35,7 +35,7 @@ pub fn evaluate<'a>(
         row.observation = row
             .observation
             .clone()
-            .try_map_box(|bounding_box| shifted(bounding_box, options.box_shift_px))?;
+            .try_map_box(|bounding_box| bounding_box.grown_to_upper_left(options.box_shift_px))?;
     }
     let plane = LocalPlane::new(first_fix(train.samples, &test));
     let mut run = Run {
@@ -55,12 +55,6 @@ pub fn evaluate<'a>(
         }
     }
     Ok(run.finish())
-}
-
-/// The box with its left and top edges moved outwards, as in the paper's test of inaccurate boxes.
-fn shifted(bounding_box: BoundingBox, by_px: f64) -> Result<BoundingBox> {
-    let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
-    BoundingBox::new(left_px - by_px, top_px - by_px, width_px + by_px, height_px + by_px)
 }
 
 fn rows_by_target(test: &[TestRow]) -> Vec<TargetRows> {
@@ -163,10 +157,10 @@ impl Run<'_> {
             predicting_s += start.elapsed().as_secs_f64();
             for (&row, prediction) in target.iter().zip(predictions) {
                 rows += 1;
-                let Some(Prediction { position, r95_m }) = prediction else { continue };
+                let Some(Prediction { position, r95_m, covariance }) = prediction else { continue };
                 let error_m = self.truth.error_m(self.predictors.test[row].truth, position);
                 scored.extend(error_m.map(|error_m| ScoredPrediction { error_m, r95_m }));
-                points.push(TracePoint { row, position, error_m });
+                points.push(TracePoint { row, position, error_m, r95_m, covariance });
             }
         }
         let Some(metrics) = Metrics::of(&scored) else {

@@ -2,6 +2,7 @@
 
 use super::report::Report;
 use crate::domain::{EpochReport, Recipe};
+use crate::geo::PlaneCovariance;
 use crate::geo::Position;
 
 /// A position predicted with the first seed.
@@ -13,6 +14,10 @@ pub struct TracePoint {
     pub position: Position,
     /// Its horizontal error, m; `None` where the truth is unknown.
     pub error_m: Option<f64>,
+    /// The 95 % radius that the method states, m, if it states one.
+    pub r95_m: Option<f64>,
+    /// The covariance of its error, if the method states one.
+    pub covariance: Option<PlaneCovariance>,
 }
 
 /// All predictions of a method with the first seed.

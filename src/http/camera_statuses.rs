@@ -1,6 +1,5 @@
 //! `/v1/camera-statuses`: all cameras at a glance.
 
-use axum::extract::State;
 use hyper::Uri;
 use jiff::Timestamp;
 use serde::Serialize;
@@ -9,6 +8,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::cameras::Camera;
 use super::extract::Params;
 use super::problem::ApiResult;
@@ -111,7 +111,7 @@ struct CameraStatusPage {
     ),
     responses((status = 200, description = "A page of statuses", body = CameraStatusPage))
 )]
-async fn list_camera_statuses(State(app): State<App>, uri: Uri) -> ApiResult {
+async fn list_camera_statuses(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
     let after = params.cursor()?;

@@ -4,6 +4,8 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+mod access;
+mod audit;
 mod body;
 mod camera_statuses;
 mod cameras;
@@ -13,6 +15,7 @@ mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
+mod keys;
 mod models;
 mod pairings;
 mod parts;
@@ -21,6 +24,7 @@ mod receivers;
 mod samples;
 mod server_info;
 mod service;
+mod session;
 #[cfg(test)]
 mod tests;
 mod tracks;
@@ -31,8 +35,7 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::body::Body;
-use axum::extract::FromRef;
-use axum::middleware::{from_fn, map_response};
+use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::response::Response;
 use hyper::Method;
 use hyper::header::{CONTENT_SECURITY_POLICY, REFERRER_POLICY, X_FRAME_OPTIONS};
@@ -49,6 +52,8 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
+pub use session::session_token;
+
 /// What the handlers share.
 #[derive(Clone)]
 struct Rest {
@@ -57,25 +62,21 @@ struct Rest {
     shutdown: Shutdown,
 }
 
-impl FromRef<Rest> for App {
-    fn from_ref(rest: &Rest) -> Self {
-        rest.app.clone()
-    }
-}
-
 /// All REST routes, the description at `/openapi.json` and its page at `/docs`, the operator's console at `/`.
 ///
-/// Requests carry their [`RequestId`] as an extension.
+/// Requests carry their [`RequestId`] and their [`Caller`](crate::app::access::Caller) as extensions.
 pub fn router(app: App, console: Console, shutdown: Shutdown) -> Router {
     let console_routes = console::routes(&console);
     let rest = Rest { app, console: Arc::new(console), shutdown };
     let (routes, described) = described().split_for_parts();
+    let parameters = Arc::new(access::QueryParameters::of(&described));
     // The page would otherwise ask a server on the internet whether the description is well formed.
     let page = SwaggerUi::new("/docs")
         .url("/openapi.json", described)
         .config(Config::default().validator_url("none").use_base_layout());
     let page = Router::from(page).layer(map_response(contain_page));
     routes
+        .route_layer(from_fn_with_state(parameters, access::authorize))
         .merge(page)
         .merge(console_routes)
         .with_state(rest)
@@ -140,7 +141,11 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(gnss_error::routes())
         .merge(evaluations::routes())
         .merge(server_info::routes())
+        .merge(keys::routes())
+        .merge(audit::routes())
+        .merge(session::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
+    description::add_security(router.get_openapi_mut());
     router
 }

@@ -17,6 +17,7 @@ use tempfile::TempDir;
 use tower::ServiceExt as _;
 
 use crate::app::App;
+use crate::app::access::{Caller, Principal};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Console, Limits};
 use crate::shutdown::Shutdown;
@@ -109,6 +110,7 @@ impl Rest {
         }
         let mut request = request.body(body).expect("a request");
         request.extensions_mut().insert(RequestId::new(HeaderValue::from_static("the-request")));
+        request.extensions_mut().insert(Caller::new(Principal::Everyone, None, None));
         self.router.clone().oneshot(request).await.expect("never fails")
     }
 

@@ -4,13 +4,14 @@ use std::fmt::Write as _;
 use std::ops::ControlFlow;
 
 use super::Runner;
-use super::experiments::{TrainTestSplit, Worlds, conditions};
+use super::simulated::Worlds;
+use super::splits::{Split, TestSet};
 use crate::clock::process_cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;
 use crate::model::network::LossWeights;
 use crate::model::{Artifact, FitOptions, FitOverrides, fit_with};
-use crate::simulation::{Options, Route, Scene};
+use crate::simulation::{Options, Scene};
 
 /// wX : wZ of the recipe `paper` (raw pixels and standardised degrees), and of `hybrid` (both scaled).
 const BALANCES: [(Recipe, [f32; 5]); 2] = [
@@ -20,6 +21,9 @@ const BALANCES: [(Recipe, [f32; 5]); 2] = [
 /// Candidates on raw labels, and on labels from a kinematic smoother.
 const SMOOTHED: [[&str; 2]; 2] =
     [["projective/sides", "projective/sides+smoothed"], ["hybrid", "hybrid+smoothed"]];
+
+/// Training rows of an ablation.
+const ROWS: usize = 2_000;
 
 /// All ablation tables.
 pub(super) fn tables(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> anyhow::Result<()> {
@@ -32,7 +36,7 @@ fn loss_balance(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> a
     let _ = writeln!(
         page,
         "## Error against the weight ratio wX : wZ\n\nMean error (m) of the regressed position from the box \
-         alone, {} worlds of 10,000 rows (airport, square). Of each recipe its own ratio stands in the \
+         alone, {} worlds of {ROWS} rows (airport, square). Of each recipe its own ratio stands in the \
          middle; ratios of `paper` are for raw pixels, those of `hybrid` for scaled boxes.\n\n\
          | recipe | wX : wZ | airport | square |\n|---|---|---|---|",
         worlds.count
@@ -46,7 +50,8 @@ fn loss_balance(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> a
                     candidate: Some(recipe.as_str()),
                     loss_weights: Some(in_units(recipe, weights)),
                 };
-                let (_, error_m) = mean_over(&Options::new(scene), worlds, recipe, overrides)?;
+                let base = Options { samples: ROWS, ..Options::new(scene) };
+                let (_, error_m) = mean_over(&base, worlds, recipe, overrides)?;
                 let _ = write!(cells, " {error_m:.3} |");
             }
             let _ = writeln!(page, "| `{recipe}` | 1 : {} |{cells}", (1e6 / ratio).round() / 1e6);
@@ -75,9 +80,7 @@ fn label_smoothing(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -
     );
     for &scene in Scene::ALL {
         let sized = |samples: usize| Options { samples, ..Options::new(scene) };
-        let cases = [("4,000 rows", "", sized(4_000)), ("300 rows", "", sized(300))];
-        let harder = conditions(scene).into_iter().filter(|(name, ..)| name.contains('%'));
-        for (name, _, options) in cases.into_iter().chain(harder) {
+        for (name, options) in [("2,000 rows", sized(ROWS)), ("300 rows", sized(300))] {
             for pair in SMOOTHED {
                 let mut columns = [String::new(), String::new()];
                 for candidate in pair {
@@ -99,21 +102,17 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
     let _ = writeln!(
         page,
         "## What the default costs\n\n`auto` on 10,000 rows, all candidates and held-out blocks included; the \
-         largest of {} worlds (marks: 20 CPU s, 65,536 bytes).\n\n| scene | CPU s | model bytes |\n\
-         |---|---|---|",
-        worlds.count
+         first world (marks for a release build: 10 CPU s, 65,536 bytes).\n\n| scene | CPU s | model bytes |\n\
+         |---|---|---|"
     );
     for &scene in Scene::ALL {
-        let (mut most_s, mut most_bytes) = (0.0f64, 0);
-        for seed in worlds.seeds() {
-            let base = Options::new(scene);
-            let world = TrainTestSplit::of_world(&base, seed, 1, Route::Lines);
+        for base in (Worlds { count: 1, ..worlds }).of(&Options::new(scene)) {
+            let split = Split::of_world(&base, &[])?;
             let started_s = process_cpu_s();
-            let artifact = train(&world, &base, Recipe::Auto, FitOverrides::default())?;
-            most_s = most_s.max(process_cpu_s() - started_s);
-            most_bytes = most_bytes.max(artifact.weights.len());
+            let artifact = train(&split, &base, Recipe::Auto, FitOverrides::default())?;
+            let trained_s = process_cpu_s() - started_s;
+            let _ = writeln!(page, "| {scene} | {trained_s:.2} | {} |", artifact.weights.len());
         }
-        let _ = writeln!(page, "| {scene} | {most_s:.2} | {most_bytes} |");
     }
     page.push('\n');
     Ok(())
@@ -127,13 +126,13 @@ fn mean_over(
     overrides: FitOverrides<'_>,
 ) -> anyhow::Result<(f64, f64)> {
     let (mut held_out_m, mut error_m) = (0.0, 0.0);
-    for seed in worlds.seeds() {
-        let world = TrainTestSplit::of_world(base, seed, 1_000, Route::Lines);
-        let artifact = train(&world, base, recipe, overrides)?;
+    for world in worlds.of(base) {
+        let split = Split::of_world(&world, &[TestSet::new(1_000)])?;
+        let artifact = train(&split, base, recipe, overrides)?;
         held_out_m += artifact.metadata.held_out.as_ref().map_or(f64::NAN, |found| found.mean_to_fix_m);
         let regressor = artifact.load()?;
         let (mut sum_m, mut count) = (0.0, 0.0);
-        for row in &world.test {
+        for row in &split.tests[0] {
             let (Some(drawn), Some(truth)) = (&row.observation.bounding_box(), row.truth) else { continue };
             let position = regressor.plane().to_position(regressor.regress(drawn, None).regressed);
             sum_m += distance_m(truth, position);
@@ -145,7 +144,7 @@ fn mean_over(
 }
 
 fn train(
-    world: &TrainTestSplit,
+    split: &Split,
     base: &Options,
     recipe: Recipe,
     overrides: FitOverrides<'_>,
@@ -154,10 +153,10 @@ fn train(
         recipe,
         seed: 1,
         epochs: None,
-        image_size: world.image_size,
+        image_size: split.image_size,
         gnss_error: GnssError::Known(SigmaM::new(base.gnss_sigma_m)?),
         gnss_bias_sigma_m: None,
     };
-    fit_with(&world.train, &options, overrides, &mut |_| ControlFlow::Continue(()))
+    fit_with(&split.train, &options, overrides, &mut |_| ControlFlow::Continue(()))
         .map_err(|error| anyhow::anyhow!("{error}"))
 }

@@ -1,7 +1,8 @@
 //! Synthetic cameras, targets and receivers with ground truth, for tests and evaluation.
 //!
 //! A world is a function of its [`Options`] alone, bit for bit. The camera is drawn from
-//! `camera_seed`, everything else from `seed`, so two worlds may share one camera.
+//! `camera_seed`, everything else from `seed`, so two worlds may share one camera. Each kind of disturbance
+//! draws from a stream of its own: switching one on leaves everything else as it was.
 //! What never happens here: any clock or randomness but the seeds, any knowledge of the methods.
 
 mod camera;
@@ -13,9 +14,10 @@ mod positions;
 mod row;
 mod scene;
 mod target;
+mod tracker;
 mod world;
 
-pub use options::{Options, Route};
+pub use options::{Options, Route, TargetShape};
 pub use row::SimulatedRow;
 pub use scene::Scene;
 pub use world::{World, simulate, simulate_split};

@@ -53,16 +53,18 @@ pub(super) struct ReceiverError {
 #[derive(Debug)]
 pub(super) struct SimulatedReceiver {
     error: ReceiverError,
+    bias: EastNorth,
     east: GaussMarkov,
     north: GaussMarkov,
     random: ChaCha8Rng,
 }
 
 impl SimulatedReceiver {
-    pub(super) fn new(error: ReceiverError, mut random: ChaCha8Rng) -> Self {
+    /// `bias` is the part of the error that never changes, m.
+    pub(super) fn new(error: ReceiverError, bias: EastNorth, mut random: ChaCha8Rng) -> Self {
         let east = GaussMarkov::new(error.time_constant_s, &mut random);
         let north = GaussMarkov::new(error.time_constant_s, &mut random);
-        Self { error, east, north, random }
+        Self { error, bias, east, north, random }
     }
 
     /// The measured position, that many seconds after the previous one.
@@ -71,8 +73,11 @@ impl SimulatedReceiver {
         let east_m = coloured_m * self.east.advance(seconds, &mut self.random);
         let north_m = coloured_m * self.north.advance(seconds, &mut self.random);
         EastNorth {
-            east_m: truth.east_m + east_m + white_m * standard_normal(&mut self.random),
-            north_m: truth.north_m + north_m + white_m * standard_normal(&mut self.random),
+            east_m: truth.east_m + east_m + white_m * standard_normal(&mut self.random) + self.bias.east_m,
+            north_m: truth.north_m
+                + north_m
+                + white_m * standard_normal(&mut self.random)
+                + self.bias.north_m,
         }
     }
 }
@@ -110,7 +115,7 @@ mod tests {
     #[test]
     fn a_receiver_has_its_variance_and_autocorrelation() {
         let error = ReceiverError { white_m: 0.13, coloured_m: 2.2, time_constant_s: 45.0 };
-        let mut receiver = SimulatedReceiver::new(error, stream(3, 1));
+        let mut receiver = SimulatedReceiver::new(error, EastNorth::default(), stream(3, 1));
         let easts: Vec<f64> =
             (0..40_000).map(|_| receiver.measure(EastNorth::default(), 1.0).east_m).collect();
         let mean = |values: &mut dyn Iterator<Item = f64>| {

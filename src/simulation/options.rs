@@ -14,8 +14,26 @@ pub enum Route {
     Lines,
     /// Along lines parallel to them, which a world of [`Route::Lines`] never covers.
     NewLine,
+    /// Between random points of the area in view, other ones for every traverse.
+    Area,
     /// Each target stays at one point of a line.
     Standing,
+}
+
+/// Extents of a target and the place of its receiver's antenna, m. The scene's outline is stretched to
+/// these extents, so the antenna's distance from the foot of the box depends on the aspect.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TargetShape {
+    /// Extent along the heading.
+    pub length_m: f64,
+    /// Extent across the heading.
+    pub width_m: f64,
+    /// Extent above the ground.
+    pub height_m: f64,
+    /// Antenna ahead of the middle of the length.
+    pub antenna_ahead_m: f64,
+    /// Antenna to the left of the middle of the width.
+    pub antenna_left_m: f64,
 }
 
 /// Parameters of a world. Shares are of rows, 0 to 0.95.
@@ -31,10 +49,19 @@ pub struct Options {
     pub samples: usize,
     /// Where the targets move.
     pub route: Route,
+    /// Offset of [`Route::NewLine`] to the left of the lines, m; `None` for that of the scene.
+    pub new_line_offset_m: Option<f64>,
     /// Number of targets, each with its own receiver and size; their rows are interleaved by time.
     pub targets: usize,
+    /// Number of sessions into which the rows are divided, each a day after the previous one, with other
+    /// traverses, noise and receiver biases.
+    pub sessions: usize,
+    /// Extents and antenna of the targets; `None` for those of the scene.
+    pub target_shape: Option<TargetShape>,
     /// Standard deviation per axis of a receiver's error, m.
     pub gnss_sigma_m: f64,
+    /// Standard deviation per axis of an additional error that each receiver keeps for a whole session, m.
+    pub gnss_bias_sigma_m: f64,
     /// Standard deviation of each edge of a bounding box, px.
     pub box_noise_px: f64,
     /// Radial displacement at the image's corner divided by its distance from the centre; negative for
@@ -42,12 +69,21 @@ pub struct Options {
     pub lens_distortion: f64,
     /// Whether rows whose box is truncated by the image border are kept.
     pub border_cuts: bool,
+    /// Whether rows with such a box are left out, although the camera truncates boxes.
+    pub without_cut_boxes: bool,
     /// Share of rows in which the lower part of the target, or all of it, is occluded.
     pub occlusion: f64,
     /// Share of rows whose fix or box is an outlier.
     pub outliers: f64,
+    /// Share of rows whose fix is wrong by `gross_fix_error_m` in a random direction.
+    pub gross_fixes: f64,
+    /// Size of those errors, m.
+    pub gross_fix_error_m: f64,
     /// Share of rows without a fix, in episodes of 20 s on average.
     pub gnss_gaps: f64,
+    /// The target ids are those of a tracker that loses a target after this time on average, s, and gives
+    /// ids of lost targets to others; `None` for ids that never change.
+    pub tracker_id_lifetime_s: Option<f64>,
     /// From that instant on the camera is rotated by that many degrees to the right.
     pub pan_deg_from: Option<(Timestamp, f64)>,
     /// Time of the first row, whole seconds.
@@ -64,17 +100,25 @@ impl Options {
             camera_seed: 1,
             samples: 10_000,
             route: Route::Lines,
+            new_line_offset_m: None,
             targets: 1,
+            sessions: 1,
+            target_shape: None,
             gnss_sigma_m: match scene {
                 Scene::Airport => 29.5,
                 Scene::Square => 2.2,
             },
+            gnss_bias_sigma_m: 0.0,
             box_noise_px: 1.0,
             lens_distortion: -0.02,
             border_cuts: matches!(scene, Scene::Airport),
+            without_cut_boxes: false,
             occlusion: 0.0,
             outliers: 0.0,
+            gross_fixes: 0.0,
+            gross_fix_error_m: 1_000.0,
             gnss_gaps: 0.0,
+            tracker_id_lifetime_s: None,
             pan_deg_from: None,
             start: Timestamp::from_second(START_S).unwrap_or(Timestamp::UNIX_EPOCH),
         }
@@ -86,17 +130,36 @@ impl Options {
         Self { samples: 600, targets: 2, ..Self::new(Scene::Square) }
     }
 
-    /// The test world of a model trained on this one: the same camera, other traverses and noise, a
-    /// week after the start.
+    /// The test world of a model trained on this one: the same camera, other traverses and noise, one
+    /// session a week after the start, with the boxes that training leaves out.
     #[must_use]
     pub fn test(&self, samples: usize) -> Self {
         Self {
             // Any odd multiplier: distinct seeds get distinct test seeds.
             seed: self.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x5bd1),
             samples,
-            start: self.start.saturating_add(SignedDuration::from_hours(168)).unwrap_or(self.start),
+            sessions: 1,
+            without_cut_boxes: false,
+            start: self.later(7),
             ..self.clone()
         }
+    }
+
+    /// The options of one session (from 0), which has its share of the rows.
+    pub(super) fn session(&self, index: usize) -> Self {
+        let sessions = self.sessions.max(1);
+        Self {
+            // The first session is the world of one session.
+            seed: self.seed.wrapping_add((index as u64).wrapping_mul(0xd134_2543_de82_ef95)),
+            samples: self.samples / sessions + usize::from(index < self.samples % sessions),
+            sessions: 1,
+            start: self.later(index as i64),
+            ..self.clone()
+        }
+    }
+
+    fn later(&self, days: i64) -> Timestamp {
+        self.start.saturating_add(SignedDuration::from_hours(24 * days)).unwrap_or(self.start)
     }
 }
 

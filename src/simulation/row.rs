@@ -10,7 +10,9 @@ use crate::geo::Position;
 pub struct SimulatedRow {
     /// The instant.
     pub time: Timestamp,
-    /// The target.
+    /// The target, from 0, whatever its id.
+    pub target: usize,
+    /// The target's id, or that which the tracker gave it.
     pub target_id: TargetId,
     /// The target's class.
     pub class: TargetClass,

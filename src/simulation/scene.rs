@@ -7,6 +7,7 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::camera::{PinholeCamera, Point};
 use super::noise::ReceiverError;
+use super::options::TargetShape;
 use super::path::{MotionProfile, Polyline, Pose};
 use crate::domain::{Error, ImageSize};
 use crate::geo::{EastNorth, Position};
@@ -137,15 +138,58 @@ impl Scene {
         }
     }
 
-    /// Points of a target's outline; `scale` 1 is the nominal size.
-    pub(super) fn body(self, pose: Pose, scale: f64, random: &mut impl Rng) -> Vec<Point> {
+    /// The line of one traverse of [`super::Route::Area`], within the view of every camera of the scene.
+    pub(super) fn area_path(self, pan_deg: f64, random: &mut impl Rng) -> Polyline {
+        let (nearest_m, farthest_m, corners, min_leg_m) = match self {
+            Self::Airport => (210.0, 560.0, 2, 200.0),
+            Self::Square => (19.0, 48.0, 3, 8.0),
+        };
+        let mut points: Vec<EastNorth> = Vec::with_capacity(corners);
+        while points.len() < corners {
+            let ahead_m: f64 = random.random_range(nearest_m..farthest_m);
+            let point = rotated(0.45 * ahead_m * random.random_range(-1.0..1.0), ahead_m, pan_deg);
+            if points.last().is_none_or(|last| last.distance_m(point) >= min_leg_m) {
+                points.push(point);
+            }
+        }
+        Polyline { points }
+    }
+
+    /// Extents and antenna of a target of nominal size.
+    #[must_use]
+    pub const fn nominal_shape(self) -> TargetShape {
+        let (length_m, width_m, height_m, antenna_ahead_m) = match self {
+            Self::Airport => (35.0, 34.0, 11.8, 3.0),
+            Self::Square => (0.56, 0.48, 1.72, 0.0),
+        };
+        TargetShape { length_m, width_m, height_m, antenna_ahead_m, antenna_left_m: 0.0 }
+    }
+
+    /// Points of the outline of a target of that shape; `scale` 1 is its nominal size.
+    pub(super) fn body(
+        self,
+        pose: Pose,
+        shape: &TargetShape,
+        scale: f64,
+        random: &mut impl Rng,
+    ) -> Vec<Point> {
         let [east, north] = pose.heading;
-        let corner = |ahead_m: f64, left_m: f64, up_m: f64| Point {
-            ground: EastNorth {
-                east_m: pose.position.east_m + scale * (ahead_m * east - left_m * north),
-                north_m: pose.position.north_m + scale * (ahead_m * north + left_m * east),
-            },
-            up_m: scale * up_m,
+        let nominal = self.nominal_shape();
+        let [along, across, upward] = [
+            shape.length_m / nominal.length_m,
+            shape.width_m / nominal.width_m,
+            shape.height_m / nominal.height_m,
+        ];
+        let corner = |ahead_m: f64, left_m: f64, up_m: f64| {
+            let ahead_m = (ahead_m + nominal.antenna_ahead_m) * along - shape.antenna_ahead_m;
+            let left_m = left_m * across - shape.antenna_left_m;
+            Point {
+                ground: EastNorth {
+                    east_m: pose.position.east_m + scale * (ahead_m * east - left_m * north),
+                    north_m: pose.position.north_m + scale * (ahead_m * north + left_m * east),
+                },
+                up_m: scale * (up_m * upward),
+            }
         };
         match self {
             Self::Airport => aircraft(&corner),
@@ -154,7 +198,7 @@ impl Scene {
     }
 }
 
-/// An airliner of 35 m; its antenna is on the roof, 3 m ahead of the centre.
+/// An airliner of 35 m, relative to its antenna on the roof, 3 m ahead of the centre.
 fn aircraft(corner: &dyn Fn(f64, f64, f64) -> Point) -> Vec<Point> {
     let mut body = vec![
         corner(14.5, 0.0, 3.0),

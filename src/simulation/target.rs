@@ -6,11 +6,11 @@ use rand_chacha::ChaCha8Rng;
 
 use super::camera::PinholeCamera;
 use super::noise::{Episodes, SimulatedReceiver, standard_normal, stream};
-use super::options::{Options, Route};
+use super::options::{Options, Route, TargetShape};
 use super::path::{Polyline, Pose};
 use super::row::SimulatedRow;
 use crate::domain::{BoundingBox, Fix, TargetClass, TargetId};
-use crate::geo::LocalPlane;
+use crate::geo::{EastNorth, LocalPlane};
 
 /// A box of which less than this share of the width or the height is inside the image is not detected.
 const MIN_VISIBLE_SHARE: f64 = 0.25;
@@ -20,14 +20,18 @@ pub(super) struct SimulatedTarget<'a> {
     options: &'a Options,
     camera: PinholeCamera,
     plane: LocalPlane,
+    index: usize,
     id: TargetId,
     class: TargetClass,
+    shape: TargetShape,
     scale: f64,
     time: Timestamp,
     motion: ChaCha8Rng,
+    area: ChaCha8Rng,
     body: ChaCha8Rng,
     detector: ChaCha8Rng,
     outlier: ChaCha8Rng,
+    gross_fix: ChaCha8Rng,
     receiver: SimulatedReceiver,
     /// Since the receiver's previous measurement, s.
     since_fix_s: f64,
@@ -46,20 +50,27 @@ impl<'a> SimulatedTarget<'a> {
         let delay_s = if index == 0 { 0 } else { receiver_parameters.random_range(0..30) };
         // The first target has the scene's nominal size, so that one target is the paper's case.
         let scale = if index == 0 { 1.0 } else { 1.0 + 0.08 * standard_normal(&mut motion).clamp(-1.5, 1.5) };
+        let mut bias = draw(8);
+        let mut bias_m = || options.gnss_bias_sigma_m * standard_normal(&mut bias);
+        let bias = EastNorth { east_m: bias_m(), north_m: bias_m() };
         let name = |text: &str| TargetId::new(text).expect("short printable names");
         Self {
             options,
             camera,
             plane,
+            index,
             id: name(&format!("{}-{}", scene.class(), index + 1)),
             class: TargetClass::new(scene.class()).expect("short printable names"),
+            shape: options.target_shape.unwrap_or(scene.nominal_shape()),
             scale,
             time: later(options.start, delay_s),
             motion,
+            area: draw(10),
             body: draw(2),
             detector: draw(3),
             outlier: draw(4),
-            receiver: SimulatedReceiver::new(receiver_error, draw(5)),
+            gross_fix: draw(9),
+            receiver: SimulatedReceiver::new(receiver_error, bias, draw(5)),
             since_fix_s: 0.0,
             gaps: Episodes::new(options.gnss_gaps, 20.0, draw(6)),
             occlusion: Episodes::new(options.occlusion, 5.0, draw(7)),
@@ -94,7 +105,12 @@ impl<'a> SimulatedTarget<'a> {
             let along_m = path.length_m() * self.motion.random_range(0.3..0.7);
             return vec![path.pose(along_m, 0.0); count];
         }
-        let motion = self.options.scene.motion();
+        let scene = self.options.scene;
+        let motion = scene.motion();
+        if self.options.route == Route::Area {
+            let path = scene.area_path(self.camera.pan_deg, &mut self.area);
+            return path.traverse(&motion, false, &mut self.motion);
+        }
         path.traverse(&motion, motion.both_ways && traverse % 2 == 1, &mut self.motion)
     }
 
@@ -108,17 +124,18 @@ impl<'a> SimulatedTarget<'a> {
         self.since_fix_s = 0.0;
         if self.outlier.random::<f64>() < self.options.outliers {
             if self.outlier.random::<bool>() {
-                let far_m = 8.0 * self.options.gnss_sigma_m;
-                let angle = std::f64::consts::TAU * self.outlier.random::<f64>();
-                measured.east_m += far_m * angle.cos();
-                measured.north_m += far_m * angle.sin();
+                measured = displaced(measured, 8.0 * self.options.gnss_sigma_m, &mut self.outlier);
             } else {
-                bounding_box = bounding_box.and_then(|bounding_box| self.displaced(bounding_box));
+                bounding_box = bounding_box.and_then(|bounding_box| self.false_detection(bounding_box));
             }
+        }
+        if self.gross_fix.random::<f64>() < self.options.gross_fixes {
+            measured = displaced(measured, self.options.gross_fix_error_m, &mut self.gross_fix);
         }
         let fix = Fix { position: self.plane.to_position(measured), sigma_m: None };
         Some(SimulatedRow {
             time: self.time,
+            target: self.index,
             target_id: self.id.clone(),
             class: self.class.clone(),
             bounding_box,
@@ -136,7 +153,7 @@ impl<'a> SimulatedTarget<'a> {
         {
             camera.pan_deg += pan_deg;
         }
-        let body = self.options.scene.body(pose, self.scale, &mut self.body);
+        let body = self.options.scene.body(pose, &self.shape, self.scale, &mut self.body);
         let mut edges = camera.extents(&body)?;
         for edge in &mut edges {
             *edge += self.options.box_noise_px * standard_normal(&mut self.detector);
@@ -149,16 +166,26 @@ impl<'a> SimulatedTarget<'a> {
         let [left, top, right, bottom] = truncated;
         let bounding_box =
             BoundingBox::new(left, top, right - left, bottom - top).ok().filter(|_| is_visible)?;
-        let is_kept = self.options.border_cuts || !bounding_box.touches_border(Some(camera.image_size));
+        let keeps_cut_boxes = self.options.border_cuts && !self.options.without_cut_boxes;
+        let is_kept = keeps_cut_boxes || !bounding_box.touches_border(Some(camera.image_size));
         is_kept.then_some(bounding_box)
     }
 
-    /// A box of the same size anywhere in the image: a false detection.
-    fn displaced(&mut self, bounding_box: BoundingBox) -> Option<BoundingBox> {
+    /// A box of the same size anywhere in the image.
+    fn false_detection(&mut self, bounding_box: BoundingBox) -> Option<BoundingBox> {
         let (width_px, height_px) = self.camera.size_px();
         let left_px = (width_px - bounding_box.width_px()).max(0.0) * self.outlier.random::<f64>();
         let top_px = (height_px - bounding_box.height_px()).max(0.0) * self.outlier.random::<f64>();
         BoundingBox::new(left_px, top_px, bounding_box.width_px(), bounding_box.height_px()).ok()
+    }
+}
+
+/// The point that far away in a random direction.
+fn displaced(point: EastNorth, distance_m: f64, random: &mut ChaCha8Rng) -> EastNorth {
+    let angle = std::f64::consts::TAU * random.random::<f64>();
+    EastNorth {
+        east_m: point.east_m + distance_m * angle.cos(),
+        north_m: point.north_m + distance_m * angle.sin(),
     }
 }
 

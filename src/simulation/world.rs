@@ -1,10 +1,12 @@
 //! Simulates a world: all targets before one camera.
 
+use super::camera::PinholeCamera;
 use super::noise::stream;
 use super::options::{Options, Route};
 use super::path::Polyline;
 use super::row::SimulatedRow;
 use super::target::SimulatedTarget;
+use super::tracker;
 use crate::domain::{ImageSize, Sample};
 use crate::geo::{LocalPlane, Position};
 
@@ -17,7 +19,7 @@ pub struct World {
     pub gnss_sigma_m: f64,
     /// Fewer than requested only if the camera, once rotated, no longer sees the targets.
     pub rows: Vec<SimulatedRow>,
-    /// The lines that the targets follow, up to their lateral deviation.
+    /// The lines that the targets follow, up to their lateral deviation; none under [`Route::Area`].
     pub truth_lines: Vec<Vec<Position>>,
     /// True position of the first target under [`Route::Standing`].
     pub truth_point: Option<Position>,
@@ -42,6 +44,9 @@ impl World {
     }
 }
 
+/// Number of the tracker's stream of a seed, beyond those of any number of targets.
+const TRACKER_STREAM: u64 = 1 << 40;
+
 /// Simulates the world of those options.
 #[must_use]
 pub fn simulate(options: &Options) -> World {
@@ -50,30 +55,45 @@ pub fn simulate(options: &Options) -> World {
     let camera = scene.camera(options.border_cuts, options.lens_distortion, &mut random);
     let mut paths = scene.paths(camera.pan_deg);
     if options.route == Route::NewLine {
-        paths = paths.iter().map(|path| path.parallel(scene.new_line_offset_m())).collect();
+        let offset_m = options.new_line_offset_m.unwrap_or(scene.new_line_offset_m());
+        paths = paths.iter().map(|path| path.parallel(offset_m)).collect();
     }
     let plane = LocalPlane::new(scene.origin());
-    let targets = options.targets.max(1);
-    let mut rows = Vec::with_capacity(options.samples);
-    let mut truth_point = None;
-    for index in 0..targets {
-        let share = options.samples / targets + usize::from(index < options.samples % targets);
-        let mut target = SimulatedTarget::new(options, camera, plane, index);
-        let first = rows.len();
-        target.run(&paths, share, &mut rows);
-        if options.route == Route::Standing && index == 0 {
-            truth_point = rows.get(first).map(|row: &SimulatedRow| row.truth);
-        }
-    }
-    rows.sort_by(|one, other| (one.time, &one.target_id).cmp(&(other.time, &other.target_id)));
+    let sessions: Vec<Vec<SimulatedRow>> = (0..options.sessions.max(1))
+        .map(|session| session_rows(&options.session(session), camera, plane, &paths))
+        .collect();
+    let first = || sessions[0].iter().find(|row| row.target == 0).map(|row| row.truth);
+    let truth_point = if options.route == Route::Standing { first() } else { None };
     let positions = |path: &Polyline| path.points.iter().map(|&point| plane.to_position(point)).collect();
+    let truth_lines =
+        if options.route == Route::Area { Vec::new() } else { paths.iter().map(positions).collect() };
     World {
         image_size: camera.image_size,
         gnss_sigma_m: options.gnss_sigma_m,
-        rows,
-        truth_lines: paths.iter().map(positions).collect(),
+        rows: sessions.into_iter().flatten().collect(),
+        truth_lines,
         truth_point,
     }
+}
+
+/// The rows of one session, ordered by time, then target.
+fn session_rows(
+    options: &Options,
+    camera: PinholeCamera,
+    plane: LocalPlane,
+    paths: &[Polyline],
+) -> Vec<SimulatedRow> {
+    let targets = options.targets.max(1);
+    let mut rows = Vec::with_capacity(options.samples);
+    for index in 0..targets {
+        let share = options.samples / targets + usize::from(index < options.samples % targets);
+        SimulatedTarget::new(options, camera, plane, index).run(paths, share, &mut rows);
+    }
+    rows.sort_by(|one, other| (one.time, &one.target_id).cmp(&(other.time, &other.target_id)));
+    if let Some(lifetime_s) = options.tracker_id_lifetime_s {
+        tracker::assign_ids(&mut rows, lifetime_s, stream(options.seed, TRACKER_STREAM));
+    }
+    rows
 }
 
 /// A training world and a test world: the same camera, other traverses and noise, a week later.

@@ -1,5 +1,7 @@
 //! The one integration test binary: everything from the outside, through real ports and files.
 
+mod access;
+mod audit;
 mod bad_input;
 mod boxes_without_fix;
 mod connections;
@@ -23,6 +25,9 @@ mod parity;
 mod power_cut;
 mod promotion;
 mod replay;
+mod simulations;
 mod storage;
 mod story;
 mod stream;
+mod tls;
+mod usage;

@@ -31,6 +31,7 @@ use crate::domain::{
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
+use crate::fusion::target_track::TargetTrack;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
@@ -108,12 +109,21 @@ impl App {
         self.live_time_bounds().check(observation.time())?;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);
-        let observed = ObservedPositions::of(observation, regressor, camera.image_size, camera.e_gnss_m2);
+        let now = self.clock.monotonic();
+        let ActiveCamera { image_size, e_gnss_m2, .. } = **camera;
+        let observed = match observation.target_id().filter(|_| regressor.is_some()) {
+            Some(target_id) => {
+                let observe =
+                    |track: &mut TargetTrack| track.observe(observation, regressor, image_size, e_gnss_m2);
+                camera.live.tracks.observe(&camera.id, target_id, now, &self.limits, observe)?
+            }
+            None => ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None),
+        };
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(self.clock.now());
         let Some(target_id) = observation.target_id() else { return Ok(ItemResult { fused, track: None }) };
-        let seen = TargetObservation { target_id, observed, model, now: self.clock.monotonic() };
+        let seen = TargetObservation { target_id, observed, model, now };
         let (track, residual) = camera.live.tracks.update(&camera.id, &seen, &self.limits)?;
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);

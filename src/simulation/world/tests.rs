@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::geo::{EastNorth, distance_m};
-use crate::simulation::Scene;
+use crate::simulation::{Scene, TargetShape};
 
 fn plane_of(scene: Scene, position: Position) -> EastNorth {
     LocalPlane::new(scene.origin()).to_plane(position)
@@ -119,4 +119,150 @@ fn a_standing_target_does_not_move_and_a_new_line_is_new() {
     let plain = simulate(&base);
     let new_line = simulate(&Options { route: Route::NewLine, ..base });
     assert!(distance_m(plain.truth_lines[0][0], new_line.truth_lines[0][0]) > 1.9);
+}
+
+/// Mean error of the fixes of every target and day, m.
+fn mean_errors(world: &World) -> std::collections::BTreeMap<(usize, i64), EastNorth> {
+    let mut sums = std::collections::BTreeMap::new();
+    for row in &world.rows {
+        let Some(fix) = row.fix else { continue };
+        let error = LocalPlane::new(row.truth).to_plane(fix.position);
+        let (sum, count) =
+            sums.entry((row.target, row.time.as_second() / 86_400)).or_insert((EastNorth::default(), 0.0));
+        sum.east_m += error.east_m;
+        sum.north_m += error.north_m;
+        *count += 1.0;
+    }
+    let mean = |(sum, count): (EastNorth, f64)| EastNorth {
+        east_m: sum.east_m / count,
+        north_m: sum.north_m / count,
+    };
+    sums.into_iter().map(|(key, sum)| (key, mean(sum))).collect()
+}
+
+#[test]
+fn a_receiver_keeps_its_bias_for_a_session_and_no_longer() {
+    let base = Options {
+        samples: 1_200,
+        targets: 3,
+        sessions: 2,
+        gnss_sigma_m: 0.2,
+        gnss_bias_sigma_m: 5.0,
+        ..Options::new(Scene::Square)
+    };
+    let world = simulate(&base);
+    assert_eq!(world.rows.len(), 1_200);
+    assert!(world.rows.windows(2).all(|pair| pair[0].time <= pair[1].time));
+    let biases = mean_errors(&world);
+    assert_eq!(biases.len(), 6, "three receivers on two days: {biases:?}");
+    for row in &world.rows {
+        let error = LocalPlane::new(row.truth).to_plane(row.fix.expect("no gaps").position);
+        let bias = biases[&(row.target, row.time.as_second() / 86_400)];
+        assert!(error.distance_m(bias) < 1.2, "{error:?} {bias:?}");
+    }
+    let all: Vec<EastNorth> = biases.into_values().collect();
+    for (index, one) in all.iter().enumerate() {
+        assert!(all[index + 1..].iter().all(|other| one.distance_m(*other) > 0.5), "{all:?}");
+    }
+    // The bias changes the fixes alone, and the first session is the world of one session.
+    let unbiased = simulate(&Options { gnss_bias_sigma_m: 0.0, sessions: 1, samples: 600, ..base });
+    for (one, other) in world.rows.iter().zip(&unbiased.rows) {
+        assert_eq!((one.time, one.bounding_box, one.truth), (other.time, other.bounding_box, other.truth));
+    }
+}
+
+#[test]
+fn the_foot_of_a_large_target_is_far_from_its_antenna_depending_on_the_aspect() {
+    let shape = TargetShape {
+        length_m: 37.0,
+        width_m: 34.0,
+        height_m: 12.0,
+        antenna_ahead_m: 14.0,
+        antenna_left_m: 0.0,
+    };
+    // Columns between the foot of the box and the antenna's place on the ground, by heading.
+    let offsets_px = |target_shape| {
+        let options =
+            Options { target_shape, samples: 1_500, box_noise_px: 0.0, ..Options::new(Scene::Airport) };
+        let camera = options.scene.camera(true, options.lens_distortion, &mut stream(1, 0));
+        let plane = LocalPlane::new(Scene::Airport.origin());
+        let offset = |row: &SimulatedRow| {
+            let seen = row.bounding_box.filter(|seen| !seen.touches_border(Some(camera.image_size)))?;
+            let ground = plane.to_plane(row.truth);
+            let antenna_px = camera.project(crate::simulation::camera::Point { ground, up_m: 0.0 })?;
+            Some(seen.foot_px()[0] - antenna_px[0])
+        };
+        let offsets: Vec<f64> = simulate(&options).rows.iter().filter_map(offset).collect();
+        let (low, high) = offsets
+            .iter()
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &one| (low.min(one), high.max(one)));
+        high - low
+    };
+    let (nominal_px, large_px) = (offsets_px(None), offsets_px(Some(shape)));
+    println!("range of the offset: nominal {nominal_px:.1} px, antenna 14 m ahead {large_px:.1} px");
+    assert!(large_px > nominal_px + 20.0, "{nominal_px} {large_px}");
+    // A scene's own shape is the scene's target.
+    let own = Options { samples: 300, ..Options::new(Scene::Airport) };
+    let stated = Options { target_shape: Some(Scene::Airport.nominal_shape()), ..own.clone() };
+    assert_eq!(simulate(&own).rows, simulate(&stated).rows);
+}
+
+#[test]
+fn a_tracker_breaks_ids_and_gives_them_to_others() {
+    let base = Options { samples: 2_400, targets: 8, route: Route::Area, ..Options::new(Scene::Square) };
+    let stable = simulate(&base);
+    let broken = simulate(&Options { tracker_id_lifetime_s: Some(20.0), ..base });
+    let mut targets_of: std::collections::BTreeMap<&str, std::collections::BTreeSet<usize>> =
+        std::collections::BTreeMap::new();
+    let mut ids_of = vec![std::collections::BTreeSet::new(); 8];
+    let mut at_once = std::collections::BTreeSet::new();
+    for (row, same) in broken.rows.iter().zip(&stable.rows) {
+        targets_of.entry(row.target_id.as_str()).or_default().insert(row.target);
+        ids_of[row.target].insert(row.target_id.as_str());
+        assert!(at_once.insert((row.time, row.target_id.as_str())), "an id stands for one target at a time");
+        // Nothing but the ids differs.
+        assert_eq!(SimulatedRow { target_id: same.target_id.clone(), ..row.clone() }, *same);
+    }
+    let shared = targets_of.values().filter(|targets| targets.len() > 1).count();
+    println!("{} ids for 8 targets, {shared} of them for several", targets_of.len());
+    assert!(ids_of.iter().all(|ids| ids.len() > 2), "{ids_of:?}");
+    assert!(2 * shared > targets_of.len(), "{targets_of:?}");
+}
+
+#[test]
+fn gross_errors_and_cut_boxes_are_where_they_were_asked_for() {
+    let base = Options { samples: 2_000, ..Options::new(Scene::Airport) };
+    let plain = simulate(&base);
+    let gross = simulate(&Options { gross_fixes: 0.05, ..base.clone() });
+    let mut far = 0;
+    for (one, other) in gross.rows.iter().zip(&plain.rows) {
+        assert_eq!(one.bounding_box, other.bounding_box);
+        let moved_m = distance_m(one.fix.expect("a fix").position, other.fix.expect("a fix").position);
+        assert!(moved_m == 0.0 || (moved_m - 1_000.0).abs() < 1.0, "{moved_m}");
+        far += usize::from(moved_m > 0.0);
+    }
+    assert!((60..140).contains(&far), "{far} of 2,000");
+    let is_cut = |world: &World| {
+        let size = Some(world.image_size);
+        world.rows.iter().any(|row| row.bounding_box.is_some_and(|seen| seen.touches_border(size)))
+    };
+    let (train, test) = simulate_split(&Options { without_cut_boxes: true, ..base }, 400);
+    assert!(!is_cut(&train) && is_cut(&test));
+}
+
+#[test]
+fn targets_of_an_area_cover_it() {
+    for &scene in Scene::ALL {
+        let world = simulate(&Options { route: Route::Area, samples: 2_000, ..Options::new(scene) });
+        assert_eq!(world.rows.len(), 2_000, "{scene}");
+        assert!(world.truth_lines.is_empty());
+        let ahead_m: Vec<f64> = world
+            .rows
+            .iter()
+            .map(|row| plane_of(scene, row.truth).distance_m(EastNorth::default()))
+            .collect();
+        let (near_m, far_m) =
+            ahead_m.iter().fold((f64::INFINITY, 0.0_f64), |(near, far), &one| (near.min(one), far.max(one)));
+        assert!(far_m > 2.0 * near_m, "{scene} {near_m} {far_m}");
+    }
 }

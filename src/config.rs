@@ -478,12 +478,6 @@ impl Config {
 
     fn check(&self) -> anyhow::Result<()> {
         let limits = &self.limits;
-        if let Some(url) = &self.console.tile_url {
-            anyhow::ensure!(
-                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
-                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
-            );
-        }
         anyhow::ensure!(
             self.admin_key.is_none() || self.admin_key_file.is_none(),
             "give admin_key or admin_key_file, not both"
@@ -491,6 +485,12 @@ impl Config {
         self.tls.certificate_and_key()?;
         self.tls.client_scope()?;
         anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
+        if let Some(url) = &self.console.tile_url {
+            anyhow::ensure!(
+                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
+                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
+            );
+        }
         anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(
             limits.reserved_requests < limits.requests,

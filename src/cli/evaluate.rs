@@ -142,12 +142,10 @@ impl Evaluate {
         let stem = self.out.file_stem().and_then(|stem| stem.to_str()).context("--out must name a file")?;
         let folder = self.out.parent().unwrap_or(Path::new(""));
         let worlds = Worlds { first: self.first_world, count: self.seeds };
-        let started_s = process_cpu_s();
         let documents = paper_experiments::run(worlds, &recordings, stem, &mut PaperRunner)?;
         for document in &documents {
             write(&folder.join(&document.path), &document.text)?;
         }
-        eprintln!("{:.0} CPU s", process_cpu_s() - started_s);
         print_line(&format_args!("{}", documents.first().map_or("", |page| page.text.trim_end())))?;
         Ok(())
     }
@@ -181,12 +179,12 @@ struct PaperRunner;
 impl paper_experiments::Runner for PaperRunner {
     fn evaluate(
         &mut self,
-        train: &[Sample],
+        train: FitInput<'_>,
         test: &[TestRow],
         truth: &Truth,
         options: &EvaluateOptions,
     ) -> anyhow::Result<Evaluation> {
-        evaluate_with_progress(train.into(), test, truth, options)
+        evaluate_with_progress(train, test, truth, options)
     }
 
     fn begin(&mut self, experiment: &str) {

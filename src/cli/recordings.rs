@@ -13,7 +13,7 @@ use crate::domain::{
 };
 use crate::evaluation::TestRow;
 use crate::exchange::{self, FixFormat, RowRules};
-use crate::fusion::pairing::{PairingRule, PairingSettings, ReceivedFix, pair};
+use crate::fusion::pairing::{Paired, PairingRule, PairingSettings, ReceivedFix, pair};
 use crate::geo::Position;
 use crate::paper_experiments::RealCamera;
 
@@ -43,9 +43,11 @@ pub(super) fn plaza(folder: &Path) -> anyhow::Result<Vec<RealCamera>> {
             let observation = Observation::new(time, Some(target_id), Some(bounding_box), None)?;
             Ok(TestRow { observation, truth })
         };
+        let Paired { samples, unpaired_detections, .. } = pair(own, fixes.clone(), &receivers, &settings);
         Ok(RealCamera {
             name: name.to_owned(),
-            train: pair(own, fixes.clone(), &receivers, &settings).samples,
+            train: samples,
+            unpaired: unpaired_detections,
             test: others.into_iter().map(test_row).collect::<anyhow::Result<_>>()?,
             image_size: Some(ImageSize::new(PLAZA_SIZE_PX.0, PLAZA_SIZE_PX.1)?),
         })

@@ -70,7 +70,9 @@ impl Series {
     }
 
     fn dashes(&self) -> &'static str {
-        self.number.map_or(DASHES[0], |number| DASHES[(number + number / COLOURS.len()) % DASHES.len()])
+        self.number.map_or(DASHES[0], |number| {
+            DASHES[(number % COLOURS.len() + number / COLOURS.len()) % DASHES.len()]
+        })
     }
 
     /// Number of dots and vertices that a frame does not show; outlines do not count.

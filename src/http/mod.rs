@@ -140,10 +140,10 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(tracks::routes())
         .merge(gnss_error::routes())
         .merge(evaluations::routes())
-        .merge(server_info::routes())
         .merge(keys::routes())
         .merge(audit::routes())
         .merge(session::routes())
+        .merge(server_info::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
     description::add_security(router.get_openapi_mut());

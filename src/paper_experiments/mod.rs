@@ -15,11 +15,13 @@ mod splits;
 mod tables;
 mod walks;
 
-use crate::domain::{ImageSize, Sample};
+use crate::clock::process_cpu_s;
+use crate::domain::{Detection, ImageSize, Sample};
 use crate::evaluation::{EvaluateOptions, Evaluation, TestRow, Truth};
+use crate::model::FitInput;
 use crate::simulation::Scene;
 use cases::Experiment;
-use page::Picture;
+use page::{Made, Picture};
 use scores::CaseScore;
 use walks::WalkCurves;
 
@@ -41,6 +43,8 @@ pub struct RealCamera {
     pub name: String,
     /// Boxes and fixes of targets with a receiver.
     pub train: Vec<Sample>,
+    /// Boxes of these targets at other instants.
+    pub unpaired: Vec<Detection>,
     /// Boxes of the other targets.
     pub test: Vec<TestRow>,
     /// Size of the image.
@@ -78,7 +82,7 @@ pub trait Runner {
     /// The evaluation's own.
     fn evaluate(
         &mut self,
-        train: &[Sample],
+        train: FitInput<'_>,
         test: &[TestRow],
         truth: &Truth,
         options: &EvaluateOptions,
@@ -99,6 +103,7 @@ pub fn run(
     stem: &str,
     runner: &mut dyn Runner,
 ) -> anyhow::Result<Vec<Document>> {
+    let started_s = process_cpu_s();
     let mut scores: Vec<CaseScore> = Vec::new();
     let experiments = experiments(worlds, recordings)?;
     let count = experiments.len();
@@ -114,9 +119,10 @@ pub fn run(
     }
     let command = command(worlds, recordings);
     let pictures = page::pictures(&scores, &curves);
-    let page = page::page(stem, (worlds, &command), &scores, &curves, &pictures);
     let mut tables = tables::tables(stem, &command, &scores);
     ablations::tables(&mut tables, worlds, runner)?;
+    let made = Made { worlds, command, cpu_s: process_cpu_s() - started_s };
+    let page = page::page(stem, &made, &scores, &curves, &pictures);
     let mut documents = vec![
         Document { path: format!("{stem}.md"), text: page },
         Document { path: format!("{stem}-tables.md"), text: tables },

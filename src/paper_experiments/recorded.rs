@@ -45,6 +45,7 @@ pub(super) fn plaza(cameras: &[RealCamera]) -> anyhow::Result<Vec<Experiment>> {
         recorded("Real people, simulated phones", case, Truth::Columns, PLAZA_SIGMA_M, move || {
             Ok(Split {
                 train: camera.train.clone(),
+                unpaired: camera.unpaired.clone(),
                 tests: vec![camera.test.clone()],
                 image_size: camera.image_size,
             })

@@ -71,7 +71,7 @@ pub(super) fn evaluate(
         let split = split()?;
         let (test, begins) = split.joined_tests()?;
         let options = options(&experiment, &split);
-        let evaluation = runner.evaluate(&split.train, &test, &experiment.truth, &options)?;
+        let evaluation = runner.evaluate(split.input(), &test, &experiment.truth, &options)?;
         for (at, scores) in worlds.iter_mut().enumerate() {
             let end = begins.get(at + 1).copied().unwrap_or(test.len());
             scores.push(WorldScore::of(&evaluation, &split, &test, begins[at]..end));

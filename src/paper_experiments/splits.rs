@@ -3,8 +3,9 @@
 use jiff::{SignedDuration, Timestamp};
 
 use super::RealRecording;
-use crate::domain::{BoundingBox, ImageSize, Observation, Sample, TargetId};
+use crate::domain::{BoundingBox, Detection, ImageSize, Observation, Sample, TargetId};
 use crate::evaluation::TestRow;
+use crate::model::FitInput;
 use crate::simulation::{Options, Route, SimulatedRow, World, simulate};
 
 /// A gap in a recording longer than this separates sessions.
@@ -41,6 +42,8 @@ impl TestSet {
 /// Training rows of one camera, and one or several sets of test rows.
 pub(super) struct Split {
     pub(super) train: Vec<Sample>,
+    /// Boxes of training without a fix.
+    pub(super) unpaired: Vec<Detection>,
     pub(super) tests: Vec<Vec<TestRow>>,
     pub(super) image_size: Option<ImageSize>,
 }
@@ -63,9 +66,15 @@ impl Split {
         };
         Ok(Self {
             train: world.training_samples(),
+            unpaired: Vec::new(),
             tests: tests.iter().map(rows).collect::<anyhow::Result<_>>()?,
             image_size: Some(world.image_size),
         })
+    }
+
+    /// What a fit learns from.
+    pub(super) fn input(&self) -> FitInput<'_> {
+        FitInput { samples: &self.train, unpaired: &self.unpaired }
     }
 
     /// All test sets as one, whose targets are told apart by the number of the set, and the index of the
@@ -132,6 +141,7 @@ pub(super) fn leave_out(recording: &RealRecording, session: &Session) -> Split {
     let is_test = |sample: &&Sample| (session.from..=session.until).contains(&sample.time);
     Split {
         train: recording.samples.iter().filter(|sample| !is_test(sample)).cloned().collect(),
+        unpaired: Vec::new(),
         tests: vec![recording.samples.iter().filter(is_test).map(test_row).collect()],
         image_size: None,
     }

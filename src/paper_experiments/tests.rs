@@ -2,10 +2,11 @@
 
 use super::cases::{Case, key};
 use super::marks::{self, ONE_STEP, TRACK, TWO_STEP};
+use super::page::{self, Made};
 use super::scores::{CaseScore, MethodScore};
 use super::simulated::Worlds;
+use super::tables;
 use super::walks::{WALKS, WalkCurves};
-use super::{page, tables};
 use crate::evaluation::{MethodReport, Metrics, ScoredPrediction};
 use crate::simulation::Scene;
 
@@ -83,7 +84,8 @@ fn the_page_begins_with_a_table_of_means_and_coverages_and_says_which_marks_are_
     let scores = scores();
     let pictures = page::pictures(&scores, &curves());
     let worlds = Worlds { first: 7, count: 3 };
-    let page = page::page("accuracy", (worlds, "the command"), &scores, &curves(), &pictures);
+    let made = Made { worlds, command: "the command".to_owned(), cpu_s: 61.0 };
+    let page = page::page("accuracy", &made, &scores, &curves(), &pictures);
     let first_table = page.lines().find(|line| line.starts_with('|')).expect("a table");
     assert!(
         first_table.starts_with("| case | GNSS | IMM-UKF | homography | DNN on the box | paper |"),

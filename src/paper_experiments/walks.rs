@@ -56,7 +56,7 @@ impl WalkCurves {
                     rows.push(train.len());
                 }
                 let evaluation =
-                    runner.evaluate(&train, &split.tests[0], &Truth::Columns, &evaluate_options)?;
+                    runner.evaluate((&train).into(), &split.tests[0], &Truth::Columns, &evaluate_options)?;
                 for (name, report) in evaluation.report.methods {
                     figures.entry((name, at)).or_default().push(report.metrics);
                 }

@@ -86,6 +86,8 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Administer, "GET /v1/keys/{key}", "sightfix.v1.KeyService/GetKey"),
     operation(Administer, "DELETE /v1/keys/{key}", "sightfix.v1.KeyService/RevokeKey"),
     operation(Operate, "GET /v1/audit", "sightfix.v1.AuditService/ListAuditEntries"),
+    operation(Read, "GET /v1/server", ""),
+    operation(Read, "GET /v1/camera-statuses", ""),
     operation(Operate, "POST /v1/cameras", "sightfix.v1.CameraService/CreateCamera"),
     operation(Read, "GET /v1/cameras", "sightfix.v1.CameraService/ListCameras"),
     operation(Read, "GET /v1/cameras/{camera}", "sightfix.v1.CameraService/GetCamera"),

@@ -101,31 +101,47 @@ test.describe('a database that is full', () => {
   });
 });
 
-test.describe('a key is asked for', () => {
-  test.use({ allowed: /401/ });
+test.describe('a server with keys', () => {
+  test.use({ allowed: /status of 40[13]/ });
 
-  test('the sign-in covers the page until the key is right', async ({ console: page, server }) => {
-    let isSignedIn = false;
-    await page.route('**/v1/**', async (route) => {
-      const problem = (status: number, detail: string): Promise<void> =>
-        route.fulfill({ status, contentType: 'application/problem+json', body: JSON.stringify({ status, detail }) });
-      if (route.request().url().endsWith('/v1/session')) {
-        isSignedIn = (route.request().postDataJSON() as { key: string }).key === 'sf_right';
-        return isSignedIn ? route.fulfill({ json: { role: 'admin', open_access: false } }) : problem(401, 'the key is unknown');
-      }
-      return isSignedIn ? route.continue() : problem(401, 'a key is required');
-    });
-    await page.goto(`${server.url}/#/settings/limits`);
-    await page.reload();
-    await expect(page.getByRole('heading', { name: 'Sign in to sightfix' })).toBeVisible();
-    await page.getByLabel('Key').fill('sf_wrong');
-    await page.getByRole('button', { name: 'Sign in' }).click();
-    await expect(page.getByRole('alert')).toContainText('the key is unknown');
-    await page.getByLabel('Key').fill('sf_right');
-    await page.getByRole('button', { name: 'Sign in' }).click();
-    await expect(page.getByRole('heading', { name: 'Sign in to sightfix' })).toBeHidden();
+  test('the first key closes it; sign-in, roles and revocation reach the page', async ({ console: page, server }) => {
+    await page.goto(`${server.url}/#/settings/keys`);
+    await expect(page.getByText('No key exists yet')).toBeVisible();
+    const createKey = async (name: string, role?: string): Promise<string> => {
+      await page.locator('main').getByLabel('Name').fill(name);
+      if (role) await page.getByLabel('Role').selectOption(role);
+      await page.getByRole('button', { name: 'Create key' }).click();
+      await expect(page.getByRole('cell', { name, exact: true })).toBeVisible();
+      return (await page.locator('.notice.good pre').textContent())!;
+    };
+    const admin = await createKey('first');
+    expect(admin).toMatch(/^sf_[0-9A-Za-z]{36}$/);
+    await expect(page.getByText('Signed in as first (admin)')).toBeVisible();
+    const viewer = await createKey('guest', 'viewer');
+    expect(viewer).not.toBe(admin);
+
+    await page.getByRole('button', { name: 'Sign out' }).click();
+    const signIn = page.getByRole('dialog', { name: 'Sign in to sightfix' });
+    await signIn.getByLabel('Key').fill(`${viewer.slice(0, -1)}${viewer.endsWith('0') ? '1' : '0'}`);
+    await signIn.getByRole('button', { name: 'Sign in' }).click();
+    await expect(signIn.getByRole('alert')).toBeVisible();
+    await signIn.getByLabel('Key').fill(viewer);
+    await signIn.getByRole('button', { name: 'Sign in' }).click();
+    await expect(signIn).toBeHidden();
+
+    // A viewer may look, and is told what it may not.
     await page.goto(`${server.url}/#/cameras`);
-    await expect(page.getByText('No camera yet')).toBeVisible();
+    await page.getByRole('button', { name: 'New camera' }).first().click();
+    const dialog = page.getByRole('dialog', { name: 'New camera' });
+    await dialog.getByLabel('Name').fill('Gate');
+    await dialog.getByRole('button', { name: 'Create camera' }).click();
+    await expect(dialog.getByRole('alert')).toContainText(/viewer|role/);
+    await dialog.getByRole('button', { name: 'Cancel' }).click();
+
+    const bearer = { authorization: `Bearer ${admin}` };
+    const { items } = await server.request<{ items: { id: string; name: string }[] }>('GET', '/v1/keys', undefined, '', bearer);
+    await server.request('DELETE', `/v1/keys/${items.find(({ name }) => name === 'guest')!.id}`, undefined, '', bearer);
+    await expect(signIn).toBeVisible();
   });
 });
 

@@ -58,9 +58,6 @@ async function look(page: Page, server: Server, path: string, ready: (page: Page
   await ready(page);
 }
 
-// A server without access control answers 404 to the questions for keys and the audit log.
-test.use({ allowed: /status of 404/ });
-
 test('every view is accessible, fits and can be shown', async ({ console: page, server }) => {
   test.setTimeout(1_200_000);
   const stop = await buildTown(server);

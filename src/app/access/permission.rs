@@ -74,6 +74,8 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Public, "GET /livez", "grpc.health.v1.Health/Check"),
     operation(Public, "GET /readyz", "grpc.health.v1.Health/Watch"),
     operation(Read, "GET /metrics", ""),
+    operation(Read, "GET /v1/server", ""),
+    operation(Read, "GET /v1/camera-statuses", ""),
     operation(Authenticated, "", "grpc.reflection.v1.ServerReflection/ServerReflectionInfo"),
     operation(Authenticated, "", "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo"),
     operation(Public, "POST /v1/session", ""),

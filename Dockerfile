@@ -13,6 +13,7 @@ COPY --from=build /usr/local/bin/sightfix /usr/local/bin/sightfix
 USER 10001
 VOLUME /data
 ENV SIGHTFIX_DATA=/data SIGHTFIX_LISTEN=0.0.0.0:8080
+# Reachable by others: give it a key (SIGHTFIX_ADMIN_KEY or --admin-key-file), or start it with --insecure.
 EXPOSE 8080
 HEALTHCHECK --interval=10s --timeout=3s --start-period=10s CMD ["sightfix", "health"]
 STOPSIGNAL SIGTERM

@@ -75,12 +75,16 @@ fn cpu_s(clock: ClockId) -> f64 {
 pub struct Randomness(Arc<Mutex<ChaCha8Rng>>);
 
 impl Randomness {
-    /// Seeded by the operating system.
+    /// A cryptographic generator (ChaCha) seeded by the operating system.
+    ///
+    /// # Panics
+    /// If the operating system has no randomness.
     #[must_use]
     pub fn system() -> Self {
-        Self::seeded(u64::from_le_bytes(
-            Uuid::new_v4().as_bytes()[..8].try_into().expect("a UUID has sixteen bytes"),
-        ))
+        let mut seed = [0; 32];
+        // Without it nothing is safe: keys must not be guessable.
+        getrandom::fill(&mut seed).expect("the operating system has randomness");
+        Self(Arc::new(Mutex::new(ChaCha8Rng::from_seed(seed))))
     }
 
     /// The same sequence for the same seed.
@@ -98,7 +102,8 @@ impl Randomness {
         uuid::Builder::from_unix_timestamp_millis(millis, &random).into_uuid()
     }
 
-    fn fill(&self, bytes: &mut [u8]) {
+    /// Fills a buffer with random bytes, good for secrets where the generator is the operating system's.
+    pub fn fill(&self, bytes: &mut [u8]) {
         self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner).fill_bytes(bytes);
     }
 }

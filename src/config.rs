@@ -7,6 +7,8 @@ use std::time::Duration;
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
+use crate::domain::{CameraId, Role, Scope};
+
 /// Everything that can be set.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -18,6 +20,16 @@ pub struct Config {
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
     pub allowed_hosts: Vec<String>,
+    /// Serve everybody on an address that other machines reach, while no key exists.
+    pub insecure: bool,
+    /// Secret of an administrator's key (`sightfix keys generate`), for the first start of a container.
+    pub admin_key: Option<Secret>,
+    /// File that contains that secret instead.
+    pub admin_key_file: Option<PathBuf>,
+    /// Encryption of the port.
+    pub tls: TlsSettings,
+    /// Secret of the key that `replay` sends to a server.
+    pub api_key: Option<Secret>,
     /// `text` or `json` lines in the log.
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
@@ -26,8 +38,81 @@ pub struct Config {
     pub training: Workers,
     /// Workers of evaluations.
     pub evaluation: Workers,
+    /// The operator's console.
+    pub console: Console,
     /// What an outside client may make large.
     pub limits: Limits,
+}
+
+/// Encryption of the port.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TlsSettings {
+    /// File with the server's certificate chain (PEM); plain HTTP without.
+    pub certificate: Option<PathBuf>,
+    /// File with its private key (PEM).
+    pub key: Option<PathBuf>,
+    /// File with the authority of client certificates (PEM); none are asked for without.
+    pub client_ca: Option<PathBuf>,
+    /// What holders of client certificates may do: `viewer` if left out, `edge`, `operator`, `admin`.
+    pub client_role: Option<String>,
+    /// The cameras that the role `edge` is restricted to.
+    pub client_camera_ids: Vec<String>,
+}
+
+impl TlsSettings {
+    /// The files of the certificate and of its key; `None` for plain HTTP.
+    ///
+    /// # Errors
+    /// Names the setting that is missing.
+    pub fn certificate_and_key(&self) -> anyhow::Result<Option<(&Path, &Path)>> {
+        match (&self.certificate, &self.key) {
+            (Some(certificate), Some(key)) => Ok(Some((certificate, key))),
+            (None, None) if self.client_ca.is_none() => Ok(None),
+            _ => anyhow::bail!(
+                "tls.certificate and tls.key must be given together, tls.client_ca only with them"
+            ),
+        }
+    }
+
+    /// What holders of client certificates may do.
+    ///
+    /// # Errors
+    /// Names the setting that cannot be used.
+    pub fn client_scope(&self) -> anyhow::Result<Scope> {
+        let role = self.client_role.as_deref().map_or(Ok(Role::Viewer), str::parse);
+        let role = role.context("the setting tls.client_role")?;
+        let cameras = self.client_camera_ids.iter().map(|id| CameraId::new(id));
+        let cameras = cameras.collect::<Result<_, _>>().context("the setting tls.client_camera_ids")?;
+        Scope::new(role, cameras).context("the setting tls.client_camera_ids")
+    }
+}
+
+/// A setting that is never shown.
+#[derive(Clone, PartialEq, Eq, Deserialize)]
+#[serde(transparent)]
+pub struct Secret(String);
+
+impl Secret {
+    /// The text.
+    #[must_use]
+    pub fn reveal(&self) -> &str {
+        &self.0
+    }
+}
+
+const HIDDEN: &str = "(hidden)";
+
+impl std::fmt::Debug for Secret {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        out.write_str(HIDDEN)
+    }
+}
+
+impl Serialize for Secret {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(HIDDEN)
+    }
 }
 
 /// Form of the log lines.
@@ -48,6 +133,17 @@ pub struct Workers {
     pub workers: usize,
     /// Seconds after which another worker claims the job of a silent one.
     pub lease_s: u32,
+}
+
+/// What the operator's console shows beside the server's own values.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Console {
+    /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
+    /// console asks no other server.
+    pub tile_url: Option<String>,
+    /// What the provider of the tiles asks to be shown on the map.
+    pub tile_attribution: Option<String>,
 }
 
 /// Everything that an outside client can make large has its limit here.
@@ -155,6 +251,10 @@ pub struct Limits {
     pub ended_runs_per_camera: u32,
     /// Ended evaluations of all cameras; beyond, the oldest is deleted.
     pub ended_evaluations: u32,
+    /// Keys; those that no longer work make room for new ones, else more are refused.
+    pub keys: u32,
+    /// Entries of the audit log; beyond, the oldest is deleted.
+    pub audit_entries: u32,
     /// Bytes of the database, beyond which nothing is stored; 0 is no limit but the disk's.
     pub database_bytes: u64,
     /// Bytes on the disk that are reserved for deletions when it is full; 0 reserves none.
@@ -163,16 +263,44 @@ pub struct Limits {
     pub drain_s: u64,
 }
 
+impl Console {
+    /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
+    /// `None` for tiles of this server.
+    #[must_use]
+    pub fn tile_origin(&self) -> Option<&str> {
+        self.tile_url.as_deref().and_then(tile_origin).filter(|origin| !origin.is_empty())
+    }
+}
+
+/// Scheme and host of a URL, which end up in a header; empty for a path of this server.
+fn tile_origin(url: &str) -> Option<&str> {
+    if url.starts_with('/') && !url.starts_with("//") {
+        return Some("");
+    }
+    let host_at = url.find("://")? + 3;
+    let host = url[host_at..].split('/').next()?;
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b".-:[]".contains(&byte);
+    let is_usable =
+        matches!(&url[..host_at], "http://" | "https://") && !host.is_empty() && host.bytes().all(is_plain);
+    is_usable.then(|| &url[..host_at + host.len()])
+}
+
 impl Default for Config {
     fn default() -> Self {
         Self {
             data: PathBuf::from("data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             allowed_hosts: Vec::new(),
+            insecure: false,
+            admin_key: None,
+            admin_key_file: None,
+            tls: TlsSettings::default(),
+            api_key: None,
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
             training: Workers::default(),
             evaluation: Workers::default(),
+            console: Console::default(),
             limits: Limits::default(),
         }
     }
@@ -236,6 +364,8 @@ impl Default for Limits {
             models_per_camera: 100,
             ended_runs_per_camera: 100,
             ended_evaluations: 1_000,
+            keys: 1_000,
+            audit_entries: 100_000,
             database_bytes: 0,
             reserve_bytes: 32 << 20,
             drain_s: 8,
@@ -276,6 +406,16 @@ pub struct Overrides {
     pub data: Option<PathBuf>,
     /// `--listen`
     pub listen: Option<SocketAddr>,
+    /// `--insecure`
+    pub insecure: bool,
+    /// `--admin-key-file`
+    pub admin_key_file: Option<PathBuf>,
+    /// `--tls-cert`
+    pub tls_certificate: Option<PathBuf>,
+    /// `--tls-key`
+    pub tls_key: Option<PathBuf>,
+    /// `--tls-client-ca`
+    pub tls_client_ca: Option<PathBuf>,
 }
 
 impl Config {
@@ -296,6 +436,7 @@ impl Config {
             .separator("__")
             .list_separator(",")
             .with_list_parse_key("allowed_hosts")
+            .with_list_parse_key("tls.client_camera_ids")
             .try_parsing(true);
         let mut loaded: Self = config::Config::builder()
             .add_source(source)
@@ -309,12 +450,47 @@ impl Config {
         if let Some(listen) = overrides.listen {
             loaded.listen = listen;
         }
+        for (setting, flag) in [
+            (&mut loaded.admin_key_file, overrides.admin_key_file),
+            (&mut loaded.tls.certificate, overrides.tls_certificate),
+            (&mut loaded.tls.key, overrides.tls_key),
+            (&mut loaded.tls.client_ca, overrides.tls_client_ca),
+        ] {
+            if flag.is_some() {
+                *setting = flag;
+            }
+        }
+        loaded.insecure |= overrides.insecure;
         loaded.check()?;
         Ok(loaded)
     }
 
+    /// The secret of the administrator's key, from the setting itself or the file that it names.
+    ///
+    /// # Errors
+    /// Names the file that cannot be read.
+    pub fn admin_key(&self) -> anyhow::Result<Option<Secret>> {
+        let Some(path) = &self.admin_key_file else { return Ok(self.admin_key.clone()) };
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the admin key from {}", path.display()))?;
+        Ok(Some(Secret(text.trim().to_owned())))
+    }
+
     fn check(&self) -> anyhow::Result<()> {
         let limits = &self.limits;
+        anyhow::ensure!(
+            self.admin_key.is_none() || self.admin_key_file.is_none(),
+            "give admin_key or admin_key_file, not both"
+        );
+        self.tls.certificate_and_key()?;
+        self.tls.client_scope()?;
+        anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
+        if let Some(url) = &self.console.tile_url {
+            anyhow::ensure!(
+                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
+                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
+            );
+        }
         anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(
             limits.reserved_requests < limits.requests,

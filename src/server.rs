@@ -5,11 +5,14 @@
 
 mod activity;
 mod connection;
+mod credentials;
 mod frame_limit;
 mod guarded_stream;
 mod host_check;
 mod pipeline;
 mod request_body;
+mod revocable_body;
+mod tls;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -21,6 +24,7 @@ use tokio::net::TcpListener;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
+use crate::domain::KeySecret;
 use crate::shutdown::Shutdown;
 use crate::store::{Store, StoreOptions};
 use crate::telemetry::Metrics;
@@ -28,6 +32,7 @@ use crate::worker;
 
 use host_check::HostCheck;
 use pipeline::RequestPipeline;
+use tls::Tls;
 
 /// How often metrics are gathered, and the registry looks for what another process on the same file
 /// has changed.
@@ -38,7 +43,31 @@ pub struct Server {
     config: Config,
     app: App,
     listener: TcpListener,
+    tls: Option<Arc<Tls>>,
     shutdown: Shutdown,
+}
+
+/// Loads again what can change while a server runs.
+#[derive(Clone)]
+pub struct Reloader {
+    app: App,
+    tls: Option<Arc<Tls>>,
+}
+
+impl Reloader {
+    /// Loads the certificate and the keys again, whether they have changed or not.
+    pub async fn reload(&self) {
+        self.reload_certificate(true).await;
+        if let Err(error) = self.app.access.refresh(&self.app.store, self.app.clock.now()).await {
+            tracing::error!(%error, "cannot look for changed keys");
+        }
+    }
+
+    async fn reload_certificate(&self, in_any_case: bool) {
+        let Some(tls) = self.tls.clone() else { return };
+        // Reads files; a panic there must not end the loop that calls this.
+        let _ = tokio::task::spawn_blocking(move || tls.reload(in_any_case)).await;
+    }
 }
 
 impl Server {
@@ -53,9 +82,14 @@ impl Server {
             .with_context(|| format!("cannot open the data folder {}", config.data.display()))?;
         store.log_newcomers();
         let app = App::new(store, clock, randomness, config.limits.clone(), Metrics::new()).await?;
+        let tls = Tls::load(&config.tls)?;
+        if tls.as_ref().is_some_and(|tls| tls.takes_client_certificates()) {
+            app.access.close();
+        }
+        prepare_access(&app, &config).await?;
         let listener = connection::listen(config.listen)
             .with_context(|| format!("cannot listen on {}", config.listen))?;
-        Ok(Self { config, app, listener, shutdown: Shutdown::new() })
+        Ok(Self { config, app, listener, tls, shutdown: Shutdown::new() })
     }
 
     /// The address that was taken; with port 0 in the settings, the system's choice.
@@ -72,6 +106,18 @@ impl Server {
         &self.app
     }
 
+    /// Loads certificate and keys again when it is asked to.
+    #[must_use]
+    pub fn reloader(&self) -> Reloader {
+        Reloader { app: self.app.clone(), tls: self.tls.clone() }
+    }
+
+    /// Whether it speaks TLS.
+    #[must_use]
+    pub const fn has_tls(&self) -> bool {
+        self.tls.is_some()
+    }
+
     /// Shuts the server down when it is asked to.
     #[must_use]
     pub fn shutdown(&self) -> Shutdown {
@@ -84,13 +130,14 @@ impl Server {
     /// # Errors
     /// The system does not report the address.
     pub async fn run(self) -> anyhow::Result<()> {
-        let Self { config, app, listener, shutdown } = self;
+        let reloader = self.reloader();
+        let Self { config, app, listener, tls, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
-        shutdown.spawn(maintenance_loop(app.clone(), shutdown.clone()));
+        shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
-        let pipeline = Arc::new(RequestPipeline::new(app.clone(), hosts, &shutdown));
-        connection::accept(listener, pipeline, &config.limits, &shutdown).await;
+        let pipeline = Arc::new(RequestPipeline::new(app.clone(), config.console, hosts, &shutdown));
+        connection::accept(listener, pipeline, tls, &config.limits, &shutdown).await;
         tracing::info!("shutting down");
         if !shutdown.drain_with_timeout(config.limits.drain_time()).await {
             tracing::warn!("requests that did not end within limits.drain_s were dropped");
@@ -101,19 +148,60 @@ impl Server {
     }
 }
 
-async fn maintenance_loop(app: App, shutdown: Shutdown) {
+/// Stores the administrator's key of the settings, and refuses to serve everybody by an oversight.
+async fn prepare_access(app: &App, config: &Config) -> anyhow::Result<()> {
+    if let Some(secret) = config.admin_key()? {
+        let secret = KeySecret::parse(secret.reveal()).context(
+            "the setting admin_key, or the file admin_key_file, must be a key of `sightfix keys generate`",
+        )?;
+        app.ensure_admin_key(&secret).await?;
+    }
+    let is_loopback = config.listen.ip().is_loopback();
+    if !app.access.is_open() {
+        if !is_loopback && config.tls.certificate.is_none() {
+            tracing::warn!("keys cross the network unencrypted: set up TLS here or at a proxy in front");
+        }
+        return Ok(());
+    }
+    anyhow::ensure!(
+        is_loopback || config.insecure,
+        "{} can be reached by other machines and no key exists: create one (sightfix keys create --role admin \
+         --name NAME), set SIGHTFIX_ADMIN_KEY, or start with --insecure to serve everybody",
+        config.listen
+    );
+    let from = if is_loopback { "on this machine" } else { "that reaches this address" };
+    tracing::warn!("no key exists: everybody {from} may do everything; `sightfix keys create` changes that");
+    Ok(())
+}
+
+/// Time between writes of when keys were used last, in rounds of the maintenance.
+const STORE_USES_EVERY: u32 = 30;
+
+async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
+    let app = &reloader.app;
+    let mut round = 0;
     loop {
         tokio::select! {
             () = shutdown.draining() => return,
             () = tokio::time::sleep(REFRESH_EVERY) => {}
         }
         app.metrics.upkeep();
+        reloader.reload_certificate(false).await;
         match app.store.maintain().await {
             Ok(status) => app.metrics.storage(&status),
             Err(error) => tracing::error!(%error, "the maintenance of the store failed"),
         }
         if let Err(error) = app.registry.refresh(&app.store).await {
             tracing::error!(%error, "cannot look for changed cameras");
+        }
+        if let Err(error) = app.access.refresh(&app.store, app.clock.now()).await {
+            tracing::error!(%error, "cannot look for changed keys");
+        }
+        round = (round + 1) % STORE_USES_EVERY;
+        if round == 0
+            && let Err(error) = app.access.store_last_uses(&app.store).await
+        {
+            tracing::error!(%error, "cannot store when keys were used last");
         }
         if let Err(error) = app.retrain_moved().await {
             tracing::error!(%error, "cannot retrain moved cameras");

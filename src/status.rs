@@ -31,6 +31,7 @@ mod code {
     pub(super) const UNIMPLEMENTED: i32 = 12;
     pub(super) const INTERNAL: i32 = 13;
     pub(super) const UNAVAILABLE: i32 = 14;
+    pub(super) const UNAUTHENTICATED: i32 = 16;
 }
 
 /// The row of the table.
@@ -50,12 +51,14 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::TrackNotFound => (404, code::NOT_FOUND, "No such target is followed"),
         Kind::EvaluationNotFound => (404, code::NOT_FOUND, "There is no such evaluation"),
         Kind::ModelNotFound => (404, code::NOT_FOUND, "There is no such model version"),
+        Kind::KeyNotFound => (404, code::NOT_FOUND, "There is no such key"),
         Kind::CameraExists => (409, code::ALREADY_EXISTS, "A camera of that id exists already"),
         Kind::RevisionMismatch => (412, code::ABORTED, "The camera was changed in the meantime"),
         Kind::RevisionRequired => {
             (428, code::FAILED_PRECONDITION, "The change needs the revision it is based on")
         }
         Kind::NoModel => (409, code::FAILED_PRECONDITION, "The camera has no active model"),
+        Kind::NoEarlierModel => (409, code::FAILED_PRECONDITION, "No other model version was active before"),
         Kind::ModelUnusable => (409, code::FAILED_PRECONDITION, "The stored model version cannot be used"),
         Kind::RunLive => (409, code::FAILED_PRECONDITION, "The camera has a training run that has not ended"),
         Kind::RunEnded => (409, code::FAILED_PRECONDITION, "The training run has ended"),
@@ -67,6 +70,8 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::Overloaded => (503, code::UNAVAILABLE, "The server has too much to do"),
         Kind::Timeout => (408, code::DEADLINE_EXCEEDED, "The request took too long"),
         Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
+        Kind::Unauthenticated => (401, code::UNAUTHENTICATED, "The request needs a key that works"),
+        Kind::PermissionDenied => (403, code::PERMISSION_DENIED, "The key may not do this"),
         Kind::HostNotAllowed => (421, code::PERMISSION_DENIED, "The server does not answer for this host"),
         Kind::OriginNotAllowed => {
             (403, code::PERMISSION_DENIED, "A page of another origin asked for a change")

@@ -6,6 +6,7 @@ REST for single requests (cameras, training runs, tracks), gRPC for the stream.
 import argparse
 import csv
 import importlib.resources
+import os
 import pathlib
 import sys
 import tempfile
@@ -38,9 +39,10 @@ def import_messages(folder):
 class Client:
     """One camera of one server."""
 
-    def __init__(self, server, camera, messages):
+    def __init__(self, server, camera, messages, key=None):
         self.server, self.camera = server.rstrip("/"), camera
         self.messages, services, self.values = messages
+        self.headers = {"authorization": f"Bearer {key}"} if key else {}
         channel = grpc.insecure_channel(urllib.parse.urlsplit(server).netloc)
         self.fusion = services.FusionServiceStub(channel)
 
@@ -48,7 +50,7 @@ class Client:
 
     def rest(self, method, path, **arguments):
         """Sends a request; raises an error with the title and detail of a problem (RFC 9457)."""
-        answer = requests.request(method, self.server + path, timeout=30, **arguments)
+        answer = requests.request(method, self.server + path, headers=self.headers, timeout=30, **arguments)
         if not answer.ok:
             problem = answer.json()
             raise RuntimeError(f"{method} {path}: {problem['title']}: {problem.get('detail', '')}")
@@ -133,7 +135,7 @@ class Client:
 
         lost = 0
         try:
-            for event in self.fusion.Stream(requests_of_client()):
+            for event in self.fusion.Stream(requests_of_client(), metadata=list(self.headers.items())):
                 kind = event.WhichOneof("kind")
                 if kind == "answer":
                     # A dropped answer frees its place in the window, too.
@@ -165,7 +167,9 @@ def main():
     given = arguments.parse_args()
 
     with tempfile.TemporaryDirectory() as folder:
-        client = Client(given.server, given.camera, import_messages(folder))
+        # A key on the command line could be read by every user of the machine.
+        key = os.environ.get("SIGHTFIX_API_KEY")
+        client = Client(given.server, given.camera, import_messages(folder), key)
         client.create_camera(given.image_size)
 
         rows = read_rows(given.training)

@@ -1,7 +1,7 @@
 //! Camera profiles.
 
 use super::{App, Page, page_of};
-use crate::domain::{Camera, CameraChange, CameraId, NewCamera, Result, Revision};
+use crate::domain::{Camera, CameraChange, CameraId, ExpectedVersion, NewCamera, Result};
 
 impl App {
     /// Stores a new camera.
@@ -31,6 +31,27 @@ impl App {
         Ok(page_of(cameras, limit, |camera| camera.id().clone()))
     }
 
+    /// What is lost by what the profile leaves out, and whether the active model fits it.
+    #[must_use]
+    pub fn camera_warnings(&self, camera: &Camera) -> Vec<String> {
+        let mut warnings = camera.profile.warnings();
+        let active = self.registry.get(camera.id());
+        let trained = active.and_then(|active| active.model().and_then(|(model, _)| model.image_size()));
+        if let (Some(stated), Some(trained)) = (camera.profile.image_size, trained)
+            && stated != trained
+        {
+            warnings.push(format!(
+                "the active model was trained on images of {}x{} px, and the profile states {}x{} px: its \
+                 positions are wrong unless the boxes are scaled",
+                trained.width_px(),
+                trained.height_px(),
+                stated.width_px(),
+                stated.height_px()
+            ));
+        }
+        warnings
+    }
+
     /// Changes a profile, from the revision that the caller saw (any, if `None`).
     ///
     /// # Errors
@@ -39,12 +60,12 @@ impl App {
         &self,
         id: &CameraId,
         change: CameraChange,
-        expected: Option<Revision>,
+        expected: Option<ExpectedVersion>,
     ) -> Result<Camera> {
         let camera = self.store.camera(id).await?;
         // Changing what was read needs the revision that was read, whatever the caller said, so
         // that two changes at once cannot undo each other.
-        let expected = expected.unwrap_or(camera.revision);
+        let expected = expected.unwrap_or(camera.version());
         let profile = change.apply(camera.profile)?;
         let camera = self.store.replace_camera(&profile, Some(expected), self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;
@@ -55,8 +76,8 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `RevisionMismatch`, `RunLive`.
-    pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
-        self.store.delete_camera(id, expected).await?;
+    pub async fn delete_camera(&self, id: &CameraId, expected: Option<ExpectedVersion>) -> Result<()> {
+        self.store.delete_camera(id, expected, self.clock.now()).await?;
         self.registry.forget(id).await;
         Ok(())
     }

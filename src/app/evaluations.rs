@@ -93,7 +93,7 @@ impl App {
     /// # Errors
     /// `EvaluationNotFound`.
     pub async fn delete_evaluation(&self, id: EvaluationId) -> Result<()> {
-        self.store.delete_evaluation(id).await
+        self.store.delete_evaluation(id, self.clock.now()).await
     }
 
     /// The request with its defaults filled in, if the stored samples allow it.

@@ -34,7 +34,7 @@ impl App {
             .iter()
             .map(|observation| {
                 let (image_size, e_gnss_m2) = (camera.image_size, camera.e_gnss_m2);
-                (observation, ObservedPositions::of(observation, regressor, image_size, e_gnss_m2))
+                (observation, ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None))
             })
             .collect();
         let fused = observed
@@ -70,8 +70,9 @@ impl App {
     /// What answers for a camera; looks into the store for one that another process has made.
     ///
     /// # Errors
-    /// `CameraNotFound`; a fault of the store.
+    /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.
     pub async fn active_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
+        self.caller().authorize_camera(id)?;
         match self.registry.get(id) {
             Some(camera) => Ok(camera),
             None => self.registry.refresh_camera(&self.store, id).await,

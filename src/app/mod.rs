@@ -2,9 +2,13 @@
 //!
 //! What never happens here: SQL, status codes, wire formats, reading the wall clock.
 
+pub mod access;
+mod audit;
+mod camera_statuses;
 mod cameras;
 mod evaluations;
 mod fusion;
+mod keys;
 mod live;
 mod models;
 mod paired_import;
@@ -19,34 +23,42 @@ use std::time::Duration;
 use tokio::sync::{Notify, Semaphore};
 use tokio_util::task::TaskTracker;
 
+use self::access::{Access, Caller};
 use crate::admission::Quotas;
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
 use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
+pub use camera_statuses::CameraStatus;
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use live::{
-    Acknowledgement, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream, LostEvents, NotStored,
-    NotStoredReason, TrackPoint,
+    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream,
+    LostEvents, NotStored, NotStoredReason, TargetUpdate, TrackPoint,
 };
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
-pub use registry::{ActiveCamera, ModelFault, Registry};
+pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use samples::{ImportReport, RejectedRow};
 pub use training::RunRequest;
 
-/// The application: everything a request needs, cheap to clone.
+/// The application: everything a request needs, on behalf of its caller. Cheap to clone.
 #[derive(Clone)]
-pub struct App(Arc<Parts>);
+pub struct App {
+    parts: Arc<Parts>,
+    /// Everything that lasts; changes are recorded as those of the caller.
+    pub store: Store,
+    caller: Caller,
+}
 
 /// What an [`App`] is made of.
 pub struct Parts {
-    /// Everything that lasts.
-    pub store: Store,
+    opened_store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
+    /// Keys and sessions, ready to answer.
+    pub access: Access,
     /// What time it is.
     pub clock: Clock,
     /// Ids and seeds.
@@ -94,12 +106,15 @@ impl App {
             tracing::info!(models = filled, "stored checksums of model versions of an earlier release");
         }
         registry.refresh(&store).await?;
+        let access = Access::default();
+        access.refresh(&store, clock.now()).await?;
         let pairings = Semaphore::new(limits.pairings);
         let (residuals, waiting) = live::residual_queue();
         let quotas = Quotas::new(&limits);
         let parts = Parts {
-            store,
+            opened_store: store,
             registry,
+            access,
             clock,
             randomness,
             limits,
@@ -113,13 +128,35 @@ impl App {
             retraining: live::RetrainSchedule::default(),
             tasks: TaskTracker::new(),
         };
-        let app = Self(Arc::new(parts));
-        app.tasks.spawn(waiting.run(Arc::downgrade(&app.0)));
+        let app = Self::of_program(Arc::new(parts), "sightfix");
+        app.tasks.spawn(waiting.run(Arc::downgrade(&app.parts)));
         Ok(app)
+    }
+
+    /// The application as a part of the program uses it by itself.
+    fn of_program(parts: Arc<Parts>, name: &str) -> Self {
+        let caller = Caller::program(name);
+        Self { store: parts.opened_store.on_behalf_of(caller.actor().clone()), parts, caller }
+    }
+
+    /// The same application on behalf of a caller.
+    #[must_use]
+    pub fn on_behalf_of(&self, caller: Caller) -> Self {
+        let store = self.store.on_behalf_of(caller.actor().clone());
+        Self { parts: self.parts.clone(), store, caller }
+    }
+
+    /// On whose behalf it works.
+    #[must_use]
+    pub const fn caller(&self) -> &Caller {
+        &self.caller
     }
 
     /// Waits for the work that answers have handed over, then closes the store. Streams must have ended.
     pub async fn close(&self) {
+        if let Err(error) = self.access.store_last_uses(&self.store).await {
+            tracing::warn!(%error, "when keys were used last could not be stored");
+        }
         self.residuals.close();
         self.tasks.close();
         if tokio::time::timeout(CLOSE_TIME, self.tasks.wait()).await.is_err() {
@@ -149,7 +186,7 @@ impl std::ops::Deref for App {
     type Target = Parts;
 
     fn deref(&self) -> &Parts {
-        &self.0
+        &self.parts
     }
 }
 
@@ -163,6 +200,8 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
         models_per_camera: limits.models_per_camera,
         ended_runs_per_camera: limits.ended_runs_per_camera,
         ended_evaluations: limits.ended_evaluations,
+        keys: limits.keys,
+        audit_entries: limits.audit_entries,
         database_bytes: match limits.database_bytes {
             0 => None,
             bytes => Some(bytes),

@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 
-use super::registry::{ModelFault, load_regressor};
+use super::registry::{ModelFault, load_model};
 use super::{App, Page, page_of};
 use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelVersion, Result};
 use crate::exchange::{RowError, TimedFix};
@@ -171,7 +171,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`, `ModelActive`.
     pub async fn delete_model(&self, id: &CameraId, number: u32) -> Result<()> {
-        self.store.delete_model(id, number).await
+        self.store.delete_model(id, number, self.clock.now()).await
     }
 
     /// Makes a version the active one, which answers from now on.
@@ -179,7 +179,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`; `ModelUnusable` if the stored version cannot be loaded.
     pub async fn activate_model(&self, id: &CameraId, number: u32) -> Result<Camera> {
-        load_regressor(&self.store, id, number).await?;
+        load_model(&self.store, id, number).await?;
         let camera = self.store.activate_model(id, number, self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;
         Ok(camera)
@@ -188,7 +188,7 @@ impl App {
     /// Makes the version active that was before the active one.
     ///
     /// # Errors
-    /// `CameraNotFound`; `NoModel` if there is none before it.
+    /// `CameraNotFound`; `NoModel` if none is active, `NoEarlierModel` if none was before it.
     pub async fn roll_back_model(&self, id: &CameraId) -> Result<Camera> {
         let camera = self.store.roll_back(id, self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;

@@ -12,11 +12,11 @@ use tokio::sync::Mutex;
 
 use super::live::camera::CameraLive;
 use crate::domain::{
-    Camera, CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, ImageSize, Receivers, Result,
-    Revision, TimeBounds,
+    Camera, CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, ImageSize,
+    Receivers, Result, Revision, TimeBounds,
 };
 use crate::exchange::RowRules;
-use crate::model::{Artifact, Regressor};
+use crate::model::{Artifact, Regressor, ViewArea};
 use crate::store::Store;
 
 /// Everything that answers for one camera.
@@ -39,10 +39,21 @@ pub struct ActiveCamera {
     pub moved: Option<Arc<CameraMoved>>,
     /// The active model and its version number.
     pub model: Option<(Arc<Regressor>, u32)>,
+    /// What an operator wants to know of that model.
+    pub model_summary: Option<Arc<ModelSummary>>,
     /// Why the active model cannot be used; then `model` is `None`.
     pub model_fault: Option<ModelFault>,
     /// Tracks, drift detection and listeners; the same as long as the camera exists.
     pub(super) live: Arc<CameraLive>,
+}
+
+/// How well a model does, and where.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelSummary {
+    /// The area that its training boxes cover.
+    pub view_area: ViewArea,
+    /// Its error on held-out samples, if there were enough.
+    pub held_out: Option<HeldOutError>,
 }
 
 /// An active model version that cannot be used.
@@ -188,19 +199,21 @@ impl Registry {
             Some(number) => store.camera_move(id, number).await?.map(Arc::new),
             None => None,
         };
-        let loaded = same.filter(|known| known.moved == moved).and_then(|known| known.model.clone());
+        let loaded = same
+            .filter(|known| known.moved == moved)
+            .and_then(|known| Some((known.model.clone()?, known.model_summary.clone()?)));
         let mut model_fault = None;
         let model = match (camera.active_model, loaded) {
             (None, _) => None,
-            (Some(number), Some(loaded)) if loaded.1 == number => Some(loaded),
-            (Some(number), _) => match load_regressor(store, id, number).await {
-                Ok(regressor) => {
+            (Some(number), Some(loaded)) if loaded.0.1 == number => Some(loaded),
+            (Some(number), _) => match load_model(store, id, number).await {
+                Ok((regressor, summary)) => {
                     // The error that the model states must contain the shift that was found.
                     let regressor = match &moved {
                         Some(moved) => regressor.with_added_error(moved.change_variance_m2()),
                         None => regressor,
                     };
-                    Some((Arc::new(regressor), number))
+                    Some(((Arc::new(regressor), number), Arc::new(summary)))
                 }
                 Err(error) => {
                     model_fault = Some(self.model_fault(id, number, error)?);
@@ -208,6 +221,7 @@ impl Registry {
                 }
             },
         };
+        let (model, model_summary) = model.unzip();
         Ok(Arc::new(ActiveCamera {
             id: id.clone(),
             key: camera.key,
@@ -222,6 +236,7 @@ impl Registry {
             retrain_when_moved: camera.profile.retrain_when_moved,
             receivers: camera.profile.receivers,
             model,
+            model_summary,
             model_fault,
         }))
     }
@@ -254,9 +269,18 @@ impl Registry {
 ///
 /// # Errors
 /// `ModelNotFound`; `ModelUnusable` if what is stored is damaged or does not pass the checks of a model.
-pub(super) async fn load_regressor(store: &Store, id: &CameraId, number: u32) -> Result<Regressor> {
+pub(super) async fn load_model(
+    store: &Store,
+    id: &CameraId,
+    number: u32,
+) -> Result<(Regressor, ModelSummary)> {
     let (metadata, weights) = store.model_content(id, number).await?;
-    Artifact { metadata, weights: weights.into() }.load().map_err(|error| match error {
+    let artifact = Artifact { metadata, weights: weights.into() };
+    let loaded = artifact.load().and_then(|regressor| {
+        let view_area = artifact.view_area(&regressor)?;
+        Ok((regressor, ModelSummary { view_area, held_out: artifact.metadata.held_out.clone() }))
+    });
+    loaded.map_err(|error| match error {
         Error::Refused(refusal) => Error::refused(
             ErrorKind::ModelUnusable,
             format!("version {number} of camera {id} cannot be used: {}", Error::Refused(refusal)),
@@ -282,7 +306,7 @@ mod tests {
             let changed = NewCamera { display_name: "gate".to_owned(), ..NewCamera::named(id.clone()) };
             store.replace_camera(&changed, None, Timestamp::UNIX_EPOCH).await.expect("changed");
             let delete = async {
-                store.delete_camera(&id, None).await.expect("deleted");
+                store.delete_camera(&id, None, Timestamp::UNIX_EPOCH).await.expect("deleted");
                 registry.forget(&id).await;
             };
             let (refreshed, ()) = tokio::join!(registry.refresh(&store), delete);

@@ -161,7 +161,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`.
     pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
-        self.store.delete_samples(id, filter).await
+        self.store.delete_samples(id, filter, self.clock.now()).await
     }
 
     pub(super) async fn store_batch(

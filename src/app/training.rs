@@ -95,7 +95,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `RunNotFound`, `RunLive`.
     pub async fn delete_run(&self, id: &CameraId, run: RunId) -> Result<()> {
-        self.store.delete_run(id, run).await
+        self.store.delete_run(id, run, self.clock.now()).await
     }
 
     /// The run's curve: one report per epoch of the final fit.

@@ -5,6 +5,7 @@ use std::path::Path;
 use clap::Args;
 
 use super::DataFolder;
+use super::output::print_line;
 
 /// Print the effective settings
 #[derive(Args)]
@@ -15,8 +16,6 @@ pub(super) struct PrintConfig {
 
 impl PrintConfig {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
-        // No setting is secret; a secret one needs a type whose serialisation hides it.
-        print!("{}", toml::to_string_pretty(&self.folder.settings(file)?)?);
-        Ok(())
+        print_line(&toml::to_string_pretty(&self.folder.settings(file)?)?.trim_end())
     }
 }

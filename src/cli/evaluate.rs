@@ -7,6 +7,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::import::{gnss_bias_sigma, image_size};
+use super::output::print_line;
 use super::progress::Progress;
 use super::recordings;
 use super::{format_of, open_file};
@@ -113,7 +114,7 @@ impl Evaluate {
         };
         let input = FitInput { samples: &train.samples, unpaired: &train.unpaired };
         let evaluation = evaluate_with_progress(input, &test, &truth, &options)?;
-        print!("{}", evaluation.report.table());
+        print_line(&format_args!("{}", evaluation.report.table().trim_end()))?;
         if let Some(path) = &self.json {
             write(path, &evaluation.report.to_json()?)?;
         }
@@ -145,7 +146,7 @@ impl Evaluate {
         for document in &documents {
             write(&folder.join(&document.path), &document.text)?;
         }
-        print!("{}", documents.first().map_or("", |page| &page.text));
+        print_line(&format_args!("{}", documents.first().map_or("", |page| page.text.trim_end())))?;
         Ok(())
     }
 

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::Args;
 
-use super::{DataFolder, camera_id, format_of, open_app, open_file, runtime};
+use super::output::print_line;
+use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime};
 use crate::clock::Clock;
 use crate::domain::{CameraId, ImageSize, TimeBounds};
 use crate::exchange::{self, RowRules};
@@ -72,7 +73,7 @@ impl Fuse {
         }
         writer.finish()?;
         out.flush()?;
-        println!("answered {answered}, rejected {rejected}");
+        print_line(&format_args!("answered {answered}, rejected {rejected}"))?;
         Ok(())
     }
 
@@ -85,7 +86,7 @@ impl Fuse {
         let id = self.camera.as_ref().context("give --camera or --model")?;
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
-            let app = open_app(&settings, "sightfix fuse").await?;
+            let app = open_app(&settings, "sightfix fuse", MissingData::Refuse).await?;
             let camera = app.camera(id).await?;
             let serving = app.registry.get(id).context("the camera was deleted")?;
             app.store.close().await;

@@ -6,6 +6,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::open_file;
+use super::output::print_line;
 use crate::app::GnssErrorEstimate;
 use crate::clock::Clock;
 use crate::config::Limits;
@@ -30,16 +31,19 @@ impl EstimateGnssError {
         for row in &estimate.rejected_rows {
             eprintln!("line {}: {}: {}", row.line, row.field, row.reason);
         }
-        println!("fixes              {}, rejected {}", estimate.fixes, estimate.rejected);
-        println!(
+        print_line(&format_args!("fixes              {}, rejected {}", estimate.fixes, estimate.rejected))?;
+        print_line(&format_args!(
             "mean               {:.8} {:.8} (longitude, latitude)",
             estimate.mean.longitude_deg(),
             estimate.mean.latitude_deg()
-        );
-        println!("east variance      {:.4} m2", estimate.east_variance_m2);
-        println!("north variance     {:.4} m2", estimate.north_variance_m2);
-        println!("e_gnss             {:.4} m2 per axis", estimate.e_gnss_m2);
-        println!("sigma              {:.4} m per axis, for the camera's gnss_error", estimate.sigma_m);
+        ))?;
+        print_line(&format_args!("east variance      {:.4} m2", estimate.east_variance_m2))?;
+        print_line(&format_args!("north variance     {:.4} m2", estimate.north_variance_m2))?;
+        print_line(&format_args!("e_gnss             {:.4} m2 per axis", estimate.e_gnss_m2))?;
+        print_line(&format_args!(
+            "sigma              {:.4} m per axis, for the camera's gnss_error",
+            estimate.sigma_m
+        ))?;
         Ok(())
     }
 }

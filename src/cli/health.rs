@@ -8,6 +8,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use clap::Args;
 
+use super::output::print_line;
 use crate::config::{Config, Overrides};
 
 const TIMEOUT: Duration = Duration::from_secs(2);
@@ -22,14 +23,14 @@ pub(super) struct Health {
 
 impl Health {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
-        let settings = Config::load(file, Overrides { data: None, listen: self.listen })?;
+        let settings = Config::load(file, Overrides { listen: self.listen, ..Overrides::default() })?;
         let mut address = settings.listen;
         if address.ip().is_unspecified() {
             address.set_ip(IpAddr::V4(Ipv4Addr::LOCALHOST));
         }
         let answer = request_liveness(address).with_context(|| format!("no answer from {address}"))?;
         anyhow::ensure!(answer.starts_with("HTTP/1.1 200"), "{address} answered {answer:?}");
-        println!("{address} is alive");
+        print_line(&format_args!("{address} is alive"))?;
         Ok(())
     }
 }

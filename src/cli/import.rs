@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
+use super::output::print_line;
 use super::progress::Progress;
-use super::{DataFolder, camera_id, format_of, open_app, open_file, runtime};
-use crate::app::ImportReport;
+use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime};
+use crate::app::{App, ImportReport};
 use crate::domain::{CameraId, Durability, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera};
 
 /// Import samples from a file into a camera
@@ -46,8 +47,9 @@ impl Import {
             bytes,
             progress: Progress::new("{bar:40} {bytes}/{total_bytes}"),
         };
+        let missing = if self.create { MissingData::Create } else { MissingData::Refuse };
         let report = runtime()?.block_on(async {
-            let app = open_app(&settings, "sightfix import").await?;
+            let app = open_app(&settings, "sightfix import", missing).await?;
             if self.create {
                 let profile = NewCamera {
                     image_size: self.image_size,
@@ -55,7 +57,9 @@ impl Import {
                     ..NewCamera::named(self.camera.clone())
                 };
                 match app.create_camera(profile).await {
-                    Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {}
+                    Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {
+                        self.check_image_size(&app).await?;
+                    }
                     created => drop(created?),
                 }
             }
@@ -63,7 +67,7 @@ impl Import {
             app.store.close().await;
             anyhow::Ok(report?)
         })?;
-        print(&report);
+        print(&report)?;
         anyhow::ensure!(
             report.accepted + report.duplicate > 0 || report.rejected == 0,
             "every row was rejected"
@@ -72,15 +76,33 @@ impl Import {
     }
 }
 
-fn print(report: &ImportReport) {
+impl Import {
+    /// Boxes of another image would be stored as if they were of this one.
+    async fn check_image_size(&self, app: &App) -> anyhow::Result<()> {
+        let stored = app.camera(&self.camera).await?.profile.image_size;
+        let Some(wanted) = self.image_size.filter(|_| stored != self.image_size) else { return Ok(()) };
+        let shown = |size: ImageSize| format!("{}x{}", size.width_px(), size.height_px());
+        anyhow::bail!(
+            "camera {} exists with the image size {}, not {}; leave --image-size out, or change the profile",
+            self.camera,
+            stored.map_or_else(|| "unknown".to_owned(), shown),
+            shown(wanted)
+        )
+    }
+}
+
+fn print(report: &ImportReport) -> anyhow::Result<()> {
     let ImportReport { accepted, without_fix, duplicate, rejected, rejected_rows } = report;
-    println!("accepted {accepted} (without a fix {without_fix}), duplicate {duplicate}, rejected {rejected}");
+    print_line(&format_args!(
+        "accepted {accepted} (without a fix {without_fix}), duplicate {duplicate}, rejected {rejected}"
+    ))?;
     for row in rejected_rows {
-        println!("line {}: {}: {}", row.line, row.field, row.reason);
+        print_line(&format_args!("line {}: {}: {}", row.line, row.field, row.reason))?;
     }
     if *rejected > rejected_rows.len() as u64 {
-        println!("... and {} more", rejected - rejected_rows.len() as u64);
+        print_line(&format_args!("... and {} more", rejected - rejected_rows.len() as u64))?;
     }
+    Ok(())
 }
 
 /// A size as `1920x1080`.

@@ -9,7 +9,9 @@ mod fuse;
 mod gnss_error;
 mod health;
 mod import;
+mod keys;
 mod openapi;
+mod output;
 mod pair;
 mod progress;
 mod recordings;
@@ -24,6 +26,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::{Args, Parser, Subcommand};
 
+use crate::app::access::Caller;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
@@ -63,6 +66,8 @@ enum Command {
     Simulate(simulate::Simulate),
     /// Stream recorded boxes and fixes to a server, as one or many cameras
     Replay(replay::Replay),
+    /// Create, list and revoke the keys that clients of a server present
+    Keys(keys::Keys),
     /// Check whether a server is alive
     Health(health::Health),
     /// Print the effective settings
@@ -93,7 +98,8 @@ impl Cli {
             Command::GnssError(command) => command.run(),
             Command::Evaluate(command) => command.run(),
             Command::Simulate(command) => command.run(),
-            Command::Replay(command) => command.run(),
+            Command::Replay(command) => command.run(file),
+            Command::Keys(command) => command.run(file),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),
@@ -104,29 +110,42 @@ impl Cli {
 /// The data folder of a command.
 #[derive(Args)]
 struct DataFolder {
-    /// Folder of the database; created if it does not exist
+    /// Folder of the database
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
 }
 
 impl DataFolder {
     fn settings(&self, file: Option<&Path>) -> anyhow::Result<Config> {
-        Config::load(file, Overrides { data: self.data.clone(), listen: None })
+        Config::load(file, Overrides { data: self.data.clone(), ..Overrides::default() })
     }
+}
+
+/// What to do where there is no data folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum MissingData {
+    Create,
+    /// A mistyped path must not become a folder.
+    Refuse,
 }
 
 /// The application on the data folder, without a server. A server may use the same folder; each logs the
 /// other, this process by its `role`.
-async fn open_app(settings: &Config, role: &str) -> anyhow::Result<App> {
+async fn open_app(settings: &Config, role: &str, missing: MissingData) -> anyhow::Result<App> {
+    let folder = settings.data.display();
+    anyhow::ensure!(
+        missing == MissingData::Create || settings.data.is_dir(),
+        "there is no data folder {folder}; `sightfix serve` and `sightfix import --create` make one"
+    );
     let options = StoreOptions { limits: store_limits(&settings.limits), role: role.to_owned() };
     let store = Store::open_with(&settings.data, options)
         .await
-        .with_context(|| format!("cannot open the data folder {}", settings.data.display()))?;
+        .with_context(|| format!("cannot open the data folder {folder}"))?;
     for other in store.newcomers() {
         eprintln!("note: another process uses the same data folder: {other}");
     }
-    Ok(App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new())
-        .await?)
+    let app = App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new());
+    Ok(app.await?.on_behalf_of(Caller::program(role)))
 }
 
 /// The tokio runtime of one command.

@@ -2,6 +2,7 @@
 
 use clap::Args;
 
+use super::output::print_line;
 use crate::http;
 
 /// Print the OpenAPI description of the REST interface
@@ -10,7 +11,6 @@ pub(super) struct Openapi {}
 
 impl Openapi {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        println!("{}", http::openapi().to_pretty_json()?);
-        Ok(())
+        print_line(&http::openapi().to_pretty_json()?)
     }
 }

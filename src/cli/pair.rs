@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 use clap::Args;
 
+use super::output::print_line;
 use super::{format_of, open_file, receiver_id, target_id};
 use crate::app::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use crate::clock::Clock;
@@ -68,15 +69,15 @@ impl Pair {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let settings = PairingSettings::new(self.method, self.window_s, self.longest_gap_s)?;
         let (mut recording, format) = self.read()?;
-        print_rejected(&recording.rejected);
+        print_rejected(&recording.rejected)?;
         let mut receivers = self.receivers()?;
         if let Some(receiver) = recording.name_fixes(format, &receivers, self.receiver_id.clone())? {
-            println!("fixes that name no receiver are those of {}", carried(&receiver));
+            print_line(&format_args!("fixes that name no receiver are those of {}", carried(&receiver)))?;
         }
         if self.estimate_offset {
             let estimates = recording.clock_offsets(&receivers);
             for (receiver, estimate) in &estimates {
-                print_offset(receiver, estimate.as_ref());
+                print_offset(receiver, estimate.as_ref())?;
             }
             if self.apply_offset {
                 receivers = applied(&receivers, &estimates)?;
@@ -84,11 +85,11 @@ impl Pair {
         }
         let Some(out) = &self.out else { return Ok(()) };
         let (paired, counts, _) = recording.paired(&receivers, &settings);
-        print_counts(&counts);
+        print_counts(&counts)?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
         let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
         if self.keep_unpaired {
-            println!("boxes kept without a fix {}", paired.unpaired_detections.len());
+            print_line(&format_args!("boxes kept without a fix {}", paired.unpaired_detections.len()))?;
         }
         exchange::write_samples(
             BufWriter::new(file),
@@ -156,7 +157,7 @@ fn carried(receiver: &Receiver) -> String {
     format!("{}, carried by {}", receiver.receiver_id, receiver.target_id)
 }
 
-fn print_rejected(rejected: &RejectedParts) {
+fn print_rejected(rejected: &RejectedParts) -> anyhow::Result<()> {
     for (part, row) in &rejected.rows {
         eprintln!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason);
     }
@@ -165,47 +166,48 @@ fn print_rejected(rejected: &RejectedParts) {
         eprintln!("... and {} more", rejected.count - printed);
     }
     if rejected.count > 0 {
-        println!("rejected rows {}", rejected.count);
+        print_line(&format_args!("rejected rows {}", rejected.count))?;
     }
+    Ok(())
 }
 
-fn print_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) {
+fn print_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) -> anyhow::Result<()> {
     let receiver_and_target = carried(receiver);
     let given_s = receiver.clock_offset.seconds();
     match estimate {
-        None => println!(
+        None => print_line(&format_args!(
             "clock offset of {receiver_and_target}: cannot be estimated (too little movement, too little overlap, or \
              more than 10 s); {given_s:+.3} s is given"
-        ),
-        Some(found) => println!(
+        )),
+        Some(found) => print_line(&format_args!(
             "clock offset of {receiver_and_target}: {:+.3} s, standard deviation {:.3} s, explains {:.1} % of the movement \
              ({:.1} % without an offset); {given_s:+.3} s is given",
             found.clock_offset.as_secs_f64(),
             found.sigma_s,
             100.0 * found.explained,
             100.0 * found.explained_at_zero,
-        ),
+        )),
     }
 }
 
-fn print_counts(counts: &PairingCounts) {
+fn print_counts(counts: &PairingCounts) -> anyhow::Result<()> {
     let PairingCounts { detections, fixes, paired, .. } = counts;
-    println!("paired {paired} of {detections} detections and {fixes} fixes");
-    println!(
+    print_line(&format_args!("paired {paired} of {detections} detections and {fixes} fixes"))?;
+    print_line(&format_args!(
         "unpaired detections: no fix of the target {}, no fix near in time {}, nearest fix is nearer to \
          another box {}, duplicate {}",
         counts.detections_without_fixes,
         counts.detections_far_from_fixes,
         counts.detections_with_fix_claimed,
         counts.detections_duplicate,
-    );
-    println!(
+    ))?;
+    print_line(&format_args!(
         "unused fixes: no receiver named {}, no box of the target {}, no box to take it {}, duplicate {}",
         counts.fixes_without_receiver,
         counts.fixes_without_detections,
         counts.fixes_unused,
         counts.fixes_duplicate,
-    );
+    ))
 }
 
 /// A receiver as `phone-7=person-1`.

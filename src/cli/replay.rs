@@ -6,14 +6,17 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use anyhow::Context as _;
 use clap::{Args, value_parser};
 use jiff::SignedDuration;
 use tokio_util::sync::CancellationToken;
 
+use super::output::print_line;
 use super::progress::Progress;
 use super::{camera_id, format_of, open_file, receiver_id, runtime, target_id};
 use crate::clock::Clock;
-use crate::domain::{CameraId, ReceiverId, TargetId, TimeBounds};
+use crate::config::{Config, Overrides};
+use crate::domain::{CameraId, KeySecret, ReceiverId, TargetId, TimeBounds};
 use crate::exchange::{self, ObservedRow, RowRules};
 use crate::replay::{
     Counters, FaultShares, FixOwner, Pace, RecordedStream, ReplayOptions, ReplayReport, replay,
@@ -57,6 +60,9 @@ struct Destination {
     /// Address of the server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
     server: String,
+    /// File with the secret of the key to present; or set SIGHTFIX_API_KEY
+    #[arg(long, value_name = "FILE")]
+    key_file: Option<PathBuf>,
     /// Camera of the server; repeat it for more, simulated cameras are assigned round robin
     #[arg(long = "camera", value_name = "ID", value_parser = camera_id, required_unless_present = "camera_prefix")]
     camera_ids: Vec<CameraId>,
@@ -127,7 +133,7 @@ struct Delivery {
 }
 
 impl Replay {
-    pub(super) fn run(self) -> anyhow::Result<()> {
+    pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let now = Clock::system().now();
         let recording = self.recording(TimeBounds::at(now))?;
         let shift = match self.pacing.shift_to_now {
@@ -136,6 +142,7 @@ impl Replay {
         };
         let options = ReplayOptions {
             server: self.destination.server.clone(),
+            key: self.destination.key(file)?,
             camera_ids: self.destination.camera_ids()?,
             cameras: self.destination.cameras as usize,
             client_name: self.destination.client_name.clone(),
@@ -153,9 +160,9 @@ impl Replay {
         };
         let report = runtime()?.block_on(replay_with_progress(recording, options))?;
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&report)?);
+            print_line(&format_args!("{}", serde_json::to_string_pretty(&report)?))?;
         } else {
-            print!("{report}");
+            print_line(&format_args!("{}", report.to_string().trim_end()))?;
         }
         anyhow::ensure!(report.is_complete(), "not every item was answered and acknowledged");
         Ok(())
@@ -178,6 +185,19 @@ impl Replay {
 }
 
 impl Destination {
+    /// The key of the file, or of the setting `api_key`.
+    fn key(&self, settings: Option<&Path>) -> anyhow::Result<Option<KeySecret>> {
+        let secret = match &self.key_file {
+            Some(path) => Some(
+                std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?,
+            ),
+            None => {
+                Config::load(settings, Overrides::default())?.api_key.map(|secret| secret.reveal().to_owned())
+            }
+        };
+        Ok(secret.map(|secret| KeySecret::parse(secret.trim())).transpose()?)
+    }
+
     fn camera_ids(&self) -> anyhow::Result<Vec<CameraId>> {
         match &self.camera_prefix {
             Some(prefix) => {

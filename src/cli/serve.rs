@@ -3,7 +3,7 @@
 mod demo;
 
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use clap::Args;
@@ -11,7 +11,7 @@ use clap::Args;
 use super::{DataFolder, runtime};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
-use crate::server::Server;
+use crate::server::{Reloader, Server};
 use crate::shutdown::Shutdown;
 use crate::telemetry;
 
@@ -24,13 +24,36 @@ pub(super) struct Serve {
     /// Fill an empty data folder with a small simulated camera, train it, and print requests to try
     #[arg(long)]
     demo: bool,
+    /// Serve everybody on an address that other machines reach, while no key exists
+    #[arg(long)]
+    insecure: bool,
+    /// File with the secret of an administrator's key; or set SIGHTFIX_ADMIN_KEY
+    #[arg(long, value_name = "FILE")]
+    admin_key_file: Option<PathBuf>,
+    /// Certificate chain of the server (PEM): serve TLS; plain HTTP then only to this machine
+    #[arg(long, value_name = "FILE", requires = "tls_key")]
+    tls_cert: Option<PathBuf>,
+    /// Private key of the certificate (PEM)
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    tls_key: Option<PathBuf>,
+    /// Authority of client certificates (PEM), which have the role of the setting tls.client_role
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    tls_client_ca: Option<PathBuf>,
     #[command(flatten)]
     folder: DataFolder,
 }
 
 impl Serve {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
-        let overrides = Overrides { data: self.folder.data, listen: self.listen };
+        let overrides = Overrides {
+            data: self.folder.data,
+            listen: self.listen,
+            insecure: self.insecure,
+            admin_key_file: self.admin_key_file,
+            tls_certificate: self.tls_cert,
+            tls_key: self.tls_key,
+            tls_client_ca: self.tls_client_ca,
+        };
         let settings = Config::load(file, overrides)?;
         telemetry::start_log(&settings)?;
         runtime()?.block_on(async {
@@ -39,8 +62,10 @@ impl Serve {
             let (app, shutdown) = (server.app().clone(), server.shutdown());
             tokio::spawn(shut_down_on_signal(shutdown.clone()));
             #[cfg(unix)]
-            log_hangups();
-            tracing::info!(%address, folder = %settings.data.display(), "serving REST and gRPC");
+            reload_on_hangup(server.reloader());
+            tracing::info!(
+                %address, folder = %settings.data.display(), tls = server.has_tls(), "serving REST and gRPC"
+            );
             let serving = tokio::spawn(server.run());
             let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
             if shown.is_err() {
@@ -80,15 +105,19 @@ async fn wait_for_signal() {
     let _ = tokio::signal::ctrl_c().await;
 }
 
-/// Logs each SIGHUP, which would else end the process: a closed terminal must not stop a server.
+/// Loads certificate and keys again with each SIGHUP, which would else end the process: a closed terminal
+/// must not stop a server.
 #[cfg(unix)]
-fn log_hangups() {
+fn reload_on_hangup(reloader: Reloader) {
     use tokio::signal::unix::{SignalKind, signal};
     match signal(SignalKind::hangup()) {
         Ok(mut hangups) => {
             tokio::spawn(async move {
                 while hangups.recv().await.is_some() {
-                    tracing::info!("SIGHUP received; settings are read at the start only");
+                    tracing::info!(
+                        "SIGHUP received: certificate and keys are loaded again, settings at the start only"
+                    );
+                    reloader.reload().await;
                 }
             });
         }

@@ -5,8 +5,9 @@ use std::path::Path;
 use clap::Args;
 use futures_util::StreamExt as _;
 
+use super::output::print_line;
 use super::progress::Progress;
-use super::{DataFolder, camera_id, open_app, runtime};
+use super::{DataFolder, MissingData, camera_id, open_app, runtime};
 use crate::app::{App, RunRequest};
 use crate::config::Config;
 use crate::domain::{CameraId, JobState, Recipe, RunProgress, TrainingRun};
@@ -36,7 +37,7 @@ impl Train {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
-            let app = open_app(&settings, "sightfix train").await?;
+            let app = open_app(&settings, "sightfix train", MissingData::Refuse).await?;
             let request = RunRequest {
                 recipe: self.recipe,
                 seed: self.seed,
@@ -48,9 +49,9 @@ impl Train {
             let ended = ended?;
             let outcome = ended.outcome.as_deref().unwrap_or("no outcome was recorded");
             anyhow::ensure!(ended.state == JobState::Succeeded, "{}: {outcome}", ended.state.as_str());
-            println!("version {} {outcome}", ended.model_version.unwrap_or_default());
+            print_line(&format_args!("version {} {outcome}", ended.model_version.unwrap_or_default()))?;
             if let Some(report) = &ended.report {
-                println!("{report}");
+                print_line(report)?;
             }
             Ok(())
         })

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 
 use super::bounding_box::ImageSize;
-use super::error::{Error, Result};
+use super::error::{Error, ErrorKind, Result};
 use super::gnss_error::{GnssBiasSigma, GnssError};
 use super::names::{CameraId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
@@ -151,6 +151,37 @@ impl CameraChange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct CameraKey(pub i64);
 
+/// What a change is based on: refused if the camera is another one by now, or has been changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ExpectedVersion {
+    /// The camera, if the caller knows which of those that had the id it means.
+    pub key: Option<CameraKey>,
+    /// The revision of its profile.
+    pub revision: Revision,
+}
+
+impl ExpectedVersion {
+    /// # Errors
+    /// `RevisionMismatch` if a camera is not the expected one.
+    pub fn check(self, camera: &Camera) -> Result<()> {
+        if self.revision == camera.revision && self.key.is_none_or(|key| key == camera.key) {
+            return Ok(());
+        }
+        let message = format!(
+            "the camera is at revision {} and was changed, or created again, since it was read; read it again and \
+             repeat the change",
+            camera.revision.0
+        );
+        Err(Error::refused(ErrorKind::RevisionMismatch, message))
+    }
+}
+
+impl From<Revision> for ExpectedVersion {
+    fn from(revision: Revision) -> Self {
+        Self { key: None, revision }
+    }
+}
+
 /// A stored camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
@@ -171,6 +202,12 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// What a change of it is based on.
+    #[must_use]
+    pub const fn version(&self) -> ExpectedVersion {
+        ExpectedVersion { key: Some(self.key), revision: self.revision }
+    }
+
     /// The camera's id.
     #[must_use]
     pub const fn id(&self) -> &CameraId {

@@ -40,6 +40,8 @@ pub enum ErrorKind {
     EvaluationNotFound,
     /// No such model version.
     ModelNotFound,
+    /// No such key.
+    KeyNotFound,
     /// A camera of that id exists already.
     CameraExists,
     /// `If-Match` names another revision than the stored one.
@@ -48,6 +50,8 @@ pub enum ErrorKind {
     RevisionRequired,
     /// The camera has no active model yet.
     NoModel,
+    /// No other model version was active before the active one.
+    NoEarlierModel,
     /// The stored model version is damaged or cannot be loaded.
     ModelUnusable,
     /// The camera has a training run that has not ended.
@@ -70,6 +74,10 @@ pub enum ErrorKind {
     Timeout,
     /// The server is ending.
     ShuttingDown,
+    /// No key was presented, or one that does not work.
+    Unauthenticated,
+    /// The key may not do this.
+    PermissionDenied,
     /// The request names a host that this server does not answer for.
     HostNotAllowed,
     /// A web page of another origin asks for a change.

@@ -94,7 +94,7 @@ pub struct EvaluationPlan {
 /// Progress of an evaluation.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, ToSchema)]
 pub struct EvaluationProgress {
-    /// Current phase: `auto, seed 2, held-out block 2 of 4 12/60`, `track, seed 2`.
+    /// Current phase: `auto, seed 2, held-out group 2 of 4 12/60`, `track, seed 2`.
     pub phase: String,
     /// Completed steps. A step is the fit of a recipe, or a method over all test samples, with one seed.
     pub steps_done: u32,

@@ -4,6 +4,8 @@
 //! it and do not check again. What never happens here: I/O, clocks,
 //! randomness, wire formats, status codes.
 
+mod access;
+mod audit;
 mod bounding_box;
 mod camera;
 mod checksum;
@@ -23,8 +25,10 @@ mod score;
 mod time;
 mod training;
 
+pub use access::{ApiKey, KeyId, KeySecret, NewKey, Role, Scope, SecretDigest};
+pub use audit::{Actor, AuditAction, AuditEntry, AuditNumber};
 pub use bounding_box::{BoundingBox, ImageSize};
-pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, NewCamera, Revision};
+pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, ExpectedVersion, NewCamera, Revision};
 pub use checksum::model_sha256;
 pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};

@@ -1,5 +1,6 @@
 //! Valid times of samples and observations, and their text format.
 
+use jiff::civil::DateTime;
 use jiff::{SignedDuration, Timestamp};
 
 use super::error::{Error, Result};
@@ -62,12 +63,64 @@ impl TimeBounds {
 /// Parses RFC 3339 text with an offset: `2020-12-14T14:41:48+08:00`.
 ///
 /// # Errors
-/// Names the field `time` for text that is not such an instant or has no offset.
+/// Names the field `time` for text that is not such an instant, has no offset, names a leap second, or lies
+/// outside of the years that can be represented.
 pub fn parse_time(text: &str) -> Result<Timestamp> {
-    text.parse().map_err(|_| {
-        Error::invalid(
-            "time",
+    let invalid = |message| Err(Error::invalid("time", message));
+    // The library takes a leap second for the second before it.
+    if text.get(16..19) == Some(":60") {
+        return invalid("has the second 60; a leap second is the second 59 or the next 0");
+    }
+    if text.len() > 19 && offset_hours(text).is_some_and(|hours| hours > 23) {
+        return invalid("has an offset of more than 23:59 hours");
+    }
+    match text.parse() {
+        Ok(time) => Ok(time),
+        Err(_)
+            if text.get(..19).is_some_and(|civil| civil.parse::<DateTime>().is_ok()) && has_offset(text) =>
+        {
+            invalid("is outside of the times that can be represented, which end in the year 9999")
+        }
+        Err(_) => invalid(
             "must be RFC 3339 with an offset, such as 2020-12-14T14:41:48+08:00 or 2020-12-14T06:41:48Z",
-        )
-    })
+        ),
+    }
+}
+
+/// The hours of an offset at the end, such as `+08:00`.
+fn offset_hours(text: &str) -> Option<u32> {
+    let offset = text.get(text.len().checked_sub(6)?..)?;
+    offset.strip_prefix(['+', '-'])?.get(..2)?.parse().ok()
+}
+
+fn has_offset(text: &str) -> bool {
+    text.ends_with(['Z', 'z']) || offset_hours(text).is_some()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_that_do_not_exist_are_refused_and_named() {
+        for (text, told) in [
+            ("2020-12-14T14:41:60Z", "second 60"),
+            ("2020-12-14T14:41:60.5+08:00", "second 60"),
+            ("2020-12-14T14:41:48+25:00", "offset"),
+            ("2020-12-14T14:41:48-24:00", "offset"),
+            ("9999-12-31T23:59:59Z", "9999"),
+            ("2020-12-14T14:41:48", "RFC 3339"),
+            ("2020-13-14T14:41:48Z", "RFC 3339"),
+            ("yesterday", "RFC 3339"),
+            ("", "RFC 3339"),
+            ("é2020-12-14T14:41:6", "RFC 3339"),
+        ] {
+            let refused = parse_time(text).expect_err(text).to_string();
+            assert!(refused.starts_with("time: ") && refused.contains(told), "{text}: {refused}");
+        }
+        for text in ["2020-12-14T14:41:48+08:00", "2020-12-14T06:41:48Z", "2020-12-14T06:41:48.123456-23:59"]
+        {
+            assert!(parse_time(text).is_ok(), "{text}");
+        }
+    }
 }

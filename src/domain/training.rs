@@ -28,7 +28,7 @@ pub struct TrainingOptions {
 /// Progress of a fit.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct RunProgress {
-    /// Current phase: `held-out block 2 of 4`, `final fit`.
+    /// Current phase: `held-out group 2 of 4`, `final fit`.
     pub phase: String,
     /// Completed epochs, over all phases.
     pub epoch: u32,
@@ -88,7 +88,7 @@ pub struct TrainingRun {
     pub ended_at: Option<Timestamp>,
 }
 
-/// Prediction error on whole targets (from five targets on) or blocks of time that were held out of the fit.
+/// Prediction error on whole targets, or on blocks of time where one target has nearly all samples, held out of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct HeldOutError {
     /// Number of groups of targets, or of blocks of time, that were held out in turn.

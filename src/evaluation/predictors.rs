@@ -5,12 +5,11 @@ use super::options::{EvaluateOptions, TestRow};
 use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, SigmaM};
 use crate::filters::ImmUkf;
-use crate::fusion::PlaneCovariance;
-use crate::fusion::observed::{ObservedPositions, UNKNOWN_RECEIVER_M2};
+use crate::fusion::observed::UNKNOWN_RECEIVER_M2;
 use crate::fusion::target_track::TargetTrack;
 use crate::fusion::track::TrackSettings;
 use crate::fusion::two_step::fuse;
-use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::geo::{EastNorth, LocalPlane, PlaneCovariance, Position};
 use crate::model::{FEWEST_SAMPLES, FitInput, R95_PER_SIGMA, Regressor, fix_sequences};
 
 /// A predicted position with its stated 95 % radius.
@@ -208,7 +207,7 @@ impl<'a> Predictors<'a> {
                 let given = &test[row].observation;
                 let used = if with_fix { Some(given.clone()) } else { given.without_fix() };
                 let observed = used.as_ref().map(|observation| {
-                    ObservedPositions::of(observation, Some(regressor), image_size, Some(e_gnss_m2))
+                    track.observe(observation, Some(regressor), image_size, Some(e_gnss_m2))
                 });
                 let estimate = match observed.filter(|observed| !observed.is_empty()) {
                     Some(observed) => track.update(&observed, || settings),

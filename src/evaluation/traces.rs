@@ -2,7 +2,7 @@
 
 use super::report::Report;
 use crate::domain::{EpochReport, Recipe};
-use crate::fusion::PlaneCovariance;
+use crate::geo::PlaneCovariance;
 use crate::geo::Position;
 
 /// A position predicted with the first seed.

@@ -3,7 +3,7 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
-use crate::domain::{CameraId, Error, EvaluationId, Result, RunId};
+use crate::domain::{AuditNumber, CameraId, Error, EvaluationId, KeyId, Result, RunId};
 
 /// Largest accepted cursor, bytes.
 const MAX_BYTES: usize = 512;
@@ -72,6 +72,30 @@ impl Cursor for EvaluationId {
 
     fn from_key(key: &str) -> Option<Self> {
         key.parse().ok()
+    }
+}
+
+impl Cursor for KeyId {
+    const LIST: &'static str = "keys";
+
+    fn to_key(&self) -> String {
+        self.to_string()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        key.parse().ok()
+    }
+}
+
+impl Cursor for AuditNumber {
+    const LIST: &'static str = "audit";
+
+    fn to_key(&self) -> String {
+        self.0.to_string()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        key.parse().ok().map(Self)
     }
 }
 

@@ -18,8 +18,10 @@ mod format;
 mod formula_guard;
 mod gpsd;
 mod gpx;
+mod json_errors;
 mod lines;
 mod nmea_fixes;
+mod objects_only;
 mod rows;
 #[cfg(test)]
 mod tests;

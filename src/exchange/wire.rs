@@ -8,9 +8,12 @@ use std::fmt;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use serde_path_to_error::Track;
 use utoipa::ToSchema;
 
-use crate::domain::{self, Error, ErrorKind, Result, SigmaM, TimeBounds, parse_time};
+use super::json_errors::refusal_of;
+use super::objects_only;
+use crate::domain::{self, Error, Result, SigmaM, TimeBounds, parse_time};
 use crate::geo::{self, PositionError};
 
 /// Text borrowed from the JSON document if it has no escapes.
@@ -347,7 +350,8 @@ impl fmt::Display for Flags<'_> {
 /// name the path of the field.
 pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
     // Tracking the path is slow, so it is done only for an error.
-    match serde_json::from_slice(json) {
+    let mut source = serde_json::Deserializer::from_slice(json);
+    match objects_only::deserialize(&mut source).and_then(|value| source.end().map(|()| value)) {
         Ok(value) => Ok(value),
         Err(_) => parse_with_path(json),
     }
@@ -355,38 +359,12 @@ pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
 
 fn parse_with_path<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
     let mut source = serde_json::Deserializer::from_slice(json);
-    let value = serde_path_to_error::deserialize(&mut source).map_err(|error| {
-        let path = error.path().to_string();
-        refusal_of(if path == "." { "" } else { &path }, &error.into_inner())
+    let mut track = Track::new();
+    let tracked = serde_path_to_error::Deserializer::new(&mut source, &mut track);
+    let value = objects_only::deserialize(tracked).map_err(|error| {
+        let path = track.path().to_string();
+        refusal_of(if path == "." { "" } else { &path }, &error)
     })?;
     source.end().map_err(|error| refusal_of("", &error))?;
     Ok(value)
-}
-
-fn refusal_of(path: &str, error: &serde_json::Error) -> Error {
-    let message = error.to_string();
-    let (what, place) = message.rfind(" at line ").map_or((message.as_str(), ""), |at| message.split_at(at));
-    if what == "number out of range" {
-        return Error::invalid(path, "the number is too large for a double");
-    }
-    if error.is_data() {
-        let (field, reason) = field_and_reason(path, what);
-        return Error::invalid(field, reason);
-    }
-    Error::field(ErrorKind::MalformedBody, path, format!("not JSON: {what}{place}"))
-}
-
-/// serde reports a missing or unknown field at its parent; this returns the path of the field itself.
-fn field_and_reason(path: &str, what: &str) -> (String, String) {
-    let join = |name: &str| if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
-    let quoted = |begin: &str| what.strip_prefix(begin).and_then(|rest| rest.split_once('`'));
-    if let Some((name, _)) = quoted("missing field `") {
-        return (join(name), "is required".to_owned());
-    }
-    if let Some((name, rest)) = quoted("unknown field `") {
-        let is_named = path == name || path.ends_with(&format!(".{name}"));
-        let field = if is_named { path.to_owned() } else { join(name) };
-        return (field, format!("is not a known field{rest}"));
-    }
-    (path.to_owned(), what.to_owned())
 }

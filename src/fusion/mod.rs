@@ -7,9 +7,6 @@ pub mod clock_offset;
 pub mod drift_detector;
 pub mod observed;
 pub mod pairing;
-mod plane_covariance;
 pub mod target_track;
 pub mod track;
 pub mod two_step;
-
-pub use plane_covariance::PlaneCovariance;

@@ -6,8 +6,8 @@ use jiff::Timestamp;
 
 use super::track::MeasurementSource;
 use crate::domain::{BoundingBox, ImageSize, Observation, SigmaM};
-use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, Position};
-use crate::model::{Regression, Regressor};
+use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, PlaneCovariance, Position};
+use crate::model::{RecentBoxes, Regression, Regressor};
 
 /// 99.9 % quantile of chi-square with 2 degrees of freedom, -2 ln(0.001): beyond it box and fix are taken
 /// to contradict each other. One consistent pair in 1,000 is.
@@ -93,8 +93,12 @@ impl ObservedBox {
         regressor: &Regressor,
         fix: Option<EastNorth>,
         image_size: Option<ImageSize>,
+        recent: Option<&mut RecentBoxes>,
     ) -> Self {
-        let independent = regressor.regress(bounding_box, None);
+        let independent = match recent {
+            Some(recent) => regressor.regress_next(bounding_box, None, recent),
+            None => regressor.regress(bounding_box, None),
+        };
         let one_step = match fix {
             Some(_) if regressor.uses_fix() => regressor.regress(bounding_box, fix),
             _ => independent,
@@ -115,9 +119,12 @@ fn is_usable(regression: &Regression) -> bool {
 
 /// Replaces a regression without a usable position: the origin, with the plane's range as `r95_m`.
 fn anywhere_in_range(regression: &Regression) -> Regression {
+    let e_regression_m2 = (PLANE_RANGE_M / regression.r95_scale).powi(2);
     Regression {
         regressed: EastNorth::default(),
-        e_regression_m2: (PLANE_RANGE_M / regression.r95_scale).powi(2),
+        e_regression_m2,
+        covariance: PlaneCovariance::isotropic(e_regression_m2),
+        box_noise: PlaneCovariance::default(),
         outside_training: true,
         ..*regression
     }
@@ -125,13 +132,15 @@ fn anywhere_in_range(regression: &Regression) -> Regression {
 
 impl<'a> ObservedPositions<'a> {
     /// `e_gnss_m2` is the receiver's variance per axis by the camera's profile, `image_size` the
-    /// profile's. A box without a model measures nothing.
+    /// profile's. A box without a model measures nothing. `recent` summarises the earlier boxes of the same
+    /// target, if it is followed, and takes this one in.
     #[must_use]
     pub fn of(
         observation: &Observation,
         regressor: Option<&'a Regressor>,
         image_size: Option<ImageSize>,
         e_gnss_m2: Option<f64>,
+        recent: Option<&mut RecentBoxes>,
     ) -> Self {
         let fix = ObservedFix::of(observation, regressor, e_gnss_m2);
         let in_plane = fix.and_then(|fix| fix.in_plane);
@@ -142,7 +151,7 @@ impl<'a> ObservedPositions<'a> {
             plane: regressor.map(Regressor::plane),
             fix,
             regressed: regressed.map(|(bounding_box, regressor)| {
-                ObservedBox::of(bounding_box, regressor, in_plane, image_size)
+                ObservedBox::of(bounding_box, regressor, in_plane, image_size, recent)
             }),
         }
     }

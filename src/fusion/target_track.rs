@@ -13,7 +13,9 @@ use super::track::{
     MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason, Track, TrackSettings,
     TrackState,
 };
+use crate::domain::{ImageSize, Observation};
 use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::model::{RecentBoxes, Regression, Regressor};
 
 /// Latest fixes of a target without a model that decide by majority where its plane belongs.
 const RECENT_FIXES: usize = 5;
@@ -29,6 +31,7 @@ pub struct TargetTrack {
     recent_fixes: VecDeque<Position>,
     /// Measurements in a row that are older than the track by more than its time to live.
     rewound: u32,
+    recent_boxes: RecentBoxes,
 }
 
 #[derive(Debug, Clone)]
@@ -47,6 +50,19 @@ pub struct TrackEstimate {
 }
 
 impl TargetTrack {
+    /// What the next observation of the target measures, its box seen beside the target's latest ones: a
+    /// deviation too small to be noticed in one box is noticed when it lasts.
+    pub fn observe<'a>(
+        &mut self,
+        observation: &Observation,
+        regressor: Option<&'a Regressor>,
+        image_size: Option<ImageSize>,
+        e_gnss_m2: Option<f64>,
+    ) -> ObservedPositions<'a> {
+        let recent = Some(&mut self.recent_boxes);
+        ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, recent)
+    }
+
     /// Feeds what was observed at one instant, late observations at their place in time. `settings` are
     /// those of a track that starts. `None` while nothing usable was observed.
     pub fn update(
@@ -103,6 +119,7 @@ impl TargetTrack {
         if track.is_expired(observed.time) || is_elsewhere || self.rewound >= REWIND_AFTER {
             self.active = None;
             self.rewound = 0;
+            self.recent_boxes = RecentBoxes::default();
         }
     }
 
@@ -166,7 +183,13 @@ fn measurement_in(plane: &LocalPlane, observed: &ObservedPositions<'_>, with_fix
     });
     let regressed = observed.usable_box().map(|observed| {
         let point = from_model_plane(observed.independent.regressed);
-        MeasuredPosition::isotropic(point, observed.independent.variance_m2())
+        let Regression { covariance, box_noise, .. } = observed.independent;
+        let scale = observed.independent.normal_scale();
+        MeasuredPosition {
+            position: point,
+            covariance: covariance.scaled(scale),
+            white: Some(box_noise.scaled(scale)),
+        }
     });
     Measurement { time: observed.time, fix, regressed }
 }
@@ -191,7 +214,7 @@ mod tests {
     use jiff::SignedDuration;
 
     use super::*;
-    use crate::domain::{Fix, Observation};
+    use crate::domain::Fix;
 
     fn fix_at(seconds: i64, longitude_deg: f64, latitude_deg: f64) -> Observation {
         let position = Position::new(longitude_deg, latitude_deg).expect("valid");
@@ -200,7 +223,8 @@ mod tests {
     }
 
     fn feed(track: &mut TargetTrack, observation: &Observation) -> Option<TrackEstimate> {
-        track.update(&ObservedPositions::of(observation, None, None, None), TrackSettings::default)
+        let observed = track.observe(observation, None, None, None);
+        track.update(&observed, TrackSettings::default)
     }
 
     fn near(estimate: &TrackEstimate, longitude_deg: f64, latitude_deg: f64) -> bool {

@@ -37,7 +37,7 @@ pub fn two_step(regression: &Regression, fix: EastNorth, e_gnss_m2: f64) -> (Eas
         east_m: weights.regression * regression.regressed.east_m + weights.gnss * fix.east_m,
         north_m: weights.regression * regression.regressed.north_m + weights.gnss * fix.north_m,
     };
-    let regression_r95_m = weights.regression * regression_r95_m(regression);
+    let regression_r95_m = weights.regression * regression.r95_m();
     let gnss_r95_m = weights.gnss * gnss_r95_m(e_gnss_m2);
     (fused, weights, regression_r95_m.hypot(gnss_r95_m))
 }
@@ -55,7 +55,7 @@ pub fn fuse(
     e_gnss_m2: Option<f64>,
 ) -> Option<FusedFix> {
     let regressor = model.map(|(regressor, _)| regressor);
-    let observed = ObservedPositions::of(observation, regressor, image_size, e_gnss_m2);
+    let observed = ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None);
     fuse_observed(observation, &observed, model, image_size)
 }
 
@@ -112,7 +112,7 @@ fn combine(observed: &ObservedPositions<'_>, regressed: &ObservedBox, flags: &mu
     let box_alone = || Combined {
         position: regressed.independent.regressed,
         confidences: ALL_REGRESSION,
-        r95_m: regression_r95_m(&regressed.independent),
+        r95_m: regressed.independent.r95_m(),
     };
     if !regressed.is_usable {
         flags.push(Flag::BoxRejected);
@@ -152,10 +152,6 @@ fn combine(observed: &ObservedPositions<'_>, regressed: &ObservedBox, flags: &mu
     }
 }
 
-fn regression_r95_m(regression: &Regression) -> f64 {
-    regression.r95_scale * regression.e_regression_m2.sqrt()
-}
-
 fn gnss_r95_m(e_gnss_m2: f64) -> f64 {
     R95_PER_SIGMA * e_gnss_m2.sqrt()
 }
@@ -193,6 +189,7 @@ fn pass_through(observation: &Observation, observed: &ObservedPositions<'_>) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geo::PlaneCovariance;
     use proptest::prelude::*;
 
     proptest! {
@@ -213,6 +210,8 @@ mod tests {
                 regressed: EastNorth { east_m, north_m: 3.0 },
                 reconstruction_error: 1.0,
                 e_regression_m2,
+                covariance: PlaneCovariance::isotropic(e_regression_m2),
+                box_noise: PlaneCovariance::default(),
                 outside_training: false,
                 r95_scale: R95_PER_SIGMA,
             };

@@ -4,7 +4,9 @@
 //! What never happens here: imports from other modules, I/O, f32.
 
 mod plane;
+mod plane_covariance;
 mod position;
 
 pub use plane::{EastNorth, LocalPlane, PLANE_RANGE_M};
+pub use plane_covariance::PlaneCovariance;
 pub use position::{Position, PositionError, distance_m};

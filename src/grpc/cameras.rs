@@ -27,13 +27,13 @@ impl CameraService for Cameras {
         &self,
         request: tonic::Request<proto::CreateCameraRequest>,
     ) -> Reply<proto::CreateCameraResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let id = CameraId::new(&asked.id)?;
             let profile = new_camera(id, asked.profile.unwrap_or_default())
                 .and_then(NewCamera::check)
                 .map_err(|error| error.under("profile"))?;
-            let camera = self.app.create_camera(profile).await?;
-            Ok(proto::CreateCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
+            let camera = app.create_camera(profile).await?;
+            Ok(proto::CreateCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
         .await
     }
@@ -42,9 +42,9 @@ impl CameraService for Cameras {
         &self,
         request: tonic::Request<proto::GetCameraRequest>,
     ) -> Reply<proto::GetCameraResponse> {
-        answer(request, |asked| async move {
-            let camera = self.app.camera(&camera_id(&asked.camera_id)?).await?;
-            Ok(proto::GetCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
+        answer(&self.app, request, |app, asked| async move {
+            let camera = app.camera(&camera_id(&asked.camera_id)?).await?;
+            Ok(proto::GetCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
         .await
     }
@@ -53,13 +53,13 @@ impl CameraService for Cameras {
         &self,
         request: tonic::Request<proto::ListCamerasRequest>,
     ) -> Reply<proto::ListCamerasResponse> {
-        answer(request, |asked| async move {
-            let size = pages::size(asked.page_size, &self.app.limits)?;
+        answer(&self.app, request, |app, asked| async move {
+            let size = pages::size(asked.page_size, &app.limits)?;
             let after = pages::cursor::<CameraId>(&asked.page_token)?;
-            let page = self.app.cameras(after.as_ref(), size).await?;
+            let page = app.cameras(after.as_ref(), size).await?;
             Ok(proto::ListCamerasResponse {
                 next_page_token: pages::token(page.next.as_ref()),
-                cameras: page.items.into_iter().map(|camera| proto::Camera::of(&self.app, camera)).collect(),
+                cameras: page.items.into_iter().map(|camera| proto::Camera::of(&app, camera)).collect(),
             })
         })
         .await
@@ -69,13 +69,13 @@ impl CameraService for Cameras {
         &self,
         request: tonic::Request<proto::UpdateCameraRequest>,
     ) -> Reply<proto::UpdateCameraResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let id = camera_id(&asked.camera_id)?;
-            let expected = asked.expected_revision.map(Revision);
+            let expected = asked.expected_revision.map(|revision| Revision(revision).into());
             let change = camera_change(&id, required(asked.profile, "profile")?, asked.update_mask)?;
-            let changed = self.app.change_camera(&id, change, expected).await;
+            let changed = app.change_camera(&id, change, expected).await;
             let camera = changed.map_err(|error| of_field(error, "profile"))?;
-            Ok(proto::UpdateCameraResponse { camera: Some(proto::Camera::of(&self.app, camera)) })
+            Ok(proto::UpdateCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
         .await
     }
@@ -84,9 +84,9 @@ impl CameraService for Cameras {
         &self,
         request: tonic::Request<proto::DeleteCameraRequest>,
     ) -> Reply<proto::DeleteCameraResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let id = camera_id(&asked.camera_id)?;
-            self.app.delete_camera(&id, asked.expected_revision.map(Revision)).await?;
+            app.delete_camera(&id, asked.expected_revision.map(|revision| Revision(revision).into())).await?;
             Ok(proto::DeleteCameraResponse {})
         })
         .await
@@ -224,7 +224,7 @@ impl proto::Camera {
             moved: app.camera_moved(camera.id()).map(|moved| (*moved).clone().into()),
             model_fault: app.model_fault(camera.id()).map(|fault| fault.reason),
             id: camera.id().as_str().to_owned(),
-            warnings: camera.profile.warnings(),
+            warnings: app.camera_warnings(&camera),
             profile: Some(camera.profile.into()),
             revision: camera.revision.0,
             created_at: Some(timestamp(camera.created_at)),

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use futures_util::stream;
 use tokio::sync::mpsc;
+use tonic::metadata::AsciiMetadataValue;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt as _;
@@ -17,7 +18,7 @@ use tonic_types::StatusExt as _;
 use super::convert::timestamp;
 use super::proto;
 use super::proto::fusion_service_client::FusionServiceClient;
-use crate::domain::{CameraId, LiveItem, Score};
+use crate::domain::{CameraId, KeySecret, LiveItem, Score};
 
 /// A server that does not take the connection within this time counts as unreachable.
 const CONNECT_TIME: Duration = Duration::from_secs(5);
@@ -112,14 +113,18 @@ impl From<Status> for ClientError {
 
 /// An HTTP/2 connection, made when it is first needed and again after it broke. Clones share it.
 #[derive(Debug, Clone)]
-pub struct Connection(Channel);
+pub struct Connection {
+    channel: Channel,
+    /// Sent with every call, if the server asks for a key.
+    authorization: Option<AsciiMetadataValue>,
+}
 
 impl Connection {
-    /// To a server such as `http://127.0.0.1:8080`. Nothing is sent yet.
+    /// To a server such as `http://127.0.0.1:8080`, with a key if it asks for one. Nothing is sent yet.
     ///
     /// # Errors
     /// An address that is none, or that asks for TLS, which this client does not speak.
-    pub fn to(server: &str) -> Result<Self, ClientError> {
+    pub fn to(server: &str, key: Option<&KeySecret>) -> Result<Self, ClientError> {
         let refused = |message: String| ClientError {
             reason: "invalid-argument".to_owned(),
             message,
@@ -135,7 +140,13 @@ impl Connection {
             .tcp_nodelay(true)
             .http2_keep_alive_interval(PING_AFTER)
             .keep_alive_timeout(PING_TIME);
-        Ok(Self(endpoint.connect_lazy()))
+        let authorization = key.map(|key| {
+            let mut value =
+                AsciiMetadataValue::try_from(format!("Bearer {}", key.reveal())).expect("a key is ASCII");
+            value.set_sensitive(true);
+            value
+        });
+        Ok(Self { channel: endpoint.connect_lazy(), authorization })
     }
 
     /// Opens a stream. The first event is [`Event::Opened`].
@@ -147,7 +158,11 @@ impl Connection {
         // The queue is empty and has room, so this cannot fail.
         let _ = sender.try_send(request(proto::stream_request::Kind::Opening(opening.into())));
         let requests = stream::poll_fn(move |context| queue.poll_recv(context));
-        let answers = FusionServiceClient::new(self.0.clone()).stream(requests).await?.into_inner();
+        let mut request = tonic::Request::new(requests);
+        if let Some(authorization) = &self.authorization {
+            request.metadata_mut().insert("authorization", authorization.clone());
+        }
+        let answers = FusionServiceClient::new(self.channel.clone()).stream(request).await?.into_inner();
         Ok((ItemSender(sender), Events(answers)))
     }
 }
@@ -256,10 +271,10 @@ mod tests {
     #[tokio::test]
     async fn only_plain_addresses_are_taken() {
         for wrong in ["https://127.0.0.1:1", "127.0.0.1:8080", "http://", "http://a b"] {
-            let refused = Connection::to(wrong).expect_err(wrong);
+            let refused = Connection::to(wrong, None).expect_err(wrong);
             assert!(!refused.retryable, "{wrong}");
         }
-        Connection::to("http://127.0.0.1:8080").expect("an address");
+        Connection::to("http://127.0.0.1:8080", None).expect("an address");
     }
 
     #[tokio::test]
@@ -273,7 +288,7 @@ mod tests {
             resume_after_seq: 0,
             store_samples: false,
         };
-        let connection = Connection::to(&format!("http://{address}")).expect("an address");
+        let connection = Connection::to(&format!("http://{address}"), None).expect("an address");
         let refused = connection.open(&opening).await.expect_err("nobody listens");
         assert!(refused.retryable, "{refused}");
     }

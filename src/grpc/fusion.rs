@@ -6,7 +6,7 @@ use super::convert::{camera_id, observation, timestamp};
 use super::outbox::Responses;
 use super::proto;
 use super::proto::fusion_service_server::FusionService;
-use super::statuses::{Reply, answer, client_address, request_id};
+use super::statuses::{Reply, answer, callers_app, client_address, request_id, to_status};
 use super::stream;
 use crate::app::App;
 use crate::domain::{Flag, FusedFix, TargetId, convert_all};
@@ -33,19 +33,20 @@ impl FusionService for Fusion {
     ) -> Reply<Self::StreamStream> {
         let id = request_id(request.extensions());
         let client = client_address(request.extensions());
-        let responses = stream::serve(&self.app, &self.shutdown, id, client, request.into_inner());
+        let app = callers_app(&self.app, request.extensions()).map_err(|error| to_status(&error, &id))?;
+        let responses = stream::serve(&app, &self.shutdown, id, client, request.into_inner());
         Ok(tonic::Response::new(responses))
     }
 
     async fn fuse(&self, request: tonic::Request<proto::FuseRequest>) -> Reply<proto::FuseResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            self.app.check_batch(asked.observations.len())?;
-            let camera = self.app.active_camera(&camera).await?;
-            let rules = camera.row_rules(self.app.clock.now());
+            app.check_batch(asked.observations.len())?;
+            let camera = app.active_camera(&camera).await?;
+            let rules = camera.row_rules(app.clock.now());
             let convert = |message| observation(message, &rules);
             let observations = convert_all("observations", asked.observations, convert)?;
-            let fused = self.app.fuse(camera, &observations).await?;
+            let fused = app.fuse(camera, &observations).await?;
             Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
         })
         .await

@@ -3,11 +3,13 @@
 //! What never happens here: checks on numbers (the constructors of [`crate::domain`] make them), status
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
+mod audit;
 mod cameras;
 mod cancel_on_shutdown;
 pub mod client;
 mod convert;
 mod fusion;
+mod keys;
 mod models;
 mod outbox;
 mod pages;
@@ -29,13 +31,15 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 use cancel_on_shutdown::CancelOnShutdown;
+use proto::audit_service_server::AuditServiceServer;
 use proto::camera_service_server::CameraServiceServer;
 use proto::fusion_service_server::FusionServiceServer;
+use proto::key_service_server::KeyServiceServer;
 use proto::model_service_server::ModelServiceServer;
 use proto::sample_service_server::SampleServiceServer;
 use proto::training_service_server::TrainingServiceServer;
 
-pub use statuses::explain;
+pub use statuses::{explain, trailers};
 
 /// Messages, services and clients generated from `proto/`.
 #[expect(clippy::allow_attributes, reason = "generated code")]
@@ -58,19 +62,27 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         TrainingServiceServer::new(training::Training::new(app, shutdown)).max_decoding_message_size(most);
     let models = ModelServiceServer::new(models::Models::new(app)).max_decoding_message_size(most);
     let fusion = FusionServiceServer::new(fusion::Fusion::new(app, shutdown)).max_decoding_message_size(most);
-    let reflection = tonic_reflection::server::Builder::configure()
-        .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
-        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-        .build_v1()
-        .expect("the build wrote the descriptors");
+    let keys = KeyServiceServer::new(keys::Keys::new(app)).max_decoding_message_size(most);
+    let audit = AuditServiceServer::new(audit::Audit::new(app)).max_decoding_message_size(most);
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    let reflection_v1 = reflection().build_v1().expect("the build wrote the descriptors");
+    // All that Python's client speaks, and older releases of others.
+    let reflection_v1alpha = reflection().build_v1alpha().expect("the build wrote the descriptors");
     Routes::default()
         .add_service(health(shutdown))
-        .add_service(CancelOnShutdown::new(reflection, shutdown))
+        .add_service(CancelOnShutdown::new(reflection_v1, shutdown))
+        .add_service(CancelOnShutdown::new(reflection_v1alpha, shutdown))
         .add_service(cameras)
         .add_service(samples)
         .add_service(training)
         .add_service(models)
         .add_service(fusion)
+        .add_service(keys)
+        .add_service(audit)
         .prepare()
 }
 
@@ -93,13 +105,15 @@ pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
 }
 
 /// The services whose health is reported; the empty name is the server as a whole.
-const HEALTHY: [&str; 6] = [
+const HEALTHY: [&str; 8] = [
     "",
     CameraServiceServer::<()>::NAME,
     SampleServiceServer::<()>::NAME,
     TrainingServiceServer::<()>::NAME,
     ModelServiceServer::<()>::NAME,
     FusionServiceServer::<()>::NAME,
+    KeyServiceServer::<()>::NAME,
+    AuditServiceServer::<()>::NAME,
 ];
 
 /// Serving until the end begins; then watchers get a last status, and their streams end.
@@ -132,7 +146,15 @@ mod tests {
             prost_types::FileDescriptorSet::decode(super::proto::FILE_DESCRIPTOR_SET).expect("descriptors");
         let services = set.file.iter().flat_map(|file| &file.service);
         let names: Vec<&str> = services.map(prost_types::ServiceDescriptorProto::name).collect();
-        let own = ["CameraService", "SampleService", "TrainingService", "ModelService", "FusionService"];
+        let own = [
+            "CameraService",
+            "SampleService",
+            "TrainingService",
+            "ModelService",
+            "FusionService",
+            "KeyService",
+            "AuditService",
+        ];
         assert_eq!(names, own);
     }
 }

@@ -25,8 +25,8 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::GetModelRequest>,
     ) -> Reply<proto::GetModelResponse> {
-        answer(request, |asked| async move {
-            let version = self.app.model(&camera_id(&asked.camera_id)?, asked.number).await?;
+        answer(&self.app, request, |app, asked| async move {
+            let version = app.model(&camera_id(&asked.camera_id)?, asked.number).await?;
             Ok(proto::GetModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -36,10 +36,10 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::ListModelsRequest>,
     ) -> Reply<proto::ListModelsResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            let size = pages::size(asked.page_size, &self.app.limits)?;
-            let page = self.app.models(&camera, pages::cursor::<u32>(&asked.page_token)?, size).await?;
+            let size = pages::size(asked.page_size, &app.limits)?;
+            let page = app.models(&camera, pages::cursor::<u32>(&asked.page_token)?, size).await?;
             Ok(proto::ListModelsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 models: page.items.into_iter().map(model).collect::<Result<_>>()?,
@@ -52,10 +52,10 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::ActivateModelRequest>,
     ) -> Reply<proto::ActivateModelResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            self.app.activate_model(&camera, asked.number).await?;
-            let version = self.app.model(&camera, asked.number).await?;
+            app.activate_model(&camera, asked.number).await?;
+            let version = app.model(&camera, asked.number).await?;
             Ok(proto::ActivateModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -65,10 +65,10 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::RollBackModelRequest>,
     ) -> Reply<proto::RollBackModelResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            self.app.roll_back_model(&camera).await?;
-            let version = self.app.active_model(&camera).await?;
+            app.roll_back_model(&camera).await?;
+            let version = app.active_model(&camera).await?;
             Ok(proto::RollBackModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -78,8 +78,8 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::DownloadModelRequest>,
     ) -> Reply<proto::DownloadModelResponse> {
-        answer(request, |asked| async move {
-            let safetensors = self.app.download_model(&camera_id(&asked.camera_id)?, asked.number).await?;
+        answer(&self.app, request, |app, asked| async move {
+            let safetensors = app.download_model(&camera_id(&asked.camera_id)?, asked.number).await?;
             Ok(proto::DownloadModelResponse { safetensors })
         })
         .await
@@ -89,12 +89,12 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::ImportModelRequest>,
     ) -> Reply<proto::ImportModelResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
             if asked.safetensors.is_empty() {
                 return Err(Error::invalid("safetensors", "is required"));
             }
-            let version = self.app.import_model(&camera, &asked.safetensors).await?;
+            let version = app.import_model(&camera, &asked.safetensors).await?;
             Ok(proto::ImportModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -104,8 +104,8 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::DeleteModelRequest>,
     ) -> Reply<proto::DeleteModelResponse> {
-        answer(request, |asked| async move {
-            self.app.delete_model(&camera_id(&asked.camera_id)?, asked.number).await?;
+        answer(&self.app, request, |app, asked| async move {
+            app.delete_model(&camera_id(&asked.camera_id)?, asked.number).await?;
             Ok(proto::DeleteModelResponse {})
         })
         .await
@@ -115,13 +115,13 @@ impl ModelService for Models {
         &self,
         request: tonic::Request<proto::EstimateGnssErrorRequest>,
     ) -> Reply<proto::EstimateGnssErrorResponse> {
-        answer(request, |asked| async move {
-            self.app.camera(&camera_id(&asked.camera_id)?).await?;
+        answer(&self.app, request, |app, asked| async move {
+            app.camera(&camera_id(&asked.camera_id)?).await?;
             let rows = (1..).zip(asked.fixes).map(|(line, message)| match fix(message) {
                 Ok(fix) => Ok(Ok(TimedFix { time: None, fix })),
                 Err(error) => RowError::of(line, error).map(Err),
             });
-            Ok(GnssErrorEstimate::from_rows(rows, self.app.limits.rejected_rows)?.into())
+            Ok(GnssErrorEstimate::from_rows(rows, app.limits.rejected_rows)?.into())
         })
         .await
     }

@@ -33,7 +33,7 @@ impl SampleService for Samples {
         request: tonic::Request<Streaming<proto::ImportSamplesRequest>>,
     ) -> Reply<proto::ImportSamplesResponse> {
         let refusal = request.extensions().get().cloned().unwrap_or_default();
-        answer(request, |messages| async move {
+        answer(&self.app, request, |app, messages| async move {
             let shutdown = self.shutdown.clone();
             let mut batches = Batches { messages, refusal, shutdown, camera: String::new() };
             let Some(first) = batches.next().await? else {
@@ -42,9 +42,9 @@ impl SampleService for Samples {
             let camera = camera_id(&first.camera_id)?;
             let durability = durability(first.durability)?;
             batches.camera = first.camera_id;
-            let rules = self.app.row_rules(&camera).await?;
+            let rules = app.row_rules(&camera).await?;
             let rows = rows(first.samples, batches, rules);
-            let report = self.app.import_rows(&camera, rows, durability).await?;
+            let report = app.import_rows(&camera, rows, durability).await?;
             Ok(imported(report, durability))
         })
         .await
@@ -54,12 +54,12 @@ impl SampleService for Samples {
         &self,
         request: tonic::Request<proto::ListSamplesRequest>,
     ) -> Reply<proto::ListSamplesResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
             let filter = sample_filter(asked.filter)?;
-            let size = pages::size(asked.page_size, &self.app.limits)?;
+            let size = pages::size(asked.page_size, &app.limits)?;
             let after = pages::cursor::<SampleKey>(&asked.page_token)?;
-            let page = self.app.samples(&camera, &filter, after, size).await?;
+            let page = app.samples(&camera, &filter, after, size).await?;
             Ok(proto::ListSamplesResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 samples: page.items.into_iter().map(Into::into).collect(),
@@ -72,9 +72,9 @@ impl SampleService for Samples {
         &self,
         request: tonic::Request<proto::CountSamplesRequest>,
     ) -> Reply<proto::CountSamplesResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let filter = sample_filter(asked.filter)?;
-            let count = self.app.count_samples(&camera_id(&asked.camera_id)?, &filter).await?;
+            let count = app.count_samples(&camera_id(&asked.camera_id)?, &filter).await?;
             let SampleCount { all, without_fix } = count;
             Ok(proto::CountSamplesResponse { count: all, without_fix })
         })
@@ -85,7 +85,7 @@ impl SampleService for Samples {
         &self,
         request: tonic::Request<proto::DeleteSamplesRequest>,
     ) -> Reply<proto::DeleteSamplesResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
             let filter = sample_filter(asked.filter)?;
             if filter == SampleFilter::default() {
@@ -94,7 +94,7 @@ impl SampleService for Samples {
                     "must have from, until, target_id or has_fix, so that not all samples go by an oversight",
                 ));
             }
-            let deleted = self.app.delete_samples(&camera, &filter).await?;
+            let deleted = app.delete_samples(&camera, &filter).await?;
             Ok(proto::DeleteSamplesResponse { deleted })
         })
         .await

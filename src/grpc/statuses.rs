@@ -2,13 +2,15 @@
 
 use std::collections::HashMap;
 
-use hyper::Response;
 use hyper::http::Extensions;
 use hyper::http::HeaderValue;
+use hyper::{HeaderMap, Response};
 use tonic::{Code, Request, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
 
 use crate::admission::ClientAddress;
+use crate::app::App;
+use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Refusal, Result, Violation};
 use crate::status;
 use crate::telemetry::RequestId;
@@ -23,16 +25,43 @@ const LONGEST_VIOLATION_TEXT: usize = 160;
 /// What a unary method gives.
 pub(super) type Reply<T> = std::result::Result<tonic::Response<T>, Status>;
 
-/// Answers a unary request by a use case.
-pub(super) async fn answer<M, R, F>(request: Request<M>, handle: impl FnOnce(M) -> F) -> Reply<R>
+/// Answers a unary request by a use case, which gets the application on behalf of the caller.
+pub(super) async fn answer<M, R, F>(
+    app: &App,
+    request: Request<M>,
+    handle: impl FnOnce(App, M) -> F,
+) -> Reply<R>
 where
     F: Future<Output = Result<R>>,
 {
     let (_, extensions, message) = request.into_parts();
-    match handle(message).await {
+    let answered = match callers_app(app, &extensions) {
+        Ok(app) => handle(app, message).await,
+        Err(error) => Err(error),
+    };
+    match answered {
         Ok(reply) => Ok(tonic::Response::new(reply)),
         Err(error) => Err(to_status(&error, &request_id(&extensions))),
     }
+}
+
+/// The application on behalf of the request's caller.
+///
+/// # Errors
+/// A fault for a request that did not come through the server's pipeline.
+pub(super) fn callers_app(app: &App, extensions: &Extensions) -> Result<App> {
+    let caller =
+        extensions.get::<Caller>().ok_or_else(|| Error::fault("a request came without its caller"))?;
+    Ok(app.on_behalf_of(caller.clone()))
+}
+
+/// An error as the last frame of a response.
+#[must_use]
+pub fn trailers(error: &Error, id: &RequestId) -> HeaderMap {
+    let mut trailers = HeaderMap::new();
+    // All of it was made here from text, so it fits into headers.
+    let _ = to_status(error, id).add_header(&mut trailers);
+    trailers
 }
 
 /// The id that the pipeline assigned to the request.

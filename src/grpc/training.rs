@@ -36,7 +36,7 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::StartTrainingRunRequest>,
     ) -> Reply<proto::StartTrainingRunResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let options = RunRequest {
                 recipe: recipe(asked.recipe)?,
                 seed: asked.seed,
@@ -44,7 +44,7 @@ impl TrainingService for Training {
                 from: instant(asked.from, "from")?,
                 until: instant(asked.until, "until")?,
             };
-            let run = self.app.start_run(&camera_id(&asked.camera_id)?, options).await?;
+            let run = app.start_run(&camera_id(&asked.camera_id)?, options).await?;
             Ok(proto::StartTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -54,8 +54,8 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::GetTrainingRunRequest>,
     ) -> Reply<proto::GetTrainingRunResponse> {
-        answer(request, |asked| async move {
-            let run = self.app.run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+        answer(&self.app, request, |app, asked| async move {
+            let run = app.run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::GetTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -65,10 +65,10 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::ListTrainingRunsRequest>,
     ) -> Reply<proto::ListTrainingRunsResponse> {
-        answer(request, |asked| async move {
+        answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            let size = pages::size(asked.page_size, &self.app.limits)?;
-            let page = self.app.runs(&camera, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
+            let size = pages::size(asked.page_size, &app.limits)?;
+            let page = app.runs(&camera, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
             Ok(proto::ListTrainingRunsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 runs: page.items.into_iter().map(Into::into).collect(),
@@ -81,8 +81,8 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::CancelTrainingRunRequest>,
     ) -> Reply<proto::CancelTrainingRunResponse> {
-        answer(request, |asked| async move {
-            let run = self.app.cancel_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+        answer(&self.app, request, |app, asked| async move {
+            let run = app.cancel_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::CancelTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -92,8 +92,8 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::DeleteTrainingRunRequest>,
     ) -> Reply<proto::DeleteTrainingRunResponse> {
-        answer(request, |asked| async move {
-            self.app.delete_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+        answer(&self.app, request, |app, asked| async move {
+            app.delete_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::DeleteTrainingRunResponse {})
         })
         .await
@@ -107,10 +107,10 @@ impl TrainingService for Training {
     ) -> Reply<Changes> {
         let id = request_id(request.extensions());
         let client = client_address(request.extensions());
-        answer(request, |asked| async move {
-            let lease = self.app.quotas.event_streams.try_acquire(client, 1)?;
+        answer(&self.app, request, |app, asked| async move {
+            let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let (camera, run) = (camera_id(&asked.camera_id)?, run_id(&asked.run_id)?);
-            let runs = self.app.watch_run(&camera, run).await?;
+            let runs = app.watch_run(&camera, run).await?;
             Ok(changes(runs, lease, self.shutdown.clone(), id))
         })
         .await
@@ -120,8 +120,8 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::GetTrainingLogRequest>,
     ) -> Reply<proto::GetTrainingLogResponse> {
-        answer(request, |asked| async move {
-            let log = self.app.run_log(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+        answer(&self.app, request, |app, asked| async move {
+            let log = app.run_log(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             let line = |(time, text)| proto::TrainingLogLine { time: Some(timestamp(time)), text };
             Ok(proto::GetTrainingLogResponse { lines: log.into_iter().map(line).collect() })
         })
@@ -132,8 +132,8 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::GetTrainingCurveRequest>,
     ) -> Reply<proto::GetTrainingCurveResponse> {
-        answer(request, |asked| async move {
-            let epochs = self.app.run_epochs(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+        answer(&self.app, request, |app, asked| async move {
+            let epochs = app.run_epochs(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::GetTrainingCurveResponse { epochs: epochs.into_iter().map(Into::into).collect() })
         })
         .await

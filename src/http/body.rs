@@ -255,7 +255,7 @@ fn announced(headers: &HeaderMap) -> Option<u64> {
 
 /// Many clients send all before they read a word; an answer to a half-read body would reach them
 /// as a reset connection. One that waits for `100 Continue` is answered at once.
-async fn discard(headers: &HeaderMap, body: &mut Body) {
+pub(super) async fn discard(headers: &HeaderMap, body: &mut Body) {
     if headers.contains_key(EXPECT) || announced(headers).is_some_and(|length| length > DISCARD_BYTES) {
         return;
     }

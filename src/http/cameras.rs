@@ -2,24 +2,31 @@
 
 use std::collections::BTreeMap;
 
-use axum::extract::State;
-use hyper::header::IF_MATCH;
+use axum::body::Body;
+use axum::response::Response;
+use http_body_util::BodyExt as _;
+use hyper::header::{CONTENT_TYPE, ETAG, IF_MATCH, IF_NONE_MATCH};
+use hyper::http::HeaderValue;
 use hyper::{HeaderMap, StatusCode, Uri};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::extract::{CameraPath, JsonBody, Params};
 use super::problem::{ApiResult, Problem};
 use super::receivers::{Receiver, receivers, shown};
-use super::wire::{Recipe, created, empty, json, nullable, with_etag};
+use super::wire::{Recipe, created, empty, json};
 use crate::app::App;
 use crate::domain::{
-    self, CameraId, Error, ErrorKind, GnssBiasSigma, NewCamera, Result, Revision, SigmaM, TargetClass,
+    self, CameraId, CameraKey, Error, ErrorKind, ExpectedVersion, GnssBiasSigma, NewCamera, Result, Revision,
+    SigmaM, TargetClass,
 };
+use crate::exchange::wire::parse_json;
 use crate::exchange::write_cursor;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -143,58 +150,92 @@ fn classes(names: &[String]) -> Result<Vec<TargetClass>> {
     names.iter().enumerate().map(class).collect()
 }
 
-/// Changes to a profile (a merge patch, RFC 7396): what is left out stays, null forgets.
-#[derive(Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+/// Changes to a profile (a merge patch, RFC 7396): what is left out stays, null restores the default, and objects
+/// such as labels are merged.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "the shape of a patch, for the description alone")]
 struct CameraChange {
-    /// New name.
+    /// New name; null is the id.
     #[schema(max_length = 200)]
     display_name: Option<String>,
     /// New size of the image; null forgets it.
-    #[serde(default, deserialize_with = "nullable")]
-    #[schema(value_type = Option<ImageSize>)]
-    image_size: Option<Option<ImageSize>>,
+    image_size: Option<ImageSize>,
     /// New error of the receiver; null is `"unknown"`.
-    #[serde(default, deserialize_with = "nullable")]
-    #[schema(value_type = Option<GnssError>)]
-    gnss_error: Option<Option<GnssError>>,
+    gnss_error: Option<GnssError>,
     /// New standard deviation per axis, m, of the bias that all fixes have in common; null is the model's own
     /// prior.
-    #[serde(default, deserialize_with = "nullable")]
-    #[schema(value_type = Option<f64>, exclusive_minimum = 0.0, maximum = 100.0)]
-    gnss_bias_sigma_m: Option<Option<f64>>,
-    /// New recipe, for runs to come.
+    #[schema(exclusive_minimum = 0.0, maximum = 100.0)]
+    gnss_bias_sigma_m: Option<f64>,
+    /// New recipe, for runs to come; null is the server's default.
     recipe: Option<Recipe>,
-    /// New classes, all of them.
+    /// New classes, all of them; null is none.
     target_classes: Option<Vec<String>>,
-    /// New labels, all of them.
-    labels: Option<BTreeMap<String, String>>,
-    /// New receivers, all of them.
+    /// Labels to be set; a label that is null is removed, null removes all.
+    labels: Option<BTreeMap<String, Option<String>>>,
+    /// New receivers, all of them; null is none.
     #[schema(max_items = 1_024)]
     receivers: Option<Vec<Receiver>>,
-    /// Whether to start a training run once the camera is found to have moved.
+    /// Whether to start a training run once the camera is found to have moved; null is not to.
     retrain_when_moved: Option<bool>,
 }
 
-impl CameraChange {
-    fn into_domain(self) -> Result<domain::CameraChange> {
-        Ok(domain::CameraChange {
-            display_name: self.display_name,
-            image_size: self.image_size.map(|size| size.map(ImageSize::to_domain).transpose()).transpose()?,
-            gnss_error: self
-                .gnss_error
-                .map(|error| error.map_or(Ok(domain::GnssError::Unknown), GnssError::to_domain))
-                .transpose()?,
-            gnss_bias_sigma: self
-                .gnss_bias_sigma_m
-                .map(|sigma_m| sigma_m.map(GnssBiasSigma::new).transpose())
-                .transpose()?,
-            recipe: self.recipe.map(domain::Recipe::from),
-            target_classes: self.target_classes.as_deref().map(classes).transpose()?,
-            labels: self.labels,
-            receivers: self.receivers.as_deref().map(receivers).transpose()?,
-            retrain_when_moved: self.retrain_when_moved,
-        })
+type Document = serde_json::Map<String, Value>;
+
+/// The fields that a patch may name.
+const PATCHED_FIELDS: [&str; 9] = [
+    "display_name",
+    "image_size",
+    "gnss_error",
+    "gnss_bias_sigma_m",
+    "recipe",
+    "target_classes",
+    "labels",
+    "receivers",
+    "retrain_when_moved",
+];
+
+/// The change that a merge patch makes of a stored camera.
+fn patched(app: &App, camera: domain::Camera, patch: &Document) -> Result<domain::CameraChange> {
+    if let Some(name) = patch.keys().find(|name| !PATCHED_FIELDS.contains(&name.as_str())) {
+        let known = PATCHED_FIELDS.join(", ");
+        return Err(Error::invalid(name, format!("is not a field that can be changed; those are {known}")));
+    }
+    let shown = serde_json::to_value(Camera::of(app, camera)).map_err(Error::fault)?;
+    let Value::Object(mut document) = shown else { return Err(Error::fault("a camera is an object")) };
+    document.retain(|name, _| name == "id" || PATCHED_FIELDS.contains(&name.as_str()));
+    merge(&mut document, patch);
+    let document = serde_json::to_vec(&document).map_err(Error::fault)?;
+    let profile = parse_json::<CameraDraft>(&document)?.into_domain()?;
+    let names = |field: &str| patch.contains_key(field);
+    Ok(domain::CameraChange {
+        display_name: names("display_name").then_some(profile.display_name),
+        image_size: names("image_size").then_some(profile.image_size),
+        gnss_error: names("gnss_error").then_some(profile.gnss_error),
+        gnss_bias_sigma: names("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
+        recipe: names("recipe").then_some(profile.recipe),
+        target_classes: names("target_classes").then_some(profile.target_classes),
+        labels: names("labels").then_some(profile.labels),
+        receivers: names("receivers").then_some(profile.receivers),
+        retrain_when_moved: names("retrain_when_moved").then_some(profile.retrain_when_moved),
+    })
+}
+
+/// RFC 7396, section 2.
+fn merge(target: &mut Document, patch: &Document) {
+    for (name, value) in patch {
+        match value {
+            Value::Null => drop(target.remove(name)),
+            Value::Object(patch) => {
+                let nested = target.entry(name.clone()).or_insert_with(|| Value::Object(Document::new()));
+                if !nested.is_object() {
+                    *nested = Value::Object(Document::new());
+                }
+                if let Value::Object(nested) = nested {
+                    merge(nested, patch);
+                }
+            }
+            other => drop(target.insert(name.clone(), other.clone())),
+        }
     }
 }
 
@@ -224,7 +265,7 @@ pub(super) struct Camera {
     receivers: Vec<Receiver>,
     /// Whether a training run is started by itself once the camera is found to have moved.
     retrain_when_moved: bool,
-    /// Counts the changes of the profile, from 1; also in the header `etag`.
+    /// Counts the changes of the profile, from 1.
     revision: u64,
     /// When it was made.
     #[schema(value_type = String, format = DateTime)]
@@ -250,10 +291,10 @@ pub(super) struct Camera {
 }
 
 impl Camera {
-    fn of(app: &App, camera: domain::Camera) -> Self {
+    pub(super) fn of(app: &App, camera: domain::Camera) -> Self {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
-        let warnings = camera.profile.warnings();
+        let warnings = app.camera_warnings(&camera);
         let domain::Camera { profile, revision, created_at, updated_at, active_model, samples, key: _ } =
             camera;
         Self {
@@ -327,14 +368,14 @@ struct CameraPage {
     post, path = "/v1/cameras", tag = "cameras", request_body = CameraDraft,
     responses(
         (status = 201, description = "The stored camera", body = Camera,
-            headers(("location" = String, description = "Its path"), ("etag" = String, description = "Its revision"))),
+            headers(("location" = String, description = "Its path"), ("etag" = String, description = "Names this state of this camera"))),
         (status = 409, description = "A camera of that id exists", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn create_camera(State(app): State<App>, body: JsonBody) -> ApiResult {
+async fn create_camera(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
     let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
-    let (location, revision) = (format!("/v1/cameras/{}", camera.id()), camera.revision);
-    Ok(with_etag(created(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, revision)?)
+    let (location, version) = (format!("/v1/cameras/{}", camera.id()), camera.version());
+    Ok(with_etag(created(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, version).await?)
 }
 
 /// List cameras by id
@@ -346,7 +387,7 @@ async fn create_camera(State(app): State<App>, body: JsonBody) -> ApiResult {
     ),
     responses((status = 200, description = "A page of cameras", body = CameraPage))
 )]
-async fn list_cameras(State(app): State<App>, uri: Uri) -> ApiResult {
+async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
     let after = params.cursor()?;
@@ -360,19 +401,28 @@ async fn list_cameras(State(app): State<App>, uri: Uri) -> ApiResult {
 
 /// Read a camera
 #[utoipa::path(
-    get, path = "/v1/cameras/{camera}", tag = "cameras", params(("camera" = String, Path, description = "The camera's id")),
-    responses((status = 200, description = "The camera", body = Camera, headers(("etag" = String, description = "Its revision"))))
+    get, path = "/v1/cameras/{camera}", tag = "cameras",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("if-none-match" = Option<String>, Header, description = "An `etag` that was read; the answer is 304 while it is current"),
+    ),
+    responses(
+        (status = 200, description = "The camera", body = Camera, headers(("etag" = String, description = "Names this state of this camera"))),
+        (status = 304, description = "As the client knows it"),
+    )
 )]
-async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
+async fn get_camera(CallerApp(app): CallerApp, CameraPath(id): CameraPath, headers: HeaderMap) -> ApiResult {
     let camera = app.camera(&id).await?;
-    let revision = camera.revision;
-    Ok(with_etag(json(&Camera::of(&app, camera))?, revision)?)
+    let version = camera.version();
+    let response = with_etag(json(&Camera::of(&app, camera))?, version).await?;
+    Ok(unless_known(&headers, response))
 }
 
 /// Change a camera's profile
 ///
-/// The change is based on a revision, named by the header `if-match` with the `etag` that was
-/// read; `if-match: *` changes whatever is there.
+/// A merge patch (RFC 7396): what is left out stays, null restores the default, objects such as labels are merged.
+/// The change is based on a revision, named by the header `if-match` with the `etag` that was read;
+/// `if-match: *` changes whatever is there.
 #[utoipa::path(
     patch, path = "/v1/cameras/{camera}", tag = "cameras",
     params(
@@ -381,13 +431,13 @@ async fn get_camera(State(app): State<App>, CameraPath(id): CameraPath) -> ApiRe
     ),
     request_body(content((CameraChange = "application/merge-patch+json"), (CameraChange = "application/json"))),
     responses(
-        (status = 200, description = "The changed camera", body = Camera, headers(("etag" = String, description = "Its new revision"))),
+        (status = 200, description = "The changed camera", body = Camera, headers(("etag" = String, description = "Names its new state"))),
         (status = 412, description = "The camera has another revision", body = Problem, content_type = "application/problem+json"),
         (status = 428, description = "`if-match` is missing", body = Problem, content_type = "application/problem+json"),
     )
 )]
 async fn change_camera(
-    State(app): State<App>,
+    CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
     headers: HeaderMap,
     body: JsonBody,
@@ -397,10 +447,34 @@ async fn change_camera(
             "the header must name the revision that the change is based on, as `etag` gave it, or be *";
         Error::field(ErrorKind::RevisionRequired, "if-match", message)
     })?;
-    let change = body.read::<CameraChange>()?.into_domain()?;
-    let camera = app.change_camera(&id, change, expected.revision()).await?;
-    let revision = camera.revision;
-    Ok(with_etag(json(&Camera::of(&app, camera))?, revision)?)
+    let patch = body.read::<Document>()?;
+    let changed = apply(&app, &id, &patch, expected.version()).await?;
+    let version = changed.version();
+    Ok(with_etag(json(&Camera::of(&app, changed))?, version).await?)
+}
+
+/// Changes what was read, so another change in between would be undone: it is read again then, unless the
+/// client named a version.
+async fn apply(
+    app: &App,
+    id: &CameraId,
+    patch: &Document,
+    expected: Option<ExpectedVersion>,
+) -> Result<domain::Camera> {
+    let mut attempts = 0;
+    loop {
+        attempts += 1;
+        let camera = app.camera(id).await?;
+        let read = camera.version();
+        let change = patched(app, camera, patch)?;
+        match app.change_camera(id, change, Some(expected.unwrap_or(read))).await {
+            Err(error)
+                if error.kind() == ErrorKind::RevisionMismatch
+                    && expected.is_none()
+                    && attempts < PATCH_ATTEMPTS => {}
+            changed => return changed,
+        }
+    }
 }
 
 /// Delete a camera with its samples, runs and models
@@ -416,8 +490,12 @@ async fn change_camera(
         (status = 412, description = "The camera has another revision", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_camera(State(app): State<App>, CameraPath(id): CameraPath, headers: HeaderMap) -> ApiResult {
-    let expected = if_match(&headers)?.and_then(IfMatch::revision);
+async fn delete_camera(
+    CallerApp(app): CallerApp,
+    CameraPath(id): CameraPath,
+    headers: HeaderMap,
+) -> ApiResult {
+    let expected = if_match(&headers)?.and_then(IfMatch::version);
     app.delete_camera(&id, expected).await?;
     Ok(empty())
 }
@@ -426,14 +504,14 @@ async fn delete_camera(State(app): State<App>, CameraPath(id): CameraPath, heade
 #[derive(Clone, Copy)]
 enum IfMatch {
     Any,
-    One(Revision),
+    One(ExpectedVersion),
 }
 
 impl IfMatch {
-    const fn revision(self) -> Option<Revision> {
+    const fn version(self) -> Option<ExpectedVersion> {
         match self {
             Self::Any => None,
-            Self::One(revision) => Some(revision),
+            Self::One(version) => Some(version),
         }
     }
 }
@@ -445,9 +523,9 @@ fn if_match(headers: &HeaderMap) -> Result<Option<IfMatch>> {
         return Ok(Some(IfMatch::Any));
     }
     let quoted = text.strip_prefix('"').and_then(|rest| rest.strip_suffix('"'));
-    match quoted.and_then(|number| number.parse().ok()) {
-        Some(revision) => Ok(Some(IfMatch::One(Revision(revision)))),
-        // No revision of ours ever looked like this, so none can match it.
+    match quoted.and_then(version_of) {
+        Some(version) => Ok(Some(IfMatch::One(version))),
+        // No version of ours ever looked like this, so none can match it.
         None => Err(Error::field(
             ErrorKind::RevisionMismatch,
             "if-match",
@@ -455,3 +533,46 @@ fn if_match(headers: &HeaderMap) -> Result<Option<IfMatch>> {
         )),
     }
 }
+
+/// The version in an `etag`; a revision alone is understood, too.
+fn version_of(etag: &str) -> Option<ExpectedVersion> {
+    let mut parts = etag.split('.');
+    match (parts.next(), parts.next(), parts.next(), parts.next()) {
+        (Some(revision), None, ..) => Some(Revision(revision.parse().ok()?).into()),
+        (Some(key), Some(revision), Some(_), None) => Some(ExpectedVersion {
+            key: Some(CameraKey(key.parse().ok()?)),
+            revision: Revision(revision.parse().ok()?),
+        }),
+        _ => None,
+    }
+}
+
+/// Names what is shown: which camera of that id, its revision, and a digest, for the active model and alarms
+/// change without a revision.
+async fn with_etag(response: Response, version: ExpectedVersion) -> Result<Response> {
+    let (mut head, body) = response.into_parts();
+    let body = body.collect().await.map_err(Error::fault)?.to_bytes();
+    let key = version.key.map_or(0, |CameraKey(key)| key);
+    let etag = format!("\"{key}.{}.{:08x}\"", version.revision.0, crc32fast::hash(&body));
+    head.headers.insert(ETAG, HeaderValue::from_str(&etag).map_err(Error::fault)?);
+    Ok(Response::from_parts(head, Body::from(body)))
+}
+
+/// A 304 in the place of what the client has shown already.
+fn unless_known(headers: &HeaderMap, response: Response) -> Response {
+    let Some(etag) = response.headers().get(ETAG).and_then(|etag| etag.to_str().ok()) else {
+        return response;
+    };
+    let known = headers.get_all(IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
+    let mut known = known.flat_map(|list| list.split(',')).map(str::trim);
+    if !known.any(|known| known == "*" || known.strip_prefix("W/").unwrap_or(known) == etag) {
+        return response;
+    }
+    let (mut head, _) = response.into_parts();
+    head.status = StatusCode::NOT_MODIFIED;
+    head.headers.remove(CONTENT_TYPE);
+    Response::from_parts(head, Body::empty())
+}
+
+/// Times that a patch without a version is made of what was read.
+const PATCH_ATTEMPTS: u32 = 8;

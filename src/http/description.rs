@@ -3,22 +3,28 @@
 use std::collections::BTreeMap;
 
 use utoipa::openapi::path::{Operation, PathItem};
+use utoipa::openapi::security::{
+    ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme,
+};
 use utoipa::openapi::tag::TagBuilder;
 use utoipa::openapi::{
     ContentBuilder, InfoBuilder, License, OpenApi, OpenApiBuilder, Ref, RefOr, Response, ResponseBuilder,
 };
 
 use super::problem::PROBLEM_JSON;
-use crate::domain::ErrorKind;
+use super::session::SESSION_COOKIE;
+use crate::app::access::Permission;
+use crate::domain::{ErrorKind, Role};
 use crate::status;
 
-const TAGS: [(&str, &str); 7] = [
+const TAGS: [(&str, &str); 8] = [
     ("cameras", "Profiles of cameras that nobody calibrated"),
     ("samples", "Boxes and fixes that cameras learn from"),
     ("training", "Background fits of a camera's model"),
     ("models", "Model versions that runs yield"),
     ("fusion", "Positions of targets"),
     ("evaluations", "Methods side by side on stored samples, against the truth"),
+    ("access", "Keys that clients present, and sessions of browsers"),
     ("service", "What watches the server"),
 ];
 
@@ -78,6 +84,50 @@ pub(super) fn add_problems(openapi: &mut OpenApi) {
         }
     }
 }
+
+/// States which operations need a key or a session, and which role.
+pub(super) fn add_security(openapi: &mut OpenApi) {
+    let schemes = &mut openapi.components.get_or_insert_default().security_schemes;
+    let key = HttpBuilder::new()
+        .scheme(HttpAuthScheme::Bearer)
+        .description(Some(
+            "A key of `POST /v1/keys` or `sightfix keys create`. Needed once the first key exists.",
+        ))
+        .build();
+    schemes.insert(KEY_SCHEME.to_owned(), SecurityScheme::Http(key).into());
+    let session = ApiKeyValue::with_description(
+        SESSION_COOKIE,
+        "The cookie of `POST /v1/session`, for pages of this server.",
+    );
+    schemes.insert(SESSION_SCHEME.to_owned(), SecurityScheme::ApiKey(ApiKey::Cookie(session)).into());
+    for (path, item) in &mut openapi.paths.paths {
+        let methods = ["GET", "POST", "PUT", "PATCH", "DELETE"];
+        for (method, operation) in methods.into_iter().zip(operations(item)) {
+            let Some(operation) = operation else { continue };
+            let permission = Permission::of_route(method, path);
+            if permission == Permission::Public {
+                continue;
+            }
+            let none: [&str; 0] = [];
+            operation.security = Some(vec![
+                SecurityRequirement::new(KEY_SCHEME, none),
+                SecurityRequirement::new(SESSION_SCHEME, none),
+            ]);
+            let roles =
+                Role::ALL.iter().filter(|role| permission.is_granted_to(**role)).map(|role| role.as_str());
+            let roles = format!("Roles: {}.", roles.collect::<Vec<_>>().join(", "));
+            let text = operation.description.take().filter(|text| !text.is_empty());
+            operation.description =
+                Some(text.map_or_else(|| roles.clone(), |text| format!("{text}\n\n{roles}")));
+            add(&mut operation.responses.responses, &OF_CALLERS);
+        }
+    }
+}
+
+const KEY_SCHEME: &str = "key";
+const SESSION_SCHEME: &str = "session";
+/// Refusals of operations that are not for everybody.
+const OF_CALLERS: [ErrorKind; 2] = [ErrorKind::Unauthenticated, ErrorKind::PermissionDenied];
 
 fn operations(item: &mut PathItem) -> [Option<&mut Operation>; 5] {
     [item.get.as_mut(), item.post.as_mut(), item.put.as_mut(), item.patch.as_mut(), item.delete.as_mut()]

@@ -1,6 +1,5 @@
 //! `/v1/evaluations`: methods side by side on stored samples, in the background.
 
-use axum::extract::State;
 use hyper::{StatusCode, Uri};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -10,10 +9,11 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::extract::{EvaluationPath, JsonBody, Params, camera_of};
 use super::problem::{ApiResult, Problem};
 use super::wire::{JobState, Recipe, created, empty, instant, json};
-use crate::app::{App, EvaluationRequest};
+use crate::app::EvaluationRequest;
 use crate::domain::{self, Error, EvaluationProgress, Method, Result, SigmaM, Truth};
 use crate::evaluation::Report;
 use crate::exchange::wire::Position;
@@ -256,7 +256,7 @@ struct EvaluationPage {
         (status = 404, description = "There is no such camera", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn start_evaluation(State(app): State<App>, body: JsonBody) -> ApiResult {
+async fn start_evaluation(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
     let draft: EvaluationDraft = body.read()?;
     let job = app.start_evaluation(&camera_of(&draft.camera_id)?, draft.to_domain()?).await?;
     let location = format!("/v1/evaluations/{}", job.id);
@@ -276,7 +276,7 @@ async fn start_evaluation(State(app): State<App>, body: JsonBody) -> ApiResult {
         (status = 404, description = "There is no such camera", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn list_evaluations(State(app): State<App>, uri: Uri) -> ApiResult {
+async fn list_evaluations(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let camera = params.take("camera", camera_of)?;
     let limit = params.limit(app.limits.page_items)?;
@@ -298,7 +298,7 @@ async fn list_evaluations(State(app): State<App>, uri: Uri) -> ApiResult {
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn get_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> ApiResult {
+async fn get_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
     let (job, report) = app.evaluation(id).await?;
     let report = report.map(RawValue::from_string).transpose().map_err(Error::fault)?;
     Ok(json(&Evaluation { report, ..Evaluation::from(job) })?)
@@ -316,7 +316,7 @@ async fn get_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPa
         (status = 409, description = "The evaluation has ended", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn cancel_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> ApiResult {
+async fn cancel_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
     Ok(json(&Evaluation::from(app.cancel_evaluation(id).await?))?)
 }
 
@@ -331,7 +331,7 @@ async fn cancel_evaluation(State(app): State<App>, EvaluationPath(id): Evaluatio
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_evaluation(State(app): State<App>, EvaluationPath(id): EvaluationPath) -> ApiResult {
+async fn delete_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
     app.delete_evaluation(id).await?;
     Ok(empty())
 }

@@ -1,6 +1,6 @@
 //! What handlers take from a request: path, parameters, JSON body, media types.
 
-use axum::extract::{FromRef, FromRequest, FromRequestParts, Path, Query, Request};
+use axum::extract::{FromRequest, FromRequestParts, Path, Query, Request};
 use bytes::Bytes;
 use hyper::header::{ACCEPT, CONTENT_TYPE};
 use hyper::http::request::Parts;
@@ -9,10 +9,10 @@ use jiff::Timestamp;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
+use super::Rest;
 use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
 use crate::admission::ClientAddress;
-use crate::app::App;
 use crate::domain::{
     CameraId, Durability, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time,
 };
@@ -123,7 +123,11 @@ struct ModelSegments {
     model: String,
 }
 
-async fn path<T: DeserializeOwned + Send, S: Send + Sync>(parts: &mut Parts, state: &S) -> Result<T> {
+/// The segments of the path.
+pub(super) async fn path<T: DeserializeOwned + Send, S: Send + Sync>(
+    parts: &mut Parts,
+    state: &S,
+) -> Result<T> {
     match Path::<T>::from_request_parts(parts, state).await {
         Ok(Path(segments)) => Ok(segments),
         Err(_) => Err(no_route()), // not UTF-8
@@ -190,32 +194,34 @@ impl Params {
         Ok(self.take("durability", str::parse)?.unwrap_or_default())
     }
 
-    /// Nothing may be left.
-    pub(super) fn end(self) -> Result<()> {
-        match self.0.first() {
+    /// # Errors
+    /// `InvalidArgument` naming a parameter that is none.
+    pub(super) fn check_names(&self, is_known: impl Fn(&str) -> bool) -> Result<()> {
+        match self.0.iter().find(|(name, _)| !is_known(name)) {
             None => Ok(()),
             Some((name, _)) => Err(Error::invalid(name.clone(), "is not a parameter of this operation")),
         }
+    }
+
+    /// Nothing may be left.
+    pub(super) fn end(self) -> Result<()> {
+        self.check_names(|_| false)
     }
 }
 
 /// A body of JSON, not yet read.
 pub(super) struct JsonBody(Bytes);
 
-impl<S> FromRequest<S> for JsonBody
-where
-    S: Send + Sync,
-    App: FromRef<S>,
-{
+impl FromRequest<Rest> for JsonBody {
     type Rejection = ApiError;
 
-    async fn from_request(request: Request, state: &S) -> ApiResult<Self> {
+    async fn from_request(request: Request, rest: &Rest) -> ApiResult<Self> {
         let (parts, content) = request.into_parts();
         let is_json = media_type(&parts.headers).is_some_and(|essence| {
             let essence = essence.to_ascii_lowercase();
             essence == "application/json" || essence.ends_with("+json")
         });
-        let limit = App::from_ref(state).limits.body_bytes;
+        let limit = rest.app.limits.body_bytes;
         let content = body::whole(&parts.headers, content, limit).await?;
         if !is_json && !content.is_empty() {
             return Err(not_read(&["application/json"]).into());

@@ -1,6 +1,5 @@
 //! `/v1/cameras/{camera}/fusions`: positions of targets.
 
-use axum::extract::State;
 use axum::response::Response;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -8,6 +7,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::extract::{CameraPath, JsonBody};
 use super::problem::{ApiResult, Problem};
 use super::wire::json_of_about;
@@ -75,7 +75,7 @@ struct Fusions<'a> {
         (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn fuse(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult<Response> {
+async fn fuse(CallerApp(app): CallerApp, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult<Response> {
     let camera = app.active_camera(&id).await?;
     let rules = camera.row_rules(app.clock.now());
     let observations = observations(&app, &body.read()?, &rules)?;

@@ -1,18 +1,19 @@
 //! `/v1/cameras/{camera}/gnss-error`: a receiver's error from many fixes at one fixed point.
 
-use axum::extract::{Request, State};
+use axum::extract::Request;
 use axum::response::Response;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::access::CallerApp;
 use super::extract::{CameraPath, media_type, not_read};
 use super::problem::ApiResult;
 use super::samples::RejectedRow;
 use super::wire::json;
 use super::{Rest, body};
-use crate::app::{App, GnssErrorEstimate};
+use crate::app::GnssErrorEstimate;
 use crate::domain::{Error, Result};
 use crate::exchange::{FixFormat, RowError, TimedFix, read_fixes, wire};
 
@@ -63,7 +64,7 @@ struct Estimate {
     responses((status = 200, description = "The receiver's error", body = Estimate))
 )]
 async fn estimate_gnss_error(
-    State(app): State<App>,
+    CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
     request: Request,
 ) -> ApiResult<Response> {

@@ -4,30 +4,38 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+mod access;
+mod audit;
 mod body;
+mod camera_statuses;
 mod cameras;
+mod console;
 mod description;
 mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
+mod keys;
 mod models;
 mod pairings;
 mod parts;
 mod problem;
 mod receivers;
 mod samples;
+mod server_info;
 mod service;
+mod session;
 #[cfg(test)]
 mod tests;
 mod tracks;
 mod training_runs;
 mod wire;
 
+use std::sync::Arc;
+
 use axum::Router;
 use axum::body::Body;
-use axum::extract::FromRef;
-use axum::middleware::{from_fn, map_response};
+use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::response::Response;
 use hyper::Method;
 use hyper::header::{CONTENT_SECURITY_POLICY, REFERRER_POLICY, X_FRAME_OPTIONS};
@@ -39,36 +47,38 @@ use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use crate::admission::RequestClass;
 use crate::app::App;
+use crate::config::Console;
 use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
+
+pub use session::session_token;
 
 /// What the handlers share.
 #[derive(Clone)]
 struct Rest {
     app: App,
+    console: Arc<Console>,
     shutdown: Shutdown,
 }
 
-impl FromRef<Rest> for App {
-    fn from_ref(rest: &Rest) -> Self {
-        rest.app.clone()
-    }
-}
-
-/// All REST routes, the description at `/openapi.json` and its page at `/docs`.
+/// All REST routes, the description at `/openapi.json` and its page at `/docs`, the operator's console at `/`.
 ///
-/// Requests carry their [`RequestId`] as an extension.
-pub fn router(app: App, shutdown: Shutdown) -> Router {
-    let rest = Rest { app, shutdown };
+/// Requests carry their [`RequestId`] and their [`Caller`](crate::app::access::Caller) as extensions.
+pub fn router(app: App, console: Console, shutdown: Shutdown) -> Router {
+    let console_routes = console::routes(&console);
+    let rest = Rest { app, console: Arc::new(console), shutdown };
     let (routes, described) = described().split_for_parts();
+    let parameters = Arc::new(access::QueryParameters::of(&described));
     // The page would otherwise ask a server on the internet whether the description is well formed.
     let page = SwaggerUi::new("/docs")
         .url("/openapi.json", described)
         .config(Config::default().validator_url("none").use_base_layout());
     let page = Router::from(page).layer(map_response(contain_page));
     routes
+        .route_layer(from_fn_with_state(parameters, access::authorize))
         .merge(page)
+        .merge(console_routes)
         .with_state(rest)
         // As one layer: axum boxes every request again for each.
         .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
@@ -76,14 +86,16 @@ pub fn router(app: App, shutdown: Shutdown) -> Router {
 
 /// What the page of the description may do: run its own scripts and ask its own server, nothing else.
 /// Swagger UI sets styles by attribute and shows images that it holds itself.
-const PAGE_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
+const DESCRIPTION_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
      img-src 'self' data:; font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
 
 async fn contain_page(mut response: Response) -> Response {
-    for (name, value) in
-        [(CONTENT_SECURITY_POLICY, PAGE_POLICY), (X_FRAME_OPTIONS, "DENY"), (REFERRER_POLICY, "no-referrer")]
-    {
+    for (name, value) in [
+        (CONTENT_SECURITY_POLICY, DESCRIPTION_POLICY),
+        (X_FRAME_OPTIONS, "DENY"),
+        (REFERRER_POLICY, "no-referrer"),
+    ] {
         response.headers_mut().insert(name, HeaderValue::from_static(value));
     }
     response
@@ -119,6 +131,7 @@ pub fn refusal(error: &Error, id: &RequestId) -> Response<Body> {
 fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
+        .merge(camera_statuses::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())
@@ -127,7 +140,12 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(tracks::routes())
         .merge(gnss_error::routes())
         .merge(evaluations::routes())
+        .merge(keys::routes())
+        .merge(audit::routes())
+        .merge(session::routes())
+        .merge(server_info::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
+    description::add_security(router.get_openapi_mut());
     router
 }

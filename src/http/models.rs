@@ -1,7 +1,7 @@
 //! `/v1/cameras/{camera}/models` and `.../active-model`: what training runs yield.
 
 use axum::body::Body;
-use axum::extract::{Request, State};
+use axum::extract::Request;
 use axum::response::Response;
 use hyper::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use hyper::http::HeaderValue;
@@ -12,11 +12,11 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::access::CallerApp;
 use super::extract::{CameraPath, JsonBody, ModelPath, Params, media_type, not_read};
 use super::problem::{ApiResult, Problem};
 use super::wire::{created, empty, json};
 use super::{Rest, body};
-use crate::app::App;
 use crate::domain::{self, Error, ModelMetadata};
 use crate::exchange::write_cursor;
 
@@ -94,7 +94,7 @@ struct Activation {
     ),
     responses((status = 200, description = "A page of versions", body = ModelPage))
 )]
-async fn list_models(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
+async fn list_models(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
@@ -112,7 +112,7 @@ async fn list_models(State(app): State<App>, CameraPath(id): CameraPath, uri: Ur
     params(("camera" = String, Path, description = "The camera's id"), ("model" = u32, Path, description = "The version's number")),
     responses((status = 200, description = "The version", body = ModelVersion))
 )]
-async fn get_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> ApiResult {
+async fn get_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) -> ApiResult {
     Ok(json(&ModelVersion::from(app.model(&id, number).await?))?)
 }
 
@@ -127,7 +127,7 @@ async fn get_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> 
         (status = 409, description = "The version is active", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> ApiResult {
+async fn delete_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) -> ApiResult {
     app.delete_model(&id, number).await?;
     Ok(empty())
 }
@@ -141,7 +141,7 @@ async fn delete_model(State(app): State<App>, ModelPath(id, number): ModelPath) 
     params(("camera" = String, Path, description = "The camera's id"), ("model" = u32, Path, description = "The version's number")),
     responses((status = 200, description = "The file", body = Vec<u8>, content_type = "application/vnd.safetensors"))
 )]
-async fn download_model(State(app): State<App>, ModelPath(id, number): ModelPath) -> ApiResult {
+async fn download_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) -> ApiResult {
     let mut response = Response::new(Body::from(app.download_model(&id, number).await?));
     let name = format!("attachment; filename=\"{id}-{number}.safetensors\"");
     let headers = response.headers_mut();
@@ -159,7 +159,7 @@ async fn download_model(State(app): State<App>, ModelPath(id, number): ModelPath
     request_body(content((Vec<u8> = "application/vnd.safetensors"), (Vec<u8> = "application/octet-stream"))),
     responses((status = 201, description = "The stored version", body = ModelVersion, headers(("location" = String, description = "Its path"))))
 )]
-async fn import_model(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> ApiResult {
+async fn import_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, request: Request) -> ApiResult {
     let (parts, content) = request.into_parts();
     let readable = [SAFETENSORS, "application/octet-stream"];
     if !media_type(&parts.headers).is_some_and(|given| readable.contains(&given)) {
@@ -179,7 +179,7 @@ async fn import_model(State(app): State<App>, CameraPath(id): CameraPath, reques
         (status = 409, description = "No version is active", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn get_active_model(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
+async fn get_active_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
     Ok(json(&ModelVersion::from(app.active_model(&id).await?))?)
 }
 
@@ -189,7 +189,7 @@ async fn get_active_model(State(app): State<App>, CameraPath(id): CameraPath) ->
     request_body = Activation,
     responses((status = 200, description = "The version that answers now", body = ModelVersion))
 )]
-async fn activate_model(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
+async fn activate_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
     let Activation { number } = body.read()?;
     app.activate_model(&id, number).await?;
     Ok(json(&ModelVersion::from(app.model(&id, number).await?))?)
@@ -203,7 +203,7 @@ async fn activate_model(State(app): State<App>, CameraPath(id): CameraPath, body
         (status = 409, description = "No version answered before", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn roll_back_model(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
+async fn roll_back_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
     app.roll_back_model(&id).await?;
     Ok(json(&ModelVersion::from(app.active_model(&id).await?))?)
 }

@@ -1,18 +1,19 @@
 //! `/v1/cameras/{camera}/samples/pairings`: an import of detections and fixes that come apart.
 
-use axum::extract::{Request, State};
+use axum::extract::Request;
 use serde::Serialize;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::extract::{CameraPath, Params};
 use super::parts::parts;
 use super::problem::{ApiResult, Problem};
 use super::receivers::Receiver;
 use super::wire::{Durability, json};
-use crate::app::{App, PairedImport, PairedReport, PairingCounts, Part};
+use crate::app::{PairedImport, PairedReport, PairingCounts, Part};
 use crate::domain::{self, Error, ReceiverId, Result, TargetId};
 use crate::exchange::{FixFormat, Format, RowError};
 use crate::fusion::clock_offset::OffsetEstimate;
@@ -170,7 +171,7 @@ struct ClockOffsetEstimate {
         (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn pair_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> ApiResult {
+async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, request: Request) -> ApiResult {
     let (head, content) = request.into_parts();
     let mut params = Params::of(&head.uri)?;
     let settings = settings(&mut params)?;

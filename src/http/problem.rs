@@ -10,7 +10,7 @@ use axum::body::Body;
 use axum::extract::Request;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use hyper::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER};
+use hyper::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER, WWW_AUTHENTICATE};
 use hyper::http::HeaderValue;
 use hyper::{Method, StatusCode};
 use serde::Serialize;
@@ -113,8 +113,14 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
     *response.status_mut() = status_of(error);
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
-    if error.kind() == ErrorKind::Overloaded {
-        headers.insert(RETRY_AFTER, HeaderValue::from_static("1"));
+    match error.kind() {
+        ErrorKind::Overloaded => {
+            headers.insert(RETRY_AFTER, HeaderValue::from_static("1"));
+        }
+        ErrorKind::Unauthenticated => {
+            headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"sightfix\""));
+        }
+        _ => {}
     }
     response
 }

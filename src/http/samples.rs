@@ -1,7 +1,7 @@
 //! `/v1/cameras/{camera}/samples`: import, list, export, count, delete.
 
 use axum::body::Body;
-use axum::extract::{Request, State};
+use axum::extract::Request;
 use axum::response::Response;
 use bytes::Bytes;
 use futures_util::stream;
@@ -13,6 +13,7 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::access::CallerApp;
 use super::extract::{CameraPath, Params, media_type, negotiate, not_read};
 use super::problem::{ApiResult, Problem};
 use super::wire::{Durability, json};
@@ -130,7 +131,11 @@ struct DeletedSamples {
         (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn import_samples(State(app): State<App>, CameraPath(id): CameraPath, request: Request) -> ApiResult {
+async fn import_samples(
+    CallerApp(app): CallerApp,
+    CameraPath(id): CameraPath,
+    request: Request,
+) -> ApiResult {
     let (parts, content) = request.into_parts();
     let mut params = Params::of(&parts.uri)?;
     let durability = params.durability()?;
@@ -172,7 +177,7 @@ fn import_format(headers: &HeaderMap) -> Result<Format> {
     )
 )]
 async fn list_samples(
-    State(app): State<App>,
+    CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
     uri: Uri,
     headers: HeaderMap,
@@ -275,7 +280,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
     ),
     responses((status = 200, description = "Their number", body = SampleCount))
 )]
-async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
+async fn count_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let filter = filter(&mut params)?;
     params.end()?;
@@ -297,7 +302,7 @@ async fn count_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: 
     ),
     responses((status = 200, description = "How many were deleted", body = DeletedSamples))
 )]
-async fn delete_samples(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
+async fn delete_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let filter = filter(&mut params)?;
     params.end()?;

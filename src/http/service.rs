@@ -9,8 +9,9 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::problem::{ApiResult, Problem};
-use crate::app::App;
+use crate::app::access::Permission;
 use crate::domain::{Error, ErrorKind};
 
 /// Time for the store's response, below the timeouts that probes of readiness have.
@@ -36,7 +37,7 @@ const NAMED_CAMERAS: usize = 100;
 ///
 /// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
 /// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
-/// a line `degraded: insufficient-storage: ...`.
+/// a line `degraded: insufficient-storage: ...`. Callers that may not read get the first line only.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -44,17 +45,20 @@ const NAMED_CAMERAS: usize = 100;
         (status = 503, description = "It is shutting down, or its store does not respond", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn readyz(State(rest): State<Rest>) -> ApiResult<String> {
+async fn readyz(State(rest): State<Rest>, CallerApp(app): CallerApp) -> ApiResult<String> {
     if rest.shutdown.is_draining() {
         return Err(Error::refused(ErrorKind::ShuttingDown, "the server is ending").into());
     }
-    match tokio::time::timeout(PING_TIME, rest.app.store.ping()).await {
+    match tokio::time::timeout(PING_TIME, app.store.ping()).await {
         Ok(answered) => answered?,
         Err(_) => return Err(slow_store().into()),
     }
-    let faults = rest.app.registry.model_faults();
     let mut text = "ready\n".to_owned();
-    if rest.app.store.is_full() {
+    if app.caller().authorize(Permission::Read).is_err() {
+        return Ok(text);
+    }
+    let faults = app.registry.model_faults();
+    if app.store.is_full() {
         text.push_str("degraded: insufficient-storage: imports are refused until space is freed\n");
     }
     for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {
@@ -76,6 +80,6 @@ fn slow_store() -> Error {
     get, path = "/metrics", tag = "service",
     responses((status = 200, description = "Metrics", body = String, content_type = "text/plain"))
 )]
-async fn metrics(State(app): State<App>) -> Response {
+async fn metrics(CallerApp(app): CallerApp) -> Response {
     ([(CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], app.metrics.render()).into_response()
 }

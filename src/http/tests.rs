@@ -17,8 +17,9 @@ use tempfile::TempDir;
 use tower::ServiceExt as _;
 
 use crate::app::App;
+use crate::app::access::{Caller, Principal};
 use crate::clock::{Clock, Randomness};
-use crate::config::Limits;
+use crate::config::{Console, Limits};
 use crate::shutdown::Shutdown;
 use crate::store::Store;
 use crate::telemetry::{Metrics, RequestId};
@@ -85,7 +86,7 @@ impl Rest {
         let app =
             App::new(store, clock, Randomness::seeded(1), limits, Metrics::new()).await.expect("an app");
         let shutdown = Shutdown::new();
-        Self { router: super::router(app, shutdown.clone()), shutdown, _folder: folder }
+        Self { router: super::router(app, Console::default(), shutdown.clone()), shutdown, _folder: folder }
     }
 
     /// With a camera `c` of 640 x 480 px.
@@ -109,6 +110,7 @@ impl Rest {
         }
         let mut request = request.body(body).expect("a request");
         request.extensions_mut().insert(RequestId::new(HeaderValue::from_static("the-request")));
+        request.extensions_mut().insert(Caller::new(Principal::Everyone, None, None));
         self.router.clone().oneshot(request).await.expect("never fails")
     }
 

@@ -17,12 +17,13 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::cameras::CameraMoved;
 use super::extract::{CameraPath, Client, JsonBody, TargetPath};
 use super::fusions::{FusionRequest, observations};
 use super::problem::{ApiResult, Problem};
 use super::wire::{json, json_of_about};
-use crate::app::{App, CameraEvent, ItemResult, LostEvents, TrackPoint};
+use crate::app::{CameraEvent, ItemResult, LostEvents, TargetUpdate, TrackPoint};
 use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
@@ -201,7 +202,7 @@ fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     params(("camera" = String, Path, description = "The camera's id")),
     responses((status = 200, description = "Positions, by target", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> ApiResult {
+async fn list_tracks(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
     Ok(geojson(&app.tracks(&id).await?)?)
 }
 
@@ -213,7 +214,7 @@ async fn list_tracks(State(app): State<App>, CameraPath(id): CameraPath) -> ApiR
     params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id")),
     responses((status = 200, description = "Positions, oldest first", body = TrackFeatures, content_type = "application/geo+json"))
 )]
-async fn get_track(State(app): State<App>, TargetPath(id, target): TargetPath) -> ApiResult {
+async fn get_track(CallerApp(app): CallerApp, TargetPath(id, target): TargetPath) -> ApiResult {
     Ok(geojson(&app.track_history(&id, &target).await?)?)
 }
 
@@ -237,6 +238,29 @@ impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
     }
 }
 
+/// A measured target: the GeoJSON feature of its track, and the observation that updated it.
+#[derive(Serialize, ToSchema)]
+struct TrackUpdate<'a> {
+    #[serde(flatten)]
+    feature: TrackFeature,
+    /// The observation's box.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    bounding_box: Option<wire::BoundingBox>,
+    /// The observation's own position; missing for a box while the camera has no model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fused: Option<wire::FusedFix<'a>>,
+}
+
+impl<'a> From<&'a TargetUpdate> for TrackUpdate<'a> {
+    fn from(update: &'a TargetUpdate) -> Self {
+        Self {
+            feature: update.point.as_ref().into(),
+            bounding_box: update.bounding_box.map(Into::into),
+            fused: update.fused.as_ref().map(Into::into),
+        }
+    }
+}
+
 /// One answer per observation, in their order.
 #[derive(Serialize, ToSchema)]
 struct FollowedObservations<'a> {
@@ -256,7 +280,7 @@ struct FollowedObservations<'a> {
         (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
+async fn follow(CallerApp(app): CallerApp, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
     let camera = app.active_camera(&id).await?;
     // Times ahead of the clock are refused before any track has changed.
     let observations = observations(&app, &body.read()?, &app.live_rules(&camera))?;
@@ -277,19 +301,20 @@ async fn follow(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBo
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/events", tag = "tracks",
     params(("camera" = String, Path, description = "The camera's id")),
-    responses((status = 200, description = "Events", body = TrackFeature, content_type = "text/event-stream"))
+    responses((status = 200, description = "Events", body = TrackUpdate<'static>, content_type = "text/event-stream"))
 )]
 async fn watch_camera(
     State(rest): State<Rest>,
+    CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
     Client(client): Client,
 ) -> ApiResult {
-    let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
-    let events = rest.app.camera_events(&id).await?;
+    let lease = app.quotas.event_streams.try_acquire(client, 1)?;
+    let events = app.camera_events(&id).await?;
     let shutdown = rest.shutdown.clone();
     let sent = stream::unfold(events, |mut events| async move {
         let event = match events.next().await? {
-            Ok(CameraEvent::Track(point)) => event_of("track", &TrackFeature::from(&*point)),
+            Ok(CameraEvent::Track(update)) => event_of("track", &TrackUpdate::from(&*update)),
             Ok(CameraEvent::Moved(moved)) => event_of("camera_moved", &CameraMoved::from(&*moved)),
             Err(LostEvents(lost)) => event_of("lost", &lost),
         };

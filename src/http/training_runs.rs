@@ -15,10 +15,11 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
+use super::access::CallerApp;
 use super::extract::{CameraPath, Client, JsonBody, Params, RunPath};
 use super::problem::{ApiResult, Problem};
 use super::wire::{JobState, Recipe, created, empty, instant, json};
-use crate::app::{App, RunRequest};
+use crate::app::RunRequest;
 use crate::domain::{self, EpochReport, Error, Result, RunProgress, TrainingReport};
 use crate::exchange::write_cursor;
 
@@ -167,7 +168,11 @@ struct RunPage {
         (status = 409, description = "The camera has a live run", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn start_training_run(State(app): State<App>, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
+async fn start_training_run(
+    CallerApp(app): CallerApp,
+    CameraPath(id): CameraPath,
+    body: JsonBody,
+) -> ApiResult {
     let run = app.start_run(&id, body.read_or_default::<RunDraft>()?.to_domain()?).await?;
     let location = format!("/v1/cameras/{id}/training-runs/{}", run.id);
     Ok(created(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
@@ -183,7 +188,7 @@ async fn start_training_run(State(app): State<App>, CameraPath(id): CameraPath, 
     ),
     responses((status = 200, description = "A page of runs", body = RunPage))
 )]
-async fn list_training_runs(State(app): State<App>, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
+async fn list_training_runs(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
@@ -201,7 +206,7 @@ async fn list_training_runs(State(app): State<App>, CameraPath(id): CameraPath, 
     params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
     responses((status = 200, description = "The run", body = TrainingRun))
 )]
-async fn get_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
+async fn get_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
     Ok(json(&TrainingRun::from(app.run(&id, run).await?))?)
 }
 
@@ -217,7 +222,7 @@ async fn get_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> 
         (status = 409, description = "The run has not ended", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn delete_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
+async fn delete_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
     app.delete_run(&id, run).await?;
     Ok(empty())
 }
@@ -233,7 +238,7 @@ async fn delete_training_run(State(app): State<App>, RunPath(id, run): RunPath) 
         (status = 409, description = "The run has ended", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn cancel_training_run(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
+async fn cancel_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
     Ok(json(&TrainingRun::from(app.cancel_run(&id, run).await?))?)
 }
 
@@ -251,6 +256,7 @@ async fn cancel_training_run(State(app): State<App>, RunPath(id, run): RunPath) 
 )]
 async fn watch_training_run(
     State(rest): State<Rest>,
+    CallerApp(app): CallerApp,
     RunPath(id, run): RunPath,
     Client(client): Client,
     headers: HeaderMap,
@@ -258,8 +264,8 @@ async fn watch_training_run(
     if headers.get("last-event-id").is_some_and(|last| last == ENDED) {
         return Ok(empty());
     }
-    let lease = rest.app.quotas.event_streams.try_acquire(client, 1)?;
-    let changes = rest.app.watch_run(&id, run).await?;
+    let lease = app.quotas.event_streams.try_acquire(client, 1)?;
+    let changes = app.watch_run(&id, run).await?;
     let shutdown = rest.shutdown.clone();
     let events = changes.take_until(async move { shutdown.draining().await }).map(move |change| {
         let _held = &lease; // until the stream is dropped
@@ -306,7 +312,7 @@ struct TrainingLog {
     params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
     responses((status = 200, description = "The log", body = TrainingLog))
 )]
-async fn get_training_log(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
+async fn get_training_log(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
     let lines = app.run_log(&id, run).await?;
     Ok(json(&TrainingLog { items: lines.into_iter().map(|(time, text)| LogLine { time, text }).collect() })?)
 }
@@ -324,6 +330,6 @@ struct TrainingCurve {
     params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
     responses((status = 200, description = "The curve", body = TrainingCurve))
 )]
-async fn get_training_curve(State(app): State<App>, RunPath(id, run): RunPath) -> ApiResult {
+async fn get_training_curve(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
     Ok(json(&TrainingCurve { items: app.run_epochs(&id, run).await? })?)
 }

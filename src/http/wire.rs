@@ -3,13 +3,13 @@
 use axum::body::Body;
 use axum::response::Response;
 use hyper::StatusCode;
-use hyper::header::{CONTENT_TYPE, ETAG, IntoHeaderName, LOCATION};
+use hyper::header::{CONTENT_TYPE, IntoHeaderName, LOCATION};
 use hyper::http::HeaderValue;
 use jiff::Timestamp;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::domain::{self, Error, Result, Revision, parse_time};
+use crate::domain::{self, Error, Result, parse_time};
 
 /// How a camera is learnt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -104,13 +104,6 @@ pub(super) fn instant(field: &str, text: Option<&str>) -> Result<Option<Timestam
     parse_time(text).map(Some).map_err(|error| error.at(field))
 }
 
-/// A field that may be left out (`None`), or be null (`Some(None)`).
-pub(super) fn nullable<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
-    deserializer: D,
-) -> std::result::Result<Option<Option<T>>, D::Error> {
-    Option::deserialize(deserializer).map(Some)
-}
-
 /// A 200 of JSON.
 pub(super) fn json(value: &impl Serialize) -> Result<Response> {
     json_of_about(value, 128)
@@ -130,12 +123,6 @@ pub(super) fn created(status: StatusCode, location: &str, value: &impl Serialize
     let mut response = json(value)?;
     *response.status_mut() = status;
     insert(&mut response, LOCATION, location)?;
-    Ok(response)
-}
-
-/// Names the revision of what is shown.
-pub(super) fn with_etag(mut response: Response, revision: Revision) -> Result<Response> {
-    insert(&mut response, ETAG, &format!("\"{}\"", revision.0))?;
     Ok(response)
 }
 

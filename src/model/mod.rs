@@ -2,7 +2,7 @@
 //!
 //! [`fit`] turns samples into an [`Artifact`]; [`Artifact::load`] turns that into a [`Regressor`], which
 //! regresses box by box from flat weights. The folders in the order of their layers: `artifact`, `network`,
-//! `samples`, `progress`, `encoder`, `uncertainty`, `regressor`, `probe`, `fitting`. This is the only module that
+//! `samples`, `progress`, `encoder`, `uncertainty`, `regressor`, `probe`, `view_area`, `fitting`. This is the only module that
 //! uses candle; it has no I/O, clocks or threads.
 
 mod artifact;
@@ -14,6 +14,7 @@ mod progress;
 mod regressor;
 mod samples;
 mod uncertainty;
+mod view_area;
 
 pub use crate::statistics::R95_PER_SIGMA;
 pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackNoiseModel};
@@ -25,6 +26,7 @@ pub use progress::{FitError, FitEvent};
 pub use regressor::{Regression, Regressor};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use samples::sequences::fix_sequences;
+pub use view_area::ViewArea;
 
 #[cfg(test)]
 mod tests;

@@ -7,7 +7,7 @@ use super::encoder::gaussian_process::RecentBoxes;
 use super::uncertainty::coverage::CoverageLookup;
 use super::uncertainty::error_model::{BoxError, ErrorModel};
 use crate::domain::{BoundingBox, ImageSize, Result};
-use crate::geo::{EastNorth, LocalPlane};
+use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
 use crate::statistics::R95_PER_SIGMA;
 
 /// White share of a regression's error variance where the model does not state it.
@@ -24,6 +24,12 @@ pub struct Regression {
     pub reconstruction_error: f64,
     /// Error variance per axis, m2; above 0.
     pub e_regression_m2: f64,
+    /// Covariance of the error, m2; its mean variance is `e_regression_m2`. Isotropic but for the recipe
+    /// `gaussian_process`.
+    pub covariance: PlaneCovariance,
+    /// Of `covariance`, the part that is independent from box to box (the detector's noise); the rest is the
+    /// same whenever the target returns to a place.
+    pub box_noise: PlaneCovariance,
     /// Whether the box is unlike those of the training samples.
     pub outside_training: bool,
     /// `r95_m = r95_scale * sqrt(e)` of the regressed and of the fused position.
@@ -35,6 +41,19 @@ impl Regression {
     #[must_use]
     pub fn variance_m2(&self) -> f64 {
         (self.r95_scale / R95_PER_SIGMA).powi(2) * self.e_regression_m2
+    }
+
+    /// The 95 % radius about the regressed position, m.
+    #[must_use]
+    pub fn r95_m(&self) -> f64 {
+        self.r95_scale * self.e_regression_m2.sqrt()
+    }
+
+    /// Factor by which `covariance` is multiplied for the normal distribution that has the stated 95 % radius,
+    /// which is larger where the covariance itself is uncertain.
+    #[must_use]
+    pub fn normal_scale(&self) -> f64 {
+        (self.r95_m() / self.covariance.r95_m()).powi(2)
     }
 }
 
@@ -76,7 +95,8 @@ impl Regressor {
     }
 
     /// Size of the image that it was trained on, if known.
-    pub(super) const fn image_size(&self) -> Option<ImageSize> {
+    #[must_use]
+    pub const fn image_size(&self) -> Option<ImageSize> {
         self.error_model.image_size()
     }
 
@@ -147,6 +167,7 @@ impl Regressor {
     ) -> Regression {
         let lookup = self.error_model.look_up(bounding_box);
         let mut r95_scale = self.r95_scale;
+        let mut stated = None;
         let (regressed, error) = match &self.encoder {
             Encoder::Paper(paper) => {
                 let estimate = paper.estimate(&self.plane, bounding_box, fix);
@@ -163,15 +184,24 @@ impl Regressor {
                 let estimate = map.estimate(bounding_box, recent);
                 r95_scale = estimate.r95_scale;
                 let reconstruction_error = reconstruction_error(bounding_box, &estimate.encoded);
-                let error = BoxError { reconstruction_error, variance_m2: estimate.variance_m2 };
-                (estimate.encoded.position, error)
+                stated = Some((estimate.covariance, estimate.box_noise));
+                let variance_m2 = estimate.covariance.per_axis_m2();
+                (estimate.encoded.position, BoxError { reconstruction_error, variance_m2 })
             }
         };
+        let e_regression_m2 =
+            (error.variance_m2 + self.added_m2).clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]);
+        let (covariance, box_noise) = stated.unwrap_or_else(|| {
+            let isotropic = PlaneCovariance::isotropic(error.variance_m2);
+            (isotropic, isotropic.scaled(self.white_share))
+        });
+        let covariance = covariance.plus(PlaneCovariance::isotropic(e_regression_m2 - error.variance_m2));
         Regression {
             regressed,
             reconstruction_error: error.reconstruction_error,
-            e_regression_m2: (error.variance_m2 + self.added_m2)
-                .clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]),
+            e_regression_m2,
+            covariance,
+            box_noise,
             outside_training: self.error_model.is_outside_training(&lookup, error.reconstruction_error),
             r95_scale,
         }

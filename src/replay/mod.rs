@@ -55,8 +55,9 @@ pub async fn replay(
     stop: CancellationToken,
 ) -> Result<ReplayReport, ClientError> {
     let connections = options.cameras.div_ceil(STREAMS_PER_CONNECTION).max(1);
-    let connections: Vec<_> =
-        (0..connections).map(|_| Connection::to(&options.server)).collect::<Result<_, _>>()?;
+    let connections: Vec<_> = (0..connections)
+        .map(|_| Connection::to(&options.server, options.key.as_ref()))
+        .collect::<Result<_, _>>()?;
     let started = Instant::now();
     let cameras = (0..options.cameras).map(|number| {
         let connection = connections[number % connections.len()].clone();

@@ -7,13 +7,15 @@ use jiff::SignedDuration;
 
 use super::fault_injection::FaultShares;
 use super::paced_feed::Pace;
-use crate::domain::CameraId;
+use crate::domain::{CameraId, KeySecret};
 
 /// Parameters of a replay.
 #[derive(Debug, Clone)]
 pub struct ReplayOptions {
     /// Address of the server, such as `http://127.0.0.1:8080`.
     pub server: String,
+    /// Key to present, if the server asks for one.
+    pub key: Option<KeySecret>,
     /// Cameras of the server. Simulated cameras are assigned to them round robin; where several share
     /// one, their target ids get a suffix, so that they are distinct targets.
     pub camera_ids: Vec<CameraId>,

@@ -10,12 +10,14 @@ use std::time::Duration;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::{Instant, MissedTickBehavior};
 
 use super::activity::Activity;
 use super::guarded_stream::GuardedStream;
 use super::pipeline::{Peer, RequestPipeline};
+use super::tls::{HANDSHAKE_RECORD, Tls};
 use crate::admission::{ClientAddress, Quota};
 use crate::config::Limits;
 use crate::shutdown::Shutdown;
@@ -53,12 +55,14 @@ pub(super) fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
 pub(super) async fn accept(
     listener: TcpListener,
     pipeline: Arc<RequestPipeline>,
+    tls: Option<Arc<Tls>>,
     limits: &Limits,
     shutdown: &Shutdown,
 ) {
     let server = Arc::new(ConnectionServer {
         builder: builder(limits),
         pipeline,
+        tls,
         limits: limits.clone(),
         shutdown: shutdown.clone(),
     });
@@ -88,7 +92,8 @@ pub(super) async fn accept(
         };
         let server = server.clone();
         shutdown.spawn(async move {
-            server.serve(stream, Peer { client, refusal }).await;
+            let peer = Peer { client, address: address.ip().to_canonical(), certificate: None, refusal };
+            server.serve(stream, peer).await;
             drop(lease);
         });
     }
@@ -116,16 +121,57 @@ fn builder(limits: &Limits) -> Builder<TokioExecutor> {
 struct ConnectionServer {
     builder: Builder<TokioExecutor>,
     pipeline: Arc<RequestPipeline>,
+    tls: Option<Arc<Tls>>,
     limits: Limits,
     shutdown: Shutdown,
 }
 
 impl ConnectionServer {
-    async fn serve(&self, stream: TcpStream, peer: Peer) {
+    /// Serves a connection, over TLS where that is set up; plain HTTP is then for this machine alone.
+    async fn serve(&self, stream: TcpStream, mut peer: Peer) {
         // Answers are written whole; waiting to fill a packet only delays them.
         let _ = stream.set_nodelay(true);
+        let _open = self.pipeline.metrics().connection();
+        let Some(tls) = &self.tls else { return self.serve_http(stream, peer).await };
+        let is_tls = async {
+            let mut first = [0];
+            Ok::<_, std::io::Error>(stream.peek(&mut first).await? > 0 && first[0] == HANDSHAKE_RECORD)
+        };
+        match self.in_time(is_tls).await {
+            Some(true) => {
+                let Some((stream, certificate)) = self.in_time(tls.accept(stream)).await else { return };
+                peer.certificate = certificate;
+                self.serve_http(stream, peer).await;
+            }
+            Some(false) if is_of_this_machine(&stream, &peer) => self.serve_http(stream, peer).await,
+            Some(false) => {
+                tracing::debug!(client = %peer.address, "plain HTTP is not served to other machines")
+            }
+            None => {}
+        }
+    }
+
+    /// What comes of the begin of a connection, if it comes in the time of a request's headers.
+    async fn in_time<T>(&self, begin: impl Future<Output = std::io::Result<T>>) -> Option<T> {
+        let begun = tokio::select! {
+            begun = tokio::time::timeout(self.limits.header_time(), begin) => begun,
+            () = self.shutdown.draining() => return None,
+        };
+        match begun {
+            Ok(Ok(begun)) => Some(begun),
+            Ok(Err(error)) => {
+                tracing::debug!(%error, "a connection could not be begun");
+                None
+            }
+            Err(_) => None,
+        }
+    }
+
+    async fn serve_http<S>(&self, stream: S, peer: Peer)
+    where
+        S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
         let metrics = self.pipeline.metrics();
-        let _open = metrics.connection();
         let activity = Activity::new();
         let mut closing = Closing::new(&self.limits, peer.refusal.is_some());
         let stream = TokioIo::new(GuardedStream::new(stream, &self.limits, activity.clone()));
@@ -162,6 +208,12 @@ impl ConnectionServer {
             metrics.connection_closed(reason);
         }
     }
+}
+
+/// Whether the client is on this machine, by either of its addresses.
+fn is_of_this_machine(stream: &TcpStream, peer: &Peer) -> bool {
+    let is_own = |own: SocketAddr| own.ip().to_canonical() == peer.address;
+    peer.address.is_loopback() || stream.local_addr().is_ok_and(is_own)
 }
 
 /// Decides when a connection is of no more use.

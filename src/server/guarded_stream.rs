@@ -1,4 +1,4 @@
-//! A client's TCP stream with a deadline for its first bytes, one for every write that makes no
+//! A client's stream, over TLS or not, with a deadline for its first bytes, one for every write that makes no
 //! progress, and a limit on HTTP/2 control frames.
 
 use std::io;
@@ -8,7 +8,6 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::TcpStream;
 use tokio::time::Sleep;
 
 use super::activity::Activity;
@@ -16,8 +15,8 @@ use super::frame_limit::{FrameLimit, PREFACE};
 use crate::config::Limits;
 use crate::telemetry::CloseReason;
 
-pub(super) struct GuardedStream {
-    stream: TcpStream,
+pub(super) struct GuardedStream<S> {
+    stream: S,
     activity: Arc<Activity>,
     frames: FrameLimit,
     /// Bytes missing until HTTP/1 and HTTP/2 can be distinguished. hyper's own timers begin
@@ -29,8 +28,8 @@ pub(super) struct GuardedStream {
     write: Option<Pin<Box<Sleep>>>,
 }
 
-impl GuardedStream {
-    pub(super) fn new(stream: TcpStream, limits: &Limits, activity: Arc<Activity>) -> Self {
+impl<S> GuardedStream<S> {
+    pub(super) fn new(stream: S, limits: &Limits, activity: Arc<Activity>) -> Self {
         Self {
             stream,
             activity,
@@ -62,7 +61,7 @@ impl GuardedStream {
     }
 }
 
-impl AsyncRead for GuardedStream {
+impl<S: AsyncRead + Unpin> AsyncRead for GuardedStream<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -90,7 +89,7 @@ impl AsyncRead for GuardedStream {
     }
 }
 
-impl AsyncWrite for GuardedStream {
+impl<S: AsyncWrite + Unpin> AsyncWrite for GuardedStream<S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,

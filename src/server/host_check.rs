@@ -39,6 +39,27 @@ impl HostCheck {
         Ok(())
     }
 
+    /// Checks that a request that a browser's cookie vouches for comes from a page of this server, if it is
+    /// to change anything: `allowed_hosts = *` does not extend to cookies.
+    ///
+    /// # Errors
+    /// `OriginNotAllowed`.
+    pub(super) fn check_same_origin<B>(&self, request: &Request<B>) -> Result<()> {
+        if matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS) {
+            return Ok(());
+        }
+        let origin = only_value(request, &ORIGIN)?.and_then(|origin| origin.split_once("://"));
+        let host = self.host(request)?;
+        let is_own = |origin: &str| {
+            host.is_some_and(|host| origin.eq_ignore_ascii_case(host)) || self.is_configured(origin)
+        };
+        if origin.is_some_and(|(_, origin)| is_own(origin)) {
+            return Ok(());
+        }
+        let message = "changes with a session's cookie must come from a page of this server itself";
+        Err(Error::field(ErrorKind::OriginNotAllowed, "origin", message))
+    }
+
     /// The host that the request names, where it may.
     fn host<'r, B>(&self, request: &'r Request<B>) -> Result<Option<&'r str>> {
         let header = only_value(request, &HOST)?;

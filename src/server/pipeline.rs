@@ -1,6 +1,7 @@
 //! What every request goes through, whatever its transport: id, span, host and origin, admission,
 //! deadline, then the transport.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -13,13 +14,18 @@ use hyper::http::HeaderValue;
 use hyper::{Method, Request, Response, Version};
 use tokio::sync::Semaphore;
 use tower::Service as _;
-use tracing::Instrument as _;
+use tracing::field::{Empty, display};
+use tracing::{Instrument as _, Span};
 
 use super::activity::{ObservedBody, OpenRequest};
+use super::credentials::credential;
 use super::host_check::HostCheck;
 use super::request_body::{AdmittedBody, RateGuard, Ticket};
+use super::revocable_body::RevocableBody;
 use crate::admission::{BodyRefusal, ClientAddress, RequestClass};
 use crate::app::App;
+use crate::app::access::{Caller, CertificateHolder, Credential, Permission, Principal};
+use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
 use crate::telemetry::{Metrics, REQUEST_ID, RequestId};
@@ -45,18 +51,29 @@ pub(super) struct RequestPipeline {
 /// The connection that a request came over.
 #[derive(Clone)]
 pub(super) struct Peer {
+    /// As limits count it.
     pub(super) client: ClientAddress,
+    /// As the audit log names it.
+    pub(super) address: IpAddr,
+    /// Whose certificate was verified, if one was presented.
+    pub(super) certificate: Option<CertificateHolder>,
     /// Why only probes are answered on it, if so.
     pub(super) refusal: Option<Arc<Error>>,
+}
+
+/// What a request was granted.
+struct Granted {
+    ticket: Ticket,
+    caller: Caller,
 }
 
 /// The body of every response; it holds the request's memory until its end.
 pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
 
 impl RequestPipeline {
-    pub(super) fn new(app: App, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+    pub(super) fn new(app: App, console: Console, hosts: HostCheck, shutdown: &Shutdown) -> Self {
         Self {
-            http: http::router(app.clone(), shutdown.clone()),
+            http: http::router(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
             shutdown: shutdown.clone(),
@@ -84,11 +101,13 @@ impl RequestPipeline {
             .get(CONTENT_TYPE)
             .is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"));
         let span = tracing::debug_span!(
-            "request", id = %id, method = %request.method(), path = request.uri().path()
+            "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
         let (mut response, ticket) = async {
             match self.admit(request, is_grpc, peer, &id).await {
-                Ok((request, ticket)) => (self.route(is_grpc, request, &ticket, &id).await, Some(ticket)),
+                Ok((request, granted)) => {
+                    (self.route(is_grpc, request, &granted, &id).await, Some(granted.ticket))
+                }
                 Err(error) => {
                     if error.kind() == ErrorKind::Overloaded {
                         self.app.metrics.refused();
@@ -119,24 +138,25 @@ impl RequestPipeline {
         is_grpc: bool,
         peer: &Peer,
         id: &RequestId,
-    ) -> Result<(Request<Body>, Ticket)> {
+    ) -> Result<(Request<Body>, Granted)> {
         let path = request.uri().path();
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
-        match self.grant(&request, class, is_grpc, peer) {
-            Ok(ticket) => {
+        match self.grant(&request, class, is_grpc, peer, id) {
+            Ok(Granted { ticket, caller }) => {
                 let limits = &self.app.limits;
                 // A live stream may be silent for longer, and looks after that itself.
                 let pace = (class != RequestClass::LiveStream)
                     .then(|| RateGuard::new(limits.body_grace(), limits.body_bytes_per_s));
-                let mut request =
-                    request.map(|body| Body::new(AdmittedBody::new(body, ticket.clone(), pace)));
+                let mut request = request
+                    .map(|body| Body::new(AdmittedBody::new(body, ticket.clone(), caller.clone(), pace)));
                 let extensions = request.extensions_mut();
                 extensions.insert(id.clone());
                 extensions.insert(peer.client);
+                extensions.insert(caller.clone());
                 if class == RequestClass::ImportStream {
                     extensions.insert(ticket.refusal());
                 }
-                Ok((request, ticket))
+                Ok((request, Granted { ticket, caller }))
             }
             Err(error) => {
                 self.discard(request).await;
@@ -151,13 +171,19 @@ impl RequestPipeline {
         class: RequestClass,
         is_grpc: bool,
         peer: &Peer,
-    ) -> Result<Ticket> {
+        id: &RequestId,
+    ) -> Result<Granted> {
         if let Some(Error::Refused(refusal)) = peer.refusal.as_deref()
             && class != RequestClass::Probe
         {
             return Err(Error::Refused(refusal.clone()));
         }
         self.hosts.check(request)?;
+        let caller = self.caller(request, class, is_grpc, peer, id)?;
+        if is_grpc {
+            // `http` compares a route's permission itself: it knows the template of the path.
+            caller.authorize(Permission::of_rpc(request.uri().path()))?;
+        }
         let limits = &self.app.limits;
         let held_bytes = match class {
             // Spooled, or read message by message, each with limits of its own.
@@ -171,16 +197,42 @@ impl RequestPipeline {
         if has_no_body || class == RequestClass::ImportStream {
             ticket.begin_work()?;
         }
-        Ok(ticket)
+        Ok(Granted { ticket, caller })
+    }
+
+    /// Who makes the request.
+    fn caller(
+        &self,
+        request: &Request<Incoming>,
+        class: RequestClass,
+        is_grpc: bool,
+        peer: &Peer,
+        id: &RequestId,
+    ) -> Result<Caller> {
+        let credential = credential(request, peer.certificate.as_ref(), is_grpc);
+        if let Credential::Session(_) = credential {
+            self.hosts.check_same_origin(request)?;
+        }
+        let principal = match self.app.access.authenticate(credential, self.app.clock.now()) {
+            // What watches the server learns that it is alive, whatever has become of its key.
+            Err(_) if class == RequestClass::Probe => Principal::Anonymous,
+            principal => principal?,
+        };
+        let caller = Caller::new(principal, Some(peer.address), Some(id.as_str().into()));
+        if let Some(key) = caller.actor().key_id {
+            Span::current().record("key", display(key));
+        }
+        Ok(caller)
     }
 
     async fn route(
         &self,
         is_grpc: bool,
         request: Request<Body>,
-        ticket: &Ticket,
+        granted: &Granted,
         id: &RequestId,
     ) -> Response<Body> {
+        let Granted { ticket, caller } = granted;
         let time = Duration::from_secs(self.app.limits.request_s);
         // An import stream reports by itself what it has stored of a body that was refused.
         let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
@@ -188,6 +240,7 @@ impl RequestPipeline {
         let answer = tokio::select! {
             biased;
             answer = tokio::time::timeout(time, transport.call(request)) => answer.map_err(|_| too_slow(time)),
+            error = caller.ended() => Err(error),
             () = self.shutdown.forced() => Err(shutting_down()),
         };
         ticket.end_work();
@@ -201,7 +254,8 @@ impl RequestPipeline {
             }
             (Ok(response), None) => {
                 let response = response.unwrap_or_else(|never| match never {});
-                if is_grpc { grpc::explain(response, id) } else { response }
+                let response = if is_grpc { grpc::explain(response, id) } else { response };
+                revocable(response, caller, is_grpc.then_some(id))
             }
         }
     }
@@ -231,6 +285,14 @@ impl RequestPipeline {
         });
         RequestId::new(id)
     }
+}
+
+/// A response that may be open for long ends when the key of its request does.
+fn revocable(response: Response<Body>, caller: &Caller, id: Option<&RequestId>) -> Response<Body> {
+    if !caller.is_revocable() || response.body().size_hint().exact().is_some() {
+        return response;
+    }
+    response.map(|body| Body::new(RevocableBody::new(body, caller.clone(), id.cloned())))
 }
 
 fn refuse(is_grpc: bool, error: &Error, id: &RequestId) -> Response<Body> {

@@ -16,6 +16,7 @@ use tokio::time::{Instant, Sleep};
 
 use crate::admission::{BodyRefusal, ClientAddress, Lease, RequestClass};
 use crate::app::App;
+use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Result};
 
 /// What is read and discarded of a refused request, so that its client reads the refusal and not a
@@ -111,6 +112,7 @@ impl Ticket {
 pub(super) struct AdmittedBody {
     body: Incoming,
     ticket: Ticket,
+    caller: Caller,
     /// `None` for a body that may be silent.
     pace: Option<RateGuard>,
     state: BodyState,
@@ -125,8 +127,8 @@ enum BodyState {
 }
 
 impl AdmittedBody {
-    pub(super) const fn new(body: Incoming, ticket: Ticket, pace: Option<RateGuard>) -> Self {
-        Self { body, ticket, pace, state: BodyState::Open }
+    pub(super) const fn new(body: Incoming, ticket: Ticket, caller: Caller, pace: Option<RateGuard>) -> Self {
+        Self { body, ticket, caller, pace, state: BodyState::Open }
     }
 
     /// What to do with a frame: pass it on, or begin to discard the body.
@@ -163,6 +165,13 @@ impl Body for AdmittedBody {
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, BodyRefused>>> {
         let this = &mut *self;
+        if this.state == BodyState::Open
+            && let Err(error) = this.caller.check_active()
+        {
+            this.ticket.refuse(error);
+            this.state = BodyState::Ended;
+            return Poll::Ready(Some(Err(BodyRefused)));
+        }
         loop {
             match this.state {
                 BodyState::Ended => return Poll::Ready(None),

@@ -8,11 +8,13 @@ use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 
 use super::Store;
+use super::audit::Change;
 use super::errors::{failed, no_camera};
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, GnssBiasSigma, GnssError, ImageSize,
-    NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SampleCount, SigmaM, TargetClass, TargetId,
+    AuditAction, Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssBiasSigma,
+    GnssError, ImageSize, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SampleCount, SigmaM,
+    TargetClass, TargetId,
 };
 
 macro_rules! columns {
@@ -52,6 +54,8 @@ impl Store {
         };
         let camera = read_camera(&row)?;
         check_limit(&mut transaction, self.limits().cameras).await?;
+        let change = Change::of_camera(AuditAction::CameraCreated, &profile.id, None);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
     }
@@ -106,12 +110,12 @@ impl Store {
     pub async fn replace_camera(
         &self,
         profile: &NewCamera,
-        expected: Option<Revision>,
+        expected: Option<ExpectedVersion>,
         now: Timestamp,
     ) -> Result<Camera> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
-        check_revision(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
+        check_version(&find_camera(&mut *transaction, &profile.id).await?, expected)?;
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
              gnss_sigma_m = ?, gnss_bias_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, \
@@ -124,6 +128,9 @@ impl Store {
             .await
             .map_err(failed)?;
         let camera = read_camera(&row)?;
+        let revision = Some(format!("revision {}", camera.revision.0));
+        let change = Change::of_camera(AuditAction::CameraChanged, &profile.id, revision);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
     }
@@ -133,10 +140,15 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::RunLive`] while a
     /// training run has not ended.
-    pub async fn delete_camera(&self, id: &CameraId, expected: Option<Revision>) -> Result<()> {
+    pub async fn delete_camera(
+        &self,
+        id: &CameraId,
+        expected: Option<ExpectedVersion>,
+        now: Timestamp,
+    ) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
-        check_revision(&find_camera(&mut *transaction, id).await?, expected)?;
+        check_version(&find_camera(&mut *transaction, id).await?, expected)?;
         let live: i64 = sqlx::query_scalar(
             "SELECT count(*) FROM training_runs JOIN cameras ON cameras.key = camera_key \
              WHERE cameras.id = ? AND state IN ('queued', 'running')",
@@ -156,6 +168,8 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+        let change = Change::of_camera(AuditAction::CameraDeleted, id, None);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
         Ok(())
@@ -197,17 +211,8 @@ pub(super) async fn camera_key(executor: impl SqliteExecutor<'_>, id: &CameraId)
         .ok_or_else(|| no_camera(id))
 }
 
-fn check_revision(camera: &Camera, expected: Option<Revision>) -> Result<()> {
-    match expected {
-        Some(expected) if expected != camera.revision => Err(Error::refused(
-            ErrorKind::RevisionMismatch,
-            format!(
-                "the camera is at revision {}, not {}; read it again and repeat the change",
-                camera.revision.0, expected.0
-            ),
-        )),
-        _ => Ok(()),
-    }
+fn check_version(camera: &Camera, expected: Option<ExpectedVersion>) -> Result<()> {
+    expected.map_or(Ok(()), |expected| expected.check(camera))
 }
 
 /// Binds the changeable columns in the order that INSERT and UPDATE share.

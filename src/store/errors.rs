@@ -2,7 +2,7 @@
 
 use sqlx::error::DatabaseError;
 
-use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, RunId};
+use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, KeyId, RunId};
 
 /// A row that does not hold what was written: another program or the disk has changed it.
 #[derive(Debug, thiserror::Error)]
@@ -73,6 +73,10 @@ pub(super) fn no_run(id: RunId) -> Error {
 
 pub(super) fn no_evaluation(id: EvaluationId) -> Error {
     Error::refused(ErrorKind::EvaluationNotFound, format!("no evaluation has the id {id}"))
+}
+
+pub(super) fn no_key(id: KeyId) -> Error {
+    Error::refused(ErrorKind::KeyNotFound, format!("no key has the id {id}"))
 }
 
 pub(super) fn no_model(camera: &CameraId, number: u32) -> Error {

@@ -8,14 +8,15 @@ use sqlx::sqlite::SqliteRow;
 use uuid::Uuid;
 
 use super::Store;
+use super::audit::Change;
 use super::cameras::camera_key;
 use super::errors::{failed, no_evaluation};
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
 use super::retention::prune_evaluations;
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    CameraId, Error, ErrorKind, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, Method,
-    Result, SigmaM, TimeRange, Truth,
+    AuditAction, CameraId, Error, ErrorKind, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress,
+    Method, Result, SigmaM, TimeRange, Truth,
 };
 use crate::geo::Position;
 
@@ -81,6 +82,8 @@ impl Store {
         .execute(&mut *transaction)
         .await
         .map_err(failed)?;
+        let change = Change::of_camera(AuditAction::EvaluationStarted, camera, Some(id.to_string()));
+        self.record(&mut transaction, change, now).await?;
         let stored = find_evaluation(&mut *transaction, id).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(stored)
@@ -199,6 +202,9 @@ impl Store {
             return Err(Error::refused(ErrorKind::EvaluationEnded, ended));
         }
         EVALUATIONS.cancel(&mut transaction, id.0, now).await?;
+        let subject = Some(id.to_string());
+        let change = Change::of_camera(AuditAction::EvaluationCancelled, &stored.camera_id, subject);
+        self.record(&mut transaction, change, now).await?;
         let stored = find_evaluation(&mut *transaction, id).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(stored)
@@ -239,17 +245,21 @@ impl Store {
     ///
     /// # Errors
     /// [`ErrorKind::EvaluationNotFound`].
-    pub async fn delete_evaluation(&self, id: EvaluationId) -> Result<()> {
+    pub async fn delete_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
-        let done = sqlx::query("DELETE FROM evaluations WHERE id = ?")
+        let stored = find_evaluation(&mut *transaction, id).await?;
+        sqlx::query("DELETE FROM evaluations WHERE id = ?")
             .bind(id.to_string())
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+        let subject = Some(id.to_string());
+        let change = Change::of_camera(AuditAction::EvaluationDeleted, &stored.camera_id, subject);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
-        if done.rows_affected() == 0 { Err(no_evaluation(id)) } else { Ok(()) }
+        Ok(())
     }
 }
 

@@ -9,15 +9,17 @@
 //! a transaction is held across anything but statements, a type of the database library becomes public.
 //! Rows that the constructors of `domain` refuse are faults that name table, column and row.
 
+mod audit;
 mod camera_moves;
 mod cameras;
 mod connection;
 mod errors;
 mod evaluations;
-
 mod folder;
 mod group_commit;
 mod jobs;
+mod keys;
+mod latest_runs;
 mod models;
 mod occupants;
 mod reserve;
@@ -38,10 +40,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use sqlx::SqlitePool;
 use sqlx::sqlite::SqlitePoolOptions;
 
-use crate::domain::{Durability, Error, ErrorKind, Result};
+use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 
 pub use group_commit::Inserted;
 pub use jobs::{Claim, Heartbeat, JobEnd};
+pub use keys::KeysVersion;
 pub use models::{NewModel, StoredHeldOutError};
 pub use occupants::Occupant;
 pub use runs::{RunEnd, RunOutput};
@@ -64,6 +67,8 @@ use writer::{Growth, Writer, WriterGuard};
 #[derive(Clone)]
 pub struct Store {
     inner: Arc<Inner>,
+    /// On whose behalf changes are recorded in the audit log.
+    actor: Arc<Actor>,
 }
 
 struct Inner {
@@ -109,6 +114,7 @@ impl Store {
     /// by a newer version.
     pub async fn open_with(folder: &Path, options: StoreOptions) -> Result<Self> {
         let StoreOptions { limits, role } = options;
+        let actor = Arc::new(Actor::program(&role));
         let (writer, readers) = connection::open(folder, Space::max_pages(&limits)).await?;
         let writer = Arc::new(writer);
         let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
@@ -123,10 +129,16 @@ impl Store {
             .max_connections(1)
             .connect_lazy_with(readers.connect_options().as_ref().clone());
         let inner = Inner { writer, readers, probe, samples, space, presence };
-        let store = Self { inner: Arc::new(inner) };
+        let store = Self { inner: Arc::new(inner), actor };
         store.reserve_space().await;
         store.count_all_samples().await?;
         Ok(store)
+    }
+
+    /// The same store, whose changes are recorded as those of an actor.
+    #[must_use]
+    pub fn on_behalf_of(&self, actor: Arc<Actor>) -> Self {
+        Self { inner: Arc::clone(&self.inner), actor }
     }
 
     /// Commits what is queued, copies the log back into the file and closes it. Later calls

@@ -6,13 +6,14 @@ use sqlx::sqlite::SqliteRow;
 use uuid::Uuid;
 
 use super::Store;
+use super::audit::{Change, version};
 use super::cameras::{camera_key, find_camera};
 use super::errors::{failed, no_model};
 use super::retention::prune_models;
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata, ModelVersion, Result,
-    RunId, TargetId, model_sha256,
+    AuditAction, BoundingBox, Camera, CameraId, Error, ErrorKind, HeldOutSampleError, ModelMetadata,
+    ModelVersion, Result, RunId, TargetId, model_sha256,
 };
 use crate::geo::Position;
 
@@ -45,6 +46,8 @@ impl Store {
         let model = NewModel { metadata, weights, held_out: &[] };
         let number = add_model(&mut transaction, key, None, &model, now).await?;
         prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
+        let change = Change::of_camera(AuditAction::ModelImported, camera, Some(version(number)));
+        self.record(&mut transaction, change, now).await?;
         let version = find_model(&mut transaction, camera, number).await?;
         transaction.commit().await.map_err(failed)?;
         version.ok_or_else(|| no_model(camera, number))
@@ -173,6 +176,8 @@ impl Store {
             return Err(no_model(camera, number));
         }
         activate(&mut transaction, key, number, now).await?;
+        let change = Change::of_camera(AuditAction::ModelActivated, camera, Some(version(number)));
+        self.record(&mut transaction, change, now).await?;
         let camera = find_camera(&mut *transaction, camera).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
@@ -181,7 +186,8 @@ impl Store {
     /// Makes the version active that was before the active one. Repeated calls go further back.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none was active before.
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none is active, [`ErrorKind::NoEarlierModel`]
+    /// if none was active before.
     pub async fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
@@ -194,11 +200,14 @@ impl Store {
         .fetch_all(&mut *transaction)
         .await
         .map_err(failed)?;
-        let [(position, _), (_, number)] = latest[..] else {
-            return Err(Error::refused(
-                ErrorKind::NoModel,
-                "no other model version was active before; activate one by its number",
-            ));
+        let (position, number) = match latest[..] {
+            [(position, _), (_, number)] => (position, number),
+            [(_, active), ..] => return Err(no_earlier_model(camera, active)),
+            [] => {
+                let message =
+                    format!("camera {camera} has no active model; activate a version by its number");
+                return Err(Error::refused(ErrorKind::NoModel, message));
+            }
         };
         sqlx::query("UPDATE activations SET rolled_back_at_us = ? WHERE camera_key = ? AND position = ?")
             .bind(now.as_microsecond())
@@ -208,6 +217,8 @@ impl Store {
             .await
             .map_err(failed)?;
         set_active(&mut transaction, key, number).await?;
+        let change = Change::of_camera(AuditAction::ModelRolledBack, camera, Some(version(number)));
+        self.record(&mut transaction, change, now).await?;
         let camera = find_camera(&mut *transaction, camera).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(camera)
@@ -303,6 +314,14 @@ async fn add_held_out_errors(
         .map_err(failed)?;
     }
     Ok(())
+}
+
+fn no_earlier_model(camera: &CameraId, active: i64) -> Error {
+    let message = format!(
+        "version {active} of camera {camera} stays active: no other version was active before it; activate one by \
+         its number"
+    );
+    Error::refused(ErrorKind::NoEarlierModel, message)
 }
 
 fn unusable(camera: &CameraId, number: u32, reason: &str) -> Error {

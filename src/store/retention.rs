@@ -1,18 +1,20 @@
 //! What is deleted one by one or by age: model versions, training runs, evaluations.
 
+use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
 use super::Store;
+use super::audit::{Change, version};
 use super::cameras::{camera_key, find_camera};
 use super::errors::{failed, no_model, no_run};
-use crate::domain::{CameraId, Error, ErrorKind, Result, RunId};
+use crate::domain::{AuditAction, CameraId, Error, ErrorKind, Result, RunId};
 
 impl Store {
     /// Deletes a model version that is not the active one. Its number is never assigned again.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`], [`ErrorKind::ModelActive`].
-    pub async fn delete_model(&self, camera: &CameraId, number: u32) -> Result<()> {
+    pub async fn delete_model(&self, camera: &CameraId, number: u32, now: Timestamp) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         if find_camera(&mut *transaction, camera).await?.active_model == Some(number) {
@@ -25,6 +27,8 @@ impl Store {
         if !remove_model(&mut transaction, key, number.into()).await? {
             return Err(no_model(camera, number));
         }
+        let change = Change::of_camera(AuditAction::ModelDeleted, camera, Some(version(number)));
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
         Ok(())
@@ -35,7 +39,7 @@ impl Store {
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunLive`].
-    pub async fn delete_run(&self, camera: &CameraId, run: RunId) -> Result<()> {
+    pub async fn delete_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
@@ -58,6 +62,8 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+        let change = Change::of_camera(AuditAction::RunDeleted, camera, Some(run.to_string()));
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
         Ok(())

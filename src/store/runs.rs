@@ -8,6 +8,7 @@ use sqlx::{SqliteConnection, SqliteExecutor};
 use uuid::Uuid;
 
 use super::Store;
+use super::audit::{Change, version};
 use super::cameras::camera_key;
 use super::errors::{failed, no_run};
 use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
@@ -15,7 +16,7 @@ use super::models::{NewModel, activate, add_model};
 use super::retention::{prune_models, prune_runs};
 use super::row_decoder::RowDecoder;
 use crate::domain::{
-    CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
+    AuditAction, CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
 };
 
 pub(super) const RUNS: Jobs = Jobs {
@@ -86,6 +87,8 @@ impl Store {
         .execute(&mut *transaction)
         .await
         .map_err(failed)?;
+        let change = Change::of_camera(AuditAction::RunStarted, camera, Some(run.to_string()));
+        self.record(&mut transaction, change, now).await?;
         let stored = find_run(&mut *transaction, run).await?;
         transaction.commit().await.map_err(failed)?;
         stored.ok_or_else(|| no_run(run))
@@ -196,6 +199,8 @@ impl Store {
             return Err(Error::refused(ErrorKind::RunEnded, ended));
         }
         RUNS.cancel(&mut transaction, run.0, now).await?;
+        let change = Change::of_camera(AuditAction::RunCancelled, camera, Some(run.to_string()));
+        self.record(&mut transaction, change, now).await?;
         let stored = find_run(&mut *transaction, run).await?;
         transaction.commit().await.map_err(failed)?;
         stored.ok_or_else(|| no_run(run))
@@ -219,11 +224,13 @@ impl Store {
         let Some(finished) = RUNS.finish(&mut transaction, (run.0, fence), end, now).await? else {
             return Ok(None);
         };
+        let mut activated = None;
         if let Some(RunOutput { model, activate: wanted }) = finished.output {
             let key = finished.camera_key;
             let number = add_model(&mut transaction, key, Some(run), &model, now).await?;
             if wanted {
                 activate(&mut transaction, key, number, now).await?;
+                activated = Some(number);
             }
             prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
             sqlx::query("UPDATE training_runs SET model_version = ? WHERE id = ?")
@@ -234,6 +241,11 @@ impl Store {
                 .map_err(failed)?;
         }
         let stored = find_run(&mut *transaction, run).await?;
+        if let Some((number, stored)) = activated.zip(stored.as_ref()) {
+            let change =
+                Change::of_camera(AuditAction::ModelActivated, &stored.camera_id, Some(version(number)));
+            self.record(&mut transaction, change, now).await?;
+        }
         transaction.commit().await.map_err(failed)?;
         Ok(stored)
     }

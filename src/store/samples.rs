@@ -5,13 +5,14 @@ use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{AssertSqlSafe, Row as _, Sqlite};
 
 use super::Store;
+use super::audit::Change;
 use super::cameras::camera_key;
 use super::errors::failed;
 use super::group_commit::Inserted;
 use super::row_decoder::RowDecoder;
 use super::sample_table::SampleTable;
 use crate::domain::{
-    BoundingBox, CameraId, CameraKey, Detection, Durability, Fix, Result, Sample, Score, SigmaM,
+    AuditAction, BoundingBox, CameraId, CameraKey, Detection, Durability, Fix, Result, Sample, Score, SigmaM,
     StoredSample, TargetClass, TargetId, TimeRange,
 };
 use crate::geo::Position;
@@ -219,7 +220,7 @@ impl Store {
     ///
     /// # Errors
     /// [`crate::domain::ErrorKind::CameraNotFound`].
-    pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+    pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter, now: Timestamp) -> Result<u64> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         let key = camera_key(&mut *transaction, id).await?;
@@ -240,6 +241,9 @@ impl Store {
             .map_err(failed)?;
             deleted += rows;
         }
+        let subject = Some(format!("{deleted} samples"));
+        let change = Change::of_camera(AuditAction::SamplesDeleted, id, subject);
+        self.record(&mut transaction, change, now).await?;
         transaction.commit().await.map_err(failed)?;
         deletion.reclaim().await;
         Ok(deleted)

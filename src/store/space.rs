@@ -36,6 +36,10 @@ pub struct StoreLimits {
     pub ended_runs_per_camera: u32,
     /// Ended evaluations of all cameras; beyond, the oldest is deleted.
     pub ended_evaluations: u32,
+    /// Keys; those that no longer work make room for new ones, else more are refused.
+    pub keys: u32,
+    /// Entries of the audit log; beyond, the oldest is deleted.
+    pub audit_entries: u32,
     /// Bytes of the database, if limited.
     pub database_bytes: Option<u64>,
     /// Bytes on the disk that are reserved for deletions when it is full.
@@ -51,6 +55,8 @@ impl Default for StoreLimits {
             models_per_camera: u32::MAX,
             ended_runs_per_camera: u32::MAX,
             ended_evaluations: u32::MAX,
+            keys: u32::MAX,
+            audit_entries: u32::MAX,
             database_bytes: None,
             reserve_bytes: 0,
         }

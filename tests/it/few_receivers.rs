@@ -58,7 +58,9 @@ impl Recording {
             gnss_bias_sigma_m: None,
         };
         let input = FitInput { samples: &samples, unpaired: &unpaired };
-        let model = fit(input, &options, &mut |_| ControlFlow::Continue(())).ok()?.load().ok()?;
+        let fitted = fit(input, &options, &mut |_| ControlFlow::Continue(()))
+            .inspect_err(|error| println!("{receivers} receivers, draw {seed}: {error}"));
+        let model = fitted.ok()?.load().expect("a model");
         let mut score = Score::default();
         for (bounding_box, truth) in &self.tests {
             let regression = model.regress(bounding_box, None);

@@ -50,6 +50,8 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("geographiclib_rs", &["geo"]),
     ("nmea", &["exchange"]),
     ("quick_xml", &["exchange"]),
+    ("rustls", &["server"]),
+    ("tokio_rustls", &["server"]),
     ("clap", &["cli"]),
     ("indicatif", &["cli"]),
     ("metrics_exporter_prometheus", &["telemetry"]),

@@ -1,8 +1,11 @@
 //! The one integration test binary: everything from the outside, through real ports and files.
 
+mod access;
+mod audit;
 mod bad_input;
 mod boxes_without_fix;
 mod connections;
+mod console;
 mod cross_site;
 mod evaluations;
 mod few_receivers;
@@ -26,3 +29,5 @@ mod simulations;
 mod storage;
 mod story;
 mod stream;
+mod tls;
+mod usage;

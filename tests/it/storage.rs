@@ -247,7 +247,7 @@ async fn models_and_runs_can_be_deleted_by_both_transports() {
     delete(&server, "/v1/cameras/c/models/2").await.expect(204);
     problem(&delete(&server, "/v1/cameras/c/models/2").await, 404, "model-not-found");
     let no_other = server.post("/v1/cameras/c/active-model/roll-back", &json!({})).await;
-    problem(&no_other, 409, "no-model");
+    problem(&no_other, 409, "no-earlier-model");
 
     let channel = channel(&server).await;
     let mut models = ModelServiceClient::new(channel.clone());

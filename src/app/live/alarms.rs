@@ -61,7 +61,7 @@ impl WaitingResiduals {
             let (Some(PairResidual { camera, residual }), Some(parts)) = (next, app.upgrade()) else {
                 return;
             };
-            App(parts).detect_drift(&camera, &residual).await;
+            App::of_program(parts, "drift detection").detect_drift(&camera, &residual).await;
         }
     }
 }

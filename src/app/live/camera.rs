@@ -1,14 +1,17 @@
 //! The state in memory of one camera that exists, from its creation to its deletion.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 
+use jiff::Timestamp;
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::drift::DriftMonitor;
 use super::sample_recorder::SampleRecorder;
+use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
-use crate::domain::CameraMoved;
+use crate::domain::{BoundingBox, CameraMoved, FusedFix};
 
 /// Events that a slow reader may lag behind before it loses some.
 const EVENTS_BEHIND: usize = 256;
@@ -17,9 +20,20 @@ const EVENTS_BEHIND: usize = 256;
 #[derive(Debug, Clone)]
 pub enum CameraEvent {
     /// A target was measured.
-    Track(Arc<TrackPoint>),
+    Track(Arc<TargetUpdate>),
     /// The camera's pose has changed.
     Moved(Arc<CameraMoved>),
+}
+
+/// A measured target: its track, and the observation that updated it.
+#[derive(Debug)]
+pub struct TargetUpdate {
+    /// The track's position with it.
+    pub point: Arc<TrackPoint>,
+    /// The observation's box.
+    pub bounding_box: Option<BoundingBox>,
+    /// The observation's own position; `None` for a box while the camera has no model.
+    pub fused: Option<FusedFix>,
 }
 
 /// Tracks, drift detection, listeners and the recording of samples of one camera.
@@ -29,6 +43,8 @@ pub(in crate::app) struct CameraLive {
     pub(super) events: broadcast::Sender<CameraEvent>,
     pub(super) moved: watch::Sender<Option<Arc<CameraMoved>>>,
     pub(super) recorder: Mutex<Weak<SampleRecorder>>,
+    last_observed_at: Mutex<Option<Timestamp>>,
+    open_streams: AtomicUsize,
     deleted: CancellationToken,
 }
 
@@ -40,6 +56,8 @@ impl CameraLive {
             events: broadcast::channel(EVENTS_BEHIND).0,
             moved: watch::channel(None).0,
             recorder: Mutex::new(Weak::new()),
+            last_observed_at: Mutex::new(None),
+            open_streams: AtomicUsize::new(0),
             deleted: CancellationToken::new(),
         })
     }
@@ -60,13 +78,46 @@ impl CameraLive {
         self.deleted.cancelled().await;
     }
 
-    pub(super) fn announce_track(&self, point: &Arc<TrackPoint>) {
-        // An error means that nobody listens.
-        let _ = self.events.send(CameraEvent::Track(point.clone()));
+    /// Makes the update only if somebody listens.
+    pub(super) fn announce_track(&self, update: impl FnOnce() -> TargetUpdate) {
+        if self.events.receiver_count() > 0 {
+            // An error means that nobody listens any more.
+            let _ = self.events.send(CameraEvent::Track(Arc::new(update())));
+        }
+    }
+
+    /// Remembers that something was observed at that time of the server.
+    pub(super) fn observed(&self, now: Timestamp) {
+        *lock(&self.last_observed_at) = Some(now);
+    }
+
+    /// When something was observed last, by the server's clock, since the server was started.
+    pub(super) fn last_observed_at(&self) -> Option<Timestamp> {
+        *lock(&self.last_observed_at)
+    }
+
+    /// Open live streams.
+    pub(super) fn open_streams(&self) -> usize {
+        self.open_streams.load(Ordering::Relaxed)
+    }
+
+    /// Counts a live stream until the guard is dropped.
+    pub(super) fn count_stream(self: &Arc<Self>) -> StreamCount {
+        self.open_streams.fetch_add(1, Ordering::Relaxed);
+        StreamCount(self.clone())
     }
 
     pub(super) fn announce_move(&self, moved: Arc<CameraMoved>) {
         let _ = self.events.send(CameraEvent::Moved(moved.clone()));
         self.moved.send_replace(Some(moved));
+    }
+}
+
+/// One open live stream of a camera.
+pub(super) struct StreamCount(Arc<CameraLive>);
+
+impl Drop for StreamCount {
+    fn drop(&mut self) {
+        self.0.open_streams.fetch_sub(1, Ordering::Relaxed);
     }
 }

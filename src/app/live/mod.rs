@@ -18,6 +18,7 @@ mod tracks;
 
 use std::sync::Arc;
 
+use jiff::Timestamp;
 use tokio::sync::broadcast;
 
 use self::camera::CameraLive;
@@ -30,10 +31,11 @@ use crate::domain::{
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
+use crate::fusion::target_track::TargetTrack;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
-pub use camera::CameraEvent;
+pub use camera::{CameraEvent, TargetUpdate};
 pub(super) use retraining::RetrainSchedule;
 pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};
@@ -46,6 +48,17 @@ pub struct ItemResult {
     pub fused: Option<FusedFix>,
     /// The target's track with it; `None` without a target or anything usable.
     pub track: Option<Arc<TrackPoint>>,
+}
+
+/// What happens in a camera's view, since the server was started.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct CameraActivity {
+    /// Targets that are tracked now.
+    pub targets: usize,
+    /// Open live streams.
+    pub streams: usize,
+    /// When a live observation came last.
+    pub last_observed_at: Option<Timestamp>,
 }
 
 /// The events of one camera from some instant on; they end when it is deleted.
@@ -96,20 +109,43 @@ impl App {
         self.live_time_bounds().check(observation.time())?;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);
-        let observed = ObservedPositions::of(observation, regressor, camera.image_size, camera.e_gnss_m2);
+        let now = self.clock.monotonic();
+        let ActiveCamera { image_size, e_gnss_m2, .. } = **camera;
+        let observed = match observation.target_id().filter(|_| regressor.is_some()) {
+            Some(target_id) => {
+                let observe =
+                    |track: &mut TargetTrack| track.observe(observation, regressor, image_size, e_gnss_m2);
+                camera.live.tracks.observe(&camera.id, target_id, now, &self.limits, observe)?
+            }
+            None => ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None),
+        };
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
+        camera.live.observed(self.clock.now());
         let Some(target_id) = observation.target_id() else { return Ok(ItemResult { fused, track: None }) };
-        let seen = TargetObservation { target_id, observed, model, now: self.clock.monotonic() };
+        let seen = TargetObservation { target_id, observed, model, now };
         let (track, residual) = camera.live.tracks.update(&camera.id, &seen, &self.limits)?;
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
-            camera.live.announce_track(point);
+            camera.live.announce_track(|| TargetUpdate {
+                point: point.clone(),
+                bounding_box: observation.bounding_box(),
+                fused: fused.clone(),
+            });
         }
         if let Some(residual) = residual {
             self.hand_over(camera, residual);
         }
         Ok(ItemResult { fused, track })
+    }
+
+    /// What happens in a camera's view.
+    pub(super) fn activity(&self, camera: &ActiveCamera) -> CameraActivity {
+        CameraActivity {
+            targets: camera.live.tracks.latest(self.clock.monotonic()).len(),
+            streams: camera.live.open_streams(),
+            last_observed_at: camera.live.last_observed_at(),
+        }
     }
 
     /// Where every target of a camera is now, by target; those that expired are left out.

@@ -7,6 +7,7 @@ use tokio::sync::watch;
 
 use super::ItemResult;
 use super::acknowledgements::{AckTracker, Acknowledgement, NotStoredReason};
+use super::camera::StreamCount;
 use super::sample_committer::{self, SampleSink};
 use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
@@ -70,6 +71,7 @@ pub struct LiveStream {
     recording: Option<StreamRecording>,
     last_seq: u64,
     _slot: SlotGuard,
+    _count: StreamCount,
     _address_lease: Lease,
 }
 
@@ -107,6 +109,7 @@ impl App {
         self.metrics.stream_opened();
         Ok(LiveStream {
             app: self.clone(),
+            _count: camera.live.count_stream(),
             camera,
             recording,
             last_seq: resume_after_seq,

@@ -62,6 +62,23 @@ pub(super) struct TargetObservation<'a> {
 }
 
 impl Tracks {
+    /// What `observe` makes of an observation with its target's [`TargetTrack`].
+    ///
+    /// # Errors
+    /// `Overloaded` if as many targets are tracked as may be, all of them observed lately.
+    pub(super) fn observe<'a>(
+        &self,
+        id: &CameraId,
+        target_id: &TargetId,
+        now: Duration,
+        limits: &Limits,
+        observe: impl FnOnce(&mut TargetTrack) -> ObservedPositions<'a>,
+    ) -> Result<ObservedPositions<'a>> {
+        let target = self.target(id, target_id, now, limits.tracks_per_camera)?;
+        let observed = observe(&mut lock(&target).track);
+        Ok(observed)
+    }
+
     /// Feeds an observation to its target's track; `None` while nothing usable was observed. With it comes
     /// the regressed position beside the fix of the same instant, if now both are known.
     ///
@@ -76,7 +93,7 @@ impl Tracks {
         if seen.observed.is_empty() {
             return Ok((None, None));
         }
-        let target = self.target(id, seen, limits.tracks_per_camera)?;
+        let target = self.target(id, seen.target_id, seen.now, limits.tracks_per_camera)?;
         let mut target = lock(&target);
         target.last_item_at = seen.now;
         let settings =
@@ -114,18 +131,19 @@ impl Tracks {
     fn target(
         &self,
         id: &CameraId,
-        seen: &TargetObservation<'_>,
+        target_id: &TargetId,
+        now: Duration,
         most: usize,
     ) -> Result<Arc<Mutex<TrackedTarget>>> {
         let mut targets = lock(&self.targets);
-        if let Some(target) = targets.get(seen.target_id) {
+        if let Some(target) = targets.get(target_id) {
             return Ok(target.clone());
         }
         if targets.len() >= most {
-            remove_expired(&mut targets, seen.now);
+            remove_expired(&mut targets, now);
         }
         if targets.len() >= most {
-            evict_longest_silent(&mut targets, seen.now);
+            evict_longest_silent(&mut targets, now);
         }
         if targets.len() >= most {
             let message = format!(
@@ -133,8 +151,8 @@ impl Tracks {
             );
             return Err(Error::refused(ErrorKind::Overloaded, message));
         }
-        let target = Arc::new(Mutex::new(TrackedTarget::new(seen.now)));
-        targets.insert(seen.target_id.clone(), target.clone());
+        let target = Arc::new(Mutex::new(TrackedTarget::new(now)));
+        targets.insert(target_id.clone(), target.clone());
         Ok(target)
     }
 }

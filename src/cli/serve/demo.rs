@@ -71,11 +71,12 @@ fn requests_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
     format!(
         "The camera `{CAMERA}` is ready. Three things to try:\n\n\
          1. Fuse a box and a fix:\n\n   \
-         curl -s http://{address}/v1/cameras/{CAMERA}/fusions --json '{observation}'\n\n\
+         curl -s http://{address}/v1/cameras/{CAMERA}/fusions -H \"content-type: application/json\" -d '{observation}'\n\n\
          2. The same over gRPC:\n\n   \
          grpcurl -plaintext -d '{{\"camera_id\":\"{CAMERA}\",\"observations\":[{observation}]}}' {address} \
          sightfix.v1.FusionService/Fuse\n\n\
-         3. Explore the whole interface in a browser:\n\n   \
+         3. Open the operator's console, and the description of the whole interface, in a browser:\n\n   \
+         http://{address}/\n   \
          http://{address}/docs\n"
     )
 }

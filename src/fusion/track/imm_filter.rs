@@ -13,8 +13,8 @@ use super::mode_filter::{
 };
 use super::settings::{MotionModel, TrackSettings};
 use super::state::{TrackState, Velocity};
-use crate::fusion::plane_covariance::PlaneCovariance;
 use crate::geo::EastNorth;
+use crate::geo::PlaneCovariance;
 
 const MODES: usize = 3;
 /// Index of the stationary mode; steady and agile follow.
@@ -130,12 +130,62 @@ impl ImmFilter {
         measurement: &Measurement,
     ) -> [Option<GateOutcome>; 2] {
         self.predict(settings, measurement.time);
-        let regressed = measurement
+        let is_elsewhere = measurement
             .regressed
-            .map(|measured| self.gate_and_update(settings, MeasurementSource::Regressed, measured));
+            .zip(measurement.fix)
+            .is_some_and(|(regressed, fix)| self.is_elsewhere(settings, regressed, fix));
+        let regressed = measurement.regressed.map(|measured| {
+            if is_elsewhere {
+                return self.restart(settings, MeasurementSource::Regressed, measured);
+            }
+            self.gate_and_update(settings, MeasurementSource::Regressed, measured)
+        });
         let fix =
             measurement.fix.map(|measured| self.gate_and_update(settings, MeasurementSource::Fix, measured));
         [regressed, fix]
+    }
+
+    /// Whether box and fix agree with each other, and neither with the track: its target id now names
+    /// another target.
+    fn is_elsewhere(
+        &self,
+        settings: &TrackSettings,
+        regressed: MeasuredPosition,
+        fix: MeasuredPosition,
+    ) -> bool {
+        if !(regressed.covariance.is_positive() && fix.covariance.is_positive()) {
+            return false;
+        }
+        let difference = EastNorth {
+            east_m: fix.position.east_m - regressed.position.east_m,
+            north_m: fix.position.north_m - regressed.position.north_m,
+        };
+        let pair_nis = fix.covariance.plus(regressed.covariance).mahalanobis_squared(difference);
+        let is_outside = |source, measured| {
+            let inflation = self.correlated_noise_inflation(settings, source);
+            let decomposition = NoiseDecomposition::new(settings, source, measured, inflation);
+            let predicted = self.predict_measurement(&decomposition);
+            !self.passes_gate(settings, &predicted, self.innovation(&predicted).1)
+        };
+        pair_nis <= settings.gate
+            && is_outside(MeasurementSource::Regressed, regressed)
+            && is_outside(MeasurementSource::Fix, fix)
+    }
+
+    fn restart(
+        &mut self,
+        settings: &TrackSettings,
+        source: MeasurementSource,
+        measured: MeasuredPosition,
+    ) -> GateOutcome {
+        *self = Self::new(settings, self.time, source, measured);
+        GateOutcome {
+            source,
+            innovation: EastNorth::default(),
+            nis: f64::NAN,
+            rejected: None,
+            reinitialized: true,
+        }
     }
 
     fn gate_and_update(
@@ -211,7 +261,7 @@ impl ImmFilter {
         if other_is_active {
             let mut candidate = self.clone();
             for mode in &mut candidate.modes {
-                mode.reset_bias(decomposition.bias);
+                mode.reset_bias(decomposition.biases[0].state);
             }
             let predicted = candidate.predict_measurement(decomposition);
             let (_, nis) = candidate.innovation(&predicted);

@@ -3,8 +3,8 @@
 use jiff::Timestamp;
 use strum::IntoStaticStr;
 
-use crate::fusion::plane_covariance::PlaneCovariance;
 use crate::geo::EastNorth;
+use crate::geo::PlaneCovariance;
 
 /// A measured position in the camera's local plane, with the covariance of its error.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -13,13 +13,15 @@ pub struct MeasuredPosition {
     pub position: EastNorth,
     /// Covariance R of the total error, white part and bias together, m2.
     pub covariance: PlaneCovariance,
+    /// Of it, the white part, m2; `None` for the share of the track's settings.
+    pub white: Option<PlaneCovariance>,
 }
 
 impl MeasuredPosition {
     /// A position with `R = variance_m2 * I`: the squared sigma of a fix, or `e_regression_m2`.
     #[must_use]
     pub const fn isotropic(position: EastNorth, variance_m2: f64) -> Self {
-        Self { position, covariance: PlaneCovariance::isotropic(variance_m2) }
+        Self { position, covariance: PlaneCovariance::isotropic(variance_m2), white: None }
     }
 }
 

@@ -1,11 +1,13 @@
 //! The Kalman filter of one motion mode.
 //!
-//! State, 8 components: `x = [p_e p_n v_e v_n b_e b_n c_e c_n]`, axes east and north; position p in
-//! m, velocity v in m/s, and the biases of receiver (b) and camera (c) in units of their own standard
-//! deviation, so that one unit-variance Gauss-Markov state serves measurements of any covariance.
+//! State, 10 components: `x = [p_e p_n v_e v_n b_e b_n c_e c_n s_e s_n]`, axes east and north; position p
+//! in m, velocity v in m/s, and the biases of receiver (b, of tens of seconds; s, of the whole session) and
+//! camera (c) in units of their own standard deviation, so that one unit-variance Gauss-Markov state serves
+//! measurements of any covariance.
 //!
-//! A measured position with error covariance R and white share w is modelled as
-//! `z = p + L b + e`, with `L = sqrtm((1 - w) R)` and `e ~ N(0, w R k)`, where k inflates the white
+//! A measured position with error covariance R, of which W is white, is modelled as
+//! `z = p + L b + e`, with `L = sqrtm(R - W)` and `e ~ N(0, k W)`; a fix has the session's bias s beside b,
+//! each with its share of `R - W`. k inflates the white
 //! part for measurements closer in time than its own correlation
 //! (Bar-Shalom, Li and Kirubarajan 2001, 8.2: state augmentation for autocorrelated noise).
 
@@ -13,16 +15,17 @@ use nalgebra::{SMatrix, SVector};
 
 use super::measurement::{MeasuredPosition, MeasurementSource};
 use super::settings::TrackSettings;
-use crate::fusion::plane_covariance::PlaneCovariance;
 use crate::geo::EastNorth;
+use crate::geo::PlaneCovariance;
 
 /// Components of the state.
-pub(super) const STATES: usize = 8;
+pub(super) const STATES: usize = 10;
 /// Index of the first (east) component of each pair; north follows.
 pub(super) const POSITION: usize = 0;
 pub(super) const VELOCITY: usize = 2;
 pub(super) const GNSS_BIAS: usize = 4;
 pub(super) const CAMERA_BIAS: usize = 6;
+pub(super) const SESSION_BIAS: usize = 8;
 
 /// Standard deviation per axis of a stationary target's velocity, m/s: keeps the covariance regular.
 const STATIONARY_SPEED_SIGMA_M_S: f64 = 0.02;
@@ -44,12 +47,19 @@ pub(super) struct ModeFilter {
 /// A measured position with its error split into a bias and a white part.
 pub(super) struct NoiseDecomposition {
     pub(super) position: EastNorth,
-    /// Index of the bias state that the measurement observes.
-    pub(super) bias: usize,
-    /// L, the symmetric square root of the bias part of R, m, as (east, north, east-north).
-    pub(super) bias_root_m: [f64; 3],
+    /// The bias that tens of seconds, or the place, change; then the session's, of a fix alone.
+    pub(super) biases: [ObservedBias; 2],
     /// Covariance of the white part, m2.
     pub(super) white: PlaneCovariance,
+}
+
+/// A bias as it enters a measurement.
+#[derive(Clone, Copy)]
+pub(super) struct ObservedBias {
+    /// Index of its first state.
+    pub(super) state: usize,
+    /// L, the symmetric square root of its part of R, m, as (east, north, east-north).
+    pub(super) root_m: [f64; 3],
 }
 
 /// The measurement as one mode predicts it.
@@ -70,15 +80,20 @@ impl NoiseDecomposition {
         measured: MeasuredPosition,
         white_inflation: f64,
     ) -> Self {
-        let (bias, white_share) = match source {
-            MeasurementSource::Fix => (GNSS_BIAS, settings.gnss.white_share),
-            MeasurementSource::Regressed => (CAMERA_BIAS, settings.regression.correlation.white_share),
+        let (bias, white_share, session_share) = match source {
+            MeasurementSource::Fix => (GNSS_BIAS, settings.gnss.white_share, settings.gnss_session.share),
+            MeasurementSource::Regressed => (CAMERA_BIAS, settings.regression.correlation.white_share, 0.0),
         };
+        let session = measured.covariance.scaled(session_share);
+        let within = measured.covariance.minus(session);
+        let white = measured.white.unwrap_or_else(|| within.scaled(white_share));
         Self {
             position: measured.position,
-            bias,
-            bias_root_m: measured.covariance.scaled(1.0 - white_share).square_root_m(),
-            white: measured.covariance.scaled(white_share * white_inflation),
+            biases: [
+                ObservedBias { state: bias, root_m: within.minus(white).square_root_m() },
+                ObservedBias { state: SESSION_BIAS, root_m: session.square_root_m() },
+            ],
+            white: white.scaled(white_inflation),
         }
     }
 }
@@ -101,10 +116,12 @@ impl ModeFilter {
         for axis in 0..2 {
             covariance[(VELOCITY + axis, VELOCITY + axis)] = initial_speed_sigma_m_s.powi(2);
         }
-        let [east, north, east_north] = decomposition.bias_root_m;
-        for (row, column, value) in [(0, 0, east), (1, 1, north), (0, 1, east_north), (1, 0, east_north)] {
-            covariance[(POSITION + row, decomposition.bias + column)] = -value;
-            covariance[(decomposition.bias + column, POSITION + row)] = -value;
+        for ObservedBias { state, root_m: [east, north, east_north] } in decomposition.biases {
+            for (row, column, value) in [(0, 0, east), (1, 1, north), (0, 1, east_north), (1, 0, east_north)]
+            {
+                covariance[(POSITION + row, state + column)] = -value;
+                covariance[(state + column, POSITION + row)] = -value;
+            }
         }
         for (row, values) in covariance_m2.rows_m2().iter().enumerate() {
             for (column, value) in values.iter().enumerate() {
@@ -139,13 +156,14 @@ impl ModeFilter {
         }
     }
 
-    /// Propagates both biases as first-order Gauss-Markov processes of unit variance,
+    /// Propagates the biases as first-order Gauss-Markov processes of unit variance,
     /// `phi = exp(-rate)`; the camera's also decorrelates with the distance travelled.
     pub(super) fn propagate_biases(&mut self, settings: &TrackSettings, step_s: f64) {
         let speed_m_s = self.mean[VELOCITY].hypot(self.mean[VELOCITY + 1]);
         let regression = &settings.regression;
         let rates = [
             (GNSS_BIAS, step_s / settings.gnss.time_constant_s),
+            (SESSION_BIAS, step_s / settings.gnss_session.time_constant_s),
             (
                 CAMERA_BIAS,
                 step_s / regression.correlation.time_constant_s
@@ -219,29 +237,26 @@ impl ModeFilter {
 
     /// Innovation, its covariance `S = H P H' + white` and `P H'`, with `H = [I 0 .. L ..]`.
     pub(super) fn predict_measurement(&self, decomposition: &NoiseDecomposition) -> PredictedMeasurement {
-        let [east, north, east_north] = decomposition.bias_root_m;
-        let bias = decomposition.bias;
-        let innovation = [
-            decomposition.position.east_m
-                - self.mean[POSITION]
-                - east * self.mean[bias]
-                - east_north * self.mean[bias + 1],
-            decomposition.position.north_m
-                - self.mean[POSITION + 1]
-                - east_north * self.mean[bias]
-                - north * self.mean[bias + 1],
-        ];
+        // H applied to a vector over the states.
+        let measured = |of: &dyn Fn(usize) -> f64| {
+            let mut sum = [of(POSITION), of(POSITION + 1)];
+            for ObservedBias { state, root_m: [east, north, east_north] } in decomposition.biases {
+                sum[0] += east * of(state) + east_north * of(state + 1);
+                sum[1] += east_north * of(state) + north * of(state + 1);
+            }
+            sum
+        };
+        let [east_m, north_m] = measured(&|state| self.mean[state]);
+        let innovation = [decomposition.position.east_m - east_m, decomposition.position.north_m - north_m];
         let mut cross = SMatrix::<f64, STATES, 2>::zeros();
         for state in 0..STATES {
-            let row = |column: usize| self.covariance[(state, column)];
-            cross[(state, 0)] = row(POSITION) + east * row(bias) + east_north * row(bias + 1);
-            cross[(state, 1)] = row(POSITION + 1) + east_north * row(bias) + north * row(bias + 1);
+            let [east, north] = measured(&|column| self.covariance[(state, column)]);
+            cross[(state, 0)] = east;
+            cross[(state, 1)] = north;
         }
-        let predicted = PlaneCovariance {
-            east_m2: cross[(POSITION, 0)] + east * cross[(bias, 0)] + east_north * cross[(bias + 1, 0)],
-            north_m2: cross[(POSITION + 1, 1)] + east_north * cross[(bias, 1)] + north * cross[(bias + 1, 1)],
-            east_north_m2: cross[(POSITION, 1)] + east * cross[(bias, 1)] + east_north * cross[(bias + 1, 1)],
-        };
+        let [east_m2, _] = measured(&|state| cross[(state, 0)]);
+        let [east_north_m2, north_m2] = measured(&|state| cross[(state, 1)]);
+        let predicted = PlaneCovariance { east_m2, north_m2, east_north_m2 };
         PredictedMeasurement {
             innovation,
             innovation_covariance: predicted.plus(decomposition.white),

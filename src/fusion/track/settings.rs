@@ -28,6 +28,21 @@ impl Default for RegressionNoise {
     }
 }
 
+/// The part of a receiver's error that lasts for a session: atmosphere, satellites, the way that it is carried.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SessionBias {
+    /// Share of the error variance of a fix, 0 to 1.
+    pub share: f64,
+    /// Time in which its correlation falls to 1/e, s.
+    pub time_constant_s: f64,
+}
+
+impl Default for SessionBias {
+    fn default() -> Self {
+        Self { share: 0.0, time_constant_s: 3_600.0 }
+    }
+}
+
 /// Motion model with the modes stationary, steady and agile (see [`super::Track`]). The process noise
 /// of the agile mode scales with the speed that the target was observed at, so that one set of
 /// parameters serves pedestrians and vehicles, and the predicted error of a pedestrian does not grow
@@ -70,8 +85,10 @@ impl Default for MotionModel {
 /// All parameters of a track.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackSettings {
-    /// Noise of the receiver.
+    /// Noise of the receiver beside its bias of the session.
     pub gnss: NoiseCorrelation,
+    /// Its bias of the session.
+    pub gnss_session: SessionBias,
     /// Noise of the camera's model.
     pub regression: RegressionNoise,
     /// Motion of the target.
@@ -92,6 +109,7 @@ impl Default for TrackSettings {
     fn default() -> Self {
         Self {
             gnss: NoiseCorrelation::PHONE,
+            gnss_session: SessionBias::default(),
             regression: RegressionNoise::default(),
             motion: MotionModel::default(),
             // Rejects one consistent measurement in 2,000.
@@ -112,6 +130,7 @@ impl TrackSettings {
         let Some(noise) = regressor.track_noise() else { return Self::default() };
         Self {
             gnss: noise.gnss,
+            gnss_session: SessionBias { share: noise.gnss_session_share, ..SessionBias::default() },
             regression: RegressionNoise {
                 correlation: noise.regression,
                 correlation_length_m: noise.regression_length_m,

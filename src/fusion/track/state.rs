@@ -3,8 +3,8 @@
 use jiff::Timestamp;
 
 use super::measurement::{MeasurementSource, Rejection};
-use crate::fusion::plane_covariance::PlaneCovariance;
 use crate::geo::EastNorth;
+use crate::geo::PlaneCovariance;
 
 /// The innovation of one accepted measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -56,7 +56,8 @@ pub struct TrackState {
     pub innovations: Vec<Innovation>,
     /// Rejected positions.
     pub rejected: Vec<Rejection>,
-    /// Whether this measurement reinitialised the track, after a series of rejections that no bias
+    /// Whether this measurement reinitialised the track: box and fix agree with each other and not with the
+    /// track, or after a series of rejections that no bias
     /// explains.
     pub reinitialized: bool,
 }

@@ -298,6 +298,23 @@ fn the_first_steps_of_a_stationary_target_are_accepted() {
 }
 
 #[test]
+fn an_id_that_names_another_target_takes_the_track_there_at_once() {
+    let walk = simulate(&Walk::pedestrian(), 23, 120);
+    let mut track = Track::start(TrackSettings::default(), &walk[0].1).expect("has both");
+    for (index, (truth, measurement)) in walk.iter().enumerate().skip(1) {
+        let apart_m = if index >= 60 { 40.0 } else { 0.0 };
+        let state = track.update(&Measurement {
+            fix: moved(measurement.fix, apart_m),
+            regressed: moved(measurement.regressed, apart_m),
+            ..*measurement
+        });
+        assert_eq!(state.reinitialized, index == 60, "{index}");
+        let truth = EastNorth { east_m: truth.east_m + apart_m, ..*truth };
+        assert!(state.position.distance_m(truth) < 6.0, "{index}: {state:?}");
+    }
+}
+
+#[test]
 fn a_single_source_that_contradicts_the_track_reinitialises_it() {
     let mut track = Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 4.0)).expect("a fix");
     for second in 1..30 {

@@ -13,14 +13,16 @@ async fn a_camera_is_made_read_changed_and_deleted() {
     });
     let made = rest.post("/v1/cameras", &profile).await.expect(201);
     assert_eq!(made.header("location"), "/v1/cameras/north-gate");
-    assert_eq!(made.header("etag"), "\"1\"");
+    let etag = made.header("etag").to_owned();
     let camera = made.json();
     for (name, value) in profile.as_object().expect("fields") {
         assert_eq!(&camera[name], value, "{name}");
     }
     assert_eq!(camera["warnings"], json!([]));
     let read = rest.get("/v1/cameras/north-gate").await.expect(200);
-    assert_eq!((read.header("etag"), read.json()), ("\"1\"", camera));
+    assert_eq!((read.header("etag"), read.json()), (etag.as_str(), camera));
+    let known = rest.send("GET", "/v1/cameras/north-gate", &[("if-none-match", &etag)], Body::empty()).await;
+    assert!(known.expect(304).body.is_empty());
 
     let path = "/v1/cameras/north-gate";
     let patch = |if_match: &'static str, change: Value| {
@@ -29,7 +31,9 @@ async fn a_camera_is_made_read_changed_and_deleted() {
         async move { rest.send("PATCH", path, &headers, change.to_string()).await }
     };
     let changed = patch("\"1\"", json!({"image_size": null, "gnss_error": "unknown"})).await.expect(200);
-    assert_eq!(changed.header("etag"), "\"2\"");
+    let changed_etag = changed.header("etag").to_owned();
+    assert_ne!(changed_etag, etag);
+    rest.send("GET", path, &[("if-none-match", &etag)], Body::empty()).await.expect(200);
     let camera = changed.json();
     assert_eq!((camera.get("image_size"), &camera["gnss_error"]), (None, &json!("unknown")));
     assert_eq!(camera["display_name"], "North gate", "what is left out stays");
@@ -54,6 +58,51 @@ async fn a_camera_is_made_read_changed_and_deleted() {
     stale.problem(412, "revision-mismatch");
     assert!(rest.send("DELETE", path, &[], Body::empty()).await.expect(204).body.is_empty());
     rest.get(path).await.problem(404, "camera-not-found");
+    // Another camera of the same id is not the one that was read.
+    rest.post("/v1/cameras", &profile).await.expect(201);
+    for known in [&etag, &changed_etag] {
+        let stale = rest.send("DELETE", path, &[("if-match", known)], Body::empty()).await;
+        stale.problem(412, "revision-mismatch");
+        rest.send("GET", path, &[("if-none-match", known)], Body::empty()).await.expect(200);
+    }
+}
+
+#[tokio::test]
+async fn a_patch_merges_as_its_standard_says() {
+    let rest = Rest::new().await;
+    let profile = json!({
+        "id": "c", "display_name": "Gate", "image_size": {"width_px": 1920, "height_px": 1080},
+        "gnss_error": "unknown", "recipe": "paper", "labels": {"site": "a", "floor": "2"},
+        "retrain_when_moved": true,
+    });
+    rest.post("/v1/cameras", &profile).await.expect(201);
+    let rest = &rest;
+    let patch = |change: Value| async move {
+        let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
+        rest.send("PATCH", "/v1/cameras/c", &headers, change.to_string()).await
+    };
+    let merged = patch(json!({"labels": {"floor": null, "door": "n"}, "image_size": {"height_px": 720}}));
+    let merged = merged.await.expect(200).json();
+    assert_eq!(merged["labels"], json!({"site": "a", "door": "n"}));
+    assert_eq!(merged["image_size"], json!({"width_px": 1920, "height_px": 720}));
+    let restored = patch(json!({
+        "display_name": null, "recipe": null, "labels": null, "retrain_when_moved": null,
+        "gnss_error": {"sigma_m": 2.0},
+    }));
+    let restored = restored.await.expect(200).json();
+    assert_eq!((&restored["display_name"], &restored["recipe"]), (&json!("c"), &json!("auto")));
+    assert_eq!((&restored["labels"], &restored["retrain_when_moved"]), (&json!({}), &json!(false)));
+    assert_eq!(restored["gnss_error"], json!({"sigma_m": 2.0}));
+    assert_eq!(restored["image_size"], merged["image_size"], "what is left out stays");
+    for (change, field) in [
+        (json!({"id": "d"}), "id"),
+        (json!({"revision": 7}), "revision"),
+        (json!({"image_size": {"width_px": "wide"}}), "image_size.width_px"),
+        (json!(["c", "Gate"]), "body"),
+        (json!(5), "body"),
+    ] {
+        assert_eq!(patch(change).await.problem(422, "invalid-argument"), [field]);
+    }
 }
 
 #[tokio::test]

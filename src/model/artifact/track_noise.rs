@@ -7,8 +7,10 @@ use crate::domain::{NoiseCorrelation, Result};
 /// Correlation of the errors of receiver and model, whose variances are stated elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackNoiseModel {
-    /// Of the receiver's error.
+    /// Of the receiver's error beside its bias of the session.
     pub gnss: NoiseCorrelation,
+    /// Share of the receiver's error variance that is constant over a session, 0 to 1.
+    pub gnss_session_share: f64,
     /// Of the model's error while the target is stationary.
     pub regression: NoiseCorrelation,
     /// Distance over which the correlation of the model's error falls to 1/e, m.
@@ -27,6 +29,9 @@ const NAMES: [&str; 5] = [
     "track_regression_length_m",
 ];
 
+/// Missing in models before it was estimated.
+const SESSION_SHARE: &str = "track_gnss_session_share";
+
 impl TrackNoiseModel {
     /// Adds the scalars to the parts of a model.
     pub(crate) fn put(&self, parts: &mut ModelParts) {
@@ -40,6 +45,7 @@ impl TrackNoiseModel {
         for (name, value) in NAMES.into_iter().zip(values) {
             parts.set(name, value);
         }
+        parts.set(SESSION_SHARE, self.gnss_session_share);
     }
 
     /// The scalars of a model's metadata; `None` in an earlier format, which has none of them.
@@ -56,6 +62,7 @@ impl TrackNoiseModel {
                 white_share: parts.parameter(gnss_share)?.clamp(LEAST_GNSS_WHITE_SHARE, 1.0),
                 time_constant_s: parts.positive_parameter(gnss_constant)?,
             },
+            gnss_session_share: parts.parameter_or(SESSION_SHARE, 0.0)?.clamp(0.0, 1.0),
             regression: NoiseCorrelation {
                 white_share: parts.parameter(regression_share)?.clamp(0.0, 1.0),
                 time_constant_s: parts.positive_parameter(regression_constant)?,

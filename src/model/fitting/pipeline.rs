@@ -17,7 +17,7 @@ use super::track_noise::estimate_track_noise;
 use super::widening::widen_radius;
 use crate::domain::{
     CandidateReport, Detection, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError,
-    HeldOutSampleError, ImageSize, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
+    HeldOutSampleError, ImageSize, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample, TrainingReport,
 };
 use crate::model::artifact::{Artifact, FORMAT, ModelParts};
 use crate::model::encoder::gaussian_process::target_height_m;
@@ -134,7 +134,11 @@ pub fn fit_with<'a>(
     let fit = FinalFit { samples, rows: &rows, context: &context, options, e_gnss_source };
     let (parts, held_out) = fit.run(&chosen, geometry.covariance, &mut run)?;
     note_errors(&held_out, &parts, &mut run)?;
-    let artifact = artifact_of(parts, &fit, chosen, held_out)?;
+    let report = training_report(&chosen.selection(), &held_out, &rows, &parts, options.image_size);
+    for line in report.to_string().lines() {
+        run.note(line)?;
+    }
+    let artifact = artifact_of(parts, &fit, chosen, held_out, report)?;
     // A model that does not pass the checks of every loaded model must not be stored.
     artifact.load().map_err(FitError::Unusable)?;
     Ok(artifact)
@@ -181,6 +185,13 @@ struct Chosen {
     reports: Vec<CandidateReport>,
     scores: Vec<f64>,
     index: usize,
+}
+
+impl Chosen {
+    fn selection(&self) -> Selection<'_> {
+        let Self { usable, reports, scores, index, .. } = self;
+        Selection { candidates: usable, reports, scores, chosen: *index }
+    }
 }
 
 /// Cross-validates the candidates and chooses one.
@@ -284,7 +295,7 @@ impl FinalFit<'_> {
         parts.set("fix_time_constant_s", context.noise.correlation.time_constant_s);
         parts.set("labels_smoothed", f64::from(u8::from(candidate.is_smoothed())));
         let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
-        estimate_track_noise(samples, &regressor).put(&mut parts);
+        estimate_track_noise(samples, &regressor, &parts).put(&mut parts);
         Ok((parts, held_out))
     }
 }
@@ -292,11 +303,10 @@ impl FinalFit<'_> {
 fn artifact_of(
     parts: ModelParts,
     FinalFit { samples, rows, context, options, e_gnss_source }: &FinalFit<'_>,
-    Chosen { candidate, usable, reports, scores, index, .. }: Chosen,
+    Chosen { candidate, reports, .. }: Chosen,
     held_out: HeldOutError,
+    report: TrainingReport,
 ) -> Result<Artifact, FitError> {
-    let selection = Selection { candidates: &usable, reports: &reports, scores: &scores, chosen: index };
-    let report = training_report(&selection, &held_out, rows, &parts, options.image_size);
     let weights = parts.tensors.to_bytes().map_err(FitError::fault)?;
     let origin = parts.plane.origin();
     Ok(Artifact {

@@ -5,7 +5,8 @@ use super::gnss_noise::{TimedResidual, estimate_gnss_noise};
 use crate::domain::{NoiseCorrelation, Sample};
 use crate::filters::noise_of_fixes;
 use crate::geo::EastNorth;
-use crate::model::artifact::TrackNoiseModel;
+use crate::model::artifact::{ModelParts, TrackNoiseModel};
+use crate::model::encoder::gaussian_process;
 use crate::model::regressor::Regressor;
 use crate::model::samples::sequences::{fix_sequences, sequences};
 
@@ -15,12 +16,19 @@ const MODEL_TIME_CONSTANT_S: f64 = 86_400.0;
 /// Correlation length of the model's own error, in standard deviations of the training positions:
 /// most of the error of a map is a shift or scale common to the whole scene.
 const MODEL_LENGTH_SIGMAS: f64 = 3.0;
+/// Share of the receiver's variance that is taken to last for a session where the fit does not estimate it:
+/// half the standard deviation of the rest, as the prior of the recipe `gaussian_process`.
+const SESSION_SHARE: f64 = 0.2;
 /// Below this many samples the receiver's correlation is not estimated; that of a phone is used.
 const MIN_SAMPLES: usize = 200;
 
 /// Estimates the receiver's correlation over time from that of the residuals, the model's from the noise of
 /// the detector and the extent of the training positions.
-pub(super) fn estimate_track_noise(samples: &[Sample], regressor: &Regressor) -> TrackNoiseModel {
+pub(super) fn estimate_track_noise(
+    samples: &[Sample],
+    regressor: &Regressor,
+    parts: &ModelParts,
+) -> TrackNoiseModel {
     let plane = regressor.plane();
     let mut variances_m2 = Vec::new();
     let mut positions = Vec::new();
@@ -38,6 +46,9 @@ pub(super) fn estimate_track_noise(samples: &[Sample], regressor: &Regressor) ->
     let regression =
         NoiseCorrelation { white_share: regressor.white_share(), time_constant_s: MODEL_TIME_CONSTANT_S };
     let regression_length_m = MODEL_LENGTH_SIGMAS * position_sigma_m(&positions);
+    if let Some((gnss, gnss_session_share)) = gaussian_process::receiver_correlation(parts) {
+        return TrackNoiseModel { gnss, gnss_session_share, regression, regression_length_m };
+    }
     let gnss = if samples.len() < MIN_SAMPLES {
         NoiseCorrelation::PHONE
     } else {
@@ -45,7 +56,7 @@ pub(super) fn estimate_track_noise(samples: &[Sample], regressor: &Regressor) ->
         let from_fixes = || noise_of_fixes(regressor.e_gnss_m2(), &fix_sequences(samples, plane));
         estimate_gnss_noise(&residuals, e_regression_m2, &regression).unwrap_or_else(from_fixes).correlation
     };
-    TrackNoiseModel { gnss, regression, regression_length_m }
+    TrackNoiseModel { gnss, gnss_session_share: SESSION_SHARE, regression, regression_length_m }
 }
 
 /// Standard deviation per axis of positions, at least 1 m.

@@ -27,3 +27,18 @@ pub(crate) fn groups_of_targets(rows_of_target: &[usize], most: usize) -> Option
     }
     Some((group_of, count))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::groups_of_targets;
+
+    #[test]
+    fn whole_targets_are_held_out_unless_one_has_nearly_all_rows() {
+        let (groups, count) = groups_of_targets(&[100, 60, 50], 4).expect("three receivers");
+        assert_eq!((groups, count), (vec![0, 1, 2], 3));
+        let (groups, count) = groups_of_targets(&[10, 40, 30, 20], 2).expect("four receivers");
+        assert_eq!((groups, count), (vec![0, 0, 1, 1], 2));
+        assert_eq!(groups_of_targets(&[100], 4), None);
+        assert_eq!(groups_of_targets(&[100, 20], 4), None);
+    }
+}

@@ -3,11 +3,11 @@
 use jiff::Timestamp;
 
 use super::{options, silent, walk};
-use crate::domain::{BoundingBox, Recipe, Sample, TargetId};
+use crate::domain::{BoundingBox, GnssError, Recipe, Sample, TargetId};
 use crate::evaluation::baselines::homography;
 use crate::geo::{EastNorth, LocalPlane};
 use crate::model::network::LossWeights;
-use crate::model::{Artifact, FitOverrides, fit, fit_with};
+use crate::model::{Artifact, FitOptions, FitOverrides, fit, fit_with};
 
 /// Mean distance to the truth of regressed and fused positions, and the share of truths inside the
 /// stated 95 % radius.
@@ -150,4 +150,198 @@ fn sessions_that_contradict_each_other_raise_the_error() {
     let (alike_m, apart_m) = (mean_error_m(0.0), mean_error_m(4.0));
     // The map lies between the two, 2 m from each.
     assert!(alike_m < 0.8 && apart_m > 1.2 && apart_m < 3.0, "{alike_m} m, {apart_m} m");
+}
+
+#[test]
+fn every_gaussian_process_holds_an_auto_encoder_and_files_without_one_still_load() {
+    let samples = walk(6, 40, 2.0, 71);
+    let artifact = fit(&samples, &options(Recipe::GaussianProcess), &mut silent).expect("fits");
+    let regressor = artifact.load().expect("loads");
+    assert!(artifact.metadata.error_scale > 0.0);
+    assert!(artifact.metadata.parameters["auto_encoder.ratio_of_means_m2"] > 0.0);
+    assert_eq!(artifact.metadata.epochs, 30);
+
+    let mut parts = artifact.parts().expect("its own file");
+    for (name, shape) in [("auto_encoder.scales", &[4, 2][..]), ("auto_encoder.position", &[3])] {
+        parts.tensors.take_f64(name, shape).expect("there");
+    }
+    for (layer, inputs, outputs) in
+        [("encoder.0", 4, 16), ("encoder.1", 16, 2), ("decoder.0", 2, 16), ("decoder.1", 16, 4)]
+    {
+        parts.tensors.take_f32(&format!("auto_encoder.{layer}.weight"), &[outputs, inputs]).expect("there");
+        parts.tensors.take_f32(&format!("auto_encoder.{layer}.bias"), &[outputs]).expect("there");
+    }
+    let mut metadata = artifact.metadata.clone();
+    metadata.report = None;
+    let document = serde_json::to_string(&metadata).expect("JSON");
+    assert!(!document.contains("\"report\""), "{document}");
+    let earlier = Artifact {
+        metadata: serde_json::from_str(&document).expect("a document of an earlier release"),
+        weights: parts.tensors.to_bytes().expect("safetensors"),
+    };
+    let earlier = earlier.load().expect("loads");
+    for sample in &samples {
+        let one = regressor.regress(&sample.bounding_box, None);
+        let other = earlier.regress(&sample.bounding_box, None);
+        assert_eq!(one.regressed, other.regressed);
+        assert_eq!(one.e_regression_m2, other.e_regression_m2);
+    }
+    let usual = regressor.regress(&samples[100].bounding_box, None);
+    let [left, top, width, height] = samples[100].bounding_box.sides_px();
+    let wide = BoundingBox::new(left - width, top, 3.0 * width, height).expect("a box");
+    let odd = regressor.regress(&wide, None);
+    assert!(odd.reconstruction_error > 4.0 * usual.reconstruction_error && odd.outside_training);
+}
+
+#[test]
+fn a_report_names_the_candidates_and_what_would_help() {
+    let samples = walk(6, 40, 2.0, 72);
+    let report = |samples: &[Sample]| {
+        let artifact = fit(samples, &options(Recipe::Projective), &mut silent).expect("fits");
+        artifact.metadata.report.expect("a report")
+    };
+    let one = report(&samples);
+    println!("{one}");
+    assert_eq!(one.candidates.len(), 4);
+    assert!((one.candidates.iter().map(|own| own.weight).sum::<f64>() - 1.0).abs() < 1e-12);
+    assert!(one.candidates.iter().all(|own| own.held_out_miss_m > 0.0 && !own.summary.is_empty()));
+    assert!(one.advice.iter().any(|line| line.contains("walk once more on another day")));
+    let next_day = samples.iter().cloned().map(|mut sample| {
+        sample.time += jiff::SignedDuration::from_hours(24);
+        let plane = LocalPlane::new(sample.fix.position);
+        sample.fix.position = plane.to_position(EastNorth { east_m: 8.0, north_m: 0.0 });
+        sample
+    });
+    let both: Vec<Sample> = samples.iter().cloned().chain(next_day).collect();
+    let two = report(&both);
+    println!("{two}");
+    assert!(two.advice.iter().any(|line| line.contains("the 2 sessions disagree by")), "{:?}", two.advice);
+}
+
+#[test]
+fn thinning_keeps_neighbours_together_and_counts_all_traverses() {
+    use crate::model::samples::rows::TrainingRows;
+    let rows = TrainingRows::new(&walk(10, 40, 2.0, 73)).expect("usable");
+    let (all, traverses) = (rows.rows.len(), rows.traverses);
+    let thinned = rows.thinned(all / 4);
+    assert!(thinned.rows.len() <= all / 4 + 8, "{} of {all}", thinned.rows.len());
+    assert_eq!(thinned.traverses, traverses);
+    let neighbours = thinned.rows.windows(2).filter(|pair| pair[0].sample.abs_diff(pair[1].sample) == 1);
+    assert!(neighbours.count() * 8 >= 6 * thinned.rows.len());
+}
+
+/// A candidate's model, and the squared bounded misses of its held-out rows by traverse.
+struct Fitted {
+    regressor: crate::model::Regressor,
+    misses_m2: Vec<f64>,
+}
+
+fn fitted_candidate(
+    name: &'static str,
+    samples: &[Sample],
+    fit_options: &FitOptions,
+    bound_m2: f64,
+) -> Fitted {
+    let mut misses_m2 = Vec::new();
+    let overrides = FitOverrides { candidate: Some(name), loss_weights: None };
+    let artifact = fit_with(samples, fit_options, overrides, &mut |event| {
+        if let crate::model::FitEvent::HeldOut(errors) = event {
+            // Spells of 20 neighbours: their errors are correlated.
+            let of_spell = |spell: &[crate::domain::HeldOutSampleError]| {
+                spell.iter().map(|error| (0.5 * error.distance_m.powi(2)).min(bound_m2)).sum()
+            };
+            misses_m2 = errors.chunks(20).map(of_spell).collect();
+        }
+        std::ops::ControlFlow::Continue(())
+    });
+    Fitted { regressor: artifact.expect("fits").load().expect("loads"), misses_m2 }
+}
+
+/// The comparison behind docs/method.md: choosing one candidate against averaging all by the shares of a
+/// Bayesian bootstrap.
+#[test]
+#[ignore = "a measurement of minutes"]
+fn averaging_all_candidates_against_choosing_one() {
+    use crate::simulation::{Options, Scene, simulate};
+    use rand::{RngExt, SeedableRng};
+    const NAMES: [&str; 7] = [
+        "gaussian_process",
+        "projective/foot",
+        "projective/sides",
+        "projective/sides+smoothed",
+        "projective/residual",
+        "hybrid",
+        "hybrid+smoothed",
+    ];
+    let (mut chosen_log, mut mean_log, mut first_log, mut worlds) = (0.0, 0.0, 0.0, 0.0);
+    for (scene, targets, rows) in [
+        (Scene::Airport, 1, 1_500),
+        (Scene::Airport, 3, 1_500),
+        (Scene::Square, 1, 900),
+        (Scene::Square, 8, 720),
+        (Scene::Square, 16, 1_440),
+    ] {
+        let simulated =
+            Options { seed: 1_040, camera_seed: 1_040, targets, samples: rows, ..Options::new(scene) };
+        let samples = simulate(&simulated).training_samples();
+        let fit_options =
+            FitOptions { gnss_error: GnssError::Unknown, epochs: None, ..options(Recipe::Auto) };
+        let bound_m2 = if scene == Scene::Airport { 1e4 } else { 60.0 };
+        let fitted: Vec<Fitted> =
+            NAMES.iter().map(|name| fitted_candidate(name, &samples, &fit_options, bound_m2)).collect();
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        let mut weights = vec![0.0; NAMES.len()];
+        for _ in 0..500 {
+            let draw: Vec<f64> =
+                fitted[0].misses_m2.iter().map(|_| -(1.0 - rng.random::<f64>()).ln()).collect();
+            let score = |own: &Fitted| {
+                own.misses_m2.iter().zip(&draw).map(|(miss, weight)| miss * weight).sum::<f64>()
+            };
+            let scores: Vec<f64> = fitted.iter().map(score).collect();
+            let best =
+                (0..scores.len()).min_by(|one, other| scores[*one].total_cmp(&scores[*other])).unwrap_or(0);
+            weights[best] += 1.0 / 500.0;
+        }
+        let artifact = fit(&samples, &fit_options, &mut silent).expect("fits");
+        let chosen = artifact.load().expect("loads");
+        let (mut chosen_m, mut mean_m, mut first_m, mut count) = (0.0, 0.0, 0.0, 0.0);
+        for row in simulate(&simulated.test(300)).rows {
+            let Some(bounding_box) = row.bounding_box else { continue };
+            let truth = |plane: &LocalPlane| plane.to_plane(row.truth);
+            let miss_m = |regressor: &crate::model::Regressor| {
+                regressor.regress(&bounding_box, None).regressed.distance_m(truth(regressor.plane()))
+            };
+            let (mut east_m, mut north_m) = (0.0, 0.0);
+            for (own, weight) in fitted.iter().zip(&weights) {
+                let point = own.regressor.regress(&bounding_box, None).regressed;
+                let truth = truth(own.regressor.plane());
+                east_m += weight * (point.east_m - truth.east_m);
+                north_m += weight * (point.north_m - truth.north_m);
+            }
+            chosen_m += miss_m(&chosen);
+            first_m += miss_m(&fitted[0].regressor);
+            mean_m += east_m.hypot(north_m);
+            count += 1.0;
+        }
+        let weights: Vec<String> =
+            NAMES.iter().zip(&weights).map(|(name, weight)| format!("{name} {weight:.2}")).collect();
+        println!(
+            "{scene}, {targets} targets: chosen {:.3} m, averaged {:.3} m, gaussian_process {:.3} m; {}",
+            chosen_m / count,
+            mean_m / count,
+            first_m / count,
+            weights.join(", ")
+        );
+        chosen_log += f64::ln(chosen_m / count);
+        mean_log += f64::ln(mean_m / count);
+        first_log += f64::ln(first_m / count);
+        worlds += 1.0;
+    }
+    let geometric = |sum: f64| (sum / worlds).exp();
+    println!(
+        "geometric mean: chosen {:.3} m, averaged {:.3} m, gaussian_process {:.3} m",
+        geometric(chosen_log),
+        geometric(mean_log),
+        geometric(first_log)
+    );
 }

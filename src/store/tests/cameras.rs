@@ -72,13 +72,14 @@ async fn pages_hold_every_camera_once_in_order() {
 #[tokio::test]
 async fn a_change_needs_the_revision_it_was_made_from() {
     let Fixture { store, folder: _folder, .. } = Fixture::new().await;
-    let changed = store.replace_camera(&full("square"), Some(Revision(1)), at(7)).await.expect("current");
+    let changed =
+        store.replace_camera(&full("square"), Some(Revision(1).into()), at(7)).await.expect("current");
     assert_eq!((changed.revision, changed.created_at, changed.updated_at), (Revision(2), at(0), at(7)));
     assert_eq!(changed.profile, full("square"));
-    let stale = store.replace_camera(&full("square"), Some(Revision(1)), at(8)).await;
+    let stale = store.replace_camera(&full("square"), Some(Revision(1).into()), at(8)).await;
     assert_eq!(kind(stale), ErrorKind::RevisionMismatch);
     assert_eq!(
-        kind(store.delete_camera(&id("square"), Some(Revision(1))).await),
+        kind(store.delete_camera(&id("square"), Some(Revision(1).into()), at(9)).await),
         ErrorKind::RevisionMismatch
     );
     let forced = store.replace_camera(&full("square"), None, at(9)).await.expect("unconditional");
@@ -92,7 +93,9 @@ async fn one_of_several_concurrent_changes_of_one_revision_succeeds() {
     let attempts: Vec<_> = (0..8)
         .map(|_| {
             let store = store.clone();
-            tokio::spawn(async move { store.replace_camera(&full("square"), Some(Revision(1)), at(7)).await })
+            tokio::spawn(async move {
+                store.replace_camera(&full("square"), Some(Revision(1).into()), at(7)).await
+            })
         })
         .collect();
     let mut winners = 0;
@@ -115,10 +118,10 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
     store.insert_model(&camera, &metadata(), b"w", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
     store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
-    assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::RunLive);
+    assert_eq!(kind(store.delete_camera(&camera, None, at(9)).await), ErrorKind::RunLive);
     store.cancel_run(&camera, run_id(1), at(4)).await.expect("cancelled");
 
-    store.delete_camera(&camera, Some(Revision(1))).await.expect("deleted");
+    store.delete_camera(&camera, Some(Revision(1).into()), at(9)).await.expect("deleted");
     assert_eq!(kind(store.camera(&camera).await), ErrorKind::CameraNotFound);
     assert_eq!(
         kind(store.insert_samples(&camera, vec![sample(1, "a")], Durability::Synced).await),
@@ -126,7 +129,7 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
     );
     assert_eq!(kind(store.log(run_id(1)).await), ErrorKind::RunNotFound);
     assert_eq!(store.active_models().await.expect("none"), []);
-    assert_eq!(kind(store.delete_camera(&camera, None).await), ErrorKind::CameraNotFound);
+    assert_eq!(kind(store.delete_camera(&camera, None, at(9)).await), ErrorKind::CameraNotFound);
 
     store.insert_camera(&NewCamera::named(camera.clone()), at(5)).await.expect("new again");
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 0);

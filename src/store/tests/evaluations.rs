@@ -147,11 +147,11 @@ async fn one_returned_to_the_queue_is_claimed_at_once_and_one_deleted_never() {
     assert_eq!((back.state, back.ended_at), (JobState::Queued, None));
     let second = fixture.claim_evaluation(4).await;
     assert_eq!(second.job.attempt, 1);
-    fixture.store.delete_evaluation(nth(1)).await.expect("known");
+    fixture.store.delete_evaluation(nth(1), at(9)).await.expect("known");
     assert_eq!(fixture.heartbeat_evaluation(second.fence, 5).await, Heartbeat::Lost);
     assert!(fixture.finish_evaluation(second.fence, success()).await.is_none());
     for gone in [
-        kind(fixture.store.delete_evaluation(nth(1)).await),
+        kind(fixture.store.delete_evaluation(nth(1), at(9)).await),
         kind(fixture.store.evaluation(nth(1)).await),
         kind(fixture.store.evaluation_report(nth(1)).await),
     ] {
@@ -185,7 +185,7 @@ async fn the_server_has_a_limit_and_a_camera_takes_its_own_along() {
     assert_eq!(kind(store.evaluations(Some(&id("none")), None, 9).await), ErrorKind::CameraNotFound);
 
     assert_eq!(fixture.claim_evaluation(2).await.job.id, nth(1), "the oldest first");
-    store.delete_camera(&fixture.camera, None).await.expect("deleted");
+    store.delete_camera(&fixture.camera, None, at(9)).await.expect("deleted");
     assert_eq!(ids(None, None, 9).await, [nth(4)]);
 }
 

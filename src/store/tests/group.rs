@@ -133,7 +133,7 @@ async fn concurrent_callers_lose_and_duplicate_nothing() {
     for round in 0..20 {
         store.insert_camera(&NewCamera::named(short_lived.clone()), at(round)).await.expect("new");
         let insert = call(&store, &short_lived, vec![sample(round, "a")]);
-        store.delete_camera(&short_lived, None).await.expect("deleted");
+        store.delete_camera(&short_lived, None, at(9)).await.expect("deleted");
         match insert.await.expect("no panic") {
             Ok(inserted) => assert_eq!(inserted.accepted, 1),
             Err(error) => assert_eq!(error.kind(), ErrorKind::CameraNotFound),

@@ -122,10 +122,10 @@ async fn futures_can_move_between_threads() {
     movable(store.close());
     movable(store.ping());
     movable(store.cameras(Some(&camera), 1));
-    movable(store.delete_camera(&camera, None));
+    movable(store.delete_camera(&camera, None, at(9)));
     movable(store.insert_samples(&camera, Vec::<Sample>::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));
-    movable(store.delete_samples(&camera, &filter));
+    movable(store.delete_samples(&camera, &filter, at(9)));
     movable(store.insert_run(run, &camera, &options(), 1, at(0)));
     movable(store.claim_run(lease, at(0)));
     movable(store.heartbeat_run(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));

@@ -58,7 +58,7 @@ async fn rolling_back_walks_through_what_was_active() {
     for expected in [2, 1] {
         assert_eq!(store.roll_back(&camera, at(5)).await.expect("back").active_model, Some(expected));
     }
-    assert_eq!(kind(store.roll_back(&camera, at(6)).await), ErrorKind::NoModel);
+    assert_eq!(kind(store.roll_back(&camera, at(6)).await), ErrorKind::NoEarlierModel);
     assert_eq!(active(&store, &camera).await, Some(1), "a refused roll back changes nothing");
 }
 

@@ -87,11 +87,11 @@ async fn deleting_takes_what_the_filter_selects() {
     store.insert_samples(&camera, all, Durability::Synced).await.expect("stored");
     let filter =
         SampleFilter { from: Some(at(3)), until: Some(at(5)), target_id: Some(target("b")), has_fix: None };
-    assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 2);
+    assert_eq!(store.delete_samples(&camera, &filter, at(9)).await.expect("deleted"), 2);
     let filter = SampleFilter { from: Some(at(8)), ..SampleFilter::default() };
-    assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 4);
+    assert_eq!(store.delete_samples(&camera, &filter, at(9)).await.expect("deleted"), 4);
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 14);
-    assert_eq!(kind(store.delete_samples(&id("none"), &filter).await), ErrorKind::CameraNotFound);
+    assert_eq!(kind(store.delete_samples(&id("none"), &filter, at(9)).await), ErrorKind::CameraNotFound);
     assert_eq!(kind(store.count_samples(&id("none"), &filter).await), ErrorKind::CameraNotFound);
     assert_eq!(kind(store.samples(&id("none"), &filter, None, 1).await), ErrorKind::CameraNotFound);
 }
@@ -150,10 +150,10 @@ async fn a_sample_with_a_fix_takes_the_place_of_one_without_and_never_the_revers
     let fixes: Vec<bool> = all.iter().take(6).map(|sample| sample.fix.is_some()).collect();
     assert_eq!((all.len(), fixes), (12, vec![false, false, false, true, false, true]));
     let filter = SampleFilter { has_fix: Some(false), until: Some(at(5)), ..SampleFilter::default() };
-    assert_eq!(store.delete_samples(&camera, &filter).await.expect("deleted"), 4);
+    assert_eq!(store.delete_samples(&camera, &filter, at(9)).await.expect("deleted"), 4);
     assert_eq!(count().await, SampleCount { all: 8, without_fix: 5 });
     let rest = SampleFilter { until: Some(at(100)), ..SampleFilter::default() };
-    assert_eq!(store.delete_samples(&camera, &rest).await.expect("deleted"), 8);
+    assert_eq!(store.delete_samples(&camera, &rest, at(9)).await.expect("deleted"), 8);
     assert_eq!(count().await, SampleCount::default());
     assert_eq!(store.maintain().await.expect("works").samples, 0);
 }

@@ -8,6 +8,7 @@ use hyper::http::HeaderValue;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use sightfix::app::App;
+use sightfix::app::access::{Caller, Principal};
 use sightfix::clock::{Clock, Randomness};
 use sightfix::config::Limits;
 use sightfix::grpc;
@@ -96,6 +97,7 @@ async fn serve(listener: TcpListener, app: App, shutdown: Shutdown) {
             let service = service_fn(move |mut request| {
                 let id = RequestId::new(HeaderValue::from_static(REQUEST));
                 request.extensions_mut().insert(id.clone());
+                request.extensions_mut().insert(Caller::new(Principal::Everyone, None, None));
                 let answer = router.clone().call(request);
                 async move { answer.await.map(|answer| grpc::explain(answer, &id)) }
             });

@@ -31,6 +31,7 @@ fn recording(rows: i64) -> RecordedStream {
 
 fn options(fake: &Fake) -> ReplayOptions {
     ReplayOptions {
+        key: None,
         server: format!("http://{}", fake.address),
         camera_ids: vec![CameraId::new("yard").expect("a slug")],
         cameras: 1,

@@ -30,7 +30,7 @@ pub use box_plausibility::RecentBoxes;
 pub(crate) use companion::EPOCHS;
 pub(crate) use leave_out::{SequenceMean, widening};
 pub(crate) use noise::{Epoch, ReceiverNoise};
-pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, target_height_m};
+pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, receiver_correlation, target_height_m};
 pub(crate) use sessions::weighted_mean;
 
 #[cfg(test)]

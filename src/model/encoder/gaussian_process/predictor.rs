@@ -91,8 +91,8 @@ pub(crate) struct Prediction {
     /// Radius that holds the truth with 95 %, in standard deviations per axis (the root of half the
     /// covariance's trace).
     pub(crate) r95_scale: f64,
-    /// Of it, the part that is new with each box: mean variance per axis, m2.
-    pub(crate) box_noise_m2: f64,
+    /// Of it, the part that is new with each box: east, cross, north, m2.
+    pub(crate) box_noise_m2: [f64; 3],
     /// How the box deviates from those of training.
     pub(crate) deviation: Deviation,
 }
@@ -323,7 +323,7 @@ impl Predictor {
             position_m,
             covariance_m2,
             r95_scale: self.r95_scale(&covariance_m2),
-            box_noise_m2: 0.5 * (noise_m2[0] + noise_m2[2]),
+            box_noise_m2: noise_m2,
             deviation,
         }
     }

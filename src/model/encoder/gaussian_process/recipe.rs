@@ -7,9 +7,9 @@ use super::map_rows::MapRows;
 use super::noise::Epoch;
 use super::predictor::Predictor;
 use super::upright_camera::UprightCamera;
-use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, Recipe, TargetClass};
-use crate::geo::EastNorth;
-use crate::model::artifact::ModelParts;
+use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, TargetClass};
+use crate::geo::{EastNorth, PlaneCovariance};
+use crate::model::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
 use crate::model::encoder::FittedEncoder;
 use crate::model::encoder::auto_encoder::AutoEncoder;
 use crate::model::encoder::features::{Encoded, features_of};
@@ -74,10 +74,10 @@ pub(crate) fn fit(
         boxes: rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect(),
         labels_m: rows.rows.iter().map(|row| [row.label.east_m, row.label.north_m]).collect(),
     };
-    let unpaired =
-        settings.unpaired.iter().map(|own| (rows.targets + own.target, features_of(&own.bounding_box)));
+    let unpaired = settings.unpaired.iter().map(|own| (own.target, features_of(&own.bounding_box)));
     let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
-    let boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
+    let mut boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
+    boxes.sort_by_key(|(target, _)| *target);
     let upright = settings.image_size.and_then(|size| {
         let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
         UprightCamera::new(&boxes, size_px, settings.target_height_m)
@@ -109,12 +109,24 @@ pub(crate) fn fit(
     Ok(FittedEncoder { parts, covariance: None })
 }
 
+/// How the receiver's error is correlated beside its bias of the session, and the share of the latter in its
+/// variance; `None` in the parts of another recipe.
+pub(crate) fn receiver_correlation(parts: &ModelParts) -> Option<(NoiseCorrelation, f64)> {
+    let of = |name: &str| parts.parameters.get(name).copied();
+    let (white_m2, short_m2) = (of("receiver_white_m2")?, of("receiver_short_m2")?);
+    let (session_m2, short_time_s) = (of("receiver_session_m2")?, of("receiver_short_time_s")?);
+    let within_m2 = white_m2 + short_m2;
+    let white_share = (white_m2 / within_m2).clamp(LEAST_GNSS_WHITE_SHARE, 1.0);
+    let correlation = NoiseCorrelation { white_share, time_constant_s: short_time_s };
+    Some((correlation, session_m2 / (within_m2 + session_m2)))
+}
+
 /// White share of the error variance: what the detector's noise makes of it, over the training boxes.
 fn white_share(predictor: &Predictor, rows: &MapRows) -> f64 {
     let (mut white_m2, mut all_m2) = (0.0, 0.0);
     for sides in rows.boxes.iter().step_by(rows.boxes.len().div_ceil(500)) {
         let prediction = predictor.predict(sides, None);
-        white_m2 += prediction.box_noise_m2;
+        white_m2 += 0.5 * (prediction.box_noise_m2[0] + prediction.box_noise_m2[2]);
         all_m2 += prediction.variance_m2();
     }
     (white_m2 / all_m2).clamp(0.0, 1.0)
@@ -174,19 +186,7 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
         report.groups,
         100.0 * report.held_out_coverage,
         report.widening
-    ))?;
-    match report.sessions {
-        Some(sessions) if sessions.between_m2 > noise.white_m2 + noise.short_m2 / 4.0 => phase.run.note(&format!(
-            "{} sessions disagree by {:.1} m: one more session on another day would help",
-            sessions.count,
-            (2.0 * sessions.between_m2).sqrt() * std::f64::consts::SQRT_2
-        )),
-        None => phase.run.note(
-            "one session only: a bias that the receivers keep for all of it is a prior; a session on another day \
-             would measure it",
-        ),
-        Some(_) => Ok(()),
-    }
+    ))
 }
 
 /// The encoder of a loaded model.
@@ -201,8 +201,10 @@ pub(crate) struct GaussianProcessEncoder {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Estimate {
     pub(crate) encoded: Encoded,
-    /// Mean error variance per axis, m2.
-    pub(crate) variance_m2: f64,
+    /// Of the position's error, m2.
+    pub(crate) covariance: PlaneCovariance,
+    /// Of it, the part that is new with each box, m2.
+    pub(crate) box_noise: PlaneCovariance,
     /// Radius of 95 % in standard deviations.
     pub(crate) r95_scale: f64,
 }
@@ -230,8 +232,14 @@ impl GaussianProcessEncoder {
         };
         Estimate {
             encoded: Encoded { position: EastNorth { east_m, north_m }, reconstruction_px },
-            variance_m2: prediction.variance_m2(),
+            covariance: plane_covariance(prediction.covariance_m2),
+            box_noise: plane_covariance(prediction.box_noise_m2),
             r95_scale: prediction.r95_scale,
         }
     }
+}
+
+/// From east, cross, north, m2.
+const fn plane_covariance([east_m2, east_north_m2, north_m2]: [f64; 3]) -> PlaneCovariance {
+    PlaneCovariance { east_m2, north_m2, east_north_m2 }
 }

@@ -263,3 +263,99 @@ fn a_deviation_too_small_for_one_box_is_noticed_when_it_lasts() {
     assert!(single.deviation.weight <= 0.0 && lasting.deviation.weight > 0.1, "{}", lasting.deviation.weight);
     assert!(lasting.variance_m2() > single.variance_m2());
 }
+
+/// Mean stated standard deviation per axis over boxes, m.
+fn stated_m(predictor: &Predictor, tests: &[(Box4, [f64; 2])]) -> f64 {
+    let sigma = |(sides, _): &(Box4, [f64; 2])| predictor.predict(sides, None).variance_m2().sqrt();
+    tests.iter().map(sigma).sum::<f64>() / tests.len() as f64
+}
+
+#[test]
+fn a_stated_bias_replaces_the_prior_of_the_only_receiver_in_its_only_session() {
+    let (mut unknown_m, mut small_m, mut large_m, mut covered) = (0.0, 0.0, 0.0, 0.0);
+    let worlds = 4;
+    for seed in 0..worlds {
+        let (rows, tests) = walkers(4500 + seed, 1, 600, 0.0);
+        let with = |bias_sigma_m: Option<f64>| {
+            let settings = FitSettings { bias_sigma_m, ..settings(None) };
+            fit(&rows, &settings).expect("rows that determine a map").0
+        };
+        let small = with(Some(0.05));
+        unknown_m += stated_m(&with(None), &tests) / worlds as f64;
+        small_m += stated_m(&small, &tests) / worlds as f64;
+        large_m += stated_m(&with(Some(3.0)), &tests) / worlds as f64;
+        covered += score(&small, &tests, 0.0).1 / worlds as f64;
+    }
+    println!("sigma without a stated bias {unknown_m:.2} m, of 0.05 m {small_m:.2} m, of 3 m {large_m:.2} m");
+    println!("with 0.05 m, which is true, {:.1} % inside", 100.0 * covered);
+    assert!(small_m < 0.95 * unknown_m && large_m > 2.7, "{unknown_m} {small_m} {large_m}");
+    assert!(covered > 0.75, "{covered}");
+}
+
+#[test]
+fn a_bias_that_several_receivers_share_is_added_to_the_answers() {
+    let (rows, tests) = walkers(4510, 6, 60, 0.5);
+    let with = |bias_sigma_m: Option<f64>| {
+        let settings = FitSettings { bias_sigma_m, ..settings(None) };
+        fit(&rows, &settings).expect("rows that determine a map").0
+    };
+    let (none_m2, stated_m2) = (
+        with(Some(1e-3)).predict(&tests[0].0, None).variance_m2(),
+        with(Some(2.0)).predict(&tests[0].0, None).variance_m2(),
+    );
+    assert!((stated_m2 - none_m2 - 4.0).abs() < 1e-3, "{none_m2} {stated_m2}");
+}
+
+#[test]
+fn a_longer_session_is_worth_more_degrees_of_freedom() {
+    let freedom = |rows_each: usize| fitted(&walkers(4520, 1, rows_each, 0.0).0).1.freedom;
+    let (short, long) = (freedom(200), freedom(3_000));
+    println!("{short:.1} degrees of freedom of 200 s, {long:.1} of 3,000 s");
+    assert!(short >= 4.0 && long > short, "{short} {long}");
+}
+
+#[test]
+fn a_receiver_whose_error_is_white_keeps_no_bias() {
+    let options = Options { seed: 4600, camera_seed: 4600, samples: 3_000, ..Options::new(Scene::Airport) };
+    let world = simulate(&options);
+    let plane = LocalPlane::new(world.rows[0].truth);
+    let mut rows = MapRows::default();
+    for sample in world.training_samples() {
+        let EastNorth { east_m, north_m } = plane.to_plane(sample.fix.position);
+        rows.epochs.push(Epoch { time_s: sample.time.as_microsecond() as f64 * 1e-6, sequence: 0 });
+        rows.boxes.push(features_of(&sample.bounding_box));
+        rows.labels_m.push([east_m, north_m]);
+    }
+    let settings = FitSettings { white_share: 1.0, ..settings(None) };
+    let (_, report) = fit(&rows, &settings).expect("rows that determine a map");
+    let receiver = report.receiver;
+    println!("{receiver:?}");
+    // Of 29.5 m per axis.
+    assert!(receiver.session_m2.sqrt() < 1.5, "{receiver:?}");
+    assert!(receiver.white_m2.sqrt() > 25.0, "{receiver:?}");
+}
+
+#[test]
+fn boxes_without_a_fix_sharpen_the_geometry_of_few_receivers() {
+    let (mut paired_m, mut all_m) = (0.0, 0.0);
+    for seed in 4700..4704 {
+        let (rows, tests) = walkers(seed, 20, 40, 1.5);
+        let few: Vec<usize> = (0..rows.boxes.len()).filter(|row| rows.epochs[*row].sequence < 2).collect();
+        let paired = rows.picked(&few);
+        let upright = |rows: &MapRows| {
+            let boxes: Vec<(u32, Box4)> =
+                rows.epochs.iter().zip(&rows.boxes).map(|(epoch, sides)| (epoch.sequence, *sides)).collect();
+            UprightCamera::new(&boxes, IMAGE_PX, PERSON_M)
+        };
+        let error_m = |upright: Option<UprightCamera>| {
+            let (predictor, _) = fit(&paired, &settings(upright)).expect("rows that determine a map");
+            score(&predictor, &tests, 0.0).0
+        };
+        let (with_paired_m, with_all_m) = (error_m(upright(&paired)), error_m(upright(&rows)));
+        println!("two receivers: {with_paired_m:.2} m, with the boxes of 18 others {with_all_m:.2} m");
+        paired_m += with_paired_m / 4.0;
+        all_m += with_all_m / 4.0;
+    }
+    println!("mean {paired_m:.2} m, with all boxes {all_m:.2} m");
+    assert!(all_m < paired_m, "{all_m} {paired_m}");
+}

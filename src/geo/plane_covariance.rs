@@ -2,7 +2,7 @@
 //!
 //! What never happens here: degrees, time, anything beyond two axes.
 
-use crate::geo::EastNorth;
+use super::EastNorth;
 
 /// 95 % radius of a bivariate normal distribution divided by its larger principal standard deviation,
 /// tabulated by the ratio of the smaller to the larger in steps of 0.1. Solved numerically from the
@@ -97,6 +97,12 @@ impl PlaneCovariance {
             north_m2: self.north_m2 + other.north_m2,
             east_north_m2: self.east_north_m2 + other.east_north_m2,
         }
+    }
+
+    /// The difference, for a part of this covariance.
+    #[must_use]
+    pub fn minus(self, part: Self) -> Self {
+        self.plus(part.scaled(-1.0))
     }
 
     /// The symmetric positive square root in m, elements (east, north, east-north), by

@@ -1,0 +1,189 @@
+// Files of rows as people have them: any separator, any column names, any convention of boxes. Mapped here to the
+// columns that the importer documents.
+import type { ImageSize, RejectedRow } from './types';
+
+export type FileKind = 'samples' | 'detections' | 'fixes';
+export type BoxForm = 'left_top' | 'centre' | 'corners';
+export type TimeForm = 'rfc3339' | 'unix_s' | 'unix_ms';
+
+export interface Table {
+  header: string[];
+  separator: string;
+  /** Raw rows with their line numbers in the file, from 1. */
+  rows: { line: number; cells: string[] }[];
+}
+
+export interface Mapping {
+  kind: FileKind;
+  /** Column of each field, -1 for none. */
+  columns: Record<string, number>;
+  boxForm: BoxForm;
+  normalised: boolean;
+  timeForm: TimeForm;
+  decimalComma: boolean;
+  /** Used where there is no column of the target. */
+  targetId: string;
+}
+
+/** Reads all rows; a quoted cell may hold separators, quotes and line ends. */
+export function parseTable(text: string): Table {
+  const content = text.charCodeAt(0) === 0xfeff ? text.slice(1) : text;
+  const firstLine = content.slice(0, Math.max(content.search(/\r?\n/), 0) || content.length);
+  const separator = [';', '\t', ',', '|'].map((it) => [it, firstLine.split(it).length] as const).sort((a, b) => b[1] - a[1])[0]![0];
+  const rows: Table['rows'] = [];
+  let cells: string[] = [];
+  let cell = '';
+  let [line, rowLine, quoted] = [1, 1, false];
+  const endRow = (): void => {
+    cells.push(cell.trim());
+    cell = '';
+    if (cells.length > 1 || cells[0] !== '') rows.push({ line: rowLine, cells });
+    cells = [];
+  };
+  for (let at = 0; at < content.length; at++) {
+    const char = content[at]!;
+    if (char === '\n') line += 1;
+    if (quoted) {
+      if (char !== '"') cell += char;
+      else if (content[at + 1] === '"') cell += content[++at];
+      else quoted = false;
+    } else if (char === '"' && cell.trim() === '') {
+      quoted = true;
+      cell = '';
+    } else if (char === separator) {
+      cells.push(cell.trim());
+      cell = '';
+    } else if (char === '\n') {
+      endRow();
+      rowLine = line;
+    } else if (char !== '\r') cell += char;
+  }
+  if (cell !== '' || cells.length > 0) endRow();
+  const header = rows.shift()?.cells ?? [];
+  return { header, separator, rows };
+}
+
+/** Names that columns of each field have in the wild, lower case without units and signs. */
+const NAMES: Record<string, string[]> = {
+  time: ['time', 'timestamp', 'datetime', 'date', 't', 'zeit', 'utc', 'timeutc'],
+  target_id: ['targetid', 'target', 'trackid', 'track', 'id', 'objectid', 'object', 'personid', 'name'],
+  receiver_id: ['receiverid', 'receiver', 'deviceid', 'device', 'phone'],
+  left: ['left', 'x', 'x1', 'xmin', 'bbleft', 'bboxleft', 'bboxx', 'boxleft', 'cx', 'xcenter', 'xcentre', 'centerx', 'centrex'],
+  top: ['top', 'y', 'y1', 'ymin', 'bbtop', 'bboxtop', 'bboxy', 'boxtop', 'cy', 'ycenter', 'ycentre', 'centery', 'centrey'],
+  width: ['width', 'w', 'bbwidth', 'bboxwidth', 'bboxw', 'boxwidth', 'x2', 'xmax', 'right'],
+  height: ['height', 'h', 'bbheight', 'bboxheight', 'bboxh', 'boxheight', 'y2', 'ymax', 'bottom'],
+  longitude: ['longitude', 'lon', 'lng', 'long', 'laenge', 'länge'],
+  latitude: ['latitude', 'lat', 'breite'],
+  sigma_m: ['sigmam', 'sigma', 'accuracy', 'horizontalaccuracy', 'std', 'hacc'],
+  class: ['class', 'label', 'category', 'klasse'],
+  score: ['score', 'confidence', 'conf', 'probability'],
+};
+
+export const REQUIRED: Record<FileKind, string[]> = {
+  samples: ['time', 'target_id', 'left', 'top', 'width', 'height', 'longitude', 'latitude'],
+  detections: ['time', 'target_id', 'left', 'top', 'width', 'height'],
+  fixes: ['time', 'longitude', 'latitude'],
+};
+export const OPTIONAL: Record<FileKind, string[]> = {
+  samples: ['sigma_m', 'class', 'score'],
+  detections: ['class', 'score'],
+  fixes: ['receiver_id', 'sigma_m'],
+};
+
+function plain(name: string): string {
+  return name.toLowerCase().replace(/_?(px|deg|m2)$/, '').replace(/[^\p{L}\p{N}]/gu, '');
+}
+
+/** What a file is, and how its columns map: the operator sees it and may change it. */
+export function guessMapping(table: Table): Mapping {
+  const names = table.header.map(plain);
+  const columns: Record<string, number> = {};
+  for (const [field, known] of Object.entries(NAMES)) {
+    const ranks = names.map((name) => known.indexOf(name)).map((rank) => (rank < 0 ? Infinity : rank));
+    const best = Math.min(...ranks);
+    columns[field] = best === Infinity ? -1 : ranks.indexOf(best);
+  }
+  const has = (field: string): boolean => columns[field]! >= 0;
+  const kind: FileKind = has('left') && has('longitude') ? 'samples' : has('left') ? 'detections' : 'fixes';
+  const at = (field: string): string => names[columns[field]!] ?? '';
+  const boxForm: BoxForm = /^(x2|xmax|right)$/.test(at('width')) ? 'corners' : /^(cx|.*cent.*)$/.test(at('left')) ? 'centre' : 'left_top';
+  const cells = (field: string): string[] => table.rows.slice(0, 200).map((row) => row.cells[columns[field]!] ?? '');
+  const decimalComma = table.separator !== ',' && [...cells('left'), ...cells('longitude')].some((it) => /^-?\d+,\d+$/.test(it));
+  const numbers = ['left', 'top', 'width', 'height'].flatMap((field) => cells(field).map((it) => Number(it.replace(',', '.'))));
+  const times = cells('time').filter(Boolean);
+  const timeForm: TimeForm = times.length > 0 && times.every((it) => /^\d+([.,]\d+)?$/.test(it)) ? (Number(times[0]!.replace(',', '.')) > 1e11 ? 'unix_ms' : 'unix_s') : 'rfc3339';
+  return {
+    kind,
+    columns,
+    boxForm,
+    normalised: has('left') && numbers.length > 0 && numbers.every((it) => it >= 0 && it <= 1),
+    timeForm,
+    decimalComma,
+    targetId: has('target_id') ? '' : 'target-1',
+  };
+}
+
+export interface MappedRow {
+  line: number;
+  cells: string[];
+}
+
+/** The columns that a mapped file has, in their order. */
+export function outputColumns(mapping: Mapping): string[] {
+  const optional = OPTIONAL[mapping.kind].filter((field) => (mapping.columns[field] ?? -1) >= 0);
+  return [...REQUIRED[mapping.kind], ...optional];
+}
+
+/** What is missing before a file can be imported, by field; empty if nothing is. */
+export function missingFields(mapping: Mapping): string[] {
+  return REQUIRED[mapping.kind].filter(
+    (field) => (mapping.columns[field] ?? -1) < 0 && !(field === 'target_id' && mapping.targetId.trim()),
+  );
+}
+
+/** One row in the importer's columns, or why it cannot be. */
+export function mapRow(row: Table['rows'][number], mapping: Mapping, image: ImageSize | undefined): MappedRow | RejectedRow {
+  const raw = (field: string): string => row.cells[mapping.columns[field] ?? -1] ?? '';
+  const reject = (field: string, reason: string): RejectedRow => ({ line: row.line, field, reason });
+  const numeric = (field: string): number => {
+    const text = mapping.decimalComma ? raw(field).replace(',', '.') : raw(field);
+    return text === '' ? NaN : Number(text);
+  };
+  const values: Record<string, string> = {};
+  if (mapping.timeForm === 'rfc3339') values.time = raw('time').replace(/^(\d{4}-\d\d-\d\d) (\d\d:)/, '$1T$2');
+  else {
+    const time_ms = numeric('time') * (mapping.timeForm === 'unix_s' ? 1000 : 1);
+    if (!Number.isFinite(time_ms) || Math.abs(time_ms) > 8.64e15) return reject('time', `'${raw('time')}' is not a number of seconds`);
+    values.time = new Date(time_ms).toISOString();
+  }
+  values.target_id = raw('target_id') || mapping.targetId;
+  if (mapping.kind !== 'fixes') {
+    const sides = ['left', 'top', 'width', 'height'].map(numeric);
+    const wrong = sides.findIndex((side) => !Number.isFinite(side));
+    if (wrong >= 0) {
+      const field = ['left', 'top', 'width', 'height'][wrong]!;
+      return reject(field, `'${raw(field)}' is not a number`);
+    }
+    let [left, top, width, height] = sides as [number, number, number, number];
+    if (mapping.normalised && image) {
+      [left, width] = [left * image.width_px, width * image.width_px];
+      [top, height] = [top * image.height_px, height * image.height_px];
+    }
+    if (mapping.boxForm === 'corners') [width, height] = [width - left, height - top];
+    if (mapping.boxForm === 'centre') [left, top] = [left - width / 2, top - height / 2];
+    const shown = (value: number): string => String(Math.round(value * 1000) / 1000);
+    Object.assign(values, { left: shown(left), top: shown(top), width: shown(width), height: shown(height) });
+  }
+  for (const field of ['longitude', 'latitude', 'sigma_m', 'score']) values[field] = mapping.decimalComma ? raw(field).replace(',', '.') : raw(field);
+  for (const field of ['class', 'receiver_id']) values[field] = raw(field);
+  return { line: row.line, cells: outputColumns(mapping).map((field) => values[field] ?? '') };
+}
+
+export function isRejected(row: MappedRow | RejectedRow): row is RejectedRow {
+  return 'reason' in row;
+}
+
+export function toCsv(columns: string[], rows: MappedRow[]): string {
+  const cell = (text: string): string => (/[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+  return [columns, ...rows.map((row) => row.cells)].map((cells) => cells.map(cell).join(',')).join('\n') + '\n';
+}

@@ -1,0 +1,158 @@
+// What is drawn on both planes, as plain functions of a canvas: tested by what they call.
+
+export interface Pixel {
+  x: number;
+  y: number;
+}
+
+/** Half axes in metres and the angle of the first, anticlockwise from east. */
+export interface Ellipse {
+  a_m: number;
+  b_m: number;
+  angle_rad: number;
+}
+
+/** The 95 % ellipse of a horizontal covariance, m2. */
+export function ellipseOf(east_m2: number, north_m2: number, cross_m2: number): Ellipse {
+  const mean = (east_m2 + north_m2) / 2;
+  const spread = Math.hypot((east_m2 - north_m2) / 2, cross_m2);
+  const scale = Math.sqrt(-2 * Math.log(0.05));
+  return {
+    a_m: scale * Math.sqrt(mean + spread),
+    b_m: scale * Math.sqrt(Math.max(mean - spread, 0)),
+    angle_rad: 0.5 * Math.atan2(2 * cross_m2, east_m2 - north_m2),
+  };
+}
+
+export type Context = CanvasRenderingContext2D;
+
+export interface Style {
+  stroke?: string;
+  fill?: string;
+  width?: number;
+  dash?: number[];
+}
+
+function paint(context: Context, { stroke, fill, width = 1.5, dash }: Style): void {
+  if (fill) {
+    context.fillStyle = fill;
+    context.fill();
+  }
+  if (stroke) {
+    context.setLineDash(dash ?? []);
+    context.lineWidth = width;
+    context.strokeStyle = stroke;
+    context.stroke();
+  }
+}
+
+export function drawEllipse(context: Context, at: Pixel, ellipse: Ellipse, px_per_m: number, style: Style): void {
+  context.beginPath();
+  // The canvas' y axis points down, so a rotation towards north is negative.
+  context.ellipse(at.x, at.y, ellipse.a_m * px_per_m, ellipse.b_m * px_per_m, -ellipse.angle_rad, 0, 2 * Math.PI);
+  paint(context, style);
+}
+
+export function drawCircle(context: Context, at: Pixel, radius_px: number, style: Style): void {
+  context.beginPath();
+  context.arc(at.x, at.y, radius_px, 0, 2 * Math.PI);
+  paint(context, style);
+}
+
+export function drawPolygon(context: Context, corners: Pixel[], style: Style): void {
+  if (corners.length < 2) return;
+  context.beginPath();
+  corners.forEach(({ x, y }, at) => (at === 0 ? context.moveTo(x, y) : context.lineTo(x, y)));
+  context.closePath();
+  paint(context, style);
+}
+
+export function drawLine(context: Context, from: Pixel, to: Pixel, style: Style): void {
+  context.beginPath();
+  context.moveTo(from.x, from.y);
+  context.lineTo(to.x, to.y);
+  paint(context, style);
+}
+
+/** A trail that fades towards its oldest point; the last point is the newest. */
+export function drawTrail(context: Context, points: Pixel[], color: string, width = 2): void {
+  for (let at = 1; at < points.length; at++) {
+    context.globalAlpha = 0.12 + 0.78 * (at / points.length);
+    drawLine(context, points[at - 1]!, points[at]!, { stroke: color, width });
+  }
+  context.globalAlpha = 1;
+}
+
+export function drawRectangle(context: Context, x: number, y: number, width: number, height: number, style: Style): void {
+  context.beginPath();
+  context.rect(x, y, width, height);
+  paint(context, style);
+}
+
+/** Sizes a canvas to its element in device pixels; returns the context in CSS pixels, cleared. */
+export function prepare(canvas: HTMLCanvasElement, width: number, height: number): Context {
+  const ratio = window.devicePixelRatio || 1;
+  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+    canvas.width = Math.round(width * ratio);
+    canvas.height = Math.round(height * ratio);
+  }
+  const context = canvas.getContext('2d')!;
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return context;
+}
+
+const RAMP = [
+  [55, 120, 190],
+  [55, 190, 170],
+  [240, 200, 80],
+  [236, 100, 70],
+] as const;
+
+/** A colour from cold (0) to hot (1). */
+export function rampColor(value: number): string {
+  const at = Math.min(Math.max(value, 0), 1) * (RAMP.length - 1);
+  const from = RAMP[Math.min(Math.floor(at), RAMP.length - 2)]!;
+  const to = RAMP[Math.min(Math.floor(at), RAMP.length - 2) + 1]!;
+  const share = at - Math.min(Math.floor(at), RAMP.length - 2);
+  const [r, g, b] = from.map((low, channel) => Math.round(low + (to[channel]! - low) * share));
+  return `rgb(${r} ${g} ${b})`;
+}
+
+/** The colours of the theme, for canvases. */
+export interface Palette {
+  text: string;
+  muted: string;
+  grid: string;
+  gridStrong: string;
+  plane: string;
+  camera: string;
+  gnss: string;
+  fused: string;
+  accent: string;
+  danger: string;
+  warning: string;
+}
+
+export function palette(): Palette {
+  const style = getComputedStyle(document.documentElement);
+  const read = (name: string): string => style.getPropertyValue(name).trim();
+  return {
+    text: read('--text'),
+    muted: read('--muted'),
+    grid: read('--grid'),
+    gridStrong: read('--grid-strong'),
+    plane: read('--plane'),
+    camera: read('--camera'),
+    gnss: read('--gnss'),
+    fused: read('--fused'),
+    accent: read('--accent'),
+    danger: read('--danger'),
+    warning: read('--warning'),
+  };
+}
+
+/** A colour with an opacity from 0 to 1. */
+export function fade(color: string, opacity: number): string {
+  return `color-mix(in srgb, ${color} ${Math.round(opacity * 100)}%, transparent)`;
+}

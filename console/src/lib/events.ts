@@ -1,0 +1,43 @@
+// Server-sent events that come back after the server was gone.
+import { connection } from './connection.svelte';
+
+export interface EventHandlers {
+  on: Record<string, (data: unknown) => void>;
+  /** Whether events can come now. */
+  state: (isOpen: boolean) => void;
+}
+
+/** Listens until the returned function is called. */
+export function listen(path: string, handlers: EventHandlers): () => void {
+  let source: EventSource | undefined;
+  let timer: ReturnType<typeof setTimeout> | undefined;
+  let pause_ms = 500;
+  let closed = false;
+
+  function open(): void {
+    source = new EventSource(path);
+    source.onopen = () => {
+      pause_ms = 500;
+      connection.regain();
+      handlers.state(true);
+    };
+    source.onerror = () => {
+      // The browser's own pause and its end after a refusal are both too coarse for an operator.
+      source?.close();
+      if (closed) return;
+      handlers.state(false);
+      timer = setTimeout(open, pause_ms);
+      pause_ms = Math.min(pause_ms * 2, 8000);
+    };
+    for (const [name, handle] of Object.entries(handlers.on)) {
+      source.addEventListener(name, (event) => handle(JSON.parse((event as MessageEvent<string>).data)));
+    }
+  }
+
+  open();
+  return () => {
+    closed = true;
+    clearTimeout(timer);
+    source?.close();
+  };
+}

@@ -1,0 +1,70 @@
+// Plane geometry about a reference position, and figures of it. Enough for drawing within some kilometres.
+import type { Position } from './types';
+
+export interface EastNorth {
+  east_m: number;
+  north_m: number;
+}
+
+const METRES_PER_DEGREE = 111_319.490793; // of longitude at the equator, WGS 84
+export const R95_PER_SIGMA = 2.447746830680816;
+
+/** Equirectangular projection about a reference. */
+export function toPlane(reference: Position, position: Position): EastNorth {
+  const scale = Math.cos((reference.latitude_deg * Math.PI) / 180);
+  return {
+    east_m: (position.longitude_deg - reference.longitude_deg) * METRES_PER_DEGREE * scale,
+    north_m: (position.latitude_deg - reference.latitude_deg) * METRES_PER_DEGREE,
+  };
+}
+
+export function toPosition(reference: Position, point: EastNorth): Position {
+  const scale = Math.cos((reference.latitude_deg * Math.PI) / 180);
+  return {
+    longitude_deg: reference.longitude_deg + point.east_m / (METRES_PER_DEGREE * scale),
+    latitude_deg: reference.latitude_deg + point.north_m / METRES_PER_DEGREE,
+  };
+}
+
+export function distance_m(a: Position, b: Position): number {
+  const { east_m, north_m } = toPlane(a, b);
+  return Math.hypot(east_m, north_m);
+}
+
+export interface Bounds {
+  west: number;
+  south: number;
+  east: number;
+  north: number;
+}
+
+export function boundsOf(positions: Iterable<Position>): Bounds | undefined {
+  let bounds: Bounds | undefined;
+  for (const { longitude_deg: x, latitude_deg: y } of positions) {
+    bounds ??= { west: x, east: x, south: y, north: y };
+    bounds.west = Math.min(bounds.west, x);
+    bounds.east = Math.max(bounds.east, x);
+    bounds.south = Math.min(bounds.south, y);
+    bounds.north = Math.max(bounds.north, y);
+  }
+  return bounds;
+}
+
+export function centroid(positions: Position[]): Position | undefined {
+  if (positions.length === 0) return undefined;
+  const sum = positions.reduce((a, b) => ({
+    longitude_deg: a.longitude_deg + b.longitude_deg,
+    latitude_deg: a.latitude_deg + b.latitude_deg,
+  }));
+  return {
+    longitude_deg: sum.longitude_deg / positions.length,
+    latitude_deg: sum.latitude_deg / positions.length,
+  };
+}
+
+/** The largest of 1, 2, 5 times a power of ten that is at most `most`. */
+export function roundLength(most: number): number {
+  const power = 10 ** Math.floor(Math.log10(most));
+  const factor = most / power;
+  return (factor >= 5 ? 5 : factor >= 2 ? 2 : 1) * power;
+}

@@ -1,0 +1,87 @@
+// A canvas over a Leaflet map: the metric grid, and whatever a view draws.
+import type * as L from 'leaflet';
+import { drawLine, palette, prepare, type Context, type Palette, type Pixel } from './draw';
+import { roundLength } from './geo';
+import type { Position } from './types';
+
+/** What a view gets to draw on. */
+export interface PlaneView {
+  context: Context;
+  colors: Palette;
+  px_per_m: number;
+  width: number;
+  height: number;
+  at: (position: Position) => Pixel;
+}
+
+export type Draw = (view: PlaneView) => void;
+
+const GRID_TARGET_PX = 110;
+
+export class PlaneLayer {
+  readonly canvas = document.createElement('canvas');
+  readonly #leaflet: typeof L;
+  readonly #map: L.Map;
+  readonly #hasTiles: boolean;
+  #draw: Draw = () => {};
+  #frame = 0;
+
+  constructor(leaflet: typeof L, map: L.Map, hasTiles: boolean) {
+    this.#leaflet = leaflet;
+    this.#map = map;
+    this.#hasTiles = hasTiles;
+    this.canvas.className = 'plane-canvas';
+    map.getPanes().overlayPane.append(this.canvas);
+    map.on('move zoom viewreset resize', () => this.redraw());
+  }
+
+  set draw(draw: Draw) {
+    this.#draw = draw;
+    this.redraw();
+  }
+
+  /** Metres in a CSS pixel at the middle of the view. */
+  metresPerPixel(): number {
+    const latitude = (this.#map.getCenter().lat * Math.PI) / 180;
+    return (40_075_016.686 * Math.cos(latitude)) / (256 * 2 ** this.#map.getZoom());
+  }
+
+  redraw(): void {
+    cancelAnimationFrame(this.#frame);
+    this.#frame = requestAnimationFrame(() => this.#paint());
+  }
+
+  #paint(): void {
+    const { x: width, y: height } = this.#map.getSize();
+    if (width === 0 || height === 0) return;
+    const corner = this.#map.containerPointToLayerPoint([0, 0]);
+    this.#leaflet.DomUtil.setPosition(this.canvas, corner);
+    this.canvas.style.width = `${width}px`;
+    this.canvas.style.height = `${height}px`;
+    const context = prepare(this.canvas, width, height);
+    const colors = palette();
+    const at = ({ longitude_deg, latitude_deg }: Position): Pixel =>
+      this.#map.latLngToContainerPoint([latitude_deg, longitude_deg]);
+    const px_per_m = 1 / this.metresPerPixel();
+    if (!this.#hasTiles) this.#grid(context, colors, px_per_m, width, height);
+    this.#draw({ context, colors, px_per_m, width, height, at });
+  }
+
+  /** Lines of a round distance, counted from a corner that does not move with the view. */
+  #grid(context: Context, colors: Palette, px_per_m: number, width: number, height: number): void {
+    const step_px = roundLength((GRID_TARGET_PX * 1.6) / px_per_m) * px_per_m;
+    const origin = this.#map.project(this.#map.getCenter()).subtract([width / 2, height / 2]);
+    for (const [offset, length, vertical] of [
+      [origin.x, width, true],
+      [origin.y, height, false],
+    ] as const) {
+      const first = Math.ceil(offset / step_px);
+      for (let line = first; line * step_px - offset <= length; line++) {
+        const p = Math.round(line * step_px - offset) + 0.5;
+        const style = { stroke: line % 5 === 0 ? colors.gridStrong : colors.grid, width: 1 };
+        if (vertical) drawLine(context, { x: p, y: 0 }, { x: p, y: height }, style);
+        else drawLine(context, { x: 0, y: p }, { x: width, y: p }, style);
+      }
+    }
+  }
+}

@@ -1,0 +1,23 @@
+// The commands that ask the same as the try-it form.
+
+export interface TriedObservation {
+  time: string;
+  bounding_box?: { left_px: number; top_px: number; width_px: number; height_px: number };
+  fix?: { longitude_deg: number; latitude_deg: number; sigma_m?: number };
+}
+
+/** A JSON text within single quotes of a shell. */
+function quoted(value: unknown): string {
+  return `'${JSON.stringify(value).replaceAll("'", "'\\''")}'`;
+}
+
+export function curlLine(origin: string, camera: string, observation: TriedObservation): string {
+  return `curl -s ${origin}/v1/cameras/${camera}/fusions --json ${quoted(observation)}`;
+}
+
+export function grpcurlLine(origin: string, camera: string, observation: TriedObservation): string {
+  const url = new URL(origin);
+  const plain = url.protocol === 'http:' ? '-plaintext ' : '';
+  const host = url.port ? url.host : `${url.host}:${url.protocol === 'http:' ? 80 : 443}`;
+  return `grpcurl ${plain}-d ${quoted({ camera_id: camera, observations: [observation] })} ${host} sightfix.v1.FusionService/Fuse`;
+}

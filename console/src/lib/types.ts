@@ -1,0 +1,239 @@
+// The shapes of the REST interface that the console reads (docs/openapi.json).
+
+export interface Position {
+  longitude_deg: number;
+  latitude_deg: number;
+}
+export interface Fix extends Position {
+  sigma_m?: number | null;
+}
+export interface BoundingBox {
+  left_px: number;
+  top_px: number;
+  width_px: number;
+  height_px: number;
+}
+export interface ImageSize {
+  width_px: number;
+  height_px: number;
+}
+export type Recipe = 'auto' | 'gaussian_process' | 'projective' | 'hybrid' | 'paper';
+export type JobState = 'queued' | 'running' | 'succeeded' | 'failed' | 'cancelled';
+export type GnssError = 'unknown' | { sigma_m: number };
+
+export interface Receiver {
+  receiver_id: string;
+  target_id?: string | null;
+  clock_offset_s?: number;
+}
+export interface CameraMoved {
+  model_version: number;
+  began_at: string;
+  raised_at: string;
+  shift_east_m: number;
+  shift_north_m: number;
+  statistic: number;
+  targets: number;
+}
+export interface Camera {
+  id: string;
+  display_name: string;
+  image_size?: ImageSize;
+  gnss_error: GnssError;
+  recipe: Recipe;
+  target_classes: string[];
+  labels: Record<string, string>;
+  receivers: Receiver[];
+  retrain_when_moved: boolean;
+  revision: number;
+  created_at: string;
+  updated_at: string;
+  samples: number;
+  samples_without_fix: number;
+  gnss_bias_sigma_m?: number;
+  active_model?: number;
+  model_fault?: string;
+  moved?: CameraMoved;
+  warnings: string[];
+}
+export interface CameraStatus {
+  camera: Camera;
+  latest_run?: { id: string; state: JobState };
+  model?: { held_out_mean_to_fix_m?: number; median_r95_m: number; view_area: Position[] };
+  targets: number;
+  streams: number;
+  last_observed_at?: string;
+}
+export interface Page<T> {
+  items: T[];
+  next_cursor?: string;
+}
+export interface Sample {
+  time: string;
+  target_id: string;
+  bounding_box: BoundingBox;
+  /** Missing for a box that only shows the camera's geometry. */
+  fix?: Fix | null;
+  truth?: Position | null;
+}
+export interface RejectedRow {
+  part?: string;
+  line: number;
+  field: string;
+  reason: string;
+}
+export interface Imported {
+  accepted: number;
+  accepted_without_fix: number;
+  duplicate: number;
+  rejected: number;
+  rejected_rows: RejectedRow[];
+}
+export interface PairedSamples extends Imported {
+  pairing: {
+    detections: number;
+    fixes: number;
+    paired: number;
+    unpaired_detections: Record<string, number>;
+    unused_fixes: Record<string, number>;
+  };
+}
+export interface RunProgress {
+  phase: string;
+  epoch: number;
+  epochs: number;
+  reconstruction_error: number | null;
+  regression_error: number | null;
+  error_scale: number | null;
+  remaining_s?: number | null;
+}
+export interface TrainingRun {
+  id: string;
+  camera_id: string;
+  recipe: Recipe;
+  seed: number;
+  epochs?: number;
+  from?: string;
+  until?: string;
+  state: JobState;
+  progress: RunProgress;
+  attempt: number;
+  model_version?: number;
+  outcome?: string;
+  created_at: string;
+  started_at?: string;
+  ended_at?: string;
+}
+export interface EpochReport {
+  epoch: number;
+  loss: number;
+  reconstruction_error: number;
+  regression_error: number;
+  error_scale: number;
+}
+export interface HeldOutError {
+  blocks: number;
+  samples: number;
+  mean_to_fix_m: number;
+  error_to_fix_m2: number;
+  e_regression_m2: number;
+  coverage95_of_fixes: number;
+}
+export interface ModelVersion {
+  camera_id: string;
+  number: number;
+  created_at: string;
+  run_id?: string;
+  weights_bytes: number;
+  metadata: {
+    recipe: Recipe;
+    requested_recipe: Recipe;
+    samples: number;
+    targets: number;
+    passes: number;
+    epochs: number;
+    seed: number;
+    e_gnss_m2: number;
+    e_gnss_source: string;
+    held_out: HeldOutError | null;
+    candidates: { candidate: string; held_out: HeldOutError }[];
+    parameters: Record<string, number>;
+  };
+}
+export interface FusedFix {
+  time: string;
+  target_id?: string;
+  fused: Position;
+  regressed?: Position;
+  gnss?: Fix;
+  confidence_regression: number;
+  confidence_gnss: number;
+  e_regression_m2?: number;
+  e_gnss_m2?: number;
+  r95_m: number;
+  reconstruction_error?: number;
+  model_version?: number;
+  flags: string[];
+}
+export interface TrackFeature {
+  geometry: { coordinates: [number, number] };
+  properties: {
+    target_id: string;
+    time: string;
+    velocity_east_m_s: number;
+    velocity_north_m_s: number;
+    r95_m: number;
+    still: number;
+    nis?: number;
+    rejections: { source: string; reason: string; nis?: number }[];
+    restarted: boolean;
+  };
+}
+export interface TrackUpdate extends TrackFeature {
+  bounding_box?: BoundingBox;
+  fused?: FusedFix;
+}
+export interface ErrorFigures {
+  n: number;
+  mean_m: number;
+  median_m: number;
+  rmse_m: number;
+  p95_m: number;
+  max_m: number;
+  coverage50?: number | null;
+  coverage95?: number | null;
+  share_within: Record<string, number>;
+}
+export interface Evaluation {
+  id: string;
+  camera_id: string;
+  methods: string[];
+  seeds: number;
+  state: JobState;
+  progress: { phase: string; steps: number; steps_done: number; remaining_s?: number | null };
+  outcome?: string;
+  created_at: string;
+  ended_at?: string;
+  report?: { methods: Record<string, Record<string, unknown>>; failed?: Record<string, string> } | null;
+}
+export interface ServerInfo {
+  version: string;
+  limits: Record<string, number>;
+  tiles?: { url: string; attribution: string };
+}
+export type Role = 'viewer' | 'edge' | 'operator' | 'admin';
+export interface Session {
+  role: Role;
+  name?: string;
+  open_access: boolean;
+}
+export interface ApiKey {
+  id: string;
+  name: string;
+  role: Role;
+  camera_ids: string[];
+  created_at: string;
+  expires_at?: string;
+  last_used_at?: string;
+  revoked_at?: string;
+}

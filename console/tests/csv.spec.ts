@@ -1,0 +1,64 @@
+// Files as people have them.
+import { expect, test } from '@playwright/test';
+import { guessMapping, isRejected, mapRow, missingFields, outputColumns, parseTable, toCsv, type MappedRow } from '../src/lib/csv';
+import { curlLine, grpcurlLine } from '../src/lib/request_lines';
+import { sigmaOf, walkCsv } from '../src/walk/queue';
+
+function mapped(text: string, image?: { width_px: number; height_px: number }): string {
+  const table = parseTable(text);
+  const mapping = guessMapping(table);
+  expect(missingFields(mapping)).toEqual([]);
+  const rows = table.rows.map((row) => mapRow(row, mapping, image));
+  return toCsv(outputColumns(mapping), rows.filter((row): row is MappedRow => !isRejected(row)));
+}
+
+test('the documented columns pass as they are', () => {
+  const text = 'time,target_id,left,top,width,height,longitude,latitude\n2020-12-14T14:41:48+08:00,person-1,475,11,28,77,103.98678,30.6280135\n';
+  expect(mapped(text)).toBe(text);
+});
+
+test('semicolons, upper case, units, decimal commas and extra columns', () => {
+  const text = '\uFEFFTime;Target ID;LEFT_PX;TOP_PX;WIDTH_PX;HEIGHT_PX;Longitude_deg;Latitude_deg;Note\r\n2026-01-01 10:00:00Z;a;1,5;2;3;4;11,25;48,5;"x;y"\r\n';
+  expect(mapped(text)).toBe('time,target_id,left,top,width,height,longitude,latitude\n2026-01-01T10:00:00Z,a,1.5,2,3,4,11.25,48.5\n');
+});
+
+test('corners, centres and normalised boxes become left, top, width, height', () => {
+  expect(mapped('time,id,x1,y1,x2,y2\n2026-01-01T00:00:00Z,a,10,20,40,60\n')).toContain(',a,10,20,30,40\n');
+  expect(mapped('time,id,cx,cy,w,h\n2026-01-01T00:00:00Z,a,10,20,4,6\n')).toContain(',a,8,17,4,6\n');
+  const normalised = 'time,id,x_center,y_center,w,h\n2026-01-01T00:00:00Z,a,0.5,0.5,0.1,0.2\n';
+  expect(mapped(normalised, { width_px: 1000, height_px: 500 })).toContain(',a,450,200,100,100\n');
+});
+
+test('Unix times and a file without targets', () => {
+  const text = 'timestamp,lon,lat,accuracy\n1767225600,11,48,5\n';
+  expect(mapped(text)).toBe('time,longitude,latitude,sigma_m\n2026-01-01T00:00:00.000Z,11,48,5\n');
+  const boxes = guessMapping(parseTable('time,left,top,width,height\n2026-01-01T00:00:00Z,1,2,3,4\n'));
+  expect([boxes.kind, boxes.targetId]).toEqual(['detections', 'target-1']);
+});
+
+test('quotes may hold separators and line ends, and lines are counted through them', () => {
+  const table = parseTable('time,class\n"a\nb","say ""hi"", twice"\nc,d\n');
+  expect(table.rows).toEqual([
+    { line: 2, cells: ['a\nb', 'say "hi", twice'] },
+    { line: 4, cells: ['c', 'd'] },
+  ]);
+});
+
+test('a cell that is no number is rejected with its field', () => {
+  const table = parseTable('time,id,left,top,width,height\n2026-01-01T00:00:00Z,a,1,2,wide,4\n');
+  expect(mapRow(table.rows[0]!, guessMapping(table), undefined)).toEqual({ line: 2, field: 'width', reason: "'wide' is not a number" });
+});
+
+test('the lines for a shell are quoted', () => {
+  const observation = { time: "2026-01-01T00:00:00Z'", fix: { longitude_deg: 11, latitude_deg: 48 } };
+  expect(curlLine('http://h:8080', 'c', observation)).toBe(`curl -s http://h:8080/v1/cameras/c/fusions --json '{"time":"2026-01-01T00:00:00Z'\\''","fix":{"longitude_deg":11,"latitude_deg":48}}'`);
+  expect(grpcurlLine('http://h:8080', 'c', observation)).toMatch(/^grpcurl -plaintext -d '.*' h:8080 sightfix\.v1\.FusionService\/Fuse$/);
+  expect(grpcurlLine('https://h', 'c', observation)).toMatch(/^grpcurl -d .* h:443 /);
+});
+
+test('a walk is saved in the columns of the importer', () => {
+  const fix = { time: '2026-01-01T00:00:00.000Z', longitude_deg: 11, latitude_deg: 48, sigma_m: sigmaOf(5), sent: true };
+  // 68 % of a circular normal distribution lie within 1.5096 standard deviations.
+  expect(fix.sigma_m).toBeCloseTo(5 / 1.5096, 3);
+  expect(walkCsv('phone', [fix])).toBe('time,receiver_id,longitude,latitude,sigma_m\n2026-01-01T00:00:00.000Z,phone,11.00000000,48.00000000,3.312\n');
+});

@@ -1,0 +1,190 @@
+// Failures as a person meets them.
+import { readFileSync } from 'node:fs';
+import { expect, test } from './fixtures';
+import { addCamera, rowsOf, simulate, walk } from './world';
+
+const header = 'time,target_id,left,top,width,height,longitude,latitude';
+
+test.describe('the server goes and comes back', () => {
+  test.use({ allowed: /Failed to load resource|ERR_CONNECTION/ });
+
+  test('the page says so, and goes on by itself', async ({ console: page, server }) => {
+    const world = simulate(1);
+    await addCamera(server, 'gate', 'Gate', world);
+    await page.goto(`${server.url}/#/cameras/gate/live`);
+    await expect(page.getByRole('status').getByText('Live')).toBeVisible();
+    await server.kill();
+    await expect(page.getByText('Connection lost. What is shown is old.')).toBeVisible();
+    await expect(page.getByRole('alert').getByText('The server cannot be reached')).toBeVisible();
+    await server.restart();
+    await expect(page.getByRole('alert').getByText('The server cannot be reached')).toBeHidden();
+    await expect(page.getByRole('status').getByText('Live')).toBeVisible();
+    const stop = walk(server, 'gate', world.live);
+    await expect(page.getByRole('button', { name: 'person-1' })).toBeVisible();
+    stop();
+  });
+});
+
+test('bad rows are named with their lines, and can be downloaded', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/cameras', { id: 'gate' });
+  await page.goto(`${server.url}/#/cameras/gate/data`);
+  const csv = [
+    header,
+    '2026-01-01T00:00:00Z,a,10,20,30,40,11.0,48.0',
+    '2026-01-01T00:00:01Z,a,ten,20,30,40,11.0,48.0',
+    '2026-01-01T00:00:02Z,a,10,20,30,40,11.0,480.0',
+    '"2026-01-01T00:00:03Z","a",10,20,30,40,11.0,48.0',
+    'yesterday,a,10,20,30,40,11.0,48.0',
+  ].join('\n');
+  await page.locator('input[type=file]').setInputFiles({ name: 'bad.csv', mimeType: 'text/csv', buffer: Buffer.from(csv) });
+  await page.getByRole('button', { name: 'Import', exact: true }).click();
+  await expect(page.getByText('2 samples stored, 0 stored before, 3 rows rejected.')).toBeVisible();
+  const lines = await page.locator('table').last().locator('tbody tr td:first-child').allTextContents();
+  expect(lines).toEqual(['3', '4', '6']);
+  const downloading = page.waitForEvent('download');
+  await page.getByRole('button', { name: 'Download as CSV' }).click();
+  const saved = readFileSync(await (await downloading).path(), 'utf8').trim().split('\r\n');
+  expect(saved[0]).toBe('part,line,field,reason');
+  expect(saved).toHaveLength(4);
+  expect(saved[2]).toMatch(/^"","4","latitude/);
+});
+
+test('what is no table, and what has no fixes, is said before anything is sent', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/cameras', { id: 'gate' });
+  await page.goto(`${server.url}/#/cameras/gate/data`);
+  await page.locator('input[type=file]').setInputFiles({ name: 'note.csv', mimeType: 'text/csv', buffer: Buffer.from('hello') });
+  await expect(page.getByRole('alert')).toContainText('note.csv is not a table');
+  const boxes = 'time,id,x,y,w,h\n2026-01-01T00:00:00Z,a,0.1,0.2,0.1,0.2\n';
+  await page.locator('input[type=file]').setInputFiles({ name: 'boxes.csv', mimeType: 'text/csv', buffer: Buffer.from(boxes) });
+  await expect(page.getByText('These are detections alone.')).toBeVisible();
+  await expect(page.getByLabel('Normalised (0 to 1)')).toBeChecked();
+  await expect(page.getByText('Normalised boxes need the image size')).toBeVisible();
+  await expect(page.getByRole('button', { name: 'Import', exact: true })).toBeDisabled();
+});
+
+test('a run that fails says why', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/cameras', { id: 'gate' });
+  // A detector that was stuck for two thirds of the time.
+  const rows = Array.from({ length: 60 }, (_, at) => {
+    const step = Math.max(0, at - 40);
+    return `2026-01-01T00:00:${String(at).padStart(2, '0')}Z,a,${10 + 9 * step},${20 + ((step * step) % 17)},30,40,${11 + 1e-5 * step},${48 + 1e-5 * ((step * 7) % 11)}`;
+  });
+  await server.request('POST', '/v1/cameras/gate/samples', [header, ...rows].join('\n'), 'text/csv');
+  await page.goto(`${server.url}/#/cameras/gate/training`);
+  await page.getByRole('button', { name: 'Start training' }).click();
+  const run = page.locator('section', { has: page.getByRole('heading', { name: 'Training run', exact: true }) });
+  await expect(run.locator('.state')).toHaveText('failed');
+  await expect(run.locator('.notice.error')).toContainText(/repeat|same/);
+});
+
+test('a run is cancelled, and the next may start', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/cameras', { id: 'gate' });
+  await server.request('POST', '/v1/cameras/gate/samples', simulate(2, [0, 0], 2000).csv, 'text/csv');
+  await page.goto(`${server.url}/#/cameras/gate/training`);
+  await page.getByLabel('Recipe').selectOption('hybrid');
+  await page.getByRole('button', { name: 'Start training' }).click();
+  const run = page.locator('section', { has: page.getByRole('heading', { name: 'Training run', exact: true }) });
+  await run.getByRole('button', { name: 'Cancel' }).click();
+  await expect(run.locator('.state')).toHaveText('cancelled');
+  await expect(page.getByRole('button', { name: 'Start training' })).toBeEnabled();
+});
+
+test.describe('a database that is full', () => {
+  test.use({ settings: { SIGHTFIX_LIMITS__SAMPLES_PER_CAMERA: '100' }, allowed: /507/ });
+
+  test('refuses the import with the remedy', async ({ console: page, server }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate' });
+    await page.goto(`${server.url}/#/cameras/gate/data`);
+    await page.locator('input[type=file]').setInputFiles({ name: 'many.csv', mimeType: 'text/csv', buffer: Buffer.from(simulate(2).csv) });
+    await page.getByRole('button', { name: 'Import', exact: true }).click();
+    await expect(page.getByRole('alert')).toContainText('limits.samples_per_camera');
+  });
+});
+
+test.describe('a server with keys', () => {
+  test.use({ allowed: /status of 40[13]/ });
+
+  test('the first key closes it; sign-in, roles and revocation reach the page', async ({ console: page, server }) => {
+    await page.goto(`${server.url}/#/settings/keys`);
+    await expect(page.getByText('No key exists yet')).toBeVisible();
+    const createKey = async (name: string, role?: string): Promise<string> => {
+      await page.locator('main').getByLabel('Name').fill(name);
+      if (role) await page.getByLabel('Role').selectOption(role);
+      await page.getByRole('button', { name: 'Create key' }).click();
+      await expect(page.getByRole('cell', { name, exact: true })).toBeVisible();
+      return (await page.locator('.notice.good pre').textContent())!;
+    };
+    const admin = await createKey('first');
+    expect(admin).toMatch(/^sf_[0-9A-Za-z]{36}$/);
+    await expect(page.getByText('Signed in as first (admin)')).toBeVisible();
+    const viewer = await createKey('guest', 'viewer');
+    expect(viewer).not.toBe(admin);
+
+    await page.getByRole('button', { name: 'Sign out' }).click();
+    const signIn = page.getByRole('dialog', { name: 'Sign in to sightfix' });
+    await signIn.getByLabel('Key').fill(`${viewer.slice(0, -1)}${viewer.endsWith('0') ? '1' : '0'}`);
+    await signIn.getByRole('button', { name: 'Sign in' }).click();
+    await expect(signIn.getByRole('alert')).toBeVisible();
+    await signIn.getByLabel('Key').fill(viewer);
+    await signIn.getByRole('button', { name: 'Sign in' }).click();
+    await expect(signIn).toBeHidden();
+
+    // A viewer may look, and is told what it may not.
+    await page.goto(`${server.url}/#/cameras`);
+    await page.getByRole('button', { name: 'New camera' }).first().click();
+    const dialog = page.getByRole('dialog', { name: 'New camera' });
+    await dialog.getByLabel('Name').fill('Gate');
+    await dialog.getByRole('button', { name: 'Create camera' }).click();
+    await expect(dialog.getByRole('alert')).toContainText(/viewer|role/);
+    await dialog.getByRole('button', { name: 'Cancel' }).click();
+
+    const bearer = { authorization: `Bearer ${admin}` };
+    const { items } = await server.request<{ items: { id: string; name: string }[] }>('GET', '/v1/keys', undefined, '', bearer);
+    await server.request('DELETE', `/v1/keys/${items.find(({ name }) => name === 'guest')!.id}`, undefined, '', bearer);
+    await expect(signIn).toBeVisible();
+  });
+});
+
+test.describe('two operators', () => {
+  test.use({ allowed: /412/ });
+
+  test('somebody else has changed the profile', async ({ console: page, server }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate', display_name: 'Gate' });
+    await page.goto(`${server.url}/#/cameras/gate/profile`);
+    await expect(page.getByLabel('Name')).toHaveValue('Gate');
+    await server.request('PATCH', '/v1/cameras/gate', { display_name: 'Other' }, 'application/json', { 'if-match': '*' });
+    await page.getByLabel('Name').fill('Mine');
+    await page.getByRole('button', { name: 'Save' }).click();
+    await expect(page.getByRole('alert')).toContainText('Somebody else has changed the profile');
+    await page.getByRole('button', { name: 'Read again' }).click();
+    await expect(page.getByLabel('Name')).toHaveValue('Other');
+    await page.getByLabel('Type gate to confirm').fill('gate');
+    await page.getByRole('button', { name: 'Delete camera' }).click();
+    await expect(page.getByText('No camera yet')).toBeVisible();
+  });
+});
+
+test.describe('the phone page', () => {
+  test.use({ permissions: ['geolocation'], geolocation: { longitude: 11.0, latitude: 48.0, accuracy: 5 }, allowed: /ERR_INTERNET_DISCONNECTED/ });
+
+  test('queues positions without a network and sends them with one', async ({ console: page, server, context }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate' });
+    await page.goto(`${server.url}/walk#camera=gate&receiver=phone-7`);
+    await page.getByRole('button', { name: 'Start recording' }).click();
+    const sent = page.locator('dl div', { hasText: 'Sent' }).locator('dd');
+    const waiting = page.locator('dl div', { hasText: 'Waiting' }).locator('dd');
+    await expect(sent).toHaveText('1');
+    await context.setOffline(true);
+    await context.setGeolocation({ longitude: 11.0001, latitude: 48.0001, accuracy: 5 });
+    await expect(waiting).toHaveText('1');
+    await expect(page.getByText('positions wait on this phone')).toBeVisible();
+    await context.setOffline(false);
+    await expect(waiting).toHaveText('0');
+    await expect(sent).toHaveText('2');
+    const tracks = await server.request<{ features: { properties: { target_id: string } }[] }>('GET', '/v1/cameras/gate/tracks');
+    expect(tracks.features.map((feature) => feature.properties.target_id)).toEqual(['phone-7']);
+    const downloading = page.waitForEvent('download');
+    await page.getByRole('button', { name: 'Save as CSV' }).click();
+    expect(rowsOf(readFileSync(await (await downloading).path(), 'utf8'))).toHaveLength(2);
+  });
+});

@@ -1,0 +1,120 @@
+// Every view, light and dark, wide and narrow, in both languages: accessible, without overflow; and its picture.
+import { mkdirSync } from 'node:fs';
+import { resolve } from 'node:path';
+import type { Page } from '@playwright/test';
+import { accessibilityFindings, expect, test } from './fixtures';
+import { addCamera, rowsOf, simulate, walk } from './world';
+import type { Server } from './server';
+
+/** Pictures for the documentation are taken on request, so that a run of the tests changes no file. */
+const PICTURES = process.env.SIGHTFIX_PICTURES ? resolve('../docs/console') : undefined;
+if (PICTURES) mkdirSync(PICTURES, { recursive: true });
+
+const TOWN: [id: string, name: string, site: string, east_deg: number, north_deg: number][] = [
+  ['north-gate', 'North gate', 'gate', 0, 0],
+  ['tram-stop', 'Tram stop', 'plaza', -0.0021, 0.0003],
+  ['fountain', 'Fountain', 'plaza', 0.0012, 0.0006],
+  ['market-hall', 'Market hall', 'plaza', -0.0011, -0.0006],
+  ['south-gate', 'South gate', 'gate', 0.0016, -0.0005],
+];
+
+const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][] = [
+  ['overview', '#/cameras', (page) => expect(page.getByText('North gate').first()).toBeVisible()],
+  ['scene', '#/cameras/north-gate/scene', (page) => expect(page.getByText(/mean [\d.]+ m|Mittel [\d,]+ m/)).toBeVisible()],
+  ['live', '#/cameras/north-gate/live', (page) => expect(page.getByRole('button', { name: 'person-1' })).toBeVisible()],
+  ['data', '#/cameras/north-gate/data', (page) => expect(page.locator('.notice').first()).toBeVisible()],
+  ['training', '#/cameras/north-gate/training', (page) => expect(page.locator('table')).toBeVisible()],
+  ['models', '#/cameras/north-gate/models', (page) => expect(page.locator('table').first()).toBeVisible()],
+  ['evaluation', '#/cameras/north-gate/evaluation', (page) => expect(page.locator('table').first()).toBeVisible()],
+  ['try-it', '#/cameras/north-gate/try', (page) => expect(page.locator('.weights')).toBeVisible()],
+  ['profile', '#/cameras/north-gate/profile', (page) => expect(page.getByText('north-gate').first()).toBeVisible()],
+  ['settings', '#/settings/health', (page) => expect(page.getByText('/metrics')).toBeVisible()],
+  ['keys', '#/settings/keys', (page) => expect(page.locator('main .panel')).toBeVisible()],
+  ['limits', '#/settings/limits', (page) => expect(page.getByText('page_items')).toBeVisible()],
+  ['walk', 'walk#camera=north-gate&receiver=phone-1', (page) => expect(page.locator('.record')).toBeVisible()],
+];
+
+/** A town with trained cameras, one without samples, one ready to train, and an evaluation. */
+async function buildTown(server: Server): Promise<() => void> {
+  const town = PICTURES ? TOWN : TOWN.slice(0, 1);
+  const worlds = town.map(([, , , east, north], at) => simulate(at + 1, [east, north], 300));
+  for (const [at, [id, name, site]] of town.entries()) await addCamera(server, id, name, worlds[at]!, { site });
+  await server.request('POST', '/v1/cameras', { id: 'roof-east', display_name: 'Roof east', labels: { site: 'roof' } });
+  await server.request('POST', '/v1/cameras', { id: 'car-park', display_name: 'Car park', labels: { site: 'parking' } });
+  await server.request('POST', '/v1/cameras/car-park/samples', worlds[0]!.csv, 'text/csv');
+  const { id } = await server.request<{ id: string }>('POST', '/v1/evaluations', {
+    camera_id: 'north-gate',
+    methods: ['gnss', 'imm_ukf', 'homography.denied', ...(PICTURES ? ['projective.two_step'] : [])],
+    ...(worlds[0]!.csv.includes('truth') ? {} : { truth_point: rowsOf(worlds[0]!.csv)[0]!.fix }),
+  });
+  await expect.poll(async () => (await server.request<{ state: string }>('GET', `/v1/evaluations/${id}`)).state, { timeout: 600_000 }).toBe('succeeded');
+  const stops = town.slice(0, 3).map(([camera], at) => walk(server, camera, worlds[at]!.live));
+  return () => stops.forEach((stop) => stop());
+}
+
+async function look(page: Page, server: Server, path: string, ready: (page: Page) => Promise<void>): Promise<void> {
+  await page.goto('about:blank');
+  await page.goto(`${server.url}/${path}`);
+  await ready(page);
+}
+
+test('every view is accessible, fits and can be shown', async ({ console: page, server }) => {
+  test.setTimeout(1_200_000);
+  const stop = await buildTown(server);
+  // Trails grow while other views are looked at.
+  for (const theme of ['dark', 'light'] as const) {
+    await page.emulateMedia({ colorScheme: theme, reducedMotion: 'reduce' });
+    for (const [name, path, ready] of VIEWS) {
+      await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: 900 });
+      await look(page, server, path, ready);
+      expect.soft(await accessibilityFindings(page), `${name}, ${theme}`).toEqual([]);
+      if (PICTURES) {
+        await page.waitForTimeout(name === 'live' ? 6000 : 1200);
+        await page.screenshot({ path: `${PICTURES}/${name}-${theme}.png` });
+      }
+    }
+  }
+  await page.setViewportSize({ width: 390, height: 844 });
+  await page.evaluate(() => localStorage.setItem('sightfix.language', 'de'));
+  for (const [name, path, ready] of VIEWS) {
+    await look(page, server, path, ready);
+    expect.soft(await accessibilityFindings(page), `${name}, narrow`).toEqual([]);
+    const overflow = await page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
+    expect.soft(overflow, `${name} scrolls sideways at 390 px`).toBeLessThanOrEqual(0);
+    const hidden = await page.locator('main').evaluate((main) => main.scrollWidth - main.clientWidth);
+    expect.soft(hidden, `${name} is cut off at 390 px`).toBeLessThanOrEqual(0);
+    if (PICTURES && (name === 'overview' || name === 'scene')) await page.screenshot({ path: `${PICTURES}/${name}-phone.png` });
+  }
+  stop();
+});
+
+test('the keyboard reaches a camera and its tabs', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/cameras', { id: 'gate', display_name: 'Gate' });
+  await page.reload();
+  await expect(page.getByRole('link', { name: /^Gate/ })).toBeVisible();
+  await page.keyboard.press('Tab');
+  await expect(page.getByText('Skip to the content')).toBeFocused();
+  await page.keyboard.press('Enter');
+  for (let presses = 0; presses < 20; presses++) {
+    await page.keyboard.press('Tab');
+    if (await page.getByRole('link', { name: /^Gate/ }).evaluate((link) => link === document.activeElement)) break;
+  }
+  await page.keyboard.press('Enter');
+  await expect(page.getByRole('heading', { name: 'Gate' })).toBeVisible();
+  await page.getByRole('link', { name: 'Data', exact: true }).focus();
+  await page.keyboard.press('Enter');
+  await expect(page.getByText('Drop files here')).toBeVisible();
+});
+
+test('the first view is small, and the map comes later', async ({ console: page, server }) => {
+  const sizes = new Map<string, number>();
+  page.on('response', (response) => void response.request().sizes().then(({ responseBodySize }) => sizes.set(new URL(response.url()).pathname, responseBodySize)).catch(() => undefined));
+  await page.goto('about:blank');
+  await page.goto(server.url);
+  await expect(page.getByText('No camera yet')).toBeVisible();
+  await expect.poll(() => [...sizes.keys()].some((path) => path.includes('leaflet-src'))).toBe(true);
+  const first = [...sizes].filter(([path]) => !path.includes('leaflet'));
+  const bytes = first.reduce((sum, [, size]) => sum + size, 0);
+  console.log(`first view without the map: ${Math.round(bytes / 1000)} kB compressed in ${first.length} files`);
+  expect(bytes).toBeLessThan(200_000);
+});

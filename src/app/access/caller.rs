@@ -1,0 +1,154 @@
+//! On whose behalf a use case runs.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use super::key_table::ActiveKey;
+use super::permission::Permission;
+use crate::domain::{Actor, CameraId, Error, ErrorKind, Result, Scope};
+
+/// The holder of a client certificate that the server's client authority has signed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CertificateHolder {
+    /// The first 16 hexadecimal digits of the certificate's SHA-256.
+    pub fingerprint: Arc<str>,
+    /// What certificates of that authority may do.
+    pub scope: Arc<Scope>,
+}
+
+/// Who makes a request.
+#[derive(Clone)]
+pub enum Principal {
+    /// Somebody without a credential.
+    Anonymous,
+    /// Anybody, while no key exists.
+    Everyone,
+    /// The program itself: a background job, or a command on the data folder.
+    Program,
+    /// The holder of a key.
+    Key(Arc<ActiveKey>),
+    /// The holder of a client certificate.
+    Certificate(CertificateHolder),
+}
+
+impl Principal {
+    /// What the principal is restricted to; `None` for no restriction, and for the anonymous, who may do
+    /// nothing.
+    #[must_use]
+    pub fn scope(&self) -> Option<&Scope> {
+        match self {
+            Self::Anonymous | Self::Everyone | Self::Program => None,
+            Self::Key(key) => Some(&key.key().scope),
+            Self::Certificate(holder) => Some(&holder.scope),
+        }
+    }
+
+    fn name(&self) -> Arc<str> {
+        match self {
+            Self::Anonymous => "anonymous".into(),
+            Self::Everyone => "open access".into(),
+            Self::Program => "program".into(),
+            Self::Key(key) => key.name(),
+            Self::Certificate(holder) => format!("certificate {}", holder.fingerprint).into(),
+        }
+    }
+}
+
+/// A principal, and where its request comes from. Clones share it.
+#[derive(Clone)]
+pub struct Caller(Arc<Parts>);
+
+struct Parts {
+    principal: Principal,
+    actor: Arc<Actor>,
+}
+
+impl Caller {
+    /// The sender of a request.
+    #[must_use]
+    pub fn new(principal: Principal, address: Option<IpAddr>, request_id: Option<Arc<str>>) -> Self {
+        let key_id = match &principal {
+            Principal::Key(key) => Some(key.key().id),
+            _ => None,
+        };
+        let actor = Arc::new(Actor { name: principal.name(), key_id, address, request_id });
+        Self(Arc::new(Parts { principal, actor }))
+    }
+
+    /// A part of the program that acts by itself.
+    #[must_use]
+    pub fn program(name: &str) -> Self {
+        Self(Arc::new(Parts { principal: Principal::Program, actor: Arc::new(Actor::program(name)) }))
+    }
+
+    /// Who it is.
+    #[must_use]
+    pub fn principal(&self) -> &Principal {
+        &self.0.principal
+    }
+
+    /// As the audit log and the log name it.
+    #[must_use]
+    pub fn actor(&self) -> &Arc<Actor> {
+        &self.0.actor
+    }
+
+    /// Checks that the caller may use operations that need a permission.
+    ///
+    /// # Errors
+    /// `Unauthenticated` without a credential; `PermissionDenied` if the role does not have it.
+    pub fn authorize(&self, permission: Permission) -> Result<()> {
+        match self.principal() {
+            Principal::Anonymous if permission != Permission::Public => Err(Error::refused(
+                ErrorKind::Unauthenticated,
+                "the request needs a key: send the header `authorization: Bearer sf_...`",
+            )),
+            principal => match principal.scope().map(Scope::role) {
+                Some(role) if !permission.is_granted_to(role) => Err(Error::refused(
+                    ErrorKind::PermissionDenied,
+                    format!("the role {role} may not do this; use a key of another role"),
+                )),
+                _ => Ok(()),
+            },
+        }
+    }
+
+    /// Checks that the caller may reach a camera.
+    ///
+    /// # Errors
+    /// `PermissionDenied` if its key is restricted to others.
+    pub fn authorize_camera(&self, camera: &CameraId) -> Result<()> {
+        match self.principal().scope() {
+            Some(scope) if !scope.contains(camera) => Err(Error::refused(
+                ErrorKind::PermissionDenied,
+                format!("the key is not for camera {camera}"),
+            )),
+            _ => Ok(()),
+        }
+    }
+
+    /// Checks that the caller's key has not been revoked, nor expired, since the request began.
+    ///
+    /// # Errors
+    /// `Unauthenticated`.
+    pub fn check_active(&self) -> Result<()> {
+        match self.principal() {
+            Principal::Key(key) => key.check_active(),
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether the caller may lose its access while a request is open.
+    #[must_use]
+    pub fn is_revocable(&self) -> bool {
+        matches!(self.principal(), Principal::Key(_))
+    }
+
+    /// Waits until the caller's key is revoked or expires; the error says so.
+    pub async fn ended(&self) -> Error {
+        match self.principal() {
+            Principal::Key(key) => key.ended().await,
+            _ => std::future::pending().await,
+        }
+    }
+}

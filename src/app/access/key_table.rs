@@ -1,0 +1,173 @@
+//! The keys that work, looked up without a lock and without the database.
+
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+
+use arc_swap::ArcSwap;
+use jiff::Timestamp;
+use tokio::sync::Mutex;
+use tokio_util::sync::CancellationToken;
+
+use crate::domain::{ApiKey, Error, ErrorKind, KeyId, Result, SecretDigest};
+use crate::store::{KeysVersion, Store};
+
+/// A key that works, until it is revoked or expires.
+pub struct ActiveKey {
+    key: ApiKey,
+    name: Arc<str>,
+    digest: SecretDigest,
+    /// Microseconds since 1970; 0 if never.
+    last_used_us: AtomicI64,
+    stored_use_us: AtomicI64,
+    has_ended: AtomicBool,
+    ended: CancellationToken,
+}
+
+impl ActiveKey {
+    fn new(key: ApiKey, digest: SecretDigest) -> Arc<Self> {
+        let last_used_us = key.last_used_at.map_or(0, Timestamp::as_microsecond);
+        Arc::new(Self {
+            name: key.name.as_str().into(),
+            key,
+            digest,
+            last_used_us: AtomicI64::new(last_used_us),
+            stored_use_us: AtomicI64::new(last_used_us),
+            has_ended: AtomicBool::new(false),
+            ended: CancellationToken::new(),
+        })
+    }
+
+    /// As it was stored when it was loaded; its last use may be later.
+    #[must_use]
+    pub const fn key(&self) -> &ApiKey {
+        &self.key
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> Arc<str> {
+        self.name.clone()
+    }
+
+    /// Records a use; `false` if the key does not work any more.
+    pub(super) fn use_at(&self, now: Timestamp) -> bool {
+        let works = !self.has_ended() && self.key.is_valid_at(now);
+        if works {
+            self.last_used_us.fetch_max(now.as_microsecond(), Ordering::Relaxed);
+        }
+        works
+    }
+
+    pub(super) fn has_ended(&self) -> bool {
+        self.has_ended.load(Ordering::Acquire)
+    }
+
+    pub(super) fn check_active(&self) -> Result<()> {
+        if self.has_ended() { Err(does_not_work()) } else { Ok(()) }
+    }
+
+    /// Waits until the key is revoked or expires.
+    pub(super) async fn ended(&self) -> Error {
+        self.ended.cancelled().await;
+        does_not_work()
+    }
+
+    fn end(&self) {
+        self.has_ended.store(true, Ordering::Release);
+        self.ended.cancel();
+    }
+}
+
+fn does_not_work() -> Error {
+    Error::refused(ErrorKind::Unauthenticated, "the key is unknown, was revoked or has expired")
+}
+
+/// The keys by the first 64 bits of their digests, which nobody can choose.
+#[derive(Default)]
+struct Keys {
+    by_bucket: HashMap<u64, Vec<Arc<ActiveKey>>>,
+    /// `None` before the store was read.
+    version: Option<KeysVersion>,
+}
+
+impl Keys {
+    fn iter(&self) -> impl Iterator<Item = &Arc<ActiveKey>> {
+        self.by_bucket.values().flatten()
+    }
+}
+
+/// The keys of the store, replaced as a whole when one changes.
+#[derive(Default)]
+pub(super) struct KeyTable {
+    keys: ArcSwap<Keys>,
+    /// Held from reading the store to replacing the table.
+    change: Mutex<()>,
+}
+
+impl KeyTable {
+    /// Whether no key was ever created; `false` before the store was read.
+    pub(super) fn is_empty(&self) -> bool {
+        self.keys.load().version.as_ref().is_some_and(KeysVersion::is_empty)
+    }
+
+    /// The key with a digest, which is used now.
+    ///
+    /// # Errors
+    /// `Unauthenticated`.
+    pub(super) fn use_key(&self, digest: &SecretDigest, now: Timestamp) -> Result<Arc<ActiveKey>> {
+        let keys = self.keys.load();
+        let bucket = keys.by_bucket.get(&digest.bucket()).map_or(&[][..], Vec::as_slice);
+        let key = bucket.iter().find(|key| key.digest == *digest && key.use_at(now));
+        key.cloned().ok_or_else(does_not_work)
+    }
+
+    pub(super) async fn refresh(&self, store: &Store, now: Timestamp) -> Result<()> {
+        let _change = self.change.lock().await;
+        let known = self.keys.load_full();
+        let version = store.keys_version().await?;
+        if known.version.as_ref() != Some(&version) {
+            let is_first = known.version.as_ref().is_some_and(KeysVersion::is_empty);
+            self.replace(&known, store.unrevoked_keys().await?, version);
+            if is_first {
+                tracing::info!("a key was created: from now on every request needs one");
+            }
+        }
+        // Open streams of a key that has expired end here; new requests look at the time themselves.
+        self.keys.load().iter().filter(|key| !key.key.is_valid_at(now)).for_each(|key| key.end());
+        Ok(())
+    }
+
+    fn replace(&self, known: &Keys, stored: Vec<(ApiKey, SecretDigest)>, version: KeysVersion) {
+        let by_id: HashMap<KeyId, &Arc<ActiveKey>> = known.iter().map(|key| (key.key.id, key)).collect();
+        let mut by_bucket: HashMap<u64, Vec<Arc<ActiveKey>>> = HashMap::new();
+        let mut kept = HashSet::new();
+        for (key, digest) in stored {
+            kept.insert(key.id);
+            // What is open for a key holds the same value, and ends with it.
+            let active = by_id.get(&key.id).map_or_else(|| ActiveKey::new(key, digest), |&it| it.clone());
+            by_bucket.entry(digest.bucket()).or_default().push(active);
+        }
+        self.keys.store(Arc::new(Keys { by_bucket, version: Some(version) }));
+        known.iter().filter(|key| !kept.contains(&key.key.id)).for_each(|key| key.end());
+    }
+
+    /// The keys that were used since the last call, with the time of their latest use.
+    pub(super) fn take_unstored_uses(&self) -> Vec<(KeyId, Timestamp)> {
+        let keys = self.keys.load();
+        let unstored = |key: &&Arc<ActiveKey>| {
+            let used_us = key.last_used_us.load(Ordering::Relaxed);
+            key.stored_use_us.swap(used_us, Ordering::Relaxed) != used_us
+        };
+        keys.iter().filter(unstored).filter_map(|key| Some((key.key.id, last_use(key)?))).collect()
+    }
+
+    pub(super) fn last_use(&self, id: KeyId) -> Option<Timestamp> {
+        last_use(self.keys.load().iter().find(|key| key.key.id == id)?)
+    }
+}
+
+fn last_use(key: &ActiveKey) -> Option<Timestamp> {
+    let used_us = key.last_used_us.load(Ordering::Relaxed);
+    Timestamp::from_microsecond(used_us).ok().filter(|_| used_us != 0)
+}

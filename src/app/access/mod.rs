@@ -1,0 +1,132 @@
+//! Who may do what: the one check for REST, gRPC, streams and pages alike.
+//!
+//! [`Access::authenticate`] makes a [`Principal`] of a credential, [`Caller::authorize`] compares it with the
+//! [`Permission`] that an operation needs, and [`Caller::authorize_camera`] restricts devices to their
+//! cameras. All of it is answered from memory. What never happens here: headers, status codes, TLS.
+
+mod caller;
+mod key_table;
+mod permission;
+mod sessions;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use jiff::Timestamp;
+
+use self::key_table::KeyTable;
+use self::sessions::Sessions;
+use crate::domain::{Error, ErrorKind, KeyId, KeySecret, Result};
+use crate::store::Store;
+
+pub use caller::{Caller, CertificateHolder, Principal};
+pub use key_table::ActiveKey;
+pub use permission::{OPERATIONS, Operation, Permission};
+pub use sessions::{SESSION_TIME, SessionToken};
+
+/// What a client presents.
+#[derive(Debug, Clone, Copy)]
+pub enum Credential<'a> {
+    /// Nothing.
+    None,
+    /// A key's secret.
+    Key(&'a str),
+    /// The token of a browser's session.
+    Session(&'a str),
+    /// A client certificate that was verified.
+    Certificate(&'a CertificateHolder),
+    /// Something that is none of these.
+    Unreadable,
+}
+
+/// The keys and sessions of a server.
+#[derive(Default)]
+pub struct Access {
+    keys: KeyTable,
+    sessions: Sessions,
+    /// Credentials are needed although no key exists, because there are client certificates.
+    is_closed: AtomicBool,
+}
+
+impl Access {
+    /// Asks every client for a credential, even while no key exists.
+    pub fn close(&self) {
+        self.is_closed.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether everybody may do everything, because no key was ever created.
+    #[must_use]
+    pub fn is_open(&self) -> bool {
+        !self.is_closed.load(Ordering::Relaxed) && self.keys.is_empty()
+    }
+
+    /// Who presents a credential. While access is open, nobody is asked for one.
+    ///
+    /// # Errors
+    /// `Unauthenticated` for a key that does not work, or a header that cannot be read.
+    pub fn authenticate(&self, credential: Credential<'_>, now: Timestamp) -> Result<Principal> {
+        if self.is_open() {
+            return Ok(Principal::Everyone);
+        }
+        match credential {
+            Credential::None => Ok(Principal::Anonymous),
+            Credential::Certificate(holder) => Ok(Principal::Certificate(holder.clone())),
+            Credential::Key(secret) => {
+                let digest = KeySecret::parse(secret)?.digest();
+                self.keys.use_key(&digest, now).map(Principal::Key)
+            }
+            // A page whose session has ended must be able to sign in again.
+            Credential::Session(token) => Ok(match self.sessions.key_of(token, now) {
+                Some(key) if key.use_at(now) => Principal::Key(key),
+                _ => Principal::Anonymous,
+            }),
+            Credential::Unreadable => Err(Error::refused(
+                ErrorKind::Unauthenticated,
+                "the header authorization must be `Bearer sf_...`, once",
+            )),
+        }
+    }
+
+    /// Starts a session for the holder of a key.
+    ///
+    /// # Errors
+    /// `Unauthenticated` for a key that does not work.
+    pub(super) fn start_session(
+        &self,
+        secret: &str,
+        token: &SessionToken,
+        now: Timestamp,
+    ) -> Result<Principal> {
+        let key = self.keys.use_key(&KeySecret::parse(secret)?.digest(), now)?;
+        self.sessions.start(token, key.clone(), now);
+        Ok(Principal::Key(key))
+    }
+
+    /// Ends a session; nothing happens if there is none.
+    pub fn end_session(&self, token: &str) {
+        self.sessions.end(token);
+    }
+
+    /// Brings the keys up to date with the store, also after changes of another process, and ends what
+    /// is open for keys that no longer work.
+    ///
+    /// # Errors
+    /// A fault if the store cannot be read.
+    pub async fn refresh(&self, store: &Store, now: Timestamp) -> Result<()> {
+        self.keys.refresh(store, now).await
+    }
+
+    /// Stores when keys were used last.
+    ///
+    /// # Errors
+    /// A fault if the store cannot be written.
+    pub async fn store_last_uses(&self, store: &Store) -> Result<()> {
+        let uses = self.keys.take_unstored_uses();
+        if uses.is_empty() { Ok(()) } else { store.note_key_uses(&uses).await }
+    }
+
+    /// When a key was used last, as far as this process knows.
+    #[must_use]
+    pub(super) fn last_use(&self, id: KeyId) -> Option<Timestamp> {
+        self.keys.last_use(id)
+    }
+}

@@ -1,0 +1,202 @@
+//! The operations of both transports with the permission that each needs, and the roles that have it.
+
+use std::collections::HashMap;
+use std::sync::LazyLock;
+
+use crate::domain::Role;
+
+/// What an operation needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Permission {
+    /// Nothing: health and the description of the interface.
+    Public,
+    /// Any key that works.
+    Authenticated,
+    /// To read cameras, samples, runs, models, tracks, evaluations and metrics.
+    Read,
+    /// To fuse, stream and add samples, for the cameras of the key.
+    Ingest,
+    /// To change everything but keys, and to read the audit log.
+    Operate,
+    /// To create, list and revoke keys.
+    Administer,
+}
+
+impl Permission {
+    /// Whether a role has it.
+    #[must_use]
+    pub const fn is_granted_to(self, role: Role) -> bool {
+        match self {
+            Self::Public | Self::Authenticated => true,
+            Self::Read => matches!(role, Role::Viewer | Role::Operator | Role::Admin),
+            Self::Ingest => matches!(role, Role::Edge | Role::Operator | Role::Admin),
+            Self::Operate => matches!(role, Role::Operator | Role::Admin),
+            Self::Administer => matches!(role, Role::Admin),
+        }
+    }
+
+    /// What a REST route needs, by its method and the template of its path. A route that is missing in
+    /// the table is for administrators only.
+    #[must_use]
+    pub fn of_route(method: &str, template: &str) -> Self {
+        // The router answers HEAD by the handler of GET.
+        let method = if method == "HEAD" { "GET" } else { method };
+        let row = ROUTES.get(template).and_then(|methods| methods.iter().find(|row| row.0 == method));
+        row.map_or(Self::Administer, |row| row.1)
+    }
+
+    /// What an RPC needs, by its path. One that is missing in the table is for administrators only.
+    #[must_use]
+    pub fn of_rpc(path: &str) -> Self {
+        RPCS.get(path.strip_prefix('/').unwrap_or(path)).copied().unwrap_or(Self::Administer)
+    }
+}
+
+/// What a client can ask for, on either transport.
+#[derive(Debug, Clone, Copy)]
+pub struct Operation {
+    /// What it needs.
+    pub permission: Permission,
+    /// `METHOD template` of the REST route; empty without one.
+    pub route: &'static str,
+    /// `package.Service/Method` of the RPC; empty without one.
+    pub rpc: &'static str,
+}
+
+const fn operation(permission: Permission, route: &'static str, rpc: &'static str) -> Operation {
+    Operation { permission, route, rpc }
+}
+
+use Permission::{Administer, Authenticated, Ingest, Operate, Public, Read};
+
+/// Every operation. A test compares the table with the routes and services that exist.
+pub const OPERATIONS: &[Operation] = &[
+    operation(Public, "GET /livez", "grpc.health.v1.Health/Check"),
+    operation(Public, "GET /readyz", "grpc.health.v1.Health/Watch"),
+    operation(Read, "GET /metrics", ""),
+    operation(Read, "GET /v1/server", ""),
+    operation(Read, "GET /v1/camera-statuses", ""),
+    operation(Authenticated, "", "grpc.reflection.v1.ServerReflection/ServerReflectionInfo"),
+    operation(Authenticated, "", "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo"),
+    operation(Public, "POST /v1/session", ""),
+    operation(Authenticated, "GET /v1/session", ""),
+    operation(Public, "DELETE /v1/session", ""),
+    operation(Administer, "POST /v1/keys", "sightfix.v1.KeyService/CreateKey"),
+    operation(Administer, "GET /v1/keys", "sightfix.v1.KeyService/ListKeys"),
+    operation(Administer, "GET /v1/keys/{key}", "sightfix.v1.KeyService/GetKey"),
+    operation(Administer, "DELETE /v1/keys/{key}", "sightfix.v1.KeyService/RevokeKey"),
+    operation(Operate, "GET /v1/audit", "sightfix.v1.AuditService/ListAuditEntries"),
+    operation(Read, "GET /v1/server", ""),
+    operation(Read, "GET /v1/camera-statuses", ""),
+    operation(Operate, "POST /v1/cameras", "sightfix.v1.CameraService/CreateCamera"),
+    operation(Read, "GET /v1/cameras", "sightfix.v1.CameraService/ListCameras"),
+    operation(Read, "GET /v1/cameras/{camera}", "sightfix.v1.CameraService/GetCamera"),
+    operation(Operate, "PATCH /v1/cameras/{camera}", "sightfix.v1.CameraService/UpdateCamera"),
+    operation(Operate, "DELETE /v1/cameras/{camera}", "sightfix.v1.CameraService/DeleteCamera"),
+    operation(Operate, "POST /v1/cameras/{camera}/gnss-error", "sightfix.v1.ModelService/EstimateGnssError"),
+    operation(Ingest, "POST /v1/cameras/{camera}/samples", "sightfix.v1.SampleService/ImportSamples"),
+    operation(Ingest, "POST /v1/cameras/{camera}/samples/pairings", ""),
+    operation(Read, "GET /v1/cameras/{camera}/samples", "sightfix.v1.SampleService/ListSamples"),
+    operation(Read, "GET /v1/cameras/{camera}/samples/count", "sightfix.v1.SampleService/CountSamples"),
+    operation(Operate, "DELETE /v1/cameras/{camera}/samples", "sightfix.v1.SampleService/DeleteSamples"),
+    operation(
+        Operate,
+        "POST /v1/cameras/{camera}/training-runs",
+        "sightfix.v1.TrainingService/StartTrainingRun",
+    ),
+    operation(Read, "GET /v1/cameras/{camera}/training-runs", "sightfix.v1.TrainingService/ListTrainingRuns"),
+    operation(
+        Read,
+        "GET /v1/cameras/{camera}/training-runs/{run}",
+        "sightfix.v1.TrainingService/GetTrainingRun",
+    ),
+    operation(
+        Operate,
+        "DELETE /v1/cameras/{camera}/training-runs/{run}",
+        "sightfix.v1.TrainingService/DeleteTrainingRun",
+    ),
+    operation(
+        Operate,
+        "POST /v1/cameras/{camera}/training-runs/{run}/cancel",
+        "sightfix.v1.TrainingService/CancelTrainingRun",
+    ),
+    operation(
+        Read,
+        "GET /v1/cameras/{camera}/training-runs/{run}/events",
+        "sightfix.v1.TrainingService/WatchTrainingRun",
+    ),
+    operation(
+        Read,
+        "GET /v1/cameras/{camera}/training-runs/{run}/log",
+        "sightfix.v1.TrainingService/GetTrainingLog",
+    ),
+    operation(
+        Read,
+        "GET /v1/cameras/{camera}/training-runs/{run}/curve",
+        "sightfix.v1.TrainingService/GetTrainingCurve",
+    ),
+    operation(Operate, "POST /v1/cameras/{camera}/models", "sightfix.v1.ModelService/ImportModel"),
+    operation(Read, "GET /v1/cameras/{camera}/models", "sightfix.v1.ModelService/ListModels"),
+    operation(Read, "GET /v1/cameras/{camera}/models/{model}", "sightfix.v1.ModelService/GetModel"),
+    operation(Operate, "DELETE /v1/cameras/{camera}/models/{model}", "sightfix.v1.ModelService/DeleteModel"),
+    operation(Read, "GET /v1/cameras/{camera}/models/{model}/file", "sightfix.v1.ModelService/DownloadModel"),
+    operation(Read, "GET /v1/cameras/{camera}/active-model", ""),
+    operation(Operate, "PUT /v1/cameras/{camera}/active-model", "sightfix.v1.ModelService/ActivateModel"),
+    operation(
+        Operate,
+        "POST /v1/cameras/{camera}/active-model/roll-back",
+        "sightfix.v1.ModelService/RollBackModel",
+    ),
+    operation(Ingest, "POST /v1/cameras/{camera}/fusions", "sightfix.v1.FusionService/Fuse"),
+    operation(Ingest, "POST /v1/cameras/{camera}/tracks", "sightfix.v1.FusionService/Stream"),
+    operation(Read, "GET /v1/cameras/{camera}/tracks", ""),
+    operation(Read, "GET /v1/cameras/{camera}/tracks/{target}", ""),
+    operation(Read, "GET /v1/cameras/{camera}/events", ""),
+    operation(Operate, "POST /v1/evaluations", ""),
+    operation(Read, "GET /v1/evaluations", ""),
+    operation(Read, "GET /v1/evaluations/{evaluation}", ""),
+    operation(Operate, "POST /v1/evaluations/{evaluation}/cancel", ""),
+    operation(Operate, "DELETE /v1/evaluations/{evaluation}", ""),
+];
+
+type Methods = Vec<(&'static str, Permission)>;
+
+static ROUTES: LazyLock<HashMap<&'static str, Methods>> = LazyLock::new(|| {
+    let mut routes: HashMap<_, Methods> = HashMap::new();
+    for operation in OPERATIONS {
+        if let Some((method, template)) = operation.route.split_once(' ') {
+            routes.entry(template).or_default().push((method, operation.permission));
+        }
+    }
+    routes
+});
+
+static RPCS: LazyLock<HashMap<&'static str, Permission>> =
+    LazyLock::new(|| OPERATIONS.iter().map(|operation| (operation.rpc, operation.permission)).collect());
+
+#[cfg(test)]
+mod tests {
+
+    use super::*;
+
+    #[test]
+    fn roles_have_the_permissions_that_the_documentation_states() {
+        let granted = |role: Role| {
+            [Public, Authenticated, Read, Ingest, Operate, Administer].map(|it| it.is_granted_to(role))
+        };
+        assert_eq!(granted(Role::Viewer), [true, true, true, false, false, false]);
+        assert_eq!(granted(Role::Edge), [true, true, false, true, false, false]);
+        assert_eq!(granted(Role::Operator), [true, true, true, true, true, false]);
+        assert_eq!(granted(Role::Admin), [true; 6]);
+        assert_eq!(Role::ALL.len(), 4);
+    }
+
+    #[test]
+    fn what_is_not_in_the_table_is_for_administrators() {
+        assert_eq!(Permission::of_route("GET", "/v1/new-route"), Administer);
+        assert_eq!(Permission::of_route("PUT", "/v1/cameras"), Administer);
+        assert_eq!(Permission::of_rpc("/sightfix.v1.NewService/New"), Administer);
+        assert_eq!(Permission::of_rpc(""), Administer);
+        assert_eq!(Permission::of_route("HEAD", "/v1/cameras"), Read);
+    }
+}

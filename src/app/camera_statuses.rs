@@ -1,0 +1,44 @@
+//! What an operator wants to know of every camera at a glance.
+
+use std::sync::Arc;
+
+use super::live::CameraActivity;
+use super::registry::ModelSummary;
+use super::{App, Page, page_of};
+use crate::domain::{Camera, CameraId, JobState, Result, RunId};
+
+/// A camera with its latest run, its model and what happens in its view.
+pub struct CameraStatus {
+    /// Its profile.
+    pub camera: Camera,
+    /// Its latest training run, and that run's state.
+    pub latest_run: Option<(RunId, JobState)>,
+    /// The active model's summary; `None` without a usable model.
+    pub model_summary: Option<Arc<ModelSummary>>,
+    /// What happens in its view.
+    pub activity: CameraActivity,
+}
+
+impl App {
+    /// Statuses of cameras by id, from behind a cursor on.
+    ///
+    /// # Errors
+    /// A fault of the store.
+    pub async fn camera_statuses(
+        &self,
+        after: Option<&CameraId>,
+        limit: u32,
+    ) -> Result<Page<CameraStatus, CameraId>> {
+        let cameras = self.store.cameras_with_latest_run(after, limit + 1).await?;
+        let statuses = cameras.into_iter().map(|(camera, latest_run)| {
+            let active = self.registry.get(camera.id());
+            CameraStatus {
+                model_summary: active.as_ref().and_then(|active| active.model_summary.clone()),
+                activity: active.map_or_else(CameraActivity::default, |active| self.activity(&active)),
+                camera,
+                latest_run,
+            }
+        });
+        Ok(page_of(statuses.collect(), limit, |status| status.camera.id().clone()))
+    }
+}

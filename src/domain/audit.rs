@@ -1,0 +1,103 @@
+//! The audit log: who changed what, when and from where.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use strum::{EnumString, IntoStaticStr};
+
+use super::access::KeyId;
+use super::error::Error;
+use super::names::CameraId;
+
+/// On whose behalf something is changed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Actor {
+    /// Name of the key, or what part of the program acts by itself.
+    pub name: Arc<str>,
+    /// The key, if one was presented.
+    pub key_id: Option<KeyId>,
+    /// The client's network address; `None` for a process on the data folder itself.
+    pub address: Option<IpAddr>,
+    /// Id of the request, as in the log.
+    pub request_id: Option<Arc<str>>,
+}
+
+impl Actor {
+    /// A part of the program that acts by itself.
+    #[must_use]
+    pub fn program(name: &str) -> Self {
+        Self { name: name.into(), key_id: None, address: None, request_id: None }
+    }
+}
+
+/// What was changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, EnumString, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case", parse_err_ty = Error, parse_err_fn = unknown_action)]
+pub enum AuditAction {
+    /// A camera was created.
+    CameraCreated,
+    /// A camera's profile was changed.
+    CameraChanged,
+    /// A camera was deleted with all that belongs to it.
+    CameraDeleted,
+    /// Samples were deleted.
+    SamplesDeleted,
+    /// A training run was queued.
+    RunStarted,
+    /// A training run was cancelled.
+    RunCancelled,
+    /// An ended training run was deleted.
+    RunDeleted,
+    /// A model version was imported.
+    ModelImported,
+    /// A model version became the active one.
+    ModelActivated,
+    /// The model version before became the active one again.
+    ModelRolledBack,
+    /// A model version was deleted.
+    ModelDeleted,
+    /// An evaluation was queued.
+    EvaluationStarted,
+    /// An evaluation was cancelled.
+    EvaluationCancelled,
+    /// An ended evaluation was deleted.
+    EvaluationDeleted,
+    /// A key was created.
+    KeyCreated,
+    /// A key was revoked.
+    KeyRevoked,
+}
+
+impl AuditAction {
+    /// Name in the database and in wire formats.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
+}
+
+fn unknown_action(_: &str) -> Error {
+    Error::invalid("action", "is not an action of the audit log")
+}
+
+/// Number of an entry of the audit log; entries are numbered in the order of their commits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct AuditNumber(pub u64);
+
+/// An entry of the audit log.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AuditEntry {
+    /// Its number.
+    pub number: AuditNumber,
+    /// Time of the change.
+    pub time: Timestamp,
+    /// Who changed it, and from where.
+    pub actor: Actor,
+    /// What was done.
+    pub action: AuditAction,
+    /// The camera that it was done to or for; it may have been deleted since.
+    pub camera_id: Option<CameraId>,
+    /// What exactly: id of a run, number of a model version, name and role of a key.
+    pub subject: Option<String>,
+}

@@ -1,0 +1,57 @@
+//! `/v1/server`: what the server is, and what it allows.
+
+use std::collections::BTreeMap;
+
+use axum::extract::State;
+use serde::Serialize;
+use serde_json::Value;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::problem::ApiResult;
+use super::wire::json;
+use crate::domain::Error;
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new().routes(routes!(get_server))
+}
+
+/// What the server is, and what it allows.
+#[derive(Serialize, ToSchema)]
+struct Server {
+    /// Its version.
+    #[schema(example = "0.1.0")]
+    version: &'static str,
+    /// The limits in force, by the name of the setting below `limits`.
+    #[schema(value_type = BTreeMap<String, f64>)]
+    limits: BTreeMap<String, Value>,
+    /// Map tiles that the operator's console may show, if they are set.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tiles: Option<Tiles>,
+}
+
+/// Map tiles.
+#[derive(Serialize, ToSchema)]
+struct Tiles {
+    /// Where they are, with `{z}`, `{x}` and `{y}`.
+    url: String,
+    /// What their provider asks to be shown.
+    attribution: String,
+}
+
+/// Read what the server is and what it allows
+#[utoipa::path(
+    get, path = "/v1/server", tag = "service",
+    responses((status = 200, description = "Version, limits and map tiles", body = Server))
+)]
+async fn get_server(State(rest): State<Rest>) -> ApiResult {
+    let limits = serde_json::to_value(&rest.app.limits).and_then(serde_json::from_value);
+    let tiles = rest
+        .console
+        .tile_url
+        .clone()
+        .map(|url| Tiles { url, attribution: rest.console.tile_attribution.clone().unwrap_or_default() });
+    Ok(json(&Server { version: env!("CARGO_PKG_VERSION"), limits: limits.map_err(Error::fault)?, tiles })?)
+}

@@ -1,0 +1,126 @@
+//! `/v1/session`: a browser's session in the place of a key.
+
+use axum::response::Response;
+use hyper::HeaderMap;
+use hyper::header::{COOKIE, ORIGIN, SET_COOKIE};
+use hyper::http::HeaderValue;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::access::CallerApp;
+use super::extract::JsonBody;
+use super::keys::{Role, camera_ids};
+use super::problem::ApiResult;
+use super::wire::{empty, json};
+use crate::app::access::{Principal, SESSION_TIME};
+use crate::domain::{Error, Result};
+
+/// Name of the cookie that carries a session's token.
+pub(super) const SESSION_COOKIE: &str = "sightfix_session";
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new().routes(routes!(start_session, get_session, end_session))
+}
+
+/// A sign-in.
+#[derive(Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+struct SessionDraft {
+    /// The secret of a key.
+    #[schema(example = "sf_...")]
+    key: String,
+}
+
+/// Who asks, and what they may do.
+#[derive(Serialize, ToSchema)]
+struct Session {
+    /// What the caller may do.
+    role: Role,
+    /// Name of the caller's key.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<String>,
+    /// Id of the caller's key.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    key_id: Option<String>,
+    /// The cameras that the caller is restricted to; empty for all.
+    camera_ids: Vec<String>,
+    /// Whether everybody may do everything, because no key was created yet.
+    open_access: bool,
+}
+
+impl Session {
+    fn of(principal: &Principal) -> Self {
+        let key = match principal {
+            Principal::Key(key) => Some(key.key()),
+            _ => None,
+        };
+        let scope = principal.scope();
+        Self {
+            role: scope.map_or(Role::Admin, |scope| scope.role().into()),
+            name: key.map(|key| key.name.clone()),
+            key_id: key.map(|key| key.id.to_string()),
+            camera_ids: scope.map(camera_ids).unwrap_or_default(),
+            open_access: matches!(principal, Principal::Everyone),
+        }
+    }
+}
+
+/// Sign in with a key
+///
+/// Sets a cookie (`HttpOnly`, `SameSite=Strict`, over HTTPS also `Secure`) that stands for the key for
+/// twelve hours, or until the key is revoked or the server restarts. Changes with the cookie are taken
+/// from pages of this server only.
+#[utoipa::path(
+    post, path = "/v1/session", tag = "access", request_body = SessionDraft,
+    responses((status = 200, description = "Who has signed in", body = Session, headers(("set-cookie" = String, description = "The session"))))
+)]
+async fn start_session(CallerApp(app): CallerApp, headers: HeaderMap, body: JsonBody) -> ApiResult {
+    let SessionDraft { key } = body.read()?;
+    let (token, principal) = app.start_session(&key)?;
+    let response = json(&Session::of(&principal))?;
+    Ok(with_cookie(response, &headers, token.reveal(), SESSION_TIME.as_secs())?)
+}
+
+/// Who asks, and what they may do
+#[utoipa::path(
+    get, path = "/v1/session", tag = "access",
+    responses((status = 200, description = "The caller", body = Session))
+)]
+async fn get_session(CallerApp(app): CallerApp) -> ApiResult {
+    Ok(json(&Session::of(app.caller().principal()))?)
+}
+
+/// Sign out
+#[utoipa::path(
+    delete, path = "/v1/session", tag = "access",
+    responses((status = 204, description = "The session has ended"))
+)]
+async fn end_session(CallerApp(app): CallerApp, headers: HeaderMap) -> ApiResult {
+    if let Some(token) = session_token(&headers) {
+        app.access.end_session(token);
+    }
+    Ok(with_cookie(empty(), &headers, "", 0)?)
+}
+
+/// The token of the session's cookie.
+#[must_use]
+pub fn session_token(headers: &HeaderMap) -> Option<&str> {
+    let cookies = headers.get_all(COOKIE).iter().filter_map(|header| header.to_str().ok());
+    cookies.flat_map(|cookies| cookies.split(';')).find_map(|cookie| {
+        let (name, value) = cookie.trim().split_once('=')?;
+        (name == SESSION_COOKIE).then_some(value)
+    })
+}
+
+fn with_cookie(mut response: Response, headers: &HeaderMap, token: &str, age_s: i64) -> Result<Response> {
+    // The browser names the scheme that it sees, whether TLS ends here or at a proxy.
+    let is_https = headers.get(ORIGIN).is_some_and(|origin| origin.as_bytes().starts_with(b"https://"));
+    let secure = if is_https { "; Secure" } else { "" };
+    let cookie =
+        format!("{SESSION_COOKIE}={token}; Path=/; Max-Age={age_s}; HttpOnly; SameSite=Strict{secure}");
+    response.headers_mut().insert(SET_COOKIE, HeaderValue::from_str(&cookie).map_err(Error::fault)?);
+    Ok(response)
+}

@@ -1,0 +1,70 @@
+//! What a request presents: a key, a browser's session, or the certificate of its connection.
+
+use hyper::Request;
+use hyper::header::AUTHORIZATION;
+
+use crate::app::access::{CertificateHolder, Credential};
+use crate::http::session_token;
+
+/// The credential of a request. A key is stronger than a session, and a session than a certificate, so that
+/// whoever names somebody explicitly is taken for them.
+pub(super) fn credential<'r, B>(
+    request: &'r Request<B>,
+    certificate: Option<&'r CertificateHolder>,
+    is_grpc: bool,
+) -> Credential<'r> {
+    let mut headers = request.headers().get_all(AUTHORIZATION).iter();
+    if let Some(header) = headers.next() {
+        let parts = header.to_str().ok().and_then(|text| text.split_once(' '));
+        return match parts {
+            Some((scheme, key)) if scheme.eq_ignore_ascii_case("bearer") && headers.next().is_none() => {
+                Credential::Key(key.trim())
+            }
+            _ => Credential::Unreadable,
+        };
+    }
+    if !is_grpc && let Some(token) = session_token(request.headers()) {
+        return Credential::Session(token);
+    }
+    certificate.map_or(Credential::None, Credential::Certificate)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::domain::{Role, Scope};
+
+    /// The credential of a request with these headers over a connection with a certificate.
+    fn shown(headers: &[(&str, &str)], is_grpc: bool) -> String {
+        let holder = CertificateHolder {
+            fingerprint: "00".into(),
+            scope: Arc::new(Scope::new(Role::Viewer, Vec::new()).expect("all cameras")),
+        };
+        let mut request = Request::get("/");
+        for (name, value) in headers {
+            request = request.header(*name, *value);
+        }
+        let request = request.body(()).expect("a request");
+        match credential(&request, Some(&holder), is_grpc) {
+            Credential::Key(key) => format!("key {key}"),
+            Credential::Session(token) => format!("session {token}"),
+            other => format!("{other:?}").split('(').next().unwrap_or_default().to_owned(),
+        }
+    }
+
+    #[test]
+    fn the_strongest_credential_counts() {
+        let cookie = ("cookie", "theme=dark; sightfix_session=t0; x=y");
+        assert_eq!(shown(&[], false), "Certificate");
+        assert_eq!(shown(&[cookie], false), "session t0");
+        assert_eq!(shown(&[cookie], true), "Certificate", "cookies are for pages");
+        assert_eq!(shown(&[cookie, ("authorization", "bearer  k")], false), "key k");
+        assert_eq!(shown(&[("authorization", "Basic eDp5")], false), "Unreadable");
+        assert_eq!(
+            shown(&[("authorization", "Bearer a"), ("authorization", "Bearer b")], true),
+            "Unreadable"
+        );
+    }
+}

@@ -1,0 +1,124 @@
+//! The operator's console and what the interface answers for it.
+
+use hyper::body::Bytes;
+use serde_json::{Value, json};
+
+use crate::harness::{TestServer, data_folder, sightfix, simulated_csv};
+
+async fn asset(server: &TestServer, path: &str, headers: &[(&str, &str)]) -> crate::harness::Answer {
+    server.send("GET", path, headers, Bytes::new()).await
+}
+
+/// Paths of the scripts and styles that a page asks for.
+fn assets_of(page: &str) -> Vec<String> {
+    let paths = page.split('"').filter(|part| part.starts_with("/assets/"));
+    paths.map(ToOwned::to_owned).collect()
+}
+
+#[tokio::test]
+async fn pages_are_revalidated_and_contained() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    for path in ["/", "/walk"] {
+        let page = asset(&server, path, &[]).await.expect(200);
+        assert_eq!(page.header("content-type"), "text/html; charset=utf-8");
+        assert_eq!(page.header("cache-control"), "no-cache");
+        let policy = page.header("content-security-policy");
+        assert!(policy.contains("default-src 'none'") && !policy.contains("unsafe"), "{policy}");
+        assert!(!page.text().contains("<style") && !page.text().contains("onload="), "{}", page.text());
+        let tag = page.header("etag").to_owned();
+        let known = asset(&server, path, &[("if-none-match", &tag)]).await.expect(304);
+        assert!(known.body.is_empty() && known.header("etag") == tag);
+        asset(&server, path, &[("if-none-match", "\"other\"")]).await.expect(200);
+    }
+    server.send("POST", "/", &[], Bytes::new()).await.expect(405);
+}
+
+#[tokio::test]
+async fn hashed_files_are_kept_for_a_year_and_sent_compressed() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    let page = asset(&server, "/", &[]).await.expect(200).text();
+    let paths = assets_of(&page);
+    assert!(paths.iter().any(|path| path.ends_with(".js")), "{page}");
+    for path in paths.iter().filter(|path| path.ends_with(".js")) {
+        let whole = asset(&server, path, &[]).await.expect(200);
+        assert_eq!(whole.header("cache-control"), "public, max-age=31536000, immutable");
+        assert!(!whole.headers.contains_key("content-encoding"));
+        let mut tags = vec![whole.header("etag").to_owned()];
+        for (accepted, encoding) in [("gzip, deflate", "gzip"), ("gzip, deflate, br", "br")] {
+            let short = asset(&server, path, &[("accept-encoding", accepted)]).await.expect(200);
+            assert_eq!(
+                (short.header("content-encoding"), short.header("vary")),
+                (encoding, "accept-encoding")
+            );
+            assert!(short.body.len() < whole.body.len(), "{path} as {encoding}");
+            tags.push(short.header("etag").to_owned());
+        }
+        tags.dedup();
+        assert_eq!(tags.len(), 3, "every encoding has a tag of its own");
+        let refused = asset(&server, path, &[("accept-encoding", "br;q=0, gzip;q=0")]).await.expect(200);
+        assert!(!refused.headers.contains_key("content-encoding"));
+    }
+}
+
+#[tokio::test]
+async fn a_status_shows_samples_run_model_and_activity() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    let status = async || -> Value {
+        let page = server.get("/v1/camera-statuses?limit=1").await.expect(200).json();
+        page["items"][0].clone()
+    };
+    server.post("/v1/cameras", &json!({"id": "a"})).await.expect(201);
+    server.post("/v1/cameras", &json!({"id": "b"})).await.expect(201);
+    let empty = status().await;
+    assert_eq!((&empty["camera"]["id"], &empty["camera"]["samples"]), (&json!("a"), &json!(0)), "{empty}");
+    assert!(empty.get("model").is_none() && empty.get("last_observed_at").is_none(), "{empty}");
+
+    let headers = [("content-type", "text/csv")];
+    let csv = simulated_csv();
+    let rows = csv.lines().count() - 1;
+    server.send("POST", "/v1/cameras/a/samples", &headers, csv).await.expect(200);
+    let run = server.train("a", &json!({"recipe": "projective", "epochs": 5})).await;
+    let trained = status().await;
+    assert_eq!(
+        (&trained["camera"]["samples"], &trained["latest_run"]["id"]),
+        (&json!(rows), &run["id"]),
+        "{trained}"
+    );
+    let corners = trained["model"]["view_area"].as_array().expect("corners");
+    assert!(corners.len() >= 3 && trained["model"]["median_r95_m"].as_f64() > Some(0.0), "{trained}");
+
+    let fix = &corners[0];
+    let observation = json!({"time": jiff::Timestamp::now().to_string(), "target_id": "p", "fix": fix});
+    server.post("/v1/cameras/a/tracks", &observation).await.expect(200);
+    let live = status().await;
+    assert_eq!((&live["targets"], &live["streams"]), (&json!(1), &json!(0)), "{live}");
+    assert!(live["last_observed_at"].is_string(), "{live}");
+
+    let page = server.get("/v1/camera-statuses?limit=1").await.expect(200).json();
+    let cursor = page["next_cursor"].as_str().expect("another page").to_owned();
+    let last = server.get(&format!("/v1/camera-statuses?limit=1&cursor={cursor}")).await.expect(200).json();
+    assert_eq!(last["items"][0]["camera"]["id"], "b", "{last}");
+    assert!(last.get("next_cursor").is_none(), "{last}");
+}
+
+#[tokio::test]
+async fn tiles_are_shown_only_from_the_set_server() {
+    let folder = data_folder();
+    let settings = [("SIGHTFIX_CONSOLE__TILE_URL", "https://tiles.example.org/a/{z}/{x}/{y}.png")];
+    let server = TestServer::start_with(folder.path(), &settings);
+    let policy = asset(&server, "/", &[]).await.expect(200).header("content-security-policy").to_owned();
+    assert!(policy.contains("img-src 'self' data: blob: https://tiles.example.org;"), "{policy}");
+    let info = server.get("/v1/server").await.expect(200).json();
+    assert_eq!(info["tiles"]["url"], settings[0].1, "{info}");
+    assert_eq!(info["limits"]["page_items"], 1_000, "{info}");
+
+    for url in ["tiles/{z}/{x}/{y}", "https://tiles.example.org/{z}", "https://a;script-src *;/{z}/{x}/{y}"] {
+        let output = sightfix().args(["config"]).env("SIGHTFIX_CONSOLE__TILE_URL", url).output();
+        let output = output.expect("the binary runs");
+        assert!(!output.status.success(), "{url} was taken");
+        assert!(String::from_utf8_lossy(&output.stderr).contains("console.tile_url"));
+    }
+}

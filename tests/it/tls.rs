@@ -1,0 +1,246 @@
+//! TLS on the shared port: both protocols, client certificates, certificates that change.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use http_body_util::{BodyExt as _, Empty};
+use hyper::body::Bytes;
+use hyper::{Request, StatusCode};
+use hyper_util::rt::{TokioExecutor, TokioIo};
+use rcgen::{BasicConstraints, Certificate, CertificateParams, IsCa, Issuer, KeyPair};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
+use rustls::{ClientConfig, RootCertStore};
+use tempfile::TempDir;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+
+use crate::harness::{TestServer, data_folder, run, sightfix};
+
+/// An authority for certificates of servers and clients.
+struct Authority {
+    certificate: Certificate,
+    issuer: Issuer<'static, KeyPair>,
+}
+
+impl Authority {
+    fn new() -> Self {
+        let mut params = CertificateParams::new(Vec::new()).expect("no names");
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let key = KeyPair::generate().expect("a key");
+        let certificate = params.self_signed(&key).expect("a certificate");
+        Self { certificate, issuer: Issuer::new(params, key) }
+    }
+
+    /// A certificate for `localhost`, and its key.
+    fn issue(&self) -> (Certificate, KeyPair) {
+        let key = KeyPair::generate().expect("a key");
+        let params = CertificateParams::new(vec!["localhost".to_owned()]).expect("a name");
+        (params.signed_by(&key, &self.issuer).expect("a certificate"), key)
+    }
+}
+
+/// The files of a server's certificate.
+struct Files {
+    _folder: TempDir,
+    certificate: PathBuf,
+    key: PathBuf,
+    client_ca: PathBuf,
+}
+
+impl Files {
+    fn new(authority: &Authority) -> Self {
+        let folder = data_folder();
+        let path = |name: &str| folder.path().join(name);
+        let (certificate, key, client_ca) = (path("cert.pem"), path("key.pem"), path("ca.pem"));
+        std::fs::write(&client_ca, authority.certificate.pem()).expect("a file");
+        let files = Self { _folder: folder, certificate, key, client_ca };
+        files.replace(authority);
+        files
+    }
+
+    fn replace(&self, authority: &Authority) {
+        let (certificate, key) = authority.issue();
+        std::fs::write(&self.key, key.serialize_pem()).expect("a file");
+        std::fs::write(&self.certificate, certificate.pem()).expect("a file");
+    }
+
+    fn serve(&self, data: &TempDir) -> Command {
+        let mut command = sightfix();
+        command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(data.path());
+        command.arg("--tls-cert").arg(&self.certificate).arg("--tls-key").arg(&self.key);
+        command.stdout(Stdio::null());
+        command
+    }
+}
+
+/// A connection that trusts the authority, offers the protocols, and presents a certificate if there is one.
+async fn connect(
+    address: SocketAddr,
+    authority: &Authority,
+    protocols: &[&str],
+    own: Option<(Certificate, KeyPair)>,
+) -> std::io::Result<TlsStream<TcpStream>> {
+    let mut roots = RootCertStore::empty();
+    roots.add(authority.certificate.der().clone()).expect("an authority");
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let builder = ClientConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .expect("versions")
+        .with_root_certificates(roots);
+    let mut config = match own {
+        None => builder.with_no_client_auth(),
+        Some((certificate, key)) => {
+            let chain: Vec<CertificateDer<'static>> = vec![certificate.der().clone()];
+            let key = PrivateKeyDer::try_from(key.serialize_der()).expect("a key");
+            builder.with_client_auth_cert(chain, key).expect("a certificate of its own")
+        }
+    };
+    config.alpn_protocols = protocols.iter().map(|name| name.as_bytes().to_vec()).collect();
+    let stream = TcpStream::connect(address).await.expect("the server listens");
+    let name = ServerName::try_from("localhost").expect("a name");
+    TlsConnector::from(Arc::new(config)).connect(name, stream).await
+}
+
+/// Asks for a path over HTTP/1.1 or, where it was agreed, HTTP/2.
+async fn get(stream: TlsStream<TcpStream>, path: &str, key: Option<&str>) -> (StatusCode, String) {
+    let is_h2 = stream.get_ref().1.alpn_protocol() == Some(b"h2");
+    let mut request = Request::get(format!("https://localhost{path}")).header("host", "localhost");
+    if let Some(key) = key {
+        request = request.header("authorization", format!("Bearer {key}"));
+    }
+    let request = request.body(Empty::<Bytes>::new()).expect("a request");
+    let stream = TokioIo::new(stream);
+    let answer = if is_h2 {
+        let (mut sender, connection) =
+            hyper::client::conn::http2::handshake(TokioExecutor::new(), stream).await.expect("HTTP/2");
+        tokio::spawn(connection);
+        sender.send_request(request).await
+    } else {
+        let (mut sender, connection) = hyper::client::conn::http1::handshake(stream).await.expect("HTTP/1.1");
+        tokio::spawn(connection);
+        sender.send_request(request).await
+    };
+    let (head, body) = answer.expect("an answer").into_parts();
+    let body = body.collect().await.expect("a whole body").to_bytes();
+    (head.status, String::from_utf8_lossy(&body).into_owned())
+}
+
+#[tokio::test]
+async fn both_protocols_are_served_over_tls_and_plain_http_on_this_machine() {
+    let (authority, data) = (Authority::new(), data_folder());
+    let files = Files::new(&authority);
+    let server = TestServer::run(files.serve(&data));
+    for (offered, agreed) in
+        [(&["h2", "http/1.1"][..], Some(&b"h2"[..])), (&["http/1.1"], Some(b"http/1.1")), (&[], None)]
+    {
+        let stream = connect(server.address, &authority, offered, None).await.expect("a handshake");
+        assert_eq!(stream.get_ref().1.alpn_protocol(), agreed, "{offered:?}");
+        assert_eq!(get(stream, "/livez", None).await, (StatusCode::OK, "alive\n".to_owned()), "{offered:?}");
+    }
+    server.get("/v1/cameras").await.expect(200);
+    run(&["health", "--listen", &server.address.to_string()]);
+    let foreign = connect(server.address, &Authority::new(), &["h2"], None).await;
+    assert!(foreign.is_err(), "the client checks the certificate");
+}
+
+#[tokio::test]
+async fn a_handshake_that_does_not_go_on_is_ended() {
+    let (authority, data) = (Authority::new(), data_folder());
+    let files = Files::new(&authority);
+    let mut command = files.serve(&data);
+    command.env("SIGHTFIX_LIMITS__HEADER_S", "1");
+    let server = TestServer::run(command);
+    for begin in [&b""[..], &[0x16], &[0x16, 3, 1, 2, 0, 1, 0]] {
+        let mut stream = TcpStream::connect(server.address).await.expect("the server listens");
+        stream.write_all(begin).await.expect("sent");
+        let mut rest = Vec::new();
+        // A server that waits on would make the test wait without end; nextest and CI limit that.
+        let ended = tokio::time::timeout(Duration::from_secs(30), stream.read_to_end(&mut rest)).await;
+        assert!(ended.is_ok(), "{begin:?}: the connection stays open");
+    }
+    server.get("/livez").await.expect(200);
+}
+
+#[tokio::test]
+async fn client_certificates_have_the_role_of_their_authority() {
+    let (authority, data) = (Authority::new(), data_folder());
+    let files = Files::new(&authority);
+    let admin = run(&[
+        "keys",
+        "create",
+        "--name",
+        "a",
+        "--role",
+        "admin",
+        "--data",
+        data.path().to_str().expect("UTF-8"),
+    ]);
+    let mut command = files.serve(&data);
+    command.arg("--tls-client-ca").arg(&files.client_ca).env("SIGHTFIX_TLS__CLIENT_ROLE", "operator");
+    let server = TestServer::run(command);
+    let open = |own| connect(server.address, &authority, &["h2"], own);
+    let (status, text) = get(open(Some(authority.issue())).await.expect("open"), "/v1/session", None).await;
+    assert_eq!(status, StatusCode::OK, "{text}");
+    assert!(text.contains("\"operator\""), "{text}");
+    let stream = open(Some(authority.issue())).await.expect("open");
+    assert_eq!(get(stream, "/v1/keys", None).await.0, StatusCode::FORBIDDEN);
+    let stream = open(None).await.expect("a key will do");
+    assert_eq!(get(stream, "/v1/cameras", None).await.0, StatusCode::UNAUTHORIZED);
+    let stream = open(None).await.expect("a key will do");
+    assert_eq!(get(stream, "/v1/keys", Some(admin.trim())).await.0, StatusCode::OK);
+    // One of another authority is refused in the handshake, which TLS 1.3 tells with the first answer.
+    let foreign = open(Some(Authority::new().issue())).await;
+    let is_refused = match foreign {
+        Err(_) => true,
+        Ok(mut stream) => stream.read(&mut [0; 64]).await.map_or(true, |bytes| bytes == 0),
+    };
+    assert!(is_refused, "a certificate of somebody else");
+}
+
+/// Whether the server presents a certificate of the authority.
+async fn trusts(address: SocketAddr, authority: &Authority) -> bool {
+    connect(address, authority, &["h2"], None).await.is_ok()
+}
+
+#[tokio::test]
+async fn a_changed_certificate_is_loaded_and_a_broken_one_is_not() {
+    let (first, second, data) = (Authority::new(), Authority::new(), data_folder());
+    let files = Files::new(&first);
+    let server = TestServer::run(files.serve(&data));
+    let trusts = |authority| trusts(server.address, authority);
+    assert!(trusts(&first).await);
+    files.replace(&second);
+    while !trusts(&second).await {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    std::fs::write(&files.certificate, "no certificate").expect("a file");
+    let hangup = Command::new("kill").args(["-HUP", &server.pid().to_string()]).status();
+    assert!(hangup.expect("kill runs").success());
+    server
+        .logged(|entry| entry["message"].as_str().is_some_and(|text| text.contains("cannot be used")))
+        .await;
+    assert!(trusts(&second).await, "the one before stays");
+    files.replace(&first);
+    while !trusts(&first).await {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+#[test]
+fn files_that_cannot_be_used_are_named() {
+    let (authority, data) = (Authority::new(), data_folder());
+    let files = Files::new(&authority);
+    std::fs::write(&files.key, "no key").expect("a file");
+    let refused = files.serve(&data).output().expect("the binary runs");
+    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(!refused.status.success() && told.contains("key.pem"), "{told}");
+    let mut command = files.serve(&data);
+    let refused = command.env("SIGHTFIX_TLS__CLIENT_ROLE", "edge").output().expect("the binary runs");
+    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(told.contains("client_camera_ids"), "{told}");
+}

@@ -1,0 +1,157 @@
+//! Mistakes that people make with the interfaces, and what they are told.
+
+use std::fs::File;
+use std::process::Stdio;
+
+use futures_util::stream;
+use serde_json::json;
+use tonic_reflection::pb::v1alpha::ServerReflectionRequest;
+use tonic_reflection::pb::v1alpha::server_reflection_client::ServerReflectionClient;
+use tonic_reflection::pb::v1alpha::server_reflection_request::MessageRequest;
+use tonic_reflection::pb::v1alpha::server_reflection_response::MessageResponse;
+
+use crate::harness::{TestServer, data_folder, run, sightfix, simulated_csv};
+
+const MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.safetensors");
+const JSON: [(&str, &str); 1] = [("content-type", "application/json")];
+
+#[tokio::test]
+async fn an_array_is_no_object_and_types_are_named_as_in_json() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
+    for (path, body, field, told) in [
+        (
+            "/v1/cameras",
+            r#"["arr", "n", null, null, null, [], {}, [], false]"#,
+            "body",
+            "an object, not an array",
+        ),
+        ("/v1/cameras", r#"{"id": "d", "image_size": [640, 480]}"#, "image_size", "an object, not an array"),
+        ("/v1/cameras", r#"{"id": 5}"#, "id", "text, not a number"),
+        ("/v1/cameras", r#"{"id": "d", "labels": []}"#, "labels", "an object, not an array"),
+        ("/v1/cameras", r#"{"id": "d", "recipe": "x"}"#, "recipe", "one of paper"),
+        ("/v1/cameras", "7", "body", "an object, not a number"),
+        ("/v1/cameras/c/training-runs", "[]", "body", "an object, not an array"),
+        ("/v1/cameras/c/training-runs", r#"{"epochs": -1}"#, "epochs", "a whole number"),
+        ("/v1/cameras/c/fusions", r#"["2026-01-01T00:00:00Z"]"#, "body", "an object, not an array"),
+        ("/v1/cameras/c/fusions", r#"{"observations": [[]]}"#, "observations[0]", "an object, not an array"),
+    ] {
+        let problem = server.send("POST", path, &JSON, body).await.expect(422).json();
+        let violation = &problem["violations"][0];
+        assert_eq!(violation["field"], field, "{body}: {problem}");
+        let message = violation["message"].as_str().expect("text");
+        assert!(message.contains(told), "{body}: {message}");
+        for word in ["struct", "sequence", "f64", "u32", "i64", "enum", "expected"] {
+            assert!(!message.contains(word), "{body}: {message}");
+        }
+    }
+    assert_eq!(server.get("/v1/cameras").await.expect(200).json()["items"].as_array().map(Vec::len), Some(1));
+}
+
+#[tokio::test]
+async fn a_parameter_that_an_operation_does_not_have_is_refused() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
+    for (method, path) in [
+        ("GET", "/v1/cameras/c?verbose=1"),
+        ("GET", "/v1/cameras?limt=5"),
+        ("GET", "/v1/cameras/c/active-model?x"),
+        ("DELETE", "/v1/cameras/c?force=true"),
+        ("POST", "/v1/cameras/c/fusions?method=x"),
+        ("GET", "/v1/cameras/c/tracks?since=1"),
+    ] {
+        let problem = server.send(method, path, &JSON, "{}").await.expect(422).json();
+        assert!(problem["detail"].as_str().is_some_and(|text| text.contains("not a parameter")), "{problem}");
+    }
+    server.get("/v1/cameras/c?").await.expect(200);
+    server.get("/v1/cameras/c/samples?limit=5").await.expect(200);
+}
+
+#[test]
+fn a_closed_or_full_output_is_no_panic() {
+    let mut child =
+        sightfix().arg("openapi").stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
+    drop(child.stdout.take());
+    let closed = child.wait_with_output().expect("ends");
+    assert!(closed.status.success() && closed.stderr.is_empty(), "{closed:?}");
+    for arguments in [&["openapi"][..], &["config"], &["keys", "generate"]] {
+        let full = File::options().write(true).open("/dev/full").expect("Linux has it");
+        let ended = sightfix().args(arguments).stdout(full).output().expect("runs");
+        let told = String::from_utf8_lossy(&ended.stderr).into_owned();
+        assert_eq!(ended.status.code(), Some(1), "{arguments:?}: {told}");
+        assert!(told.contains("standard output cannot be written"), "{arguments:?}: {told}");
+    }
+}
+
+#[test]
+fn commands_make_no_folder_of_a_typo_and_compare_the_image_size() {
+    let folder = data_folder();
+    let typo = folder.path().join("typo");
+    let file = folder.path().join("samples.csv");
+    std::fs::write(&file, simulated_csv()).expect("a file");
+    let (path, data) = (file.to_str().expect("UTF-8"), folder.path().join("data"));
+    let data = data.to_str().expect("UTF-8");
+    let told = |arguments: &[&str]| {
+        let ended = sightfix().args(arguments).output().expect("runs");
+        assert_eq!(ended.status.code(), Some(1), "{arguments:?}");
+        String::from_utf8_lossy(&ended.stderr).into_owned()
+    };
+    let typo_text = typo.to_str().expect("UTF-8");
+    for arguments in [
+        &["train", "--camera", "c", "--data", typo_text][..],
+        &["import", path, "--camera", "c", "--data", typo_text],
+        &["keys", "list", "--data", typo_text],
+    ] {
+        assert!(told(arguments).contains("there is no data folder"), "{arguments:?}");
+        assert!(!typo.exists(), "{arguments:?}");
+    }
+    let import = ["import", path, "--camera", "c", "--data", data, "--create", "--image-size"];
+    run(&[&import[..], &["640x480"]].concat());
+    run(&[&import[..], &["640x480"]].concat());
+    let refused = told(&[&import[..], &["1280x720"]].concat());
+    assert!(refused.contains("640x480") && refused.contains("1280x720"), "{refused}");
+}
+
+#[tokio::test]
+async fn a_roll_back_and_a_model_of_another_image_tell_the_truth() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    let profile = json!({"id": "c", "image_size": {"width_px": 640, "height_px": 480}});
+    server.post("/v1/cameras", &profile).await.expect(201);
+    let roll_back = "/v1/cameras/c/active-model/roll-back";
+    let none = server.send("POST", roll_back, &[], "").await.expect(409).json();
+    assert_eq!(none["type"], "urn:sightfix:problem:no-model", "{none}");
+    let headers = [("content-type", "application/octet-stream")];
+    let model = std::fs::read(MODEL).expect("a model");
+    server.send("POST", "/v1/cameras/c/models", &headers, model).await.expect(201);
+    server.send("PUT", "/v1/cameras/c/active-model", &JSON, r#"{"number": 1}"#).await.expect(200);
+    let first = server.send("POST", roll_back, &[], "").await.expect(409).json();
+    assert_eq!(first["type"], "urn:sightfix:problem:no-earlier-model", "{first}");
+    assert!(first["detail"].as_str().is_some_and(|text| text.contains("version 1")), "{first}");
+    let camera = server.get("/v1/cameras/c").await.expect(200).json();
+    let warns = |camera: &serde_json::Value| {
+        let warnings = camera["warnings"].as_array().expect("warnings");
+        warnings.iter().any(|text| text.as_str().is_some_and(|text| text.contains("640x480")))
+    };
+    assert!(warns(&camera), "{camera}");
+}
+
+#[tokio::test]
+async fn reflection_is_served_to_older_clients_too() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{}", server.address));
+    let channel = endpoint.expect("an address").connect().await.expect("a connection");
+    let request = ServerReflectionRequest {
+        host: String::new(),
+        message_request: Some(MessageRequest::ListServices(String::new())),
+    };
+    let mut client = ServerReflectionClient::new(channel);
+    let mut answers =
+        client.server_reflection_info(stream::iter([request])).await.expect("served").into_inner();
+    let answer = answers.message().await.expect("an answer").expect("one answer").message_response;
+    let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("no list") };
+    assert!(list.service.iter().any(|service| service.name == "sightfix.v1.FusionService"), "{list:?}");
+}

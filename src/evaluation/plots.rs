@@ -114,7 +114,7 @@ pub(crate) fn calibration(title: &str, traces: &[&Trace]) -> Option<String> {
 fn cumulative(mut values: Vec<f64>) -> Vec<[f64; 2]> {
     values.sort_by(f64::total_cmp);
     let count = values.len();
-    let steps = count.min(DISTRIBUTION_POINTS).max(1);
+    let steps = count.clamp(1, DISTRIBUTION_POINTS);
     let vertex = |step: usize| {
         let rank = step * count / steps;
         Some([*values.get(rank.saturating_sub(1))?, rank as f64 / count as f64])

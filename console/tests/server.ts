@@ -25,8 +25,10 @@ export class Server {
 
   /** Starts the binary and waits until it listens. */
   async run(listen: string): Promise<void> {
+    // Settings of whoever runs the tests are not the test's.
+    const inherited = Object.fromEntries(Object.entries(process.env).filter(([name]) => !name.startsWith('SIGHTFIX_')));
     const child = spawn(BINARY, ['serve', '--data', this.#folder, '--listen', listen], {
-      env: { ...process.env, SIGHTFIX_LOG_FORMAT: 'json', ...this.#settings },
+      env: { ...inherited, SIGHTFIX_LOG_FORMAT: 'json', ...this.#settings },
       stdio: ['ignore', 'ignore', 'pipe'],
       cwd: tmpdir(),
     });

@@ -71,7 +71,8 @@ test('the real square: drop, map, train, look, try, live', async ({ console: pag
   await expect(page.getByText(/^[3-4]\d\d events$/)).toBeVisible();
   const [fix_m, regressed_m] = [mean(errors.fix), mean(errors.regressed)];
   console.log(`mean distance to the surveyed line: fixes ${fix_m.toFixed(2)} m, regressed ${regressed_m.toFixed(2)} m`);
-  expect(regressed_m).toBeLessThan(0.6 * fix_m);
+  // From the box alone on a recording that the model has not seen: clearly better than the receiver.
+  expect(regressed_m).toBeLessThan(0.8 * fix_m);
 });
 
 test('two files recorded apart are mapped, paired, trained and followed', async ({ console: page, server }) => {

@@ -7,7 +7,7 @@ import { addCamera, rowsOf, simulate, walk } from './world';
 import type { Server } from './server';
 
 /** Pictures for the documentation are taken on request, so that a run of the tests changes no file. */
-const PICTURES = process.env.SIGHTFIX_PICTURES ? resolve('../docs/console') : undefined;
+const PICTURES = process.env.CONSOLE_PICTURES ? resolve('../docs/console') : undefined;
 if (PICTURES) mkdirSync(PICTURES, { recursive: true });
 
 const TOWN: [id: string, name: string, site: string, east_deg: number, north_deg: number][] = [

@@ -91,7 +91,9 @@ async fn a_status_shows_samples_run_model_and_activity() {
     assert!(corners.len() >= 3 && trained["model"]["median_r95_m"].as_f64() > Some(0.0), "{trained}");
 
     let fix = &corners[0];
-    let observation = json!({"time": jiff::Timestamp::now().to_string(), "target_id": "p", "fix": fix});
+    #[expect(clippy::disallowed_methods, reason = "the server reads the wall clock, too")]
+    let now = jiff::Timestamp::now();
+    let observation = json!({"time": now.to_string(), "target_id": "p", "fix": fix});
     server.post("/v1/cameras/a/tracks", &observation).await.expect(200);
     let live = status().await;
     assert_eq!((&live["targets"], &live["streams"]), (&json!(1), &json!(0)), "{live}");

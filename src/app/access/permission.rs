@@ -171,8 +171,10 @@ static ROUTES: LazyLock<HashMap<&'static str, Methods>> = LazyLock::new(|| {
     routes
 });
 
-static RPCS: LazyLock<HashMap<&'static str, Permission>> =
-    LazyLock::new(|| OPERATIONS.iter().map(|operation| (operation.rpc, operation.permission)).collect());
+static RPCS: LazyLock<HashMap<&'static str, Permission>> = LazyLock::new(|| {
+    let rpcs = OPERATIONS.iter().filter(|operation| !operation.rpc.is_empty());
+    rpcs.map(|operation| (operation.rpc, operation.permission)).collect()
+});
 
 #[cfg(test)]
 mod tests {

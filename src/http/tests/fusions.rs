@@ -46,9 +46,10 @@ async fn items_at_fault_are_named_with_their_place() {
     let fields = rest.post(FUSIONS, &json!({ "observations": many })).await.problem(413, "too-large");
     assert_eq!(fields, ["observations"]);
     let json = [("content-type", "application/json")];
-    for body in ["NaN", "[", "{\"time\":NaN}", "\u{0}"] {
+    for body in ["NaN", "{", "{\"time\":NaN}", "\u{0}"] {
         rest.send("POST", FUSIONS, &json, body).await.problem(400, "malformed-body");
     }
+    assert_eq!(rest.send("POST", FUSIONS, &json, "[]").await.problem(422, "invalid-argument"), ["body"]);
     let infinite = r#"{"time":"2025-01-01T00:00:00Z","fix":{"longitude_deg":1e999,"latitude_deg":1}}"#;
     assert_eq!(
         rest.send("POST", FUSIONS, &json, infinite).await.problem(422, "invalid-argument"),

@@ -288,7 +288,8 @@ fn a_stated_bias_replaces_the_prior_of_the_only_receiver_in_its_only_session() {
     }
     println!("sigma without a stated bias {unknown_m:.2} m, of 0.05 m {small_m:.2} m, of 3 m {large_m:.2} m");
     println!("with 0.05 m, which is true, {:.1} % inside", 100.0 * covered);
-    assert!(small_m < 0.95 * unknown_m && large_m > 2.7, "{unknown_m} {small_m} {large_m}");
+    // Within ten minutes a bias that decorrelates over an hour changes a little, so somewhat below 3 m.
+    assert!(small_m < 0.95 * unknown_m && large_m > 2.4, "{unknown_m} {small_m} {large_m}");
     assert!(covered > 0.75, "{covered}");
 }
 
@@ -307,11 +308,11 @@ fn a_bias_that_several_receivers_share_is_added_to_the_answers() {
 }
 
 #[test]
-fn a_longer_session_is_worth_more_degrees_of_freedom() {
-    let freedom = |rows_each: usize| fitted(&walkers(4520, 1, rows_each, 0.0).0).1.freedom;
-    let (short, long) = (freedom(200), freedom(3_000));
-    println!("{short:.1} degrees of freedom of 200 s, {long:.1} of 3,000 s");
-    assert!(short >= 4.0 && long > short, "{short} {long}");
+fn more_receivers_are_worth_more_degrees_of_freedom() {
+    let freedom = |receivers: usize| fitted(&walkers(4520, receivers, 200, 0.8).0).1.freedom;
+    let (one, twelve) = (freedom(1), freedom(12));
+    println!("{one:.1} degrees of freedom of one receiver, {twelve:.1} of twelve");
+    assert!(one >= 4.0 && twelve > one, "{one} {twelve}");
 }
 
 #[test]

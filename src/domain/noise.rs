@@ -37,6 +37,12 @@ pub struct GaussMarkovNoise {
 }
 
 impl GaussMarkovNoise {
+    /// Noise of a standard deviation per axis (m) and its correlation.
+    #[must_use]
+    pub fn new(sigma_m: f64, correlation: NoiseCorrelation) -> Self {
+        Self { variance_m2: sigma_m * sigma_m, correlation }
+    }
+
     /// White noise of a variance (m2).
     #[must_use]
     pub const fn white(variance_m2: f64) -> Self {

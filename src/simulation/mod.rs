@@ -28,5 +28,5 @@ pub use world::{World, simulate, simulate_split};
 pub(crate) use noise::{standard_normal, stream};
 #[cfg(test)]
 pub(crate) use positions::{
-    PositionNoise, SimulatedPositions, SiteVisits, VISIT_GNSS_SIGMA_M, VISIT_MODEL_SIGMA_M, Walk, at_s,
+    SimulatedPositions, SiteVisits, VISIT_GNSS_SIGMA_M, VISIT_MODEL_SIGMA_M, Walk, at_s,
 };

@@ -6,6 +6,7 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
+use crate::domain::GaussMarkovNoise;
 use crate::geo::EastNorth;
 
 /// An independent stream of a seed: enabling one kind of noise does not change the draws of another.
@@ -40,19 +41,10 @@ impl GaussMarkov {
     }
 }
 
-/// Error of a receiver: standard deviations per axis (m) of the white part and of the Gauss-Markov
-/// part, and the time constant (s) of the latter.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct ReceiverError {
-    pub(super) white_m: f64,
-    pub(super) coloured_m: f64,
-    pub(super) time_constant_s: f64,
-}
-
 /// One receiver with independent errors on both axes.
 #[derive(Debug)]
 pub(super) struct SimulatedReceiver {
-    error: ReceiverError,
+    error: GaussMarkovNoise,
     bias: EastNorth,
     east: GaussMarkov,
     north: GaussMarkov,
@@ -61,15 +53,15 @@ pub(super) struct SimulatedReceiver {
 
 impl SimulatedReceiver {
     /// `bias` is the part of the error that never changes, m.
-    pub(super) fn new(error: ReceiverError, bias: EastNorth, mut random: ChaCha8Rng) -> Self {
-        let east = GaussMarkov::new(error.time_constant_s, &mut random);
-        let north = GaussMarkov::new(error.time_constant_s, &mut random);
+    pub(super) fn new(error: GaussMarkovNoise, bias: EastNorth, mut random: ChaCha8Rng) -> Self {
+        let east = GaussMarkov::new(error.correlation.time_constant_s, &mut random);
+        let north = GaussMarkov::new(error.correlation.time_constant_s, &mut random);
         Self { error, bias, east, north, random }
     }
 
     /// The measured position, that many seconds after the previous one.
     pub(super) fn measure(&mut self, truth: EastNorth, seconds: f64) -> EastNorth {
-        let ReceiverError { white_m, coloured_m, .. } = self.error;
+        let (white_m, coloured_m) = (self.error.white_sigma_m(), self.error.coloured_sigma_m());
         let east_m = coloured_m * self.east.advance(seconds, &mut self.random);
         let north_m = coloured_m * self.north.advance(seconds, &mut self.random);
         EastNorth {
@@ -111,10 +103,12 @@ impl Episodes {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::NoiseCorrelation;
 
     #[test]
     fn a_receiver_has_its_variance_and_autocorrelation() {
-        let error = ReceiverError { white_m: 0.13, coloured_m: 2.2, time_constant_s: 45.0 };
+        let correlation = NoiseCorrelation { white_share: 0.0035, time_constant_s: 45.0 };
+        let error = GaussMarkovNoise::new(2.204, correlation);
         let mut receiver = SimulatedReceiver::new(error, EastNorth::default(), stream(3, 1));
         let easts: Vec<f64> =
             (0..40_000).map(|_| receiver.measure(EastNorth::default(), 1.0).east_m).collect();

@@ -8,6 +8,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::noise::{GaussMarkov, standard_normal, stream};
+use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 use crate::geo::EastNorth;
 
 /// True, received and regressed position of one instant.
@@ -19,21 +20,11 @@ pub(crate) struct SimulatedPositions {
     pub(crate) regressed: EastNorth,
 }
 
-/// An error of standard deviation `sigma_m` per axis: a white part and a Gauss-Markov bias.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct PositionNoise {
-    pub(crate) sigma_m: f64,
-    /// Share of the variance that is white, 0 to 1.
-    pub(crate) white_share: f64,
-    /// Of the bias, s.
-    pub(crate) time_constant_s: f64,
-}
-
 /// One target that walks at constant speed and turns at random, a measurement per second.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Walk {
-    pub(crate) gnss: PositionNoise,
-    pub(crate) regression: PositionNoise,
+    pub(crate) gnss: GaussMarkovNoise,
+    pub(crate) regression: GaussMarkovNoise,
     /// Distance over which the regression's bias decorrelates to 1/e, m.
     pub(crate) regression_length_m: f64,
     pub(crate) speed_m_s: f64,
@@ -47,8 +38,11 @@ impl Walk {
     /// A pedestrian with a phone.
     pub(crate) fn pedestrian() -> Self {
         Self {
-            gnss: PositionNoise { sigma_m: 2.2, white_share: 0.02, time_constant_s: 40.0 },
-            regression: PositionNoise { sigma_m: 0.9, white_share: 0.3, time_constant_s: 300.0 },
+            gnss: GaussMarkovNoise::new(2.2, NoiseCorrelation::PHONE),
+            regression: GaussMarkovNoise::new(
+                0.9,
+                NoiseCorrelation { white_share: 0.3, time_constant_s: 300.0 },
+            ),
             regression_length_m: 10.0,
             speed_m_s: 1.3,
             turn_interval_s: 25,
@@ -62,8 +56,8 @@ impl Walk {
         let (mut place, mut heading_rad, mut wanted_rad) = ([0.0; 2], 0.0_f64, 0.0_f64);
         let max_turn_rad = self.max_lateral_m_s2 / self.speed_m_s.max(0.1);
         let regression_rate =
-            1.0 / self.regression.time_constant_s + self.speed_m_s / self.regression_length_m;
-        let mut gnss_bias = bias_pair(self.gnss.time_constant_s, &mut random);
+            1.0 / self.regression.correlation.time_constant_s + self.speed_m_s / self.regression_length_m;
+        let mut gnss_bias = bias_pair(self.gnss.correlation.time_constant_s, &mut random);
         let mut regression_bias = bias_pair(1.0 / regression_rate, &mut random);
         (0..seconds)
             .map(|second| {
@@ -78,24 +72,20 @@ impl Walk {
                 SimulatedPositions {
                     time: at_s(f64::from(second)),
                     truth: EastNorth { east_m: place[0], north_m: place[1] },
-                    fix: self.gnss.measure(place, gnss, &mut random),
-                    regressed: self.regression.measure(place, regression, &mut random),
+                    fix: measure(&self.gnss, place, gnss, &mut random),
+                    regressed: measure(&self.regression, place, regression, &mut random),
                 }
             })
             .collect()
     }
 }
 
-impl PositionNoise {
-    fn measure(&self, place: [f64; 2], bias: [f64; 2], random: &mut ChaCha8Rng) -> EastNorth {
-        let [east_m, north_m] = [0, 1].map(|axis| {
-            place[axis]
-                + self.sigma_m
-                    * ((1.0 - self.white_share).sqrt() * bias[axis]
-                        + self.white_share.sqrt() * standard_normal(random))
-        });
-        EastNorth { east_m, north_m }
-    }
+/// A place with that noise; `bias` is the Gauss-Markov part in units of its standard deviation.
+fn measure(noise: &GaussMarkovNoise, place: [f64; 2], bias: [f64; 2], random: &mut ChaCha8Rng) -> EastNorth {
+    let [east_m, north_m] = [0, 1].map(|axis| {
+        place[axis] + noise.coloured_sigma_m() * bias[axis] + noise.white_sigma_m() * standard_normal(random)
+    });
+    EastNorth { east_m, north_m }
 }
 
 /// Standard deviation per axis of the fixes of [`SiteVisits`], m.

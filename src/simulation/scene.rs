@@ -6,10 +6,9 @@ use rand::{Rng, RngExt};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::camera::{PinholeCamera, Point};
-use super::noise::ReceiverError;
 use super::path::{MotionProfile, Polyline, Pose};
 use super::shape::TargetShape;
-use crate::domain::{Error, ImageSize};
+use crate::domain::{Error, GaussMarkovNoise, ImageSize, NoiseCorrelation};
 use crate::geo::{EastNorth, Position};
 
 /// White part of a phone's error per axis, m, as measured; the rest is a Gauss-Markov bias.
@@ -124,16 +123,13 @@ impl Scene {
     }
 
     /// The error model of a receiver with that standard deviation per axis.
-    pub(super) fn receiver_error(self, sigma_m: f64, random: &mut impl Rng) -> ReceiverError {
+    pub(super) fn receiver_error(self, sigma_m: f64, random: &mut impl Rng) -> GaussMarkovNoise {
         match self {
-            Self::Airport => ReceiverError { white_m: sigma_m, coloured_m: 0.0, time_constant_s: 1.0 },
+            Self::Airport => GaussMarkovNoise::white(sigma_m * sigma_m),
             Self::Square => {
-                let white_m = PHONE_WHITE_M.min(sigma_m);
-                ReceiverError {
-                    white_m,
-                    coloured_m: (sigma_m * sigma_m - white_m * white_m).sqrt(),
-                    time_constant_s: random.random_range(35.0..60.0),
-                }
+                let white_share = (PHONE_WHITE_M / sigma_m).min(1.0).powi(2);
+                let time_constant_s = random.random_range(35.0..60.0);
+                GaussMarkovNoise::new(sigma_m, NoiseCorrelation { white_share, time_constant_s })
             }
         }
     }

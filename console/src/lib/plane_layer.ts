@@ -25,6 +25,7 @@ export class PlaneLayer {
   readonly #hasTiles: boolean;
   #draw: Draw = () => {};
   #frame = 0;
+  #isClosed = false;
 
   constructor(leaflet: typeof L, map: L.Map, hasTiles: boolean) {
     this.#leaflet = leaflet;
@@ -48,7 +49,14 @@ export class PlaneLayer {
 
   redraw(): void {
     cancelAnimationFrame(this.#frame);
+    if (this.#isClosed) return;
     this.#frame = requestAnimationFrame(() => this.#paint());
+  }
+
+  /** Draws no more: a frame that was asked for before the map is removed would meet a map without panes. */
+  close(): void {
+    cancelAnimationFrame(this.#frame);
+    this.#isClosed = true;
   }
 
   #paint(): void {

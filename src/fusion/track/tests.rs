@@ -4,18 +4,17 @@ use jiff::SignedDuration;
 use proptest::prelude::*;
 
 use super::*;
-use crate::domain::{GnssError, NoiseCorrelation, Recipe};
+use crate::domain::{GaussMarkovNoise, GnssError, NoiseCorrelation, Recipe};
 use crate::geo::EastNorth;
 use crate::model::{FitOptions, TimedResidual, estimate_gnss_noise, fit};
 use crate::simulation::{
-    Options, PositionNoise, SimulatedPositions, Walk, at_s, simulate as simulate_world, standard_normal,
-    stream,
+    Options, SimulatedPositions, Walk, at_s, simulate as simulate_world, standard_normal, stream,
 };
 
 /// Both positions of an instant, with the covariances that the simulation has.
 fn measurement(walk: &Walk, positions: &SimulatedPositions) -> Measurement {
     let measured =
-        |position, noise: PositionNoise| MeasuredPosition::isotropic(position, noise.sigma_m * noise.sigma_m);
+        |position, noise: GaussMarkovNoise| MeasuredPosition::isotropic(position, noise.variance_m2);
     Measurement {
         time: positions.time,
         fix: Some(measured(positions.fix, walk.gnss)),
@@ -112,7 +111,7 @@ fn a_pedestrian_is_tracked_consistently_and_better_than_by_two_step_fusion() {
 #[test]
 fn the_positions_of_a_stationary_target_are_averaged() {
     let pedestrian = Walk::pedestrian();
-    let regression = PositionNoise { sigma_m: 1.5, ..pedestrian.regression };
+    let regression = GaussMarkovNoise::new(1.5, pedestrian.regression.correlation);
     let standing = Walk { speed_m_s: 0.0, regression, ..pedestrian };
     let summary = run(TrackSettings::default(), &standing, 100..160, 450);
     println!("{summary:?}");
@@ -126,8 +125,8 @@ fn the_positions_of_a_stationary_target_are_averaged() {
 fn the_estimated_noise_improves_tracks_of_white_and_of_correlated_receivers() {
     let pedestrian = Walk::pedestrian();
     let white = Walk {
-        gnss: PositionNoise { sigma_m: 29.5, white_share: 1.0, time_constant_s: 40.0 },
-        regression: PositionNoise { sigma_m: 4.0, ..pedestrian.regression },
+        gnss: GaussMarkovNoise::new(29.5, NoiseCorrelation::WHITE),
+        regression: GaussMarkovNoise::new(4.0, pedestrian.regression.correlation),
         speed_m_s: 8.0,
         ..pedestrian
     };
@@ -135,15 +134,18 @@ fn the_estimated_noise_improves_tracks_of_white_and_of_correlated_receivers() {
         let traverses: Vec<Vec<TimedResidual>> = (500..520)
             .map(|seed| simulate(&walk, seed, 300).iter().map(|(_, it)| residual(it)).collect())
             .collect();
-        let e_regression_m2 = walk.regression.sigma_m.powi(2);
+        let e_regression_m2 = walk.regression.variance_m2;
         let estimate =
             estimate_gnss_noise(&traverses, e_regression_m2, &RegressionNoise::default().correlation)
                 .expect("enough");
         println!("{estimate:?}");
-        assert!((estimate.correlation.white_share - walk.gnss.white_share).abs() < 0.1, "{estimate:?}");
-        assert!((estimate.variance_m2.sqrt() / walk.gnss.sigma_m - 1.0).abs() < 0.15, "{estimate:?}");
+        assert!(
+            (estimate.correlation.white_share - walk.gnss.correlation.white_share).abs() < 0.1,
+            "{estimate:?}"
+        );
+        assert!(((estimate.variance_m2 / walk.gnss.variance_m2).sqrt() - 1.0).abs() < 0.15, "{estimate:?}");
         let informed = TrackSettings { gnss: estimate.correlation, ..TrackSettings::default() };
-        let wrong_share = 1.0 - walk.gnss.white_share;
+        let wrong_share = 1.0 - walk.gnss.correlation.white_share;
         let misled = TrackSettings {
             gnss: NoiseCorrelation { white_share: wrong_share, time_constant_s: 40.0 },
             ..TrackSettings::default()

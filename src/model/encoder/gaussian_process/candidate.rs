@@ -6,7 +6,7 @@ use super::groups::Grouping;
 use super::hyperparameters::{Hyperparameters, LikelihoodRows, Priors, join, kernel_columns};
 use super::kernel::inducing_points;
 use super::map_rows::MapRows;
-use super::noise::{Epoch, ReceiverNoise, Whitener};
+use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
 use super::projective_mean::{Box4, COEFFICIENTS, FOOT_COEFFICIENTS, ProjectiveMean};
 use super::upright_camera::{Parameters, UprightCamera};
@@ -22,7 +22,7 @@ const NO_SIDES: f64 = 1e-4;
 
 /// What a map is made of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Form {
+pub(crate) enum MapForm {
     /// The foot's homography alone.
     Homography,
     /// The same with the geometry that the boxes' heights tell as prior.
@@ -31,7 +31,7 @@ pub(crate) enum Form {
     Residual,
 }
 
-impl Form {
+impl MapForm {
     pub(crate) const fn as_str(self) -> &'static str {
         match self {
             Self::Homography => "homography",
@@ -48,7 +48,7 @@ type Deviation = (DVector<f64>, [DVector<f64>; 2]);
 /// A map on its way: rows, where it is linearised, and what gross errors have cost each row.
 #[derive(Debug, Clone)]
 pub(crate) struct Draft<'a> {
-    pub(crate) form: Form,
+    pub(crate) form: MapForm,
     pub(crate) rows: &'a MapRows,
     pub(crate) inputs: &'a [[f64; 4]],
     pub(crate) mean: ProjectiveMean,
@@ -68,8 +68,8 @@ pub(crate) struct Columns {
 }
 
 /// A solved map with everything that leaving groups out needs.
-pub(crate) struct Candidate {
-    pub(crate) form: Form,
+pub(crate) struct MapCandidate {
+    pub(crate) form: MapForm,
     pub(crate) mean: ProjectiveMean,
     pub(crate) parameters: Hyperparameters,
     pub(crate) inducing: Vec<[f64; 4]>,
@@ -80,7 +80,7 @@ pub(crate) struct Candidate {
     pub(crate) without: Vec<Posterior>,
 }
 
-impl Form {
+impl MapForm {
     /// Gauss-Newton rounds about each set of hyper-parameters.
     const fn relinearizations(self) -> usize {
         match self {
@@ -99,7 +99,7 @@ impl<'a> Draft<'a> {
     ) -> Option<Self> {
         let of_start = |start: &Parameters| {
             let placed = camera.placed(start, &self.mean, &self.rows.boxes, &self.rows.labels_m);
-            let mut draft = Draft { form: Form::Upright, upright: Some((camera, placed)), ..self.clone() };
+            let mut draft = Draft { form: MapForm::Upright, upright: Some((camera, placed)), ..self.clone() };
             draft.set_coefficients(&camera.coefficients(&placed, &self.mean)?)?;
             draft.relinearize(parameters)?;
             let columns = draft.columns(&[], parameters)?;
@@ -138,8 +138,8 @@ impl<'a> Draft<'a> {
 
     fn inducing(&self, most: usize) -> Vec<[f64; 4]> {
         match self.form {
-            Form::Homography | Form::Upright => Vec::new(),
-            Form::Residual => {
+            MapForm::Homography | MapForm::Upright => Vec::new(),
+            MapForm::Residual => {
                 let count = (self.inputs.len() / ROWS_PER_INDUCING).clamp(4, most);
                 inducing_points(self.inputs, count)
             }
@@ -178,7 +178,7 @@ impl<'a> Draft<'a> {
     }
 
     fn prior(&self, parameters: &Hyperparameters) -> Option<TangentPrior> {
-        let side_scale = if self.form == Form::Residual { parameters.side_scale } else { NO_SIDES };
+        let side_scale = if self.form == MapForm::Residual { parameters.side_scale } else { NO_SIDES };
         let prior = TangentPrior::independent(&self.mean.prior_variances(side_scale));
         let Some((camera, at)) = &self.upright else { return Some(prior) };
         let (mean, precision) = camera.prior_on_coefficients(at, &self.mean)?;
@@ -188,10 +188,10 @@ impl<'a> Draft<'a> {
     fn columns(&self, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Columns> {
         let (tangent, labels_m) = linearize(self.rows, &self.mean);
         let (phi, left_out_m2) = match self.form {
-            Form::Homography | Form::Upright => {
+            MapForm::Homography | MapForm::Upright => {
                 (DMatrix::zeros(self.inputs.len(), 0), vec![0.0; self.inputs.len()])
             }
-            Form::Residual => kernel_columns(self.inputs, inducing, parameters)?,
+            MapForm::Residual => kernel_columns(self.inputs, inducing, parameters)?,
         };
         Some(Columns { tangent, labels_m, phi, left_out_m2 })
     }
@@ -213,7 +213,7 @@ impl<'a> Draft<'a> {
                 .enumerate()
                 .map(|(row, miss_m)| [miss_m[0] - kernel_m[0][row], miss_m[1] - kernel_m[1][row]])
                 .collect();
-            let whitener = Whitener::new(&self.rows.epochs, &parameters.noise, &self.inflation_m2);
+            let whitener = ReceiverWhitener::new(&self.rows.epochs, &parameters.noise, &self.inflation_m2);
             self.inflation_m2 = whitener.inflation_m2(&residuals_m);
         }
         Some(())
@@ -223,7 +223,7 @@ impl<'a> Draft<'a> {
     ///
     /// Groups' Gram matrices add up, so leaving one out is a subtraction; where a target's spells are
     /// groups of their own, each is whitened on its own.
-    pub(crate) fn solve(self, parameters: &Hyperparameters, grouping: &Grouping) -> Option<Candidate> {
+    pub(crate) fn solve(self, parameters: &Hyperparameters, grouping: &Grouping) -> Option<MapCandidate> {
         let inducing = self.inducing(MAX_INDUCING);
         let columns = self.columns(&inducing, parameters)?;
         let prior = self.prior(parameters)?;
@@ -235,7 +235,16 @@ impl<'a> Draft<'a> {
         let without =
             groups.iter().map(|own| Posterior::new(&sum.minus(own), &prior)).collect::<Option<_>>()?;
         let Self { form, mean, .. } = self;
-        Some(Candidate { form, mean, parameters: *parameters, inducing, columns, total, posterior, without })
+        Some(MapCandidate {
+            form,
+            mean,
+            parameters: *parameters,
+            inducing,
+            columns,
+            total,
+            posterior,
+            without,
+        })
     }
 }
 
@@ -253,7 +262,7 @@ impl Columns {
             rows.iter().map(|row| self.left_out_m2[*row] + inflation_m2[*row]).collect();
         let columns = join(&[&self.tangent, &self.phi, &self.labels_m]);
         let columns = if rows.len() == epochs.len() { columns } else { columns.select_rows(rows) };
-        Gram::new(columns, &Whitener::new(&own, &parameters.noise, &variances))
+        Gram::new(columns, &ReceiverWhitener::new(&own, &parameters.noise, &variances))
     }
 
     fn slopes(&self, row: usize) -> [[f64; COEFFICIENTS]; 2] {
@@ -261,7 +270,7 @@ impl Columns {
     }
 }
 
-impl Candidate {
+impl MapCandidate {
     /// A row's fix less its position by a posterior, m, and that position's covariance, m2.
     pub(crate) fn residual(&self, posterior: &Posterior, row: usize) -> ([f64; 2], [f64; 3]) {
         let slopes = self.columns.slopes(row);

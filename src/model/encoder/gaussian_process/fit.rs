@@ -1,15 +1,15 @@
 //! From rows to a model: robust start, hyper-parameters, candidates, weights, calibration.
 
 use super::box_plausibility::BoxPlausibility;
-use super::candidate::{Candidate, Draft, Form};
+use super::candidate::{Draft, MapCandidate, MapForm};
 use super::edge_noise::edge_covariance_px2;
 use super::groups::{Grouping, groups};
 use super::hyperparameters::{Hyperparameters, Priors};
 use super::kernel::InputScales;
 use super::leave_out::{calibrate, weigh};
 use super::map_rows::{MapRows, scatter_m2};
-use super::noise::{Epoch, ReceiverNoise, Whitener};
-use super::predictor::{Map, Predictor, Stated};
+use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
+use super::predictor::{PositionMap, Predictor, Stated};
 use super::projective_mean::ProjectiveMean;
 use super::sessions::Sessions;
 use super::upright_camera::UprightCamera;
@@ -87,14 +87,14 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
 
     let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, settings.seed);
     let kept = without_negligible(&weights);
-    let jackknives: Vec<_> = candidates.iter().map(Candidate::jackknife).collect();
+    let jackknives: Vec<_> = candidates.iter().map(MapCandidate::jackknife).collect();
     let maps = candidates
         .iter()
         .zip(&jackknives)
         .zip(&kept)
         .filter(|(_, weight)| **weight > 0.0)
-        .map(|((candidate, (_, deviations)), weight)| Map::new(candidate, deviations, *weight))
-        .collect::<Option<Vec<Map>>>()?;
+        .map(|((candidate, (_, deviations)), weight)| PositionMap::new(candidate, deviations, *weight))
+        .collect::<Option<Vec<PositionMap>>>()?;
     let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise, &bias);
     let stated = Stated {
         edge_px2: edge_covariance_px2(&all.epochs, &all.boxes),
@@ -108,7 +108,7 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     predictor.widening = calibration.widening;
     let residuals_m: Vec<[f64; 2]> =
         (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
-    let of_candidate = |((candidate, weight), miss_m2): ((&Candidate, &f64), &f64)| {
+    let of_candidate = |((candidate, weight), miss_m2): ((&MapCandidate, &f64), &f64)| {
         (candidate.form.as_str(), *weight, *miss_m2)
     };
     let report = FitReport {
@@ -132,7 +132,7 @@ struct Solutions {
     parameters: Hyperparameters,
     /// The noise before its white part was raised.
     receiver: ReceiverNoise,
-    candidates: Vec<Candidate>,
+    candidates: Vec<MapCandidate>,
 }
 
 /// Estimates the hyper-parameters and solves every form of the map.
@@ -146,10 +146,11 @@ fn solve(
 ) -> Option<Solutions> {
     let residuals_m = rows.misses_m(&mean);
     let scatter_m2 = scatter_m2(&residuals_m).max(MIN_SCATTER_M2);
-    let white = Whitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
+    let white =
+        ReceiverWhitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
     let inflation_m2 = white.inflation_m2(&residuals_m);
-    let mut residual = Draft { form: Form::Residual, rows, inputs, mean, inflation_m2, upright: None };
-    let mut homography = Draft { form: Form::Homography, ..residual.clone() };
+    let mut residual = Draft { form: MapForm::Residual, rows, inputs, mean, inflation_m2, upright: None };
+    let mut homography = Draft { form: MapForm::Homography, ..residual.clone() };
     let spread_m = residual.mean.spread_m;
     let mut priors = Priors::new(scatter_m2.sqrt(), settings.white_share, spread_m, interval_s(&rows.epochs));
     if let BiasPrior::OfSession { sigma_m } = bias {
@@ -172,7 +173,7 @@ fn without_negligible(weights: &[f64]) -> Vec<f64> {
     kept.map(|weight| weight / sum).collect()
 }
 
-fn mixed_residual(candidates: &[Candidate], weights: &[f64], row: usize) -> [f64; 2] {
+fn mixed_residual(candidates: &[MapCandidate], weights: &[f64], row: usize) -> [f64; 2] {
     let mut sum_m = [0.0; 2];
     for (candidate, weight) in candidates.iter().zip(weights).filter(|(_, weight)| **weight > 0.0) {
         let own_m = candidate.residual(&candidate.posterior, row).0;
@@ -240,7 +241,7 @@ fn independent_biases(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
 fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise, bias: &BiasPrior) -> f64 {
     let information = |noise: &ReceiverNoise| {
         let mut ones = vec![1.0; epochs.len()];
-        Whitener::new(epochs, noise, &vec![0.0; epochs.len()]).apply(&mut ones);
+        ReceiverWhitener::new(epochs, noise, &vec![0.0; epochs.len()]).apply(&mut ones);
         ones.iter().map(|one| one * one).sum::<f64>()
     };
     let within = ReceiverNoise { session_m2: 0.0, ..*noise };

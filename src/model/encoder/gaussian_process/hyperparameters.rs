@@ -4,7 +4,7 @@
 use nalgebra::{DMatrix, SMatrix, SVector};
 
 use super::kernel::LengthScales;
-use super::noise::{Epoch, ReceiverNoise, Whitener};
+use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
 use super::projective_mean::ProjectiveMean;
 
@@ -167,7 +167,7 @@ impl LikelihoodRows<'_> {
             .zip(self.inflation_m2)
             .map(|(left_out, inflation)| left_out + inflation)
             .collect();
-        let whitener = Whitener::new(self.epochs, &parameters.noise, &variances);
+        let whitener = ReceiverWhitener::new(self.epochs, &parameters.noise, &variances);
         let columns = join(&[self.tangent, &phi, self.labels_m]);
         Some((Gram::new(columns, &whitener), 2.0 * whitener.log_determinant))
     }

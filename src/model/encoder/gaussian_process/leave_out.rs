@@ -4,7 +4,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::Exp1;
 
-use super::candidate::Candidate;
+use super::candidate::MapCandidate;
 use super::groups::Grouping;
 use super::map_rows::MapRows;
 use super::noise::{Epoch, ReceiverNoise};
@@ -29,7 +29,7 @@ struct LeftOutRow {
 
 /// What left-out rows say of the mixture.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Calibration {
+pub(crate) struct LeftOutCalibration {
     /// Factor on the map's variance, at least 1.
     pub(crate) widening: f64,
     /// Mean squared miss per axis to the fixes, bounded, m2.
@@ -52,7 +52,7 @@ fn sequences(grouping: &Grouping, epochs: &[Epoch]) -> Vec<(usize, Vec<usize>)> 
 /// Share of the draws of a Bayesian bootstrap (Rubin 1981) over left-out sequences in which each
 /// candidate has the smallest mean squared miss, and these means over all rows, m2.
 pub(crate) fn weigh(
-    candidates: &[Candidate],
+    candidates: &[MapCandidate],
     grouping: &Grouping,
     rows: &MapRows,
     noise: &ReceiverNoise,
@@ -92,13 +92,13 @@ pub(crate) fn weigh(
 /// Holds the stated error of the mixture against left-out rows. `extra_m2` is what the model states
 /// beside the posterior at a row (the jackknife), mean per axis.
 pub(crate) fn calibrate(
-    candidates: &[Candidate],
+    candidates: &[MapCandidate],
     weights: &[f64],
     grouping: &Grouping,
     rows: &MapRows,
     noise: &ReceiverNoise,
     extra_m2: &dyn Fn(usize) -> f64,
-) -> Calibration {
+) -> LeftOutCalibration {
     let receiver_m2 = noise.variance_m2();
     let (mut miss_m2, mut inside, mut count) = (0.0, 0.0, 0.0_f64);
     let mut means = Vec::new();
@@ -121,10 +121,10 @@ pub(crate) fn calibrate(
         means.push(SequenceMean { square_m2, noise_m2, map_m2 });
     }
     let count = count.max(1.0);
-    Calibration { widening: widening(&means), miss_m2: miss_m2 / count, coverage: inside / count }
+    LeftOutCalibration { widening: widening(&means), miss_m2: miss_m2 / count, coverage: inside / count }
 }
 
-fn mixed(candidates: &[Candidate], weights: &[f64], group: usize, row: usize) -> LeftOutRow {
+fn mixed(candidates: &[MapCandidate], weights: &[f64], group: usize, row: usize) -> LeftOutRow {
     let of: Vec<([f64; 2], [f64; 3])> =
         candidates.iter().map(|candidate| candidate.residual(&candidate.without[group], row)).collect();
     let residual_m =

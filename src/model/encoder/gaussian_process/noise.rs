@@ -46,7 +46,7 @@ pub(crate) struct Epoch {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Step {
+struct WhiteningStep {
     decay: [f64; 2],
     gain: [f64; 2],
     inverse_sigma: f64,
@@ -56,13 +56,13 @@ struct Step {
 
 /// The filter of one set of rows.
 #[derive(Debug, Clone)]
-pub(crate) struct Whitener {
-    steps: Vec<Step>,
+pub(crate) struct ReceiverWhitener {
+    steps: Vec<WhiteningStep>,
     /// Sum of the logarithms of the innovations' variances.
     pub(crate) log_determinant: f64,
 }
 
-impl Whitener {
+impl ReceiverWhitener {
     /// `inflation_m2` is added to each row's white variance.
     pub(crate) fn new(epochs: &[Epoch], noise: &ReceiverNoise, inflation_m2: &[f64]) -> Self {
         let stationary_m2 = [noise.short_m2, noise.session_m2];
@@ -87,7 +87,7 @@ impl Whitener {
             p01 -= gain[0] * gain[1] * variance_m2;
             p11 -= gain[1] * gain[1] * variance_m2;
             log_determinant += variance_m2.ln();
-            steps.push(Step { decay, gain, inverse_sigma: 1.0 / variance_m2.sqrt(), nominal_m2 });
+            steps.push(WhiteningStep { decay, gain, inverse_sigma: 1.0 / variance_m2.sqrt(), nominal_m2 });
         }
         Self { steps, log_determinant }
     }

@@ -7,7 +7,7 @@
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, SVector};
 
-use super::noise::Whitener;
+use super::noise::ReceiverWhitener;
 use super::projective_mean::{COEFFICIENTS, FOOT_COEFFICIENTS};
 
 const PHI: usize = 2 * COEFFICIENTS;
@@ -18,7 +18,7 @@ pub(crate) struct Gram(DMatrix<f64>);
 
 impl Gram {
     /// Whitens the columns and multiplies.
-    pub(crate) fn new(mut columns: DMatrix<f64>, whitener: &Whitener) -> Self {
+    pub(crate) fn new(mut columns: DMatrix<f64>, whitener: &ReceiverWhitener) -> Self {
         let rows = columns.nrows();
         if rows > 0 {
             for column in columns.as_mut_slice().chunks_exact_mut(rows) {

@@ -7,7 +7,7 @@
 use nalgebra::{DMatrix, DVector, Matrix4, SymmetricEigen};
 
 use super::box_plausibility::{BoxPlausibility, Deviation, RecentBoxes};
-use super::candidate::Candidate;
+use super::candidate::MapCandidate;
 use super::edge_noise::edges_px;
 use super::f_distribution::f_quantile;
 use super::kernel::{InputScales, LengthScales};
@@ -41,7 +41,7 @@ pub(crate) struct CoefficientDeviation {
 
 /// One map of the mixture.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Map {
+pub(crate) struct PositionMap {
     /// Weights of all maps sum to 1.
     pub(crate) weight: f64,
     pub(crate) mean: ProjectiveMean,
@@ -69,7 +69,7 @@ pub(crate) struct Map {
 /// A fitted model, ready to answer.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Predictor {
-    pub(crate) maps: Vec<Map>,
+    pub(crate) maps: Vec<PositionMap>,
     pub(crate) input_scales: InputScales,
     /// Covariance of left, top, right and bottom, px2.
     pub(crate) edge_px2: [f64; 16],
@@ -83,7 +83,7 @@ pub(crate) struct Predictor {
 
 /// The position of one box.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Prediction {
+pub(crate) struct MapPrediction {
     /// East and north, m.
     pub(crate) position_m: [f64; 2],
     /// East, cross, north, m2.
@@ -115,7 +115,7 @@ pub(super) struct Mixture {
     pub(super) by_edge: [[f64; 4]; 2],
 }
 
-impl Prediction {
+impl MapPrediction {
     /// Mean variance per axis, m2.
     #[inline]
     pub(crate) fn variance_m2(&self) -> f64 {
@@ -123,14 +123,14 @@ impl Prediction {
     }
 }
 
-impl Map {
+impl PositionMap {
     /// `None` for matrices that are not positive definite.
     pub(crate) fn new(
-        candidate: &Candidate,
+        candidate: &MapCandidate,
         deviations: &[(DVector<f64>, [DVector<f64>; 2])],
         weight: f64,
     ) -> Option<Self> {
-        let Candidate { parameters, posterior, inducing, .. } = candidate;
+        let MapCandidate { parameters, posterior, inducing, .. } = candidate;
         let (directions, determined) = determined_directions(candidate);
         let residual_m = if inducing.is_empty() { 0.0 } else { parameters.residual_m };
         let inverse_factor = parameters.lengths.inverse_factor(inducing)?;
@@ -281,7 +281,7 @@ impl Map {
 }
 
 impl Predictor {
-    pub(crate) fn new(maps: Vec<Map>, input_scales: InputScales, stated: Stated) -> Self {
+    pub(crate) fn new(maps: Vec<PositionMap>, input_scales: InputScales, stated: Stated) -> Self {
         Self {
             maps,
             input_scales,
@@ -296,7 +296,7 @@ impl Predictor {
     }
 
     /// Position and error of a box; `recent` are the boxes of its target up to now.
-    pub(crate) fn predict(&self, sides: &Box4, recent: Option<&RecentBoxes>) -> Prediction {
+    pub(crate) fn predict(&self, sides: &Box4, recent: Option<&RecentBoxes>) -> MapPrediction {
         let mixture = self.mix(sides, true);
         let mut position_m = mixture.position_m;
         let noise_m2 = quadratic(&mixture.by_edge, &self.edge_px2);
@@ -319,7 +319,7 @@ impl Predictor {
             }
             position_m = [position_m[0] + moved_m[0], position_m[1] + moved_m[1]];
         }
-        Prediction {
+        MapPrediction {
             position_m,
             covariance_m2,
             r95_scale: self.r95_scale(&covariance_m2),
@@ -337,7 +337,7 @@ impl Predictor {
     /// Mean variance per axis of the jackknife at a box, m2.
     pub(crate) fn jackknife_m2(&self, sides: &Box4) -> f64 {
         let (input, by_px) = (self.input_scales.input(sides), self.input_scales.slopes(sides));
-        let of = |map: &Map| {
+        let of = |map: &PositionMap| {
             let [east_m2, _, north_m2] = map.jackknife_m2(&map.terms(sides, &input, &by_px));
             0.5 * map.weight * (east_m2 + north_m2)
         };
@@ -390,7 +390,7 @@ impl Predictor {
 
 /// The directions of the kernel's weights that training determines, as columns, and the share of each
 /// one's prior variance that it takes away.
-fn determined_directions(candidate: &Candidate) -> (DMatrix<f64>, Vec<f64>) {
+fn determined_directions(candidate: &MapCandidate) -> (DMatrix<f64>, Vec<f64>) {
     let count = candidate.inducing.len();
     if count == 0 {
         return (DMatrix::zeros(0, 0), Vec::new());

@@ -3,7 +3,7 @@
 //! Half an hour without any row ends a session. Within one, no filter can tell a receiver's lasting bias
 //! from the map; between them, the means of their residuals about one map scatter by it.
 
-use super::noise::{Epoch, ReceiverNoise, Whitener};
+use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use crate::model::samples::rows::SESSION_GAP_S;
 
 /// Sessions with fewer rows say nothing.
@@ -56,8 +56,8 @@ pub(crate) fn weighted_mean(
     noise: &ReceiverNoise,
     residuals_m: &[[f64; 2]],
 ) -> ([f64; 2], f64) {
-    let plain = Whitener::new(epochs, noise, &vec![0.0; epochs.len()]);
-    let whitener = Whitener::new(epochs, noise, &plain.inflation_m2(residuals_m));
+    let plain = ReceiverWhitener::new(epochs, noise, &vec![0.0; epochs.len()]);
+    let whitener = ReceiverWhitener::new(epochs, noise, &plain.inflation_m2(residuals_m));
     let mut ones = vec![1.0; residuals_m.len()];
     whitener.apply(&mut ones);
     let information = ones.iter().map(|one| one * one).sum::<f64>();

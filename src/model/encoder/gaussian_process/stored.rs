@@ -4,7 +4,7 @@ use super::box_plausibility::{BoxPlausibility, Cell, MAX_CELLS};
 use super::candidate::MAX_INDUCING;
 use super::groups::GROUPS;
 use super::kernel::{InputScales, LengthScales};
-use super::predictor::{CoefficientDeviation, MAX_RANK, Map, Predictor, QUANTILES};
+use super::predictor::{CoefficientDeviation, MAX_RANK, PositionMap, Predictor, QUANTILES};
 use super::projective_mean::{COEFFICIENTS, ProjectiveMean};
 use crate::domain::{Error, FeatureScale, Result};
 use crate::model::artifact::ModelParts;
@@ -70,8 +70,8 @@ impl Predictor {
             return Err(invalid("r95_quantiles must be above 0"));
         }
         let maps = (0..count as usize)
-            .map(|at| Map::take(&format!("map{at}."), scales, parts))
-            .collect::<Result<Vec<Map>>>()?;
+            .map(|at| PositionMap::take(&format!("map{at}."), scales, parts))
+            .collect::<Result<Vec<PositionMap>>>()?;
         Ok(Self {
             maps,
             input_scales: InputScales(input_scales),
@@ -84,7 +84,7 @@ impl Predictor {
     }
 }
 
-impl Map {
+impl PositionMap {
     fn put(&self, prefix: &str, parts: &mut ModelParts) {
         let (points, rank) = (self.inducing.len(), self.rank);
         let name = |own: &str| format!("{prefix}{own}");

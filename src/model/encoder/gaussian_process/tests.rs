@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use super::box_plausibility::RecentBoxes;
 use super::fit::{FitReport, FitSettings, fit};
 use super::map_rows::MapRows;
-use super::noise::{Epoch, ReceiverNoise, Whitener};
+use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
 use super::predictor::Predictor;
 use super::projective_mean::{Box4, COEFFICIENTS};
@@ -105,7 +105,7 @@ fn innovations_of_the_three_part_noise_are_white_with_unit_variance() {
             }
         }
     }
-    Whitener::new(&epochs, &noise, &vec![0.0; epochs.len()]).apply(&mut column);
+    ReceiverWhitener::new(&epochs, &noise, &vec![0.0; epochs.len()]).apply(&mut column);
     let count = column.len() as f64;
     let variance = column.iter().map(|value| value * value).sum::<f64>() / count;
     let correlation = column.windows(2).map(|pair| pair[0] * pair[1]).sum::<f64>() / count;
@@ -125,7 +125,7 @@ fn subtracting_a_groups_gram_matrix_is_a_fit_without_it() {
     let noise = ReceiverNoise { short_m2: 1.0, short_time_s: 10.0, ..ReceiverNoise::white(0.5) };
     let gram = |rows: std::ops::Range<usize>| {
         let own = &epochs[rows.clone()];
-        let whitener = Whitener::new(own, &noise, &vec![0.0; own.len()]);
+        let whitener = ReceiverWhitener::new(own, &noise, &vec![0.0; own.len()]);
         Gram::new(columns.rows(rows.start, rows.len()).into_owned(), &whitener)
     };
     let prior = TangentPrior::independent(&[4.0; COEFFICIENTS]);

@@ -154,18 +154,15 @@ async fn with_samples(settings: &[(&str, &str)]) -> (tempfile::TempDir, TestServ
 const EXPORT: &str =
     "GET /v1/cameras/c/samples HTTP/1.1\r\nhost: localhost\r\naccept: application/x-ndjson\r\n\r\n";
 
-/// Waits until the only connection is the one that asks.
-async fn until_alone(server: &TestServer) -> String {
+/// Waits until the server has closed that many connections because their clients did not read.
+async fn until_stalled(server: &TestServer, count: u32) {
+    let wanted = format!("sightfix_connections_closed_total{{reason=\"stalled\"}} {count}");
     let looking = async {
-        loop {
-            let metrics = server.get("/metrics").await.expect(200).text();
-            if metrics.lines().any(|line| line == "sightfix_connections 1") {
-                return metrics;
-            }
+        while !server.get("/metrics").await.expect(200).text().lines().any(|line| line == wanted) {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, looking).await.expect("the connection is closed")
+    tokio::time::timeout(PATIENCE, looking).await.expect("the connection is closed");
 }
 
 #[tokio::test]
@@ -173,8 +170,7 @@ async fn readers_that_never_read_are_closed() {
     let (_folder, server) = with_samples(&[("SIGHTFIX_LIMITS__IDLE_S", "1")]).await;
     let mut http_1 = connect_from([127, 0, 0, 1], server.address).await;
     http_1.write_all(EXPORT.as_bytes()).await.expect("the server reads");
-    let metrics = until_alone(&server).await;
-    assert!(metrics.contains("sightfix_connections_closed_total{reason=\"stalled\"} 1"), "{metrics}");
+    until_stalled(&server, 1).await;
 
     let stream = TokioIo::new(connect_from([127, 0, 0, 1], server.address).await);
     let (mut client, connection) = http2::Builder::new(TokioExecutor::new())
@@ -189,8 +185,7 @@ async fn readers_that_never_read_are_closed() {
         client.send_request(request.body(Full::default()).expect("a request")).await.expect("a head");
     let closed = tokio::time::timeout(PATIENCE, connection).await;
     let _ = closed.expect("the connection is closed, though pings are answered");
-    let metrics = server.get("/metrics").await.expect(200).text();
-    assert!(metrics.contains("sightfix_connections_closed_total{reason=\"stalled\"} 2"), "{metrics}");
+    until_stalled(&server, 2).await;
     drop(unread);
 }
 

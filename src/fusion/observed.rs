@@ -16,6 +16,11 @@ pub const PAIR_GATE: f64 = 13.816;
 /// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
 pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 
+/// Least radius of a camera's scene, m: a target may be beyond what few samples of one place have shown.
+const LEAST_SCENE_RADIUS_M: f64 = 100.0;
+/// Standard deviations of a fix beyond the scene's radius from which it cannot be of a target in view.
+const SCENE_MARGIN_SIGMAS: f64 = 4.0;
+
 /// The error variance per axis, m2, of an observation's fix: its own, else the camera profile's, else the
 /// model's, else that of a phone in the open.
 #[must_use]
@@ -37,6 +42,9 @@ pub struct ObservedFix {
     pub variance_m2: f64,
     /// In the model's plane; `None` without a model, or beyond the plane's range.
     pub in_plane: Option<EastNorth>,
+    /// Whether it may be of a target in view: within [`Regressor::scene_radius_m`] (at least
+    /// [`LEAST_SCENE_RADIUS_M`]) and four of its standard deviations of the scene's centre.
+    pub is_in_scene: bool,
 }
 
 /// A box as a measured position.
@@ -79,11 +87,13 @@ pub struct PairInnovation {
 impl ObservedFix {
     fn of(observation: &Observation, regressor: Option<&Regressor>, e_gnss_m2: Option<f64>) -> Option<Self> {
         let position = observation.fix()?.position;
-        Some(Self {
-            position,
-            variance_m2: fix_variance_m2(observation, regressor, e_gnss_m2),
-            in_plane: regressor.and_then(|regressor| regressor.plane().to_plane_within_range(position)),
-        })
+        let variance_m2 = fix_variance_m2(observation, regressor, e_gnss_m2);
+        let in_plane = regressor.and_then(|regressor| regressor.plane().to_plane_within_range(position));
+        let is_in_scene = regressor.zip(in_plane).is_some_and(|(regressor, point)| {
+            let radius_m = regressor.scene_radius_m().max(LEAST_SCENE_RADIUS_M);
+            point.distance_m(EastNorth::default()) <= radius_m + SCENE_MARGIN_SIGMAS * variance_m2.sqrt()
+        });
+        Some(Self { position, variance_m2, in_plane, is_in_scene })
     }
 }
 
@@ -185,13 +195,14 @@ impl<'a> ObservedPositions<'a> {
     }
 
     /// The source not to use where the two contradict each other: the box if it is unusual, for then its
-    /// stated error rests on no training box; else the fix, for multipath, a frozen receiver and swapped
-    /// coordinates give it errors that no receiver states.
+    /// stated error rests on no training box, and the fix is of the scene; else the fix, for multipath, a
+    /// frozen receiver and swapped coordinates give it errors that no receiver states.
     #[must_use]
     pub fn contradicting_source(&self) -> Option<MeasurementSource> {
         let contradicts = self.innovation().is_some_and(|innovation| innovation.nis > PAIR_GATE);
         let is_unusual =
             contradicts.then(|| self.usable_box().is_some_and(|observed| observed.is_unusual))?;
-        Some(if is_unusual { MeasurementSource::Regressed } else { MeasurementSource::Fix })
+        let is_in_scene = self.fix.is_some_and(|fix| fix.is_in_scene);
+        Some(if is_unusual && is_in_scene { MeasurementSource::Regressed } else { MeasurementSource::Fix })
     }
 }

@@ -125,6 +125,13 @@ impl Regressor {
         self.track_noise
     }
 
+    /// Radius about the plane's origin, the centre of the training positions, that holds these: three of their
+    /// standard deviations per axis, m. Infinite for a model of an earlier format.
+    #[must_use]
+    pub fn scene_radius_m(&self) -> f64 {
+        self.track_noise.map_or(f64::INFINITY, |noise| noise.regression_length_m)
+    }
+
     /// White share of the regression's error variance, 0 to 1, which is independent between boxes; the rest
     /// is the same whenever the target returns to a place.
     #[must_use]

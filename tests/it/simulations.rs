@@ -158,3 +158,28 @@ fn plots_show_every_method_and_count_what_is_outside() {
     evaluate("hybrid.denied");
     assert!(read("error_scale.svg").expect("hybrid has epochs").contains(">hybrid"));
 }
+
+#[test]
+fn gross_errors_of_the_fixes_cost_no_accuracy() {
+    let folder = data_folder();
+    let flags =
+        ["airport", "--samples", "1500", "--test-samples", "600", "--seed", "4001", "--camera-seed", "4001"];
+    let two_step_m = |gross: &str| {
+        simulate(
+            folder.path(),
+            &[&flags[..], &["--gross-fixes", gross, "--gross-fix-error-m", "1000"]].concat(),
+        );
+        let path = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
+        let (train, test, json) = (path("train.csv"), path("test.csv"), path("report.json"));
+        let flags =
+            ["--image-size", "1920x1080", "--gnss-sigma-m", "29.5", "--methods", "projective.two_step"];
+        let files = ["evaluate", "--train", &train, "--test", &test, "--json", &json];
+        run(&[&files[..], &flags].concat());
+        let report = std::fs::read(&json).expect("a report");
+        let report: serde_json::Value = serde_json::from_slice(&report).expect("JSON");
+        report["methods"]["projective.two_step"]["mean_m"].as_f64().unwrap_or_else(|| panic!("{report}"))
+    };
+    let (without_m, with_m) = (two_step_m("0"), two_step_m("0.05"));
+    println!("two-step {without_m:.2} m, with 5 % of the fixes off by 1 km {with_m:.2} m");
+    assert!(with_m < 1.15 * without_m, "{without_m} {with_m}");
+}

@@ -241,6 +241,20 @@ pub struct Limits {
     pub truth_line_positions: usize,
     /// Cameras; more are refused.
     pub cameras: u32,
+    /// Sites; more are refused.
+    pub sites: u32,
+    /// Boxes and fixes of one site that wait for its tracker; beyond, they are dropped.
+    pub site_queue: usize,
+    /// Frames of one site that wait for earlier ones of other cameras; beyond, the oldest is tracked.
+    pub site_frames: usize,
+    /// Boxes of one frame; beyond, they are dropped.
+    pub boxes_per_frame: usize,
+    /// Milliseconds that a frame waits for the rest of its boxes, and for earlier frames of other cameras.
+    pub site_wait_ms: u64,
+    /// World tracks of one site.
+    pub tracks_per_site: usize,
+    /// Events of one site that a reader may continue behind; a slower one loses the oldest.
+    pub site_events: usize,
     /// Samples of one camera; more are refused.
     pub samples_per_camera: u64,
     /// Samples of all cameras; more are refused.
@@ -359,6 +373,13 @@ impl Default for Limits {
             rows_per_evaluation: 100_000,
             truth_line_positions: 1_000,
             cameras: 10_000,
+            sites: 1_000,
+            site_queue: 16_384,
+            site_frames: 1_024,
+            boxes_per_frame: 256,
+            site_wait_ms: 300,
+            tracks_per_site: 1_024,
+            site_events: 4_096,
             samples_per_camera: 10_000_000,
             samples: 100_000_000,
             models_per_camera: 100,
@@ -512,6 +533,15 @@ impl Config {
         for (name, workers) in [("training", &self.training), ("evaluation", &self.evaluation)] {
             anyhow::ensure!(workers.workers >= 1, "{name}.workers must be at least 1");
             anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
+        }
+        for (name, limit) in [
+            ("site_queue", limits.site_queue),
+            ("site_frames", limits.site_frames),
+            ("boxes_per_frame", limits.boxes_per_frame),
+            ("tracks_per_site", limits.tracks_per_site),
+            ("site_events", limits.site_events),
+        ] {
+            anyhow::ensure!(limit >= 1, "limits.{name} must be at least 1");
         }
         anyhow::ensure!(self.limits.page_items >= 1, "limits.page_items must be at least 1");
         // One active version and the one that a training run adds.

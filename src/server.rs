@@ -191,6 +191,9 @@ async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
             Ok(status) => app.metrics.storage(&status),
             Err(error) => tracing::error!(%error, "the maintenance of the store failed"),
         }
+        if let Err(error) = app.site_registry.refresh(&app.store).await {
+            tracing::error!(%error, "cannot look for changed sites");
+        }
         if let Err(error) = app.registry.refresh(&app.store).await {
             tracing::error!(%error, "cannot look for changed cameras");
         }

@@ -53,7 +53,10 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ModelNotFound => (404, code::NOT_FOUND, "There is no such model version"),
         Kind::KeyNotFound => (404, code::NOT_FOUND, "There is no such key"),
         Kind::CameraExists => (409, code::ALREADY_EXISTS, "A camera of that id exists already"),
-        Kind::RevisionMismatch => (412, code::ABORTED, "The camera was changed in the meantime"),
+        Kind::SiteNotFound => (404, code::NOT_FOUND, "There is no such site"),
+        Kind::SiteExists => (409, code::ALREADY_EXISTS, "A site of that id exists already"),
+        Kind::SiteInUse => (409, code::FAILED_PRECONDITION, "The site has cameras"),
+        Kind::RevisionMismatch => (412, code::ABORTED, "The resource was changed in the meantime"),
         Kind::RevisionRequired => {
             (428, code::FAILED_PRECONDITION, "The change needs the revision it is based on")
         }

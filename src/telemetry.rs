@@ -4,4 +4,4 @@ mod logging;
 mod metrics;
 
 pub use logging::{REQUEST_ID, RequestId, start_log};
-pub use metrics::{CloseReason, JobMetrics, Metrics, OpenConnection};
+pub use metrics::{CloseReason, JobMetrics, Metrics, OpenConnection, SiteItemOutcome};

@@ -15,6 +15,8 @@ mod paired_import;
 mod recording;
 mod registry;
 mod samples;
+mod site_registry;
+mod sites;
 mod training;
 
 use std::sync::Arc;
@@ -34,13 +36,15 @@ pub use camera_statuses::CameraStatus;
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream,
-    LostEvents, NotStored, NotStoredReason, TargetUpdate, TrackPoint,
+    LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind, SiteEvents,
+    SiteTracks, StoredSiteEvent, TargetUpdate, TrackPoint, WorldSighting, WorldTrackPoint,
 };
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use samples::{ImportReport, RejectedRow};
+pub use site_registry::{ActiveSite, SiteRegistry};
 pub use training::RunRequest;
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.
@@ -57,6 +61,8 @@ pub struct Parts {
     opened_store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
+    /// Sites, ready to track.
+    pub site_registry: SiteRegistry,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -106,6 +112,8 @@ impl App {
             tracing::info!(models = filled, "stored checksums of model versions of an earlier release");
         }
         registry.refresh(&store).await?;
+        let site_registry = SiteRegistry::new(randomness.clone(), limits.site_events);
+        site_registry.refresh(&store).await?;
         let access = Access::default();
         access.refresh(&store, clock.now()).await?;
         let pairings = Semaphore::new(limits.pairings);
@@ -114,6 +122,7 @@ impl App {
         let parts = Parts {
             opened_store: store,
             registry,
+            site_registry,
             access,
             clock,
             randomness,
@@ -158,6 +167,7 @@ impl App {
             tracing::warn!(%error, "when keys were used last could not be stored");
         }
         self.residuals.close();
+        self.site_registry.close();
         self.tasks.close();
         if tokio::time::timeout(CLOSE_TIME, self.tasks.wait()).await.is_err() {
             tracing::warn!("samples or residuals of live streams were still under way at the end");
@@ -195,6 +205,7 @@ impl std::ops::Deref for App {
 pub const fn store_limits(limits: &Limits) -> StoreLimits {
     StoreLimits {
         cameras: limits.cameras,
+        sites: limits.sites,
         samples_per_camera: limits.samples_per_camera,
         samples: limits.samples,
         models_per_camera: limits.models_per_camera,

@@ -30,7 +30,7 @@ use crate::app::access::Caller;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
-use crate::domain::{CameraId, ReceiverId, TargetId};
+use crate::domain::{CameraId, ReceiverId, SiteId, TargetId};
 use crate::exchange::Format;
 use crate::store::{Store, StoreOptions};
 use crate::telemetry::Metrics;
@@ -155,6 +155,10 @@ fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
 
 fn camera_id(text: &str) -> Result<CameraId, String> {
     CameraId::new(text).map_err(|error| error.to_string())
+}
+
+fn site_id(text: &str) -> Result<SiteId, String> {
+    SiteId::new(text).map_err(|error| error.to_string())
 }
 
 fn receiver_id(text: &str) -> Result<ReceiverId, String> {

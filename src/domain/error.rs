@@ -44,6 +44,12 @@ pub enum ErrorKind {
     KeyNotFound,
     /// A camera of that id exists already.
     CameraExists,
+    /// No such site.
+    SiteNotFound,
+    /// A site of that id exists already.
+    SiteExists,
+    /// The site has cameras.
+    SiteInUse,
     /// `If-Match` names another revision than the stored one.
     RevisionMismatch,
     /// The change needs an `If-Match`.

@@ -14,6 +14,7 @@ mod error;
 mod evaluation;
 mod gnss_error;
 mod job;
+mod live_id;
 mod method;
 mod names;
 mod noise;
@@ -22,6 +23,7 @@ mod receiver;
 mod recipe;
 mod sample;
 mod score;
+mod site;
 mod time;
 mod training;
 
@@ -35,14 +37,16 @@ pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssBiasSigma, GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};
+pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
-pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
+pub use names::{CameraId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use sample::{Sample, SampleCount, StoredSample};
 pub use score::Score;
+pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,

@@ -5,6 +5,7 @@
 
 pub mod clock_offset;
 pub mod drift_detector;
+pub mod frame_assembler;
 pub mod observed;
 pub mod pairing;
 pub mod target_track;

@@ -10,13 +10,16 @@ pub mod client;
 mod convert;
 mod fusion;
 mod keys;
+mod mask;
 mod models;
 mod outbox;
 mod pages;
 mod samples;
+mod sites;
 mod statuses;
 mod stream;
 mod training;
+mod world_tracks;
 
 use futures_util::FutureExt as _;
 use hyper::Response;
@@ -37,6 +40,7 @@ use proto::fusion_service_server::FusionServiceServer;
 use proto::key_service_server::KeyServiceServer;
 use proto::model_service_server::ModelServiceServer;
 use proto::sample_service_server::SampleServiceServer;
+use proto::site_service_server::SiteServiceServer;
 use proto::training_service_server::TrainingServiceServer;
 
 pub use statuses::{explain, trailers};
@@ -64,6 +68,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
     let fusion = FusionServiceServer::new(fusion::Fusion::new(app, shutdown)).max_decoding_message_size(most);
     let keys = KeyServiceServer::new(keys::Keys::new(app)).max_decoding_message_size(most);
     let audit = AuditServiceServer::new(audit::Audit::new(app)).max_decoding_message_size(most);
+    let sites = SiteServiceServer::new(sites::Sites::new(app, shutdown)).max_decoding_message_size(most);
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
@@ -83,6 +88,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .add_service(fusion)
         .add_service(keys)
         .add_service(audit)
+        .add_service(sites)
         .prepare()
 }
 
@@ -105,7 +111,7 @@ pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
 }
 
 /// The services whose health is reported; the empty name is the server as a whole.
-const HEALTHY: [&str; 8] = [
+const HEALTHY: [&str; 9] = [
     "",
     CameraServiceServer::<()>::NAME,
     SampleServiceServer::<()>::NAME,
@@ -114,6 +120,7 @@ const HEALTHY: [&str; 8] = [
     FusionServiceServer::<()>::NAME,
     KeyServiceServer::<()>::NAME,
     AuditServiceServer::<()>::NAME,
+    SiteServiceServer::<()>::NAME,
 ];
 
 /// Serving until the end begins; then watchers get a last status, and their streams end.
@@ -154,6 +161,7 @@ mod tests {
             "FusionService",
             "KeyService",
             "AuditService",
+            "SiteService",
         ];
         assert_eq!(names, own);
     }

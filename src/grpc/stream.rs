@@ -291,6 +291,7 @@ fn answer_of(seq: u64, item: ItemResult) -> proto::StreamAnswer {
         track: item.track.map(|point| point.as_ref().into()),
         flags,
         lost_answers: 0,
+        world_track_id: item.world_track.map(|id| id.to_string()),
     }
 }
 

@@ -14,7 +14,7 @@ use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
 use crate::admission::ClientAddress;
 use crate::domain::{
-    CameraId, Durability, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time,
+    CameraId, Durability, Error, ErrorKind, EvaluationId, LiveId, Result, RunId, SiteId, TargetId, parse_time,
 };
 use crate::exchange::{Cursor, read_cursor, wire};
 
@@ -40,6 +40,32 @@ impl<S: Send + Sync> FromRequestParts<S> for CameraPath {
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         Ok(Self(camera_of(&path::<CameraSegment, S>(parts, state).await?.camera)?))
+    }
+}
+
+/// A site of the path. What is no slug names no site.
+pub(super) struct SitePath(pub(super) SiteId);
+
+impl<S: Send + Sync> FromRequestParts<S> for SitePath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        Ok(Self(site_of(&path::<SiteSegment, S>(parts, state).await?.site)?))
+    }
+}
+
+/// A world track of the path. What is no id of a track names none that there is.
+pub(super) struct WorldTrackPath(pub(super) SiteId, pub(super) LiveId);
+
+impl<S: Send + Sync> FromRequestParts<S> for WorldTrackPath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        let WorldTrackSegments { site, track } = path(parts, state).await?;
+        let track = track.parse().map_err(|_: Error| {
+            Error::refused(ErrorKind::TrackNotFound, "that is not the id of a world track")
+        })?;
+        Ok(Self(site_of(&site)?, track))
     }
 }
 
@@ -101,6 +127,17 @@ struct CameraSegment {
 }
 
 #[derive(Deserialize)]
+struct SiteSegment {
+    site: String,
+}
+
+#[derive(Deserialize)]
+struct WorldTrackSegments {
+    site: String,
+    track: String,
+}
+
+#[derive(Deserialize)]
 struct RunSegments {
     camera: String,
     run: String,
@@ -139,6 +176,14 @@ pub(super) fn camera_of(id: &str) -> Result<CameraId> {
     CameraId::new(id).map_err(|_| {
         let shown: String = id.chars().take(80).collect();
         Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera"))
+    })
+}
+
+/// A site by its id in a path, parameter or body.
+pub(super) fn site_of(id: &str) -> Result<SiteId> {
+    SiteId::new(id).map_err(|_| {
+        let shown: String = id.chars().take(80).collect();
+        Error::refused(ErrorKind::SiteNotFound, format!("`{shown}` is not the id of a site"))
     })
 }
 

@@ -11,11 +11,13 @@ mod camera_statuses;
 mod cameras;
 mod console;
 mod description;
+mod etag;
 mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
 mod keys;
+mod merge_patch;
 mod models;
 mod pairings;
 mod parts;
@@ -27,9 +29,11 @@ mod service;
 mod session;
 #[cfg(test)]
 mod tests;
+mod sites;
 mod tracks;
 mod training_runs;
 mod wire;
+mod world_tracks;
 
 use std::sync::Arc;
 
@@ -132,6 +136,8 @@ fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
         .merge(camera_statuses::routes())
+        .merge(sites::routes())
+        .merge(world_tracks::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())

@@ -2,7 +2,7 @@
 
 use sqlx::error::DatabaseError;
 
-use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, KeyId, RunId};
+use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, KeyId, RunId, SiteId};
 
 /// A row that does not hold what was written: another program or the disk has changed it.
 #[derive(Debug, thiserror::Error)]
@@ -65,6 +65,15 @@ pub(super) fn closed() -> Error {
 
 pub(super) fn no_camera(id: &CameraId) -> Error {
     Error::refused(ErrorKind::CameraNotFound, format!("no camera has the id {id}"))
+}
+
+pub(super) fn no_site(id: &SiteId) -> Error {
+    Error::refused(ErrorKind::SiteNotFound, format!("no site has the id {id}"))
+}
+
+/// The refusal of a camera's profile that names a site.
+pub(super) fn unknown_site(id: &SiteId) -> Error {
+    Error::invalid("site", format!("is {id}, and no site has that id; create the site first"))
 }
 
 pub(super) fn no_run(id: RunId) -> Error {

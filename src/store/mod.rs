@@ -28,6 +28,7 @@ mod row_decoder;
 mod runs;
 mod sample_table;
 mod samples;
+mod sites;
 mod space;
 #[cfg(test)]
 mod tests;

@@ -26,6 +26,8 @@ const ROOM_BYTES: u64 = 1 << 20;
 pub struct StoreLimits {
     /// Cameras; more are refused.
     pub cameras: u32,
+    /// Sites; more are refused.
+    pub sites: u32,
     /// Samples of one camera; more are refused.
     pub samples_per_camera: u64,
     /// Samples of all cameras; more are refused.
@@ -50,6 +52,7 @@ impl Default for StoreLimits {
     fn default() -> Self {
         Self {
             cameras: u32::MAX,
+            sites: u32::MAX,
             samples_per_camera: u64::MAX,
             samples: u64::MAX,
             models_per_camera: u32::MAX,

@@ -22,6 +22,7 @@ pub struct Metrics {
     connections: ConnectionMetrics,
     requests: RequestMetrics,
     live: LiveMetrics,
+    sites: SiteMetrics,
     storage: StorageMetrics,
 }
 
@@ -63,6 +64,44 @@ struct LiveMetrics {
     item_errors: Counter,
     answers_lost: Counter,
     cameras_moved: Counter,
+}
+
+#[derive(Clone)]
+struct SiteMetrics {
+    items: [(SiteItemOutcome, Counter); SiteItemOutcome::ALL.len()],
+    tracks: Gauge,
+    tracks_started: Counter,
+    handovers: Counter,
+    events_lost: Counter,
+}
+
+/// What became of a box or fix that was handed to the tracker of a site.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SiteItemOutcome {
+    /// It went into the tracker.
+    Tracked,
+    /// A later frame had been tracked before.
+    Late,
+    /// The queue, or its frame, was full.
+    Overflow,
+    /// It is beyond the range of the site's plane.
+    OutOfRange,
+}
+
+impl SiteItemOutcome {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Tracked, Self::Late, Self::Overflow, Self::OutOfRange];
+
+    /// The label in the metrics.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Tracked => "tracked",
+            Self::Late => "late",
+            Self::Overflow => "overflow",
+            Self::OutOfRange => "out_of_range",
+        }
+    }
 }
 
 #[derive(Clone)]
@@ -156,6 +195,7 @@ impl Metrics {
             connections: ConnectionMetrics::register(&registry),
             requests: RequestMetrics::register(&registry),
             live: LiveMetrics::register(&registry),
+            sites: SiteMetrics::register(&registry),
             storage: StorageMetrics::register(&registry),
             handle: registry.recorder.handle(),
         }
@@ -221,6 +261,34 @@ impl Metrics {
     /// A camera was found to have moved.
     pub fn camera_moved(&self) {
         self.live.cameras_moved.increment(1);
+    }
+
+    /// A box or fix was handed to the tracker of a site.
+    pub fn site_item(&self, outcome: SiteItemOutcome) {
+        for (known, counter) in &self.sites.items {
+            counter.increment(u64::from(*known == outcome));
+        }
+    }
+
+    /// A world track was confirmed.
+    pub fn world_track_started(&self) {
+        self.sites.tracks_started.increment(1);
+        self.sites.tracks.increment(1.0);
+    }
+
+    /// A world track has ended, or was merged into another.
+    pub fn world_track_ended(&self) {
+        self.sites.tracks.decrement(1.0);
+    }
+
+    /// A camera sees a target that another camera saw before.
+    pub fn handed_over(&self) {
+        self.sites.handovers.increment(1);
+    }
+
+    /// Events of a site were lost to a slow reader.
+    pub fn site_events_lost(&self, events: u64) {
+        self.sites.events_lost.increment(events);
     }
 
     /// How much is stored, and whether more can be.
@@ -359,6 +427,25 @@ impl LiveMetrics {
                 "Answers of live streams that slow readers lost",
             ),
             cameras_moved: registry.counter("sightfix_cameras_moved_total", "Alarms that a camera was moved"),
+        }
+    }
+}
+
+impl SiteMetrics {
+    fn register(registry: &Registry) -> Self {
+        let items = |outcome: SiteItemOutcome| {
+            let help = "Boxes and fixes handed to the trackers of sites, by outcome";
+            (outcome, registry.labelled("sightfix_site_items_total", help, "outcome", outcome.as_str()))
+        };
+        Self {
+            items: SiteItemOutcome::ALL.map(items),
+            tracks: registry.gauge("sightfix_world_tracks", "Confirmed world tracks of all sites"),
+            tracks_started: registry
+                .counter("sightfix_world_tracks_started_total", "World tracks that were confirmed"),
+            handovers: registry
+                .counter("sightfix_world_track_handovers_total", "Targets handed over from camera to camera"),
+            events_lost: registry
+                .counter("sightfix_site_events_lost_total", "Events of sites that slow readers lost"),
         }
     }
 }

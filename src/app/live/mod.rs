@@ -9,9 +9,12 @@ mod acknowledgements;
 mod alarms;
 pub(super) mod camera;
 mod drift;
+mod event_log;
+mod history;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
+mod site;
 mod stream;
 mod sync;
 mod tracks;
@@ -27,7 +30,7 @@ use super::App;
 use super::fusion::fuse_observed;
 use super::registry::ActiveCamera;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, Observation, Result, TargetId, TimeBounds,
+    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, Result, TargetId, TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
@@ -37,6 +40,11 @@ pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub(super) use retraining::RetrainSchedule;
+pub(super) use site::SiteLive;
+pub use site::{
+    LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
+    WorldSighting, WorldTrackPoint,
+};
 pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};
 pub use tracks::TrackPoint;
@@ -48,6 +56,8 @@ pub struct ItemResult {
     pub fused: Option<FusedFix>,
     /// The target's track with it; `None` without a target or anything usable.
     pub track: Option<Arc<TrackPoint>>,
+    /// The target's world track in the camera's site, as of the latest frame that was tracked there.
+    pub world_track: Option<LiveId>,
 }
 
 /// What happens in a camera's view, since the server was started.
@@ -100,7 +110,8 @@ impl App {
         RowRules { time_bounds: self.live_time_bounds(), image_size: camera.image_size }
     }
 
-    /// Answers an observation, feeds its target's track and compares box and fix.
+    /// Answers an observation, feeds its target's track and the tracker of the camera's site, and compares box
+    /// and fix.
     ///
     /// # Errors
     /// `InvalidArgument` naming `time` for a time ahead of the server's clock; `Overloaded` if the camera
@@ -122,7 +133,10 @@ impl App {
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(self.clock.now());
-        let Some(target_id) = observation.target_id() else { return Ok(ItemResult { fused, track: None }) };
+        let world_track = self.feed_site(camera, observation, &observed);
+        let Some(target_id) = observation.target_id() else {
+            return Ok(ItemResult { fused, track: None, world_track });
+        };
         let seen = TargetObservation { target_id, observed, model, now };
         let (track, residual) = camera.live.tracks.update(&camera.id, &seen, &self.limits)?;
         if let Some(point) = &track {
@@ -136,7 +150,7 @@ impl App {
         if let Some(residual) = residual {
             self.hand_over(camera, residual);
         }
-        Ok(ItemResult { fused, track })
+        Ok(ItemResult { fused, track, world_track })
     }
 
     /// What happens in a camera's view.

@@ -1,0 +1,101 @@
+//! What live observations hand to the tracker of their camera's site.
+
+use jiff::Timestamp;
+use tokio::sync::mpsc;
+
+use super::task;
+use crate::app::App;
+use crate::app::registry::ActiveCamera;
+use crate::domain::{CameraId, LiveId, Observation, TargetId};
+use crate::fusion::observed::ObservedPositions;
+use crate::geo::{PlaneCovariance, Position};
+use crate::telemetry::SiteItemOutcome;
+
+/// One measured position of one target.
+#[derive(Debug)]
+pub(super) struct SiteItem {
+    /// The camera whose observation it was.
+    pub(super) camera: CameraId,
+    pub(super) time: Timestamp,
+    pub(super) target_id: Option<TargetId>,
+    pub(super) position: Position,
+    pub(super) source: ItemSource,
+}
+
+/// What measured a position.
+#[derive(Debug)]
+pub(super) enum ItemSource {
+    /// A box, through the camera's model.
+    Box {
+        /// Covariance of the error, m2, axes east and north of the model's plane, which those of the site's plane
+        /// are to within its range.
+        covariance_m2: PlaneCovariance,
+        /// Origin of the model's plane.
+        model_origin: Position,
+    },
+    /// A receiver.
+    Fix {
+        /// Error variance per axis, m2.
+        variance_m2: f64,
+    },
+}
+
+impl App {
+    /// Hands what an observation measured to the tracker of its camera's site, and returns the world track of
+    /// its target as of the latest frame. A full queue drops it, counted.
+    pub(in crate::app::live) fn feed_site(
+        &self,
+        camera: &ActiveCamera,
+        observation: &Observation,
+        observed: &ObservedPositions<'_>,
+    ) -> Option<LiveId> {
+        let site = self.site_registry.get(camera.site.as_ref()?)?;
+        let queue = site.live.queue.get_or_init(|| {
+            let (sender, receiver) = mpsc::channel(self.limits.site_queue.max(1));
+            let task = task::run(site.live.clone(), receiver, self.site_resources());
+            self.tasks.spawn(task);
+            sender
+        });
+        for item in items_of(camera, observation, observed) {
+            if queue.try_send(item).is_err() {
+                self.metrics.site_item(SiteItemOutcome::Overflow);
+            }
+        }
+        site.live.track_of(&camera.id, observation.target_id()?)
+    }
+
+    fn site_resources(&self) -> task::SiteResources {
+        task::SiteResources {
+            clock: self.clock.clone(),
+            limits: self.limits.clone(),
+            metrics: self.metrics.clone(),
+        }
+    }
+}
+
+/// The box and the fix of an observation, each if it gives a position. A fix without a target names no receiver,
+/// so nothing can be tracked by it.
+fn items_of<'a>(
+    camera: &'a ActiveCamera,
+    observation: &'a Observation,
+    observed: &'a ObservedPositions<'_>,
+) -> impl Iterator<Item = SiteItem> + 'a {
+    let item = |position, source| SiteItem {
+        camera: camera.id.clone(),
+        time: observation.time(),
+        target_id: observation.target_id().cloned(),
+        position,
+        source,
+    };
+    let by_box = observed.usable_box().zip(observed.plane).map(|(observed_box, plane)| {
+        let regression = &observed_box.independent;
+        let source = ItemSource::Box {
+            covariance_m2: regression.covariance.scaled(regression.normal_scale()),
+            model_origin: plane.origin(),
+        };
+        item(plane.to_position(regression.regressed), source)
+    });
+    let fix = observed.fix.filter(|_| observation.target_id().is_some());
+    let by_fix = fix.map(|fix| item(fix.position, ItemSource::Fix { variance_m2: fix.variance_m2 }));
+    by_box.into_iter().chain(by_fix)
+}

@@ -1,4 +1,4 @@
-//! Measured positions, confidences, two-step fusion, pairing, tracks and drift detection: pure functions and
+//! Measured positions, confidences, two-step fusion, pairing, tracks, world tracks and drift detection: pure functions and
 //! values.
 //!
 //! What never happens here: I/O, clocks, randomness, allocation that an outside client decides.
@@ -11,3 +11,4 @@ pub mod pairing;
 pub mod target_track;
 pub mod track;
 pub mod two_step;
+pub mod world;

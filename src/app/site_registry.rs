@@ -6,7 +6,7 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 use tokio::sync::Mutex;
 
-use super::live::SiteLive;
+use super::live::site::state::SiteLive;
 use crate::clock::Randomness;
 use crate::domain::{ErrorKind, Result, Revision, Site, SiteId, SiteKey};
 use crate::store::Store;

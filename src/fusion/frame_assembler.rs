@@ -116,9 +116,9 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
     }
 
     fn is_late(&self, source: &S, time: Timestamp) -> bool {
-        self.released
-            .as_ref()
-            .is_some_and(|(released, sources)| time < *released || (time == *released && sources.contains(source)))
+        self.released.as_ref().is_some_and(|(released, sources)| {
+            time < *released || (time == *released && sources.contains(source))
+        })
     }
 
     /// The next frame that waits for nothing any more, in the order of times.

@@ -13,7 +13,9 @@ pub(super) fn named_fields<const N: usize>(
 ) -> Result<impl Fn(&str) -> bool> {
     let paths: Vec<String> = match mask {
         Some(mask) => mask.paths,
-        None => fields.into_iter().zip(has).filter(|(_, has)| *has).map(|(field, _)| field.to_owned()).collect(),
+        None => {
+            fields.into_iter().zip(has).filter(|(_, has)| *has).map(|(field, _)| field.to_owned()).collect()
+        }
     };
     let unknown = |path: &String| path != "*" && !fields.contains(&path.as_str());
     if let Some(index) = paths.iter().position(unknown) {

@@ -37,7 +37,10 @@ impl SiteService for Sites {
         .await
     }
 
-    async fn get_site(&self, request: tonic::Request<proto::GetSiteRequest>) -> Reply<proto::GetSiteResponse> {
+    async fn get_site(
+        &self,
+        request: tonic::Request<proto::GetSiteRequest>,
+    ) -> Reply<proto::GetSiteResponse> {
         answer(&self.app, request, |app, asked| async move {
             let site = app.site(&site_id(&asked.site_id)?).await?;
             Ok(proto::GetSiteResponse { site: Some(site.into()) })

@@ -22,8 +22,9 @@ pub(super) mod live_id {
 
     /// What is no id of a track names none that there is.
     pub(in crate::grpc) fn of_track(text: &str) -> Result<LiveId> {
-        text.parse()
-            .map_err(|_: Error| Error::refused(ErrorKind::TrackNotFound, "that is not the id of a world track"))
+        text.parse().map_err(|_: Error| {
+            Error::refused(ErrorKind::TrackNotFound, "that is not the id of a world track")
+        })
     }
 
     /// The event to continue behind, if one is named.
@@ -86,10 +87,12 @@ impl From<StoredSiteEvent> for proto::WatchTracksResponse {
                 from_camera_id: from.to_string(),
                 to_camera_id: to.to_string(),
             }),
-            SiteEventKind::Identified { track, target_id } => Event::Identified(proto::WorldTrackIdentified {
-                track_id: track.to_string(),
-                target_id: target_id.to_string(),
-            }),
+            SiteEventKind::Identified { track, target_id } => {
+                Event::Identified(proto::WorldTrackIdentified {
+                    track_id: track.to_string(),
+                    target_id: target_id.to_string(),
+                })
+            }
             SiteEventKind::Merged { track, ended } => Event::Merged(proto::WorldTrackMerged {
                 track_id: track.to_string(),
                 ended_track_id: ended.to_string(),
@@ -98,11 +101,7 @@ impl From<StoredSiteEvent> for proto::WatchTracksResponse {
                 Event::Ended(proto::WorldTrackEnded { track_id: track.to_string() })
             }
         };
-        Self {
-            event_id: stored.id.to_string(),
-            time: Some(timestamp(stored.event.time)),
-            event: Some(event),
-        }
+        Self { event_id: stored.id.to_string(), time: Some(timestamp(stored.event.time)), event: Some(event) }
     }
 }
 

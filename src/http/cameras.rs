@@ -18,9 +18,7 @@ use super::problem::{ApiResult, Problem};
 use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, created, empty, json};
 use crate::app::App;
-use crate::domain::{
-    self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass,
-};
+use crate::domain::{self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass};
 use crate::exchange::wire::parse_json;
 use crate::exchange::write_cursor;
 
@@ -455,4 +453,3 @@ async fn delete_camera(
     app.delete_camera(&id, etag::optional(&headers)?).await?;
     Ok(empty())
 }
-

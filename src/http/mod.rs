@@ -27,9 +27,9 @@ mod samples;
 mod server_info;
 mod service;
 mod session;
+mod sites;
 #[cfg(test)]
 mod tests;
-mod sites;
 mod tracks;
 mod training_runs;
 mod wire;

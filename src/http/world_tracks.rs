@@ -210,7 +210,11 @@ fn answer(headers: &HeaderMap, points: &[Arc<WorldTrackPoint>], last_event: Opti
         (WorldTracks = "application/json"), (WorldTrackFeatures = "application/geo+json")
     )))
 )]
-async fn list_world_tracks(CallerApp(app): CallerApp, SitePath(id): SitePath, headers: HeaderMap) -> ApiResult {
+async fn list_world_tracks(
+    CallerApp(app): CallerApp,
+    SitePath(id): SitePath,
+    headers: HeaderMap,
+) -> ApiResult {
     let tracks = app.world_tracks(&id).await?;
     answer(&headers, &tracks.points, Some(tracks.last_event))
 }

@@ -83,7 +83,9 @@ impl Store {
         limit: u32,
     ) -> Result<Vec<Camera>> {
         let query = match site {
-            None => sqlx::query(concat!("SELECT ", columns!(), " FROM cameras WHERE id > ? ORDER BY id LIMIT ?")),
+            None => {
+                sqlx::query(concat!("SELECT ", columns!(), " FROM cameras WHERE id > ? ORDER BY id LIMIT ?"))
+            }
             Some(site) => sqlx::query(concat!(
                 "SELECT ",
                 columns!(),

@@ -134,10 +134,8 @@ impl Store {
         let site = find_site(&mut *transaction, id).await?;
         check_version(&site, expected)?;
         if site.cameras > 0 {
-            let message = format!(
-                "the site has {} camera(s); give them another site, or none, first",
-                site.cameras
-            );
+            let message =
+                format!("the site has {} camera(s); give them another site, or none, first", site.cameras);
             return Err(Error::refused(ErrorKind::SiteInUse, message));
         }
         sqlx::query("DELETE FROM sites WHERE id = ?")
@@ -171,7 +169,8 @@ async fn check_limit(connection: &mut SqliteConnection, limit: u32) -> Result<()
     let sites: i64 =
         sqlx::query_scalar("SELECT count(*) FROM sites").fetch_one(connection).await.map_err(failed)?;
     if sites > i64::from(limit) {
-        let message = format!("limits.sites is {limit}; delete a site that is no longer needed, or raise the limit");
+        let message =
+            format!("limits.sites is {limit}; delete a site that is no longer needed, or raise the limit");
         return Err(Error::refused(ErrorKind::InsufficientStorage, message));
     }
     Ok(())
@@ -208,10 +207,16 @@ fn read_site(row: &SqliteRow) -> Result<Site> {
     let labels = fields.parse(serde_json::from_str::<BTreeMap<String, String>>)?;
     let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
     let origin = longitude_deg.zip(latitude_deg);
-    let origin =
-        fields.checked(origin.map(|(east, north)| Position::new(east, north)).transpose())?;
+    let origin = fields.checked(origin.map(|(east, north)| Position::new(east, north)).transpose())?;
     let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
     let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
     let cameras = fields.count()?;
-    Ok(Site { key, profile: NewSite { id, display_name, labels, origin }, revision, created_at, updated_at, cameras })
+    Ok(Site {
+        key,
+        profile: NewSite { id, display_name, labels, origin },
+        revision,
+        created_at,
+        updated_at,
+        cameras,
+    })
 }

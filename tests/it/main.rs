@@ -26,6 +26,7 @@ mod power_cut;
 mod promotion;
 mod replay;
 mod simulations;
+mod sites;
 mod storage;
 mod story;
 mod stream;

@@ -14,7 +14,7 @@ mod history;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
-mod site;
+pub(super) mod site;
 mod stream;
 mod sync;
 mod tracks;
@@ -40,7 +40,6 @@ pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub(super) use retraining::RetrainSchedule;
-pub(super) use site::SiteLive;
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
     WorldSighting, WorldTrackPoint,

@@ -1,44 +1,14 @@
 //! What live observations hand to the tracker of their camera's site.
 
-use jiff::Timestamp;
 use tokio::sync::mpsc;
 
+use super::item::{ItemSource, SiteItem};
 use super::task;
 use crate::app::App;
 use crate::app::registry::ActiveCamera;
-use crate::domain::{CameraId, LiveId, Observation, TargetId};
+use crate::domain::{LiveId, Observation};
 use crate::fusion::observed::ObservedPositions;
-use crate::geo::{PlaneCovariance, Position};
 use crate::telemetry::SiteItemOutcome;
-
-/// One measured position of one target.
-#[derive(Debug)]
-pub(super) struct SiteItem {
-    /// The camera whose observation it was.
-    pub(super) camera: CameraId,
-    pub(super) time: Timestamp,
-    pub(super) target_id: Option<TargetId>,
-    pub(super) position: Position,
-    pub(super) source: ItemSource,
-}
-
-/// What measured a position.
-#[derive(Debug)]
-pub(super) enum ItemSource {
-    /// A box, through the camera's model.
-    Box {
-        /// Covariance of the error, m2, axes east and north of the model's plane, which those of the site's plane
-        /// are to within its range.
-        covariance_m2: PlaneCovariance,
-        /// Origin of the model's plane.
-        model_origin: Position,
-    },
-    /// A receiver.
-    Fix {
-        /// Error variance per axis, m2.
-        variance_m2: f64,
-    },
-}
 
 impl App {
     /// Hands what an observation measured to the tracker of its camera's site, and returns the world track of

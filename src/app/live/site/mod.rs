@@ -5,71 +5,23 @@
 
 mod events;
 mod feed;
+mod item;
 mod published;
+mod reader;
+pub(in crate::app) mod state;
 mod task;
 mod tracker;
 
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::Arc;
 
-use tokio::sync::mpsc;
-use tokio_util::sync::CancellationToken;
-
-use self::feed::SiteItem;
-use self::published::PublishedTracks;
-use super::event_log::EventLog;
 use super::sync::lock;
 use crate::app::App;
 use crate::app::site_registry::ActiveSite;
-use crate::domain::{CameraId, Error, ErrorKind, LiveId, Result, SiteId, TargetId};
-use crate::geo::Position;
+use crate::domain::{Error, ErrorKind, LiveId, Result, SiteId};
 
-pub use events::{LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, StoredSiteEvent};
+pub use events::{SiteEvent, SiteEventKind};
 pub use published::{WorldSighting, WorldTrackPoint};
-
-/// The state in memory of one site that exists, from its creation (or the start of the server) to its deletion.
-pub(in crate::app) struct SiteLive {
-    /// Of the ids of tracks and events.
-    epoch: u32,
-    /// Origin of the plane, if the operator states it.
-    origin: Mutex<Option<Position>>,
-    /// The way to the task, which starts with the first item.
-    queue: OnceLock<mpsc::Sender<SiteItem>>,
-    tracks: Mutex<PublishedTracks>,
-    events: Arc<EventLog<SiteEvent>>,
-    ended: CancellationToken,
-}
-
-impl SiteLive {
-    pub(in crate::app) fn new(epoch: u32, events: usize) -> Arc<Self> {
-        Arc::new(Self {
-            epoch,
-            origin: Mutex::default(),
-            queue: OnceLock::new(),
-            tracks: Mutex::default(),
-            events: Arc::new(EventLog::new(events)),
-            ended: CancellationToken::new(),
-        })
-    }
-
-    /// Changes the origin of the plane; tracks start again where it differs.
-    pub(in crate::app) fn set_origin(&self, origin: Option<Position>) {
-        *lock(&self.origin) = origin;
-    }
-
-    /// Ends the task and the readers of a site that is deleted, or of a server that ends.
-    pub(in crate::app) fn end(&self) {
-        self.ended.cancel();
-    }
-
-    const fn id_of(&self, number: u64) -> LiveId {
-        LiveId { epoch: self.epoch, number }
-    }
-
-    /// The world track of which a camera's tracker saw the target lately.
-    pub(super) fn track_of(&self, camera: &CameraId, target_id: &TargetId) -> Option<LiveId> {
-        lock(&self.tracks).track_of(camera, target_id)
-    }
-}
+pub use reader::{LossReason, LostSiteEvents, SiteEvents, StoredSiteEvent};
 
 /// The tracks of a site at one instant.
 #[derive(Debug)]

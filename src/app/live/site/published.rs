@@ -44,7 +44,9 @@ impl WorldTrackPoint {
 
     /// The tracker ids under which cameras see the target, with the camera of each.
     fn tracker_ids(&self) -> impl Iterator<Item = (&CameraId, &TargetId)> {
-        self.sightings.iter().filter_map(|sighting| Some((&sighting.camera_id, sighting.tracker_id.as_ref()?)))
+        self.sightings
+            .iter()
+            .filter_map(|sighting| Some((&sighting.camera_id, sighting.tracker_id.as_ref()?)))
     }
 }
 

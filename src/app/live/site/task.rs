@@ -6,8 +6,8 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 
-use super::SiteLive;
-use super::feed::SiteItem;
+use super::item::SiteItem;
+use super::state::SiteLive;
 use super::tracker::SiteTracker;
 use crate::clock::Clock;
 use crate::config::Limits;

@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::SiteLive;
 use super::events::{SiteEvent, SiteEventKind};
-use super::feed::{ItemSource, SiteItem};
+use super::item::{ItemSource, SiteItem};
 use super::published::{WorldSighting, WorldTrackPoint};
+use super::state::SiteLive;
 use crate::app::live::sync::lock;
 use crate::config::Limits;
 use crate::domain::{CameraId, LiveId, ReceiverId, TargetId};
@@ -188,7 +188,8 @@ impl SiteTracker {
             ItemSource::Box { model_origin, .. } => Some(*model_origin),
             ItemSource::Fix { .. } => None,
         };
-        let holds = |active: &ActiveTracker| active.tracker.plane().to_plane_within_range(first.position).is_some();
+        let holds =
+            |active: &ActiveTracker| active.tracker.plane().to_plane_within_range(first.position).is_some();
         match &self.active {
             Some(active) if holds(active) => return true,
             // A fix that was wrong by far must not keep the boxes out.
@@ -225,7 +226,8 @@ impl SiteTracker {
         let mut detections = Vec::with_capacity(items.len());
         for item in items {
             let detection = detection_of(item, &plane, carries);
-            let outcome = if detection.is_some() { SiteItemOutcome::Tracked } else { SiteItemOutcome::OutOfRange };
+            let outcome =
+                if detection.is_some() { SiteItemOutcome::Tracked } else { SiteItemOutcome::OutOfRange };
             self.metrics.site_item(outcome);
             detections.extend(detection);
         }

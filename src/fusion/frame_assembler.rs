@@ -125,14 +125,14 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
     pub fn release(&mut self, now: Duration) -> Option<AssembledFrame<S, T>> {
         let wait = self.limits.wait;
         self.pacing.retain(|_, clock| now.saturating_sub(clock.last_item_at) < wait);
-        let entry = self.waiting.first_entry()?;
-        let (time, source) = entry.key();
+        let ((time, source), frame) = self.waiting.first_key_value()?;
         let has_passed = |(pacing, clock): (&S, &SourceClock)| {
             // Items of the same frame come one after the other, so a source's own frame is open until its next.
             clock.latest > *time || (clock.latest == *time && pacing != source)
         };
-        let has_waited = now.saturating_sub(entry.get().since) >= wait;
-        if !has_waited && self.waiting_is_within_limit() && !self.pacing.iter().all(has_passed) {
+        let has_waited = now.saturating_sub(frame.since) >= wait;
+        let is_within_limit = self.waiting.len() <= self.limits.frames;
+        if !has_waited && is_within_limit && !self.pacing.iter().all(has_passed) {
             return None;
         }
         let ((time, source), frame) = self.waiting.pop_first()?;
@@ -141,10 +141,6 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
             released => *released = Some((time, vec![source.clone()])),
         }
         Some(AssembledFrame { source, time, items: frame.items })
-    }
-
-    fn waiting_is_within_limit(&self) -> bool {
-        self.waiting.len() <= self.limits.frames
     }
 
     /// Whether no frame waits.

@@ -57,7 +57,7 @@ pub struct SiteEvents {
     reader: EventReader<SiteEvent>,
     /// The loss to tell of first.
     restarted: Option<LostSiteEvents>,
-    /// Why events are missing, if they are; a reader that once caught up is too slow.
+    /// Why events are missing, if they are: a reader that has read one is too slow for the next.
     reason: LossReason,
     metrics: Metrics,
 }
@@ -76,7 +76,8 @@ impl SiteEvents {
             events: None,
             reason: LossReason::Restarted,
         });
-        Self { reader: live.events.reader(number), live, restarted, reason: LossReason::TooOld, metrics }
+        let reason = if after.is_some() { LossReason::TooOld } else { LossReason::TooSlow };
+        Self { reader: live.events.reader(number), live, restarted, reason, metrics }
     }
 
     /// The next event, or what was lost before it; `None` once the site is deleted. Cancelling the wait loses

@@ -18,7 +18,7 @@ use crate::fusion::world::{
     CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
     WorldTracker,
 };
-use crate::geo::{LocalPlane, PlaneCovariance, Position};
+use crate::geo::{LocalPlane, PlaneCovariance};
 use crate::telemetry::{Metrics, SiteItemOutcome};
 
 /// Positions of a track are announced at least this far apart in time; readers follow people, not frames.
@@ -357,4 +357,106 @@ fn detection_of(
         // The maps of a site's cameras are not fitted together, so what their errors have in common is unknown.
         common_covariance_m2: PlaneCovariance::default(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geo::Position;
+
+    const START_S: i64 = 1_800_000_000;
+
+    struct Site {
+        live: Arc<SiteLive>,
+        tracker: SiteTracker,
+        now: Duration,
+    }
+
+    impl Site {
+        fn new() -> Self {
+            let live = SiteLive::new(1, 100);
+            let tracker = SiteTracker::new(live.clone(), Limits::default(), Metrics::new());
+            Self { live, tracker, now: Duration::ZERO }
+        }
+
+        /// A box of a target at the origin of its camera's model, each a tenth of a second after the one before.
+        fn see(&mut self, tracker_id: &str, ms: i64) {
+            self.now += Duration::from_millis(100);
+            let origin = Position::new(8.0, 47.0).expect("valid");
+            let item = SiteItem {
+                camera: CameraId::new("a").expect("a slug"),
+                time: Timestamp::from_millisecond(1_000 * START_S + ms).expect("in range"),
+                target_id: Some(TargetId::new(tracker_id).expect("a name")),
+                position: origin,
+                source: ItemSource::Box {
+                    covariance_m2: PlaneCovariance::isotropic(0.25),
+                    model_origin: origin,
+                },
+            };
+            self.tracker.push(item, self.now);
+            self.tracker.advance(self.now);
+        }
+
+        fn numbers(&self) -> Vec<u64> {
+            lock(&self.live.tracks).latest().iter().map(|point| point.id.number).collect()
+        }
+
+        fn wait(&mut self, time: Duration) {
+            self.now += time;
+            self.tracker.advance(self.now);
+        }
+    }
+
+    #[test]
+    fn a_track_ends_by_the_monotonic_clock_where_nothing_comes() {
+        let mut site = Site::new();
+        (0..10).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [1]);
+        site.wait(Duration::from_secs(1));
+        assert_eq!(site.numbers(), [1], "it may be seen again");
+        assert!(site.tracker.is_busy());
+        site.wait(Duration::from_secs(3));
+        assert!(site.numbers().is_empty() && !site.tracker.is_busy());
+    }
+
+    #[test]
+    fn tracks_start_again_with_other_numbers_when_the_origin_is_changed() {
+        let mut site = Site::new();
+        (0..10).for_each(|frame| site.see("7", 100 * frame));
+        site.live.set_origin(Some(Position::new(8.001, 47.0).expect("valid")));
+        (10..20).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [2], "a number names one track only");
+        site.live.set_origin(Some(Position::new(9.0, 48.0).expect("valid")));
+        (20..30).for_each(|frame| site.see("7", 100 * frame));
+        assert!(site.numbers().is_empty(), "the camera is out of the plane's range");
+    }
+
+    #[test]
+    fn tracks_start_again_where_a_recording_is_played_again() {
+        let mut site = Site::new();
+        (0..100).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [1]);
+        // Late for five seconds, then the recording is taken to have begun again.
+        (0..100).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [2]);
+    }
+
+    #[test]
+    fn a_box_is_of_the_target_whose_fixes_came_through_its_camera() {
+        let mut site = Site::new();
+        let fix = SiteItem {
+            camera: CameraId::new("a").expect("a slug"),
+            time: Timestamp::from_second(START_S).expect("in range"),
+            target_id: Some(TargetId::new("walker").expect("a name")),
+            position: Position::new(8.0, 47.0).expect("valid"),
+            source: ItemSource::Fix { variance_m2: 4.0 },
+        };
+        site.tracker.push(fix, site.now);
+        (1..10).for_each(|frame| site.see("walker", 100 * frame));
+        let points = lock(&site.live.tracks).latest();
+        let identity = points[0].target_id.as_ref().map(TargetId::as_str);
+        assert_eq!((points.len(), identity), (1, Some("walker")));
+        let camera = &points[0].sightings[0];
+        assert_eq!(camera.tracker_id.as_ref().map(TargetId::as_str), Some("walker"));
+    }
 }

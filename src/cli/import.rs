@@ -90,7 +90,8 @@ impl Import {
             Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {
                 self.check_profile(app).await
             }
-            created => Ok(drop(created?)),
+            Err(error) => Err(error.into()),
+            Ok(_) => Ok(()),
         }
     }
 

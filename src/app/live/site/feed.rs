@@ -59,8 +59,10 @@ fn items_of<'a>(
     };
     let by_box = observed.usable_box().zip(observed.plane).map(|(observed_box, plane)| {
         let regression = &observed_box.independent;
+        let (covariance, scale) = (regression.covariance, regression.normal_scale());
         let source = ItemSource::Box {
-            covariance_m2: regression.covariance.scaled(regression.normal_scale()),
+            covariance_m2: covariance.scaled(scale),
+            map_covariance_m2: covariance.minus(regression.box_noise).scaled(scale),
             model_origin: plane.origin(),
         };
         item(plane.to_position(regression.regressed), source)

@@ -24,6 +24,9 @@ pub(super) enum ItemSource {
         /// Covariance of the error, m2, axes east and north of the model's plane, which those of the site's plane
         /// are to within its range.
         covariance_m2: PlaneCovariance,
+        /// Of it, the error of the map from pixels to the ground, which is the same from frame to frame at a
+        /// place, m2.
+        map_covariance_m2: PlaneCovariance,
         /// Origin of the model's plane.
         model_origin: Position,
     },

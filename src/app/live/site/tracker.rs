@@ -18,7 +18,7 @@ use crate::fusion::world::{
     CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
     WorldTracker,
 };
-use crate::geo::{LocalPlane, PlaneCovariance};
+use crate::geo::LocalPlane;
 use crate::telemetry::{Metrics, SiteItemOutcome};
 
 /// Positions of a track are announced at least this far apart in time; readers follow people, not frames.
@@ -347,22 +347,24 @@ fn detection_of(
     plane: &LocalPlane,
     carries: impl Fn(&CameraId, &TargetId) -> bool,
 ) -> Option<WorldDetection> {
-    let ItemSource::Box { covariance_m2, .. } = &item.source else { return None };
+    let ItemSource::Box { covariance_m2, map_covariance_m2, .. } = &item.source else { return None };
     let carrier = item.target_id.clone().filter(|target_id| carries(&item.camera, target_id));
     Some(WorldDetection {
         tracker_id: item.target_id.clone(),
         receiver: carrier.map(ReceiverId::from),
         position: plane.to_plane_within_range(item.position)?,
         covariance_m2: *covariance_m2,
-        // The maps of a site's cameras are not fitted together, so what their errors have in common is unknown.
-        common_covariance_m2: PlaneCovariance::default(),
+        // The error of a map does not average out over frames. How much of it other cameras share is unknown as long
+        // as the maps of a site are not fitted together: all of it is stated, so averaging over cameras gains
+        // nothing in the stated error.
+        common_covariance_m2: *map_covariance_m2,
     })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geo::Position;
+    use crate::geo::{PlaneCovariance, Position};
 
     const START_S: i64 = 1_800_000_000;
 
@@ -390,6 +392,7 @@ mod tests {
                 position: origin,
                 source: ItemSource::Box {
                     covariance_m2: PlaneCovariance::isotropic(0.25),
+                    map_covariance_m2: PlaneCovariance::isotropic(0.16),
                     model_origin: origin,
                 },
             };

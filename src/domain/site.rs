@@ -50,6 +50,19 @@ pub struct SiteChange {
 }
 
 impl SiteChange {
+    /// Names of the fields that can be changed, on both transports.
+    pub const FIELDS: [&str; 3] = ["display_name", "labels", "origin"];
+
+    /// The fields of a profile that are named, by [`Self::FIELDS`].
+    #[must_use]
+    pub fn of_fields(profile: NewSite, is_named: impl Fn(&str) -> bool) -> Self {
+        Self {
+            display_name: is_named("display_name").then_some(profile.display_name),
+            labels: is_named("labels").then_some(profile.labels),
+            origin: is_named("origin").then_some(profile.origin),
+        }
+    }
+
     /// The site after the change.
     ///
     /// # Errors

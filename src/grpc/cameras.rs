@@ -159,56 +159,32 @@ fn gnss_error(error: Option<proto::GnssError>) -> Result<GnssError> {
     }
 }
 
-/// The fields of a profile, as a mask names them.
-const FIELDS: [&str; 10] = [
-    "display_name",
-    "image_size",
-    "gnss_error",
-    "recipe",
-    "target_classes",
-    "labels",
-    "receivers",
-    "retrain_when_moved",
-    "gnss_bias_sigma_m",
-    "site",
-];
-
 /// The fields that the mask names, or those that the profile has.
 fn camera_change(
     id: &CameraId,
     profile: proto::CameraProfile,
     mask: Option<prost_types::FieldMask>,
 ) -> Result<CameraChange> {
-    let named = named_fields(mask, FIELDS, present(&profile))?;
+    let is_named = named_fields(mask, &CameraChange::FIELDS, present(&profile))?;
     let profile = new_camera(id.clone(), profile).map_err(|error| error.under("profile"))?;
-    Ok(CameraChange {
-        display_name: named("display_name").then_some(profile.display_name),
-        image_size: named("image_size").then_some(profile.image_size),
-        gnss_error: named("gnss_error").then_some(profile.gnss_error),
-        gnss_bias_sigma: named("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
-        recipe: named("recipe").then_some(profile.recipe),
-        target_classes: named("target_classes").then_some(profile.target_classes),
-        labels: named("labels").then_some(profile.labels),
-        receivers: named("receivers").then_some(profile.receivers),
-        retrain_when_moved: named("retrain_when_moved").then_some(profile.retrain_when_moved),
-        site: named("site").then_some(profile.site),
-    })
+    Ok(CameraChange::of_fields(profile, is_named))
 }
 
-/// Which of [`FIELDS`] a profile has.
-fn present(profile: &proto::CameraProfile) -> [bool; FIELDS.len()] {
-    [
-        !profile.display_name.is_empty(),
-        profile.image_size.is_some(),
-        profile.gnss_error.is_some(),
-        profile.recipe != proto::Recipe::Unspecified as i32,
-        !profile.target_classes.is_empty(),
-        !profile.labels.is_empty(),
-        !profile.receivers.is_empty(),
-        profile.retrain_when_moved.is_some(),
-        profile.gnss_bias_sigma_m.is_some(),
-        profile.site.is_some(),
-    ]
+/// Names of the fields that a profile has.
+fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
+    let has = [
+        ("display_name", !profile.display_name.is_empty()),
+        ("image_size", profile.image_size.is_some()),
+        ("gnss_error", profile.gnss_error.is_some()),
+        ("gnss_bias_sigma_m", profile.gnss_bias_sigma_m.is_some()),
+        ("recipe", profile.recipe != proto::Recipe::Unspecified as i32),
+        ("target_classes", !profile.target_classes.is_empty()),
+        ("labels", !profile.labels.is_empty()),
+        ("receivers", !profile.receivers.is_empty()),
+        ("retrain_when_moved", profile.retrain_when_moved.is_some()),
+        ("site", profile.site.is_some()),
+    ];
+    has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
 }
 
 impl proto::Camera {

@@ -2,21 +2,17 @@
 
 use crate::domain::{Error, Result};
 
-/// Whether a change names a field: those of the mask (`*` for all) or, without one, those that the profile has.
+/// Whether a change names a field: those of the mask (`*` for all) or, without one, those `present` in the
+/// profile.
 ///
 /// # Errors
-/// `InvalidArgument` naming the path of the mask that is no field.
-pub(super) fn named_fields<const N: usize>(
+/// `InvalidArgument` naming the path of the mask that is none of `fields`.
+pub(super) fn named_fields(
     mask: Option<prost_types::FieldMask>,
-    fields: [&'static str; N],
-    has: [bool; N],
-) -> Result<impl Fn(&str) -> bool> {
-    let paths: Vec<String> = match mask {
-        Some(mask) => mask.paths,
-        None => {
-            fields.into_iter().zip(has).filter(|(_, has)| *has).map(|(field, _)| field.to_owned()).collect()
-        }
-    };
+    fields: &[&str],
+    present: Vec<&'static str>,
+) -> Result<impl Fn(&str) -> bool + use<>> {
+    let paths = mask.map_or_else(|| present.into_iter().map(str::to_owned).collect(), |mask| mask.paths);
     let unknown = |path: &String| path != "*" && !fields.contains(&path.as_str());
     if let Some(index) = paths.iter().position(unknown) {
         let known = fields.join(", ");

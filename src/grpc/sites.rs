@@ -148,23 +148,21 @@ fn new_site(id: SiteId, profile: proto::SiteProfile) -> Result<NewSite> {
     })
 }
 
-/// The fields of a profile, as a mask names them.
-const FIELDS: [&str; 3] = ["display_name", "labels", "origin"];
-
 /// The fields that the mask names, or those that the profile has.
 fn site_change(
     id: &SiteId,
     profile: proto::SiteProfile,
     mask: Option<prost_types::FieldMask>,
 ) -> Result<SiteChange> {
-    let has = [!profile.display_name.is_empty(), !profile.labels.is_empty(), profile.origin.is_some()];
-    let named = named_fields(mask, FIELDS, has)?;
+    let has = [
+        ("display_name", !profile.display_name.is_empty()),
+        ("labels", !profile.labels.is_empty()),
+        ("origin", profile.origin.is_some()),
+    ];
+    let present = has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect();
+    let is_named = named_fields(mask, &SiteChange::FIELDS, present)?;
     let profile = new_site(id.clone(), profile).map_err(|error| error.under("profile"))?;
-    Ok(SiteChange {
-        display_name: named("display_name").then_some(profile.display_name),
-        labels: named("labels").then_some(profile.labels),
-        origin: named("origin").then_some(profile.origin),
-    })
+    Ok(SiteChange::of_fields(profile, is_named))
 }
 
 impl From<Site> for proto::Site {

@@ -13,7 +13,7 @@ use super::Rest;
 use super::access::CallerApp;
 use super::etag::{self, unless_known, with_etag};
 use super::extract::{CameraPath, JsonBody, Params, site_of};
-use super::merge_patch::{self, Document};
+use super::merge_patch::{self, JsonObject};
 use super::problem::{ApiResult, Problem};
 use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, created, empty, json};
@@ -178,37 +178,11 @@ struct CameraChange {
     site: Option<String>,
 }
 
-/// The fields that a patch may name.
-const PATCHED_FIELDS: [&str; 10] = [
-    "display_name",
-    "image_size",
-    "gnss_error",
-    "gnss_bias_sigma_m",
-    "recipe",
-    "target_classes",
-    "labels",
-    "receivers",
-    "retrain_when_moved",
-    "site",
-];
-
 /// The change that a merge patch makes of a stored camera.
-fn patched(app: &App, camera: domain::Camera, patch: &Document) -> Result<domain::CameraChange> {
-    let document = merge_patch::merged(&Camera::of(app, camera), patch, &PATCHED_FIELDS)?;
+fn patched(app: &App, camera: domain::Camera, patch: &JsonObject) -> Result<domain::CameraChange> {
+    let document = merge_patch::merged(&Camera::of(app, camera), patch, &domain::CameraChange::FIELDS)?;
     let profile = parse_json::<CameraDraft>(&document)?.into_domain()?;
-    let names = |field: &str| patch.contains_key(field);
-    Ok(domain::CameraChange {
-        display_name: names("display_name").then_some(profile.display_name),
-        image_size: names("image_size").then_some(profile.image_size),
-        gnss_error: names("gnss_error").then_some(profile.gnss_error),
-        gnss_bias_sigma: names("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
-        recipe: names("recipe").then_some(profile.recipe),
-        target_classes: names("target_classes").then_some(profile.target_classes),
-        labels: names("labels").then_some(profile.labels),
-        receivers: names("receivers").then_some(profile.receivers),
-        retrain_when_moved: names("retrain_when_moved").then_some(profile.retrain_when_moved),
-        site: names("site").then_some(profile.site),
-    })
+    Ok(domain::CameraChange::of_fields(profile, |field| patch.contains_key(field)))
 }
 
 /// A stored camera.
@@ -421,7 +395,7 @@ async fn change_camera(
     body: JsonBody,
 ) -> ApiResult {
     let expected = etag::required(&headers)?;
-    let patch = body.read::<Document>()?;
+    let patch = body.read::<JsonObject>()?;
     let change = || async {
         let camera = app.camera(&id).await?;
         let version = expected.unwrap_or(camera.version());

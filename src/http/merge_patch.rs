@@ -6,7 +6,7 @@ use serde_json::Value;
 use crate::domain::{Error, ErrorKind, Result};
 
 /// A JSON object.
-pub(super) type Document = serde_json::Map<String, Value>;
+pub(super) type JsonObject = serde_json::Map<String, Value>;
 
 /// Times that a patch without a version is made of what was read.
 const ATTEMPTS: u32 = 8;
@@ -15,7 +15,7 @@ const ATTEMPTS: u32 = 8;
 ///
 /// # Errors
 /// `InvalidArgument` naming a field that cannot be changed.
-pub(super) fn merged(shown: &impl Serialize, patch: &Document, fields: &[&str]) -> Result<Vec<u8>> {
+pub(super) fn merged(shown: &impl Serialize, patch: &JsonObject, fields: &[&str]) -> Result<Vec<u8>> {
     if let Some(name) = patch.keys().find(|name| !fields.contains(&name.as_str())) {
         let known = fields.join(", ");
         return Err(Error::invalid(name, format!("is not a field that can be changed; those are {known}")));
@@ -28,14 +28,14 @@ pub(super) fn merged(shown: &impl Serialize, patch: &Document, fields: &[&str]) 
 }
 
 /// RFC 7396, section 2.
-fn merge(target: &mut Document, patch: &Document) {
+fn merge(target: &mut JsonObject, patch: &JsonObject) {
     for (name, value) in patch {
         match value {
             Value::Null => drop(target.remove(name)),
             Value::Object(patch) => {
-                let nested = target.entry(name.clone()).or_insert_with(|| Value::Object(Document::new()));
+                let nested = target.entry(name.clone()).or_insert_with(|| Value::Object(JsonObject::new()));
                 if !nested.is_object() {
-                    *nested = Value::Object(Document::new());
+                    *nested = Value::Object(JsonObject::new());
                 }
                 if let Value::Object(nested) = nested {
                     merge(nested, patch);

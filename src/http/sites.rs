@@ -13,7 +13,7 @@ use super::Rest;
 use super::access::CallerApp;
 use super::etag::{self, unless_known, with_etag};
 use super::extract::{JsonBody, Params, SitePath};
-use super::merge_patch::{self, Document};
+use super::merge_patch::{self, JsonObject};
 use super::problem::{ApiResult, Problem};
 use super::wire::{created, empty, json};
 use crate::domain::{self, NewSite, Result, SiteId};
@@ -73,19 +73,11 @@ struct SiteChange {
     origin: Option<Position>,
 }
 
-/// The fields that a patch may name.
-const PATCHED_FIELDS: [&str; 3] = ["display_name", "labels", "origin"];
-
 /// The change that a merge patch makes of a stored site.
-fn patched(site: domain::Site, patch: &Document) -> Result<domain::SiteChange> {
-    let document = merge_patch::merged(&Site::from(site), patch, &PATCHED_FIELDS)?;
+fn patched(site: domain::Site, patch: &JsonObject) -> Result<domain::SiteChange> {
+    let document = merge_patch::merged(&Site::from(site), patch, &domain::SiteChange::FIELDS)?;
     let profile = parse_json::<SiteDraft>(&document)?.into_domain()?;
-    let names = |field: &str| patch.contains_key(field);
-    Ok(domain::SiteChange {
-        display_name: names("display_name").then_some(profile.display_name),
-        labels: names("labels").then_some(profile.labels),
-        origin: names("origin").then_some(profile.origin),
-    })
+    Ok(domain::SiteChange::of_fields(profile, |field| patch.contains_key(field)))
 }
 
 /// A stored site.
@@ -218,7 +210,7 @@ async fn change_site(
     body: JsonBody,
 ) -> ApiResult {
     let expected = etag::required(&headers)?;
-    let patch = body.read::<Document>()?;
+    let patch = body.read::<JsonObject>()?;
     let change = || async {
         let site = app.site(&id).await?;
         let version = expected.unwrap_or(site.version());

@@ -6,7 +6,7 @@
 //! of a detection's error that differs between cameras; the part that they have in common is added to the output
 //! only, for it does not average out. What never happens here: I/O, clocks, randomness, pixels, degrees.
 
-mod assignment;
+pub mod assignment;
 mod constant_velocity;
 mod frame;
 mod merging;

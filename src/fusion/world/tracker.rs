@@ -163,7 +163,9 @@ impl WorldTracker {
         FixOutcome { track: Some(id), events }
     }
 
-    /// The pairs of detection and track within the gates.
+    /// The pairs of detection and track within the gates. The cost of a pair is its negative log-likelihood but for
+    /// a constant, `(d^2 + ln |S|) / 2`, less a bonus for the track's own tracker id; that of a detection without a
+    /// track is `-ln` of the density of new targets and false detections (Blackman and Popoli 1999, 6.4).
     fn candidates(&self, frame: &CameraFrame, detections: &[WorldDetection]) -> Vec<Candidate> {
         let settings = &self.settings;
         let mut candidates = Vec::new();
@@ -174,6 +176,8 @@ impl WorldTracker {
                 let same_receiver = match (&track.receiver, &detection.receiver) {
                     (Some(own), Some(other)) if own != other => continue,
                     (Some(_), Some(_)) => true,
+                    // Whose fix it is must be decided from more than one box.
+                    _ if track.is_measured_by_receiver() => continue,
                     _ => false,
                 };
                 let s = predicted.plus(detection.covariance_m2);
@@ -197,7 +201,7 @@ impl WorldTracker {
                 let bonus = if is_own_id { settings.own_id_bonus } else { 0.0 }
                     + if same_receiver { RECEIVER_BONUS } else { 0.0 };
                 let cost = 0.5 * (distance.min(RECEIVER_BONUS) + s.determinant().ln()) - bonus;
-                candidates.push(Candidate { detection: number, track: index, cost });
+                candidates.push(Candidate { row: number, column: index, cost });
             }
         }
         candidates

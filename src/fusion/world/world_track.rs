@@ -202,6 +202,11 @@ impl WorldTrack {
         }
     }
 
+    /// Whether its position is that of its receiver: no camera sees it.
+    pub(super) const fn is_measured_by_receiver(&self) -> bool {
+        self.measured_by_receiver
+    }
+
     /// Covariance of the filter's position and of the errors that a camera's detection does not share with the
     /// latest measurement.
     pub(super) fn gating_covariance(&self) -> PlaneCovariance {

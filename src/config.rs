@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
-use crate::domain::{CameraId, Role, Scope};
+use crate::domain::{CameraId, Role, SampleOverflow, Scope};
 
 /// Everything that can be set.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -17,6 +17,8 @@ pub struct Config {
     pub data: PathBuf,
     /// Address of the one port for REST and gRPC.
     pub listen: SocketAddr,
+    /// Address of a second port, for probes and metrics alone, without keys and without TLS; none if left out.
+    pub metrics_listen: Option<SocketAddr>,
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
     pub allowed_hosts: Vec<String>,
@@ -241,8 +243,10 @@ pub struct Limits {
     pub truth_line_positions: usize,
     /// Cameras; more are refused.
     pub cameras: u32,
-    /// Samples of one camera; more are refused.
+    /// Samples of one camera.
     pub samples_per_camera: u64,
+    /// What happens beyond `samples_per_camera`: `refuse`, or `delete_oldest`.
+    pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
     pub samples: u64,
     /// Model versions of one camera; beyond, the oldest that is not active is deleted.
@@ -290,6 +294,7 @@ impl Default for Config {
         Self {
             data: PathBuf::from("data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            metrics_listen: None,
             allowed_hosts: Vec::new(),
             insecure: false,
             admin_key: None,
@@ -360,6 +365,7 @@ impl Default for Limits {
             truth_line_positions: 1_000,
             cameras: 10_000,
             samples_per_camera: 10_000_000,
+            sample_overflow: SampleOverflow::Refuse,
             samples: 100_000_000,
             models_per_camera: 100,
             ended_runs_per_camera: 100,

@@ -196,6 +196,7 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
     StoreLimits {
         cameras: limits.cameras,
         samples_per_camera: limits.samples_per_camera,
+        sample_overflow: limits.sample_overflow,
         samples: limits.samples,
         models_per_camera: limits.models_per_camera,
         ended_runs_per_camera: limits.ended_runs_per_camera,

@@ -21,6 +21,7 @@ mod observation;
 mod receiver;
 mod recipe;
 mod sample;
+mod sample_overflow;
 mod score;
 mod time;
 mod training;
@@ -42,6 +43,7 @@ pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Obs
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use sample::{Sample, SampleCount, StoredSample};
+pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{

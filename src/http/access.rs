@@ -19,6 +19,7 @@ use super::problem::{ApiError, ApiResult};
 use crate::app::App;
 use crate::app::access::{Caller, Permission};
 use crate::domain::{Error, Result};
+use crate::telemetry::{MatchedRoute, Route};
 
 /// The query parameters of the operations, as the description names them.
 pub(super) struct QueryParameters(HashMap<(String, &'static str), HashSet<String>>);
@@ -71,6 +72,11 @@ pub(super) async fn authorize(
 ) -> Response {
     let template = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
     let permission = Permission::of_route(request.method().as_str(), template);
+    if let Some(matched) = request.extensions().get::<MatchedRoute>()
+        && let Some((method, template)) = Permission::named_route(request.method().as_str(), template)
+    {
+        matched.set(Route { method, template });
+    }
     let authorized = match request.extensions().get::<Caller>() {
         Some(caller) => caller.authorize(permission),
         None => Err(no_caller()),

@@ -84,6 +84,17 @@ pub fn router(app: App, console: Console, shutdown: Shutdown) -> Router {
         .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
 }
 
+/// Probes and metrics alone, for the listener of the setting `metrics_listen`.
+pub fn monitoring_router(app: App, shutdown: Shutdown) -> Router {
+    let rest = Rest { app, console: Arc::default(), shutdown };
+    let (routes, described) = service::routes().split_for_parts();
+    let parameters = Arc::new(access::QueryParameters::of(&described));
+    routes
+        .route_layer(from_fn_with_state(parameters, access::authorize))
+        .with_state(rest)
+        .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
+}
+
 /// What the page of the description may do: run its own scripts and ask its own server, nothing else.
 /// Swagger UI sets styles by attribute and shows images that it holds itself.
 const DESCRIPTION_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \

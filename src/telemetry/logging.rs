@@ -2,25 +2,42 @@
 
 use std::io::IsTerminal as _;
 
+use anyhow::Context as _;
 use hyper::http::{HeaderName, HeaderValue};
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{EnvFilter, Layer as _, Registry, fmt, reload};
 
 use crate::config::{Config, LogFormat};
+
+/// Changes what is logged while the process runs.
+#[derive(Clone)]
+pub struct LogControl(reload::Handle<EnvFilter, Registry>);
+
+impl LogControl {
+    /// Logs what another filter selects.
+    ///
+    /// # Errors
+    /// A filter that cannot be read; the one before stays.
+    pub fn set_filter(&self, filter: &str) -> anyhow::Result<()> {
+        self.0.reload(EnvFilter::try_new(filter)?).context("cannot change the log's filter")
+    }
+}
 
 /// Starts the log of the process, on standard error.
 ///
 /// # Errors
 /// A filter that cannot be read, or a log that was started before.
-pub fn start_log(config: &Config) -> anyhow::Result<()> {
-    let filter = tracing_subscriber::EnvFilter::try_new(&config.log_filter)?;
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_ansi(std::io::stderr().is_terminal())
-        .with_writer(std::io::stderr);
-    match config.log_format {
-        LogFormat::Text => log.try_init(),
-        LogFormat::Json => log.json().flatten_event(true).try_init(),
-    }
-    .map_err(|error| anyhow::anyhow!("cannot start the log: {error}"))
+pub fn start_log(config: &Config) -> anyhow::Result<LogControl> {
+    let (filter, control) = reload::Layer::new(EnvFilter::try_new(&config.log_filter)?);
+    let lines = fmt::layer().with_ansi(std::io::stderr().is_terminal()).with_writer(std::io::stderr);
+    let lines = match config.log_format {
+        LogFormat::Text => lines.boxed(),
+        LogFormat::Json => lines.json().flatten_event(true).boxed(),
+    };
+    let log = tracing_subscriber::registry().with(filter).with(lines);
+    log.try_init().context("cannot start the log")?;
+    Ok(LogControl(control))
 }
 
 /// Header that carries the request id, in and out.

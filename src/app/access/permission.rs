@@ -45,6 +45,20 @@ impl Permission {
         row.map_or(Self::Administer, |row| row.1)
     }
 
+    /// A route as the table has it, with its method; `None` if it is missing there.
+    #[must_use]
+    pub fn named_route(method: &str, template: &str) -> Option<(&'static str, &'static str)> {
+        let (template, methods) = ROUTES.get_key_value(template)?;
+        let method = methods.iter().find(|row| row.0 == method).map_or("other", |row| row.0);
+        Some((method, template))
+    }
+
+    /// An RPC's name as the table has it, by its path; `None` if it is missing there.
+    #[must_use]
+    pub fn named_rpc(path: &str) -> Option<&'static str> {
+        RPCS.get_key_value(path.strip_prefix('/').unwrap_or(path)).map(|(name, _)| *name)
+    }
+
     /// What an RPC needs, by its path. One that is missing in the table is for administrators only.
     #[must_use]
     pub fn of_rpc(path: &str) -> Self {

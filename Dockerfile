@@ -5,7 +5,8 @@ RUN apt-get update && apt-get install -y --no-install-recommends gcc g++ libc6-d
 WORKDIR /build
 COPY . .
 RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/build/target \
-    cargo build --release --locked && cp target/release/sightfix /usr/local/bin/sightfix && mkdir /data
+    cargo build --release --locked \
+    && objcopy --strip-debug target/release/sightfix /usr/local/bin/sightfix && mkdir /data
 
 # The C library, certificates and nothing else: no shell, no package manager.
 FROM gcr.io/distroless/cc-debian12

@@ -36,6 +36,9 @@ pub struct Config {
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
     pub log_filter: String,
+    /// Collector of OpenTelemetry traces (OTLP over gRPC), such as `http://localhost:4317`; needs the cargo feature
+    /// `otel`.
+    pub trace_endpoint: Option<String>,
     /// Workers of training runs.
     pub training: Workers,
     /// Workers of evaluations.
@@ -303,6 +306,7 @@ impl Default for Config {
             api_key: None,
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
+            trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
             console: Console::default(),

@@ -55,15 +55,15 @@ impl Serve {
             tls_client_ca: self.tls_client_ca,
         };
         let settings = Config::load(file, overrides.clone())?;
-        let log = telemetry::start_log(&settings)?;
         let source = SettingsSource { file: file.map(Path::to_owned), overrides };
         runtime()?.block_on(async {
+            let log = telemetry::start_log(&settings)?;
             let server = Server::bind(settings.clone(), Clock::system(), Randomness::system()).await?;
             let address = server.address().context("cannot determine the address")?;
             let (app, shutdown) = (server.app().clone(), server.shutdown());
             tokio::spawn(shut_down_on_signal(shutdown.clone()));
             #[cfg(unix)]
-            reload_on_hangup(source, log, server.reloader());
+            reload_on_hangup(source, log.clone(), server.reloader());
             tracing::info!(
                 %address, folder = %settings.data.display(), tls = server.has_tls(), "serving REST and gRPC"
             );
@@ -76,6 +76,7 @@ impl Serve {
                 shutdown.drain();
             }
             serving.await.context("the server task panicked")??;
+            log.close();
             shown
         })
     }

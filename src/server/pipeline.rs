@@ -28,7 +28,7 @@ use crate::app::access::{Caller, CertificateHolder, Credential, Permission, Prin
 use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
-use crate::telemetry::{MatchedRoute, Metrics, OTHER_RPC, REQUEST_ID, RequestId, RpcCall};
+use crate::telemetry::{MatchedRoute, Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
 use crate::{grpc, http};
 
 /// Longest request id that is taken from a client, in bytes.
@@ -37,8 +37,6 @@ const LONGEST_REQUEST_ID: usize = 128;
 const DISCARDED_BODIES: usize = 256;
 /// How long the body of a refused request is read.
 const DISCARD_TIME: Duration = Duration::from_secs(10);
-/// Target of the log line of each request.
-const LOG: &str = "sightfix::requests";
 
 /// Whom a listener serves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -130,8 +128,10 @@ impl RequestPipeline {
         let id = self.request_id(&request);
         let is_grpc = self.audience == Audience::Clients && has_grpc_content(&request);
         let span = tracing::debug_span!(
-            target: LOG, "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
+            target: REQUESTS, "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
+        #[cfg(feature = "otel")]
+        crate::telemetry::continue_trace(&span, request.headers());
         let counted = if is_grpc {
             let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
             Counted::Grpc(self.app.metrics.call(rpc))
@@ -177,7 +177,7 @@ impl RequestPipeline {
             Counted::Http(matched) => {
                 let route = matched.get();
                 self.app.metrics.answered(route, status, time);
-                tracing::debug!(target: LOG, route = route.template, status, %client, duration_ms, "answered");
+                tracing::debug!(target: REQUESTS, route = route.template, status, %client, duration_ms, "answered");
                 None
             }
             Counted::Grpc(mut call) => {
@@ -186,7 +186,7 @@ impl RequestPipeline {
                 if let Some(grpc_status) = grpc_status {
                     call.ended(grpc_status.as_bytes());
                 }
-                tracing::debug!(target: LOG, ?grpc_status, %client, duration_ms, "answered");
+                tracing::debug!(target: REQUESTS, ?grpc_status, %client, duration_ms, "answered");
                 Some(call)
             }
         }

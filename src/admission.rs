@@ -107,6 +107,10 @@ impl Quota {
         Ok(lease)
     }
 
+    fn usage(&self) -> QuotaUsage {
+        QuotaUsage { held: self.lock().total, limit: self.0.total }
+    }
+
     fn lock(&self) -> MutexGuard<'_, Held> {
         self.0.held.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -118,6 +122,15 @@ impl Quota {
             format!("{holder} has reached its limit of {limit} {what}; try again in a second"),
         )
     }
+}
+
+/// How much of a [`Quota`] all clients hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct QuotaUsage {
+    /// Held now.
+    pub held: u64,
+    /// At most.
+    pub limit: u64,
 }
 
 /// What one holder has of a [`Quota`].
@@ -208,6 +221,36 @@ impl Quotas {
             live_streams: quota("live streams", limits.live_streams),
             event_streams: quota("event streams", limits.event_streams),
         }
+    }
+
+    /// How many there are.
+    pub const COUNT: usize = 8;
+    /// Their names in the metrics, in the order of [`Quotas::usages`].
+    pub const NAMES: [&str; Self::COUNT] = [
+        "requests",
+        "reserved_requests",
+        "import_streams",
+        "request_memory_bytes",
+        "import_memory_bytes",
+        "import_disk_bytes",
+        "live_streams",
+        "event_streams",
+    ];
+
+    /// How much of each is held.
+    #[must_use]
+    pub fn usages(&self) -> [QuotaUsage; Self::COUNT] {
+        [
+            &self.requests,
+            &self.reserved_requests,
+            &self.import_streams,
+            &self.request_memory,
+            &self.import_memory,
+            &self.import_disk,
+            &self.live_streams,
+            &self.event_streams,
+        ]
+        .map(Quota::usage)
     }
 
     /// Memory for a request that begins; grows with its body.

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
-use crate::domain::{CameraId, Role, Scope};
+use crate::domain::{CameraId, Role, SampleOverflow, Scope};
 
 /// Everything that can be set.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -17,6 +17,8 @@ pub struct Config {
     pub data: PathBuf,
     /// Address of the one port for REST and gRPC.
     pub listen: SocketAddr,
+    /// Address of a second port, for probes and metrics alone, without keys and without TLS; none if left out.
+    pub metrics_listen: Option<SocketAddr>,
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
     pub allowed_hosts: Vec<String>,
@@ -34,6 +36,9 @@ pub struct Config {
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
     pub log_filter: String,
+    /// Collector of OpenTelemetry traces (OTLP over gRPC), such as `http://localhost:4317`; needs the cargo feature
+    /// `otel`.
+    pub trace_endpoint: Option<String>,
     /// Workers of training runs.
     pub training: Workers,
     /// Workers of evaluations.
@@ -255,8 +260,10 @@ pub struct Limits {
     pub tracks_per_site: usize,
     /// Events of one site that a reader may continue behind; a slower one loses the oldest.
     pub site_events: usize,
-    /// Samples of one camera; more are refused.
+    /// Samples of one camera.
     pub samples_per_camera: u64,
+    /// What happens beyond `samples_per_camera`: `refuse`, or `delete_oldest`.
+    pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
     pub samples: u64,
     /// Model versions of one camera; beyond, the oldest that is not active is deleted.
@@ -304,6 +311,7 @@ impl Default for Config {
         Self {
             data: PathBuf::from("data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            metrics_listen: None,
             allowed_hosts: Vec::new(),
             insecure: false,
             admin_key: None,
@@ -312,6 +320,7 @@ impl Default for Config {
             api_key: None,
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
+            trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
             console: Console::default(),
@@ -381,6 +390,7 @@ impl Default for Limits {
             tracks_per_site: 1_024,
             site_events: 4_096,
             samples_per_camera: 10_000_000,
+            sample_overflow: SampleOverflow::Refuse,
             samples: 100_000_000,
             models_per_camera: 100,
             ended_runs_per_camera: 100,

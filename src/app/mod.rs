@@ -207,6 +207,7 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
         cameras: limits.cameras,
         sites: limits.sites,
         samples_per_camera: limits.samples_per_camera,
+        sample_overflow: limits.sample_overflow,
         samples: limits.samples,
         models_per_camera: limits.models_per_camera,
         ended_runs_per_camera: limits.ended_runs_per_camera,

@@ -197,6 +197,14 @@ impl fmt::Display for Fault {
     }
 }
 
+impl Fault {
+    /// The cause, if it is of that type.
+    #[must_use]
+    pub fn cause<T: StdError + 'static>(&self) -> Option<&T> {
+        self.0.downcast_ref()
+    }
+}
+
 /// Refused or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

@@ -22,6 +22,7 @@ mod observation;
 mod receiver;
 mod recipe;
 mod sample;
+mod sample_overflow;
 mod score;
 mod site;
 mod time;
@@ -45,6 +46,7 @@ pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Obs
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use sample::{Sample, SampleCount, StoredSample};
+pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use time::{TimeBounds, parse_time};

@@ -19,8 +19,9 @@ use super::body::discard;
 use super::extract::Params;
 use super::problem::{ApiError, ApiResult};
 use crate::app::App;
-use crate::app::access::{Caller, Permission};
+use crate::app::access::{Caller, Permission, RoutePermission};
 use crate::domain::{Error, Result};
+use crate::telemetry::{MatchedRoute, Route};
 
 /// The query parameters of the operations, as the description names them.
 struct QueryParameters(HashMap<(String, &'static str), HashSet<String>>);
@@ -96,7 +97,11 @@ impl<S> Authorize<S> {
     fn check(&self, request: &Request) -> Result<()> {
         let template = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
         let caller = request.extensions().get::<Caller>().ok_or_else(no_caller)?;
-        caller.authorize(Permission::of_route(request.method().as_str(), template))?;
+        let route = RoutePermission::of(request.method().as_str(), template);
+        if let (Some(matched), Some(route)) = (request.extensions().get::<MatchedRoute>(), route) {
+            matched.set(Route { method: route.method, template: route.template });
+        }
+        caller.authorize(route.map_or(Permission::Administer, |route| route.permission))?;
         self.parameters.check(template, request.method(), request.uri())
     }
 }

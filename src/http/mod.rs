@@ -88,6 +88,14 @@ impl Transport {
         Self(routes.route_layer(authorize).merge(page).merge(console_routes).with_state(rest))
     }
 
+    /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
+    #[must_use]
+    pub fn monitoring(app: App, shutdown: Shutdown) -> Self {
+        let rest = Rest { app, console: Arc::default(), shutdown };
+        let (routes, described) = service::routes().split_for_parts();
+        Self(routes.route_layer(access::AuthorizeLayer::of(&described)).with_state(rest))
+    }
+
     /// Answers a request, which carries its [`RequestId`] and its [`Caller`](crate::app::access::Caller) as
     /// extensions. Whatever part of the router refuses it, or panics, the answer is a problem.
     pub async fn answer(&self, request: Request<Body>) -> Response<Body> {

@@ -17,7 +17,7 @@ use tower::Service as _;
 use tracing::field::{Empty, display};
 use tracing::{Instrument as _, Span};
 
-use super::activity::{ObservedBody, OpenRequest};
+use super::activity::{GRPC_STATUS, ObservedBody, OpenRequest};
 use super::credentials::credential;
 use super::host_check::HostCheck;
 use super::request_body::{AdmittedBody, RateGuard, Ticket};
@@ -28,7 +28,7 @@ use crate::app::access::{Caller, CertificateHolder, Credential, Permission, Prin
 use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
-use crate::telemetry::{Metrics, REQUEST_ID, RequestId};
+use crate::telemetry::{MatchedRoute, Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
 use crate::{grpc, http};
 
 /// Longest request id that is taken from a client, in bytes.
@@ -38,6 +38,21 @@ const DISCARDED_BODIES: usize = 256;
 /// How long the body of a refused request is read.
 const DISCARD_TIME: Duration = Duration::from_secs(10);
 
+/// Whom a listener serves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Audience {
+    /// Clients, each with what its credential allows.
+    Clients,
+    /// Whoever reaches the address of the setting `metrics_listen`, with probes and metrics alone.
+    Monitoring,
+}
+
+/// How a request is counted.
+enum Counted {
+    Http(MatchedRoute),
+    Grpc(RpcCall),
+}
+
 /// The way from a connection to the transports.
 pub(super) struct RequestPipeline {
     app: App,
@@ -46,6 +61,7 @@ pub(super) struct RequestPipeline {
     hosts: HostCheck,
     shutdown: Shutdown,
     discards: Semaphore,
+    audience: Audience,
 }
 
 /// The connection that a request came over.
@@ -78,6 +94,20 @@ impl RequestPipeline {
             hosts,
             shutdown: shutdown.clone(),
             discards: Semaphore::new(DISCARDED_BODIES),
+            audience: Audience::Clients,
+            app,
+        }
+    }
+
+    /// Probes and metrics alone, without keys.
+    pub(super) fn monitoring(app: App, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+        Self {
+            http: http::Transport::monitoring(app.clone(), shutdown.clone()),
+            grpc: Router::new(),
+            hosts,
+            shutdown: shutdown.clone(),
+            discards: Semaphore::new(DISCARDED_BODIES),
+            audience: Audience::Monitoring,
             app,
         }
     }
@@ -96,15 +126,20 @@ impl RequestPipeline {
         let began = Instant::now();
         let is_http_1 = request.version() < Version::HTTP_2;
         let id = self.request_id(&request);
-        let is_grpc = request
-            .headers()
-            .get(CONTENT_TYPE)
-            .is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"));
+        let is_grpc = self.audience == Audience::Clients && has_grpc_content(&request);
         let span = tracing::debug_span!(
-            "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
+            target: REQUESTS, "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
+        #[cfg(feature = "otel")]
+        crate::telemetry::continue_trace(&span, request.headers());
+        let counted = if is_grpc {
+            let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
+            Counted::Grpc(self.app.metrics.call(rpc))
+        } else {
+            Counted::Http(MatchedRoute::default())
+        };
         let (mut response, ticket) = async {
-            match self.admit(request, is_grpc, peer, &id).await {
+            match self.admit(request, &counted, peer, &id).await {
                 Ok((request, granted)) => {
                     (self.route(is_grpc, request, &granted, &id).await, Some(granted.ticket))
                 }
@@ -116,7 +151,7 @@ impl RequestPipeline {
                 }
             }
         }
-        .instrument(span)
+        .instrument(span.clone())
         .await;
         let headers = response.headers_mut();
         headers.insert(REQUEST_ID, id.header().clone());
@@ -124,10 +159,37 @@ impl RequestPipeline {
         if peer.refusal.is_some() && is_http_1 {
             headers.insert(CONNECTION, HeaderValue::from_static("close"));
         }
-        let time = began.elapsed();
-        self.app.metrics.answered(response.status().as_u16(), time);
-        tracing::debug!(id = %id, status = response.status().as_u16(), duration_ms = time.as_secs_f64() * 1e3);
-        response.map(|body| ObservedBody::new(body, open, ticket))
+        let call = span.in_scope(|| self.count(counted, &response, peer, began.elapsed()));
+        response.map(|body| ObservedBody::new(body, open, call, ticket))
+    }
+
+    /// Counts and logs an answer. A call of an RPC is counted when it ends.
+    fn count(
+        &self,
+        counted: Counted,
+        response: &Response<Body>,
+        peer: &Peer,
+        time: Duration,
+    ) -> Option<RpcCall> {
+        let (status, duration_ms, client) =
+            (response.status().as_u16(), time.as_secs_f64() * 1e3, peer.address);
+        match counted {
+            Counted::Http(matched) => {
+                let route = matched.get();
+                self.app.metrics.answered(route, status, time);
+                tracing::debug!(target: REQUESTS, route = route.template, status, %client, duration_ms, "answered");
+                None
+            }
+            Counted::Grpc(mut call) => {
+                call.answered(time);
+                let grpc_status = response.headers().get(GRPC_STATUS);
+                if let Some(grpc_status) = grpc_status {
+                    call.ended(grpc_status.as_bytes());
+                }
+                tracing::debug!(target: REQUESTS, ?grpc_status, %client, duration_ms, "answered");
+                Some(call)
+            }
+        }
     }
 
     /// The request as the transports get it, with what it was granted; the body of a refused one is
@@ -135,11 +197,12 @@ impl RequestPipeline {
     async fn admit(
         &self,
         request: Request<Incoming>,
-        is_grpc: bool,
+        counted: &Counted,
         peer: &Peer,
         id: &RequestId,
     ) -> Result<(Request<Body>, Granted)> {
         let path = request.uri().path();
+        let is_grpc = matches!(counted, Counted::Grpc(_));
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
         match self.grant(&request, class, is_grpc, peer, id) {
             Ok(Granted { ticket, caller }) => {
@@ -153,6 +216,9 @@ impl RequestPipeline {
                 extensions.insert(id.clone());
                 extensions.insert(peer.client);
                 extensions.insert(caller.clone());
+                if let Counted::Http(matched) = counted {
+                    extensions.insert(matched.clone());
+                }
                 if class == RequestClass::ImportStream {
                     extensions.insert(ticket.refusal());
                 }
@@ -209,6 +275,9 @@ impl RequestPipeline {
         peer: &Peer,
         id: &RequestId,
     ) -> Result<Caller> {
+        if self.audience == Audience::Monitoring {
+            return Ok(Caller::program("monitoring"));
+        }
         let credential = credential(request, peer.certificate.as_ref(), is_grpc);
         if let Credential::Session(_) = credential {
             self.hosts.check_same_origin(request)?;
@@ -290,6 +359,11 @@ impl RequestPipeline {
         });
         RequestId::new(id)
     }
+}
+
+fn has_grpc_content(request: &Request<Incoming>) -> bool {
+    let content_type = request.headers().get(CONTENT_TYPE);
+    content_type.is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"))
 }
 
 /// A response that may be open for long ends when the key of its request does.

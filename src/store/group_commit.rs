@@ -12,10 +12,11 @@ use sqlx::SqliteConnection;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::errors::{closed, copy_of, failed, no_camera};
+use super::sample_retention::delete_oldest;
 use super::sample_table::{Insert, Row, SampleTable, delete_replaced, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
-use crate::domain::{CameraId, CameraKey, Durability, Error, Result, StoredSample};
+use crate::domain::{CameraId, CameraKey, Durability, Error, Result, SampleOverflow, StoredSample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -89,6 +90,11 @@ impl GroupCommit {
             // An error means that the task has ended already, which is what is waited for.
             let _ = end.await;
         }
+    }
+
+    /// Rows that wait or are being committed.
+    pub(super) fn queued_rows(&self) -> u32 {
+        ROWS_IN_FLIGHT.saturating_sub(u32::try_from(self.rows.available_permits()).unwrap_or(u32::MAX))
     }
 
     pub(super) fn has_ended(&self) -> bool {
@@ -256,6 +262,11 @@ async fn store(
         }
     }
     count_stored(connection, &cameras, group, &outcomes).await?;
+    if space.limits.sample_overflow == SampleOverflow::DeleteOldest {
+        for camera in cameras.values() {
+            delete_oldest(connection, camera.key, space.limits.samples_per_camera).await?;
+        }
+    }
     Ok(Some(outcomes))
 }
 

@@ -2,11 +2,14 @@
 
 mod access;
 mod audit;
+mod backup;
 mod bad_input;
 mod boxes_without_fix;
 mod connections;
 mod console;
 mod cross_site;
+mod data_folder;
+mod doctor;
 mod evaluations;
 mod few_receivers;
 mod gaussian_process;
@@ -18,7 +21,9 @@ mod live_client;
 mod live_faults;
 mod live_saturation;
 mod model_integrity;
+mod monitoring;
 mod openapi;
+mod operator_files;
 mod overload;
 mod pairing;
 mod parity;

@@ -26,7 +26,7 @@ use crate::domain::{
     self, CameraId, CameraKey, Error, ErrorKind, ExpectedVersion, GnssBiasSigma, NewCamera, Result, Revision,
     SigmaM, TargetClass,
 };
-use crate::exchange::wire::parse_json;
+use crate::exchange::wire::parse_document;
 use crate::exchange::write_cursor;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -205,7 +205,7 @@ fn patched(app: &App, camera: domain::Camera, patch: &Document) -> Result<domain
     document.retain(|name, _| name == "id" || PATCHED_FIELDS.contains(&name.as_str()));
     merge(&mut document, patch);
     let document = serde_json::to_vec(&document).map_err(Error::fault)?;
-    let profile = parse_json::<CameraDraft>(&document)?.into_domain()?;
+    let profile = parse_document::<CameraDraft>(&document)?.into_domain()?;
     let names = |field: &str| patch.contains_key(field);
     Ok(domain::CameraChange {
         display_name: names("display_name").then_some(profile.display_name),

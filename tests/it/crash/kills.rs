@@ -18,6 +18,9 @@ use super::load::Load;
 use super::setting;
 use crate::harness::{TestServer, data_folder, run, sightfix};
 
+/// The calls by which SQLite writes, and flushes.
+const WRITE: &str = "pwrite64";
+const FLUSH: &str = "fsync,fdatasync";
 /// A server that reached no such call is killed after this time.
 const LONGEST_LIFE: Duration = Duration::from_secs(3);
 /// Every so many moments are those of a database that is being created.
@@ -41,18 +44,18 @@ impl Kill {
         let time = Duration::from_millis(random.random_range(20..1_500));
         match random.random_range(0..20) {
             0..8 => Self::After(time),
-            8..14 => Self::AtCall("pwrite64", number),
-            14..17 => Self::AtCall("fdatasync", number.div_ceil(4)),
-            17 => Self::AfterFailure("fdatasync", number.div_ceil(4), "EIO", time),
-            18 => Self::AfterFailure("pwrite64", number, "EIO", time),
-            _ => Self::AfterFailure("pwrite64", number, "ENOSPC", time),
+            8..14 => Self::AtCall(WRITE, number),
+            14..17 => Self::AtCall(FLUSH, number.div_ceil(4)),
+            17 => Self::AfterFailure(FLUSH, number.div_ceil(4), "EIO", time),
+            18 => Self::AfterFailure(WRITE, number, "EIO", time),
+            _ => Self::AfterFailure(WRITE, number, "ENOSPC", time),
         }
     }
 
     fn name(&self) -> &'static str {
         match self {
             Self::After(_) => "at a random time",
-            Self::AtCall("fdatasync", _) => "at a flush",
+            Self::AtCall(FLUSH, _) => "at a flush",
             Self::AtCall(..) => "at a write",
             Self::AfterFailure(..) => "after a call that failed",
         }
@@ -69,8 +72,8 @@ impl Kill {
         };
         let mut command = Command::new("strace");
         // -D: the tracer is a child of the server, so that signals meet the server.
-        command.args(["-D", "-f", "-qq", "--seccomp-bpf", "-o", "/dev/null"]);
-        command.args(["-e", "trace=pwrite64,fdatasync", "-e", &injection]);
+        command.args(["-D", "-f", "-qq", "-o", "/dev/null"]);
+        command.args(["-e", "trace=pwrite64,fsync,fdatasync", "-e", &injection]);
         command.arg(sightfix().get_program()).current_dir(std::env::temp_dir());
         command
     }
@@ -175,8 +178,8 @@ impl Totals {
 async fn kill_creation(random: &mut ChaCha8Rng, key: &str, totals: &mut Totals) {
     let folder = data_folder();
     let kill = match random.random_range(0..4) {
-        0 => Kill::AtCall("fdatasync", random.random_range(1..8)),
-        _ => Kill::AtCall("pwrite64", random.random_range(1..150)),
+        0 => Kill::AtCall(FLUSH, random.random_range(1..8)),
+        _ => Kill::AtCall(WRITE, random.random_range(1..150)),
     };
     let mut ended = start(kill.command(), folder.path(), key);
     if let Ok(server) = &mut ended {

@@ -9,7 +9,7 @@ use axum::body::Body;
 use bytes::{Buf as _, Bytes, BytesMut};
 use http_body_util::BodyExt as _;
 use hyper::HeaderMap;
-use hyper::header::{CONTENT_LENGTH, EXPECT};
+use hyper::header::{CONTENT_ENCODING, CONTENT_LENGTH, EXPECT};
 use hyper::http::request::Parts;
 use tokio::io::AsyncWriteExt as _;
 
@@ -27,7 +27,7 @@ const DISCARD_TIME: Duration = Duration::from_secs(10);
 /// # Errors
 /// `TooLarge` beyond the limit; `Timeout` and `Cancelled` for a body that does not come.
 pub(super) async fn whole(headers: &HeaderMap, mut body: Body, limit: usize) -> Result<Bytes> {
-    check_announced(headers, &mut body, limit).await?;
+    check_headers(headers, &mut body, limit).await?;
     let Some(first) = next(&mut body).await? else { return Ok(Bytes::new()) };
     let mut gathered = Gathered::One(first);
     while let Some(part) = next(&mut body).await? {
@@ -123,7 +123,7 @@ impl SpoolLeases {
 /// temporary file cannot be written.
 pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
     let limit = app.limits.import_bytes;
-    check_announced(&head.headers, &mut body, limit).await?;
+    check_headers(&head.headers, &mut body, limit).await?;
     let mut spool = Spool::new(app, client_id(head))?;
     while let Some(part) = next(&mut body).await? {
         let pushed =
@@ -241,12 +241,19 @@ fn too_large(limit: usize) -> Error {
 }
 
 /// Refuses a body by the length that its header announces, before any of it is read.
-async fn check_announced(headers: &HeaderMap, body: &mut Body, limit: usize) -> Result<()> {
-    if announced(headers).is_some_and(|length| length > limit as u64) {
-        discard(headers, body).await;
-        return Err(too_large(limit));
-    }
-    Ok(())
+/// Refuses a body by its headers: too long, or compressed, which is not read since a few bytes could become many.
+async fn check_headers(headers: &HeaderMap, body: &mut Body, limit: usize) -> Result<()> {
+    let is_encoded = headers.get_all(CONTENT_ENCODING).iter().any(|encoding| encoding != "identity");
+    let refusal = if announced(headers).is_some_and(|length| length > limit as u64) {
+        too_large(limit)
+    } else if is_encoded {
+        let message = "compressed bodies are not read; send it as it is, without this header";
+        Error::field(ErrorKind::UnsupportedMediaType, "content-encoding", message)
+    } else {
+        return Ok(());
+    };
+    discard(headers, body).await;
+    Err(refusal)
 }
 
 fn announced(headers: &HeaderMap) -> Option<u64> {

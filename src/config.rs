@@ -22,6 +22,8 @@ pub struct Config {
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
     pub allowed_hosts: Vec<String>,
+    /// Addresses or networks (`10.0.0.0/8`) of proxies in front, whose `X-Forwarded-For` names the client.
+    pub trusted_proxies: Vec<String>,
     /// Serve everybody on an address that other machines reach, while no key exists.
     pub insecure: bool,
     /// Secret of an administrator's key (`sightfix keys generate`), for the first start of a container.
@@ -204,8 +206,10 @@ pub struct Limits {
     pub requests: usize,
     /// How many of `requests` are reserved for fusions.
     pub reserved_requests: usize,
-    /// Share of each limit on connections, requests, streams and bytes that one client address may
-    /// hold, above 0 and up to 1.
+    /// Requests per second of one client, which is a key, or an address without one; 0 is no limit.
+    pub requests_per_s: u32,
+    /// Share of each limit on requests, streams and bytes that one client (a key, or an address without
+    /// one) may hold, and of the limit on connections that one address may hold; above 0 and up to 1.
     pub client_share: f64,
     /// Event streams open at a time.
     pub event_streams: usize,
@@ -313,6 +317,7 @@ impl Default for Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             metrics_listen: None,
             allowed_hosts: Vec::new(),
+            trusted_proxies: Vec::new(),
             insecure: false,
             admin_key: None,
             admin_key_file: None,
@@ -362,6 +367,7 @@ impl Default for Limits {
             streams_per_connection: 256,
             requests: 1_024,
             reserved_requests: 256,
+            requests_per_s: 0,
             client_share: 0.5,
             event_streams: 256,
             tracks_per_camera: 256,
@@ -467,6 +473,7 @@ impl Config {
             .separator("__")
             .list_separator(",")
             .with_list_parse_key("allowed_hosts")
+            .with_list_parse_key("trusted_proxies")
             .with_list_parse_key("tls.client_camera_ids")
             .try_parsing(true);
         let mut loaded: Self = config::Config::builder()

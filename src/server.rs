@@ -3,6 +3,9 @@
 //! A request enters here once, whatever its transport: it gets its id, its span, its place among
 //! the requests at work and its deadline, then goes to `http` or `grpc` by its content type.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod activity;
 mod connection;
 mod credentials;
@@ -10,6 +13,7 @@ mod frame_limit;
 mod guarded_stream;
 mod host_check;
 mod pipeline;
+mod proxies;
 mod request_body;
 mod revocable_body;
 mod tls;
@@ -32,6 +36,7 @@ use crate::worker;
 
 use host_check::HostCheck;
 use pipeline::RequestPipeline;
+use proxies::TrustedProxies;
 use tls::Tls;
 
 /// How often metrics are gathered, and the registry looks for what another process on the same file
@@ -46,6 +51,7 @@ pub struct Server {
     /// For probes and metrics alone.
     monitoring: Option<TcpListener>,
     tls: Option<Arc<Tls>>,
+    proxies: TrustedProxies,
     shutdown: Shutdown,
 }
 
@@ -78,6 +84,7 @@ impl Server {
     /// # Errors
     /// Names the folder or the address that cannot be used.
     pub async fn bind(config: Config, clock: Clock, randomness: Randomness) -> anyhow::Result<Self> {
+        let proxies = TrustedProxies::new(&config.trusted_proxies)?;
         let options = StoreOptions {
             limits: store_limits(&config.limits),
             role: "server".to_owned(),
@@ -100,7 +107,7 @@ impl Server {
                 .with_context(|| format!("cannot listen on {address}, the setting metrics_listen"))
         });
         let monitoring = monitoring.transpose()?;
-        Ok(Self { config, app, listener, monitoring, tls, shutdown: Shutdown::new() })
+        Ok(Self { config, app, listener, monitoring, tls, proxies, shutdown: Shutdown::new() })
     }
 
     /// The address that was taken; with port 0 in the settings, the system's choice.
@@ -148,12 +155,13 @@ impl Server {
     /// The system does not report the address.
     pub async fn run(self) -> anyhow::Result<()> {
         let reloader = self.reloader();
-        let Self { config, app, listener, monitoring, tls, shutdown } = self;
+        let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
-        let pipeline = Arc::new(RequestPipeline::new(app.clone(), config.console, hosts, &shutdown));
+        let pipeline = RequestPipeline::new(app.clone(), config.console, hosts, proxies, &shutdown);
+        let pipeline = Arc::new(pipeline);
         let monitored = async {
             let Some(listener) = monitoring else { return anyhow::Ok(()) };
             let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);

@@ -13,6 +13,8 @@ pub struct Status {
     pub slug: &'static str,
     /// Title of the problem, the same for every occurrence.
     pub title: &'static str,
+    /// Seconds after which the same request may succeed; `None` if it will not by itself.
+    pub retry_after_s: Option<u32>,
 }
 
 /// Where the problem types are described; a slug follows.
@@ -71,6 +73,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::UnusableSamples => (422, code::FAILED_PRECONDITION, "The samples cannot support a fit"),
         Kind::Cancelled => (499, code::CANCELLED, "The request was cancelled"),
         Kind::Overloaded => (503, code::UNAVAILABLE, "The server has too much to do"),
+        Kind::RateLimited => (429, code::RESOURCE_EXHAUSTED, "The client sends too many requests"),
         Kind::Timeout => (408, code::DEADLINE_EXCEEDED, "The request took too long"),
         Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
         Kind::Unauthenticated => (401, code::UNAUTHENTICATED, "The request needs a key that works"),
@@ -81,5 +84,6 @@ pub fn of(kind: ErrorKind) -> Status {
         }
         Kind::Internal => (500, code::INTERNAL, "The server failed"),
     };
-    Status { http, grpc, slug: kind.as_str(), title }
+    let is_temporary = matches!(kind, Kind::Overloaded | Kind::RateLimited | Kind::ShuttingDown);
+    Status { http, grpc, slug: kind.as_str(), title, retry_after_s: is_temporary.then_some(1) }
 }

@@ -2,6 +2,9 @@
 //!
 //! What never happens here: SQL, status codes, wire formats, reading the wall clock.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 pub mod access;
 mod audit;
 mod camera_statuses;

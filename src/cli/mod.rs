@@ -161,7 +161,7 @@ async fn open_app(settings: &Config, role: &str, missing: MissingData) -> anyhow
         .await
         .with_context(|| format!("cannot open the data folder {folder}"))?;
     for other in store.newcomers() {
-        eprintln!("note: another process uses the same data folder: {other}");
+        output::print_note(format_args!("note: another process uses the same data folder: {other}"));
     }
     let app = App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new());
     Ok(app.await?.on_behalf_of(Caller::program(role)))

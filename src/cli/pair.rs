@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 use clap::Args;
 
-use super::output::print_line;
+use super::output::{print_line, print_note};
 use super::{format_of, open_file, receiver_id, target_id};
 use crate::app::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use crate::clock::Clock;
@@ -159,11 +159,11 @@ fn carried(receiver: &Receiver) -> String {
 
 fn print_rejected(rejected: &RejectedParts) -> anyhow::Result<()> {
     for (part, row) in &rejected.rows {
-        eprintln!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason);
+        print_note(format_args!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason));
     }
     let printed = rejected.rows.len() as u64;
     if rejected.count > printed {
-        eprintln!("... and {} more", rejected.count - printed);
+        print_note(format_args!("... and {} more", rejected.count - printed));
     }
     if rejected.count > 0 {
         print_line(&format_args!("rejected rows {}", rejected.count))?;

@@ -76,6 +76,8 @@ pub enum ErrorKind {
     Cancelled,
     /// More requests are in flight than the server takes.
     Overloaded,
+    /// The client sends more requests per second than it may.
+    RateLimited,
     /// The request took longer than it may.
     Timeout,
     /// The server is ending.
@@ -102,7 +104,7 @@ impl ErrorKind {
 
 /// Most fields at fault that one refusal names. gRPC sends them in headers, of which clients take no more
 /// than 8 kB.
-const MOST_VIOLATIONS: usize = 16;
+pub const MOST_VIOLATIONS: usize = 16;
 
 /// Converts all items of a list.
 ///

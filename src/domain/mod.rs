@@ -4,6 +4,9 @@
 //! it and do not check again. What never happens here: I/O, clocks,
 //! randomness, wire formats, status codes.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod access;
 mod audit;
 mod bounding_box;
@@ -34,7 +37,7 @@ pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, ExpectedVersion, NewCamera, Revision};
 pub use checksum::model_sha256;
 pub use durability::Durability;
-pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};
+pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssBiasSigma, GnssError, SigmaM};
 pub use job::{EvaluationId, JobState, RunId};

@@ -7,6 +7,9 @@
 //! line, field and reason takes its place. Numbers are checked by the constructors of
 //! [`crate::domain`] only. What never happens here: transports, storage, clocks.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod columns;
 mod csv_rows;
 mod cursor;
@@ -19,6 +22,7 @@ mod formula_guard;
 mod gpsd;
 mod gpx;
 mod json_errors;
+mod json_violations;
 mod lines;
 mod nmea_fixes;
 mod objects_only;

@@ -3,6 +3,9 @@
 //! What never happens here: checks on numbers (the constructors of [`crate::domain`] make them), status
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod audit;
 mod cameras;
 mod cancel_on_shutdown;
@@ -74,8 +77,10 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
             .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
+    #[expect(clippy::expect_used, reason = "every start tests it")]
     let reflection_v1 = reflection().build_v1().expect("the build wrote the descriptors");
     // All that Python's client speaks, and older releases of others.
+    #[expect(clippy::expect_used, reason = "every start tests it")]
     let reflection_v1alpha = reflection().build_v1alpha().expect("the build wrote the descriptors");
     Routes::default()
         .add_service(health(shutdown))

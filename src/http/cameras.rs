@@ -19,7 +19,7 @@ use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, created, empty, json};
 use crate::app::App;
 use crate::domain::{self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass};
-use crate::exchange::wire::parse_json;
+use crate::exchange::wire::parse_document;
 use crate::exchange::write_cursor;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -181,7 +181,7 @@ struct CameraChange {
 /// The change that a merge patch makes of a stored camera.
 fn patched(app: &App, camera: domain::Camera, patch: &JsonObject) -> Result<domain::CameraChange> {
     let document = merge_patch::merged(&Camera::of(app, camera), patch, &domain::CameraChange::FIELDS)?;
-    let profile = parse_json::<CameraDraft>(&document)?.into_domain()?;
+    let profile = parse_document::<CameraDraft>(&document)?.into_domain()?;
     Ok(domain::CameraChange::of_fields(profile, |field| patch.contains_key(field)))
 }
 

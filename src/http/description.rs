@@ -30,10 +30,11 @@ const TAGS: [(&str, &str); 9] = [
 ];
 
 /// Refusals that any operation may meet.
-const ANY: [ErrorKind; 5] = [
+const ANY: [ErrorKind; 6] = [
     ErrorKind::Timeout,
     ErrorKind::Internal,
     ErrorKind::Overloaded,
+    ErrorKind::RateLimited,
     ErrorKind::InvalidArgument,
     ErrorKind::HostNotAllowed,
 ];

@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 use super::Rest;
 use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
-use crate::admission::ClientAddress;
+use crate::admission::ClientId;
 use crate::domain::{
     CameraId, Durability, Error, ErrorKind, EvaluationId, LiveId, Result, RunId, SiteId, TargetId, parse_time,
 };
@@ -22,13 +22,13 @@ use crate::exchange::{Cursor, read_cursor, wire};
 const PAGE_ITEMS: u32 = 100;
 
 /// Who sends the request.
-pub(super) struct Client(pub(super) ClientAddress);
+pub(super) struct Client(pub(super) ClientId);
 
 impl<S: Send + Sync> FromRequestParts<S> for Client {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
-        Ok(Self(body::client_address(parts)))
+        Ok(Self(body::client_id(parts)))
     }
 }
 
@@ -277,13 +277,13 @@ impl FromRequest<Rest> for JsonBody {
 
 impl JsonBody {
     /// # Errors
-    /// `MalformedBody` for what is not JSON; `InvalidArgument` naming the path of a field of the
+    /// `MalformedBody` for what is not JSON; `InvalidArgument` naming the paths of all fields of the
     /// wrong type, missing or unknown.
     pub(super) fn read<'a, T: Deserialize<'a>>(&'a self) -> Result<T> {
         if self.0.is_empty() {
             return Err(Error::refused(ErrorKind::MalformedBody, "the operation needs a body of JSON"));
         }
-        wire::parse_json(&self.0)
+        wire::parse_document(&self.0)
     }
 
     /// The same where all of the body may be left out.

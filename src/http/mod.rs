@@ -4,6 +4,9 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod access;
 mod audit;
 mod body;

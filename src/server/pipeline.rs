@@ -20,9 +20,10 @@ use tracing::{Instrument as _, Span};
 use super::activity::{GRPC_STATUS, ObservedBody, OpenRequest};
 use super::credentials::credential;
 use super::host_check::HostCheck;
+use super::proxies::TrustedProxies;
 use super::request_body::{AdmittedBody, RateGuard, Ticket};
 use super::revocable_body::RevocableBody;
-use crate::admission::{BodyRefusal, ClientAddress, RequestClass};
+use crate::admission::{BodyRefusal, ClientId, RequestClass};
 use crate::app::App;
 use crate::app::access::{Caller, CertificateHolder, Credential, Permission, Principal};
 use crate::config::Console;
@@ -59,6 +60,7 @@ pub(super) struct RequestPipeline {
     http: http::Transport,
     grpc: Router,
     hosts: HostCheck,
+    proxies: TrustedProxies,
     shutdown: Shutdown,
     discards: Semaphore,
     audience: Audience,
@@ -67,8 +69,8 @@ pub(super) struct RequestPipeline {
 /// The connection that a request came over.
 #[derive(Clone)]
 pub(super) struct Peer {
-    /// As limits count it.
-    pub(super) client: ClientAddress,
+    /// As limits count it while it presents no key.
+    pub(super) client: ClientId,
     /// As the audit log names it.
     pub(super) address: IpAddr,
     /// Whose certificate was verified, if one was presented.
@@ -81,17 +83,26 @@ pub(super) struct Peer {
 struct Granted {
     ticket: Ticket,
     caller: Caller,
+    /// As limits count the caller.
+    client: ClientId,
 }
 
 /// The body of every response; it holds the request's memory until its end.
 pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
 
 impl RequestPipeline {
-    pub(super) fn new(app: App, console: Console, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+    pub(super) fn new(
+        app: App,
+        console: Console,
+        hosts: HostCheck,
+        proxies: TrustedProxies,
+        shutdown: &Shutdown,
+    ) -> Self {
         Self {
             http: http::Transport::new(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
+            proxies,
             shutdown: shutdown.clone(),
             discards: Semaphore::new(DISCARDED_BODIES),
             audience: Audience::Clients,
@@ -124,6 +135,7 @@ impl RequestPipeline {
         open: OpenRequest,
     ) -> Response<ResponseBody> {
         let began = Instant::now();
+        let peer = &*self.proxies.original(peer, request.headers());
         let is_http_1 = request.version() < Version::HTTP_2;
         let id = self.request_id(&request);
         let is_grpc = self.audience == Audience::Clients && has_grpc_content(&request);
@@ -205,7 +217,8 @@ impl RequestPipeline {
         let is_grpc = matches!(counted, Counted::Grpc(_));
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
         match self.grant(&request, class, is_grpc, peer, id) {
-            Ok(Granted { ticket, caller }) => {
+            Ok(granted) => {
+                let Granted { ticket, caller, client } = &granted;
                 let limits = &self.app.limits;
                 // A live stream may be silent for longer, and looks after that itself.
                 let pace = (class != RequestClass::LiveStream)
@@ -214,7 +227,7 @@ impl RequestPipeline {
                     .map(|body| Body::new(AdmittedBody::new(body, ticket.clone(), caller.clone(), pace)));
                 let extensions = request.extensions_mut();
                 extensions.insert(id.clone());
-                extensions.insert(peer.client);
+                extensions.insert(*client);
                 extensions.insert(caller.clone());
                 if let Counted::Http(matched) = counted {
                     extensions.insert(matched.clone());
@@ -222,7 +235,7 @@ impl RequestPipeline {
                 if class == RequestClass::ImportStream {
                     extensions.insert(ticket.refusal());
                 }
-                Ok((request, Granted { ticket, caller }))
+                Ok((request, granted))
             }
             Err(error) => {
                 self.discard(request).await;
@@ -245,7 +258,15 @@ impl RequestPipeline {
             return Err(Error::Refused(refusal.clone()));
         }
         self.hosts.check(request)?;
-        let caller = self.caller(request, class, is_grpc, peer, id)?;
+        let now = tokio::time::Instant::now();
+        let caller = self.caller(request, class, is_grpc, peer, id).map_err(|error| {
+            // Guesses of keys count for the address that they come from.
+            self.app.quotas.request_rate.count(peer.client, now).err().unwrap_or(error)
+        })?;
+        let client = caller.actor().key_id.map_or(peer.client, ClientId::Key);
+        if class != RequestClass::Probe {
+            self.app.quotas.request_rate.count(client, now)?;
+        }
         if is_grpc {
             // `http` compares a route's permission itself: it knows the template of the path.
             caller.authorize(Permission::of_rpc(request.uri().path()))?;
@@ -257,13 +278,13 @@ impl RequestPipeline {
             _ if is_grpc => limits.message_bytes,
             _ => limits.body_bytes,
         };
-        let ticket = Ticket::open(&self.app, class, peer.client, held_bytes)?;
+        let ticket = Ticket::open(&self.app, class, client, held_bytes)?;
         let has_no_body = request.body().is_end_stream()
             || matches!(*request.method(), Method::GET | Method::HEAD | Method::DELETE | Method::OPTIONS);
         if has_no_body || class == RequestClass::ImportStream {
             ticket.begin_work()?;
         }
-        Ok(Granted { ticket, caller })
+        Ok(Granted { ticket, caller, client })
     }
 
     /// Who makes the request.
@@ -301,7 +322,7 @@ impl RequestPipeline {
         granted: &Granted,
         id: &RequestId,
     ) -> Response<Body> {
-        let Granted { ticket, caller } = granted;
+        let Granted { ticket, caller, .. } = granted;
         let time = Duration::from_secs(self.app.limits.request_s);
         // An import stream reports by itself what it has stored of a body that was refused.
         let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
@@ -355,7 +376,9 @@ impl RequestPipeline {
         let id = own.cloned().unwrap_or_else(|| {
             let uuid = self.app.randomness.uuid_v7(self.app.clock.now());
             let mut text = [0; uuid::fmt::Hyphenated::LENGTH];
-            HeaderValue::from_str(uuid.hyphenated().encode_lower(&mut text)).expect("a UUID is ASCII")
+            let text = uuid.hyphenated().encode_lower(&mut text);
+            #[expect(clippy::expect_used, reason = "its form is fixed")]
+            HeaderValue::from_str(text).expect("a UUID is ASCII")
         });
         RequestId::new(id)
     }

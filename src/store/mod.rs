@@ -9,6 +9,9 @@
 //! a transaction is held across anything but statements, a type of the database library becomes public.
 //! Rows that the constructors of `domain` refuse are faults that name table, column and row.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod audit;
 mod backup;
 mod camera_moves;

@@ -52,7 +52,11 @@ pub const REQUESTS: &str = "sightfix::requests";
 /// A filter that cannot be read, or a log that was started before.
 pub fn start_log(config: &Config) -> anyhow::Result<LogControl> {
     let (filter, control) = reload::Layer::new(EnvFilter::try_new(&config.log_filter)?);
-    let lines = fmt::layer().with_ansi(std::io::stderr().is_terminal()).with_writer(std::io::stderr);
+    let lines = fmt::layer()
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr)
+        // A line that cannot be written is lost: reported by `eprintln!`, it would end the server.
+        .log_internal_errors(false);
     let lines = match config.log_format {
         LogFormat::Text => lines.boxed(),
         LogFormat::Json => lines.json().flatten_event(true).boxed(),

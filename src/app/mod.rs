@@ -10,6 +10,7 @@ mod evaluations;
 mod fusion;
 mod keys;
 mod live;
+mod matching;
 mod models;
 mod paired_import;
 mod recording;
@@ -36,6 +37,7 @@ pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream,
     LostEvents, NotStored, NotStoredReason, TargetUpdate, TrackPoint,
 };
+pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};

@@ -41,7 +41,7 @@ pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
-pub use sample::{Sample, SampleCount, StoredSample};
+pub use sample::{Association, Sample, SampleCount, StoredSample};
 pub use score::Score;
 pub use time::{TimeBounds, parse_time};
 pub use training::{

@@ -17,6 +17,7 @@ mod layering;
 mod live_client;
 mod live_faults;
 mod live_saturation;
+mod matching;
 mod model_integrity;
 mod openapi;
 mod overload;

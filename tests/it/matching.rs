@@ -2,6 +2,8 @@
 //! and over REST.
 
 mod crowd;
+mod plaza;
+mod ships;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -22,7 +24,10 @@ struct Matched {
 impl Matched {
     /// Right samples and all of them.
     fn right(&self) -> (usize, usize) {
-        let right = self.samples.iter().filter(|own| own.0 == format!("phone-{}", own.3)).count();
+        let is_right = |target: &str, number: usize| {
+            target.ends_with(&format!("-{number}")) && !target.starts_with("emitter")
+        };
+        let right = self.samples.iter().filter(|own| is_right(&own.0, own.3)).count();
         (right, self.samples.len())
     }
 }
@@ -128,4 +133,53 @@ fn marks_of_one_phone_among_ten_walkers() {
     }
     println!("right in {identified} of 20 worlds, wrong in {wrong}");
     assert!(identified >= 19 && wrong == 0);
+}
+
+/// Share of right samples over some worlds, and the number of worlds that were matched.
+fn share_right(crowd: Crowd, seeds: std::ops::RangeInclusive<u64>) -> (f64, usize) {
+    let folder = data_folder();
+    let (mut right, mut all, mut matched) = (0, 0, 0);
+    for seed in seeds {
+        let found = run_match(&folder, &Crowd { seed, ..crowd }.recorded(), &["--image-size", IMAGE]);
+        let own = found.right();
+        println!("world {seed}: {} of {}; {}", own.0, own.1, found.printed.lines().next().unwrap_or(""));
+        matched += usize::from(found.succeeded);
+        (right, all) = (right + own.0, all + own.1);
+    }
+    (right as f64 / all.max(1) as f64, matched)
+}
+
+#[test]
+#[ignore = "takes minutes: the marks of docs/association.md"]
+fn marks_of_ids_that_swap() {
+    let crowd = Crowd { walkers: 15, phones: 6, seconds: 240, ..ONE_AMONG_TEN };
+    let (steady, steady_worlds) = share_right(crowd, 1..=4);
+    let (swapped, swapped_worlds) = share_right(Crowd { swap_s: 60.0, ..crowd }, 1..=4);
+    println!(
+        "right without swaps {steady:.3} ({steady_worlds} worlds), with swaps {swapped:.3} ({swapped_worlds} worlds)"
+    );
+    assert!(swapped >= steady - 0.05 && swapped_worlds > 0);
+}
+
+#[test]
+#[ignore = "takes minutes: the marks of docs/association.md"]
+fn marks_of_ships_that_pass() {
+    let folder = data_folder();
+    let (mut refused, mut identified, mut wrong) = (0, 0, 0);
+    for seed in 1..=5 {
+        for passes in [1, 5] {
+            let matched = run_match(&folder, &ships::recorded(seed, passes), &["--image-size", IMAGE]);
+            let (right, all) = matched.right();
+            println!(
+                "world {seed}, {passes} passes: {right} of {all}; {}",
+                matched.printed.lines().next().unwrap_or("")
+            );
+            let is_right = matched.succeeded && right * 100 >= all * 95;
+            refused += usize::from(passes == 1 && !matched.succeeded);
+            identified += usize::from(passes == 5 && is_right);
+            wrong += usize::from(matched.succeeded && !is_right);
+        }
+    }
+    println!("one pass refused in {refused} of 5, five passes right in {identified} of 5, wrong {wrong}");
+    assert!(wrong == 0);
 }

@@ -137,7 +137,7 @@ impl<'a> JointSearch<'a> {
         }
         let fixes = scene.fixes(&plane);
         let gnss = settings.gnss.unwrap_or_else(|| receiver_noise(None));
-        let has_known_height = class.as_ref().is_none_or(|own| GroundCamera::knows_height_of(own));
+        let has_known_height = class.as_ref().is_none_or(GroundCamera::knows_height_of);
         let (ground, motion) = if has_known_height {
             (GROUND_OF_KNOWN_HEIGHT, common_motion(scene, &cameras, &GROUND_OF_KNOWN_HEIGHT))
         } else {

@@ -18,3 +18,6 @@ mod tracklet;
 pub use self::chains::ChainSettings;
 pub use self::joint::{JointMatch, WorldScores, match_without_model};
 pub use self::matching::{MatchSettings, MatchedPiece, Matching, match_with_model};
+
+#[cfg(test)]
+mod tests;

@@ -25,6 +25,8 @@ const MAP_TIME_CONSTANT_S: f64 = 20.0;
 pub(super) const SEEN_PROBABILITY: f64 = 0.8;
 /// Largest factor between the ground by usual heights and the true one.
 const MAX_SCALE: f64 = 100.0;
+/// Log weights below it add nothing to the prior of a receiver whose carrier is not seen.
+const NEGLIGIBLE: f64 = -20.0;
 const YAWS: usize = 48;
 /// Longest pairs whose position suggests a translation for each yaw.
 const GRID_PAIRS: usize = 80;
@@ -74,13 +76,37 @@ struct Pair {
     gz: C,
 }
 
+/// A placement's part of the quadratic forms, the same for all pairs.
+struct Coefficients {
+    turn: C,
+    shift: C,
+    turn_squared: f64,
+    shift_squared: f64,
+    mixed: C,
+}
+
+impl Coefficients {
+    fn new(turn: C, shift: C) -> Self {
+        let (turn_squared, shift_squared) = (turn.norm_sqr(), shift.norm_sqr());
+        Self { turn, shift, turn_squared, shift_squared, mixed: shift.conj() * turn }
+    }
+}
+
 impl Pair {
-    fn log_ratio(&self, turn: C, shift: C) -> f64 {
-        let squared = self.zz + turn.norm_sqr() * self.gg + shift.norm_sqr() * self.ones
-            - 2.0 * (turn.conj() * self.gz).re
-            - 2.0 * (shift.conj() * self.z).re
-            + 2.0 * (shift.conj() * turn * self.g).re;
+    /// Log-likelihood ratio at a placement: with half the negative of `(z - w g - t)' K^-1 (z - w g - t)`.
+    #[inline]
+    fn log_ratio(&self, at: &Coefficients) -> f64 {
+        let squared = self.zz + at.turn_squared * self.gg + at.shift_squared * self.ones
+            - 2.0 * (at.turn.re * self.gz.re + at.turn.im * self.gz.im)
+            - 2.0 * (at.shift.re * self.z.re + at.shift.im * self.z.im)
+            + 2.0 * (at.mixed.re * self.g.re - at.mixed.im * self.g.im);
         self.peak - 0.5 * squared
+    }
+
+    /// Log of prior times tempered ratio.
+    #[inline]
+    fn log_weight(&self, at: &Coefficients) -> f64 {
+        TEMPERING * self.log_ratio(at) + self.log_prior
     }
 }
 
@@ -137,10 +163,23 @@ impl PlacementSearch {
         self.scores(placement.turn, placement.shift_m)
     }
 
+    /// Log-likelihood ratio of each pair where ground and plane are the same.
+    #[cfg(test)]
+    pub(super) fn log_ratios_at_identity(&self) -> Vec<f64> {
+        self.pairs
+            .iter()
+            .map(|pair| pair.log_ratio(&Coefficients::new(C::new(1.0, 0.0), C::default())))
+            .collect()
+    }
+
     fn scores(&self, turn: C, shift: C) -> Vec<f64> {
         let mut sums = vec![1.0 - SEEN_PROBABILITY; self.receivers];
+        let at = Coefficients::new(turn, shift);
         for pair in &self.pairs {
-            sums[pair.receiver] += (TEMPERING * pair.log_ratio(turn, shift) + pair.log_prior).exp();
+            let log_weight = pair.log_weight(&at);
+            if log_weight > NEGLIGIBLE {
+                sums[pair.receiver] += log_weight.exp();
+            }
         }
         sums.iter_mut().for_each(|sum| *sum = sum.ln());
         sums
@@ -236,8 +275,9 @@ impl PlacementSearch {
         let totals = self.scores(turn, shift);
         let (mut ones, mut gg) = (0.0, 0.0);
         let (mut z, mut g, mut gz) = (C::default(), C::default(), C::default());
+        let at = Coefficients::new(turn, shift);
         for pair in &self.pairs {
-            let log_weight = TEMPERING * pair.log_ratio(turn, shift) + pair.log_prior - totals[pair.receiver];
+            let log_weight = pair.log_weight(&at) - totals[pair.receiver];
             if log_weight > -9.0 {
                 let weight = TEMPERING * log_weight.exp();
                 ones += weight * pair.ones;

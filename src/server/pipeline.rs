@@ -41,7 +41,7 @@ const DISCARD_TIME: Duration = Duration::from_secs(10);
 /// The way from a connection to the transports.
 pub(super) struct RequestPipeline {
     app: App,
-    http: Router,
+    http: http::Transport,
     grpc: Router,
     hosts: HostCheck,
     shutdown: Shutdown,
@@ -73,7 +73,7 @@ pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
 impl RequestPipeline {
     pub(super) fn new(app: App, console: Console, hosts: HostCheck, shutdown: &Shutdown) -> Self {
         Self {
-            http: http::router(app.clone(), console, shutdown.clone()),
+            http: http::Transport::new(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
             shutdown: shutdown.clone(),
@@ -236,10 +236,16 @@ impl RequestPipeline {
         let time = Duration::from_secs(self.app.limits.request_s);
         // An import stream reports by itself what it has stored of a body that was refused.
         let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
-        let mut transport = if is_grpc { self.grpc.clone() } else { self.http.clone() };
+        let answer = async {
+            if !is_grpc {
+                return self.http.answer(request).await;
+            }
+            let answer = self.grpc.clone().call(request).await;
+            answer.unwrap_or_else(|never| match never {})
+        };
         let answer = tokio::select! {
             biased;
-            answer = tokio::time::timeout(time, transport.call(request)) => answer.map_err(|_| too_slow(time)),
+            answer = tokio::time::timeout(time, answer) => answer.map_err(|_| too_slow(time)),
             error = caller.ended() => Err(error),
             () = self.shutdown.forced() => Err(shutting_down()),
         };
@@ -253,7 +259,6 @@ impl RequestPipeline {
                 refuse(is_grpc, &error, id)
             }
             (Ok(response), None) => {
-                let response = response.unwrap_or_else(|never| match never {});
                 let response = if is_grpc { grpc::explain(response, id) } else { response };
                 revocable(response, caller, is_grpc.then_some(id))
             }

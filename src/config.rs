@@ -181,6 +181,10 @@ pub struct Limits {
     pub pairing_rows: usize,
     /// Imports in two parts that are paired at the same time; more wait.
     pub pairings: usize,
+    /// Tracklets of an import whose boxes and fixes are matched.
+    pub match_tracklets: usize,
+    /// Receivers of an import whose boxes and fixes are matched.
+    pub match_receivers: usize,
     /// Rejected rows of an import that are reported one by one.
     pub rejected_rows: usize,
     /// Bytes of a request's headers.
@@ -355,6 +359,8 @@ impl Default for Limits {
             page_items: 1_000,
             pairing_rows: 500_000,
             pairings: 1,
+            match_tracklets: 20_000,
+            match_receivers: 200,
             rejected_rows: 100,
             header_bytes: 32 << 10,
             header_s: 10,

@@ -70,6 +70,9 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::EvaluationEnded => (409, code::FAILED_PRECONDITION, "The evaluation has ended"),
         Kind::ModelActive => (409, code::FAILED_PRECONDITION, "The model version is the active one"),
         Kind::InsufficientStorage => (507, code::RESOURCE_EXHAUSTED, "There is no space to store it"),
+        Kind::NotIdentifiable => {
+            (422, code::FAILED_PRECONDITION, "Whose fixes belong to whose boxes cannot be told")
+        }
         Kind::UnusableSamples => (422, code::FAILED_PRECONDITION, "The samples cannot support a fit"),
         Kind::Cancelled => (499, code::CANCELLED, "The request was cancelled"),
         Kind::Overloaded => (503, code::UNAVAILABLE, "The server has too much to do"),

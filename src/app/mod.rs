@@ -13,6 +13,7 @@ mod evaluations;
 mod fusion;
 mod keys;
 mod live;
+mod matching;
 mod models;
 mod paired_import;
 mod recording;
@@ -42,6 +43,7 @@ pub use live::{
     LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind, SiteEvents,
     SiteTracks, StoredSiteEvent, TargetUpdate, TrackPoint, WorldSighting, WorldTrackPoint,
 };
+pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};

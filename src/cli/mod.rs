@@ -104,7 +104,7 @@ impl Cli {
         match self.command {
             Command::Serve(command) => command.run(file),
             Command::Import(command) => command.run(file),
-            Command::Pair(command) => command.run(),
+            Command::Pair(command) => command.run(file),
             Command::Train(command) => command.run(file),
             Command::Fuse(command) => command.run(file),
             Command::GnssError(command) => command.run(),

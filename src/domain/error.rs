@@ -70,6 +70,8 @@ pub enum ErrorKind {
     ModelActive,
     /// The disk is full, or as much is stored as the settings allow.
     InsufficientStorage,
+    /// Whose fixes belong to whose boxes cannot be told.
+    NotIdentifiable,
     /// The stored samples cannot support a fit.
     UnusableSamples,
     /// The caller went away or cancelled.

@@ -48,7 +48,7 @@ pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
-pub use sample::{Sample, SampleCount, StoredSample};
+pub use sample::{Association, Sample, SampleCount, StoredSample};
 pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};

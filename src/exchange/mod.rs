@@ -37,7 +37,7 @@ pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
 pub use rows::{ObservedRow, RowRules, read_detections, read_observations, read_samples};
-pub use write::{FusedWriter, SampleWriter, write_fused, write_samples};
+pub use write::{FusedWriter, MatchedSampleWriter, SampleWriter, write_fused, write_samples};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.
 pub const MAX_ROW_BYTES: usize = 64 * 1024;

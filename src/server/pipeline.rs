@@ -116,6 +116,7 @@ impl RequestPipeline {
             http: http::Transport::monitoring(app.clone(), shutdown.clone()),
             grpc: Router::new(),
             hosts,
+            proxies: TrustedProxies::default(),
             shutdown: shutdown.clone(),
             discards: Semaphore::new(DISCARDED_BODIES),
             audience: Audience::Monitoring,

@@ -15,6 +15,7 @@ use crate::admission::ClientId;
 const X_FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
 
 /// The proxies whose statement of the client's address is used.
+#[derive(Default)]
 pub(super) struct TrustedProxies(Vec<Network>);
 
 impl TrustedProxies {

@@ -24,6 +24,7 @@ mod limits;
 mod live_client;
 mod live_faults;
 mod live_saturation;
+mod matching;
 mod model_integrity;
 mod monitoring;
 mod openapi;

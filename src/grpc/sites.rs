@@ -5,7 +5,7 @@ use super::mask::named_fields;
 use super::pages;
 use super::proto;
 use super::proto::site_service_server::SiteService;
-use super::statuses::{Reply, answer, client_address, request_id};
+use super::statuses::{Reply, answer, client_id, request_id};
 use super::world_tracks::{Events, events, live_id};
 use crate::app::App;
 use crate::domain::{NewSite, Result, Revision, Site, SiteChange, SiteId};
@@ -122,7 +122,7 @@ impl SiteService for Sites {
 
     async fn watch_tracks(&self, request: tonic::Request<proto::WatchTracksRequest>) -> Reply<Events> {
         let id = request_id(request.extensions());
-        let client = client_address(request.extensions());
+        let client = client_id(request.extensions());
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let site = site_id(&asked.site_id)?;

@@ -36,8 +36,8 @@ mod runs;
 mod sample_retention;
 mod sample_table;
 mod samples;
-mod sites;
 mod server_lock;
+mod sites;
 mod space;
 #[cfg(test)]
 mod tests;

@@ -531,17 +531,26 @@ impl SiteMetrics {
     fn register(registry: &Registry) -> Self {
         let items = |outcome: SiteItemOutcome| {
             let help = "Boxes and fixes handed to the trackers of sites, by outcome";
-            (outcome, registry.labelled("sightfix_site_items_total", help, "outcome", outcome.as_str()))
+            (outcome, registry.counter("sightfix_site_items_total", help, &[("outcome", outcome.as_str())]))
         };
         Self {
             items: SiteItemOutcome::ALL.map(items),
-            tracks: registry.gauge("sightfix_world_tracks", "Confirmed world tracks of all sites"),
-            tracks_started: registry
-                .counter("sightfix_world_tracks_started_total", "World tracks that were confirmed"),
-            handovers: registry
-                .counter("sightfix_world_track_handovers_total", "Targets handed over from camera to camera"),
-            events_lost: registry
-                .counter("sightfix_site_events_lost_total", "Events of sites that slow readers lost"),
+            tracks: registry.gauge("sightfix_world_tracks", "Confirmed world tracks of all sites", &[]),
+            tracks_started: registry.counter(
+                "sightfix_world_tracks_started_total",
+                "World tracks that were confirmed",
+                &[],
+            ),
+            handovers: registry.counter(
+                "sightfix_world_track_handovers_total",
+                "Targets handed over from camera to camera",
+                &[],
+            ),
+            events_lost: registry.counter(
+                "sightfix_site_events_lost_total",
+                "Events of sites that slow readers lost",
+                &[],
+            ),
         }
     }
 }

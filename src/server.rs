@@ -5,6 +5,7 @@
 
 mod activity;
 mod connection;
+mod cors;
 mod credentials;
 mod frame_limit;
 mod guarded_stream;
@@ -135,8 +136,9 @@ impl Server {
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
-        let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
-        let pipeline = Arc::new(RequestPipeline::new(app.clone(), config.console, hosts, &shutdown));
+        let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
+        let cors = cors::layer(&config.cors_origins);
+        let pipeline = Arc::new(RequestPipeline::new(app.clone(), config.console, hosts, cors, &shutdown));
         connection::accept(listener, pipeline, tls, &config.limits, &shutdown).await;
         tracing::info!("shutting down");
         if !shutdown.drain_with_timeout(config.limits.drain_time()).await {

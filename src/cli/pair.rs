@@ -7,12 +7,14 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 use clap::Args;
 
+use super::import::image_size;
+use super::layout::LayoutFlags;
 use super::output::print_line;
 use super::{format_of, open_file, receiver_id, target_id};
 use crate::app::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use crate::clock::Clock;
 use crate::config::Limits;
-use crate::domain::{ClockOffset, Receiver, ReceiverId, Receivers, TargetId, TimeBounds};
+use crate::domain::{ClockOffset, ImageSize, Receiver, ReceiverId, Receivers, TargetId, TimeBounds};
 use crate::exchange::{self, FixFormat, RowRules};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
@@ -63,6 +65,11 @@ pub(super) struct Pair {
     /// Write the boxes that find no fix, too, with empty longitude and latitude
     #[arg(long)]
     keep_unpaired: bool,
+    /// Size of the camera's image, for --box-unit share
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size)]
+    image_size: Option<ImageSize>,
+    #[command(flatten)]
+    layout: LayoutFlags,
 }
 
 impl Pair {
@@ -107,16 +114,18 @@ impl Pair {
         if let Some(out) = &self.out {
             format_of(out)?; // fail early
         }
-        let rules = RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: None };
+        let rules =
+            RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: self.image_size };
+        let layout = self.layout.to_layout();
         let (detections, fixes) = (open_file(&self.detections)?, open_file(&self.fixes)?);
         let boxes = exchange::read_detections(
             detections,
-            format_of(&self.detections)?,
+            (format_of(&self.detections)?, &layout),
             &rules,
             self.target_id.clone(),
         )
         .map_err(|error| of_part(Part::Detections, error))?;
-        let fixes = exchange::read_received_fixes(fixes, format, rules.time_bounds)
+        let fixes = exchange::read_received_fixes(fixes, (format, &layout), rules.time_bounds)
             .map_err(|error| of_part(Part::Fixes, error))?;
         let limits = RecordingLimits { rows: usize::MAX, rejected_rows: Limits::default().rejected_rows };
         Ok((Recording::read(boxes, fixes, limits)?, format))

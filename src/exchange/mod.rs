@@ -8,9 +8,11 @@
 //! [`crate::domain`] only. What never happens here: transports, storage, clocks.
 
 mod columns;
+mod csv_layout;
 mod csv_rows;
 mod cursor;
 mod elements;
+mod feature;
 mod file_row;
 mod fix_row;
 mod fixes;
@@ -28,11 +30,14 @@ mod tests;
 pub mod wire;
 mod write;
 
+pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
-pub use rows::{ObservedRow, RowRules, read_detections, read_observations, read_samples};
+pub use rows::{
+    ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
+};
 pub use write::{FusedWriter, SampleWriter, write_fused, write_samples};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.

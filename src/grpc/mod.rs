@@ -9,6 +9,7 @@ mod cancel_on_shutdown;
 pub mod client;
 mod convert;
 mod fusion;
+mod idempotency;
 mod keys;
 mod models;
 mod outbox;

@@ -7,6 +7,7 @@
 mod access;
 mod audit;
 mod body;
+mod body_coding;
 mod camera_statuses;
 mod cameras;
 mod console;
@@ -15,6 +16,7 @@ mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
+mod idempotency;
 mod keys;
 mod models;
 mod pairings;
@@ -81,7 +83,12 @@ pub fn router(app: App, console: Console, shutdown: Shutdown) -> Router {
         .merge(console_routes)
         .with_state(rest)
         // As one layer: axum boxes every request again for each.
-        .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
+        .layer((
+            body_coding::response_layer(),
+            from_fn(body_coding::decode_request),
+            from_fn(problem::problem_layer),
+            CatchPanicLayer::custom(problem::panicked),
+        ))
 }
 
 /// What the page of the description may do: run its own scripts and ask its own server, nothing else.

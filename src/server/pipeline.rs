@@ -1,6 +1,7 @@
 //! What every request goes through, whatever its transport: id, span, host and origin, admission,
 //! deadline, then the transport.
 
+use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,11 +10,12 @@ use axum::Router;
 use axum::body::Body;
 use http_body_util::BodyExt as _;
 use hyper::body::{Body as _, Incoming};
-use hyper::header::{CONNECTION, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
+use hyper::header::{CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
 use hyper::http::HeaderValue;
 use hyper::{Method, Request, Response, Version};
 use tokio::sync::Semaphore;
-use tower::Service as _;
+use tower::{Layer as _, Service as _, ServiceExt as _, service_fn};
+use tower_http::cors::CorsLayer;
 use tracing::field::{Empty, display};
 use tracing::{Instrument as _, Span};
 
@@ -46,6 +48,7 @@ pub(super) struct RequestPipeline {
     hosts: HostCheck,
     shutdown: Shutdown,
     discards: Semaphore,
+    cors: Option<CorsLayer>,
 }
 
 /// The connection that a request came over.
@@ -71,11 +74,18 @@ struct Granted {
 pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
 
 impl RequestPipeline {
-    pub(super) fn new(app: App, console: Console, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+    pub(super) fn new(
+        app: App,
+        console: Console,
+        hosts: HostCheck,
+        cors: Option<CorsLayer>,
+        shutdown: &Shutdown,
+    ) -> Self {
         Self {
             http: http::router(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
+            cors,
             shutdown: shutdown.clone(),
             discards: Semaphore::new(DISCARDED_BODIES),
             app,
@@ -103,21 +113,8 @@ impl RequestPipeline {
         let span = tracing::debug_span!(
             "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
-        let (mut response, ticket) = async {
-            match self.admit(request, is_grpc, peer, &id).await {
-                Ok((request, granted)) => {
-                    (self.route(is_grpc, request, &granted, &id).await, Some(granted.ticket))
-                }
-                Err(error) => {
-                    if error.kind() == ErrorKind::Overloaded {
-                        self.app.metrics.refused();
-                    }
-                    (refuse(is_grpc, &error, &id), None)
-                }
-            }
-        }
-        .instrument(span)
-        .await;
+        let mut response = self.respond(request, is_grpc, peer, &id).instrument(span).await;
+        let ticket = response.extensions_mut().remove::<Ticket>();
         let headers = response.headers_mut();
         headers.insert(REQUEST_ID, id.header().clone());
         headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
@@ -128,6 +125,44 @@ impl RequestPipeline {
         self.app.metrics.answered(response.status().as_u16(), time);
         tracing::debug!(id = %id, status = response.status().as_u16(), duration_ms = time.as_secs_f64() * 1e3);
         response.map(|body| ObservedBody::new(body, open, ticket))
+    }
+
+    /// The response, with the ticket of an admitted request as an extension.
+    async fn respond(
+        &self,
+        request: Request<Incoming>,
+        is_grpc: bool,
+        peer: &Peer,
+        id: &RequestId,
+    ) -> Response<Body> {
+        let Some(cors) = &self.cors else { return self.admit_and_route(request, is_grpc, peer, id).await };
+        let service = service_fn(|request| async {
+            Ok::<_, Infallible>(self.admit_and_route(request, is_grpc, peer, id).await)
+        });
+        let Ok(response) = cors.layer(service).oneshot(request).await;
+        response
+    }
+
+    async fn admit_and_route(
+        &self,
+        request: Request<Incoming>,
+        is_grpc: bool,
+        peer: &Peer,
+        id: &RequestId,
+    ) -> Response<Body> {
+        match self.admit(request, is_grpc, peer, id).await {
+            Ok((request, granted)) => {
+                let mut response = self.route(is_grpc, request, &granted, id).await;
+                response.extensions_mut().insert(granted.ticket);
+                response
+            }
+            Err(error) => {
+                if error.kind() == ErrorKind::Overloaded {
+                    self.app.metrics.refused();
+                }
+                refuse(is_grpc, &error, id)
+            }
+        }
     }
 
     /// The request as the transports get it, with what it was granted; the body of a refused one is
@@ -192,6 +227,10 @@ impl RequestPipeline {
             _ => limits.body_bytes,
         };
         let ticket = Ticket::open(&self.app, class, peer.client, held_bytes)?;
+        if request.headers().contains_key(CONTENT_ENCODING) {
+            // What it decodes to is not known before it has been read.
+            ticket.charge(held_bytes as u64)?;
+        }
         let has_no_body = request.body().is_end_stream()
             || matches!(*request.method(), Method::GET | Method::HEAD | Method::DELETE | Method::OPTIONS);
         if has_no_body || class == RequestClass::ImportStream {

@@ -17,6 +17,7 @@ mod errors;
 mod evaluations;
 mod folder;
 mod group_commit;
+mod idempotency;
 mod jobs;
 mod keys;
 mod latest_runs;
@@ -42,7 +43,8 @@ use sqlx::sqlite::SqlitePoolOptions;
 
 use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 
-pub use group_commit::Inserted;
+pub use group_commit::{InsertOptions, Inserted};
+pub use idempotency::{Completion, IdempotencyRecord, StoredAnswer};
 pub use jobs::{Claim, Heartbeat, JobEnd};
 pub use keys::KeysVersion;
 pub use models::{NewModel, StoredHeldOutError};

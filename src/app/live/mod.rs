@@ -9,6 +9,7 @@ mod acknowledgements;
 mod alarms;
 pub(super) mod camera;
 mod drift;
+mod event_log;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
@@ -19,9 +20,9 @@ mod tracks;
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use tokio::sync::broadcast;
 
 use self::camera::CameraLive;
+use self::event_log::EventCursor;
 use self::tracks::TargetObservation;
 use super::App;
 use super::fusion::fuse_observed;
@@ -36,6 +37,7 @@ use crate::fusion::target_track::TargetTrack;
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
+pub use event_log::{EventId, LostEvents};
 pub(super) use retraining::RetrainSchedule;
 pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};
@@ -63,27 +65,22 @@ pub struct CameraActivity {
 
 /// The events of one camera from some instant on; they end when it is deleted.
 pub struct CameraEvents {
-    events: broadcast::Receiver<CameraEvent>,
+    cursor: EventCursor,
     live: Arc<CameraLive>,
 }
 
-/// Events that were lost because the reader was too slow.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LostEvents(pub u64);
-
 impl CameraEvents {
     /// The next event; `None` once the camera is deleted.
-    pub async fn next(&mut self) -> Option<Result<CameraEvent, LostEvents>> {
-        use broadcast::error::RecvError;
-        let event = tokio::select! {
-            biased;
-            () = self.live.deleted() => return None,
-            event = self.events.recv() => event,
-        };
-        match event {
-            Ok(event) => Some(Ok(event)),
-            Err(RecvError::Lagged(lost)) => Some(Err(LostEvents(lost))),
-            Err(RecvError::Closed) => None,
+    pub async fn next(&mut self) -> Option<Result<(EventId, CameraEvent), LostEvents>> {
+        loop {
+            if let Some(event) = self.live.events.next(&mut self.cursor) {
+                return Some(event);
+            }
+            tokio::select! {
+                biased;
+                () = self.live.deleted() => return None,
+                () = self.cursor.changed() => {}
+            }
         }
     }
 }
@@ -127,7 +124,7 @@ impl App {
         let (track, residual) = camera.live.tracks.update(&camera.id, &seen, &self.limits)?;
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
-            camera.live.announce_track(|| TargetUpdate {
+            camera.live.announce_track(now, || TargetUpdate {
                 point: point.clone(),
                 bounding_box: observation.bounding_box(),
                 fused: fused.clone(),
@@ -170,14 +167,14 @@ impl App {
         })
     }
 
-    /// Everything that happens in a camera's view from now on. A reader that is too slow misses the
-    /// oldest of what it has not read.
+    /// Everything that happens in a camera's view from now on, or after the last event that the reader has
+    /// seen. A reader that is too slow, or was away for too long, misses the oldest of what it has not read.
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn camera_events(&self, id: &CameraId) -> Result<CameraEvents> {
+    pub async fn camera_events(&self, id: &CameraId, last_seen: Option<EventId>) -> Result<CameraEvents> {
         let live = self.active_camera(id).await?.live.clone();
-        Ok(CameraEvents { events: live.events.subscribe(), live })
+        Ok(CameraEvents { cursor: live.events.reader(last_seen), live })
     }
 
     /// Whether a camera's active model no longer fits what the camera sees.

@@ -125,6 +125,35 @@ pub struct CameraChange {
 }
 
 impl CameraChange {
+    /// Names of the fields that can be changed, on both transports.
+    pub const FIELDS: [&str; 9] = [
+        "display_name",
+        "image_size",
+        "gnss_error",
+        "gnss_bias_sigma_m",
+        "recipe",
+        "target_classes",
+        "labels",
+        "receivers",
+        "retrain_when_moved",
+    ];
+
+    /// The fields of a profile that are named, by [`Self::FIELDS`].
+    #[must_use]
+    pub fn of_fields(profile: NewCamera, is_named: impl Fn(&str) -> bool) -> Self {
+        Self {
+            display_name: is_named("display_name").then_some(profile.display_name),
+            image_size: is_named("image_size").then_some(profile.image_size),
+            gnss_error: is_named("gnss_error").then_some(profile.gnss_error),
+            gnss_bias_sigma: is_named("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
+            recipe: is_named("recipe").then_some(profile.recipe),
+            target_classes: is_named("target_classes").then_some(profile.target_classes),
+            labels: is_named("labels").then_some(profile.labels),
+            receivers: is_named("receivers").then_some(profile.receivers),
+            retrain_when_moved: is_named("retrain_when_moved").then_some(profile.retrain_when_moved),
+        }
+    }
+
     /// The profile after the change.
     ///
     /// # Errors

@@ -85,7 +85,7 @@ mod tests {
 
     #[test]
     fn types_are_named_as_in_json() {
-        for (what, told) in [
+        for (what, message) in [
             ("invalid type: string \"x\", expected f64", "must be a number, not text"),
             ("invalid type: integer `5`, expected a string", "must be text, not a number"),
             ("invalid type: null, expected f64", "must be a number, not null"),
@@ -97,7 +97,7 @@ mod tests {
                 "must be a whole number from 0 on, not true or false",
             ),
         ] {
-            assert_eq!(field_and_reason("a.b", what), ("a.b".to_owned(), told.to_owned()));
+            assert_eq!(field_and_reason("a.b", what), ("a.b".to_owned(), message.to_owned()));
         }
         assert_eq!(
             field_and_reason("recipe", "unknown variant `x`, expected one of `paper`, `auto`").1,

@@ -17,12 +17,12 @@ use crate::domain::{Fix, FusedFix, Sample};
 
 /// Writes samples one by one. Between two of them the output can be drained (`get_mut`), so an export of
 /// any length needs the memory of one page.
-pub struct SampleWriter<W: Write>(Document<W>);
+pub struct SampleWriter<W: Write>(PositionDocument<W>);
 
 impl<W: Write> SampleWriter<W> {
     /// A writer of that format. Nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
-        Self(Document::new(out, format, "samples"))
+        Self(PositionDocument::new(out, format, "samples"))
     }
 
     /// Writes one sample. Without a fix its columns are empty, and its GeoJSON feature has no geometry.
@@ -56,12 +56,12 @@ impl<W: Write> SampleWriter<W> {
 }
 
 /// Writes fused positions one by one, like [`SampleWriter`].
-pub struct FusedWriter<W: Write>(Document<W>);
+pub struct FusedWriter<W: Write>(PositionDocument<W>);
 
 impl<W: Write> FusedWriter<W> {
     /// A writer of that format. Nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
-        Self(Document::new(out, format, "items"))
+        Self(PositionDocument::new(out, format, "items"))
     }
 
     /// Writes one fused position.
@@ -124,7 +124,7 @@ pub fn write_fused<'a, W: Write>(
 }
 
 /// The framing of a document: beginning, separators and end.
-struct Document<W> {
+struct PositionDocument<W> {
     out: W,
     format: Format,
     /// Name of the array in a JSON document.
@@ -132,7 +132,7 @@ struct Document<W> {
     has_begun: bool,
 }
 
-impl<W: Write> Document<W> {
+impl<W: Write> PositionDocument<W> {
     const fn new(out: W, format: Format, name: &'static str) -> Self {
         Self { out, format, name, has_begun: false }
     }

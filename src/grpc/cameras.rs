@@ -156,19 +156,6 @@ fn gnss_error(error: Option<proto::GnssError>) -> Result<GnssError> {
     }
 }
 
-/// The fields of a profile, as a mask names them.
-const FIELDS: [&str; 9] = [
-    "display_name",
-    "image_size",
-    "gnss_error",
-    "recipe",
-    "target_classes",
-    "labels",
-    "receivers",
-    "retrain_when_moved",
-    "gnss_bias_sigma_m",
-];
-
 /// The fields that the mask names, or those that the profile has.
 fn camera_change(
     id: &CameraId,
@@ -179,43 +166,32 @@ fn camera_change(
         Some(mask) => mask.paths,
         None => present(&profile).into_iter().map(str::to_owned).collect(),
     };
-    let unknown = |path: &String| path != "*" && !FIELDS.contains(&path.as_str());
+    let unknown = |path: &String| path != "*" && !CameraChange::FIELDS.contains(&path.as_str());
     if let Some(index) = paths.iter().position(unknown) {
-        let known = FIELDS.join(", ");
+        let known = CameraChange::FIELDS.join(", ");
         return Err(Error::invalid(
             format!("update_mask.paths[{index}]"),
             format!("must be one of {known}, or * for all"),
         ));
     }
-    let named = |field: &str| paths.iter().any(|path| path == field || path == "*");
     let profile = new_camera(id.clone(), profile).map_err(|error| error.under("profile"))?;
-    Ok(CameraChange {
-        display_name: named("display_name").then_some(profile.display_name),
-        image_size: named("image_size").then_some(profile.image_size),
-        gnss_error: named("gnss_error").then_some(profile.gnss_error),
-        gnss_bias_sigma: named("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
-        recipe: named("recipe").then_some(profile.recipe),
-        target_classes: named("target_classes").then_some(profile.target_classes),
-        labels: named("labels").then_some(profile.labels),
-        receivers: named("receivers").then_some(profile.receivers),
-        retrain_when_moved: named("retrain_when_moved").then_some(profile.retrain_when_moved),
-    })
+    Ok(CameraChange::of_fields(profile, |field| paths.iter().any(|path| path == field || path == "*")))
 }
 
 /// Names of the fields that a profile has.
 fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
     let has = [
-        !profile.display_name.is_empty(),
-        profile.image_size.is_some(),
-        profile.gnss_error.is_some(),
-        profile.recipe != proto::Recipe::Unspecified as i32,
-        !profile.target_classes.is_empty(),
-        !profile.labels.is_empty(),
-        !profile.receivers.is_empty(),
-        profile.retrain_when_moved.is_some(),
-        profile.gnss_bias_sigma_m.is_some(),
+        ("display_name", !profile.display_name.is_empty()),
+        ("image_size", profile.image_size.is_some()),
+        ("gnss_error", profile.gnss_error.is_some()),
+        ("gnss_bias_sigma_m", profile.gnss_bias_sigma_m.is_some()),
+        ("recipe", profile.recipe != proto::Recipe::Unspecified as i32),
+        ("target_classes", !profile.target_classes.is_empty()),
+        ("labels", !profile.labels.is_empty()),
+        ("receivers", !profile.receivers.is_empty()),
+        ("retrain_when_moved", profile.retrain_when_moved.is_some()),
     ];
-    FIELDS.into_iter().zip(has).filter_map(|(field, has)| has.then_some(field)).collect()
+    has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
 }
 
 impl proto::Camera {

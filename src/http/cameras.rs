@@ -179,56 +179,32 @@ struct CameraChange {
     retrain_when_moved: Option<bool>,
 }
 
-type Document = serde_json::Map<String, Value>;
-
-/// The fields that a patch may name.
-const PATCHED_FIELDS: [&str; 9] = [
-    "display_name",
-    "image_size",
-    "gnss_error",
-    "gnss_bias_sigma_m",
-    "recipe",
-    "target_classes",
-    "labels",
-    "receivers",
-    "retrain_when_moved",
-];
+type JsonObject = serde_json::Map<String, Value>;
 
 /// The change that a merge patch makes of a stored camera.
-fn patched(app: &App, camera: domain::Camera, patch: &Document) -> Result<domain::CameraChange> {
-    if let Some(name) = patch.keys().find(|name| !PATCHED_FIELDS.contains(&name.as_str())) {
-        let known = PATCHED_FIELDS.join(", ");
+fn patched(app: &App, camera: domain::Camera, patch: &JsonObject) -> Result<domain::CameraChange> {
+    if let Some(name) = patch.keys().find(|name| !domain::CameraChange::FIELDS.contains(&name.as_str())) {
+        let known = domain::CameraChange::FIELDS.join(", ");
         return Err(Error::invalid(name, format!("is not a field that can be changed; those are {known}")));
     }
     let shown = serde_json::to_value(Camera::of(app, camera)).map_err(Error::fault)?;
     let Value::Object(mut document) = shown else { return Err(Error::fault("a camera is an object")) };
-    document.retain(|name, _| name == "id" || PATCHED_FIELDS.contains(&name.as_str()));
+    document.retain(|name, _| name == "id" || domain::CameraChange::FIELDS.contains(&name.as_str()));
     merge(&mut document, patch);
     let document = serde_json::to_vec(&document).map_err(Error::fault)?;
     let profile = parse_json::<CameraDraft>(&document)?.into_domain()?;
-    let names = |field: &str| patch.contains_key(field);
-    Ok(domain::CameraChange {
-        display_name: names("display_name").then_some(profile.display_name),
-        image_size: names("image_size").then_some(profile.image_size),
-        gnss_error: names("gnss_error").then_some(profile.gnss_error),
-        gnss_bias_sigma: names("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
-        recipe: names("recipe").then_some(profile.recipe),
-        target_classes: names("target_classes").then_some(profile.target_classes),
-        labels: names("labels").then_some(profile.labels),
-        receivers: names("receivers").then_some(profile.receivers),
-        retrain_when_moved: names("retrain_when_moved").then_some(profile.retrain_when_moved),
-    })
+    Ok(domain::CameraChange::of_fields(profile, |field| patch.contains_key(field)))
 }
 
 /// RFC 7396, section 2.
-fn merge(target: &mut Document, patch: &Document) {
+fn merge(target: &mut JsonObject, patch: &JsonObject) {
     for (name, value) in patch {
         match value {
             Value::Null => drop(target.remove(name)),
             Value::Object(patch) => {
-                let nested = target.entry(name.clone()).or_insert_with(|| Value::Object(Document::new()));
+                let nested = target.entry(name.clone()).or_insert_with(|| Value::Object(JsonObject::new()));
                 if !nested.is_object() {
-                    *nested = Value::Object(Document::new());
+                    *nested = Value::Object(JsonObject::new());
                 }
                 if let Value::Object(nested) = nested {
                     merge(nested, patch);
@@ -447,7 +423,7 @@ async fn change_camera(
             "the header must name the revision that the change is based on, as `etag` gave it, or be *";
         Error::field(ErrorKind::RevisionRequired, "if-match", message)
     })?;
-    let patch = body.read::<Document>()?;
+    let patch = body.read::<JsonObject>()?;
     let changed = apply(&app, &id, &patch, expected.version()).await?;
     let version = changed.version();
     Ok(with_etag(json(&Camera::of(&app, changed))?, version).await?)
@@ -458,7 +434,7 @@ async fn change_camera(
 async fn apply(
     app: &App,
     id: &CameraId,
-    patch: &Document,
+    patch: &JsonObject,
     expected: Option<ExpectedVersion>,
 ) -> Result<domain::Camera> {
     let mut attempts = 0;

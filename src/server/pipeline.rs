@@ -3,7 +3,7 @@
 
 use std::convert::Infallible;
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -43,7 +43,7 @@ const DISCARD_TIME: Duration = Duration::from_secs(10);
 /// The way from a connection to the transports.
 pub(super) struct RequestPipeline {
     app: App,
-    http: Router,
+    http: http::Transport,
     grpc: Router,
     hosts: HostCheck,
     shutdown: Shutdown,
@@ -82,7 +82,7 @@ impl RequestPipeline {
         shutdown: &Shutdown,
     ) -> Self {
         Self {
-            http: http::router(app.clone(), console, shutdown.clone()),
+            http: http::Transport::new(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
             cors,
@@ -113,8 +113,7 @@ impl RequestPipeline {
         let span = tracing::debug_span!(
             "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
-        let mut response = self.respond(request, is_grpc, peer, &id).instrument(span).await;
-        let ticket = response.extensions_mut().remove::<Ticket>();
+        let (mut response, ticket) = self.respond(request, is_grpc, peer, &id).instrument(span).await;
         let headers = response.headers_mut();
         headers.insert(REQUEST_ID, id.header().clone());
         headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
@@ -127,20 +126,24 @@ impl RequestPipeline {
         response.map(|body| ObservedBody::new(body, open, ticket))
     }
 
-    /// The response, with the ticket of an admitted request as an extension.
+    /// The response, and the ticket of a request that was admitted.
     async fn respond(
         &self,
         request: Request<Incoming>,
         is_grpc: bool,
         peer: &Peer,
         id: &RequestId,
-    ) -> Response<Body> {
+    ) -> (Response<Body>, Option<Ticket>) {
         let Some(cors) = &self.cors else { return self.admit_and_route(request, is_grpc, peer, id).await };
+        let granted = OnceLock::new();
         let service = service_fn(|request| async {
-            Ok::<_, Infallible>(self.admit_and_route(request, is_grpc, peer, id).await)
+            let (response, ticket) = self.admit_and_route(request, is_grpc, peer, id).await;
+            // The service is called once.
+            let _ = granted.set(ticket);
+            Ok::<_, Infallible>(response)
         });
         let Ok(response) = cors.layer(service).oneshot(request).await;
-        response
+        (response, granted.into_inner().flatten())
     }
 
     async fn admit_and_route(
@@ -149,18 +152,16 @@ impl RequestPipeline {
         is_grpc: bool,
         peer: &Peer,
         id: &RequestId,
-    ) -> Response<Body> {
+    ) -> (Response<Body>, Option<Ticket>) {
         match self.admit(request, is_grpc, peer, id).await {
             Ok((request, granted)) => {
-                let mut response = self.route(is_grpc, request, &granted, id).await;
-                response.extensions_mut().insert(granted.ticket);
-                response
+                (self.route(is_grpc, request, &granted, id).await, Some(granted.ticket))
             }
             Err(error) => {
                 if error.kind() == ErrorKind::Overloaded {
                     self.app.metrics.refused();
                 }
-                refuse(is_grpc, &error, id)
+                (refuse(is_grpc, &error, id), None)
             }
         }
     }
@@ -275,10 +276,16 @@ impl RequestPipeline {
         let time = Duration::from_secs(self.app.limits.request_s);
         // An import stream reports by itself what it has stored of a body that was refused.
         let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
-        let mut transport = if is_grpc { self.grpc.clone() } else { self.http.clone() };
+        let answer = async {
+            if !is_grpc {
+                return self.http.answer(request).await;
+            }
+            let answer = self.grpc.clone().call(request).await;
+            answer.unwrap_or_else(|never| match never {})
+        };
         let answer = tokio::select! {
             biased;
-            answer = tokio::time::timeout(time, transport.call(request)) => answer.map_err(|_| too_slow(time)),
+            answer = tokio::time::timeout(time, answer) => answer.map_err(|_| too_slow(time)),
             error = caller.ended() => Err(error),
             () = self.shutdown.forced() => Err(shutting_down()),
         };
@@ -292,7 +299,6 @@ impl RequestPipeline {
                 refuse(is_grpc, &error, id)
             }
             (Ok(response), None) => {
-                let response = response.unwrap_or_else(|never| match never {});
                 let response = if is_grpc { grpc::explain(response, id) } else { response };
                 revocable(response, caller, is_grpc.then_some(id))
             }

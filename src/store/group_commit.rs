@@ -66,22 +66,24 @@ impl From<Durability> for InsertOptions {
 
 /// Queues batches for the task.
 pub(super) struct GroupCommit {
-    queue: mpsc::Sender<Request>,
+    queue: mpsc::Sender<WriteRequest>,
     rows: Arc<Semaphore>,
 }
 
-enum Request {
-    Insert(Batch),
+enum WriteRequest {
+    Insert(SampleBatch),
     /// Everything queued before is committed, then the task ends.
     End(oneshot::Sender<()>),
 }
 
-struct Batch {
+struct SampleBatch {
     camera: CameraId,
     /// The camera must still be this one; `None` for whichever has the id.
     key: Option<CameraKey>,
     samples: Vec<StoredSample>,
     options: InsertOptions,
+    /// Samples that were left out because a later one of the batch takes their place.
+    repeated: u64,
     /// On whose behalf.
     actor: Arc<Actor>,
     reply: oneshot::Sender<Result<Inserted>>,
@@ -110,16 +112,15 @@ impl GroupCommit {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
         let permit = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = Batch { camera, key, samples, options, actor, reply, _permit: permit };
-        self.queue.send(Request::Insert(batch)).await.map_err(|_| self.task_ended())?;
-        let inserted = answer.await.map_err(|_| self.task_ended())??;
-        Ok(Inserted { duplicate: inserted.duplicate + repeated, ..inserted })
+        let batch = SampleBatch { camera, key, samples, options, repeated, actor, reply, _permit: permit };
+        self.queue.send(WriteRequest::Insert(batch)).await.map_err(|_| self.task_ended())?;
+        answer.await.map_err(|_| self.task_ended())?
     }
 
     pub(super) async fn close(&self) {
         self.rows.close();
         let (ended, end) = oneshot::channel();
-        if self.queue.send(Request::End(ended)).await.is_ok() {
+        if self.queue.send(WriteRequest::End(ended)).await.is_ok() {
             // An error means that the task has ended already, which is what is waited for.
             let _ = end.await;
         }
@@ -141,7 +142,7 @@ impl GroupCommit {
     }
 }
 
-async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<Request>) {
+async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<WriteRequest>) {
     while let Some(first) = requests.recv().await {
         // The writer first: batches that are queued while it is locked for another change join the group.
         let guard = writer.lock(Durability::default(), Growth::Limited).await;
@@ -164,24 +165,24 @@ async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receive
 }
 
 /// The strongest that a caller of the group asks for: one flush is enough for all of them.
-fn durability_of(group: &[Batch]) -> Durability {
+fn durability_of(group: &[SampleBatch]) -> Durability {
     group.iter().map(|batch| batch.options.durability).max().unwrap_or_default()
 }
 
 /// Splits a group, in its order, into those of one transaction each: a batch that replaces samples must find
 /// what the batches before it have stored, so it has its own.
-fn transactions(group: Vec<Batch>) -> Vec<Vec<Batch>> {
-    let mut transactions: Vec<Vec<Batch>> = Vec::new();
+fn transactions(group: Vec<SampleBatch>) -> Vec<Vec<SampleBatch>> {
+    let mut transactions: Vec<Vec<SampleBatch>> = Vec::new();
     for batch in group {
         match transactions.last_mut() {
-            Some(last) if !batch.replaces() && !last.iter().any(Batch::replaces) => last.push(batch),
+            Some(last) if !batch.replaces() && !last.iter().any(SampleBatch::replaces) => last.push(batch),
             _ => transactions.push(vec![batch]),
         }
     }
     transactions
 }
 
-impl Batch {
+impl SampleBatch {
     fn replaces(&self) -> bool {
         self.options.on_conflict == OnConflict::Replace
     }
@@ -189,19 +190,19 @@ impl Batch {
 
 /// What is in the queue now, up to the rows of one transaction.
 fn gather(
-    first: Request,
-    requests: &mut mpsc::Receiver<Request>,
-) -> (Vec<Batch>, Option<oneshot::Sender<()>>) {
+    first: WriteRequest,
+    requests: &mut mpsc::Receiver<WriteRequest>,
+) -> (Vec<SampleBatch>, Option<oneshot::Sender<()>>) {
     let mut group = Vec::new();
     let mut rows = 0;
     let mut next = Some(first);
     while let Some(request) = next {
         match request {
-            Request::Insert(batch) => {
+            WriteRequest::Insert(batch) => {
                 rows += batch.samples.len();
                 group.push(batch);
             }
-            Request::End(ended) => return (group, Some(ended)),
+            WriteRequest::End(ended) => return (group, Some(ended)),
         }
         next = if rows < ROWS_PER_TRANSACTION { requests.try_recv().ok() } else { None };
     }
@@ -210,7 +211,7 @@ fn gather(
 
 /// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
 /// alone, so that one bad row fails nobody but its caller.
-async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch>) {
+async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<SampleBatch>) {
     match commit(guard, space, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
@@ -232,7 +233,7 @@ async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch
     }
 }
 
-fn refuse_all(group: Vec<Batch>, error: &Error) {
+fn refuse_all(group: Vec<SampleBatch>, error: &Error) {
     for batch in group {
         let _ = batch.reply.send(Err(copy_of(error)));
     }
@@ -249,7 +250,7 @@ enum Failure {
 async fn commit(
     guard: &mut WriterGuard<'_>,
     space: &Space,
-    group: &[Batch],
+    group: &[SampleBatch],
 ) -> Result<Vec<Result<Inserted>>, Failure> {
     let committed = try_commit(guard, space, group).await;
     match &committed {
@@ -263,7 +264,7 @@ async fn commit(
 async fn try_commit(
     guard: &mut WriterGuard<'_>,
     space: &Space,
-    group: &[Batch],
+    group: &[SampleBatch],
 ) -> Result<Vec<Result<Inserted>>, Failure> {
     for counting in [Counting::Together, Counting::Apart] {
         let mut transaction = guard.begin().await.map_err(Failure::Transaction)?;
@@ -294,7 +295,7 @@ enum Counting {
 async fn store(
     connection: &mut SqliteConnection,
     space: &Space,
-    group: &[Batch],
+    group: &[SampleBatch],
     counting: Counting,
 ) -> Result<Option<Vec<Result<Inserted>>>> {
     let mut cameras = cameras_of(connection, group).await?;
@@ -305,7 +306,11 @@ async fn store(
     let admitted = admit(&mut cameras, space, group);
     let mut outcomes: Vec<Result<Inserted>> = admitted
         .iter()
-        .map(|camera| camera.as_ref().map(|_| Inserted { replaced, ..Inserted::default() }).map_err(copy_of))
+        .zip(group)
+        .map(|(camera, batch)| {
+            let begun = Inserted { replaced, duplicate: batch.repeated, ..Inserted::default() };
+            camera.as_ref().map(|_| begun).map_err(copy_of)
+        })
         .collect();
     // Those with a fix first: of two rows of one key, the one with a fix is stored.
     for table in [SampleTable::WithFix, SampleTable::WithoutFix] {
@@ -329,7 +334,7 @@ async fn store(
 /// Deletes the stored samples whose place those of a batch take; returns how many.
 async fn replace(
     connection: &mut SqliteConnection,
-    batch: &Batch,
+    batch: &SampleBatch,
     cameras: &mut HashMap<String, Known>,
     space: &Space,
 ) -> Result<u64> {
@@ -351,7 +356,7 @@ async fn replace(
 async fn complete(
     connection: &mut SqliteConnection,
     space: &Space,
-    group: &[Batch],
+    group: &[SampleBatch],
     outcomes: &[Result<Inserted>],
 ) -> Result<()> {
     for (batch, outcome) in group.iter().zip(outcomes) {
@@ -364,7 +369,7 @@ async fn complete(
 }
 
 /// The key of each batch's camera, or why the batch is not stored.
-fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[Batch]) -> Vec<Result<i64>> {
+fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[SampleBatch]) -> Vec<Result<i64>> {
     let mut quota = space.quota();
     let admitted = group.iter().map(|batch| {
         let camera = cameras
@@ -380,7 +385,7 @@ fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[Batch]) -
 /// The rows of admitted batches that a table takes, and where statements must end.
 fn rows_of<'a>(
     table: SampleTable,
-    group: &'a [Batch],
+    group: &'a [SampleBatch],
     admitted: &[Result<i64>],
     counting: Counting,
 ) -> (Vec<Row<'a>>, Vec<usize>) {
@@ -460,7 +465,10 @@ struct Known {
 
 /// The cameras of a group by their ids, read in its own transaction, so that none can vanish before
 /// the commit. One statement for all, since a round trip costs as much as several rows.
-async fn cameras_of(connection: &mut SqliteConnection, group: &[Batch]) -> Result<HashMap<String, Known>> {
+async fn cameras_of(
+    connection: &mut SqliteConnection,
+    group: &[SampleBatch],
+) -> Result<HashMap<String, Known>> {
     let mut ids: Vec<&str> = group.iter().map(|batch| batch.camera.as_str()).collect();
     ids.sort_unstable();
     ids.dedup();
@@ -488,7 +496,7 @@ fn as_count(stored: i64) -> u64 {
 async fn count_stored(
     connection: &mut SqliteConnection,
     cameras: &HashMap<String, Known>,
-    group: &[Batch],
+    group: &[SampleBatch],
     outcomes: &[Result<Inserted>],
 ) -> Result<()> {
     // Per camera: added with a fix, added without, replaced.

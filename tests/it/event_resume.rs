@@ -149,7 +149,7 @@ async fn a_run_is_sent_again_only_if_it_has_changed() {
     let (_folder, server) = with_camera().await;
     let csv = [("content-type", "text/csv")];
     server.send("POST", "/v1/cameras/c/samples", &csv, simulated_csv()).await.expect(200);
-    let wish = json!({"recipe": "hybrid", "epochs": 300});
+    let wish = json!({"recipe": "projective", "epochs": 40});
     let run = server.post("/v1/cameras/c/training-runs", &wish).await.expect(202);
     let path = format!("{}/events", run.header("location"));
     let mut events = Events::open(&server, &path, None).await;

@@ -116,7 +116,7 @@ async fn a_fault_of_one_row_refuses_them_all_and_names_it() {
         (NDJSON, "{".to_owned(), 422),
         (GEOJSON, json!({"type": "Feature"}).to_string(), 422),
         (GEOJSON, json!({"type": "FeatureCollection", "features": []}).to_string(), 422),
-        (GEOJSON, "[".to_owned(), 400),
+        (GEOJSON, "{".to_owned(), 400),
         ("text/plain", ROWS.to_owned(), 415),
     ] {
         fuse(&server, from, JSON, body).await.expect(status);

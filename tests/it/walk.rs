@@ -1,16 +1,33 @@
 //! A walk with a phone beside a camera: fixes of a receiver over REST, boxes of the camera over a live stream,
 //! samples of both, a model of these.
 
-use futures_util::future::join_all;
-use jiff::SignedDuration;
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
 use sightfix::grpc::proto;
-use sightfix::simulation::Options;
+use sightfix::simulation::{Options, SimulatedRow};
 
 use crate::harness::{TestServer, data_folder};
 use crate::live_client::{boxed, channel, open, rows, yard};
 
 const TRACKS: &str = "/v1/cameras/yard/tracks?store_samples=true";
+
+/// A row's fix as the phone page sends it. The phone's clock is half a second ahead of the camera's.
+fn fix_of_phone(row: &SimulatedRow) -> Value {
+    let position = row.fix.expect("a fix").position;
+    let fix = json!({
+        "longitude_deg": position.longitude_deg(), "latitude_deg": position.latitude_deg(), "sigma_m": 2.0,
+    });
+    json!({"time": row.time + SignedDuration::from_millis(500), "receiver_id": "phone-1", "fix": fix})
+}
+
+/// Until when the target is tracked: a camera without a model tracks it by its fixes alone.
+async fn tracked_until(server: &TestServer) -> Option<Timestamp> {
+    let tracks = server.get("/v1/cameras/yard/tracks").await.expect(200).json();
+    tracks["features"][0]["properties"]["time"].as_str()?.parse().ok()
+}
 
 #[tokio::test]
 async fn fixes_of_a_phone_and_boxes_of_a_stream_become_samples_that_train_the_camera() {
@@ -22,31 +39,34 @@ async fn fixes_of_a_phone_and_boxes_of_a_stream_become_samples_that_train_the_ca
     let walked: Vec<_> = world.iter().filter(|row| row.target_id == *walker && row.fix.is_some()).collect();
     assert!(walked.len() >= 50, "{} rows", walked.len());
 
+    let server = Arc::new(server);
     let channel = channel(&server).await;
     let mut edge = open(&channel, "edge", true).await;
-    for row in &walked {
-        edge.item(proto::StreamItem { target_id: Some("walker".to_owned()), ..boxed(row) }).await;
+    let mut requests = Vec::new();
+    // Both devices send a second of the walk at a time, so neither is ahead by more than may be late.
+    for part in walked.chunk_by(|a, b| a.time.as_second() == b.time.as_second()) {
+        for row in part {
+            edge.item(proto::StreamItem { target_id: Some("walker".to_owned()), ..boxed(row) }).await;
+        }
+        let body = json!({ "observations": part.iter().map(|row| fix_of_phone(row)).collect::<Vec<_>>() });
+        let sender = server.clone();
+        // Its answer comes when it is decided what becomes of the fixes, so the walk goes on meanwhile.
+        requests.push(tokio::spawn(async move { sender.post(TRACKS, &body).await.expect(200).json() }));
+        let latest = part[part.len() - 1].time;
+        while tracked_until(&server).await.is_none_or(|time| time < latest) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
     }
-    // The phone's clock is half a second ahead of the camera's.
-    let fixes: Vec<Value> = walked
-        .iter()
-        .filter_map(|row| {
-            let (time, fix) = (row.time + SignedDuration::from_millis(500), row.fix?);
-            let (longitude_deg, latitude_deg) = (fix.position.longitude_deg(), fix.position.latitude_deg());
-            let fix = json!({"longitude_deg": longitude_deg, "latitude_deg": latitude_deg, "sigma_m": 2.0});
-            Some(json!({"time": time, "receiver_id": "phone-1", "fix": fix}))
-        })
-        .collect();
-    // Several requests at once, as the page sends while earlier ones wait for their answers.
-    let bodies: Vec<Value> = fixes.chunks(50).map(|part| json!({ "observations": part })).collect();
-    let answers = join_all(bodies.iter().map(|body| server.post(TRACKS, body))).await;
-    let stored: Vec<Value> = answers.into_iter().map(|it| it.expect(200).json()["stored"].clone()).collect();
-    let in_samples: u64 = stored.iter().filter_map(|it| it["in_samples"].as_u64()).sum();
+    let mut in_samples = 0;
+    for request in requests {
+        let answer = request.await.expect("no panic");
+        in_samples += answer["stored"]["in_samples"].as_u64().unwrap_or_default();
+    }
     edge.finish().await;
     let path = "/v1/cameras/yard/samples";
     let count = server.get(&format!("{path}/count")).await.expect(200).json();
-    assert_eq!(count, json!({"count": walked.len(), "without_fix": 0}), "{stored:?}");
-    assert_eq!(in_samples, walked.len() as u64, "{stored:?}");
+    assert_eq!(count, json!({"count": walked.len(), "without_fix": 0}), "{in_samples}");
+    assert_eq!(in_samples, walked.len() as u64);
     let sample = server.get(&format!("{path}?limit=1")).await.expect(200).json()["items"][0].clone();
     assert_eq!(sample["target_id"], "walker", "the receivers of the profile say whose the phone is");
     assert_eq!(sample["time"], walked[0].time.to_string(), "in the camera's time");

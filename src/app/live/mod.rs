@@ -23,6 +23,7 @@ use jiff::Timestamp;
 
 use self::camera::CameraLive;
 use self::event_log::EventCursor;
+use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
 use super::fusion::fuse_observed;
@@ -32,7 +33,6 @@ use crate::domain::{
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
-use crate::fusion::target_track::TargetTrack;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
@@ -108,20 +108,28 @@ impl App {
         let regressor = model.map(|(regressor, _)| regressor);
         let now = self.clock.monotonic();
         let ActiveCamera { image_size, e_gnss_m2, .. } = **camera;
-        let observed = match observation.target_id().filter(|_| regressor.is_some()) {
-            Some(target_id) => {
-                let observe =
-                    |track: &mut TargetTrack| track.observe(observation, regressor, image_size, e_gnss_m2);
-                camera.live.tracks.observe(&camera.id, target_id, now, &self.limits, observe)?
+        // A box without a model measures nothing, so it makes no target.
+        let measures = regressor.is_some() || observation.fix().is_some();
+        let target = match observation.target_id().filter(|_| measures) {
+            Some(id) => {
+                Some(camera.live.tracks.target(&camera.id, id, now, self.limits.tracks_per_camera)?)
             }
+            None => None,
+        };
+        let mut target = target.as_ref().map(|target| lock(target));
+        let observed = match &mut target {
+            Some(target) => target.observe(observation, regressor, image_size, e_gnss_m2),
             None => ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None),
         };
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(self.clock.now());
-        let Some(target_id) = observation.target_id() else { return Ok(ItemResult { fused, track: None }) };
-        let seen = TargetObservation { target_id, observed, model, now };
-        let (track, residual) = camera.live.tracks.update(&camera.id, &seen, &self.limits)?;
+        let (track, residual) = match (target, observation.target_id()) {
+            (Some(mut target), Some(target_id)) => {
+                target.update(&TargetObservation { target_id, observed, model, now }, &self.limits)
+            }
+            _ => (None, None),
+        };
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
             camera.live.announce_track(now, || TargetUpdate {

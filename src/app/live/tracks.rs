@@ -12,7 +12,7 @@ use jiff::SignedDuration;
 
 use super::sync::lock;
 use crate::config::Limits;
-use crate::domain::{CameraId, Error, ErrorKind, Result, TargetId};
+use crate::domain::{CameraId, Error, ErrorKind, ImageSize, Observation, Result, TargetId};
 use crate::fusion::drift_detector::{ResidualSample, TimeAligner, TimedEstimate};
 use crate::fusion::observed::ObservedPositions;
 use crate::fusion::target_track::{TargetTrack, TrackEstimate};
@@ -43,7 +43,7 @@ pub(super) struct Tracks {
 }
 
 /// One target; without a track until something usable was measured of it.
-struct TrackedTarget {
+pub(super) struct TrackedTarget {
     track: TargetTrack,
     /// Reading of the monotonic clock at the last observation.
     last_item_at: Duration,
@@ -62,50 +62,6 @@ pub(super) struct TargetObservation<'a> {
 }
 
 impl Tracks {
-    /// What `observe` makes of an observation with its target's [`TargetTrack`].
-    ///
-    /// # Errors
-    /// `Overloaded` if as many targets are tracked as may be, all of them observed lately.
-    pub(super) fn observe<'a>(
-        &self,
-        id: &CameraId,
-        target_id: &TargetId,
-        now: Duration,
-        limits: &Limits,
-        observe: impl FnOnce(&mut TargetTrack) -> ObservedPositions<'a>,
-    ) -> Result<ObservedPositions<'a>> {
-        let target = self.target(id, target_id, now, limits.tracks_per_camera)?;
-        let observed = observe(&mut lock(&target).track);
-        Ok(observed)
-    }
-
-    /// Feeds an observation to its target's track; `None` while nothing usable was observed. With it comes
-    /// the regressed position beside the fix of the same instant, if now both are known.
-    ///
-    /// # Errors
-    /// `Overloaded` if as many targets are tracked as may be, all of them observed lately.
-    pub(super) fn update(
-        &self,
-        id: &CameraId,
-        seen: &TargetObservation<'_>,
-        limits: &Limits,
-    ) -> Result<(Option<Arc<TrackPoint>>, Option<ResidualSample>)> {
-        if seen.observed.is_empty() {
-            return Ok((None, None));
-        }
-        let target = self.target(id, seen.target_id, seen.now, limits.tracks_per_camera)?;
-        let mut target = lock(&target);
-        target.last_item_at = seen.now;
-        let settings =
-            || seen.model.map_or_else(TrackSettings::default, |(it, _)| TrackSettings::from_model(it));
-        let estimate = target.track.update(&seen.observed, settings);
-        let residual = target.residuals.observe(seen);
-        let Some(TrackEstimate { position, state }) = estimate else { return Ok((None, residual)) };
-        let point = Arc::new(TrackPoint { target_id: seen.target_id.clone(), position, state });
-        target.remember(&point, limits.track_points);
-        Ok((Some(point), residual))
-    }
-
     /// The latest point of every target, by target.
     pub(super) fn latest(&self, now: Duration) -> Vec<Arc<TrackPoint>> {
         let mut targets = lock(&self.targets);
@@ -128,7 +84,10 @@ impl Tracks {
     }
 
     /// The target's entry, made if there is room for it.
-    fn target(
+    ///
+    /// # Errors
+    /// `Overloaded` if as many targets are tracked as may be, all of them observed lately.
+    pub(super) fn target(
         &self,
         id: &CameraId,
         target_id: &TargetId,
@@ -176,6 +135,38 @@ fn evict_longest_silent(targets: &mut Targets, now: Duration) {
 }
 
 impl TrackedTarget {
+    /// What an observation measures, seen beside the target's latest boxes.
+    pub(super) fn observe<'a>(
+        &mut self,
+        observation: &Observation,
+        regressor: Option<&'a Regressor>,
+        image_size: Option<ImageSize>,
+        e_gnss_m2: Option<f64>,
+    ) -> ObservedPositions<'a> {
+        self.track.observe(observation, regressor, image_size, e_gnss_m2)
+    }
+
+    /// Feeds what was observed to the track; `None` while nothing usable was observed. With it comes the
+    /// regressed position beside the fix of the same instant, if now both are known.
+    pub(super) fn update(
+        &mut self,
+        seen: &TargetObservation<'_>,
+        limits: &Limits,
+    ) -> (Option<Arc<TrackPoint>>, Option<ResidualSample>) {
+        if seen.observed.is_empty() {
+            return (None, None);
+        }
+        self.last_item_at = seen.now;
+        let settings =
+            || seen.model.map_or_else(TrackSettings::default, |(it, _)| TrackSettings::from_model(it));
+        let estimate = self.track.update(&seen.observed, settings);
+        let residual = self.residuals.observe(seen);
+        let Some(TrackEstimate { position, state }) = estimate else { return (None, residual) };
+        let point = Arc::new(TrackPoint { target_id: seen.target_id.clone(), position, state });
+        self.remember(&point, limits.track_points);
+        (Some(point), residual)
+    }
+
     fn new(now: Duration) -> Self {
         Self {
             track: TargetTrack::default(),

@@ -72,7 +72,18 @@ impl<'a> Feature<'a> {
         let Properties { time, target_id, bounding_box, fix, sigma_m, class, score, truth } = self.properties;
         let at_point = self.geometry.map(|point| point.to_fix(sigma_m)).transpose()?;
         let fix = fix.or(at_point);
-        Ok(FileRow { time, target_id, bounding_box, fix, class, score, truth, receiver_id: None })
+        Ok(FileRow {
+            time,
+            target_id,
+            bounding_box,
+            fix,
+            class,
+            score,
+            truth,
+            _tracker_id: None,
+            _match_probability: None,
+            receiver_id: None,
+        })
     }
 }
 

@@ -12,6 +12,7 @@ use serde_path_to_error::Track;
 use utoipa::ToSchema;
 
 use super::json_errors::refusal_of;
+use super::json_violations::all_violations;
 use super::objects_only;
 use crate::domain::{self, Error, Result, SigmaM, TimeBounds, parse_time};
 use crate::geo::{self, PositionError};
@@ -117,20 +118,21 @@ impl From<domain::Fix> for Fix {
     }
 }
 
-/// Covariance of a position's error in the local plane, m2.
+/// A covariance on the ground in m2, axes east and north.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, ToSchema)]
-pub struct Covariance {
+pub struct PlaneCovariance {
     /// Variance along east.
-    pub east: f64,
+    pub east_m2: f64,
     /// Variance along north.
-    pub north: f64,
+    pub north_m2: f64,
     /// Covariance of east and north.
-    pub east_north: f64,
+    pub east_north_m2: f64,
 }
 
-impl From<geo::PlaneCovariance> for Covariance {
+impl From<geo::PlaneCovariance> for PlaneCovariance {
     fn from(covariance: geo::PlaneCovariance) -> Self {
-        Self { east: covariance.east_m2, north: covariance.north_m2, east_north: covariance.east_north_m2 }
+        let geo::PlaneCovariance { east_m2, north_m2, east_north_m2 } = covariance;
+        Self { east_m2, north_m2, east_north_m2 }
     }
 }
 
@@ -304,10 +306,10 @@ pub struct FusedFix<'a> {
     /// Radius about `fused` that contains the true position with 95 % probability, m.
     pub r95_m: f64,
     /// Covariance of the normal distribution about `fused` that has this radius: its 95 % ellipse.
-    pub covariance_m2: Covariance,
+    pub covariance: PlaneCovariance,
     /// The same about `regressed`.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub regressed_covariance_m2: Option<Covariance>,
+    pub regressed_covariance: Option<PlaneCovariance>,
     /// Reconstruction error of the auto-encoder, in the recipe's units.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reconstruction_error: Option<f64>,
@@ -332,8 +334,8 @@ impl<'a> From<&'a domain::FusedFix> for FusedFix<'a> {
             e_regression_m2: fused.e_regression_m2,
             e_gnss_m2: fused.e_gnss_m2,
             r95_m: fused.r95_m,
-            covariance_m2: fused.covariance.into(),
-            regressed_covariance_m2: fused.regressed_covariance.map(Covariance::from),
+            covariance: fused.covariance.into(),
+            regressed_covariance: fused.regressed_covariance.map(PlaneCovariance::from),
             reconstruction_error: fused.reconstruction_error,
             model_version: fused.model_version,
             flags: Flags(&fused.flags),
@@ -402,6 +404,14 @@ pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
         Ok(value) => Ok(value),
         Err(_) => parse_with_path(json),
     }
+}
+
+/// Parses a document from JSON text; its refusal names all fields at fault, and takes several passes.
+///
+/// # Errors
+/// As [`parse_json`].
+pub fn parse_document<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
+    parse_json(json).map_err(|first| all_violations::<T>(json, first))
 }
 
 fn parse_with_path<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {

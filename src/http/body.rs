@@ -15,7 +15,7 @@ use sha2::{Digest as _, Sha256};
 use tokio::io::AsyncWriteExt as _;
 
 use super::body_coding::is_undecodable;
-use crate::admission::{ClientAddress, Lease};
+use crate::admission::{ClientId, Lease};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind, IdempotentRequest, RequestHasher, Result};
 
@@ -147,7 +147,7 @@ pub(super) struct SpoolLeases {
 }
 
 impl SpoolLeases {
-    fn new(app: &App, client: ClientAddress) -> Result<Self> {
+    fn new(app: &App, client: ClientId) -> Result<Self> {
         let memory = app.quotas.import_memory.try_acquire(client, 0)?;
         Ok(Self { memory, disk: app.quotas.import_disk.try_acquire(client, 0)? })
     }
@@ -161,7 +161,7 @@ impl SpoolLeases {
 pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
     let limit = app.limits.import_bytes;
     check_announced(&head.headers, &mut body, limit).await?;
-    let mut spool = Spool::new(app, client_address(head))?;
+    let mut spool = Spool::new(app, client_id(head))?;
     while let Some(part) = next(&mut body).await? {
         let pushed =
             if spool.length + part.len() > limit { Err(too_large(limit)) } else { spool.push(part).await };
@@ -174,8 +174,8 @@ pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<S
 }
 
 /// Who sends a request.
-pub(super) fn client_address(head: &Parts) -> ClientAddress {
-    head.extensions.get().copied().unwrap_or(ClientAddress::UNKNOWN)
+pub(super) fn client_id(head: &Parts) -> ClientId {
+    head.extensions.get().copied().unwrap_or(ClientId::UNKNOWN)
 }
 
 /// Gathers what comes piece by piece, in memory up to a size and in a temporary file beyond, or where
@@ -189,7 +189,7 @@ pub(super) struct Spool {
 }
 
 impl Spool {
-    pub(super) fn new(app: &App, client: ClientAddress) -> Result<Self> {
+    pub(super) fn new(app: &App, client: ClientId) -> Result<Self> {
         Ok(Self {
             memory_bytes: app.limits.import_memory_bytes,
             length: 0,

@@ -4,6 +4,9 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod access;
 mod audit;
 mod body;
@@ -12,12 +15,14 @@ mod camera_statuses;
 mod cameras;
 mod console;
 mod description;
+mod etag;
 mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
 mod idempotency;
 mod keys;
+mod merge_patch;
 mod models;
 mod pairings;
 mod parts;
@@ -27,11 +32,13 @@ mod samples;
 mod server_info;
 mod service;
 mod session;
+mod sites;
 #[cfg(test)]
 mod tests;
 mod tracks;
 mod training_runs;
 mod wire;
+mod world_tracks;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
@@ -84,6 +91,14 @@ impl Transport {
             .config(Config::default().validator_url("none").use_base_layout());
         let page = Router::from(page).layer(map_response(contain_page));
         Self(routes.route_layer(authorize).merge(page).merge(console_routes).with_state(rest))
+    }
+
+    /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
+    #[must_use]
+    pub fn monitoring(app: App, shutdown: Shutdown) -> Self {
+        let rest = Rest { app, console: Arc::default(), shutdown };
+        let (routes, described) = service::routes().split_for_parts();
+        Self(routes.route_layer(access::AuthorizeLayer::of(&described)).with_state(rest))
     }
 
     /// Answers a request, which carries its [`RequestId`] and its [`Caller`](crate::app::access::Caller) as
@@ -150,6 +165,8 @@ fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
         .merge(camera_statuses::routes())
+        .merge(sites::routes())
+        .merge(world_tracks::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())

@@ -117,14 +117,11 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
     *response.status_mut() = status_of(error);
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
-    match error.kind() {
-        ErrorKind::Overloaded => {
-            headers.insert(RETRY_AFTER, HeaderValue::from_static("1"));
-        }
-        ErrorKind::Unauthenticated => {
-            headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"sightfix\""));
-        }
-        _ => {}
+    if let Some(seconds) = row.retry_after_s {
+        headers.insert(RETRY_AFTER, seconds.into());
+    }
+    if error.kind() == ErrorKind::Unauthenticated {
+        headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"sightfix\""));
     }
     response
 }

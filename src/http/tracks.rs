@@ -30,9 +30,10 @@ use crate::app::{
 use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
+use crate::geo::Position;
 
 /// Interval of the keep-alive comments of a silent event stream.
-const KEEP_ALIVE: Duration = Duration::from_secs(15);
+pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(15);
 /// Typical size of a followed observation as JSON, to reserve memory.
 const ITEM_BYTES: usize = 1_024;
 
@@ -118,7 +119,7 @@ struct TrackState {
     /// Radius about the position that holds the true one with 95 % probability, m.
     r95_m: f64,
     /// Covariance of the normal distribution about the position that has this radius: its 95 % ellipse.
-    covariance_m2: wire::Covariance,
+    covariance: wire::PlaneCovariance,
     /// Probability that the target is stationary, 0 to 1.
     still: f64,
     /// Normalised innovation squared of what was used; 2 on average for each of box and fix.
@@ -139,7 +140,7 @@ impl From<&TrackPoint> for TrackState {
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
-            covariance_m2: state.normal_covariance().into(),
+            covariance: state.normal_covariance().into(),
             still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
@@ -150,12 +151,21 @@ impl From<&TrackPoint> for TrackState {
 
 /// The GeoJSON geometry of a position (RFC 7946).
 #[derive(Serialize, ToSchema)]
-struct PointGeometry {
+pub(super) struct PointGeometry {
     /// `Point`.
     #[schema(example = "Point")]
     r#type: &'static str,
     /// Longitude and latitude in degrees, WGS 84.
     coordinates: [f64; 2],
+}
+
+impl From<Position> for PointGeometry {
+    fn from(position: Position) -> Self {
+        // A centimetre is the seventh decimal; more would only look precise.
+        let rounded = |degrees: f64| (degrees * 1e7).round() / 1e7;
+        let coordinates = [rounded(position.longitude_deg()), rounded(position.latitude_deg())];
+        Self { r#type: "Point", coordinates }
+    }
 }
 
 /// A position of a target as a GeoJSON feature.
@@ -172,14 +182,7 @@ struct TrackFeature {
 
 impl From<&TrackPoint> for TrackFeature {
     fn from(point: &TrackPoint) -> Self {
-        // A centimetre is the seventh decimal; more would only look precise.
-        let rounded = |degrees: f64| (degrees * 1e7).round() / 1e7;
-        let coordinates = [rounded(point.position.longitude_deg()), rounded(point.position.latitude_deg())];
-        Self {
-            r#type: "Feature",
-            geometry: PointGeometry { r#type: "Point", coordinates },
-            properties: point.into(),
-        }
+        Self { r#type: "Feature", geometry: point.position.into(), properties: point.into() }
     }
 }
 
@@ -233,6 +236,9 @@ struct FollowedObservation<'a> {
     /// The track's position, the best there is; missing without a target.
     #[serde(skip_serializing_if = "Option::is_none")]
     track: Option<TrackFeature>,
+    /// The target's world track in the camera's site, as of the latest frame that was tracked there.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    world_track_id: Option<String>,
 }
 
 impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
@@ -240,6 +246,7 @@ impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
         Self {
             fused: followed.fused.as_ref().map(Into::into),
             track: followed.track.as_ref().map(|point| point.as_ref().into()),
+            world_track_id: followed.world_track.map(|id| id.to_string()),
         }
     }
 }
@@ -387,12 +394,11 @@ async fn watch_camera(
     let events = app.camera_events(&id, last_seen).await?;
     let shutdown = rest.shutdown.clone();
     let sent = stream::unfold(events, |mut events| async move {
-        let event = match events.next().await? {
-            Ok((id, CameraEvent::Track(update))) => event_of(id, "track", &TrackUpdate::from(&*update)),
-            Ok((id, CameraEvent::Moved(moved))) => event_of(id, "camera_moved", &CameraMoved::from(&*moved)),
-            Err(LostEvents { count, id }) => event_of(id, "lost", &count),
+        let (id, event) = match events.next().await? {
+            Ok((id, event)) => (id, camera_event(&event)),
+            Err(LostEvents { count, id }) => (id, event_of("lost", &count)),
         };
-        Some((event, events))
+        Some((event.id(id.to_string()), events))
     });
     let sent = sent.take_until(async move { shutdown.draining().await }).map(move |event| {
         let _held = &lease; // until the stream is dropped
@@ -401,8 +407,15 @@ async fn watch_camera(
     Ok(Sse::new(sent).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
 }
 
-fn event_of(id: EventId, name: &str, value: &impl Serialize) -> Event {
-    Event::default().id(id.to_string()).event(name).json_data(value).unwrap_or_else(|error| {
+fn camera_event(event: &CameraEvent) -> Event {
+    match event {
+        CameraEvent::Track(update) => event_of("track", &TrackUpdate::from(&**update)),
+        CameraEvent::Moved(moved) => event_of("camera_moved", &CameraMoved::from(&**moved)),
+    }
+}
+
+pub(super) fn event_of(name: &str, value: &impl Serialize) -> Event {
+    Event::default().event(name).json_data(value).unwrap_or_else(|error| {
         tracing::error!(%error, "an event cannot be written");
         Event::default().event("error").data("the server failed")
     })

@@ -15,11 +15,13 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use super::audit::{Change, record};
 use super::errors::{closed, copy_of, failed, no_camera};
 use super::idempotency::{Completion, insert_answer};
+use super::sample_retention::delete_oldest;
 use super::sample_table::{Insert, Row, SampleTable, delete_replaced, delete_stored, keep_last, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
 use crate::domain::{
-    Actor, AuditAction, CameraId, CameraKey, Durability, Error, OnConflict, Result, StoredSample,
+    Actor, AuditAction, CameraId, CameraKey, Durability, Error, OnConflict, Result, SampleOverflow,
+    StoredSample,
 };
 
 /// A transaction takes no further caller beyond so many rows.
@@ -124,6 +126,11 @@ impl GroupCommit {
             // An error means that the task has ended already, which is what is waited for.
             let _ = end.await;
         }
+    }
+
+    /// Rows that wait or are being committed.
+    pub(super) fn queued_rows(&self) -> u32 {
+        ROWS_IN_FLIGHT.saturating_sub(u32::try_from(self.rows.available_permits()).unwrap_or(u32::MAX))
     }
 
     pub(super) fn has_ended(&self) -> bool {
@@ -327,6 +334,11 @@ async fn store(
         }
     }
     count_stored(connection, &cameras, group, &outcomes).await?;
+    if space.limits.sample_overflow == SampleOverflow::DeleteOldest {
+        for camera in cameras.values() {
+            delete_oldest(connection, camera.key, space.limits.samples_per_camera).await?;
+        }
+    }
     complete(connection, space, group, &outcomes).await?;
     Ok(Some(outcomes))
 }

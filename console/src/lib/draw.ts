@@ -15,8 +15,8 @@ export interface Ellipse {
 }
 
 /** The 95 % ellipse of a covariance that the server states. */
-export function ellipse95({ east, north, east_north }: Covariance): Ellipse {
-  return ellipseOf(east, north, east_north);
+export function ellipse95({ east_m2, north_m2, east_north_m2 }: Covariance): Ellipse {
+  return ellipseOf(east_m2, north_m2, east_north_m2);
 }
 
 /** The 95 % ellipse of a horizontal covariance, m2. */

@@ -167,9 +167,9 @@ export interface ModelVersion {
 }
 /** Covariance of a position's error, m2. */
 export interface Covariance {
-  east: number;
-  north: number;
-  east_north: number;
+  east_m2: number;
+  north_m2: number;
+  east_north_m2: number;
 }
 export interface FusedFix {
   time: string;
@@ -182,8 +182,8 @@ export interface FusedFix {
   e_regression_m2?: number;
   e_gnss_m2?: number;
   r95_m: number;
-  covariance_m2: Covariance;
-  regressed_covariance_m2?: Covariance;
+  covariance: Covariance;
+  regressed_covariance?: Covariance;
   reconstruction_error?: number;
   model_version?: number;
   flags: string[];
@@ -196,7 +196,7 @@ export interface TrackFeature {
     velocity_east_m_s: number;
     velocity_north_m_s: number;
     r95_m: number;
-    covariance_m2: Covariance;
+    covariance: Covariance;
     still: number;
     nis?: number;
     rejections: { source: string; reason: string; nis?: number }[];

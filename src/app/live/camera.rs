@@ -8,8 +8,8 @@ use jiff::Timestamp;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use super::camera_events::CameraEventLog;
 use super::drift::DriftMonitor;
-use super::event_log::EventLog;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
@@ -39,7 +39,7 @@ pub struct TargetUpdate {
 pub(in crate::app) struct CameraLive {
     pub(super) tracks: Tracks,
     pub(super) drift: DriftMonitor,
-    pub(super) events: EventLog<CameraEvent>,
+    pub(super) events: CameraEventLog<CameraEvent>,
     pub(super) moved: watch::Sender<Option<Arc<CameraMoved>>>,
     pub(super) recorder: Mutex<Weak<SampleRecorder>>,
     last_observed_at: Mutex<Option<Timestamp>>,
@@ -53,7 +53,7 @@ impl CameraLive {
         Arc::new(Self {
             tracks: Tracks::default(),
             drift: DriftMonitor::default(),
-            events: EventLog::new(event_log),
+            events: CameraEventLog::new(event_log),
             moved: watch::channel(None).0,
             recorder: Mutex::new(Weak::new()),
             last_observed_at: Mutex::new(None),

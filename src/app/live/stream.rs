@@ -12,7 +12,7 @@ use super::camera::StreamCount;
 use super::sample_committer::{self, SampleSink};
 use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
-use crate::admission::{ClientAddress, Lease};
+use crate::admission::{ClientId, Lease};
 use crate::app::App;
 use crate::app::registry::ActiveCamera;
 use crate::domain::{
@@ -77,7 +77,7 @@ pub struct LiveStream {
     last_seq: u64,
     _slot: SlotGuard,
     _count: StreamCount,
-    _address_lease: Lease,
+    _client_lease: Lease,
 }
 
 struct StreamRecording {
@@ -96,7 +96,7 @@ impl App {
         &self,
         id: &CameraId,
         client_name: &str,
-        client_address: ClientAddress,
+        client_id: ClientId,
         resume_after_seq: u64,
         store_samples: Option<Durability>,
     ) -> Result<LiveStream> {
@@ -104,7 +104,7 @@ impl App {
         let camera = self.active_camera(id).await?;
         let limits = &self.limits;
         // Names are the client's choice; its address is not.
-        let address_lease = self.quotas.live_streams.try_acquire(client_address, 1)?;
+        let client_lease = self.quotas.live_streams.try_acquire(client_id, 1)?;
         let slot =
             self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
         let recording = store_samples.map(|durability| StreamRecording {
@@ -119,7 +119,7 @@ impl App {
             recording,
             last_seq: resume_after_seq,
             _slot: slot,
-            _address_lease: address_lease,
+            _client_lease: client_lease,
         })
     }
 
@@ -132,11 +132,11 @@ impl App {
         &self,
         camera: &Arc<ActiveCamera>,
         observations: Vec<Observation>,
-        client_address: ClientAddress,
+        client: ClientId,
         durability: Durability,
     ) -> Result<(Vec<ItemResult>, Acknowledgement)> {
         let name = format!("requests of {}", camera.id);
-        let mut stream = self.open_stream(&camera.id, &name, client_address, 0, Some(durability)).await?;
+        let mut stream = self.open_stream(&camera.id, &name, client, 0, Some(durability)).await?;
         let mut followed = Vec::with_capacity(observations.len());
         for (seq, observation) in (1..).zip(observations) {
             let (time, target_id, bounding_box, fix) = observation.into_parts();

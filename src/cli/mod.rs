@@ -13,6 +13,7 @@ mod gnss_error;
 mod health;
 mod import;
 mod keys;
+mod layout;
 mod openapi;
 mod output;
 mod pair;

@@ -12,6 +12,7 @@ mod served;
 mod streams;
 mod train;
 mod transports;
+mod world;
 
 /// As in the binary itself.
 #[global_allocator]
@@ -20,13 +21,14 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
-    let parts: [(&str, fn()); 7] = [
+    let parts: [(&str, fn()); 8] = [
         ("fuse", fuse::run),
         ("http", transports::http),
         ("grpc", transports::grpc),
         ("streams", streams::run),
         ("import", import::run),
         ("train", train::run),
+        ("world", world::run),
         ("beside", beside::run),
     ];
     for (name, part) in parts {

@@ -5,6 +5,7 @@
 
 mod config;
 mod evaluate;
+mod evaluate_site;
 mod fuse;
 mod gnss_error;
 mod health;
@@ -18,6 +19,8 @@ mod recordings;
 mod replay;
 mod serve;
 mod simulate;
+mod simulate_site;
+mod site_recording;
 mod train;
 
 use std::fs::File;

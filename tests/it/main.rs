@@ -31,3 +31,4 @@ mod story;
 mod stream;
 mod tls;
 mod usage;
+mod world_tracks;

@@ -3,6 +3,7 @@
 //!
 //! `cargo bench` runs all parts; `cargo bench -- fuse http` some of them.
 
+mod attacks;
 mod beside;
 mod fuse;
 mod import;
@@ -30,6 +31,7 @@ fn main() {
         ("train", train::run),
         ("world", world::run),
         ("beside", beside::run),
+        ("attacks", attacks::run),
     ];
     for (name, part) in parts {
         if wanted.is_empty() || wanted.iter().any(|wish| wish == name) {

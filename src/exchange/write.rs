@@ -56,12 +56,12 @@ impl<W: Write> SampleWriter<W> {
 }
 
 /// Writes samples with how they were matched, like [`SampleWriter`]: two columns more.
-pub struct MatchedSampleWriter<W: Write>(Document<W>);
+pub struct MatchedSampleWriter<W: Write>(PositionDocument<W>);
 
 impl<W: Write> MatchedSampleWriter<W> {
     /// A writer of that format. Nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
-        Self(Document::new(out, format, "samples"))
+        Self(PositionDocument::new(out, format, "samples"))
     }
 
     /// Writes one sample; without an association its two columns are empty.

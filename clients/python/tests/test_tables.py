@@ -69,6 +69,16 @@ def test_a_bad_row_of_a_table_is_rejected_by_its_number(client: Client) -> None:
     assert [row.line for row in imported.rejected_rows] == [2, 3]
 
 
+def test_ids_of_numbers_stay_texts(client: Client) -> None:
+    client.cameras.create(id="yard")
+    box = {"left": [1, 1], "top": [1, 1], "width": [10, 10], "height": [20, 20]}
+    times = ["2026-01-01T12:00:00Z", "2026-01-01T12:00:01Z"]
+    for ids in (pd.Series([7, 8]), pd.Series([7.0, 8.0])):
+        client.samples.import_table("yard", {"time": times, "target_id": ids, **box})
+    assert [it.target_id for it in client.samples.list("yard")] == ["7", "8"]
+    assert [it.target_id for it in live_items({"time": times, "target_id": np.array([7, 8])})] == ["7", "8"]
+
+
 def test_tables_that_would_be_misread_are_refused(client: Client) -> None:
     naive = datetime(2026, 1, 1, 12)
     box = {"left": [1], "top": [1], "width": [1], "height": [1]}

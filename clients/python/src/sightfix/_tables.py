@@ -104,7 +104,7 @@ def grouped(row: Mapping[str, Any], scalars: tuple[str, ...]) -> dict[str, Any]:
 
     A `sigma_m` without coordinates is no fix.
     """
-    values: dict[str, Any] = {name: json_scalar(row[name]) for name in scalars if name in row}
+    values: dict[str, Any] = {name: json_scalar(name, row[name]) for name in scalars if name in row}
     for name, members in (("bounding_box", BOX), ("fix", FIX)):
         group = {member: row[member] for member in members if member in row}
         if group.keys() - {"sigma_m"}:
@@ -112,9 +112,14 @@ def grouped(row: Mapping[str, Any], scalars: tuple[str, ...]) -> dict[str, Any]:
     return values
 
 
-def json_scalar(value: Any) -> Any:
-    """A time as RFC 3339; everything else as it is."""
-    return format_time(value) if isinstance(value, datetime) else value
+def json_scalar(name: str, value: Any) -> Any:
+    """A time as RFC 3339, an id or class as text; everything else as it is."""
+    if isinstance(value, datetime):
+        return format_time(value)
+    if name in ("target_id", "class"):
+        # Ids of numbers alone become numbers in a frame, and floats where some are missing.
+        return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+    return value
 
 
 def sample_columns(samples: Iterable[Sample]) -> dict[str, list[Any]]:

@@ -3,6 +3,7 @@
 //!
 //! `cargo bench` runs all parts; `cargo bench -- fuse http` some of them.
 
+mod attacks;
 mod beside;
 mod fuse;
 mod import;
@@ -20,7 +21,7 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
-    let parts: [(&str, fn()); 7] = [
+    let parts: [(&str, fn()); 8] = [
         ("fuse", fuse::run),
         ("http", transports::http),
         ("grpc", transports::grpc),
@@ -28,6 +29,7 @@ fn main() {
         ("import", import::run),
         ("train", train::run),
         ("beside", beside::run),
+        ("attacks", attacks::run),
     ];
     for (name, part) in parts {
         if wanted.is_empty() || wanted.iter().any(|wish| wish == name) {

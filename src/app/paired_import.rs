@@ -1,16 +1,20 @@
 //! An import of two files that are paired on the way.
 
 use std::io::Read;
+use std::sync::Arc;
 
+use super::matching::{MatchReport, MatchRequest};
 use super::recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use super::samples::{BATCH_ROWS, told_what_is_stored};
 use super::{App, ImportReport};
 use crate::domain::{
-    CameraId, Durability, Error, Receiver, ReceiverId, Receivers, Result, StoredSample, TargetId,
+    CameraId, Durability, Error, ImageSize, Receiver, ReceiverId, Receivers, Result, StoredSample, TargetId,
 };
 use crate::exchange::{self, FixFormat, Format, RowRules};
+use crate::fusion::association::MatchSettings;
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::PairingSettings;
+use crate::model::Regressor;
 
 /// Two files to be paired, and how.
 pub struct PairedImport<D, F> {
@@ -34,6 +38,8 @@ pub struct PairedImport<D, F> {
     pub durability: Durability,
     /// Whether the clock offsets are estimated, too. They are reported, never applied.
     pub estimates_offsets: bool,
+    /// How boxes are matched with receivers first; `None` where their targets have the same ids.
+    pub matching: Option<MatchSettings>,
 }
 
 /// What became of two files.
@@ -49,7 +55,19 @@ pub struct PairedReport {
     pub unnamed_fixes_of: Option<Receiver>,
     /// Clock offsets by receiver, if they were asked for; `None` where the files do not show them.
     pub clock_offsets: Vec<(Receiver, Option<OffsetEstimate>)>,
+    /// What was matched, if that was asked for.
+    pub matching: Option<MatchReport>,
 }
+
+/// What the camera says about its fixes and boxes.
+struct CameraContext {
+    receivers: Receivers,
+    regressor: Option<Arc<Regressor>>,
+    image_size: Option<ImageSize>,
+}
+
+/// The same files are matched in the same way whenever they are sent.
+const MATCH_SEED: u64 = 1;
 
 /// What was paired, before it is stored.
 struct Work {
@@ -73,12 +91,17 @@ impl App {
         import: PairedImport<impl Read + Send + 'static, impl Read + Send + 'static>,
     ) -> Result<PairedReport> {
         let rules = self.row_rules(id).await?;
-        let receivers = self.active_camera(id).await?.receivers.clone();
+        let active = self.active_camera(id).await?;
+        let camera = CameraContext {
+            receivers: active.receivers.clone(),
+            regressor: active.model.as_ref().map(|(regressor, _)| regressor.clone()),
+            image_size: active.image_size,
+        };
         let limits =
             RecordingLimits { rows: self.limits.pairing_rows, rejected_rows: self.limits.rejected_rows };
         let durability = import.durability;
         let _place = self.pairings.acquire().await.map_err(Error::fault)?;
-        let pairing = tokio::task::spawn_blocking(move || import.paired(&rules, &receivers, limits));
+        let pairing = tokio::task::spawn_blocking(move || import.paired(&rules, &camera, limits));
         let Work { mut samples, mut report } = pairing.await.map_err(Error::fault)??;
         while !samples.is_empty() {
             let rest = samples.split_off(samples.len().min(BATCH_ROWS));
@@ -93,7 +116,8 @@ impl App {
 }
 
 impl<D: Read, F: Read> PairedImport<D, F> {
-    fn paired(self, rules: &RowRules, receivers: &Receivers, limits: RecordingLimits) -> Result<Work> {
+    fn paired(self, rules: &RowRules, camera: &CameraContext, limits: RecordingLimits) -> Result<Work> {
+        let receivers = &camera.receivers;
         let boxes = exchange::read_detections(self.detections, self.detections_format, rules, self.target_id)
             .map_err(|error| of_part(Part::Detections, error))?;
         let fixes = exchange::read_received_fixes(self.fixes, self.fixes_format, rules.time_bounds)
@@ -102,9 +126,19 @@ impl<D: Read, F: Read> PairedImport<D, F> {
         let unnamed_fixes_of = recording.name_fixes(self.fixes_format, receivers, self.receiver_id)?;
         let clock_offsets =
             if self.estimates_offsets { recording.clock_offsets(receivers) } else { Vec::new() };
-        let (paired, counts, rejected) = recording.paired(receivers, &self.settings);
+        let (recording, receivers, matching) = match self.matching {
+            None => (recording, receivers.clone(), None),
+            Some(settings) => {
+                let regressor = camera.regressor.as_deref();
+                let request =
+                    MatchRequest { regressor, image_size: camera.image_size, settings, seed: MATCH_SEED };
+                let matched = recording.matched(receivers, &request)?;
+                (matched.recording, matched.receivers, Some(matched.report))
+            }
+        };
+        let (paired, counts, rejected) = recording.paired(&receivers, &self.settings);
         let samples = ImportReport::default();
-        let report = PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets };
+        let report = PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets, matching };
         Ok(Work { samples: paired.into_samples(self.keeps_unpaired), report })
     }
 }

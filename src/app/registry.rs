@@ -13,7 +13,7 @@ use tokio::sync::Mutex;
 use super::live::camera::CameraLive;
 use crate::domain::{
     Camera, CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, ImageSize,
-    Receivers, Result, Revision, TimeBounds,
+    Receivers, Result, Revision, SiteId, TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::model::{Artifact, Regressor, ViewArea};
@@ -35,6 +35,8 @@ pub struct ActiveCamera {
     pub receivers: Receivers,
     /// Whether to train again by itself after the camera was moved.
     pub retrain_when_moved: bool,
+    /// The site whose tracks the camera contributes to.
+    pub site: Option<SiteId>,
     /// What the drift detector found with that model.
     pub moved: Option<Arc<CameraMoved>>,
     /// The active model and its version number.
@@ -234,6 +236,7 @@ impl Registry {
             },
             live: same.map_or_else(CameraLive::new, |known| known.live.clone()),
             retrain_when_moved: camera.profile.retrain_when_moved,
+            site: camera.profile.site,
             receivers: camera.profile.receivers,
             model,
             model_summary,

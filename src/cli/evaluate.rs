@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::import::{gnss_bias_sigma, image_size};
-use super::output::print_line;
+use super::output::{print_line, print_note};
 use super::progress::Progress;
 use super::recordings;
 use super::{format_of, open_file};
@@ -188,7 +188,7 @@ impl paper_experiments::Runner for PaperRunner {
     }
 
     fn begin(&mut self, experiment: &str) {
-        eprintln!("{experiment}");
+        print_note(format_args!("{experiment}"));
     }
 }
 
@@ -234,10 +234,10 @@ fn read_train(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Trai
         }
     }
     if ignored > 0 {
-        eprintln!("{}: {ignored} rows without a box are ignored", path.display());
+        print_note(format_args!("{}: {ignored} rows without a box are ignored", path.display()));
     }
     if !file.unpaired.is_empty() {
-        eprintln!("{}: {} rows are boxes without a fix", path.display(), file.unpaired.len());
+        print_note(format_args!("{}: {} rows are boxes without a fix", path.display(), file.unpaired.len()));
     }
     Ok(file)
 }
@@ -271,13 +271,19 @@ fn read(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<Observ
             Err(error) => {
                 invalid += 1;
                 if invalid <= MAX_REPORTED_ROWS {
-                    eprintln!("{}: line {}: {}: {}", path.display(), error.line, error.field, error.reason);
+                    print_note(format_args!(
+                        "{}: line {}: {}: {}",
+                        path.display(),
+                        error.line,
+                        error.field,
+                        error.reason
+                    ));
                 }
             }
         }
     }
     if invalid > MAX_REPORTED_ROWS {
-        eprintln!("{}: and {} more invalid rows", path.display(), invalid - MAX_REPORTED_ROWS);
+        print_note(format_args!("{}: and {} more invalid rows", path.display(), invalid - MAX_REPORTED_ROWS));
     }
     Ok(rows)
 }

@@ -7,9 +7,11 @@ use clap::Args;
 
 use super::output::print_line;
 use super::progress::Progress;
-use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime};
+use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime, site_id};
 use crate::app::{App, ImportReport};
-use crate::domain::{CameraId, Durability, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera};
+use crate::domain::{
+    CameraId, Durability, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera, NewSite, SiteId,
+};
 
 /// Import samples from a file into a camera
 #[derive(Args)]
@@ -31,6 +33,9 @@ pub(super) struct Import {
     /// model's own prior]
     #[arg(long, value_name = "S", value_parser = gnss_bias_sigma, requires = "create")]
     gnss_bias_sigma_m: Option<GnssBiasSigma>,
+    /// Site of the camera, for --create; it is created, too, if it does not exist
+    #[arg(long, value_name = "ID", value_parser = site_id, requires = "create")]
+    site: Option<SiteId>,
     #[command(flatten)]
     folder: DataFolder,
 }
@@ -51,17 +56,7 @@ impl Import {
         let report = runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix import", missing).await?;
             if self.create {
-                let profile = NewCamera {
-                    image_size: self.image_size,
-                    gnss_bias_sigma: self.gnss_bias_sigma_m,
-                    ..NewCamera::named(self.camera.clone())
-                };
-                match app.create_camera(profile).await {
-                    Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {
-                        self.check_image_size(&app).await?;
-                    }
-                    created => drop(created?),
-                }
+                self.create_camera(&app).await?;
             }
             let report = app.import_file(&self.camera, source, format, Durability::Synced).await;
             app.store.close().await;
@@ -77,9 +72,39 @@ impl Import {
 }
 
 impl Import {
-    /// Boxes of another image would be stored as if they were of this one.
-    async fn check_image_size(&self, app: &App) -> anyhow::Result<()> {
-        let stored = app.camera(&self.camera).await?.profile.image_size;
+    /// Creates the camera and its site, as far as they do not exist.
+    async fn create_camera(&self, app: &App) -> anyhow::Result<()> {
+        if let Some(site) = &self.site {
+            match app.create_site(NewSite::named(site.clone())).await {
+                Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::SiteExists => {}
+                created => drop(created?),
+            }
+        }
+        let profile = NewCamera {
+            image_size: self.image_size,
+            gnss_bias_sigma: self.gnss_bias_sigma_m,
+            site: self.site.clone(),
+            ..NewCamera::named(self.camera.clone())
+        };
+        match app.create_camera(profile).await {
+            Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {
+                self.check_profile(app).await
+            }
+            Err(error) => Err(error.into()),
+            Ok(_) => Ok(()),
+        }
+    }
+
+    /// Boxes of another image, or of a camera elsewhere, would be stored as if they were of this one.
+    async fn check_profile(&self, app: &App) -> anyhow::Result<()> {
+        let profile = app.camera(&self.camera).await?.profile;
+        anyhow::ensure!(
+            self.site.is_none() || profile.site == self.site,
+            "camera {} exists and belongs to {}; leave --site out, or change the profile",
+            self.camera,
+            profile.site.map_or_else(|| "no site".to_owned(), |site| format!("site {site}"))
+        );
+        let stored = profile.image_size;
         let Some(wanted) = self.image_size.filter(|_| stored != self.image_size) else { return Ok(()) };
         let shown = |size: ImageSize| format!("{}x{}", size.width_px(), size.height_px());
         anyhow::bail!(

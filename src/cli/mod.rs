@@ -3,8 +3,11 @@
 //!
 //! What never happens here: rules of the domain.
 
+mod backup;
 mod config;
+mod doctor;
 mod evaluate;
+mod exit_code;
 mod fuse;
 mod gnss_error;
 mod health;
@@ -16,6 +19,7 @@ mod pair;
 mod progress;
 mod recordings;
 mod replay;
+mod restore;
 mod serve;
 mod simulate;
 mod train;
@@ -30,10 +34,12 @@ use crate::app::access::Caller;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
-use crate::domain::{CameraId, ReceiverId, TargetId};
+use crate::domain::{CameraId, ReceiverId, SiteId, TargetId};
 use crate::exchange::Format;
-use crate::store::{Store, StoreOptions};
+use crate::store::{Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
+
+pub use exit_code::exit_code;
 
 /// Positions of targets from the bounding boxes of an uncalibrated fixed camera and from GNSS fixes
 #[derive(Parser)]
@@ -68,6 +74,12 @@ enum Command {
     Replay(replay::Replay),
     /// Create, list and revoke the keys that clients of a server present
     Keys(keys::Keys),
+    /// Copy the database into one verified file, also while a server uses it
+    Backup(backup::Backup),
+    /// Put a backup in the place of the database
+    Restore(restore::Restore),
+    /// Check folder, database, models, clock, port and system, and say what to do
+    Doctor(doctor::Doctor),
     /// Check whether a server is alive
     Health(health::Health),
     /// Print the effective settings
@@ -92,7 +104,7 @@ impl Cli {
         match self.command {
             Command::Serve(command) => command.run(file),
             Command::Import(command) => command.run(file),
-            Command::Pair(command) => command.run(),
+            Command::Pair(command) => command.run(file),
             Command::Train(command) => command.run(file),
             Command::Fuse(command) => command.run(file),
             Command::GnssError(command) => command.run(),
@@ -100,6 +112,9 @@ impl Cli {
             Command::Simulate(command) => command.run(),
             Command::Replay(command) => command.run(file),
             Command::Keys(command) => command.run(file),
+            Command::Backup(command) => command.run(file),
+            Command::Restore(command) => command.run(file),
+            Command::Doctor(command) => command.run(file),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),
@@ -137,12 +152,16 @@ async fn open_app(settings: &Config, role: &str, missing: MissingData) -> anyhow
         missing == MissingData::Create || settings.data.is_dir(),
         "there is no data folder {folder}; `sightfix serve` and `sightfix import --create` make one"
     );
-    let options = StoreOptions { limits: store_limits(&settings.limits), role: role.to_owned() };
+    let options = StoreOptions {
+        limits: store_limits(&settings.limits),
+        role: role.to_owned(),
+        sharing: Sharing::Command,
+    };
     let store = Store::open_with(&settings.data, options)
         .await
         .with_context(|| format!("cannot open the data folder {folder}"))?;
     for other in store.newcomers() {
-        eprintln!("note: another process uses the same data folder: {other}");
+        output::print_note(format_args!("note: another process uses the same data folder: {other}"));
     }
     let app = App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new());
     Ok(app.await?.on_behalf_of(Caller::program(role)))
@@ -155,6 +174,10 @@ fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
 
 fn camera_id(text: &str) -> Result<CameraId, String> {
     CameraId::new(text).map_err(|error| error.to_string())
+}
+
+fn site_id(text: &str) -> Result<SiteId, String> {
+    SiteId::new(text).map_err(|error| error.to_string())
 }
 
 fn receiver_id(text: &str) -> Result<ReceiverId, String> {

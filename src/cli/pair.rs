@@ -2,20 +2,30 @@
 
 use std::fs::File;
 use std::io::BufWriter;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::Context as _;
 use clap::Args;
 
-use super::output::print_line;
-use super::{format_of, open_file, receiver_id, target_id};
-use crate::app::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
+use super::import::image_size;
+use super::output::{print_line, print_note};
+use super::{
+    DataFolder, MissingData, camera_id, format_of, open_app, open_file, receiver_id, runtime, target_id,
+};
+use crate::app::{
+    MatchReport, MatchRequest, PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part,
+};
 use crate::clock::Clock;
 use crate::config::Limits;
-use crate::domain::{ClockOffset, Receiver, ReceiverId, Receivers, TargetId, TimeBounds};
-use crate::exchange::{self, FixFormat, RowRules};
+use crate::domain::{
+    CameraId, ClockOffset, ImageSize, Receiver, ReceiverId, Receivers, TargetId, TimeBounds,
+};
+use crate::exchange::{self, FixFormat, MatchedSampleWriter, RowRules};
+use crate::fusion::association::MatchSettings;
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
+use crate::model::{Artifact, Regressor};
 
 /// Pair detections and fixes that were recorded separately into samples
 #[derive(Args)]
@@ -63,10 +73,67 @@ pub(super) struct Pair {
     /// Write the boxes that find no fix, too, with empty longitude and latitude
     #[arg(long)]
     keep_unpaired: bool,
+    #[command(flatten)]
+    matching: MatchFlags,
+}
+
+/// Matching of boxes that have only a tracker's ids with fixes that have only receivers'
+#[derive(Args)]
+struct MatchFlags {
+    /// Find out whose boxes show whose receivers: boxes need only a tracker's ids. Sure samples get the
+    /// receiver's id as target_id, and the columns tracker_id and match_probability
+    #[arg(long = "match", conflicts_with_all = ["receivers", "estimate_offset"])]
+    matches: bool,
+    /// A downloaded model file to match with [default: no model: camera and matches are found together]
+    #[arg(long, value_name = "FILE", requires = "matches", conflicts_with = "camera")]
+    model: Option<PathBuf>,
+    /// The camera whose active model is used to match
+    #[arg(long, value_name = "ID", value_parser = camera_id, requires = "matches")]
+    camera: Option<CameraId>,
+    /// Size of the image, to match without a model
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size, requires = "matches")]
+    image_size: Option<ImageSize>,
+    /// Leave out samples whose match is less probable than this
+    #[arg(long, value_name = "P", requires = "matches", default_value_t = 0.9)]
+    min_probability: f64,
+    /// The receivers' clocks are off by at most this, s
+    #[arg(long, value_name = "S", requires = "matches", default_value_t = 0.0)]
+    clock_window_s: f64,
+    /// Seed of the sampling of assignments
+    #[arg(long, value_name = "N", requires = "matches", default_value_t = 1)]
+    match_seed: u64,
+    #[command(flatten)]
+    folder: DataFolder,
+}
+
+impl MatchFlags {
+    fn settings(&self) -> crate::domain::Result<MatchSettings> {
+        let limits = Limits::default();
+        MatchSettings::new(self.min_probability, self.clock_window_s, &limits)
+    }
+
+    fn regressor(&self, file: Option<&Path>) -> anyhow::Result<Option<Arc<Regressor>>> {
+        if let Some(path) = &self.model {
+            let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+            return Ok(Some(Arc::new(Artifact::from_file(&bytes)?.load()?)));
+        }
+        let Some(id) = &self.camera else { return Ok(None) };
+        let settings = self.folder.settings(file)?;
+        runtime()?.block_on(async {
+            let app = open_app(&settings, "sightfix pair", MissingData::Refuse).await?;
+            let camera = app.camera(id).await?;
+            let serving = app.registry.get(id).context("the camera was deleted")?;
+            app.store.close().await;
+            let (regressor, _) = serving.model.clone().with_context(|| {
+                format!("camera {} has no active model: train it first, or match without", camera.id())
+            })?;
+            Ok(Some(regressor))
+        })
+    }
 }
 
 impl Pair {
-    pub(super) fn run(self) -> anyhow::Result<()> {
+    pub(super) fn run(self, config: Option<&Path>) -> anyhow::Result<()> {
         let settings = PairingSettings::new(self.method, self.window_s, self.longest_gap_s)?;
         let (mut recording, format) = self.read()?;
         print_rejected(&recording.rejected)?;
@@ -84,6 +151,9 @@ impl Pair {
             }
         }
         let Some(out) = &self.out else { return Ok(()) };
+        if self.matching.matches {
+            return self.write_matched(recording, &receivers, &settings, out, config);
+        }
         let (paired, counts, _) = recording.paired(&receivers, &settings);
         print_counts(&counts)?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
@@ -96,6 +166,37 @@ impl Pair {
             format_of(out)?,
             &paired.into_samples(self.keep_unpaired),
         )?;
+        Ok(())
+    }
+
+    /// Matches, pairs and writes the samples of sure matches.
+    fn write_matched(
+        &self,
+        recording: Recording,
+        receivers: &Receivers,
+        settings: &PairingSettings,
+        out: &Path,
+        config: Option<&Path>,
+    ) -> anyhow::Result<()> {
+        let regressor = self.matching.regressor(config)?;
+        let request = MatchRequest {
+            regressor: regressor.as_deref(),
+            image_size: self.matching.image_size,
+            settings: self.matching.settings()?,
+            seed: self.matching.match_seed,
+        };
+        let matched = recording.matched(receivers, &request)?;
+        print_match(&matched.report)?;
+        let (paired, counts, _) = matched.recording.paired(&matched.receivers, settings);
+        print_counts(&counts)?;
+        anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
+        let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
+        let mut writer = MatchedSampleWriter::new(BufWriter::new(file), format_of(out)?);
+        for sample in paired.into_samples(self.keep_unpaired) {
+            let key = (sample.time, sample.target_id.clone());
+            writer.write(&sample, matched.associations.get(&key))?;
+        }
+        writer.finish()?;
         Ok(())
     }
 
@@ -159,11 +260,11 @@ fn carried(receiver: &Receiver) -> String {
 
 fn print_rejected(rejected: &RejectedParts) -> anyhow::Result<()> {
     for (part, row) in &rejected.rows {
-        eprintln!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason);
+        print_note(format_args!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason));
     }
     let printed = rejected.rows.len() as u64;
     if rejected.count > printed {
-        eprintln!("... and {} more", rejected.count - printed);
+        print_note(format_args!("... and {} more", rejected.count - printed));
     }
     if rejected.count > 0 {
         print_line(&format_args!("rejected rows {}", rejected.count))?;
@@ -188,6 +289,34 @@ fn print_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) -> anyho
             100.0 * found.explained_at_zero,
         )),
     }
+}
+
+fn print_match(report: &MatchReport) -> anyhow::Result<()> {
+    if let Some(world) = &report.world {
+        print_line(&format_args!(
+            "found the camera with score {:.1}; with shifted clocks at most {:.1}, another place at most {:.1}",
+            world.best, world.best_shifted, world.second
+        ))?;
+    }
+    print_line(&format_args!(
+        "matched {} tracklets (cut {} times) with {} receivers: {} boxes of probability {} or more, {} of less left out",
+        report.tracklets,
+        report.cuts,
+        report.receivers,
+        report.matched_detections,
+        report.min_probability,
+        report.unsure_detections,
+    ))?;
+    for (receiver_id, offset) in &report.clock_offsets {
+        print_line(&format_args!("clock offset of {receiver_id}: {:+.1} s found", offset.seconds()))?;
+    }
+    for pair in &report.pairs {
+        print_line(&format_args!(
+            "{} is {} from {} to {}, {} boxes, probability {:.3}",
+            pair.tracker_id, pair.receiver_id, pair.from, pair.to, pair.detections, pair.probability
+        ))?;
+    }
+    Ok(())
 }
 
 fn print_counts(counts: &PairingCounts) -> anyhow::Result<()> {

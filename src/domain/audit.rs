@@ -41,6 +41,12 @@ pub enum AuditAction {
     CameraChanged,
     /// A camera was deleted with all that belongs to it.
     CameraDeleted,
+    /// A site was created.
+    SiteCreated,
+    /// A site was changed.
+    SiteChanged,
+    /// A site was deleted.
+    SiteDeleted,
     /// Samples were deleted.
     SamplesDeleted,
     /// A training run was queued.

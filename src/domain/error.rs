@@ -44,6 +44,12 @@ pub enum ErrorKind {
     KeyNotFound,
     /// A camera of that id exists already.
     CameraExists,
+    /// No such site.
+    SiteNotFound,
+    /// A site of that id exists already.
+    SiteExists,
+    /// The site has cameras.
+    SiteInUse,
     /// `If-Match` names another revision than the stored one.
     RevisionMismatch,
     /// The change needs an `If-Match`.
@@ -64,12 +70,16 @@ pub enum ErrorKind {
     ModelActive,
     /// The disk is full, or as much is stored as the settings allow.
     InsufficientStorage,
+    /// Whose fixes belong to whose boxes cannot be told.
+    NotIdentifiable,
     /// The stored samples cannot support a fit.
     UnusableSamples,
     /// The caller went away or cancelled.
     Cancelled,
     /// More requests are in flight than the server takes.
     Overloaded,
+    /// The client sends more requests per second than it may.
+    RateLimited,
     /// The request took longer than it may.
     Timeout,
     /// The server is ending.
@@ -96,7 +106,7 @@ impl ErrorKind {
 
 /// Most fields at fault that one refusal names. gRPC sends them in headers, of which clients take no more
 /// than 8 kB.
-const MOST_VIOLATIONS: usize = 16;
+pub const MOST_VIOLATIONS: usize = 16;
 
 /// Converts all items of a list.
 ///
@@ -188,6 +198,14 @@ impl fmt::Display for Fault {
             source = cause.source();
         }
         Ok(())
+    }
+}
+
+impl Fault {
+    /// The cause, if it is of that type.
+    #[must_use]
+    pub fn cause<T: StdError + 'static>(&self) -> Option<&T> {
+        self.0.downcast_ref()
     }
 }
 

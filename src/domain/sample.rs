@@ -31,6 +31,15 @@ pub struct Sample<F = Fix> {
 /// the camera, not to its place.
 pub type StoredSample = Sample<Option<Fix>>;
 
+/// How a sample's target was matched with a receiver; the sample's target is the receiver.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Association {
+    /// Id that the tracker gave the box.
+    pub tracker_id: TargetId,
+    /// Posterior probability of the match, 0 to 1.
+    pub probability: f64,
+}
+
 impl<F> Sample<F> {
     fn replace_fix<G>(self, replace: impl FnOnce(F) -> G) -> Sample<G> {
         let Self { time, target_id, bounding_box, fix, class, score, truth } = self;

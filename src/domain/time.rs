@@ -103,7 +103,7 @@ mod tests {
 
     #[test]
     fn times_that_do_not_exist_are_refused_and_named() {
-        for (text, told) in [
+        for (text, message) in [
             ("2020-12-14T14:41:60Z", "second 60"),
             ("2020-12-14T14:41:60.5+08:00", "second 60"),
             ("2020-12-14T14:41:48+25:00", "offset"),
@@ -116,7 +116,7 @@ mod tests {
             ("é2020-12-14T14:41:6", "RFC 3339"),
         ] {
             let refused = parse_time(text).expect_err(text).to_string();
-            assert!(refused.starts_with("time: ") && refused.contains(told), "{text}: {refused}");
+            assert!(refused.starts_with("time: ") && refused.contains(message), "{text}: {refused}");
         }
         for text in ["2020-12-14T14:41:48+08:00", "2020-12-14T06:41:48Z", "2020-12-14T06:41:48.123456-23:59"]
         {

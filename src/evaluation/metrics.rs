@@ -23,7 +23,7 @@ pub struct ScoredPrediction {
 /// Figures of the horizontal error of one method with one seed, or their means over seeds.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 #[schema(as = ErrorFigures)]
-pub struct Metrics {
+pub struct ErrorMetrics {
     /// Mean.
     pub mean_m: f64,
     /// Median.
@@ -46,7 +46,7 @@ pub struct Metrics {
     pub n: usize,
 }
 
-impl Metrics {
+impl ErrorMetrics {
     /// Figures of some predictions; `None` if there are none.
     #[must_use]
     pub fn of(predictions: &[ScoredPrediction]) -> Option<Self> {
@@ -132,13 +132,13 @@ mod tests {
 
     #[test]
     fn figures_of_known_errors() {
-        let metrics = Metrics::of(&scored(&[4.0, 1.0, 3.0, 2.0, 10.0])).expect("some");
+        let metrics = ErrorMetrics::of(&scored(&[4.0, 1.0, 3.0, 2.0, 10.0])).expect("some");
         assert!(near(metrics.mean_m, 4.0) && near(metrics.median_m, 3.0) && near(metrics.max_m, 10.0));
         assert!(near(metrics.variance_m2, 10.0) && near(metrics.rmse_m, 26.0f64.sqrt()));
         assert!(near(metrics.p95_m, 8.8), "{}", metrics.p95_m);
         assert!(near(metrics.share_within["3"], 0.6) && near(metrics.share_within["0.5"], 0.0));
         assert_eq!((metrics.coverage95, metrics.n), (None, 5));
-        assert_eq!(Metrics::of(&[]), None);
+        assert_eq!(ErrorMetrics::of(&[]), None);
     }
 
     #[test]
@@ -151,7 +151,7 @@ mod tests {
                 r95_m: Some(2.447_746_8),
             })
             .collect();
-        let metrics = Metrics::of(&predictions).expect("some");
+        let metrics = ErrorMetrics::of(&predictions).expect("some");
         assert!((metrics.coverage95.expect("stated") - 0.95).abs() < 0.006, "{metrics:?}");
         assert!((metrics.coverage50.expect("stated") - 0.5).abs() < 0.015, "{metrics:?}");
     }
@@ -159,8 +159,8 @@ mod tests {
     #[test]
     fn seeds_are_averaged_and_the_largest_error_kept() {
         let seeds =
-            [&[1.0, 3.0][..], &[2.0, 6.0][..]].map(|errors| Metrics::of(&scored(errors)).expect("some"));
-        let both = Metrics::over_seeds(&seeds).expect("two");
+            [&[1.0, 3.0][..], &[2.0, 6.0][..]].map(|errors| ErrorMetrics::of(&scored(errors)).expect("some"));
+        let both = ErrorMetrics::over_seeds(&seeds).expect("two");
         assert!(near(both.mean_m, 3.0) && near(both.max_m, 6.0));
         assert_eq!(both.n, 2);
     }

@@ -12,6 +12,7 @@ pub(crate) mod plots;
 mod predictors;
 mod report;
 mod runner;
+pub mod site;
 #[cfg(test)]
 mod tests;
 mod traces;
@@ -19,7 +20,7 @@ mod training;
 mod truth;
 
 pub use crate::domain::{Method, Truth};
-pub use metrics::{BOUNDS_M, Metrics, ScoredPrediction};
+pub use metrics::{BOUNDS_M, ErrorMetrics, ScoredPrediction};
 pub use options::{EvaluateOptions, Progress, TestRow};
 pub use plots::plots;
 pub use report::{MethodReport, Report};

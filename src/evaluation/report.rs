@@ -6,14 +6,14 @@ use std::fmt::Write as _;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::metrics::Metrics;
+use super::metrics::ErrorMetrics;
 
 /// One method's figures, the means over seeds.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct MethodReport {
     /// Figures of the errors.
     #[serde(flatten)]
-    pub metrics: Metrics,
+    pub metrics: ErrorMetrics,
     /// The mean error with each seed.
     pub seed_means_m: Vec<f64>,
     /// CPU seconds spent on fitting what the method needs, per seed.
@@ -81,7 +81,7 @@ impl Report {
             "n"
         );
         for (name, one) in self.rows() {
-            let Metrics { mean_m, median_m, p95_m, max_m, rmse_m, n, .. } = one.metrics;
+            let ErrorMetrics { mean_m, median_m, p95_m, max_m, rmse_m, n, .. } = one.metrics;
             let within = one.metrics.share_within.get("5").copied().unwrap_or_default();
             // Writing to a string cannot fail.
             let _ = writeln!(
@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn the_document_has_the_promised_keys() {
-        let metrics = Metrics::of(&[ScoredPrediction { error_m: 1.5, r95_m: None }]).expect("one");
+        let metrics = ErrorMetrics::of(&[ScoredPrediction { error_m: 1.5, r95_m: None }]).expect("one");
         let method = MethodReport { metrics, seed_means_m: vec![1.0, 2.0], train_cpu_s: 0.5, fuse_us: 1.0 };
         assert!((method.seed_spread_m() - 0.5f64.sqrt()).abs() < 1e-12);
         let report = Report {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-use super::metrics::{Metrics, ScoredPrediction};
+use super::metrics::{ErrorMetrics, ScoredPrediction};
 use super::options::{EvaluateOptions, Progress, TestRow};
 use super::predictors::{Prediction, Predictor, Predictors, TargetRows};
 use super::report::MethodReport;
@@ -88,7 +88,7 @@ impl Steps<'_> {
 
 /// The figures of one method with one seed.
 struct SeedRun {
-    metrics: Metrics,
+    metrics: ErrorMetrics,
     train_cpu_s: f64,
     fuse_us: f64,
 }
@@ -163,7 +163,7 @@ impl Run<'_> {
                 points.push(TracePoint { row, position, error_m, r95_m, covariance });
             }
         }
-        let Some(metrics) = Metrics::of(&scored) else {
+        let Some(metrics) = ErrorMetrics::of(&scored) else {
             return self.fail(method, "no test row has both an answer and a truth".to_owned());
         };
         let name = method.to_string();
@@ -178,9 +178,9 @@ impl Run<'_> {
         let report = &mut self.evaluation.report;
         report.order = self.predictors.options.methods.iter().map(Method::to_string).collect();
         for (name, seeds) in self.seeds {
-            let figures: Vec<Metrics> = seeds.iter().map(|seed| seed.metrics.clone()).collect();
+            let figures: Vec<ErrorMetrics> = seeds.iter().map(|seed| seed.metrics.clone()).collect();
             let count = seeds.len() as f64;
-            let Some(metrics) = Metrics::over_seeds(&figures) else { continue };
+            let Some(metrics) = ErrorMetrics::over_seeds(&figures) else { continue };
             report.methods.insert(
                 name,
                 MethodReport {

@@ -27,11 +27,13 @@ pub(super) const CLASS: usize = 9;
 pub(super) const SCORE: usize = 10;
 pub(super) const TRUTH_LONGITUDE: usize = 11;
 pub(super) const TRUTH_LATITUDE: usize = 12;
-pub(super) const RECEIVER_ID: usize = 13;
+pub(super) const RECEIVER_ID: usize = 15;
 /// Number of columns of a file of fixes.
-pub(super) const COUNT: usize = 14;
+pub(super) const COUNT: usize = 16;
 /// Number of columns of a file of samples, observations or detections: the first of all.
-pub(super) const OF_SAMPLES: usize = 13;
+pub(super) const OF_SAMPLES: usize = 15;
+/// Of these, the columns of samples that were not matched: the last two say how a sample was.
+pub(super) const OF_UNMATCHED: usize = 13;
 
 /// All columns, in the order of writing.
 pub(super) const COLUMNS: [Column; COUNT] = [
@@ -48,6 +50,8 @@ pub(super) const COLUMNS: [Column; COUNT] = [
     column("score", "score", "score"),
     column("truth_longitude", "truth_longitude_deg", "truth.longitude_deg"),
     column("truth_latitude", "truth_latitude_deg", "truth.latitude_deg"),
+    column("tracker_id", "tracker_id", "tracker_id"),
+    column("match_probability", "match_probability", "match_probability"),
     column("receiver_id", "receiver_id", "receiver_id"),
 ];
 

@@ -157,6 +157,8 @@ impl<'a> CsvCells<'a> {
             truth: self
                 .numbers([TRUTH_LONGITUDE, TRUTH_LATITUDE])?
                 .map(|[longitude_deg, latitude_deg]| wire::Position { longitude_deg, latitude_deg }),
+            _tracker_id: None,
+            _match_probability: None,
             receiver_id: self.name(RECEIVER_ID),
         })
     }

@@ -50,6 +50,11 @@ pub(super) struct FileRow<'a> {
     pub class: Option<Text<'a>>,
     pub score: Option<f64>,
     pub truth: Option<wire::Position>,
+    /// With `match_probability`, what `sightfix pair --match` says about its samples; not stored.
+    #[serde(borrow, rename = "tracker_id")]
+    pub _tracker_id: Option<Text<'a>>,
+    #[serde(rename = "match_probability")]
+    pub _match_probability: Option<f64>,
     /// Only CSV files of fixes have it.
     #[serde(skip)]
     pub receiver_id: Option<Text<'a>>,

@@ -7,6 +7,9 @@
 //! line, field and reason takes its place. Numbers are checked by the constructors of
 //! [`crate::domain`] only. What never happens here: transports, storage, clocks.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod columns;
 mod csv_rows;
 mod cursor;
@@ -19,6 +22,7 @@ mod formula_guard;
 mod gpsd;
 mod gpx;
 mod json_errors;
+mod json_violations;
 mod lines;
 mod nmea_fixes;
 mod objects_only;
@@ -33,7 +37,7 @@ pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
 pub use rows::{ObservedRow, RowRules, read_detections, read_observations, read_samples};
-pub use write::{FusedWriter, SampleWriter, write_fused, write_samples};
+pub use write::{FusedWriter, MatchedSampleWriter, SampleWriter, write_fused, write_samples};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.
 pub const MAX_ROW_BYTES: usize = 64 * 1024;

@@ -12,6 +12,7 @@ use serde_path_to_error::Track;
 use utoipa::ToSchema;
 
 use super::json_errors::refusal_of;
+use super::json_violations::all_violations;
 use super::objects_only;
 use crate::domain::{self, Error, Result, SigmaM, TimeBounds, parse_time};
 use crate::geo::{self, PositionError};
@@ -355,6 +356,14 @@ pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
         Ok(value) => Ok(value),
         Err(_) => parse_with_path(json),
     }
+}
+
+/// Parses a document from JSON text; its refusal names all fields at fault, and takes several passes.
+///
+/// # Errors
+/// As [`parse_json`].
+pub fn parse_document<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
+    parse_json(json).map_err(|first| all_violations::<T>(json, first))
 }
 
 fn parse_with_path<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {

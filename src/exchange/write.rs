@@ -9,20 +9,20 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::columns::{COLUMNS, OF_SAMPLES};
+use super::columns::{COLUMNS, OF_SAMPLES, OF_UNMATCHED};
 use super::format::Format;
 use super::formula_guard::guarded;
 use super::wire;
-use crate::domain::{Fix, FusedFix, Sample};
+use crate::domain::{Association, Fix, FusedFix, Sample, StoredSample};
 
 /// Writes samples one by one. Between two of them the output can be drained (`get_mut`), so an export of
 /// any length needs the memory of one page.
-pub struct SampleWriter<W: Write>(Document<W>);
+pub struct SampleWriter<W: Write>(PositionDocument<W>);
 
 impl<W: Write> SampleWriter<W> {
     /// A writer of that format. Nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
-        Self(Document::new(out, format, "samples"))
+        Self(PositionDocument::new(out, format, "samples"))
     }
 
     /// Writes one sample. Without a fix its columns are empty, and its GeoJSON feature has no geometry.
@@ -55,13 +55,62 @@ impl<W: Write> SampleWriter<W> {
     }
 }
 
+/// Writes samples with how they were matched, like [`SampleWriter`]: two columns more.
+pub struct MatchedSampleWriter<W: Write>(PositionDocument<W>);
+
+impl<W: Write> MatchedSampleWriter<W> {
+    /// A writer of that format. Nothing is written yet.
+    pub const fn new(out: W, format: Format) -> Self {
+        Self(PositionDocument::new(out, format, "samples"))
+    }
+
+    /// Writes one sample; without an association its two columns are empty.
+    ///
+    /// # Errors
+    /// An I/O error of the output.
+    pub fn write(&mut self, sample: &StoredSample, association: Option<&Association>) -> io::Result<()> {
+        let row = MatchedRow {
+            sample: wire::Sample::from(sample),
+            tracker_id: association.map(|own| own.tracker_id.as_str()),
+            match_probability: association.map(|own| own.probability),
+        };
+        match self.0.format {
+            Format::Csv => self.0.csv_row(matched_header, |out| matched_cells(out, &row)),
+            Format::Ndjson | Format::Json => self.0.json_row(&row),
+            Format::GeoJson => {
+                let position = row.sample.fix.map(|fix| fix.position());
+                self.0.json_row(&Feature::new(position, &row))
+            }
+        }
+    }
+
+    /// Completes the document and returns the output.
+    ///
+    /// # Errors
+    /// An I/O error of the output.
+    pub fn finish(self) -> io::Result<W> {
+        self.0.finish(matched_header)
+    }
+}
+
+/// A sample, the id that the tracker gave it, and the posterior probability of the match.
+#[derive(Serialize)]
+struct MatchedRow<'a> {
+    #[serde(flatten)]
+    sample: wire::Sample<'a>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tracker_id: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    match_probability: Option<f64>,
+}
+
 /// Writes fused positions one by one, like [`SampleWriter`].
-pub struct FusedWriter<W: Write>(Document<W>);
+pub struct FusedWriter<W: Write>(PositionDocument<W>);
 
 impl<W: Write> FusedWriter<W> {
     /// A writer of that format. Nothing is written yet.
     pub const fn new(out: W, format: Format) -> Self {
-        Self(Document::new(out, format, "items"))
+        Self(PositionDocument::new(out, format, "items"))
     }
 
     /// Writes one fused position.
@@ -124,7 +173,7 @@ pub fn write_fused<'a, W: Write>(
 }
 
 /// The framing of a document: beginning, separators and end.
-struct Document<W> {
+struct PositionDocument<W> {
     out: W,
     format: Format,
     /// Name of the array in a JSON document.
@@ -132,7 +181,7 @@ struct Document<W> {
     has_begun: bool,
 }
 
-impl<W: Write> Document<W> {
+impl<W: Write> PositionDocument<W> {
     const fn new(out: W, format: Format, name: &'static str) -> Self {
         Self { out, format, name, has_begun: false }
     }
@@ -185,14 +234,37 @@ impl<W: Write> Document<W> {
 }
 
 fn sample_header<W: Write>(out: &mut W) -> io::Result<()> {
-    for (index, column) in COLUMNS.iter().take(OF_SAMPLES).enumerate() {
-        let end = if index + 1 < OF_SAMPLES { "," } else { "\n" };
+    header(out, OF_UNMATCHED)
+}
+
+fn matched_header<W: Write>(out: &mut W) -> io::Result<()> {
+    header(out, OF_SAMPLES)
+}
+
+/// A line of the names of the first columns.
+fn header<W: Write>(out: &mut W, columns: usize) -> io::Result<()> {
+    for (index, column) in COLUMNS.iter().take(columns).enumerate() {
+        let end = if index + 1 < columns { "," } else { "\n" };
         write!(out, "{}{end}", column.plain)?;
     }
     Ok(())
 }
 
 fn sample_cells<W: Write>(out: &mut W, row: &wire::Sample<'_>) -> io::Result<()> {
+    unmatched_cells(out, row)?;
+    writeln!(out)
+}
+
+fn matched_cells<W: Write>(out: &mut W, row: &MatchedRow<'_>) -> io::Result<()> {
+    unmatched_cells(out, &row.sample)?;
+    write!(out, ",{},", row.tracker_id.map(text_cell).unwrap_or_default())?;
+    match row.match_probability {
+        Some(probability) => writeln!(out, "{probability:.4}"),
+        None => writeln!(out),
+    }
+}
+
+fn unmatched_cells<W: Write>(out: &mut W, row: &wire::Sample<'_>) -> io::Result<()> {
     let wire::BoundingBox { left_px, top_px, width_px, height_px } = row.bounding_box;
     write!(out, "{},{},", row.time, text_cell(row.target_id))?;
     write!(out, "{left_px},{top_px},{width_px},{height_px},")?;
@@ -201,8 +273,8 @@ fn sample_cells<W: Write>(out: &mut W, row: &wire::Sample<'_>) -> io::Result<()>
     cell(out, row.class.map(text_cell))?;
     cell(out, row.score)?;
     match row.truth {
-        Some(truth) => writeln!(out, "{:.8},{:.8}", truth.longitude_deg, truth.latitude_deg),
-        None => writeln!(out, ","),
+        Some(truth) => write!(out, "{:.8},{:.8}", truth.longitude_deg, truth.latitude_deg),
+        None => write!(out, ","),
     }
 }
 

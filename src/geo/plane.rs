@@ -30,7 +30,8 @@ impl EastNorth {
     /// Whether the point lies within [`PLANE_RANGE_M`] of the origin; false if it is not finite.
     #[must_use]
     pub fn is_within_range(self) -> bool {
-        self.east_m.hypot(self.north_m) <= PLANE_RANGE_M
+        // Squared: this is asked several times an answer, and `hypot` guards against overflow that cannot matter here.
+        self.east_m * self.east_m + self.north_m * self.north_m <= PLANE_RANGE_M * PLANE_RANGE_M
     }
 
     /// Half the squared distance, m2: the mean squared error over the two axes, as in (2).
@@ -95,8 +96,8 @@ impl LocalPlane {
     #[must_use]
     pub fn to_plane_within_range(&self, position: Position) -> Option<EastNorth> {
         let (point, up_m) = self.topocentric(position);
-        let chord_m = point.east_m.hypot(point.north_m).hypot(up_m);
-        (chord_m <= PLANE_RANGE_M).then_some(point)
+        let chord_m2 = point.east_m * point.east_m + point.north_m * point.north_m + up_m * up_m;
+        (chord_m2 <= PLANE_RANGE_M * PLANE_RANGE_M).then_some(point)
     }
 
     /// East and north, and up along the normal at the origin, of a position on the ellipsoid, m.
@@ -138,7 +139,7 @@ impl LocalPlane {
             outward_m = self.axis_m + self.cos_latitude * up_m - self.sin_latitude * north_m;
             upward_m = self.equator_m + self.sin_latitude * up_m + self.cos_latitude * north_m;
         }
-        let axis_m = east_m.hypot(outward_m);
+        let axis_m = (east_m * east_m + outward_m * outward_m).sqrt();
         let longitude_deg = self.origin.longitude_deg() + east_m.atan2(outward_m).to_degrees();
         // At height zero tan(latitude) = upward / (axis (1 - e2)), without iteration.
         let latitude_deg = upward_m.atan2(axis_m * polar_squared).to_degrees();

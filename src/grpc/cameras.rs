@@ -1,6 +1,7 @@
 //! `CameraService`.
 
-use super::convert::{camera_id, of_field, recipe, required, timestamp};
+use super::convert::{camera_id, of_field, recipe, required, site_id, timestamp};
+use super::mask::named_fields;
 use super::pages;
 use super::proto;
 use super::proto::camera_service_server::CameraService;
@@ -8,7 +9,7 @@ use super::statuses::{Reply, answer};
 use crate::app::App;
 use crate::domain::{
     Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, NewCamera,
-    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, TargetClass, TargetId,
 };
 
 pub(super) struct Cameras {
@@ -32,7 +33,7 @@ impl CameraService for Cameras {
             let profile = new_camera(id, asked.profile.unwrap_or_default())
                 .and_then(NewCamera::check)
                 .map_err(|error| error.under("profile"))?;
-            let camera = app.create_camera(profile).await?;
+            let camera = app.create_camera(profile).await.map_err(|error| of_field(error, "profile"))?;
             Ok(proto::CreateCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
         .await
@@ -56,7 +57,8 @@ impl CameraService for Cameras {
         answer(&self.app, request, |app, asked| async move {
             let size = pages::size(asked.page_size, &app.limits)?;
             let after = pages::cursor::<CameraId>(&asked.page_token)?;
-            let page = app.cameras(after.as_ref(), size).await?;
+            let site = Some(&asked.site_id).filter(|id| !id.is_empty()).map(|id| site_id(id)).transpose()?;
+            let page = app.cameras(site.as_ref(), after.as_ref(), size).await?;
             Ok(proto::ListCamerasResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 cameras: page.items.into_iter().map(|camera| proto::Camera::of(&app, camera)).collect(),
@@ -111,6 +113,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
         labels: profile.labels.into_iter().collect(),
         receivers: receivers(&profile.receivers)?,
         retrain_when_moved: profile.retrain_when_moved.unwrap_or(named.retrain_when_moved),
+        site: profile.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
         id: named.id,
     })
 }
@@ -156,66 +159,32 @@ fn gnss_error(error: Option<proto::GnssError>) -> Result<GnssError> {
     }
 }
 
-/// The fields of a profile, as a mask names them.
-const FIELDS: [&str; 9] = [
-    "display_name",
-    "image_size",
-    "gnss_error",
-    "recipe",
-    "target_classes",
-    "labels",
-    "receivers",
-    "retrain_when_moved",
-    "gnss_bias_sigma_m",
-];
-
 /// The fields that the mask names, or those that the profile has.
 fn camera_change(
     id: &CameraId,
     profile: proto::CameraProfile,
     mask: Option<prost_types::FieldMask>,
 ) -> Result<CameraChange> {
-    let paths = match mask {
-        Some(mask) => mask.paths,
-        None => present(&profile).into_iter().map(str::to_owned).collect(),
-    };
-    let unknown = |path: &String| path != "*" && !FIELDS.contains(&path.as_str());
-    if let Some(index) = paths.iter().position(unknown) {
-        let known = FIELDS.join(", ");
-        return Err(Error::invalid(
-            format!("update_mask.paths[{index}]"),
-            format!("must be one of {known}, or * for all"),
-        ));
-    }
-    let named = |field: &str| paths.iter().any(|path| path == field || path == "*");
+    let is_named = named_fields(mask, &CameraChange::FIELDS, present(&profile))?;
     let profile = new_camera(id.clone(), profile).map_err(|error| error.under("profile"))?;
-    Ok(CameraChange {
-        display_name: named("display_name").then_some(profile.display_name),
-        image_size: named("image_size").then_some(profile.image_size),
-        gnss_error: named("gnss_error").then_some(profile.gnss_error),
-        gnss_bias_sigma: named("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
-        recipe: named("recipe").then_some(profile.recipe),
-        target_classes: named("target_classes").then_some(profile.target_classes),
-        labels: named("labels").then_some(profile.labels),
-        receivers: named("receivers").then_some(profile.receivers),
-        retrain_when_moved: named("retrain_when_moved").then_some(profile.retrain_when_moved),
-    })
+    Ok(CameraChange::of_fields(profile, is_named))
 }
 
 /// Names of the fields that a profile has.
 fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
     let has = [
-        !profile.display_name.is_empty(),
-        profile.image_size.is_some(),
-        profile.gnss_error.is_some(),
-        profile.recipe != proto::Recipe::Unspecified as i32,
-        !profile.target_classes.is_empty(),
-        !profile.labels.is_empty(),
-        !profile.receivers.is_empty(),
-        profile.retrain_when_moved.is_some(),
-        profile.gnss_bias_sigma_m.is_some(),
+        ("display_name", !profile.display_name.is_empty()),
+        ("image_size", profile.image_size.is_some()),
+        ("gnss_error", profile.gnss_error.is_some()),
+        ("gnss_bias_sigma_m", profile.gnss_bias_sigma_m.is_some()),
+        ("recipe", profile.recipe != proto::Recipe::Unspecified as i32),
+        ("target_classes", !profile.target_classes.is_empty()),
+        ("labels", !profile.labels.is_empty()),
+        ("receivers", !profile.receivers.is_empty()),
+        ("retrain_when_moved", profile.retrain_when_moved.is_some()),
+        ("site", profile.site.is_some()),
     ];
-    FIELDS.into_iter().zip(has).filter_map(|(field, has)| has.then_some(field)).collect()
+    has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
 }
 
 impl proto::Camera {
@@ -254,6 +223,7 @@ impl From<NewCamera> for proto::CameraProfile {
             receivers: profile.receivers.iter().map(Into::into).collect(),
             retrain_when_moved: Some(profile.retrain_when_moved),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
+            site: profile.site.map(|site| site.as_str().to_owned()),
         }
     }
 }

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use super::proto;
 use crate::domain::{
     self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Score,
-    StoredSample, TargetClass, TargetId, TimeRange,
+    SiteId, StoredSample, TargetClass, TargetId, TimeRange,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -27,6 +27,14 @@ pub(super) fn camera_id(id: &str) -> Result<CameraId> {
     CameraId::new(required_text(id, "camera_id")?).map_err(|_| {
         let shown: String = id.chars().take(80).collect();
         Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera"))
+    })
+}
+
+/// The site that a request names. What is no slug names no site.
+pub(super) fn site_id(id: &str) -> Result<SiteId> {
+    SiteId::new(required_text(id, "site_id")?).map_err(|_| {
+        let shown: String = id.chars().take(80).collect();
+        Error::refused(ErrorKind::SiteNotFound, format!("`{shown}` is not the id of a site"))
     })
 }
 
@@ -129,7 +137,7 @@ pub(super) fn fix(fix: proto::Fix) -> Result<domain::Fix> {
     .to_domain()
 }
 
-fn position(position: proto::Position) -> Result<geo::Position> {
+pub(super) fn position(position: proto::Position) -> Result<geo::Position> {
     wire::Position {
         longitude_deg: required(position.longitude_deg, "longitude_deg")?,
         latitude_deg: required(position.latitude_deg, "latitude_deg")?,

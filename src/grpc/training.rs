@@ -9,7 +9,7 @@ use super::convert::{camera_id, instant, recipe, run_id, timestamp};
 use super::pages;
 use super::proto;
 use super::proto::training_service_server::TrainingService;
-use super::statuses::{Reply, answer, client_address, request_id, to_status};
+use super::statuses::{Reply, answer, client_id, request_id, to_status};
 use crate::admission::Lease;
 use crate::app::{App, RunRequest};
 use crate::domain::{
@@ -106,7 +106,7 @@ impl TrainingService for Training {
         request: tonic::Request<proto::WatchTrainingRunRequest>,
     ) -> Reply<Changes> {
         let id = request_id(request.extensions());
-        let client = client_address(request.extensions());
+        let client = client_id(request.extensions());
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let (camera, run) = (camera_id(&asked.camera_id)?, run_id(&asked.run_id)?);

@@ -3,12 +3,14 @@
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
+use std::task::{Context, Poll};
 
-use axum::extract::{FromRequestParts, MatchedPath, Request, State};
-use axum::middleware::Next;
+use axum::extract::{FromRequestParts, MatchedPath, Request};
 use axum::response::{IntoResponse as _, Response};
+use futures_util::future::{BoxFuture, Either};
 use hyper::http::request::Parts;
 use hyper::{Method, Uri};
+use tower::{Layer, Service};
 use utoipa::openapi::path::ParameterIn;
 use utoipa::openapi::{OpenApi, RefOr};
 
@@ -17,14 +19,15 @@ use super::body::discard;
 use super::extract::Params;
 use super::problem::{ApiError, ApiResult};
 use crate::app::App;
-use crate::app::access::{Caller, Permission};
+use crate::app::access::{Caller, Permission, RoutePermission};
 use crate::domain::{Error, Result};
+use crate::telemetry::{MatchedRoute, Route};
 
 /// The query parameters of the operations, as the description names them.
-pub(super) struct QueryParameters(HashMap<(String, &'static str), HashSet<String>>);
+struct QueryParameters(HashMap<(String, String), HashSet<String>>);
 
 impl QueryParameters {
-    pub(super) fn of(description: &OpenApi) -> Self {
+    fn of(description: &OpenApi) -> Self {
         let mut parameters = HashMap::new();
         for (template, item) in &description.paths.paths {
             let operations = [
@@ -35,53 +38,94 @@ impl QueryParameters {
                 ("DELETE", &item.delete),
             ];
             for (method, operation) in operations {
-                let described = operation.iter().flat_map(|operation| operation.parameters.iter().flatten());
-                let names = described.filter_map(|parameter| match parameter {
+                let Some(operation) = operation else { continue };
+                let names = operation.parameters.iter().flatten().filter_map(|parameter| match parameter {
                     RefOr::T(parameter) if parameter.parameter_in == ParameterIn::Query => {
                         Some(parameter.name.clone())
                     }
                     _ => None,
                 });
-                parameters.insert((template.clone(), method), names.collect());
+                parameters.insert((template.clone(), method.to_owned()), names.collect());
             }
         }
         Self(parameters)
     }
 
+    /// A method that the route does not have is left to the router to refuse.
+    ///
     /// # Errors
     /// `InvalidArgument` naming a parameter that the operation does not have.
     fn check(&self, template: &str, method: &Method, uri: &Uri) -> Result<()> {
         if uri.query().is_none_or(str::is_empty) {
             return Ok(());
         }
-        let method = METHODS.into_iter().find(|name| *name == method.as_str()).unwrap_or("GET");
-        let known = self.0.get(&(template.to_owned(), method));
-        Params::of(uri)?.check_names(|name| known.is_some_and(|known| known.contains(name)))
+        // The router answers HEAD by the handler of GET.
+        let method = if method == Method::HEAD { &Method::GET } else { method };
+        match self.0.get(&(template.to_owned(), method.to_string())) {
+            Some(known) => Params::of(uri)?.check_names(|name| known.contains(name)),
+            None => Ok(()),
+        }
     }
 }
 
-const METHODS: [&str; 5] = ["GET", "POST", "PUT", "PATCH", "DELETE"];
-
 /// Refuses a request before its handler runs, if the caller may not use the matched route, or the query has
 /// what the operation does not know.
-pub(super) async fn authorize(
-    State(parameters): State<Arc<QueryParameters>>,
-    request: Request,
-    next: Next,
-) -> Response {
-    let template = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
-    let permission = Permission::of_route(request.method().as_str(), template);
-    let authorized = match request.extensions().get::<Caller>() {
-        Some(caller) => caller.authorize(permission),
-        None => Err(no_caller()),
-    };
-    let checked = authorized.and_then(|()| parameters.check(template, request.method(), request.uri()));
-    match checked {
-        Ok(()) => next.run(request).await,
-        Err(error) => {
-            let (head, mut body) = request.into_parts();
-            discard(&head.headers, &mut body).await;
-            ApiError::from(error).into_response()
+#[derive(Clone)]
+pub(super) struct AuthorizeLayer(Arc<QueryParameters>);
+
+impl AuthorizeLayer {
+    /// For the routes of a description.
+    pub(super) fn of(description: &OpenApi) -> Self {
+        Self(Arc::new(QueryParameters::of(description)))
+    }
+}
+
+impl<S> Layer<S> for AuthorizeLayer {
+    type Service = Authorize<S>;
+
+    fn layer(&self, inner: S) -> Authorize<S> {
+        Authorize { inner, parameters: self.0.clone() }
+    }
+}
+
+/// A route behind an [`AuthorizeLayer`]. A service and not a function: that would cost every request two more
+/// boxes.
+#[derive(Clone)]
+pub(super) struct Authorize<S> {
+    inner: S,
+    parameters: Arc<QueryParameters>,
+}
+
+impl<S> Authorize<S> {
+    fn check(&self, request: &Request) -> Result<()> {
+        let template = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
+        let caller = request.extensions().get::<Caller>().ok_or_else(no_caller)?;
+        let route = RoutePermission::of(request.method().as_str(), template);
+        if let (Some(matched), Some(route)) = (request.extensions().get::<MatchedRoute>(), route) {
+            matched.set(Route { method: route.method, template: route.template });
+        }
+        caller.authorize(route.map_or(Permission::Administer, |route| route.permission))?;
+        self.parameters.check(template, request.method(), request.uri())
+    }
+}
+
+impl<S: Service<Request, Response = Response>> Service<Request> for Authorize<S> {
+    type Response = Response;
+    type Error = S::Error;
+    type Future = Either<S::Future, BoxFuture<'static, std::result::Result<Response, S::Error>>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<std::result::Result<(), S::Error>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, request: Request) -> Self::Future {
+        match self.check(&request) {
+            Ok(()) => Either::Left(self.inner.call(request)),
+            Err(error) => Either::Right(Box::pin(async move {
+                let (head, mut body) = request.into_parts();
+                discard(&head.headers, &mut body).await;
+                Ok(ApiError::from(error).into_response())
+            })),
         }
     }
 }

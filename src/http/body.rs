@@ -9,11 +9,11 @@ use axum::body::Body;
 use bytes::{Buf as _, Bytes, BytesMut};
 use http_body_util::BodyExt as _;
 use hyper::HeaderMap;
-use hyper::header::{CONTENT_LENGTH, EXPECT};
+use hyper::header::{CONTENT_ENCODING, CONTENT_LENGTH, EXPECT};
 use hyper::http::request::Parts;
 use tokio::io::AsyncWriteExt as _;
 
-use crate::admission::{ClientAddress, Lease};
+use crate::admission::{ClientId, Lease};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind, Result};
 
@@ -27,7 +27,7 @@ const DISCARD_TIME: Duration = Duration::from_secs(10);
 /// # Errors
 /// `TooLarge` beyond the limit; `Timeout` and `Cancelled` for a body that does not come.
 pub(super) async fn whole(headers: &HeaderMap, mut body: Body, limit: usize) -> Result<Bytes> {
-    check_announced(headers, &mut body, limit).await?;
+    check_headers(headers, &mut body, limit).await?;
     let Some(first) = next(&mut body).await? else { return Ok(Bytes::new()) };
     let mut gathered = Gathered::One(first);
     while let Some(part) = next(&mut body).await? {
@@ -110,7 +110,7 @@ pub(super) struct SpoolLeases {
 }
 
 impl SpoolLeases {
-    fn new(app: &App, client: ClientAddress) -> Result<Self> {
+    fn new(app: &App, client: ClientId) -> Result<Self> {
         let memory = app.quotas.import_memory.try_acquire(client, 0)?;
         Ok(Self { memory, disk: app.quotas.import_disk.try_acquire(client, 0)? })
     }
@@ -123,8 +123,8 @@ impl SpoolLeases {
 /// temporary file cannot be written.
 pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
     let limit = app.limits.import_bytes;
-    check_announced(&head.headers, &mut body, limit).await?;
-    let mut spool = Spool::new(app, client_address(head))?;
+    check_headers(&head.headers, &mut body, limit).await?;
+    let mut spool = Spool::new(app, client_id(head))?;
     while let Some(part) = next(&mut body).await? {
         let pushed =
             if spool.length + part.len() > limit { Err(too_large(limit)) } else { spool.push(part).await };
@@ -137,8 +137,8 @@ pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<S
 }
 
 /// Who sends a request.
-pub(super) fn client_address(head: &Parts) -> ClientAddress {
-    head.extensions.get().copied().unwrap_or(ClientAddress::UNKNOWN)
+pub(super) fn client_id(head: &Parts) -> ClientId {
+    head.extensions.get().copied().unwrap_or(ClientId::UNKNOWN)
 }
 
 /// Gathers what comes piece by piece, in memory up to a size and in a temporary file beyond, or where
@@ -152,7 +152,7 @@ pub(super) struct Spool {
 }
 
 impl Spool {
-    pub(super) fn new(app: &App, client: ClientAddress) -> Result<Self> {
+    pub(super) fn new(app: &App, client: ClientId) -> Result<Self> {
         Ok(Self {
             memory_bytes: app.limits.import_memory_bytes,
             length: 0,
@@ -241,12 +241,19 @@ fn too_large(limit: usize) -> Error {
 }
 
 /// Refuses a body by the length that its header announces, before any of it is read.
-async fn check_announced(headers: &HeaderMap, body: &mut Body, limit: usize) -> Result<()> {
-    if announced(headers).is_some_and(|length| length > limit as u64) {
-        discard(headers, body).await;
-        return Err(too_large(limit));
-    }
-    Ok(())
+/// Refuses a body by its headers: too long, or compressed, which is not read since a few bytes could become many.
+async fn check_headers(headers: &HeaderMap, body: &mut Body, limit: usize) -> Result<()> {
+    let is_encoded = headers.get_all(CONTENT_ENCODING).iter().any(|encoding| encoding != "identity");
+    let refusal = if announced(headers).is_some_and(|length| length > limit as u64) {
+        too_large(limit)
+    } else if is_encoded {
+        let message = "compressed bodies are not read; send it as it is, without this header";
+        Error::field(ErrorKind::UnsupportedMediaType, "content-encoding", message)
+    } else {
+        return Ok(());
+    };
+    discard(headers, body).await;
+    Err(refusal)
 }
 
 fn announced(headers: &HeaderMap) -> Option<u64> {

@@ -12,9 +12,9 @@ use serde::de::DeserializeOwned;
 use super::Rest;
 use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
-use crate::admission::ClientAddress;
+use crate::admission::ClientId;
 use crate::domain::{
-    CameraId, Durability, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time,
+    CameraId, Durability, Error, ErrorKind, EvaluationId, LiveId, Result, RunId, SiteId, TargetId, parse_time,
 };
 use crate::exchange::{Cursor, read_cursor, wire};
 
@@ -22,13 +22,13 @@ use crate::exchange::{Cursor, read_cursor, wire};
 const PAGE_ITEMS: u32 = 100;
 
 /// Who sends the request.
-pub(super) struct Client(pub(super) ClientAddress);
+pub(super) struct Client(pub(super) ClientId);
 
 impl<S: Send + Sync> FromRequestParts<S> for Client {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
-        Ok(Self(body::client_address(parts)))
+        Ok(Self(body::client_id(parts)))
     }
 }
 
@@ -40,6 +40,32 @@ impl<S: Send + Sync> FromRequestParts<S> for CameraPath {
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         Ok(Self(camera_of(&path::<CameraSegment, S>(parts, state).await?.camera)?))
+    }
+}
+
+/// A site of the path. What is no slug names no site.
+pub(super) struct SitePath(pub(super) SiteId);
+
+impl<S: Send + Sync> FromRequestParts<S> for SitePath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        Ok(Self(site_of(&path::<SiteSegment, S>(parts, state).await?.site)?))
+    }
+}
+
+/// A world track of the path. What is no id of a track names none that there is.
+pub(super) struct WorldTrackPath(pub(super) SiteId, pub(super) LiveId);
+
+impl<S: Send + Sync> FromRequestParts<S> for WorldTrackPath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        let WorldTrackSegments { site, track } = path(parts, state).await?;
+        let track = track.parse().map_err(|_: Error| {
+            Error::refused(ErrorKind::TrackNotFound, "that is not the id of a world track")
+        })?;
+        Ok(Self(site_of(&site)?, track))
     }
 }
 
@@ -101,6 +127,17 @@ struct CameraSegment {
 }
 
 #[derive(Deserialize)]
+struct SiteSegment {
+    site: String,
+}
+
+#[derive(Deserialize)]
+struct WorldTrackSegments {
+    site: String,
+    track: String,
+}
+
+#[derive(Deserialize)]
 struct RunSegments {
     camera: String,
     run: String,
@@ -139,6 +176,14 @@ pub(super) fn camera_of(id: &str) -> Result<CameraId> {
     CameraId::new(id).map_err(|_| {
         let shown: String = id.chars().take(80).collect();
         Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera"))
+    })
+}
+
+/// A site by its id in a path, parameter or body.
+pub(super) fn site_of(id: &str) -> Result<SiteId> {
+    SiteId::new(id).map_err(|_| {
+        let shown: String = id.chars().take(80).collect();
+        Error::refused(ErrorKind::SiteNotFound, format!("`{shown}` is not the id of a site"))
     })
 }
 
@@ -232,13 +277,13 @@ impl FromRequest<Rest> for JsonBody {
 
 impl JsonBody {
     /// # Errors
-    /// `MalformedBody` for what is not JSON; `InvalidArgument` naming the path of a field of the
+    /// `MalformedBody` for what is not JSON; `InvalidArgument` naming the paths of all fields of the
     /// wrong type, missing or unknown.
     pub(super) fn read<'a, T: Deserialize<'a>>(&'a self) -> Result<T> {
         if self.0.is_empty() {
             return Err(Error::refused(ErrorKind::MalformedBody, "the operation needs a body of JSON"));
         }
-        wire::parse_json(&self.0)
+        wire::parse_document(&self.0)
     }
 
     /// The same where all of the body may be left out.

@@ -4,6 +4,9 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod access;
 mod audit;
 mod body;
@@ -11,11 +14,13 @@ mod camera_statuses;
 mod cameras;
 mod console;
 mod description;
+mod etag;
 mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
 mod keys;
+mod merge_patch;
 mod models;
 mod pairings;
 mod parts;
@@ -25,22 +30,26 @@ mod samples;
 mod server_info;
 mod service;
 mod session;
+mod sites;
 #[cfg(test)]
 mod tests;
 mod tracks;
 mod training_runs;
 mod wire;
+mod world_tracks;
 
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 
 use axum::Router;
 use axum::body::Body;
-use axum::middleware::{from_fn, from_fn_with_state, map_response};
+use axum::middleware::map_response;
 use axum::response::Response;
-use hyper::Method;
+use futures_util::FutureExt as _;
 use hyper::header::{CONTENT_SECURITY_POLICY, REFERRER_POLICY, X_FRAME_OPTIONS};
 use hyper::http::HeaderValue;
-use tower_http::catch_panic::CatchPanicLayer;
+use hyper::{Method, Request};
+use tower::Service as _;
 use utoipa::openapi::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_swagger_ui::{Config, SwaggerUi};
@@ -63,25 +72,43 @@ struct Rest {
 }
 
 /// All REST routes, the description at `/openapi.json` and its page at `/docs`, the operator's console at `/`.
-///
-/// Requests carry their [`RequestId`] and their [`Caller`](crate::app::access::Caller) as extensions.
-pub fn router(app: App, console: Console, shutdown: Shutdown) -> Router {
-    let console_routes = console::routes(&console);
-    let rest = Rest { app, console: Arc::new(console), shutdown };
-    let (routes, described) = described().split_for_parts();
-    let parameters = Arc::new(access::QueryParameters::of(&described));
-    // The page would otherwise ask a server on the internet whether the description is well formed.
-    let page = SwaggerUi::new("/docs")
-        .url("/openapi.json", described)
-        .config(Config::default().validator_url("none").use_base_layout());
-    let page = Router::from(page).layer(map_response(contain_page));
-    routes
-        .route_layer(from_fn_with_state(parameters, access::authorize))
-        .merge(page)
-        .merge(console_routes)
-        .with_state(rest)
-        // As one layer: axum boxes every request again for each.
-        .layer((from_fn(problem::problem_layer), CatchPanicLayer::custom(problem::panicked)))
+#[derive(Clone)]
+pub struct Transport(Router);
+
+impl Transport {
+    /// The transport over an application.
+    #[must_use]
+    pub fn new(app: App, console: Console, shutdown: Shutdown) -> Self {
+        let console_routes = console::routes(&console);
+        let rest = Rest { app, console: Arc::new(console), shutdown };
+        let (routes, described) = described().split_for_parts();
+        let authorize = access::AuthorizeLayer::of(&described);
+        // The page would otherwise ask a server on the internet whether the description is well formed.
+        let page = SwaggerUi::new("/docs")
+            .url("/openapi.json", described)
+            .config(Config::default().validator_url("none").use_base_layout());
+        let page = Router::from(page).layer(map_response(contain_page));
+        Self(routes.route_layer(authorize).merge(page).merge(console_routes).with_state(rest))
+    }
+
+    /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
+    #[must_use]
+    pub fn monitoring(app: App, shutdown: Shutdown) -> Self {
+        let rest = Rest { app, console: Arc::default(), shutdown };
+        let (routes, described) = service::routes().split_for_parts();
+        Self(routes.route_layer(access::AuthorizeLayer::of(&described)).with_state(rest))
+    }
+
+    /// Answers a request, which carries its [`RequestId`] and its [`Caller`](crate::app::access::Caller) as
+    /// extensions. Whatever part of the router refuses it, or panics, the answer is a problem.
+    pub async fn answer(&self, request: Request<Body>) -> Response<Body> {
+        // Not as layers of the router: axum would box the service and the future of every request for each.
+        let refused = problem::Refused::of(&request);
+        let answer = AssertUnwindSafe(self.0.clone().call(request)).catch_unwind().await;
+        let answer =
+            answer.map_or_else(problem::panicked, |answer| answer.unwrap_or_else(|never| match never {}));
+        refused.explain(answer)
+    }
 }
 
 /// What the page of the description may do: run its own scripts and ask its own server, nothing else.
@@ -132,6 +159,8 @@ fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
         .merge(camera_statuses::routes())
+        .merge(sites::routes())
+        .merge(world_tracks::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())

@@ -13,9 +13,10 @@ use super::parts::parts;
 use super::problem::{ApiResult, Problem};
 use super::receivers::Receiver;
 use super::wire::{Durability, json};
-use crate::app::{PairedImport, PairedReport, PairingCounts, Part};
+use crate::app::{self, App, MatchReport, PairedImport, PairedReport, PairingCounts, Part};
 use crate::domain::{self, Error, ReceiverId, Result, TargetId};
 use crate::exchange::{FixFormat, Format, RowError};
+use crate::fusion::association::MatchSettings;
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
 
@@ -57,9 +58,50 @@ struct PairedSamples {
     /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
     #[serde(skip_serializing_if = "Option::is_none")]
     unnamed_fixes_of: Option<Receiver>,
+    /// What was matched, if that was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    matching: Option<Matching>,
     /// Clock offsets of the receivers as the files show them, if that was asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     clock_offsets: Option<Vec<ClockOffsetEstimate>>,
+}
+
+/// Boxes matched with receivers. The samples of a match have the receiver's id as target id.
+#[derive(Serialize, ToSchema)]
+struct Matching {
+    /// Tracklets: stretches of boxes of one tracker's id.
+    tracklets: usize,
+    /// Receivers with fixes.
+    receivers: usize,
+    /// Tracklets cut where their id seems to have moved to another target.
+    cuts: usize,
+    /// Bound on the posterior probability.
+    min_probability: f64,
+    /// Boxes matched with at least that probability.
+    matched_detections: u64,
+    /// Boxes whose most probable receiver is less probable, but at least 0.5: left out.
+    unsure_detections: u64,
+    /// Pairs of tracklet and receiver with at least that probability.
+    pairs: Vec<MatchedPair>,
+}
+
+/// A tracklet, or a part of it, and the receiver that its target carries.
+#[derive(Serialize, ToSchema)]
+struct MatchedPair {
+    /// The receiver; the target id of the samples.
+    receiver_id: String,
+    /// Id that the tracker gave the boxes.
+    tracker_id: String,
+    /// Time of the first box.
+    #[schema(value_type = String, format = DateTime)]
+    from: jiff::Timestamp,
+    /// Time of the last box.
+    #[schema(value_type = String, format = DateTime)]
+    to: jiff::Timestamp,
+    /// Number of boxes.
+    detections: u64,
+    /// Posterior probability of the match, 0 to 1.
+    probability: f64,
 }
 
 /// A row that was not taken, and why.
@@ -151,6 +193,11 @@ struct ClockOffsetEstimate {
 /// With `keep_unpaired` the boxes that find no fix, other than duplicates, are stored as samples without a
 /// fix, whose boxes training uses for the geometry of the camera.
 ///
+/// With `match` the boxes need only a tracker's ids: whose boxes show whose receivers is found out by the
+/// camera's active model, without one together with the camera, whose profile then needs the image size.
+/// Samples of sure matches have the receiver's id as target id; others are left out and counted. If nobody
+/// can tell, the answer is a problem of type `not-identifiable` with what to record, and nothing is stored.
+///
 /// One bad row never loses the others. Sending the same again does no harm.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/samples/pairings", tag = "samples",
@@ -162,12 +209,16 @@ struct ClockOffsetEstimate {
         ("target_id" = Option<String>, Query, description = "The target of boxes that name none"),
         ("receiver_id" = Option<String>, Query, description = "The receiver of fixes that name none"),
         ("keep_unpaired" = Option<bool>, Query, description = "Store the boxes that find no fix as samples without one"),
+        ("match" = Option<bool>, Query, description = "Find out whose boxes show whose receivers"),
+        ("min_probability" = Option<f64>, Query, description = "With `match`, leave out samples whose match is less probable, 0.9 if left out; 0.5 to 1"),
+        ("clock_window_s" = Option<f64>, Query, description = "With `match`, the receivers' clocks are off by at most this, 0 if left out; 0 to 30"),
         ("durability" = Option<String>, Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
         ("estimate_offset" = Option<bool>, Query, description = "Tell the receivers' clock offsets as the files show them; they are not applied"),
     ),
     request_body(content = PairingParts, content_type = "multipart/form-data"),
     responses(
         (status = 200, description = "What became of the rows", body = PairedSamples),
+        (status = 422, description = "A parameter cannot be used, or, with `match`, nobody can tell whose fixes belong to whose boxes", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
     )
 )]
@@ -180,6 +231,7 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
     let estimates_offsets = params.flag("estimate_offset")?.unwrap_or(false);
     let keeps_unpaired = params.flag("keep_unpaired")?.unwrap_or(false);
     let durability = params.durability()?;
+    let matching = matching(&mut params, &app)?;
     params.end()?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let names = [Part::Detections, Part::Fixes].map(Part::as_str);
@@ -208,9 +260,32 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
         keeps_unpaired,
         durability,
         estimates_offsets,
+        matching,
     };
     let report = app.import_paired(&id, import).await?;
     Ok(json(&paired_samples(report, durability, estimates_offsets))?)
+}
+
+/// How boxes are matched with receivers, if that is asked for.
+fn matching(params: &mut Params, app: &App) -> Result<Option<MatchSettings>> {
+    let mut number = |name: &str| {
+        params.take(name, |text| text.parse::<f64>().map_err(|_| Error::invalid(name, "must be a number")))
+    };
+    let (min_probability, clock_window_s) = (number("min_probability")?, number("clock_window_s")?);
+    if !params.flag("match")?.unwrap_or(false) {
+        return match (min_probability, clock_window_s) {
+            (None, None) => Ok(None),
+            (Some(_), _) => Err(Error::invalid("min_probability", "needs match=true")),
+            (None, Some(_)) => Err(Error::invalid("clock_window_s", "needs match=true")),
+        };
+    }
+    let default = MatchSettings::default();
+    let settings = MatchSettings::new(
+        min_probability.unwrap_or(default.min_probability),
+        clock_window_s.unwrap_or(default.clock_window_s),
+        &app.limits,
+    )?;
+    Ok(Some(settings))
 }
 
 fn settings(params: &mut Params) -> Result<PairingSettings> {
@@ -224,7 +299,7 @@ fn settings(params: &mut Params) -> Result<PairingSettings> {
 }
 
 fn paired_samples(report: PairedReport, durability: domain::Durability, with_offsets: bool) -> PairedSamples {
-    let PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets } = report;
+    let PairedReport { samples, counts, rejected, unnamed_fixes_of, clock_offsets, matching } = report;
     let estimates = clock_offsets.iter().map(|(receiver, found)| offset(receiver, found.as_ref()));
     PairedSamples {
         accepted: samples.accepted,
@@ -235,6 +310,7 @@ fn paired_samples(report: PairedReport, durability: domain::Durability, with_off
         durability: durability.into(),
         pairing: counts.into(),
         unnamed_fixes_of: unnamed_fixes_of.as_ref().map(Receiver::from),
+        matching: matching.map(Matching::from),
         clock_offsets: with_offsets.then(|| estimates.collect()),
     }
 }
@@ -251,6 +327,28 @@ fn offset(receiver: &domain::Receiver, found: Option<&OffsetEstimate>) -> ClockO
         sigma_s: found.map(|found| found.sigma_s),
         explained: found.map(|found| found.explained),
         explained_at_zero: found.map(|found| found.explained_at_zero),
+    }
+}
+
+impl From<MatchReport> for Matching {
+    fn from(report: MatchReport) -> Self {
+        let pair = |own: app::MatchedPair| MatchedPair {
+            receiver_id: own.receiver_id.as_str().to_owned(),
+            tracker_id: own.tracker_id.as_str().to_owned(),
+            from: own.from,
+            to: own.to,
+            detections: own.detections,
+            probability: own.probability,
+        };
+        Self {
+            tracklets: report.tracklets,
+            receivers: report.receivers,
+            cuts: report.cuts,
+            min_probability: report.min_probability,
+            matched_detections: report.matched_detections,
+            unsure_detections: report.unsure_detections,
+            pairs: report.pairs.into_iter().map(pair).collect(),
+        }
     }
 }
 

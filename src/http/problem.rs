@@ -1,6 +1,6 @@
 //! Errors as RFC 9457 problems, by the one table in [`crate::status`].
 //!
-//! A handler's error carries no request; the layer [`problem_layer`] knows the request and writes the
+//! A handler's error carries no request; [`Refused::explain`] knows the request and writes the
 //! problem, and the log line of a fault, once and here.
 
 use std::any::Any;
@@ -8,11 +8,10 @@ use std::sync::Arc;
 
 use axum::body::Body;
 use axum::extract::Request;
-use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use hyper::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER, WWW_AUTHENTICATE};
 use hyper::http::HeaderValue;
-use hyper::{Method, StatusCode};
+use hyper::{Method, StatusCode, Uri};
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -23,7 +22,7 @@ use crate::telemetry::RequestId;
 /// Media type of a problem.
 pub(super) const PROBLEM_JSON: &str = "application/problem+json";
 
-/// An error on its way to the layer that writes its problem.
+/// An error on its way to where its problem is written.
 #[derive(Clone)]
 pub(super) struct ApiError(Arc<Error>);
 
@@ -113,42 +112,52 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
     *response.status_mut() = status_of(error);
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
-    match error.kind() {
-        ErrorKind::Overloaded => {
-            headers.insert(RETRY_AFTER, HeaderValue::from_static("1"));
-        }
-        ErrorKind::Unauthenticated => {
-            headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"sightfix\""));
-        }
-        _ => {}
+    if let Some(seconds) = row.retry_after_s {
+        headers.insert(RETRY_AFTER, seconds.into());
+    }
+    if error.kind() == ErrorKind::Unauthenticated {
+        headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"sightfix\""));
     }
     response
 }
 
-/// Writes the problem of a refused request, in whatever part of the router it was refused.
-pub(super) async fn problem_layer(request: Request, next: Next) -> Response {
-    let id = request.extensions().get::<RequestId>().cloned();
-    let uri = request.uri().clone();
-    let is_head = request.method() == Method::HEAD;
-    let answer = next.run(request).await;
-    let error = match answer.extensions().get::<ApiError>() {
-        Some(refused) => refused.0.clone(),
-        None => match routing_error(&answer) {
-            Some(error) => Arc::new(error),
-            None => return answer,
-        },
-    };
-    let id = id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
-    let mut problem = response(&error, &id, Some(uri.path()));
-    for (name, value) in answer.headers() {
-        if name != CONTENT_TYPE && name != CONTENT_LENGTH {
-            problem.headers_mut().insert(name, value.clone());
+/// What the problem of a request says of it, should it be refused.
+pub(super) struct Refused {
+    id: Option<RequestId>,
+    uri: Uri,
+    is_head: bool,
+}
+
+impl Refused {
+    pub(super) fn of(request: &Request) -> Self {
+        Self {
+            id: request.extensions().get().cloned(),
+            uri: request.uri().clone(),
+            is_head: request.method() == Method::HEAD,
         }
     }
-    if is_head {
-        *problem.body_mut() = Body::empty();
+
+    /// The answer as it is, or the problem of a refusal, in whatever part of the router it was refused.
+    pub(super) fn explain(self, answer: Response) -> Response {
+        let error = match answer.extensions().get::<ApiError>() {
+            Some(refused) => refused.0.clone(),
+            None => match routing_error(&answer) {
+                Some(error) => Arc::new(error),
+                None => return answer,
+            },
+        };
+        let id = self.id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
+        let mut problem = response(&error, &id, Some(self.uri.path()));
+        for (name, value) in answer.headers() {
+            if name != CONTENT_TYPE && name != CONTENT_LENGTH {
+                problem.headers_mut().insert(name, value.clone());
+            }
+        }
+        if self.is_head {
+            *problem.body_mut() = Body::empty();
+        }
+        problem
     }
-    problem
 }
 
 /// The error of a request that the router itself refused, with a status alone.

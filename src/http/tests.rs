@@ -1,4 +1,4 @@
-//! The REST interface through its router, without a port.
+//! The REST transport, without a port.
 
 mod cameras;
 mod description;
@@ -7,15 +7,14 @@ mod fusions;
 mod samples;
 mod training;
 
-use axum::Router;
 use axum::body::{Body, Bytes};
 use http_body_util::BodyExt as _;
 use hyper::http::HeaderValue;
 use hyper::{HeaderMap, Request, StatusCode};
 use serde_json::{Value, json};
 use tempfile::TempDir;
-use tower::ServiceExt as _;
 
+use super::Transport;
 use crate::app::App;
 use crate::app::access::{Caller, Principal};
 use crate::clock::{Clock, Randomness};
@@ -24,9 +23,9 @@ use crate::shutdown::Shutdown;
 use crate::store::Store;
 use crate::telemetry::{Metrics, RequestId};
 
-/// A router over a store of its own; no worker runs.
+/// The transport over a store of its own; no worker runs.
 struct Rest {
-    router: Router,
+    transport: Transport,
     shutdown: Shutdown,
     _folder: TempDir,
 }
@@ -86,7 +85,8 @@ impl Rest {
         let app =
             App::new(store, clock, Randomness::seeded(1), limits, Metrics::new()).await.expect("an app");
         let shutdown = Shutdown::new();
-        Self { router: super::router(app, Console::default(), shutdown.clone()), shutdown, _folder: folder }
+        let transport = Transport::new(app, Console::default(), shutdown.clone());
+        Self { transport, shutdown, _folder: folder }
     }
 
     /// With a camera `c` of 640 x 480 px.
@@ -111,7 +111,7 @@ impl Rest {
         let mut request = request.body(body).expect("a request");
         request.extensions_mut().insert(RequestId::new(HeaderValue::from_static("the-request")));
         request.extensions_mut().insert(Caller::new(Principal::Everyone, None, None));
-        self.router.clone().oneshot(request).await.expect("never fails")
+        self.transport.answer(request).await
     }
 
     async fn send(

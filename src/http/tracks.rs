@@ -27,9 +27,10 @@ use crate::app::{CameraEvent, ItemResult, LostEvents, TargetUpdate, TrackPoint};
 use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
+use crate::geo::Position;
 
 /// Interval of the keep-alive comments of a silent event stream.
-const KEEP_ALIVE: Duration = Duration::from_secs(15);
+pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(15);
 /// Typical size of a followed observation as JSON, to reserve memory.
 const ITEM_BYTES: usize = 1_024;
 
@@ -144,12 +145,21 @@ impl From<&TrackPoint> for TrackState {
 
 /// The GeoJSON geometry of a position (RFC 7946).
 #[derive(Serialize, ToSchema)]
-struct PointGeometry {
+pub(super) struct PointGeometry {
     /// `Point`.
     #[schema(example = "Point")]
     r#type: &'static str,
     /// Longitude and latitude in degrees, WGS 84.
     coordinates: [f64; 2],
+}
+
+impl From<Position> for PointGeometry {
+    fn from(position: Position) -> Self {
+        // A centimetre is the seventh decimal; more would only look precise.
+        let rounded = |degrees: f64| (degrees * 1e7).round() / 1e7;
+        let coordinates = [rounded(position.longitude_deg()), rounded(position.latitude_deg())];
+        Self { r#type: "Point", coordinates }
+    }
 }
 
 /// A position of a target as a GeoJSON feature.
@@ -166,14 +176,7 @@ struct TrackFeature {
 
 impl From<&TrackPoint> for TrackFeature {
     fn from(point: &TrackPoint) -> Self {
-        // A centimetre is the seventh decimal; more would only look precise.
-        let rounded = |degrees: f64| (degrees * 1e7).round() / 1e7;
-        let coordinates = [rounded(point.position.longitude_deg()), rounded(point.position.latitude_deg())];
-        Self {
-            r#type: "Feature",
-            geometry: PointGeometry { r#type: "Point", coordinates },
-            properties: point.into(),
-        }
+        Self { r#type: "Feature", geometry: point.position.into(), properties: point.into() }
     }
 }
 
@@ -227,6 +230,9 @@ struct FollowedObservation<'a> {
     /// The track's position, the best there is; missing without a target.
     #[serde(skip_serializing_if = "Option::is_none")]
     track: Option<TrackFeature>,
+    /// The target's world track in the camera's site, as of the latest frame that was tracked there.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    world_track_id: Option<String>,
 }
 
 impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
@@ -234,6 +240,7 @@ impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
         Self {
             fused: followed.fused.as_ref().map(Into::into),
             track: followed.track.as_ref().map(|point| point.as_ref().into()),
+            world_track_id: followed.world_track.map(|id| id.to_string()),
         }
     }
 }
@@ -327,7 +334,7 @@ async fn watch_camera(
     Ok(Sse::new(sent).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
 }
 
-fn event_of(name: &str, value: &impl Serialize) -> Event {
+pub(super) fn event_of(name: &str, value: &impl Serialize) -> Event {
     Event::default().event(name).json_data(value).unwrap_or_else(|error| {
         tracing::error!(%error, "an event cannot be written");
         Event::default().event("error").data("the server failed")

@@ -13,12 +13,13 @@ mod probe;
 mod progress;
 mod regressor;
 mod samples;
+mod site;
 mod uncertainty;
 mod view_area;
 
 pub use crate::statistics::R95_PER_SIGMA;
 pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackNoiseModel};
-pub use encoder::gaussian_process::RecentBoxes;
+pub use encoder::gaussian_process::{GroundCamera, GroundPoint, RecentBoxes};
 pub use encoder::projection::Projection;
 pub use encoder::projection_fit::fit_foot_points;
 pub use fitting::{FitInput, FitOptions, FitOverrides, TimedResidual, estimate_gnss_noise, fit, fit_with};
@@ -26,6 +27,7 @@ pub use progress::{FitError, FitEvent};
 pub use regressor::{Regression, Regressor};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use samples::sequences::fix_sequences;
+pub use site::{SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, fit_site};
 pub use view_area::ViewArea;
 
 #[cfg(test)]

@@ -178,7 +178,7 @@ fn walk_table(page: &mut String, curve: &WalkCurves) {
         WALKS.iter().zip(rows).map(|(walks, rows)| format!(" {walks} ({rows} rows) |")).collect();
     let _ = writeln!(page, "| walks |{heads}\n|---|{}", "---|".repeat(WALKS.len()));
     for (name, figures) in &curve.methods {
-        let cell = |one: &Option<crate::evaluation::Metrics>| {
+        let cell = |one: &Option<crate::evaluation::ErrorMetrics>| {
             let Some(one) = one else { return " - |".to_owned() };
             let coverage = one.coverage95.filter(|_| name == DEFAULT);
             let coverage = coverage.map_or_else(String::new, |share| format!(" ({:.0})", 100.0 * share));

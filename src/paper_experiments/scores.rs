@@ -8,7 +8,8 @@ use super::splits::Split;
 use crate::clock::process_cpu_s;
 use crate::domain::Recipe;
 use crate::evaluation::{
-    Curve, EvaluateOptions, Evaluation, MethodReport, Metrics, ScoredPrediction, TestRow, Trace, TracePoint,
+    Curve, ErrorMetrics, EvaluateOptions, Evaluation, MethodReport, ScoredPrediction, TestRow, Trace,
+    TracePoint,
 };
 
 /// The recipe of tracks, and the default recipe of a camera.
@@ -20,7 +21,7 @@ pub(super) struct MethodScore {
     /// On all rows for which it has a position; the seeds' means are those of the worlds.
     pub(super) report: MethodReport,
     /// On the rows with a box, so that methods with a box and without are compared on the same rows.
-    pub(super) with_box: Option<Metrics>,
+    pub(super) with_box: Option<ErrorMetrics>,
 }
 
 /// The figures of a case, means over its worlds.
@@ -46,7 +47,7 @@ pub(super) struct CaseScore {
 
 impl CaseScore {
     /// The figures of a method on rows with a box.
-    pub(super) fn figures(&self, method: &str) -> Option<&Metrics> {
+    pub(super) fn figures(&self, method: &str) -> Option<&ErrorMetrics> {
         self.methods.iter().find(|one| one.name == method)?.with_box.as_ref()
     }
 
@@ -142,9 +143,9 @@ impl WorldScore {
     }
 }
 
-fn metrics_of<'a>(points: impl Iterator<Item = &'a TracePoint>) -> Option<Metrics> {
+fn metrics_of<'a>(points: impl Iterator<Item = &'a TracePoint>) -> Option<ErrorMetrics> {
     let scored = |point: &TracePoint| Some(ScoredPrediction { error_m: point.error_m?, r95_m: point.r95_m });
-    Metrics::of(&points.filter_map(scored).collect::<Vec<_>>())
+    ErrorMetrics::of(&points.filter_map(scored).collect::<Vec<_>>())
 }
 
 /// The means over worlds of a case.
@@ -177,15 +178,15 @@ fn average(name: &str, worlds: &[WorldScore]) -> Option<MethodScore> {
     let every: Vec<&MethodScore> =
         worlds.iter().filter_map(|world| world.methods.iter().find(|other| other.name == name)).collect();
     let count = every.len() as f64;
-    let figures: Vec<Metrics> = every.iter().map(|one| one.report.metrics.clone()).collect();
-    let with_box: Vec<Metrics> = every.iter().filter_map(|one| one.with_box.clone()).collect();
+    let figures: Vec<ErrorMetrics> = every.iter().map(|one| one.report.metrics.clone()).collect();
+    let with_box: Vec<ErrorMetrics> = every.iter().filter_map(|one| one.with_box.clone()).collect();
     let report = MethodReport {
-        metrics: Metrics::over_seeds(&figures)?,
+        metrics: ErrorMetrics::over_seeds(&figures)?,
         seed_means_m: every.iter().flat_map(|one| one.report.seed_means_m.clone()).collect(),
         train_cpu_s: every.iter().map(|one| one.report.train_cpu_s).sum::<f64>() / count,
         fuse_us: every.iter().map(|one| one.report.fuse_us).sum::<f64>() / count,
     };
-    Some(MethodScore { name: name.to_owned(), report, with_box: Metrics::over_seeds(&with_box) })
+    Some(MethodScore { name: name.to_owned(), report, with_box: ErrorMetrics::over_seeds(&with_box) })
 }
 
 /// The predictions of all worlds per method; rows are those of their own worlds.

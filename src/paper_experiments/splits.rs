@@ -77,7 +77,7 @@ impl Split {
         FitInput { samples: &self.train, unpaired: &self.unpaired }
     }
 
-    /// All test sets as one, whose targets are told apart by the number of the set, and the index of the
+    /// All test sets as one, whose targets are distinguished by the number of the set, and the index of the
     /// first row of each set. So one model is judged on all of them.
     pub(super) fn joined_tests(&self) -> anyhow::Result<(Vec<TestRow>, Vec<usize>)> {
         let (mut joined, mut begins) = (Vec::new(), Vec::new());
@@ -120,24 +120,24 @@ pub(super) fn forty_rows_of_four_traverses(samples: &[Sample]) -> Vec<Sample> {
 }
 
 /// A session of a recording, in the order of time.
-pub(super) struct Session {
+pub(super) struct RecordedSession {
     pub(super) from: Timestamp,
     pub(super) until: Timestamp,
 }
 
 /// The sessions of a recording that are long enough to be test sets.
-pub(super) fn sessions(recording: &RealRecording) -> Vec<Session> {
+pub(super) fn sessions(recording: &RealRecording) -> Vec<RecordedSession> {
     let is_same = |one: &Sample, next: &Sample| next.time.duration_since(one.time) < MAX_GAP;
     recording
         .samples
         .chunk_by(is_same)
         .filter(|session| session.len() >= MIN_SESSION_ROWS)
-        .map(|session| Session { from: session[0].time, until: session[session.len() - 1].time })
+        .map(|session| RecordedSession { from: session[0].time, until: session[session.len() - 1].time })
         .collect()
 }
 
 /// One session as the test set of a model that is trained on the others.
-pub(super) fn leave_out(recording: &RealRecording, session: &Session) -> Split {
+pub(super) fn leave_out(recording: &RealRecording, session: &RecordedSession) -> Split {
     let is_test = |sample: &&Sample| (session.from..=session.until).contains(&sample.time);
     Split {
         train: recording.samples.iter().filter(|sample| !is_test(sample)).cloned().collect(),

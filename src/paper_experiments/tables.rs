@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::scores::CaseScore;
-use crate::evaluation::Metrics;
+use crate::evaluation::ErrorMetrics;
 
 /// Epochs whose Es is listed.
 const SHOWN_EPOCHS: [u32; 8] = [1, 2, 5, 10, 20, 50, 100, 200];
@@ -57,7 +57,7 @@ fn section(page: &mut String, score: &CaseScore) {
     );
     for method in &score.methods {
         let one = &method.report;
-        let Metrics { mean_m, median_m, p95_m, max_m, variance_m2, rmse_m, n, .. } = one.metrics;
+        let ErrorMetrics { mean_m, median_m, p95_m, max_m, variance_m2, rmse_m, n, .. } = one.metrics;
         let within = |bound: &str| percent(one.metrics.share_within.get(bound).copied());
         let _ = writeln!(
             page,

@@ -7,16 +7,16 @@ use super::scores::{CaseScore, MethodScore};
 use super::simulated::Worlds;
 use super::tables;
 use super::walks::{WALKS, WalkCurves};
-use crate::evaluation::{MethodReport, Metrics, ScoredPrediction};
+use crate::evaluation::{ErrorMetrics, MethodReport, ScoredPrediction};
 use crate::simulation::Scene;
 
 /// Figures of that mean (m), with that share of the true positions inside the stated radius.
-fn figures(mean_m: f64, coverage: Option<f64>) -> Metrics {
+fn figures(mean_m: f64, coverage: Option<f64>) -> ErrorMetrics {
     let r95_m =
         |index: u32| coverage.map(|share| if f64::from(index) < 100.0 * share { 2.0 * mean_m } else { 0.0 });
     let predictions: Vec<ScoredPrediction> =
         (0..100).map(|index| ScoredPrediction { error_m: mean_m, r95_m: r95_m(index) }).collect();
-    Metrics::of(&predictions).expect("some")
+    ErrorMetrics::of(&predictions).expect("some")
 }
 
 fn method(name: &str, mean_m: f64, coverage: Option<f64>) -> MethodScore {

@@ -9,7 +9,7 @@ use crate::clock::process_cpu_s;
 use crate::domain::{Recipe, Sample, SigmaM};
 use crate::evaluation::axis::{Axes, AxisSpec};
 use crate::evaluation::chart::{Series, Shape, chart};
-use crate::evaluation::{EvaluateOptions, Method, Metrics, Truth};
+use crate::evaluation::{ErrorMetrics, EvaluateOptions, Method, Truth};
 use crate::simulation::Scene;
 
 /// Numbers of walks.
@@ -27,14 +27,14 @@ pub(super) struct WalkCurves {
     /// Training rows of the first world, per number of walks.
     pub(super) rows: Vec<usize>,
     /// Figures by method, one per number of walks; `None` where the method could not run on every world.
-    pub(super) methods: Vec<(String, Vec<Option<Metrics>>)>,
+    pub(super) methods: Vec<(String, Vec<Option<ErrorMetrics>>)>,
 }
 
 impl WalkCurves {
     /// Fits every recipe to the first walks of every world.
     pub(super) fn of(scene: Scene, worlds: Worlds, runner: &mut dyn Runner) -> anyhow::Result<Self> {
         let methods = Method::list(METHODS)?;
-        let mut figures: BTreeMap<(String, usize), Vec<Metrics>> = BTreeMap::new();
+        let mut figures: BTreeMap<(String, usize), Vec<ErrorMetrics>> = BTreeMap::new();
         let mut rows = Vec::new();
         let options = walks_of(scene, worlds);
         for world in &options {
@@ -66,7 +66,7 @@ impl WalkCurves {
             let name = method.to_string();
             let at = |at| {
                 let found = figures.get(&(name.clone(), at))?;
-                if found.len() == options.len() { Metrics::over_seeds(found) } else { None }
+                if found.len() == options.len() { ErrorMetrics::over_seeds(found) } else { None }
             };
             let curve = (0..WALKS.len()).map(at).collect();
             (name, curve)
@@ -76,7 +76,7 @@ impl WalkCurves {
 
     /// The curves as a picture.
     pub(super) fn picture(&self) -> String {
-        let series = |(number, (name, figures)): (usize, &(String, Vec<Option<Metrics>>))| {
+        let series = |(number, (name, figures)): (usize, &(String, Vec<Option<ErrorMetrics>>))| {
             let points = WALKS.iter().zip(figures);
             let points = points.filter_map(|(&walks, one)| Some([walks as f64, one.as_ref()?.mean_m]));
             Series::new(name.trim_end_matches(".denied"), number, points.collect(), Shape::Line)

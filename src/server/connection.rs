@@ -18,7 +18,7 @@ use super::activity::Activity;
 use super::guarded_stream::GuardedStream;
 use super::pipeline::{Peer, RequestPipeline};
 use super::tls::{HANDSHAKE_RECORD, Tls};
-use crate::admission::{ClientAddress, Quota};
+use crate::admission::{ClientId, Quota};
 use crate::config::Limits;
 use crate::shutdown::Shutdown;
 use crate::telemetry::CloseReason;
@@ -81,7 +81,7 @@ pub(super) async fn accept(
                 }
             },
         };
-        let client = ClientAddress::from(address.ip());
+        let client = ClientId::from(address.ip());
         let (lease, refusal) = match connections.try_acquire(client, 1) {
             Ok(lease) => (lease, None),
             Err(error) => {

@@ -7,7 +7,7 @@ use crate::app::access::{CertificateHolder, Credential};
 use crate::http::session_token;
 
 /// The credential of a request. A key is stronger than a session, and a session than a certificate, so that
-/// whoever names somebody explicitly is taken for them.
+/// what the request names explicitly identifies the caller.
 pub(super) fn credential<'r, B>(
     request: &'r Request<B>,
     certificate: Option<&'r CertificateHolder>,

@@ -23,7 +23,7 @@ impl HostCheck {
     /// From the setting `allowed_hosts` and the address that the server listens on.
     pub(super) fn new(allowed_hosts: &[String], listen: SocketAddr) -> Self {
         Self {
-            configured: allowed_hosts.iter().map(|host| host.to_ascii_lowercase()).collect(),
+            configured: allowed_hosts.to_vec(),
             accepts_all: allowed_hosts.iter().any(|host| host == "*"),
             is_loopback: listen.ip().is_loopback(),
         }
@@ -83,18 +83,20 @@ impl HostCheck {
         if self.accepts_all || self.is_configured(host) {
             return true;
         }
-        let name = without_port(host).trim_end_matches('.').to_ascii_lowercase();
+        let name = without_port(host).trim_end_matches('.');
         let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
         match address {
             Ok(address) => !self.is_loopback || address.is_loopback(),
             // A name that somebody else can point here has a dot: it is one of the public DNS.
-            Err(_) => name == "localhost" || !self.is_loopback && !name.contains('.'),
+            Err(_) => name.eq_ignore_ascii_case("localhost") || !self.is_loopback && !name.contains('.'),
         }
     }
 
     fn is_configured(&self, host: &str) -> bool {
-        let host = host.to_ascii_lowercase();
-        self.configured.iter().any(|allowed| *allowed == host || allowed.as_str() == without_port(&host))
+        let is_host = |allowed: &String| {
+            allowed.eq_ignore_ascii_case(host) || allowed.eq_ignore_ascii_case(without_port(host))
+        };
+        self.configured.iter().any(is_host)
     }
 
     fn check_origin<B>(&self, request: &Request<B>, host: Option<&str>) -> Result<()> {

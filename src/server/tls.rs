@@ -70,7 +70,7 @@ impl Tls {
         self.client_scope.is_some()
     }
 
-    /// Loads the files again if one has changed, or in any case if told to. Connections that are open keep
+    /// Loads the files again if one has changed, or in any case if asked to. Connections that are open keep
     /// their certificate. Where the files cannot be used, the certificate stays as it is; that is logged once.
     pub(super) fn reload(&self, in_any_case: bool) {
         let versions = self.files.versions();

@@ -12,10 +12,11 @@ use sqlx::SqliteConnection;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::errors::{closed, copy_of, failed, no_camera};
+use super::sample_retention::delete_oldest;
 use super::sample_table::{Insert, Row, SampleTable, delete_replaced, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
-use crate::domain::{CameraId, CameraKey, Durability, Error, Result, StoredSample};
+use crate::domain::{CameraId, CameraKey, Durability, Error, Result, SampleOverflow, StoredSample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -39,17 +40,17 @@ pub struct Inserted {
 
 /// Queues batches for the task.
 pub(super) struct GroupCommit {
-    queue: mpsc::Sender<Request>,
+    queue: mpsc::Sender<WriteRequest>,
     rows: Arc<Semaphore>,
 }
 
-enum Request {
-    Insert(Batch),
+enum WriteRequest {
+    Insert(SampleBatch),
     /// Everything queued before is committed, then the task ends.
     End(oneshot::Sender<()>),
 }
 
-struct Batch {
+struct SampleBatch {
     camera: CameraId,
     /// The camera must still be this one; `None` for whichever has the id.
     key: Option<CameraKey>,
@@ -77,18 +78,23 @@ impl GroupCommit {
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
         let permit = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = Batch { camera, key, samples, durability, reply, _permit: permit };
-        self.queue.send(Request::Insert(batch)).await.map_err(|_| self.task_ended())?;
+        let batch = SampleBatch { camera, key, samples, durability, reply, _permit: permit };
+        self.queue.send(WriteRequest::Insert(batch)).await.map_err(|_| self.task_ended())?;
         answer.await.map_err(|_| self.task_ended())?
     }
 
     pub(super) async fn close(&self) {
         self.rows.close();
         let (ended, end) = oneshot::channel();
-        if self.queue.send(Request::End(ended)).await.is_ok() {
+        if self.queue.send(WriteRequest::End(ended)).await.is_ok() {
             // An error means that the task has ended already, which is what is waited for.
             let _ = end.await;
         }
+    }
+
+    /// Rows that wait or are being committed.
+    pub(super) fn queued_rows(&self) -> u32 {
+        ROWS_IN_FLIGHT.saturating_sub(u32::try_from(self.rows.available_permits()).unwrap_or(u32::MAX))
     }
 
     pub(super) fn has_ended(&self) -> bool {
@@ -107,7 +113,7 @@ impl GroupCommit {
     }
 }
 
-async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<Request>) {
+async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<WriteRequest>) {
     while let Some(first) = requests.recv().await {
         // The writer first: batches that are queued while it is locked for another change join the group.
         let guard = writer.lock(Durability::default(), Growth::Limited).await;
@@ -128,25 +134,25 @@ async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receive
 }
 
 /// The strongest that a caller of the group asks for: one flush is enough for all of them.
-fn durability_of(group: &[Batch]) -> Durability {
+fn durability_of(group: &[SampleBatch]) -> Durability {
     group.iter().map(|batch| batch.durability).max().unwrap_or_default()
 }
 
 /// What is in the queue now, up to the rows of one transaction.
 fn gather(
-    first: Request,
-    requests: &mut mpsc::Receiver<Request>,
-) -> (Vec<Batch>, Option<oneshot::Sender<()>>) {
+    first: WriteRequest,
+    requests: &mut mpsc::Receiver<WriteRequest>,
+) -> (Vec<SampleBatch>, Option<oneshot::Sender<()>>) {
     let mut group = Vec::new();
     let mut rows = 0;
     let mut next = Some(first);
     while let Some(request) = next {
         match request {
-            Request::Insert(batch) => {
+            WriteRequest::Insert(batch) => {
                 rows += batch.samples.len();
                 group.push(batch);
             }
-            Request::End(ended) => return (group, Some(ended)),
+            WriteRequest::End(ended) => return (group, Some(ended)),
         }
         next = if rows < ROWS_PER_TRANSACTION { requests.try_recv().ok() } else { None };
     }
@@ -155,7 +161,7 @@ fn gather(
 
 /// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
 /// alone, so that one bad row fails nobody but its caller.
-async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch>) {
+async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<SampleBatch>) {
     match commit(guard, space, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
@@ -177,7 +183,7 @@ async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Batch
     }
 }
 
-fn refuse_all(group: Vec<Batch>, error: &Error) {
+fn refuse_all(group: Vec<SampleBatch>, error: &Error) {
     for batch in group {
         let _ = batch.reply.send(Err(copy_of(error)));
     }
@@ -194,7 +200,7 @@ enum Failure {
 async fn commit(
     guard: &mut WriterGuard<'_>,
     space: &Space,
-    group: &[Batch],
+    group: &[SampleBatch],
 ) -> Result<Vec<Result<Inserted>>, Failure> {
     let committed = try_commit(guard, space, group).await;
     match &committed {
@@ -207,7 +213,7 @@ async fn commit(
 async fn try_commit(
     guard: &mut WriterGuard<'_>,
     space: &Space,
-    group: &[Batch],
+    group: &[SampleBatch],
 ) -> Result<Vec<Result<Inserted>>, Failure> {
     for counting in [Counting::Together, Counting::Apart] {
         let mut transaction = guard.begin().await.map_err(Failure::Transaction)?;
@@ -234,7 +240,7 @@ enum Counting {
 async fn store(
     connection: &mut SqliteConnection,
     space: &Space,
-    group: &[Batch],
+    group: &[SampleBatch],
     counting: Counting,
 ) -> Result<Option<Vec<Result<Inserted>>>> {
     let mut cameras = cameras_of(connection, group).await?;
@@ -256,11 +262,16 @@ async fn store(
         }
     }
     count_stored(connection, &cameras, group, &outcomes).await?;
+    if space.limits.sample_overflow == SampleOverflow::DeleteOldest {
+        for camera in cameras.values() {
+            delete_oldest(connection, camera.key, space.limits.samples_per_camera).await?;
+        }
+    }
     Ok(Some(outcomes))
 }
 
 /// The key of each batch's camera, or why the batch is not stored.
-fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[Batch]) -> Vec<Result<i64>> {
+fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[SampleBatch]) -> Vec<Result<i64>> {
     let mut quota = space.quota();
     let admitted = group.iter().map(|batch| {
         let camera = cameras
@@ -276,7 +287,7 @@ fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[Batch]) -
 /// The rows of admitted batches that a table takes, and where statements must end.
 fn rows_of<'a>(
     table: SampleTable,
-    group: &'a [Batch],
+    group: &'a [SampleBatch],
     admitted: &[Result<i64>],
     counting: Counting,
 ) -> (Vec<Row<'a>>, Vec<usize>) {
@@ -356,7 +367,10 @@ struct Known {
 
 /// The cameras of a group by their ids, read in its own transaction, so that none can vanish before
 /// the commit. One statement for all, since a round trip costs as much as several rows.
-async fn cameras_of(connection: &mut SqliteConnection, group: &[Batch]) -> Result<HashMap<String, Known>> {
+async fn cameras_of(
+    connection: &mut SqliteConnection,
+    group: &[SampleBatch],
+) -> Result<HashMap<String, Known>> {
     let mut ids: Vec<&str> = group.iter().map(|batch| batch.camera.as_str()).collect();
     ids.sort_unstable();
     ids.dedup();
@@ -384,7 +398,7 @@ fn as_count(stored: i64) -> u64 {
 async fn count_stored(
     connection: &mut SqliteConnection,
     cameras: &HashMap<String, Known>,
-    group: &[Batch],
+    group: &[SampleBatch],
     outcomes: &[Result<Inserted>],
 ) -> Result<()> {
     // Per camera: added with a fix, added without, replaced.

@@ -18,7 +18,7 @@ impl Store {
         after: Option<&CameraId>,
         limit: u32,
     ) -> Result<Vec<(Camera, Option<(RunId, JobState)>)>> {
-        let cameras = self.cameras(after, limit).await?;
+        let cameras = self.cameras(None, after, limit).await?;
         let Some(last) = cameras.last() else { return Ok(Vec::new()) };
         // Ids of runs are UUIDs of version 7: the largest is the latest.
         let rows = sqlx::query(

@@ -43,7 +43,7 @@ async fn create_camera(server: &TestServer, train: &World, test: &World) {
 
 /// Waits until an evaluation satisfies a condition.
 async fn until(server: &TestServer, path: &str, condition: impl Fn(&Value) -> bool) -> Value {
-    for _ in 0..1_200 {
+    for _ in 0..3_600 {
         let seen = server.get(path).await.expect(200).json();
         if condition(&seen) {
             return seen;
@@ -122,7 +122,8 @@ async fn rest_and_command_line_give_the_same_figures() {
 #[tokio::test]
 async fn an_evaluation_is_resumed_after_a_kill() {
     let folder = data_folder();
-    let short_lease = [("SIGHTFIX_EVALUATION__LEASE_S", "3")];
+    // Longer than a loaded machine needs to start the server again.
+    let short_lease = [("SIGHTFIX_EVALUATION__LEASE_S", "12")];
     let server = TestServer::start_with(folder.path(), &short_lease);
     let (train, test) = square(400, 60);
     create_camera(&server, &train, &test).await;

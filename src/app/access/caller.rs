@@ -1,7 +1,7 @@
 //! On whose behalf a use case runs.
 
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 use super::key_table::ActiveKey;
 use super::permission::Permission;
@@ -44,9 +44,12 @@ impl Principal {
     }
 
     fn name(&self) -> Arc<str> {
+        // Shared, because every request needs one.
+        static ANONYMOUS: LazyLock<Arc<str>> = LazyLock::new(|| "anonymous".into());
+        static EVERYONE: LazyLock<Arc<str>> = LazyLock::new(|| "open access".into());
         match self {
-            Self::Anonymous => "anonymous".into(),
-            Self::Everyone => "open access".into(),
+            Self::Anonymous => ANONYMOUS.clone(),
+            Self::Everyone => EVERYONE.clone(),
             Self::Program => "program".into(),
             Self::Key(key) => key.name(),
             Self::Certificate(holder) => format!("certificate {}", holder.fingerprint).into(),
@@ -54,11 +57,9 @@ impl Principal {
     }
 }
 
-/// A principal, and where its request comes from. Clones share it.
+/// A principal, and where its request comes from. Clones are cheap.
 #[derive(Clone)]
-pub struct Caller(Arc<Parts>);
-
-struct Parts {
+pub struct Caller {
     principal: Principal,
     actor: Arc<Actor>,
 }
@@ -72,25 +73,25 @@ impl Caller {
             _ => None,
         };
         let actor = Arc::new(Actor { name: principal.name(), key_id, address, request_id });
-        Self(Arc::new(Parts { principal, actor }))
+        Self { principal, actor }
     }
 
     /// A part of the program that acts by itself.
     #[must_use]
     pub fn program(name: &str) -> Self {
-        Self(Arc::new(Parts { principal: Principal::Program, actor: Arc::new(Actor::program(name)) }))
+        Self { principal: Principal::Program, actor: Arc::new(Actor::program(name)) }
     }
 
     /// Who it is.
     #[must_use]
-    pub fn principal(&self) -> &Principal {
-        &self.0.principal
+    pub const fn principal(&self) -> &Principal {
+        &self.principal
     }
 
     /// As the audit log and the log name it.
     #[must_use]
-    pub fn actor(&self) -> &Arc<Actor> {
-        &self.0.actor
+    pub const fn actor(&self) -> &Arc<Actor> {
+        &self.actor
     }
 
     /// Checks that the caller may use operations that need a permission.

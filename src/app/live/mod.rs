@@ -9,9 +9,12 @@ mod acknowledgements;
 mod alarms;
 pub(super) mod camera;
 mod drift;
+mod event_log;
+mod history;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
+pub(super) mod site;
 mod stream;
 mod sync;
 mod tracks;
@@ -22,21 +25,25 @@ use jiff::Timestamp;
 use tokio::sync::broadcast;
 
 use self::camera::CameraLive;
+use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
 use super::fusion::fuse_observed;
 use super::registry::ActiveCamera;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, Observation, Result, TargetId, TimeBounds,
+    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, Result, TargetId, TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
-use crate::fusion::target_track::TargetTrack;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub(super) use retraining::RetrainSchedule;
+pub use site::{
+    LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
+    WorldSighting, WorldTrackPoint,
+};
 pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};
 pub use tracks::TrackPoint;
@@ -48,6 +55,8 @@ pub struct ItemResult {
     pub fused: Option<FusedFix>,
     /// The target's track with it; `None` without a target or anything usable.
     pub track: Option<Arc<TrackPoint>>,
+    /// The target's world track in the camera's site, as of the latest frame that was tracked there.
+    pub world_track: Option<LiveId>,
 }
 
 /// What happens in a camera's view, since the server was started.
@@ -100,7 +109,8 @@ impl App {
         RowRules { time_bounds: self.live_time_bounds(), image_size: camera.image_size }
     }
 
-    /// Answers an observation, feeds its target's track and compares box and fix.
+    /// Answers an observation, feeds its target's track and the tracker of the camera's site, and compares box
+    /// and fix.
     ///
     /// # Errors
     /// `InvalidArgument` naming `time` for a time ahead of the server's clock; `Overloaded` if the camera
@@ -111,20 +121,29 @@ impl App {
         let regressor = model.map(|(regressor, _)| regressor);
         let now = self.clock.monotonic();
         let ActiveCamera { image_size, e_gnss_m2, .. } = **camera;
-        let observed = match observation.target_id().filter(|_| regressor.is_some()) {
-            Some(target_id) => {
-                let observe =
-                    |track: &mut TargetTrack| track.observe(observation, regressor, image_size, e_gnss_m2);
-                camera.live.tracks.observe(&camera.id, target_id, now, &self.limits, observe)?
+        // A box without a model measures nothing, so it makes no target.
+        let measures = regressor.is_some() || observation.fix().is_some();
+        let target = match observation.target_id().filter(|_| measures) {
+            Some(id) => {
+                Some(camera.live.tracks.target(&camera.id, id, now, self.limits.tracks_per_camera)?)
             }
+            None => None,
+        };
+        let mut target = target.as_ref().map(|target| lock(target));
+        let observed = match &mut target {
+            Some(target) => target.observe(observation, regressor, image_size, e_gnss_m2),
             None => ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None),
         };
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(self.clock.now());
-        let Some(target_id) = observation.target_id() else { return Ok(ItemResult { fused, track: None }) };
-        let seen = TargetObservation { target_id, observed, model, now };
-        let (track, residual) = camera.live.tracks.update(&camera.id, &seen, &self.limits)?;
+        let world_track = self.feed_site(camera, observation, &observed);
+        let (track, residual) = match (target, observation.target_id()) {
+            (Some(mut target), Some(target_id)) => {
+                target.update(&TargetObservation { target_id, observed, model, now }, &self.limits)
+            }
+            _ => (None, None),
+        };
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
             camera.live.announce_track(|| TargetUpdate {
@@ -136,7 +155,7 @@ impl App {
         if let Some(residual) = residual {
             self.hand_over(camera, residual);
         }
-        Ok(ItemResult { fused, track })
+        Ok(ItemResult { fused, track, world_track })
     }
 
     /// What happens in a camera's view.

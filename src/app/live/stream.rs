@@ -11,7 +11,7 @@ use super::camera::StreamCount;
 use super::sample_committer::{self, SampleSink};
 use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
-use crate::admission::{ClientAddress, Lease};
+use crate::admission::{ClientId, Lease};
 use crate::app::App;
 use crate::app::registry::ActiveCamera;
 use crate::domain::{
@@ -72,7 +72,7 @@ pub struct LiveStream {
     last_seq: u64,
     _slot: SlotGuard,
     _count: StreamCount,
-    _address_lease: Lease,
+    _client_lease: Lease,
 }
 
 struct StreamRecording {
@@ -91,7 +91,7 @@ impl App {
         &self,
         id: &CameraId,
         client_name: &str,
-        client_address: ClientAddress,
+        client_id: ClientId,
         resume_after_seq: u64,
         store_samples: Option<Durability>,
     ) -> Result<LiveStream> {
@@ -99,7 +99,7 @@ impl App {
         let camera = self.active_camera(id).await?;
         let limits = &self.limits;
         // Names are the client's choice; its address is not.
-        let address_lease = self.quotas.live_streams.try_acquire(client_address, 1)?;
+        let client_lease = self.quotas.live_streams.try_acquire(client_id, 1)?;
         let slot =
             self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
         let recording = store_samples.map(|durability| StreamRecording {
@@ -114,7 +114,7 @@ impl App {
             recording,
             last_seq: resume_after_seq,
             _slot: slot,
-            _address_lease: address_lease,
+            _client_lease: client_lease,
         })
     }
 

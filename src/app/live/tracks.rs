@@ -4,15 +4,14 @@
 //! is waited for, and everything is bounded by the limits. Ages are read from the monotonic clock, so a
 //! step of the wall clock neither hides targets nor keeps them.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use jiff::SignedDuration;
-
+use super::history::History;
 use super::sync::lock;
 use crate::config::Limits;
-use crate::domain::{CameraId, Error, ErrorKind, Result, TargetId};
+use crate::domain::{CameraId, Error, ErrorKind, ImageSize, Observation, Result, TargetId};
 use crate::fusion::drift_detector::{ResidualSample, TimeAligner, TimedEstimate};
 use crate::fusion::observed::ObservedPositions;
 use crate::fusion::target_track::{TargetTrack, TrackEstimate};
@@ -20,8 +19,6 @@ use crate::fusion::track::{TrackSettings, TrackState};
 use crate::geo::Position;
 use crate::model::Regressor;
 
-/// Points of a history are at least this far apart in time; the latest is always there.
-const HISTORY_STEP: SignedDuration = SignedDuration::from_millis(500);
 /// A target without an observation for this long gives way to a new one where there is no room.
 const EVICT_AFTER: Duration = Duration::from_secs(2);
 
@@ -43,12 +40,11 @@ pub(super) struct Tracks {
 }
 
 /// One target; without a track until something usable was measured of it.
-struct TrackedTarget {
+pub(super) struct TrackedTarget {
     track: TargetTrack,
     /// Reading of the monotonic clock at the last observation.
     last_item_at: Duration,
-    /// In order of time; the last is the latest.
-    history: VecDeque<Arc<TrackPoint>>,
+    history: History<TrackPoint>,
     residuals: ResidualSource,
 }
 
@@ -62,56 +58,12 @@ pub(super) struct TargetObservation<'a> {
 }
 
 impl Tracks {
-    /// What `observe` makes of an observation with its target's [`TargetTrack`].
-    ///
-    /// # Errors
-    /// `Overloaded` if as many targets are tracked as may be, all of them observed lately.
-    pub(super) fn observe<'a>(
-        &self,
-        id: &CameraId,
-        target_id: &TargetId,
-        now: Duration,
-        limits: &Limits,
-        observe: impl FnOnce(&mut TargetTrack) -> ObservedPositions<'a>,
-    ) -> Result<ObservedPositions<'a>> {
-        let target = self.target(id, target_id, now, limits.tracks_per_camera)?;
-        let observed = observe(&mut lock(&target).track);
-        Ok(observed)
-    }
-
-    /// Feeds an observation to its target's track; `None` while nothing usable was observed. With it comes
-    /// the regressed position beside the fix of the same instant, if now both are known.
-    ///
-    /// # Errors
-    /// `Overloaded` if as many targets are tracked as may be, all of them observed lately.
-    pub(super) fn update(
-        &self,
-        id: &CameraId,
-        seen: &TargetObservation<'_>,
-        limits: &Limits,
-    ) -> Result<(Option<Arc<TrackPoint>>, Option<ResidualSample>)> {
-        if seen.observed.is_empty() {
-            return Ok((None, None));
-        }
-        let target = self.target(id, seen.target_id, seen.now, limits.tracks_per_camera)?;
-        let mut target = lock(&target);
-        target.last_item_at = seen.now;
-        let settings =
-            || seen.model.map_or_else(TrackSettings::default, |(it, _)| TrackSettings::from_model(it));
-        let estimate = target.track.update(&seen.observed, settings);
-        let residual = target.residuals.observe(seen);
-        let Some(TrackEstimate { position, state }) = estimate else { return Ok((None, residual)) };
-        let point = Arc::new(TrackPoint { target_id: seen.target_id.clone(), position, state });
-        target.remember(&point, limits.track_points);
-        Ok((Some(point), residual))
-    }
-
     /// The latest point of every target, by target.
     pub(super) fn latest(&self, now: Duration) -> Vec<Arc<TrackPoint>> {
         let mut targets = lock(&self.targets);
         remove_expired(&mut targets, now);
         let mut points: Vec<_> =
-            targets.values().filter_map(|target| lock(target).history.back().cloned()).collect();
+            targets.values().filter_map(|target| lock(target).history.latest().cloned()).collect();
         points.sort_by(|a, b| a.target_id.cmp(&b.target_id));
         points
     }
@@ -123,12 +75,15 @@ impl Tracks {
             remove_expired(&mut targets, now);
             targets.get(target_id).cloned()?
         };
-        let target = lock(&target);
-        Some(target.history.iter().cloned().collect::<Vec<_>>()).filter(|points| !points.is_empty())
+        let points = lock(&target).history.points();
+        Some(points).filter(|points| !points.is_empty())
     }
 
     /// The target's entry, made if there is room for it.
-    fn target(
+    ///
+    /// # Errors
+    /// `Overloaded` if as many targets are tracked as may be, all of them observed lately.
+    pub(super) fn target(
         &self,
         id: &CameraId,
         target_id: &TargetId,
@@ -176,33 +131,45 @@ fn evict_longest_silent(targets: &mut Targets, now: Duration) {
 }
 
 impl TrackedTarget {
+    /// What an observation measures, seen beside the target's latest boxes.
+    pub(super) fn observe<'a>(
+        &mut self,
+        observation: &Observation,
+        regressor: Option<&'a Regressor>,
+        image_size: Option<ImageSize>,
+        e_gnss_m2: Option<f64>,
+    ) -> ObservedPositions<'a> {
+        self.track.observe(observation, regressor, image_size, e_gnss_m2)
+    }
+
+    /// Feeds what was observed to the track; `None` while nothing usable was observed. With it comes the
+    /// regressed position beside the fix of the same instant, if now both are known.
+    pub(super) fn update(
+        &mut self,
+        seen: &TargetObservation<'_>,
+        limits: &Limits,
+    ) -> (Option<Arc<TrackPoint>>, Option<ResidualSample>) {
+        if seen.observed.is_empty() {
+            return (None, None);
+        }
+        self.last_item_at = seen.now;
+        let settings =
+            || seen.model.map_or_else(TrackSettings::default, |(it, _)| TrackSettings::from_model(it));
+        let estimate = self.track.update(&seen.observed, settings);
+        let residual = self.residuals.observe(seen);
+        let Some(TrackEstimate { position, state }) = estimate else { return (None, residual) };
+        let point = Arc::new(TrackPoint { target_id: seen.target_id.clone(), position, state });
+        self.history.push(&point, |point| point.state.time, limits.track_points);
+        (Some(point), residual)
+    }
+
     fn new(now: Duration) -> Self {
         Self {
             track: TargetTrack::default(),
             last_item_at: now,
-            history: VecDeque::new(),
+            history: History::default(),
             residuals: ResidualSource::default(),
         }
-    }
-
-    /// Keeps the latest point, and before it only points some time apart.
-    fn remember(&mut self, point: &Arc<TrackPoint>, most: usize) {
-        if self.history.back().is_some_and(|latest| point.state.time < latest.state.time) {
-            // The track restarted at an earlier time.
-            self.history.clear();
-        }
-        let time = |at: usize| self.history.get(at).map(|point| point.state.time);
-        let last = self.history.len().saturating_sub(1);
-        let is_close = time(last)
-            .zip(last.checked_sub(1).and_then(time))
-            .is_some_and(|(latest, before)| latest.duration_since(before) < HISTORY_STEP);
-        if is_close {
-            self.history.pop_back();
-        }
-        while self.history.len() >= most.max(2) {
-            self.history.pop_front();
-        }
-        self.history.push_back(point.clone());
     }
 }
 

@@ -40,8 +40,12 @@ impl TimeAligner {
     /// Adds a regressed position. Returns the regressed position interpolated to the time of the
     /// pending fix, and that fix, if this box follows it.
     pub fn push_regressed(&mut self, estimate: TimedEstimate) -> Option<(TimedEstimate, TimedEstimate)> {
-        let index = self.regressed.partition_point(|other| other.time < estimate.time);
-        self.regressed.insert(index, estimate);
+        if self.regressed.back().is_none_or(|latest| latest.time < estimate.time) {
+            self.regressed.push_back(estimate);
+        } else {
+            let index = self.regressed.partition_point(|other| other.time < estimate.time);
+            self.regressed.insert(index, estimate);
+        }
         if self.regressed.len() > MAX_BUFFERED {
             self.regressed.pop_front();
         }

@@ -121,7 +121,7 @@ async fn a_dropped_transaction_is_rolled_back_and_releases_the_writer() {
             .accepted,
         1
     );
-    assert_eq!(store.cameras(None, 9).await.expect("a page").len(), 1);
+    assert_eq!(store.cameras(None, None, 9).await.expect("a page").len(), 1);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]

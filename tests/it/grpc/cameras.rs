@@ -3,7 +3,7 @@
 use sightfix::grpc::proto;
 use tonic::Code;
 
-use super::server::{Server, told};
+use super::server::{Server, refusal_of};
 
 fn yard() -> proto::CameraProfile {
     proto::CameraProfile {
@@ -15,6 +15,7 @@ fn yard() -> proto::CameraProfile {
         labels: [("site".to_owned(), "north".to_owned())].into(),
         receivers: vec![receiver("phone-7", "person-1", -18.35), receiver("tag", "tag", 0.0)],
         retrain_when_moved: Some(true),
+        site: None,
         gnss_bias_sigma_m: Some(1.5),
     }
 }
@@ -36,7 +37,7 @@ async fn a_camera_lives_from_creation_to_deletion() {
     assert_eq!(created.profile, Some(yard()));
     assert_eq!((created.revision, created.active_model, created.warnings.len()), (1, None, 0));
     let status = cameras.create_camera(create).await.expect_err("taken");
-    assert_eq!(told(&status, Code::AlreadyExists, "camera-exists").1, ["id"]);
+    assert_eq!(refusal_of(&status, Code::AlreadyExists, "camera-exists").1, ["id"]);
 
     let update = proto::UpdateCameraRequest {
         camera_id: "yard".to_owned(),
@@ -60,17 +61,17 @@ async fn a_camera_lives_from_creation_to_deletion() {
     assert_eq!(updated.as_ref().and_then(|camera| camera.profile.clone()), Some(expected));
     assert_eq!(updated.as_ref().map(|camera| (camera.revision, camera.warnings.len())), Some((2, 1)));
     let status = cameras.update_camera(update).await.expect_err("an old revision");
-    told(&status, Code::Aborted, "revision-mismatch");
+    refusal_of(&status, Code::Aborted, "revision-mismatch");
     let read = cameras.get_camera(get("yard")).await.expect("there").into_inner().camera;
     assert_eq!(read, updated);
 
     let delete = proto::DeleteCameraRequest { camera_id: "yard".to_owned(), expected_revision: Some(1) };
     let status = cameras.delete_camera(delete.clone()).await.expect_err("an old revision");
-    told(&status, Code::Aborted, "revision-mismatch");
+    refusal_of(&status, Code::Aborted, "revision-mismatch");
     let delete = proto::DeleteCameraRequest { expected_revision: None, ..delete };
     cameras.delete_camera(delete).await.expect("gone");
     let status = cameras.get_camera(get("yard")).await.expect_err("gone");
-    told(&status, Code::NotFound, "camera-not-found");
+    refusal_of(&status, Code::NotFound, "camera-not-found");
 }
 
 #[tokio::test]
@@ -84,7 +85,7 @@ async fn cameras_come_page_by_page() {
     let mut pages = Vec::new();
     let mut page_token = String::new();
     loop {
-        let request = proto::ListCamerasRequest { page_size: 2, page_token };
+        let request = proto::ListCamerasRequest { page_size: 2, page_token, ..Default::default() };
         let page = cameras.list_cameras(request).await.expect("a page").into_inner();
         pages.push(page.cameras.iter().map(|camera| camera.id.clone()).collect::<Vec<_>>().join(""));
         page_token = page.next_page_token;
@@ -93,12 +94,12 @@ async fn cameras_come_page_by_page() {
         }
     }
     assert_eq!(pages, ["ab", "cd", "e"]);
-    let request = proto::ListCamerasRequest { page_size: 0, page_token: "!".to_owned() };
+    let request = proto::ListCamerasRequest { page_token: "!".to_owned(), ..Default::default() };
     let status = cameras.list_cameras(request).await.expect_err("no token");
-    assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["page_token"]);
-    let request = proto::ListCamerasRequest { page_size: 1_000_000, page_token: String::new() };
+    assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["page_token"]);
+    let request = proto::ListCamerasRequest { page_size: 1_000_000, ..Default::default() };
     let status = cameras.list_cameras(request).await.expect_err("too many");
-    assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["page_size"]);
+    assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["page_size"]);
 }
 
 #[tokio::test]
@@ -126,7 +127,7 @@ async fn bad_profiles_are_refused_by_the_path_of_the_field() {
     ] {
         let create = proto::CreateCameraRequest { id: "yard".to_owned(), profile: Some(profile) };
         let status = server.cameras().create_camera(create).await.expect_err(field);
-        let (message, fields) = told(&status, Code::InvalidArgument, "invalid-argument");
+        let (message, fields) = refusal_of(&status, Code::InvalidArgument, "invalid-argument");
         assert_eq!(fields, [field]);
         assert!(message.starts_with(field), "{message}");
     }
@@ -135,17 +136,17 @@ async fn bad_profiles_are_refused_by_the_path_of_the_field() {
     profile.labels.insert(long, String::new());
     let create = proto::CreateCameraRequest { id: "yard".to_owned(), profile: Some(profile) };
     let status = server.cameras().create_camera(create).await.expect_err("a long label");
-    told(&status, Code::InvalidArgument, "invalid-argument");
+    refusal_of(&status, Code::InvalidArgument, "invalid-argument");
 
     for id in ["", "Yard", "-yard"] {
         let create = proto::CreateCameraRequest { id: id.to_owned(), profile: None };
         let status = server.cameras().create_camera(create).await.expect_err("no slug");
-        assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["id"]);
+        assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["id"]);
     }
     let status = server.cameras().get_camera(get("")).await.expect_err("no id");
-    assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["camera_id"]);
+    assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["camera_id"]);
     let status = server.cameras().get_camera(get("No Slug")).await.expect_err("no such camera");
-    told(&status, Code::NotFound, "camera-not-found");
+    refusal_of(&status, Code::NotFound, "camera-not-found");
     let none = server.cameras().list_cameras(proto::ListCamerasRequest::default()).await.expect("a page");
     assert!(none.into_inner().cameras.is_empty(), "a refused camera was stored");
 }

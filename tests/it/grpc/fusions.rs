@@ -3,7 +3,7 @@
 use sightfix::grpc::proto;
 use tonic::Code;
 
-use super::server::{Server, told};
+use super::server::{Server, refusal_of};
 
 const NOON: prost_types::Timestamp = prost_types::Timestamp { seconds: 1_700_000_000, nanos: 500_000_000 };
 
@@ -56,7 +56,7 @@ async fn without_a_model_fixes_pass_and_boxes_are_refused() {
 
     let boxed = proto::Observation { bounding_box: sides(10.0, 10.0, 20.0, 40.0), ..good() };
     let status = server.fusion().fuse(of_yard(vec![good(), boxed])).await.expect_err("no model");
-    let (message, _) = told(&status, Code::FailedPrecondition, "no-model");
+    let (message, _) = refusal_of(&status, Code::FailedPrecondition, "no-model");
     assert!(message.contains("yard"), "{message}");
 }
 
@@ -89,7 +89,7 @@ async fn observations_with_bad_values_name_the_field() {
     ] {
         let request = of_yard(vec![good(), bad.clone()]);
         let status = server.fusion().fuse(request).await.expect_err(field);
-        let (_, fields) = told(&status, Code::InvalidArgument, "invalid-argument");
+        let (_, fields) = refusal_of(&status, Code::InvalidArgument, "invalid-argument");
         assert_eq!(fields, [format!("observations[1].{field}")], "{bad:?}");
     }
 }
@@ -99,12 +99,12 @@ async fn batches_have_a_camera_and_a_length() {
     let server = Server::with_camera(profile()).await;
     let elsewhere = proto::FuseRequest { camera_id: "nowhere".to_owned(), observations: vec![good()] };
     let status = server.fusion().fuse(elsewhere).await.expect_err("no such camera");
-    told(&status, Code::NotFound, "camera-not-found");
+    refusal_of(&status, Code::NotFound, "camera-not-found");
     let status = server.fusion().fuse(of_yard(Vec::new())).await.expect_err("none");
-    assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["observations"]);
+    assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["observations"]);
     let many = vec![good(); server.app.limits.batch_observations + 1];
     let status = server.fusion().fuse(of_yard(many)).await.expect_err("too many");
-    assert_eq!(told(&status, Code::ResourceExhausted, "too-large").1, ["observations"]);
+    assert_eq!(refusal_of(&status, Code::ResourceExhausted, "too-large").1, ["observations"]);
 }
 
 #[tokio::test]
@@ -123,5 +123,5 @@ async fn fixes_of_one_point_tell_the_receivers_error() {
     assert!((0.5..5.0).contains(&told_of.sigma_m), "{told_of:?}");
     let few = proto::EstimateGnssErrorRequest { fixes: request.fixes[..9].to_vec(), ..request };
     let status = models.estimate_gnss_error(few).await.expect_err("too few");
-    assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["fixes"]);
+    assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["fixes"]);
 }

@@ -8,7 +8,7 @@ use sightfix::grpc::proto;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
 use tonic::{Code, Status};
 
-use super::server::{Server, told};
+use super::server::{Server, refusal_of};
 
 const BEGIN_S: i64 = 1_700_000_000;
 
@@ -105,7 +105,7 @@ async fn a_stream_names_one_camera_that_exists() {
     let nameless = proto::ImportSamplesRequest { samples: samples(0..2), ..Default::default() };
     for messages in [Vec::new(), vec![nameless]] {
         let status = send(&server, messages).await.expect_err("no camera");
-        assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["camera_id"]);
+        assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["camera_id"]);
     }
     let elsewhere = proto::ImportSamplesRequest {
         camera_id: "nowhere".to_owned(),
@@ -113,9 +113,9 @@ async fn a_stream_names_one_camera_that_exists() {
         ..Default::default()
     };
     let status = send(&server, vec![elsewhere.clone()]).await.expect_err("no such camera");
-    told(&status, Code::NotFound, "camera-not-found");
+    refusal_of(&status, Code::NotFound, "camera-not-found");
     let status = send(&server, vec![batch(samples(0..2)), elsewhere]).await.expect_err("another camera");
-    let (message, fields) = told(&status, Code::InvalidArgument, "invalid-argument");
+    let (message, fields) = refusal_of(&status, Code::InvalidArgument, "invalid-argument");
     assert_eq!(fields, ["camera_id"]);
     assert!(message.contains("2 rows before it are stored"), "{message}");
     assert_eq!(count(&server, None).await, 2);
@@ -136,7 +136,7 @@ async fn an_import_ends_with_the_server_and_says_what_is_stored() {
     .expect("samples are stored as they come");
     server.begin_shutdown();
     let status = importing.await.expect("no panic").expect_err("the server ends");
-    let (message, _) = told(&status, Code::Unavailable, "shutting-down");
+    let (message, _) = refusal_of(&status, Code::Unavailable, "shutting-down");
     assert!(message.contains("5 rows"), "{message}");
 }
 
@@ -161,7 +161,7 @@ async fn samples_come_back_page_by_page_and_go_by_a_filter() {
     let delete = |filter| proto::DeleteSamplesRequest { camera_id: "yard".to_owned(), filter };
     for none in [None, Some(proto::SampleFilter::default())] {
         let status = client(&server).delete_samples(delete(none)).await.expect_err("all of them");
-        assert_eq!(told(&status, Code::InvalidArgument, "invalid-argument").1, ["filter"]);
+        assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["filter"]);
     }
     let until = prost_types::Timestamp { seconds: BEGIN_S + 10, nanos: 0 };
     let filter = proto::SampleFilter { until: Some(until), ..Default::default() };

@@ -10,7 +10,7 @@ use sightfix::simulation::{Options, simulate};
 use tonic::Code;
 use tonic::transport::Channel;
 
-use super::server::{Server, told};
+use super::server::{Server, refusal_of};
 
 /// A model of the small simulated square after a few passes, as a file.
 fn file(seed: u64) -> bytes::Bytes {
@@ -54,7 +54,7 @@ async fn versions_come_and_go_and_answer_as_the_application_does() {
         assert_eq!(active.map(|model| model.number), Some(version));
     }
     let status = models.activate_model(number(3)).await.expect_err("no such version");
-    told(&status, Code::NotFound, "model-not-found");
+    refusal_of(&status, Code::NotFound, "model-not-found");
     let back = proto::RollBackModelRequest { camera_id: "yard".to_owned() };
     let active = models.roll_back_model(back).await.expect("one before").into_inner().model;
     assert_eq!(active, Some(first));
@@ -85,19 +85,19 @@ async fn fuses_as_the_application_does(server: &Server) {
             .push(Observation::new(sample.time, target_id, Some(sample.bounding_box), fix).expect("a box"));
     }
     let request = proto::FuseRequest { camera_id: "yard".to_owned(), observations: messages };
-    let told = server.fusion().fuse(request).await.expect("positions").into_inner().fusions;
+    let fusions = server.fusion().fuse(request).await.expect("positions").into_inner().fusions;
     let active = server.app.active_camera(&camera).await.expect("known");
     let expected = server.app.fuse(active, &observations).await.expect("positions");
-    assert_eq!(told.len(), expected.len());
-    for (told, expected) in told.iter().zip(&expected) {
-        let position = told.fused.expect("set");
+    assert_eq!(fusions.len(), expected.len());
+    for (fused, expected) in fusions.iter().zip(&expected) {
+        let position = fused.fused.expect("set");
         let bits = |value: Option<f64>| value.map(f64::to_bits);
         assert_eq!(bits(position.longitude_deg), bits(Some(expected.fused.longitude_deg())));
         assert_eq!(bits(position.latitude_deg), bits(Some(expected.fused.latitude_deg())));
-        assert_eq!(told.r95_m.to_bits(), expected.r95_m.to_bits());
-        assert_eq!(told.confidence_gnss.to_bits(), expected.confidences.gnss.to_bits());
-        assert_eq!(bits(told.e_regression_m2), bits(expected.e_regression_m2));
-        assert_eq!((told.model_version, told.gnss.is_some()), (Some(1), expected.gnss.is_some()));
+        assert_eq!(fused.r95_m.to_bits(), expected.r95_m.to_bits());
+        assert_eq!(fused.confidence_gnss.to_bits(), expected.confidences.gnss.to_bits());
+        assert_eq!(bits(fused.e_regression_m2), bits(expected.e_regression_m2));
+        assert_eq!((fused.model_version, fused.gnss.is_some()), (Some(1), expected.gnss.is_some()));
     }
 }
 
@@ -113,5 +113,5 @@ async fn files_that_are_no_models_are_refused() {
     }
     let back = proto::RollBackModelRequest { camera_id: "yard".to_owned() };
     let status = models.roll_back_model(back).await.expect_err("none");
-    told(&status, Code::FailedPrecondition, "no-model");
+    refusal_of(&status, Code::FailedPrecondition, "no-model");
 }

@@ -109,7 +109,7 @@ async fn serve(listener: TcpListener, app: App, shutdown: Shutdown) {
 
 /// Holds a refusal to its code and reason, and gives its message and the fields it names.
 #[track_caller]
-pub(super) fn told(status: &Status, code: Code, reason: &str) -> (String, Vec<String>) {
+pub(super) fn refusal_of(status: &Status, code: Code, reason: &str) -> (String, Vec<String>) {
     assert_eq!(status.code(), code, "{status:?}");
     let details = status.get_error_details();
     let info = details.error_info().unwrap_or_else(|| panic!("no ErrorInfo: {status:?}"));
@@ -161,7 +161,7 @@ async fn unknown_services_and_methods_are_told_apart_from_missing_things() {
     let server = Server::start().await;
     for path in ["/sightfix.v1.NoService/Fuse", "/sightfix.v1.FusionService/NoMethod"] {
         let status = call(&server.channel, path, b"").await;
-        let (message, _) = told(&status, Code::Unimplemented, "route-not-found");
+        let (message, _) = refusal_of(&status, Code::Unimplemented, "route-not-found");
         assert!(message.contains("reflection"), "{message}");
     }
 }
@@ -171,11 +171,11 @@ async fn messages_that_cannot_be_read_are_the_clients_fault() {
     let server = Server::with(Limits { message_bytes: 1_000, ..Limits::default() }).await;
     // Field 1 as a varint, where the camera's id should be.
     let status = call(&server.channel, "/sightfix.v1.FusionService/Fuse", b"\x08\x01").await;
-    told(&status, Code::InvalidArgument, "malformed-body");
+    refusal_of(&status, Code::InvalidArgument, "malformed-body");
 
     let request = proto::GetCameraRequest { camera_id: "x".repeat(1_001) };
     let status = server.cameras().get_camera(request).await.expect_err("too large");
-    told(&status, Code::ResourceExhausted, "too-large");
+    refusal_of(&status, Code::ResourceExhausted, "too-large");
 }
 
 #[tokio::test]
@@ -253,12 +253,12 @@ async fn a_watched_run_is_followed_to_the_end_of_the_run_or_of_the_server() {
     assert_eq!(first, Some(run.clone()));
     server.shutdown.drain();
     let status = watched.message().await.expect_err("the server ends");
-    told(&status, Code::Unavailable, "shutting-down");
+    refusal_of(&status, Code::Unavailable, "shutting-down");
 
     let cancel = proto::CancelTrainingRunRequest { camera_id: "yard".to_owned(), run_id: run.id.clone() };
     training.cancel_training_run(cancel.clone()).await.expect("live");
     let status = training.cancel_training_run(cancel).await.expect_err("ended");
-    told(&status, Code::FailedPrecondition, "run-ended");
+    refusal_of(&status, Code::FailedPrecondition, "run-ended");
     let mut watched = training.watch_training_run(watch).await.expect("a stream").into_inner();
     let last = watched.message().await.expect("in order").expect("the run").run.expect("set");
     assert_eq!(last.state(), proto::TrainingRunState::Cancelled);
@@ -266,5 +266,5 @@ async fn a_watched_run_is_followed_to_the_end_of_the_run_or_of_the_server() {
 
     let unknown = proto::GetTrainingRunRequest { camera_id: "yard".to_owned(), run_id: "7".to_owned() };
     let status = training.get_training_run(unknown).await.expect_err("no such run");
-    told(&status, Code::NotFound, "run-not-found");
+    refusal_of(&status, Code::NotFound, "run-not-found");
 }

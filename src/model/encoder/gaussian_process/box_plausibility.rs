@@ -95,7 +95,7 @@ impl BoxPlausibility {
         let sides: Vec<[f64; 2]> = boxes.iter().map(log_sides).collect();
         let centres = centres(&feet, (boxes.len() / ROWS_PER_CELL).clamp(1, MAX_CELLS));
         let everywhere: Vec<usize> = (0..boxes.len()).collect();
-        let prior = Regression::fit(&feet, &sides, &everywhere, None);
+        let prior = LinearRegression::fit(&feet, &sides, &everywhere, None);
         let mut members = vec![Vec::new(); centres.len()];
         for (row, foot) in feet.iter().enumerate() {
             members[nearest(&centres, foot)].push(row);
@@ -103,7 +103,7 @@ impl BoxPlausibility {
         fitted.cells = centres
             .iter()
             .zip(&members)
-            .map(|(centre, own)| Regression::fit(&feet, &sides, own, Some(&prior)).cell(*centre))
+            .map(|(centre, own)| LinearRegression::fit(&feet, &sides, own, Some(&prior)).cell(*centre))
             .collect();
         fitted.set_normal(epochs, boxes);
         fitted
@@ -216,13 +216,13 @@ impl Cell {
 }
 
 /// A robust linear regression of log sides on place.
-struct Regression {
+struct LinearRegression {
     coefficients: Matrix3x2<f64>,
     covariance: Matrix2<f64>,
     inverse: Matrix3<f64>,
 }
 
-impl Regression {
+impl LinearRegression {
     fn fit(feet: &[[f64; 2]], sides: &[[f64; 2]], rows: &[usize], prior: Option<&Self>) -> Self {
         let ridge = match prior {
             Some(_) => Matrix3::from_diagonal(&Vector3::new(0.1, PRIOR_ROWS, PRIOR_ROWS)),

@@ -11,7 +11,7 @@ use super::map_rows::{MapRows, scatter_m2};
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::predictor::{PositionMap, Predictor, Stated};
 use super::projective_mean::ProjectiveMean;
-use super::sessions::Sessions;
+use super::sessions::SessionBiases;
 use super::upright_camera::UprightCamera;
 use crate::model::samples::rows::SESSION_GAP_S;
 use crate::statistics::median;
@@ -46,7 +46,7 @@ pub(crate) struct FitReport {
     /// Factor on the map's variance by left-out targets.
     pub(crate) widening: f64,
     /// How sessions differ, if there are several.
-    pub(crate) sessions: Option<Sessions>,
+    pub(crate) sessions: Option<SessionBiases>,
     /// Share of the jackknife's variance that is added, per candidate.
     pub(crate) jackknife_shares: Vec<f64>,
     /// Degrees of freedom of the radius.
@@ -118,7 +118,7 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
         groups: grouping.members().len(),
         candidates: candidates.iter().zip(&weights).zip(&misses_m2).map(of_candidate).collect(),
         widening: calibration.widening,
-        sessions: Sessions::new(&rows.epochs, &residuals_m, &parameters.noise),
+        sessions: SessionBiases::new(&rows.epochs, &residuals_m, &parameters.noise),
         jackknife_shares: jackknives.iter().map(|(share, _)| *share).collect(),
         freedom,
         held_out_m2: calibration.miss_m2,

@@ -3,7 +3,7 @@
 //!
 //! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
 //! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
-//! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; of an answer: `predictor`, `box_plausibility`;
+//! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`;
 //! `recipe` and `stored` connect both to the rest of the module. Random starts have a seed of their own.
 
 mod box_plausibility;
@@ -12,6 +12,7 @@ mod companion;
 mod edge_noise;
 mod f_distribution;
 mod fit;
+mod ground_camera;
 mod groups;
 mod hyperparameters;
 mod kernel;
@@ -20,7 +21,7 @@ mod map_rows;
 mod noise;
 mod posterior;
 mod predictor;
-mod projective_mean;
+pub(crate) mod projective_mean;
 mod recipe;
 mod sessions;
 mod stored;
@@ -28,6 +29,7 @@ mod upright_camera;
 
 pub use box_plausibility::RecentBoxes;
 pub(crate) use companion::EPOCHS;
+pub use ground_camera::{GroundCamera, GroundPoint};
 pub(crate) use leave_out::{SequenceMean, widening};
 pub(crate) use noise::{Epoch, ReceiverNoise};
 pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, receiver_correlation, target_height_m};

@@ -11,7 +11,7 @@ use super::candidate::MapCandidate;
 use super::edge_noise::edges_px;
 use super::f_distribution::f_quantile;
 use super::kernel::{InputScales, LengthScales};
-use super::projective_mean::{Box4, COEFFICIENTS, Evaluation, ProjectiveMean};
+use super::projective_mean::{Box4, COEFFICIENTS, EvaluatedMean, ProjectiveMean};
 
 /// Directions of the kernel's weights at most.
 pub(crate) const MAX_RANK: usize = 40;
@@ -99,7 +99,7 @@ pub(crate) struct MapPrediction {
 
 /// What one map says of one box.
 struct MapTerms {
-    evaluation: Evaluation,
+    evaluation: EvaluatedMean,
     q: [f64; MAX_RANK],
     position_m: [f64; 2],
     /// Derivatives by foot u, foot v, width, height, m per px.

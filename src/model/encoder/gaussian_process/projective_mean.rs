@@ -48,7 +48,7 @@ pub(crate) struct ProjectiveMean {
 
 /// Where the ratio is evaluated: numerators' terms and their values.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Evaluation {
+pub(crate) struct EvaluatedMean {
     terms: [f64; 5],
     denominator: f64,
     /// East and north less the centre, m.
@@ -75,7 +75,7 @@ impl ProjectiveMean {
     }
 
     #[inline]
-    pub(crate) fn evaluate(&self, sides: &Box4) -> Evaluation {
+    pub(crate) fn evaluate(&self, sides: &Box4) -> EvaluatedMean {
         let scaled = |at: usize| (sides[at] - self.scales_px[at][0]) / self.scales_px[at][1];
         let bounded = |at: usize| scaled(at).clamp(-MAX_SIDE, MAX_SIDE);
         let terms = [1.0, scaled(0), scaled(1), bounded(2), bounded(3)];
@@ -90,7 +90,7 @@ impl ProjectiveMean {
                 + c[side + 1] * terms[4]
         };
         let offset_m = [numerator(0, 8) / denominator, numerator(3, 10) / denominator];
-        Evaluation { terms, denominator, offset_m }
+        EvaluatedMean { terms, denominator, offset_m }
     }
 
     /// East and north, m.
@@ -102,7 +102,7 @@ impl ProjectiveMean {
 
     /// Derivatives of east and north by foot u, foot v, width and height, m per px.
     #[inline]
-    pub(crate) fn jacobian(&self, at: &Evaluation) -> [[f64; 4]; 2] {
+    pub(crate) fn jacobian(&self, at: &EvaluatedMean) -> [[f64; 4]; 2] {
         let c = &self.coefficients;
         let slopes_d = [c[6], c[7], c[12], c[13]];
         let slopes_n = [[c[1], c[2], c[8], c[9]], [c[4], c[5], c[10], c[11]]];
@@ -222,7 +222,7 @@ impl ProjectiveMean {
     }
 }
 
-impl Evaluation {
+impl EvaluatedMean {
     /// Derivatives of east and north by the coefficients.
     #[inline]
     pub(crate) fn tangent(&self) -> [[f64; COEFFICIENTS]; 2] {

@@ -199,7 +199,7 @@ pub(crate) struct GaussianProcessEncoder {
 
 /// Position, error and reconstruction of a box.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Estimate {
+pub(crate) struct BoxEstimate {
     pub(crate) encoded: Encoded,
     /// Of the position's error, m2.
     pub(crate) covariance: PlaneCovariance,
@@ -218,7 +218,11 @@ impl GaussianProcessEncoder {
 
     /// Position and error of a box. `recent` holds the earlier boxes of its target, and takes this one in.
     #[inline]
-    pub(crate) fn estimate(&self, bounding_box: &BoundingBox, recent: Option<&mut RecentBoxes>) -> Estimate {
+    pub(crate) fn estimate(
+        &self,
+        bounding_box: &BoundingBox,
+        recent: Option<&mut RecentBoxes>,
+    ) -> BoxEstimate {
         let sides = features_of(bounding_box);
         let recent = recent.map(|recent| {
             recent.push(&self.predictor.plausibility.deviation(&sides, None));
@@ -230,7 +234,7 @@ impl GaussianProcessEncoder {
             Some(auto_encoder) => auto_encoder.encode(bounding_box).reconstruction_px,
             None => self.predictor.reconstruct(&sides, &prediction.deviation),
         };
-        Estimate {
+        BoxEstimate {
             encoded: Encoded { position: EastNorth { east_m, north_m }, reconstruction_px },
             covariance: plane_covariance(prediction.covariance_m2),
             box_noise: plane_covariance(prediction.box_noise_m2),

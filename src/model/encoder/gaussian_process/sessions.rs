@@ -11,14 +11,14 @@ const MIN_ROWS: usize = 20;
 
 /// How sessions differ.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Sessions {
+pub(crate) struct SessionBiases {
     pub(crate) count: usize,
     /// Variance per axis between the sessions' mean residuals, beyond what short-lived noise leaves of a
     /// mean, m2.
     pub(crate) between_m2: f64,
 }
 
-impl Sessions {
+impl SessionBiases {
     /// From residuals about one map, rows in the order of target and time; `None` for fewer than two.
     pub(crate) fn new(epochs: &[Epoch], residuals_m: &[[f64; 2]], noise: &ReceiverNoise) -> Option<Self> {
         let mut order: Vec<usize> = (0..epochs.len()).collect();

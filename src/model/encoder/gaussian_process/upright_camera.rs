@@ -132,6 +132,20 @@ impl UprightCamera {
         }
     }
 
+    /// Log density of the focal length a priori, but for a constant.
+    pub(crate) fn log_focal_prior(&self, parameters: &Parameters) -> f64 {
+        let (focal, sigma) = FOCAL_PRIOR;
+        -0.5 * ((parameters[0] - (focal * self.width_px).ln()) / sigma).powi(2)
+    }
+
+    /// Where the ray of a pixel meets the ground, in m to the right of and ahead of the camera; `None` beyond
+    /// the horizon.
+    pub(crate) fn ground_m(&self, parameters: &Parameters, u: f64, v: f64) -> Option<[f64; 2]> {
+        let ray = self.ray(parameters, u, v);
+        let camera_m = parameters[4].exp();
+        (ray.down > 0.01).then(|| [camera_m * ray.right / ray.down, camera_m * ray.forward / ray.down])
+    }
+
     /// Height in pixels of the box of a target of usual height whose foot is there; `None` beyond the
     /// horizon.
     fn box_height_px(&self, parameters: &Parameters, u: f64, v: f64) -> Option<f64> {
@@ -335,11 +349,9 @@ impl UprightCamera {
         boxes: &[Box4],
         labels_m: &[[f64; 2]],
     ) -> Parameters {
-        let camera_m = start[4].exp();
         let on_ground = |(sides, label): (&Box4, &[f64; 2])| {
-            let ray = self.ray(start, sides[0], sides[1]);
-            let ground = [camera_m * ray.right / ray.down, camera_m * ray.forward / ray.down];
-            (ray.down > 0.01).then_some((ground, [label[0] - mean.centre_m[0], label[1] - mean.centre_m[1]]))
+            let ground = self.ground_m(start, sides[0], sides[1])?;
+            Some((ground, [label[0] - mean.centre_m[0], label[1] - mean.centre_m[1]]))
         };
         let pairs: Vec<([f64; 2], [f64; 2])> = boxes.iter().zip(labels_m).filter_map(on_ground).collect();
         let mut weights = vec![1.0; pairs.len()];

@@ -1,0 +1,201 @@
+//! Recordings whose boxes have only a tracker's ids and whose fixes only receivers': matched, then paired.
+//!
+//! What never happens here: evidence and search (they are [`crate::fusion::association`]'s).
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use jiff::Timestamp;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::recording::Recording;
+use crate::domain::{
+    Association, ClockOffset, Error, ErrorKind, ImageSize, ReceiverId, Receivers, Result, TargetId,
+};
+use crate::fusion::association::{
+    MatchSettings, Matching, WorldScores, match_with_model, match_without_model,
+};
+use crate::model::Regressor;
+
+/// What a recording is matched by.
+#[derive(Debug, Clone, Copy)]
+pub struct MatchRequest<'a> {
+    /// The camera's model; `None` to find one.
+    pub regressor: Option<&'a Regressor>,
+    /// Size of the image, needed without a model.
+    pub image_size: Option<ImageSize>,
+    /// Bounds of probability, clocks and size.
+    pub settings: MatchSettings,
+    /// Seed of everything random.
+    pub seed: u64,
+}
+
+/// A recording whose sure boxes have the ids of their receivers.
+#[derive(Debug, Clone)]
+pub struct MatchedRecording {
+    /// Boxes that are not sure keep their tracker's id.
+    pub recording: Recording,
+    /// The receivers under their own ids, with the clock offsets that were found.
+    pub receivers: Receivers,
+    /// How each sure box was matched, by time and receiver.
+    pub associations: Associations,
+    /// What was matched.
+    pub report: MatchReport,
+}
+
+/// How boxes were matched, by time and target.
+pub type Associations = BTreeMap<(Timestamp, TargetId), Association>;
+
+/// What became of tracklets and receivers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatchReport {
+    /// Tracklets: stretches of boxes of one tracker's id.
+    pub tracklets: usize,
+    /// Receivers with fixes.
+    pub receivers: usize,
+    /// Tracklets cut where their id may have moved to another target.
+    pub cuts: usize,
+    /// Bound on the posterior probability.
+    pub min_probability: f64,
+    /// Boxes matched with at least that probability.
+    pub matched_detections: u64,
+    /// Boxes whose most probable receiver is less probable than that, but at least 0.5: left out.
+    pub unsure_detections: u64,
+    /// Sure pairs, in order of receiver and time.
+    pub pairs: Vec<MatchedPair>,
+    /// Clock offsets found, beside those given.
+    pub clock_offsets: Vec<(ReceiverId, ClockOffset)>,
+    /// What the search of a camera without a model found.
+    pub world: Option<WorldScores>,
+}
+
+/// A tracklet, or a part of it, with its receiver.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatchedPair {
+    /// The receiver.
+    pub receiver_id: ReceiverId,
+    /// Id that the tracker gave the boxes.
+    pub tracker_id: TargetId,
+    /// First and last box.
+    pub from: Timestamp,
+    /// Last box.
+    pub to: Timestamp,
+    /// Number of boxes.
+    pub detections: u64,
+    /// Posterior probability.
+    pub probability: f64,
+}
+
+/// From this probability on a match that is not sure is counted as such.
+const UNSURE_PROBABILITY: f64 = 0.5;
+
+impl Recording {
+    /// Finds out whose boxes show whose receivers, and gives sure boxes the ids of their receivers.
+    ///
+    /// # Errors
+    /// `NotIdentifiable` with the reason and a remedy; `TooLarge` beyond the settings' bounds;
+    /// `InvalidArgument` where neither model nor image size is given.
+    pub fn matched(mut self, receivers: &Receivers, request: &MatchRequest<'_>) -> Result<MatchedRecording> {
+        let mut random = ChaCha8Rng::seed_from_u64(request.seed);
+        let settings = &request.settings;
+        let (matching, world) = match (request.regressor, request.image_size) {
+            (Some(regressor), _) => {
+                let matching = match_with_model(
+                    &self.detections,
+                    &self.fixes,
+                    receivers,
+                    regressor,
+                    settings,
+                    &mut random,
+                )?;
+                (matching, None)
+            }
+            (None, Some(image_size)) => {
+                let joint = match_without_model(
+                    &self.detections,
+                    &self.fixes,
+                    receivers,
+                    image_size,
+                    settings,
+                    &mut random,
+                )?;
+                (joint.matching, Some(joint.scores))
+            }
+            (None, None) => {
+                let message = "is needed to match without a model";
+                return Err(Error::invalid("image_size", message));
+            }
+        };
+        let report = self.report(&matching, settings.min_probability, world);
+        if report.pairs.is_empty() {
+            return Err(Error::refused(
+                ErrorKind::NotIdentifiable,
+                format!(
+                    "no tracklet has a receiver of probability {} or more; record longer, with receivers \
+                     carried across the whole view while few others are there",
+                    settings.min_probability
+                ),
+            ));
+        }
+        let receivers = matching.receivers_of(&self.fixes, receivers);
+        let associations = self.rename(&matching, settings.min_probability)?;
+        Ok(MatchedRecording { recording: self, receivers, associations, report })
+    }
+
+    fn report(&self, matching: &Matching, min_probability: f64, world: Option<WorldScores>) -> MatchReport {
+        let time = |at: Option<&usize>| at.map_or(Timestamp::UNIX_EPOCH, |at| self.detections[*at].time);
+        let mut pairs: Vec<MatchedPair> = matching
+            .sure(min_probability)
+            .map(|piece| MatchedPair {
+                receiver_id: piece.receiver_id.clone(),
+                tracker_id: piece.tracker_id.clone(),
+                from: time(piece.detections.first()),
+                to: time(piece.detections.last()),
+                detections: piece.detections.len() as u64,
+                probability: piece.probability,
+            })
+            .collect();
+        pairs.sort_by(|one, other| (&one.receiver_id, one.from).cmp(&(&other.receiver_id, other.from)));
+        let unsure = matching
+            .pieces
+            .iter()
+            .filter(|piece| (UNSURE_PROBABILITY..min_probability).contains(&piece.probability));
+        MatchReport {
+            tracklets: matching.tracklets,
+            receivers: matching.receivers,
+            cuts: matching.cuts,
+            min_probability,
+            matched_detections: pairs.iter().map(|pair| pair.detections).sum(),
+            unsure_detections: unsure.map(|piece| piece.detections.len() as u64).sum(),
+            pairs,
+            clock_offsets: matching.clock_offsets.clone(),
+            world,
+        }
+    }
+
+    /// Sure boxes get their receiver's id. A tracker's id that is also a receiver's is changed: its boxes
+    /// must not be paired by name.
+    fn rename(&mut self, matching: &Matching, min_probability: f64) -> Result<Associations> {
+        let mut associations = Associations::new();
+        let mut is_sure = vec![false; self.detections.len()];
+        for piece in matching.sure(min_probability) {
+            let target_id = TargetId::from(piece.receiver_id.clone());
+            for at in &piece.detections {
+                is_sure[*at] = true;
+                let own = &mut self.detections[*at];
+                own.target_id = target_id.clone();
+                let association =
+                    Association { tracker_id: piece.tracker_id.clone(), probability: piece.probability };
+                associations.insert((own.time, target_id.clone()), association);
+            }
+        }
+        let receivers: BTreeSet<TargetId> =
+            self.fixes.iter().filter_map(|fix| fix.receiver_id.clone()).map(TargetId::from).collect();
+        for (own, is_sure) in self.detections.iter_mut().zip(is_sure) {
+            if !is_sure && receivers.contains(&own.target_id) {
+                own.target_id = TargetId::new(&format!("tracker {}", own.target_id))?;
+            }
+        }
+        Ok(associations)
+    }
+}

@@ -1,0 +1,214 @@
+//! Log-likelihood ratio of a receiver's fixes: carried by the target of a chain of tracklets, or by
+//! somebody else.
+//!
+//! Carried: fix less position of the tracklet is white noise (receiver and detector) plus two
+//! Gauss-Markov processes, the receiver's bias and the error of the map. Somebody else: the fixes follow a
+//! target that starts anywhere in the scene and whose velocity is a Gauss-Markov process, plus the same
+//! receiver error. Both likelihoods are products of the innovations' densities of a Kalman filter, which
+//! marginalises bias, map error and motion exactly. Axes are independent and alike, so both share one
+//! covariance.
+
+use std::f64::consts::TAU;
+
+use super::tracklet::{Residual, SceneMotion, TimedFix};
+use crate::domain::GaussMarkovNoise;
+
+/// Correlation time of the map's error along a walk, s.
+const MAP_TIME_CONSTANT_S: f64 = 20.0;
+/// Correlation time of a target's velocity, s.
+const VELOCITY_TIME_CONSTANT_S: f64 = 8.0;
+/// A share of the fixes has gross errors; these are as likely under either hypothesis.
+const OUTLIER_SHARE: f64 = 0.01;
+/// Standard deviation of a gross error in that of the innovation.
+const OUTLIER_SCALE: f64 = 10.0;
+/// After so long a gap between fixes the motion of somebody else starts again, s.
+const MAX_GAP_S: f64 = 60.0;
+
+/// What the likelihoods assume.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct EvidenceModel {
+    /// Error of a receiver.
+    pub(super) gnss: GaussMarkovNoise,
+    /// Motion of somebody else.
+    pub(super) motion: SceneMotion,
+}
+
+impl EvidenceModel {
+    /// Variance of a receiver's bias per axis, m2: the larger of what the receiver states and what is assumed.
+    fn bias_m2(&self, fix: &TimedFix) -> f64 {
+        self.gnss.coloured_variance_m2().max(fix.stated_variance_m2.unwrap_or(0.0))
+    }
+}
+
+/// A filter of `N` states, alike for both axes: means by axis, common covariance.
+#[derive(Debug, Clone, Copy)]
+struct AxisFilter<const N: usize> {
+    means: [[f64; N]; 2],
+    covariance: [[f64; N]; N],
+}
+
+impl<const N: usize> AxisFilter<N> {
+    /// Log density of a measurement of the sum of the states that `observed` marks, in both axes; updates
+    /// the states unless it is an outlier.
+    fn update(&mut self, measured: [f64; 2], observed: [bool; N], noise_m2: f64) -> f64 {
+        let rows: [f64; N] = std::array::from_fn(|row| {
+            (0..N).filter(|at| observed[*at]).map(|at| self.covariance[row][at]).sum()
+        });
+        let sum = |values: &[f64; N]| -> f64 { (0..N).filter(|at| observed[*at]).map(|at| values[at]).sum() };
+        let variance_m2 = sum(&rows) + noise_m2;
+        let innovations = [0, 1].map(|axis| measured[axis] - sum(&self.means[axis]));
+        let squared = innovations.iter().map(|innovation| innovation * innovation).sum::<f64>() / variance_m2;
+        let nominal = (1.0 - OUTLIER_SHARE) * (-0.5 * squared).exp();
+        let scale = OUTLIER_SCALE * OUTLIER_SCALE;
+        let outlier = OUTLIER_SHARE / scale * (-0.5 * squared / scale).exp();
+        if nominal > outlier {
+            for (mean, innovation) in self.means.iter_mut().zip(innovations) {
+                for (state, row) in mean.iter_mut().zip(rows) {
+                    *state += row / variance_m2 * innovation;
+                }
+            }
+            for (own, row) in self.covariance.iter_mut().zip(rows) {
+                for (element, column) in own.iter_mut().zip(rows) {
+                    *element -= row * column / variance_m2;
+                }
+            }
+        }
+        (nominal + outlier).max(1e-300).ln() - (TAU * variance_m2).ln()
+    }
+
+    /// Multiplies the states by factors and adds variances.
+    fn decay(&mut self, factors: [f64; N], added: [f64; N]) {
+        for mean in &mut self.means {
+            for (state, factor) in mean.iter_mut().zip(factors) {
+                *state *= factor;
+            }
+        }
+        for (row, own) in self.covariance.iter_mut().enumerate() {
+            for (column, element) in own.iter_mut().enumerate() {
+                *element *= factors[row] * factors[column];
+            }
+            own[row] += added[row];
+        }
+    }
+}
+
+/// Somebody else's motion after the fixes so far: position, velocity, bias.
+#[derive(Debug, Clone, Copy)]
+struct FreeMotion {
+    filter: AxisFilter<3>,
+    last_s: Option<f64>,
+}
+
+impl FreeMotion {
+    const fn new() -> Self {
+        Self { filter: AxisFilter { means: [[0.0; 3]; 2], covariance: [[0.0; 3]; 3] }, last_s: None }
+    }
+
+    /// Log density of a fix given those before.
+    fn step(&mut self, fix: &TimedFix, model: &EvidenceModel) -> f64 {
+        let (bias_m2, white_m2) = (model.bias_m2(fix), model.gnss.white_variance_m2());
+        let position = [fix.position.east_m, fix.position.north_m];
+        let elapsed_s = self.last_s.map(|last_s| (fix.time_s - last_s).max(0.0));
+        self.last_s = Some(fix.time_s);
+        match elapsed_s.filter(|elapsed_s| *elapsed_s <= MAX_GAP_S) {
+            None => self.start(position, bias_m2, white_m2, model),
+            Some(elapsed_s) => {
+                self.predict(elapsed_s, bias_m2, model);
+                self.filter.update(position, [true, false, true], white_m2)
+            }
+        }
+    }
+
+    /// Returns the log density of a fix anywhere in the scene: the mean of a normal log density.
+    fn start(&mut self, position: [f64; 2], bias_m2: f64, white_m2: f64, model: &EvidenceModel) -> f64 {
+        let SceneMotion { spread_m, speed_m_s } = model.motion;
+        self.filter = AxisFilter {
+            means: position.map(|axis| [axis, 0.0, 0.0]),
+            covariance: [
+                [bias_m2 + white_m2, 0.0, -bias_m2],
+                [0.0, speed_m_s * speed_m_s, 0.0],
+                [-bias_m2, 0.0, bias_m2],
+            ],
+        };
+        -(TAU * (spread_m * spread_m + bias_m2 + white_m2)).ln() - 1.0
+    }
+
+    fn predict(&mut self, elapsed_s: f64, bias_m2: f64, model: &EvidenceModel) {
+        let speed_m2_s2 = model.motion.speed_m_s.powi(2);
+        let tau_s = VELOCITY_TIME_CONSTANT_S;
+        let velocity = (-elapsed_s / tau_s).exp();
+        let lever_s = tau_s * (1.0 - velocity);
+        for mean in &mut self.filter.means {
+            mean[0] += lever_s * mean[1];
+        }
+        let covariance = &mut self.filter.covariance;
+        let velocity_row = covariance[1];
+        for (own, other) in covariance[0].iter_mut().zip(velocity_row) {
+            *own += lever_s * other;
+        }
+        for row in covariance.iter_mut() {
+            row[0] += lever_s * row[1];
+        }
+        let bias = model.gnss.correlation.decay(elapsed_s);
+        let added = [0.0, speed_m2_s2 * (1.0 - velocity * velocity), bias_m2 * (1.0 - bias * bias)];
+        self.filter.decay([1.0, velocity, bias], added);
+        // Integrated Ornstein-Uhlenbeck process (Gillespie 1996).
+        let position_m2 = speed_m2_s2 * (2.0 * tau_s * (elapsed_s - lever_s) - lever_s * lever_s).max(0.0);
+        let mixed = speed_m2_s2 * lever_s * (1.0 - velocity);
+        let covariance = &mut self.filter.covariance;
+        covariance[0][0] += position_m2;
+        covariance[0][1] += mixed;
+        covariance[1][0] += mixed;
+    }
+}
+
+/// Log-likelihood of fixes (in order of time) of somebody who is not seen.
+pub(super) fn free_log_likelihood(fixes: &[TimedFix], model: &EvidenceModel) -> f64 {
+    let mut motion = FreeMotion::new();
+    fixes.iter().map(|fix| motion.step(fix, model)).sum()
+}
+
+/// Both hypotheses after the residuals so far.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LikelihoodRatio {
+    /// Bias and map error.
+    carried: AxisFilter<2>,
+    free: FreeMotion,
+    /// Fixes so far.
+    pub(super) fixes: u32,
+    /// Log-likelihood ratio.
+    pub(super) log_ratio: f64,
+}
+
+impl LikelihoodRatio {
+    pub(super) const fn new() -> Self {
+        let carried = AxisFilter { means: [[0.0; 2]; 2], covariance: [[0.0; 2]; 2] };
+        Self { carried, free: FreeMotion::new(), fixes: 0, log_ratio: 0.0 }
+    }
+
+    /// The ratio after more residuals, in order of time.
+    pub(super) fn extended(mut self, residuals: &[Residual], model: &EvidenceModel) -> Self {
+        for residual in residuals {
+            self.step(residual, model);
+        }
+        self
+    }
+
+    pub(super) fn step(&mut self, residual: &Residual, model: &EvidenceModel) {
+        let (fix, map_m2) = (&residual.fix, residual.map_variance_m2);
+        let bias_m2 = model.bias_m2(fix);
+        match self.free.last_s {
+            None => self.carried.covariance = [[bias_m2, 0.0], [0.0, map_m2]],
+            Some(last_s) => {
+                let elapsed_s = (fix.time_s - last_s).max(0.0);
+                let bias = model.gnss.correlation.decay(elapsed_s);
+                let map = (-elapsed_s / MAP_TIME_CONSTANT_S).exp();
+                self.carried.decay([bias, map], [bias_m2 * (1.0 - bias * bias), map_m2 * (1.0 - map * map)]);
+            }
+        }
+        let noise_m2 = model.gnss.white_variance_m2() + residual.box_variance_m2;
+        self.log_ratio += self.carried.update(residual.difference_m, [true; 2], noise_m2);
+        self.log_ratio -= self.free.step(fix, model);
+        self.fixes += 1;
+    }
+}

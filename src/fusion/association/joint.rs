@@ -1,0 +1,405 @@
+//! Boxes matched with receivers where the camera has no model: both are found together.
+//!
+//! Boxes alone give the ground plane up to place and direction ([`GroundCamera`], one per focal length).
+//! [`PlacementSearch`] finds these by the fixes of all receivers, whoever carries them. Sure pieces then
+//! train a model in the normal way, which matches again, until both stay. A world is accepted only on
+//! evidence that identities which are certainly wrong cannot have.
+
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+
+use jiff::SignedDuration;
+use rand::Rng;
+
+use super::evidence::EvidenceModel;
+use super::matching::{
+    Located, MatchSettings, Matching, check_size, match_located, match_scene, receiver_noise,
+};
+use super::placement::{Placement, PlacementSearch, SEEN_PROBABILITY};
+use super::recording::Scene;
+use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
+use crate::domain::{
+    Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, Receivers, Recipe, Result, Sample,
+    TargetClass, TargetId,
+};
+use crate::fusion::pairing::{PairingRule, PairingSettings, pair};
+use crate::geo::EastNorth;
+use crate::model::{Artifact, FitError, FitInput, FitOptions, GroundCamera, fit};
+
+/// Shifts of the receivers' clocks as shares of the recording, for identities that are certainly wrong.
+const SHIFTS: [f64; 6] = [0.15, -0.2, 0.27, -0.33, 0.4, -0.45];
+/// Shifts are at least this long, s: beyond the memory of walks and of receivers' errors.
+const LEAST_SHIFT_S: f64 = 25.0;
+/// The score of the best world exceeds that of all wrong ones by at least this.
+const MIN_MARGIN: f64 = 6.0;
+/// The best world exceeds every other world of the same recording by at least this.
+const MIN_MODE_MARGIN: f64 = 3.0;
+/// Two placements closer than this are one world, m.
+const SAME_WORLD_M: f64 = 6.0;
+/// Receivers with sure pieces at least.
+const MIN_RECEIVERS: usize = 3;
+/// Of the gain in score, one receiver has at most this share: a world must not hang on one of them.
+const MAX_RECEIVER_SHARE: f64 = 0.5;
+/// What is known about the ground of targets whose height is known: people and cars.
+const GROUND_OF_KNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06 };
+/// The same of all others, such as ships: the antenna stands somewhere on a large target.
+const GROUND_OF_UNKNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 8.0, scale_sigma: 1.5 };
+/// Rounds of training and matching.
+const ROUNDS: usize = 2;
+/// Placements kept per ground camera.
+const MODES: usize = 4;
+
+/// What was found, and the model that was trained on it.
+#[derive(Debug, Clone)]
+pub struct JointMatch {
+    /// Which boxes show which receivers' carriers.
+    pub matching: Matching,
+    /// The model of the last round.
+    pub model: Artifact,
+    /// Score of the world, of the best one with shifted clocks, and of the second best.
+    pub scores: WorldScores,
+}
+
+/// Scores of placements: sums over receivers of the log of prior plus evidence.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WorldScores {
+    /// Of the world found.
+    pub best: f64,
+    /// Of the best world with clocks shifted.
+    pub best_shifted: f64,
+    /// Of the best other world, with true clocks; negative infinity if there is none.
+    pub second: f64,
+}
+
+/// How well boxes alone determine the ground.
+#[derive(Debug, Clone, Copy)]
+struct GroundPrior {
+    /// Standard deviation per axis of a target's position, m.
+    map_sigma_m: f64,
+    /// Standard deviation of the logarithm of the scale.
+    scale_sigma: f64,
+}
+
+/// One candidate world.
+#[derive(Clone, Copy)]
+struct World {
+    camera: usize,
+    placement: Placement,
+}
+
+/// Matches detections with fixes and trains a model, where nothing is known but the image's size.
+///
+/// # Errors
+/// `NotIdentifiable`, with the reason and what to record, where another assignment explains the recording
+/// as well; `TooLarge` beyond the settings' bounds.
+pub fn match_without_model(
+    detections: &[Detection],
+    fixes: &[ReceivedFix],
+    receivers: &Receivers,
+    image_size: ImageSize,
+    settings: &MatchSettings,
+    random: &mut impl Rng,
+) -> Result<JointMatch> {
+    let scene = Scene::new(detections, fixes, receivers);
+    check_size(&scene, settings)?;
+    let search = JointSearch::new(&scene, image_size, settings)?;
+    let (world, scores) = search.accepted_world()?;
+    let matching = search.matched(&world, random);
+    search.trained(matching, scores, random)
+}
+
+struct JointSearch<'a> {
+    scene: &'a Scene<'a>,
+    settings: &'a MatchSettings,
+    image_size: ImageSize,
+    model: EvidenceModel,
+    ground: GroundPrior,
+    cameras: Vec<GroundCamera>,
+    fixes: Vec<Vec<TimedFix>>,
+}
+
+impl<'a> JointSearch<'a> {
+    fn new(scene: &'a Scene<'a>, image_size: ImageSize, settings: &'a MatchSettings) -> Result<Self> {
+        let Some(plane) = scene.plane() else {
+            return Err(not_identifiable("no fix names a receiver", "name the receiver of every fix"));
+        };
+        let class = most_frequent_class(scene.detections);
+        let mut boxes = Vec::with_capacity(scene.detections.len());
+        for (at, seen) in scene.tracklets.iter().enumerate() {
+            boxes.extend(seen.detections.iter().map(|own| (at as u32, scene.detections[*own].bounding_box)));
+        }
+        let cameras = GroundCamera::of_boxes(&boxes, image_size, class.as_ref());
+        if cameras.is_empty() {
+            return Err(not_identifiable(
+                "too few boxes show whole targets",
+                "record targets that are not cut by the image's border, near and far",
+            ));
+        }
+        let fixes = scene.fixes(&plane);
+        let gnss = settings.gnss.unwrap_or_else(|| receiver_noise(None));
+        let has_known_height = class.as_ref().is_none_or(GroundCamera::knows_height_of);
+        let (ground, motion) = if has_known_height {
+            (GROUND_OF_KNOWN_HEIGHT, common_motion(scene, &cameras, &GROUND_OF_KNOWN_HEIGHT))
+        } else {
+            // Boxes do not tell the scale, so the motion is that of the receivers.
+            (GROUND_OF_UNKNOWN_HEIGHT, motion_of_receivers(&fixes))
+        };
+        Ok(Self {
+            scene,
+            settings,
+            image_size,
+            model: EvidenceModel { gnss, motion },
+            ground,
+            cameras,
+            fixes,
+        })
+    }
+
+    fn on_ground(&self, camera: usize) -> Vec<Tracklet> {
+        on_ground(self.scene, &self.cameras[camera], &self.ground)
+    }
+
+    /// The best worlds of these cameras with the receivers' clocks shifted, the best first.
+    fn worlds(&self, cameras: impl IntoIterator<Item = usize>, shift_s: f64) -> Vec<World> {
+        let mut worlds = Vec::new();
+        for camera in cameras {
+            let search = self.search(camera, shift_s);
+            worlds.extend(search.search(MODES).into_iter().map(|placement| World { camera, placement }));
+        }
+        worlds.sort_by(|one, other| other.placement.score.total_cmp(&one.placement.score));
+        worlds
+    }
+
+    fn search(&self, camera: usize, shift_s: f64) -> PlacementSearch {
+        let tracklets = self.on_ground(camera);
+        let prior = (self.ground.scale_sigma, self.cameras[camera].log_prior());
+        PlacementSearch::new(&tracklets, &self.fixes, shift_s, &self.model, self.ground.map_sigma_m, prior)
+    }
+
+    /// The best world, if it is better than all that must be wrong and all others that may be right.
+    fn accepted_world(&self) -> Result<(World, WorldScores)> {
+        let worlds = self.worlds(0..self.cameras.len(), 0.0);
+        let Some(best) = worlds.first().copied() else {
+            return Err(not_identifiable(
+                "no receiver has three fixes while a tracklet is seen",
+                "record boxes and fixes at the same time, with targets in view for 20 s and more",
+            ));
+        };
+        let shifted = self.shifts_s().into_iter().filter_map(|shift_s| {
+            // The focal length hardly changes how well wrong identities fit.
+            self.worlds([best.camera], shift_s).first().map(|world| world.placement.score)
+        });
+        let scores = WorldScores {
+            best: best.placement.score,
+            best_shifted: shifted.fold(f64::NEG_INFINITY, f64::max),
+            second: self.second(&best, &worlds),
+        };
+        self.check(&best, &scores)?;
+        Ok((best, scores))
+    }
+
+    fn check(&self, best: &World, scores: &WorldScores) -> Result<()> {
+        if scores.best < scores.best_shifted + MIN_MARGIN {
+            return Err(not_identifiable(
+                &format!(
+                    "identities shifted in time explain it about as well (score {:.1} against {:.1}): too few \
+                     or too short visits, or too many candidates",
+                    scores.best, scores.best_shifted
+                ),
+                "record longer, with receivers carried across the whole view, best while few others are there",
+            ));
+        }
+        if scores.best < scores.second + MIN_MODE_MARGIN {
+            return Err(not_identifiable(
+                &format!(
+                    "another place and direction of the camera explains it about as well (score {:.1} against \
+                     {:.1}): paths are parallel or too much alike",
+                    scores.best, scores.second
+                ),
+                "record walks in different directions, with turns",
+            ));
+        }
+        let search = self.search(best.camera, 0.0);
+        let by_receiver = search.scores_of(&best.placement);
+        let empty = (1.0 - SEEN_PROBABILITY).ln();
+        let gains: Vec<f64> = by_receiver.iter().map(|score| (score - empty).max(0.0)).collect();
+        let all: f64 = gains.iter().sum();
+        let largest = gains.iter().copied().fold(0.0, f64::max);
+        if self.fixes.len() > 1 && largest > MAX_RECEIVER_SHARE * all.max(1e-9) {
+            return Err(not_identifiable(
+                "it hangs on one receiver",
+                "record more receivers, or the same one on several visits",
+            ));
+        }
+        Ok(())
+    }
+
+    /// Score of the best world that is another one than the best.
+    fn second(&self, best: &World, worlds: &[World]) -> f64 {
+        let points = |world: &World| -> Vec<[f64; 2]> {
+            let tracklets = self.on_ground(world.camera);
+            let all = tracklets.iter().flat_map(|own| &own.points);
+            all.step_by(50)
+                .map(|point| world.placement.apply(point.position.east_m, point.position.north_m))
+                .collect()
+        };
+        let at_best = points(best);
+        worlds[1..]
+            .iter()
+            .find(|world| {
+                let at = points(world);
+                let distances = at_best.iter().zip(&at).map(|(a, b)| (a[0] - b[0]).hypot(a[1] - b[1]));
+                distances.sum::<f64>() > SAME_WORLD_M * at_best.len().max(1) as f64
+            })
+            .map_or(f64::NEG_INFINITY, |world| world.placement.score)
+    }
+
+    /// Shifts of clocks that leave no true identity.
+    fn shifts_s(&self) -> Vec<f64> {
+        let times = || self.scene.detections.iter().map(|own| own.time);
+        let (Some(first), Some(last)) = (times().min(), times().max()) else { return Vec::new() };
+        let length_s = last.duration_since(first).as_secs_f64();
+        SHIFTS.iter().map(|share| (share * length_s).abs().max(LEAST_SHIFT_S).copysign(*share)).collect()
+    }
+
+    fn matched(&self, world: &World, random: &mut impl Rng) -> Matching {
+        let camera = &self.cameras[world.camera];
+        let (tracklets, points) = self.scene.located(|bounding_box| {
+            let point = camera.ground_point(bounding_box)?;
+            let [east_m, north_m] = world.placement.apply(point.right_m, point.forward_m);
+            Some((EastNorth { east_m, north_m }, point.box_variance_m2, self.ground.map_sigma_m.powi(2)))
+        });
+        let located =
+            Located { tracklets: &tracklets, detections: &points, fixes: &self.fixes, gnss: self.model.gnss };
+        match_located(self.scene, &located, self.settings, random)
+    }
+
+    /// Trains on the sure pieces and matches by the model, in turn.
+    fn trained(
+        &self,
+        mut matching: Matching,
+        scores: WorldScores,
+        random: &mut impl Rng,
+    ) -> Result<JointMatch> {
+        let mut latest = None;
+        for _ in 0..ROUNDS {
+            let artifact = self.fit(&matching)?;
+            let regressor = artifact.load()?;
+            matching = match_scene(self.scene, &regressor, self.settings, random);
+            latest = Some(artifact);
+        }
+        self.check_receivers(&matching)?;
+        let model = latest.ok_or_else(|| Error::fault("no round of training"))?;
+        Ok(JointMatch { matching, model, scores })
+    }
+
+    fn check_receivers(&self, matching: &Matching) -> Result<()> {
+        let mut sure: Vec<_> =
+            matching.sure(self.settings.min_probability).map(|piece| &piece.receiver_id).collect();
+        sure.sort();
+        sure.dedup();
+        let least = MIN_RECEIVERS.min(self.fixes.len());
+        if sure.len() < least {
+            return Err(not_identifiable(
+                &format!("only {} of {} receivers have a sure box", sure.len(), self.fixes.len()),
+                "record longer, with receivers carried across the whole view",
+            ));
+        }
+        Ok(())
+    }
+
+    fn fit(&self, matching: &Matching) -> Result<Artifact> {
+        let (samples, unpaired) =
+            training_samples(self.scene.detections, self.scene, matching, self.settings);
+        let options = FitOptions {
+            recipe: Recipe::GaussianProcess,
+            seed: 1,
+            epochs: None,
+            image_size: Some(self.image_size),
+            gnss_error: GnssError::Unknown,
+            gnss_bias_sigma_m: None,
+        };
+        let input = FitInput { samples: &samples, unpaired: &unpaired };
+        fit(input, &options, &mut |_| ControlFlow::Continue(())).map_err(|error| match error {
+            FitError::Unusable(reason) => not_identifiable(
+                &format!("the sure boxes cannot train a model: {reason}"),
+                "record longer, with receivers carried across the whole view",
+            ),
+            error => Error::fault(error),
+        })
+    }
+}
+
+/// Tracklets on the ground of a camera: right and forward in the place of east and north.
+fn on_ground(scene: &Scene<'_>, camera: &GroundCamera, ground: &GroundPrior) -> Vec<Tracklet> {
+    let located = scene.located(|bounding_box| {
+        let point = camera.ground_point(bounding_box)?;
+        let position = EastNorth { east_m: point.right_m, north_m: point.forward_m };
+        Some((position, point.box_variance_m2, ground.map_sigma_m.powi(2)))
+    });
+    located.0
+}
+
+/// Motion of the targets, the same for all cameras, so that their scores can be compared: the geometric mean.
+fn common_motion(scene: &Scene<'_>, cameras: &[GroundCamera], ground: &GroundPrior) -> SceneMotion {
+    let motions: Vec<SceneMotion> =
+        cameras.iter().map(|camera| SceneMotion::of(&on_ground(scene, camera, ground))).collect();
+    let mean = |of: fn(&SceneMotion) -> f64| {
+        (motions.iter().map(|motion| of(motion).ln()).sum::<f64>() / motions.len().max(1) as f64).exp()
+    };
+    SceneMotion { spread_m: mean(|own| own.spread_m), speed_m_s: mean(|own| own.speed_m_s) }
+}
+
+fn motion_of_receivers(fixes: &[Vec<TimedFix>]) -> SceneMotion {
+    let point = |fix: &TimedFix| TrackPoint {
+        time_s: fix.time_s,
+        position: fix.position,
+        box_variance_m2: 0.0,
+        map_variance_m2: 0.0,
+    };
+    let tracks: Vec<Tracklet> =
+        fixes.iter().map(|own| Tracklet { points: own.iter().map(point).collect() }).collect();
+    SceneMotion::of(&tracks)
+}
+
+/// Samples of the sure boxes, under their receivers' ids, and all other boxes.
+fn training_samples(
+    detections: &[Detection],
+    scene: &Scene<'_>,
+    matching: &Matching,
+    settings: &MatchSettings,
+) -> (Vec<Sample>, Vec<Detection>) {
+    let mut is_sure = vec![false; detections.len()];
+    let mut sure = Vec::new();
+    for piece in matching.sure(settings.min_probability) {
+        for at in &piece.detections {
+            is_sure[*at] = true;
+            let target_id = TargetId::from(piece.receiver_id.clone());
+            sure.push(Detection { target_id, ..detections[*at].clone() });
+        }
+    }
+    let settings = PairingSettings {
+        rule: PairingRule::Interpolated,
+        window: SignedDuration::from_secs(1),
+        ..PairingSettings::default()
+    };
+    let receivers = matching.receivers_of(scene.received, scene.receivers);
+    let samples = pair(sure, scene.received.to_vec(), &receivers, &settings).samples;
+    let others = detections.iter().zip(&is_sure).filter(|(_, is_sure)| !**is_sure);
+    (samples, others.map(|(own, _)| own.clone()).collect())
+}
+
+fn most_frequent_class(detections: &[Detection]) -> Option<TargetClass> {
+    let mut counts: BTreeMap<Option<&str>, (usize, Option<&TargetClass>)> = BTreeMap::new();
+    for own in detections {
+        let class = own.class.as_ref();
+        counts.entry(class.map(TargetClass::as_str)).or_insert((0, class)).0 += 1;
+    }
+    counts.into_values().max_by_key(|(count, _)| *count).and_then(|(_, class)| class.cloned())
+}
+
+/// The refusal of a recording that does not say whose the fixes are.
+fn not_identifiable(reason: &str, remedy: &str) -> Error {
+    let message = format!("whose fixes belong to whose boxes is not identifiable: {reason}; {remedy}");
+    Error::refused(ErrorKind::NotIdentifiable, message)
+}

@@ -1,0 +1,262 @@
+//! Boxes matched with receivers where a model regresses positions.
+
+use std::collections::BTreeSet;
+
+use rand::Rng;
+
+use super::assignment::posterior;
+use super::chains::{Chain, ChainSettings, Piece, PieceTable};
+use super::cuts;
+use super::evidence::EvidenceModel;
+use super::recording::Scene;
+use super::tracklet::{SceneMotion, TimedFix, Tracklet};
+use crate::config::Limits;
+use crate::domain::{
+    ClockOffset, Detection, Error, ErrorKind, GaussMarkovNoise, NoiseCorrelation, ReceivedFix, Receiver,
+    ReceiverId, Receivers, Result, TargetId,
+};
+use crate::model::Regressor;
+
+/// Step of the search for a receiver's clock offset, s.
+const OFFSET_STEP_S: f64 = 0.5;
+/// Posterior probabilities below it are not reported.
+const LEAST_PROBABILITY: f64 = 0.01;
+/// White error per axis that every receiver has at least, m: differences of its fixes are not trusted
+/// further.
+const LEAST_WHITE_SIGMA_M: f64 = 0.5;
+/// Error of a receiver of which nothing is known: that of a phone.
+const PHONE: (f64, NoiseCorrelation) = (2.61, NoiseCorrelation { white_share: 0.083, time_constant_s: 30.0 });
+
+/// How tracklets are matched with receivers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MatchSettings {
+    /// Posterior probability from which on a box counts as the receiver's.
+    pub min_probability: f64,
+    /// A receiver's clock is off by at most this, s; 0 for clocks that are exact.
+    pub clock_window_s: f64,
+    /// Error of the receivers; `None` for what the model states, else that of a phone.
+    pub gnss: Option<GaussMarkovNoise>,
+    /// Evidence and prior probabilities.
+    pub chains: ChainSettings,
+    /// Tracklets of one recording at most.
+    pub max_tracklets: usize,
+    /// Receivers of one recording at most.
+    pub max_receivers: usize,
+}
+
+impl MatchSettings {
+    /// # Errors
+    /// Names `min_probability` unless it is from 0.5 to 1, and `clock_window_s` unless it is from 0 to 30 s.
+    pub fn new(min_probability: f64, clock_window_s: f64, limits: &Limits) -> Result<Self> {
+        if !(0.5..=1.0).contains(&min_probability) {
+            return Err(Error::invalid("min_probability", "must be a number from 0.5 to 1"));
+        }
+        if !(0.0..=30.0).contains(&clock_window_s) {
+            return Err(Error::invalid("clock_window_s", "must be a number of seconds from 0 to 30"));
+        }
+        let (max_tracklets, max_receivers) = (limits.match_tracklets, limits.match_receivers);
+        Ok(Self { min_probability, clock_window_s, max_tracklets, max_receivers, ..Self::default() })
+    }
+}
+
+impl Default for MatchSettings {
+    fn default() -> Self {
+        Self {
+            min_probability: 0.9,
+            clock_window_s: 0.0,
+            gnss: None,
+            chains: ChainSettings::default(),
+            max_tracklets: 20_000,
+            max_receivers: 200,
+        }
+    }
+}
+
+/// A part of a tracklet and the receiver that its target carries most probably.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatchedPiece {
+    /// Id that the tracker gave it.
+    pub tracker_id: TargetId,
+    /// Indices of its detections, in order of time.
+    pub detections: Vec<usize>,
+    /// The receiver.
+    pub receiver_id: ReceiverId,
+    /// Posterior probability.
+    pub probability: f64,
+}
+
+/// Which boxes show the carriers of which receivers.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Matching {
+    /// Pieces of tracklets with their most probable receivers, in order of tracker's id and time.
+    pub pieces: Vec<MatchedPiece>,
+    /// Clock offsets found, beside those that were given.
+    pub clock_offsets: Vec<(ReceiverId, ClockOffset)>,
+    /// Tracklets and receivers that were compared.
+    pub tracklets: usize,
+    /// Receivers with fixes.
+    pub receivers: usize,
+    /// Cuts within tracklets where the tracker's id may have moved to another target.
+    pub cuts: usize,
+}
+
+impl Matching {
+    /// The receivers of fixes under their own ids, their given clock offsets corrected by those found.
+    #[must_use]
+    pub fn receivers_of(&self, fixes: &[ReceivedFix], given: &Receivers) -> Receivers {
+        let ids: BTreeSet<&ReceiverId> = fixes.iter().filter_map(|fix| fix.receiver_id.as_ref()).collect();
+        let receivers = ids.into_iter().map(|id| {
+            let given_s = given.get(id).map_or(0.0, |own| own.clock_offset.seconds());
+            let found = self.clock_offsets.iter().find(|(own, _)| own == id);
+            let found_s = found.map_or(0.0, |(_, own)| own.seconds());
+            let clock_offset = ClockOffset::from_seconds(given_s + found_s).unwrap_or(ClockOffset::ZERO);
+            Receiver { clock_offset, ..Receiver::named(id.clone()) }
+        });
+        // The bound on receivers is smaller than that of a list of receivers.
+        Receivers::new(receivers).unwrap_or_default()
+    }
+
+    /// Pieces from a posterior probability on.
+    pub fn sure(&self, min_probability: f64) -> impl Iterator<Item = &MatchedPiece> {
+        self.pieces.iter().filter(move |piece| piece.probability >= min_probability)
+    }
+}
+
+/// Receivers' fixes and tracklets in one plane.
+pub(super) struct Located<'a> {
+    pub(super) tracklets: &'a [Tracklet],
+    /// Detections of the points of each tracklet.
+    pub(super) detections: &'a [Vec<usize>],
+    pub(super) fixes: &'a [Vec<TimedFix>],
+    pub(super) gnss: GaussMarkovNoise,
+}
+
+/// Matches detections with fixes by the positions that a model regresses.
+///
+/// # Errors
+/// `TooLarge` for more tracklets or receivers than the settings allow.
+pub fn match_with_model(
+    detections: &[Detection],
+    fixes: &[ReceivedFix],
+    receivers: &Receivers,
+    regressor: &Regressor,
+    settings: &MatchSettings,
+    random: &mut impl Rng,
+) -> Result<Matching> {
+    let scene = Scene::new(detections, fixes, receivers);
+    check_size(&scene, settings)?;
+    Ok(match_scene(&scene, regressor, settings, random))
+}
+
+pub(super) fn match_scene(
+    scene: &Scene<'_>,
+    regressor: &Regressor,
+    settings: &MatchSettings,
+    random: &mut impl Rng,
+) -> Matching {
+    let (tracklets, points) = scene.regressed(regressor);
+    let located = Located {
+        tracklets: &tracklets,
+        detections: &points,
+        fixes: &scene.fixes(regressor.plane()),
+        gnss: settings.gnss.unwrap_or_else(|| receiver_noise(Some(regressor))),
+    };
+    match_located(scene, &located, settings, random)
+}
+
+/// The error of the receivers by a model; without one, that of a phone.
+pub(super) fn receiver_noise(regressor: Option<&Regressor>) -> GaussMarkovNoise {
+    let (sigma_m, correlation) = PHONE;
+    let noise = regressor.and_then(|regressor| {
+        let correlation = regressor.track_noise()?.gnss;
+        Some(GaussMarkovNoise { variance_m2: regressor.e_gnss_m2(), correlation })
+    });
+    noise
+        .unwrap_or_else(|| GaussMarkovNoise::new(sigma_m, correlation))
+        .with_white_at_least(LEAST_WHITE_SIGMA_M * LEAST_WHITE_SIGMA_M)
+}
+
+pub(super) fn check_size(scene: &Scene<'_>, settings: &MatchSettings) -> Result<()> {
+    let refuse = |what: &str, count: usize, most: usize| {
+        let message = format!(
+            "there are {count} {what}, at most {most} are matched at once; split the recording by time"
+        );
+        Err(Error::refused(ErrorKind::TooLarge, message))
+    };
+    match (scene.tracklets.len(), scene.receiver_ids.len()) {
+        (count, _) if count > settings.max_tracklets => refuse("tracklets", count, settings.max_tracklets),
+        (_, count) if count > settings.max_receivers => refuse("receivers", count, settings.max_receivers),
+        _ => Ok(()),
+    }
+}
+
+pub(super) fn match_located(
+    scene: &Scene<'_>,
+    located: &Located<'_>,
+    settings: &MatchSettings,
+    random: &mut impl Rng,
+) -> Matching {
+    let model = EvidenceModel { gnss: located.gnss, motion: SceneMotion::of(located.tracklets) };
+    let offsets_s = clock_offsets_s(located, &model, settings);
+    let timed: Vec<(&[TimedFix], f64)> =
+        located.fixes.iter().map(Vec::as_slice).zip(offsets_s.iter().copied()).collect();
+    let pieces = cuts::pieces(located.tracklets, &timed, &model, &settings.chains);
+    let table = PieceTable::new(located.tracklets, pieces, &settings.chains);
+    let chains: Vec<Vec<Chain>> = timed
+        .iter()
+        .map(|(fixes, offset_s)| table.chains(fixes, *offset_s, &model, &settings.chains))
+        .collect();
+    let probabilities = posterior(&chains, table.pieces.len(), random);
+    let most_probable = |at: usize| {
+        let all = probabilities.iter().map(|own| own[at]).enumerate();
+        all.max_by(|one, other| one.1.total_cmp(&other.1))
+    };
+    let mut matching = Matching {
+        tracklets: located.tracklets.len(),
+        receivers: scene.receiver_ids.len(),
+        cuts: table.pieces.len() - located.tracklets.len(),
+        ..Matching::default()
+    };
+    for (at, piece) in table.pieces.iter().enumerate() {
+        let Some((receiver, probability)) = most_probable(at) else { continue };
+        if probability >= LEAST_PROBABILITY {
+            let Piece { tracklet, first, end } = *piece;
+            matching.pieces.push(MatchedPiece {
+                tracker_id: scene.tracklets[tracklet].tracker_id.clone(),
+                detections: located.detections[tracklet][first..end].to_vec(),
+                receiver_id: scene.receiver_ids[receiver].clone(),
+                probability,
+            });
+        }
+    }
+    let found = scene.receiver_ids.iter().zip(offsets_s).filter(|(_, offset_s)| *offset_s != 0.0);
+    matching.clock_offsets = found
+        .filter_map(|(id, offset_s)| Some((id.clone(), ClockOffset::from_seconds(offset_s).ok()?)))
+        .collect();
+    matching
+}
+
+/// The clock offset of each receiver with the largest evidence, over all chains, under a normal prior.
+fn clock_offsets_s(located: &Located<'_>, model: &EvidenceModel, settings: &MatchSettings) -> Vec<f64> {
+    let window_s = settings.clock_window_s;
+    let steps = (window_s / OFFSET_STEP_S).floor() as i32;
+    if steps < 1 {
+        return vec![0.0; located.fixes.len()];
+    }
+    let whole = |(tracklet, own): (usize, &Tracklet)| Piece { tracklet, first: 0, end: own.points.len() };
+    let pieces = located.tracklets.iter().enumerate().map(whole).collect();
+    let table = PieceTable::new(located.tracklets, pieces, &settings.chains);
+    let evidence = |fixes: &[TimedFix], offset_s: f64| {
+        let chains = table.chains(fixes, offset_s, model, &settings.chains);
+        let most = chains.iter().map(|own| own.log_weight).fold(f64::NEG_INFINITY, f64::max);
+        let sum: f64 = chains.iter().map(|own| (own.log_weight - most).exp()).sum();
+        most + sum.ln() - 0.5 * (2.0 * offset_s / window_s).powi(2)
+    };
+    let best = |fixes: &Vec<TimedFix>| {
+        let grid = (-steps..=steps).map(|step| f64::from(step) * OFFSET_STEP_S);
+        grid.map(|offset_s| (offset_s, evidence(fixes, offset_s)))
+            .max_by(|one, other| one.1.total_cmp(&other.1))
+            .map_or(0.0, |(offset_s, _)| offset_s)
+    };
+    located.fixes.iter().map(best).collect()
+}

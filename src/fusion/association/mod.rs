@@ -1,0 +1,23 @@
+//! Whose fix is it: anonymous tracklets matched with the receivers that their targets carry.
+//!
+//! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
+//! too. `docs/association.md` has the formulas and figures. The files in the order of their imports:
+//! `tracklet`, `evidence`, `chains`, `assignment`, `cuts`, `placement`, `recording`, `matching`, `joint`.
+//! What never happens here: I/O, clocks, randomness that is not handed in.
+
+mod assignment;
+mod chains;
+mod cuts;
+mod evidence;
+mod joint;
+mod matching;
+mod placement;
+mod recording;
+mod tracklet;
+
+pub use self::chains::ChainSettings;
+pub use self::joint::{JointMatch, WorldScores, match_without_model};
+pub use self::matching::{MatchSettings, MatchedPiece, Matching, match_with_model};
+
+#[cfg(test)]
+mod tests;

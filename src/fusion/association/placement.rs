@@ -1,0 +1,362 @@
+//! Search of place and direction of a camera whose ground plane is known up to these: nobody says whose
+//! fixes belong to whose boxes.
+//!
+//! With ground points `g` and fixes `z` as complex numbers (east + i north), a placement is `z = w g + t`
+//! with `w = s exp(-i yaw)`. Under the coloured noise of a pair of tracklet and receiver (precision K^-1)
+//! the log-likelihood is a quadratic form of (w, t) with seven coefficients, so a placement is scored in
+//! constant time per pair. Placements that single pairs suggest, and a grid of yaws, are refined by
+//! expectation-maximisation: soft assignment of receivers to tracklets, then the least-squares (w, t) in
+//! closed form. `docs/association.md` has the formulas.
+
+use nalgebra::{Complex, DMatrix};
+
+use super::evidence::{EvidenceModel, free_log_likelihood};
+use super::tracklet::{TimedFix, Tracklet};
+
+type C = Complex<f64>;
+
+/// Fixes of a pair at most; more are thinned evenly.
+const MAX_FIXES: usize = 40;
+/// Fixes of a pair at least.
+const MIN_FIXES: usize = 3;
+/// Correlation time of the map's error along a walk, s.
+const MAP_TIME_CONSTANT_S: f64 = 20.0;
+/// Probability that the carrier of a receiver is among the boxes.
+pub(super) const SEEN_PROBABILITY: f64 = 0.8;
+/// Largest factor between the ground by usual heights and the true one.
+const MAX_SCALE: f64 = 100.0;
+/// Log weights below it add nothing to the prior of a receiver whose carrier is not seen.
+const NEGLIGIBLE: f64 = -20.0;
+const YAWS: usize = 48;
+/// Longest pairs whose position suggests a translation for each yaw.
+const GRID_PAIRS: usize = 80;
+/// Placements refined, and rounds of refinement.
+const REFINED: usize = 32;
+const ROUNDS: usize = 25;
+/// Log-likelihood ratios are multiplied by it: what the noise model leaves out makes them overstated.
+const TEMPERING: f64 = 0.6;
+
+/// Scale, direction and place: `z = w g + t`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Placement {
+    turn: C,
+    shift_m: C,
+    /// Sum over receivers of the log of prior plus evidence.
+    pub(super) score: f64,
+}
+
+impl Placement {
+    /// East and north of a ground point, m.
+    pub(super) fn apply(&self, right_m: f64, forward_m: f64) -> [f64; 2] {
+        let at = self.turn * C::new(right_m, forward_m) + self.shift_m;
+        [at.re, at.im]
+    }
+
+    /// Root mean square distance to another placement over ground points, m.
+    fn distance_m(&self, other: &Self, points: &[C]) -> f64 {
+        let sum: f64 = points
+            .iter()
+            .map(|point| ((self.turn - other.turn) * point + self.shift_m - other.shift_m).norm_sqr())
+            .sum();
+        (sum / points.len().max(1) as f64).sqrt()
+    }
+}
+
+/// Quadratic form of one pair.
+struct Pair {
+    receiver: usize,
+    log_prior: f64,
+    /// Log-likelihood ratio at residuals of zero.
+    peak: f64,
+    ones: f64,
+    z: C,
+    g: C,
+    zz: f64,
+    gg: f64,
+    gz: C,
+}
+
+/// A placement's part of the quadratic forms, the same for all pairs.
+struct Coefficients {
+    turn: C,
+    shift: C,
+    turn_squared: f64,
+    shift_squared: f64,
+    mixed: C,
+}
+
+impl Coefficients {
+    fn new(turn: C, shift: C) -> Self {
+        let (turn_squared, shift_squared) = (turn.norm_sqr(), shift.norm_sqr());
+        Self { turn, shift, turn_squared, shift_squared, mixed: shift.conj() * turn }
+    }
+}
+
+impl Pair {
+    /// Log-likelihood ratio at a placement: with half the negative of `(z - w g - t)' K^-1 (z - w g - t)`.
+    #[inline]
+    fn log_ratio(&self, at: &Coefficients) -> f64 {
+        let squared = self.zz + at.turn_squared * self.gg + at.shift_squared * self.ones
+            - 2.0 * (at.turn.re * self.gz.re + at.turn.im * self.gz.im)
+            - 2.0 * (at.shift.re * self.z.re + at.shift.im * self.z.im)
+            + 2.0 * (at.mixed.re * self.g.re - at.mixed.im * self.g.im);
+        self.peak - 0.5 * squared
+    }
+
+    /// Log of prior times tempered ratio.
+    #[inline]
+    fn log_weight(&self, at: &Coefficients) -> f64 {
+        TEMPERING * self.log_ratio(at) + self.log_prior
+    }
+}
+
+/// The pairs of a recording under one ground plane.
+pub(super) struct PlacementSearch {
+    pairs: Vec<Pair>,
+    receivers: usize,
+    /// Standard deviation of the logarithm of the scale.
+    scale_sigma: f64,
+    /// Log prior density of the ground plane, a part of every score.
+    log_prior: f64,
+    /// Some of the ground points, m.
+    points: Vec<C>,
+}
+
+impl PlacementSearch {
+    /// `tracklets` have positions (right, forward) in the place of (east, north).
+    pub(super) fn new(
+        tracklets: &[Tracklet],
+        receivers: &[Vec<TimedFix>],
+        offset_s: f64,
+        model: &EvidenceModel,
+        map_sigma_m: f64,
+        (scale_sigma, log_prior): (f64, f64),
+    ) -> Self {
+        let mut pairs = Vec::new();
+        for (receiver, fixes) in receivers.iter().enumerate() {
+            let of_receiver = pairs.len();
+            for tracklet in tracklets {
+                pairs.extend(pair(receiver, tracklet, fixes, offset_s, model, map_sigma_m));
+            }
+            let candidates = (pairs.len() - of_receiver).max(1) as f64;
+            for own in &mut pairs[of_receiver..] {
+                own.log_prior = (SEEN_PROBABILITY / candidates).ln();
+            }
+        }
+        let all: Vec<C> = tracklets
+            .iter()
+            .flat_map(|own| &own.points)
+            .map(|point| C::new(point.position.east_m, point.position.north_m))
+            .collect();
+        let stride = all.len().div_ceil(200).max(1);
+        Self {
+            pairs,
+            receivers: receivers.len(),
+            scale_sigma,
+            log_prior,
+            points: all.into_iter().step_by(stride).collect(),
+        }
+    }
+
+    /// Score by receiver of a placement.
+    pub(super) fn scores_of(&self, placement: &Placement) -> Vec<f64> {
+        self.scores(placement.turn, placement.shift_m)
+    }
+
+    /// Log-likelihood ratio of each pair where ground and plane are the same.
+    #[cfg(test)]
+    pub(super) fn log_ratios_at_identity(&self) -> Vec<f64> {
+        self.pairs
+            .iter()
+            .map(|pair| pair.log_ratio(&Coefficients::new(C::new(1.0, 0.0), C::default())))
+            .collect()
+    }
+
+    fn scores(&self, turn: C, shift: C) -> Vec<f64> {
+        let mut sums = vec![1.0 - SEEN_PROBABILITY; self.receivers];
+        let at = Coefficients::new(turn, shift);
+        for pair in &self.pairs {
+            let log_weight = pair.log_weight(&at);
+            if log_weight > NEGLIGIBLE {
+                sums[pair.receiver] += log_weight.exp();
+            }
+        }
+        sums.iter_mut().for_each(|sum| *sum = sum.ln());
+        sums
+    }
+
+    fn score(&self, turn: C, shift: C) -> f64 {
+        let scale = turn.norm().ln() / self.scale_sigma;
+        self.scores(turn, shift).iter().sum::<f64>() + self.log_prior - 0.5 * scale * scale
+    }
+
+    /// The best placements that differ from each other, the best first.
+    pub(super) fn search(&self, most: usize) -> Vec<Placement> {
+        let mut starts = self.suggested();
+        starts.extend(self.grid());
+        starts.sort_by(|one, other| other.score.total_cmp(&one.score));
+        let mut modes: Vec<Placement> = Vec::new();
+        for start in distinct(starts, &self.points, REFINED, 1.0) {
+            modes.push(self.refined(start));
+        }
+        modes.sort_by(|one, other| other.score.total_cmp(&one.score));
+        distinct(modes, &self.points, most, 1.0)
+    }
+
+    /// The placement that each pair alone suggests.
+    fn suggested(&self) -> Vec<Placement> {
+        self.pairs
+            .iter()
+            .filter_map(|pair| {
+                let moved = pair.gz - pair.g.conj() * pair.z / pair.ones;
+                let spread = pair.gg - pair.g.norm_sqr() / pair.ones;
+                // A target that stands still tells no direction.
+                (moved.norm() > 4.0 && spread > 4.0).then(|| {
+                    let turn = moved / moved.norm() * self.scale(moved.norm(), spread);
+                    self.placed(turn, (pair.z - turn * pair.g) / pair.ones)
+                })
+            })
+            .collect()
+    }
+
+    /// For each yaw the translations that the longest pairs suggest.
+    fn grid(&self) -> Vec<Placement> {
+        let mut order: Vec<&Pair> = self.pairs.iter().collect();
+        order.sort_by(|one, other| other.ones.total_cmp(&one.ones));
+        // Pairs of a few receivers only would all be wrong where these are out of view.
+        let mut longest: Vec<&Pair> = Vec::new();
+        let per_receiver = (GRID_PAIRS / self.receivers.max(1)).max(4);
+        let mut counts = vec![0; self.receivers];
+        for pair in order {
+            if counts[pair.receiver] < per_receiver && longest.len() < GRID_PAIRS {
+                counts[pair.receiver] += 1;
+                longest.push(pair);
+            }
+        }
+        let mut best = Vec::with_capacity(YAWS * 3);
+        for step in 0..YAWS {
+            let turn = C::from_polar(1.0, step as f64 / YAWS as f64 * std::f64::consts::TAU);
+            let mut own: Vec<Placement> =
+                longest.iter().map(|pair| self.placed(turn, (pair.z - turn * pair.g) / pair.ones)).collect();
+            own.sort_by(|one, other| other.score.total_cmp(&one.score));
+            best.extend(own.into_iter().take(3));
+        }
+        best
+    }
+
+    /// The most probable scale, by the prior to first order about 1.
+    fn scale(&self, moved: f64, spread: f64) -> f64 {
+        let precision = self.scale_sigma.powi(-2);
+        ((moved + precision) / (spread + precision)).clamp(1.0 / MAX_SCALE, MAX_SCALE)
+    }
+
+    fn placed(&self, turn: C, shift: C) -> Placement {
+        Placement { turn, shift_m: shift, score: self.score(turn, shift) }
+    }
+
+    /// Expectation-maximisation from a placement; the best of its rounds.
+    fn refined(&self, start: Placement) -> Placement {
+        let (mut best, mut at) = (start, start);
+        for _ in 0..ROUNDS {
+            let Some(next) = self.maximised(at.turn, at.shift_m) else { break };
+            let gain = next.score - at.score;
+            at = next;
+            if at.score > best.score {
+                best = at;
+            }
+            if gain.abs() < 1e-3 {
+                break;
+            }
+        }
+        best
+    }
+
+    fn maximised(&self, turn: C, shift: C) -> Option<Placement> {
+        let totals = self.scores(turn, shift);
+        let (mut ones, mut gg) = (0.0, 0.0);
+        let (mut z, mut g, mut gz) = (C::default(), C::default(), C::default());
+        let at = Coefficients::new(turn, shift);
+        for pair in &self.pairs {
+            let log_weight = pair.log_weight(&at) - totals[pair.receiver];
+            if log_weight > -9.0 {
+                let weight = TEMPERING * log_weight.exp();
+                ones += weight * pair.ones;
+                gg += weight * pair.gg;
+                z += pair.z * weight;
+                g += pair.g * weight;
+                gz += pair.gz * weight;
+            }
+        }
+        let spread = gg - g.norm_sqr() / ones;
+        if !(ones > 1e-9 && spread > 1e-9) {
+            return None;
+        }
+        let moved = gz - g.conj() * z / ones;
+        let turn = moved / moved.norm().max(1e-12) * self.scale(moved.norm(), spread);
+        Some(self.placed(turn, (z - turn * g) / ones))
+    }
+}
+
+/// Those that differ from all better ones by at least a distance, m; at most so many.
+fn distinct(sorted: Vec<Placement>, points: &[C], most: usize, apart_m: f64) -> Vec<Placement> {
+    let mut kept: Vec<Placement> = Vec::new();
+    for own in sorted {
+        if kept.len() == most {
+            break;
+        }
+        if kept.iter().all(|better| better.distance_m(&own, points) > apart_m) {
+            kept.push(own);
+        }
+    }
+    kept
+}
+
+fn pair(
+    receiver: usize,
+    tracklet: &Tracklet,
+    fixes: &[TimedFix],
+    offset_s: f64,
+    model: &EvidenceModel,
+    map_sigma_m: f64,
+) -> Option<Pair> {
+    let residuals = tracklet.residuals(fixes, offset_s, 2.5);
+    let stride = residuals.len().div_ceil(MAX_FIXES).max(1);
+    let rows: Vec<_> = residuals.into_iter().step_by(stride).collect();
+    if rows.len() < MIN_FIXES {
+        return None;
+    }
+    let bias_m2 = model.gnss.coloured_variance_m2();
+    let white_m2 = model.gnss.white_variance_m2();
+    let covariance = DMatrix::from_fn(rows.len(), rows.len(), |i, j| {
+        let lag_s = (rows[i].fix.time_s - rows[j].fix.time_s).abs();
+        let white = if i == j { white_m2 + rows[i].box_variance_m2 } else { 0.0 };
+        bias_m2 * model.gnss.correlation.decay(lag_s)
+            + map_sigma_m * map_sigma_m * (-lag_s / MAP_TIME_CONSTANT_S).exp()
+            + white
+    });
+    let factor = covariance.cholesky()?;
+    let log_determinant = 2.0 * factor.l_dirty().diagonal().iter().map(|own| own.ln()).sum::<f64>();
+    let count = rows.len() as f64;
+    let fixed: Vec<TimedFix> = rows.iter().map(|row| row.fix).collect();
+    let peak = -log_determinant - count * std::f64::consts::TAU.ln() - free_log_likelihood(&fixed, model);
+    // Columns: one, z (east, north), g (right, forward), whitened.
+    let mut columns = DMatrix::from_fn(rows.len(), 5, |i, column| {
+        let fix = rows[i].fix.position;
+        let [east_m, north_m] = rows[i].difference_m;
+        [1.0, fix.east_m, fix.north_m, fix.east_m - east_m, fix.north_m - north_m][column]
+    });
+    factor.l_dirty().solve_lower_triangular_mut(&mut columns);
+    let dot = |a: usize, b: usize| columns.column(a).dot(&columns.column(b));
+    Some(Pair {
+        receiver,
+        log_prior: 0.0,
+        peak,
+        ones: dot(0, 0),
+        z: C::new(dot(0, 1), dot(0, 2)),
+        g: C::new(dot(0, 3), dot(0, 4)),
+        zz: dot(1, 1) + dot(2, 2),
+        gg: dot(3, 3) + dot(4, 4),
+        // conj(g) z
+        gz: C::new(dot(3, 1) + dot(4, 2), dot(3, 2) - dot(4, 1)),
+    })
+}

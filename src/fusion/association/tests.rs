@@ -1,0 +1,158 @@
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::assignment::posterior;
+use super::chains::{Chain, ChainSettings};
+use super::cuts;
+use super::evidence::{EvidenceModel, LikelihoodRatio};
+use super::placement::PlacementSearch;
+use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
+use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
+use crate::geo::EastNorth;
+use crate::simulation::{standard_normal, stream};
+
+const MODEL: EvidenceModel = EvidenceModel {
+    gnss: GaussMarkovNoise {
+        variance_m2: 6.8,
+        correlation: NoiseCorrelation { white_share: 0.083, time_constant_s: 30.0 },
+    },
+    motion: SceneMotion { spread_m: 6.0, speed_m_s: 0.8 },
+};
+
+/// A walk of a minute with a turn, from a point on, m.
+fn walk(from_m: [f64; 2], turn: f64) -> Tracklet {
+    let points = (0..120).map(|step| {
+        let time_s = 0.5 * f64::from(step);
+        let heading = turn * time_s / 60.0;
+        let position = EastNorth {
+            east_m: from_m[0] + 0.9 * time_s * heading.cos(),
+            north_m: from_m[1] + 0.9 * time_s * heading.sin(),
+        };
+        TrackPoint { time_s, position, box_variance_m2: 0.04, map_variance_m2: 0.25 }
+    });
+    Tracklet { points: points.collect() }
+}
+
+/// Fixes of a receiver that is carried along a walk.
+fn carried(track: &Tracklet, seed: u64) -> Vec<TimedFix> {
+    let mut random = stream(seed, 0);
+    let mut bias_m = [0, 1].map(|_| 2.5 * standard_normal(&mut random));
+    let decay = (-1.0_f64 / 30.0).exp();
+    track
+        .points
+        .iter()
+        .step_by(2)
+        .map(|point| {
+            bias_m = bias_m
+                .map(|own| decay * own + 2.5 * (1.0 - decay * decay).sqrt() * standard_normal(&mut random));
+            let [east_m, north_m] = bias_m.map(|own| own + 0.75 * standard_normal(&mut random));
+            let position = EastNorth {
+                east_m: point.position.east_m + east_m,
+                north_m: point.position.north_m + north_m,
+            };
+            TimedFix { time_s: point.time_s, position, stated_variance_m2: None }
+        })
+        .collect()
+}
+
+#[test]
+fn the_recursive_ratio_is_that_of_the_dense_covariance() {
+    let track = walk([1.0, 2.0], 1.5);
+    for seed in 1..=3 {
+        // The quadratic form takes at most 40 fixes without thinning.
+        let fixes: Vec<TimedFix> = carried(&track, seed).into_iter().take(40).collect();
+        let recursive = LikelihoodRatio::new().extended(&track.residuals(&fixes, 0.0, 2.5), &MODEL).log_ratio;
+        let dense = PlacementSearch::new(
+            std::slice::from_ref(&track),
+            std::slice::from_ref(&fixes),
+            0.0,
+            &MODEL,
+            0.5,
+            (0.06, 0.0),
+        );
+        let dense = dense.log_ratios_at_identity()[0];
+        // The recursion allows for gross errors in 1 % of the fixes, under both hypotheses.
+        assert!((recursive - dense).abs() < 0.5, "seed {seed}: {recursive} {dense}");
+    }
+}
+
+#[test]
+fn the_carrier_has_the_largest_ratio() {
+    let tracks = [walk([0.0, 0.0], 1.5), walk([2.0, -3.0], -1.0), walk([-4.0, 6.0], 2.5)];
+    for seed in 1..=5 {
+        let fixes = carried(&tracks[0], seed);
+        let ratios = tracks.each_ref().map(|track| {
+            LikelihoodRatio::new().extended(&track.residuals(&fixes, 0.0, 2.5), &MODEL).log_ratio
+        });
+        assert!(ratios[0] > 3.0 && ratios[0] > ratios[1] + 3.0 && ratios[0] > ratios[2] + 3.0, "{ratios:?}");
+    }
+}
+
+#[test]
+fn a_swap_in_the_middle_of_a_tracklet_is_cut() {
+    let (own, other) = (walk([0.0, 0.0], 1.5), walk([2.0, -3.0], -1.0));
+    let fixes = carried(&own, 7);
+    let mut swapped = own.clone();
+    swapped.points[60..].copy_from_slice(&other.points[60..]);
+    let receivers = [(fixes.as_slice(), 0.0)];
+    let settings = ChainSettings::default();
+    let pieces = cuts::pieces(&[own, swapped], &receivers, &MODEL, &settings);
+    let of = |tracklet| pieces.iter().filter(move |piece| piece.tracklet == tracklet);
+    assert_eq!(of(0).count(), 1, "{pieces:?}");
+    assert!(of(1).any(|piece| (52..=68).contains(&piece.end)), "{pieces:?}");
+}
+
+fn chain(pieces: &[usize], log_weight: f64) -> Chain {
+    Chain { pieces: pieces.to_vec(), log_weight }
+}
+
+#[test]
+fn sampled_probabilities_are_those_of_the_enumeration() {
+    // Two receivers want piece 0; the second one may have piece 1, or both.
+    let chains = vec![
+        vec![chain(&[], 0.0), chain(&[0], 1.5), chain(&[1], 0.2)],
+        vec![chain(&[], 0.0), chain(&[0], 1.0), chain(&[1], 0.8), chain(&[0, 1], 2.0)],
+    ];
+    let mut expected = vec![vec![0.0; 2]; 2];
+    let mut total = 0.0;
+    for one in &chains[0] {
+        for other in &chains[1] {
+            if one.pieces.iter().all(|piece| !other.pieces.contains(piece)) {
+                let weight = (one.log_weight + other.log_weight).exp();
+                total += weight;
+                one.pieces.iter().for_each(|piece| expected[0][*piece] += weight);
+                other.pieces.iter().for_each(|piece| expected[1][*piece] += weight);
+            }
+        }
+    }
+    let sampled = posterior(&chains, 2, &mut ChaCha8Rng::seed_from_u64(3));
+    for (own, wanted) in sampled.iter().flatten().zip(expected.iter().flatten()) {
+        assert!((own - wanted / total).abs() < 0.06, "{sampled:?} {expected:?} {total}");
+    }
+}
+
+#[test]
+fn place_and_direction_are_found_by_fixes_of_unknown_carriers() {
+    let tracks =
+        [walk([0.0, 0.0], 1.5), walk([8.0, -3.0], -1.0), walk([-4.0, 9.0], 2.5), walk([3.0, 5.0], 4.0)];
+    // The ground as the camera sees it: turned by 70 degrees, 100 m away.
+    let (sin, cos) = 70.0_f64.to_radians().sin_cos();
+    let seen = |track: &Tracklet| {
+        let turned = track.points.iter().map(|point| {
+            let (east, north) = (point.position.east_m - 100.0, point.position.north_m);
+            let position = EastNorth { east_m: cos * east - sin * north, north_m: sin * east + cos * north };
+            TrackPoint { position, ..*point }
+        });
+        Tracklet { points: turned.collect() }
+    };
+    let ground: Vec<Tracklet> = tracks.iter().map(seen).collect();
+    let receivers: Vec<Vec<TimedFix>> = (0..3).map(|at| carried(&tracks[at], 20 + at as u64)).collect();
+    let search = PlacementSearch::new(&ground, &receivers, 0.0, &MODEL, 1.0, (0.06, 0.0));
+    let best = search.search(1)[0];
+    for (track, ground) in tracks.iter().zip(&ground) {
+        let (truth, point) = (track.points[60].position, ground.points[60].position);
+        let [east_m, north_m] = best.apply(point.east_m, point.north_m);
+        let error_m = (east_m - truth.east_m).hypot(north_m - truth.north_m);
+        assert!(error_m < 5.0, "{error_m}");
+    }
+}

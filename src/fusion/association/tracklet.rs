@@ -1,0 +1,142 @@
+//! Tracklets in the plane and the fixes of receivers, as association compares them.
+
+use crate::geo::EastNorth;
+
+/// Position of a tracklet at one instant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TrackPoint {
+    /// Seconds since a common origin.
+    pub(super) time_s: f64,
+    /// Position, m.
+    pub(super) position: EastNorth,
+    /// Variance per axis of the part of its error that is independent from box to box, m2.
+    pub(super) box_variance_m2: f64,
+    /// Variance per axis of the part of its error that is alike at places nearby, m2.
+    pub(super) map_variance_m2: f64,
+}
+
+/// The boxes of one tracker's id, in order of time.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Tracklet {
+    /// Its positions.
+    pub(super) points: Vec<TrackPoint>,
+}
+
+/// One fix of a receiver by the camera's clock.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TimedFix {
+    /// Seconds since a common origin.
+    pub(super) time_s: f64,
+    /// Position, m.
+    pub(super) position: EastNorth,
+    /// Variance per axis that the receiver states, m2.
+    pub(super) stated_variance_m2: Option<f64>,
+}
+
+/// Difference of a fix and a tracklet's position at its instant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Residual {
+    pub(super) fix: TimedFix,
+    pub(super) difference_m: [f64; 2],
+    pub(super) box_variance_m2: f64,
+    pub(super) map_variance_m2: f64,
+}
+
+impl Tracklet {
+    /// First and last instant, s; an empty interval without points.
+    #[must_use]
+    pub(super) fn span_s(&self) -> [f64; 2] {
+        match (self.points.first(), self.points.last()) {
+            (Some(first), Some(last)) => [first.time_s, last.time_s],
+            _ => [f64::INFINITY, f64::NEG_INFINITY],
+        }
+    }
+
+    /// The position at an instant on the straight line between neighbours at most `max_gap_s` apart.
+    fn at(&self, time_s: f64, max_gap_s: f64) -> Option<TrackPoint> {
+        let next = self.points.partition_point(|point| point.time_s < time_s);
+        let after = self.points.get(next)?;
+        let Some(before) = next.checked_sub(1).map(|at| &self.points[at]) else {
+            return (after.time_s <= time_s).then_some(*after);
+        };
+        let gap_s = after.time_s - before.time_s;
+        if gap_s > max_gap_s {
+            return None;
+        }
+        let share = if gap_s > 0.0 { (time_s - before.time_s) / gap_s } else { 0.0 };
+        let mix = |of: fn(&TrackPoint) -> f64| (1.0 - share) * of(before) + share * of(after);
+        Some(TrackPoint {
+            time_s,
+            position: EastNorth {
+                east_m: mix(|point| point.position.east_m),
+                north_m: mix(|point| point.position.north_m),
+            },
+            box_variance_m2: mix(|point| point.box_variance_m2),
+            map_variance_m2: mix(|point| point.map_variance_m2),
+        })
+    }
+
+    /// The differences of all fixes (in order of time, shifted by `offset_s`) within the tracklet.
+    pub(super) fn residuals(&self, fixes: &[TimedFix], offset_s: f64, max_gap_s: f64) -> Vec<Residual> {
+        let [from_s, to_s] = self.span_s();
+        let begin = fixes.partition_point(|fix| fix.time_s + offset_s < from_s);
+        fixes[begin..]
+            .iter()
+            .take_while(|fix| fix.time_s + offset_s <= to_s)
+            .filter_map(|fix| {
+                let point = self.at(fix.time_s + offset_s, max_gap_s)?;
+                Some(Residual {
+                    fix: TimedFix { time_s: fix.time_s + offset_s, ..*fix },
+                    difference_m: [
+                        fix.position.east_m - point.position.east_m,
+                        fix.position.north_m - point.position.north_m,
+                    ],
+                    box_variance_m2: point.box_variance_m2,
+                    map_variance_m2: point.map_variance_m2,
+                })
+            })
+            .collect()
+    }
+}
+
+/// How the targets of a scene move.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SceneMotion {
+    /// Standard deviation of their positions per axis, m.
+    pub(super) spread_m: f64,
+    /// Root mean square of their speed per axis, m/s.
+    pub(super) speed_m_s: f64,
+}
+
+impl SceneMotion {
+    /// Time over which a speed is measured, s: longer than the noise of boxes matters.
+    const BASELINE_S: f64 = 2.0;
+
+    /// Of the targets that the tracklets show.
+    #[must_use]
+    pub(super) fn of(tracklets: &[Tracklet]) -> Self {
+        let points = || tracklets.iter().flat_map(|tracklet| &tracklet.points);
+        let count = points().count().max(1) as f64;
+        let mean = |of: fn(&TrackPoint) -> f64| points().map(of).sum::<f64>() / count;
+        let variance = |of: fn(&TrackPoint) -> f64| {
+            let centre = mean(of);
+            points().map(|point| (of(point) - centre).powi(2)).sum::<f64>() / count
+        };
+        let spread = variance(|point| point.position.east_m) + variance(|point| point.position.north_m);
+        let (mut squares, mut steps) = (0.0, 0.0);
+        for tracklet in tracklets {
+            let mut from = 0;
+            for (at, point) in tracklet.points.iter().enumerate() {
+                let first = &tracklet.points[from];
+                let elapsed_s = point.time_s - first.time_s;
+                if elapsed_s >= Self::BASELINE_S {
+                    squares += (point.position.distance_m(first.position) / elapsed_s).powi(2);
+                    steps += 1.0;
+                    from = at;
+                }
+            }
+        }
+        let speed_m_s = if steps > 0.0 { (0.5 * squares / steps).sqrt() } else { 0.0 };
+        Self { spread_m: (0.5 * spread).sqrt().max(3.0), speed_m_s: speed_m_s.max(0.3) }
+    }
+}

@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 import pytest
-from sightfix import Client
 
+from sightfix import Client
 from tests.conftest import ServerProcess
 
 README = Path(__file__).resolve().parents[1] / "README.md"

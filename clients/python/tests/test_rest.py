@@ -94,6 +94,7 @@ def test_rejected_rows_are_counted_over_all_requests(client: Client, monkeypatch
         (3, "bounding_box.width_px"),
         (5, "bounding_box.width_px"),
     ]
+    assert client.samples.import_samples("yard", []).accepted == 0
 
 
 def test_samples_are_listed_selected_exported_and_deleted(client: Client, tmp_path: Path) -> None:

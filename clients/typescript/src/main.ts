@@ -164,6 +164,12 @@ async function models(): Promise<void> {
   expect(removed.response.status === 204, "a version that is not active can be deleted");
 }
 
+async function fuse(request: components["schemas"]["FusionRequest"]): Promise<components["schemas"]["FusedFix"][]> {
+  const answer = body(await client.POST("/v1/cameras/{camera}/fusions", { params: { path }, body: request }));
+  if (!("items" in answer)) throw new Error("the answer has no items");
+  return answer.items;
+}
+
 async function positions(): Promise<void> {
   const page = body(await client.GET("/v1/cameras/{camera}/samples", { params: { path, query: { limit: 3 } } }));
   const observations: Observation[] = page.items.map(({ time, target_id, bounding_box }) => ({
@@ -173,11 +179,11 @@ async function positions(): Promise<void> {
   }));
   const [first] = observations;
   expect(first !== undefined, "there are samples");
-  const one = body(await client.POST("/v1/cameras/{camera}/fusions", { params: { path }, body: first as Observation }));
-  expect(one.items[0]?.flags.includes("gnss_denied") === true, "a box alone has the flag gnss_denied");
-  const all = body(await client.POST("/v1/cameras/{camera}/fusions", { params: { path }, body: { observations } }));
-  expect(all.items.length === observations.length, "every observation has a position");
-  expect(all.items.every((it) => it.r95_m > 0), "every position has a radius");
+  const [one] = await fuse(first as Observation);
+  expect(one?.flags.includes("gnss_denied") === true, "a box alone has the flag gnss_denied");
+  const all = await fuse({ observations });
+  expect(all.length === observations.length, "every observation has a position");
+  expect(all.every((it) => it.r95_m > 0), "every position has a radius");
   body(await client.POST("/v1/cameras/{camera}/tracks", { params: { path }, body: { observations } }));
   const tracks = body(await client.GET("/v1/cameras/{camera}/tracks", { params: { path } }));
   const target = tracks.features[0]?.properties.target_id ?? "";

@@ -11,7 +11,8 @@ from sightfix.models import CameraMoved, TrackUpdate
 class LostEvents:
     """Events that were lost because this client read too slowly."""
 
-    count: int
+    count: int | None
+    """How many; None if the server does not know."""
 
 
 CameraEvent = TrackUpdate | CameraMoved | LostEvents
@@ -47,6 +48,6 @@ def camera_event(name: str, value: Any) -> CameraEvent | None:
         case "camera_moved":
             return from_json(CameraMoved, value)
         case "lost":
-            return LostEvents(int(value))
+            return LostEvents(value)
         case _:
             return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterable, Mapping
+from dataclasses import fields, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,7 +17,6 @@ from sightfix.models import (
     Durability,
     Imported,
     PairedSamples,
-    RejectedRow,
     Sample,
     SampleCount,
 )
@@ -229,29 +229,26 @@ class Samples:
         return await self._transport.json(request, Imported)
 
     async def _import_rows(self, camera_id: str, rows: Iterable[Mapping[str, Any]], durability: Durability) -> Imported:
-        imports, first_rows = [], [0]
+        imported: Imported | None = None
+        rows_before = 0
         for chunk in in_chunks(rows, ROWS_PER_REQUEST):
             body = b"\n".join(dump(row) for row in chunk)
-            imports.append(await self._import(camera_id, body, MEDIA_TYPES[".ndjson"], durability))
-            first_rows.append(first_rows[-1] + len(chunk))
-        return sum_of_imports(imports, first_rows, durability)
+            part = await self._import(camera_id, body, MEDIA_TYPES[".ndjson"], durability)
+            imported = part if imported is None else added(imported, part, rows_before)
+            rows_before += len(chunk)
+        # Without rows the server says what no rows become.
+        return imported or await self._import(camera_id, b"", MEDIA_TYPES[".ndjson"], durability)
 
 
-def sum_of_imports(imports: list[Imported], first_rows: list[int], durability: Durability) -> Imported:
-    """One report of an import that took several requests; `first_rows` are the rows before each."""
-    rejected = [
-        RejectedRow(line=first + row.line, field=row.field, reason=row.reason)
-        for first, imported in zip(first_rows, imports, strict=False)
-        for row in imported.rejected_rows
-    ]
-    return Imported(
-        accepted=sum(it.accepted for it in imports),
-        accepted_without_fix=sum(it.accepted_without_fix for it in imports),
-        duplicate=sum(it.duplicate for it in imports),
-        durability=imports[0].durability if imports else durability,
-        rejected=sum(it.rejected for it in imports),
-        rejected_rows=rejected,
-    )
+def added(imported: Imported, part: Imported, rows_before: int) -> Imported:
+    """One report of an import that took several requests; the rows of `part` come after `rows_before` others."""
+    counts = {
+        it.name: getattr(imported, it.name) + getattr(part, it.name)
+        for it in fields(Imported)
+        if isinstance(getattr(part, it.name), int)
+    }
+    rejected = [replace(row, line=rows_before + row.line) for row in part.rejected_rows]
+    return replace(imported, rejected_rows=[*imported.rejected_rows, *rejected], **counts)
 
 
 def media_type(file: Path) -> str:

@@ -7,6 +7,7 @@ mod backup;
 mod config;
 mod doctor;
 mod evaluate;
+mod evaluate_site;
 mod exit_code;
 mod fuse;
 mod gnss_error;
@@ -23,6 +24,8 @@ mod replay;
 mod restore;
 mod serve;
 mod simulate;
+mod simulate_site;
+mod site_recording;
 mod train;
 
 use std::fs::File;

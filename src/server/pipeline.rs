@@ -56,6 +56,12 @@ enum Counted {
     Grpc(RpcCall),
 }
 
+impl Counted {
+    const fn is_grpc(&self) -> bool {
+        matches!(self, Self::Grpc(_))
+    }
+}
+
 /// The way from a connection to the transports.
 pub(super) struct RequestPipeline {
     app: App,
@@ -145,18 +151,12 @@ impl RequestPipeline {
         let peer = &*self.proxies.original(peer, request.headers());
         let is_http_1 = request.version() < Version::HTTP_2;
         let id = self.request_id(&request);
-        let is_grpc = self.audience == Audience::Clients && has_grpc_content(&request);
+        let counted = self.begin_count(&request);
         let span = tracing::debug_span!(
             target: REQUESTS, "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
         #[cfg(feature = "otel")]
         crate::telemetry::continue_trace(&span, request.headers());
-        let counted = if is_grpc {
-            let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
-            Counted::Grpc(self.app.metrics.call(rpc))
-        } else {
-            Counted::Http(MatchedRoute::default())
-        };
         let (mut response, ticket) =
             self.respond(request, &counted, peer, &id).instrument(span.clone()).await;
         let headers = response.headers_mut();
@@ -167,6 +167,16 @@ impl RequestPipeline {
         }
         let call = span.in_scope(|| self.count(counted, &response, peer, began.elapsed()));
         response.map(|body| ObservedBody::new(body, open, call, ticket))
+    }
+
+    /// Which transport a request is for, and how it is counted.
+    fn begin_count(&self, request: &Request<Incoming>) -> Counted {
+        if self.audience == Audience::Clients && has_grpc_content(request) {
+            let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
+            Counted::Grpc(self.app.metrics.call(rpc))
+        } else {
+            Counted::Http(MatchedRoute::default())
+        }
     }
 
     /// Counts and logs an answer. A call of an RPC is counted when it ends.
@@ -225,7 +235,7 @@ impl RequestPipeline {
         peer: &Peer,
         id: &RequestId,
     ) -> (Response<Body>, Option<Ticket>) {
-        let is_grpc = matches!(counted, Counted::Grpc(_));
+        let is_grpc = counted.is_grpc();
         match self.admit(request, counted, peer, id).await {
             Ok((request, granted)) => {
                 (self.route(is_grpc, request, &granted, id).await, Some(granted.ticket))
@@ -249,7 +259,7 @@ impl RequestPipeline {
         id: &RequestId,
     ) -> Result<(Request<Body>, Granted)> {
         let path = request.uri().path();
-        let is_grpc = matches!(counted, Counted::Grpc(_));
+        let is_grpc = counted.is_grpc();
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
         match self.grant(&request, class, is_grpc, peer, id) {
             Ok(granted) => {

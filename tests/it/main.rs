@@ -49,3 +49,4 @@ mod stream;
 mod tls;
 mod usage;
 mod walk;
+mod world_tracks;

@@ -23,6 +23,7 @@ from datetime import datetime
 from typing import Any, Literal, NotRequired, TypedDict
 '''
 
+JSON_BODIES = ("application/json", "application/merge-patch+json")
 SCALARS = {"string": "str", "integer": "int", "number": "float", "boolean": "bool"}
 
 
@@ -48,7 +49,7 @@ def request_only(document: Schema) -> set[str]:
     bodies = set()
     for operation in operations:
         for media_type, content in operation.get("requestBody", {}).get("content", {}).items():
-            if media_type.endswith("json"):
+            if media_type in JSON_BODIES:
                 alternatives = [content["schema"], *content["schema"].get("oneOf", [])]
                 bodies |= {reference(schema) for schema in alternatives if "$ref" in schema}
     schemas = document["components"]["schemas"]

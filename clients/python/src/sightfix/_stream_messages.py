@@ -30,8 +30,6 @@ def to_message(item: LiveItem | Observation | Sample) -> messages.StreamItem:
     message.time.FromJsonString(format_time(item.time))
     if item.target_id is not None:
         message.target_id = item.target_id
-    if isinstance(item, LiveItem) and item.receiver_id is not None:
-        message.receiver_id = item.receiver_id
     if item.bounding_box is not None:
         box = item.bounding_box
         message.bounding_box.CopyFrom(
@@ -42,11 +40,11 @@ def to_message(item: LiveItem | Observation | Sample) -> messages.StreamItem:
         message.fix.CopyFrom(
             values.Fix(longitude_deg=fix.longitude_deg, latitude_deg=fix.latitude_deg, sigma_m=fix.sigma_m)
         )
-    if not isinstance(item, Observation):
-        if item.class_ is not None:
-            setattr(message, "class", item.class_)
-        if item.score is not None:
-            message.score = item.score
+    # Not every kind of item has these.
+    for name, attribute in (("receiver_id", "receiver_id"), ("class", "class_"), ("score", "score")):
+        value = getattr(item, attribute, None)
+        if value is not None:
+            setattr(message, name, value)
     return message
 
 

@@ -35,7 +35,7 @@ async def wait_for_job(
                 on_progress(job)
             if job.state == "succeeded":
                 return job
-            if job.state not in ("queued", "running"):
+            if job.state in ("failed", "cancelled"):
                 raise JobFailedError(job)
             if timeout_s is not None and time.monotonic() - started_s >= timeout_s:
                 raise WaitTimeoutError(f"{job.id} is {job.state} after {timeout_s} s")

@@ -13,6 +13,7 @@ mod served;
 mod streams;
 mod train;
 mod transports;
+mod world;
 
 /// As in the binary itself.
 #[global_allocator]
@@ -28,6 +29,7 @@ fn main() {
         ("streams", streams::run),
         ("import", import::run),
         ("train", train::run),
+        ("world", world::run),
         ("beside", beside::run),
         ("attacks", attacks::run),
     ];

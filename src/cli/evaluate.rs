@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::Args;
 
+use super::evaluate_site::{self, Draws};
 use super::import::{gnss_bias_sigma, image_size};
 use super::output::{print_line, print_note};
 use super::progress::Progress;
@@ -30,10 +31,10 @@ const MAX_SEEDS: u64 = 100;
 #[derive(Args)]
 pub(super) struct Evaluate {
     /// Training rows, as CSV, NDJSON or JSON; boxes without a fix serve the geometry of the camera
-    #[arg(long, value_name = "FILE", required_unless_present = "paper")]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["paper", "site"])]
     train: Option<PathBuf>,
     /// Test rows; boxes and fixes may be empty
-    #[arg(long, value_name = "FILE", required_unless_present = "paper")]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["paper", "site"])]
     test: Option<PathBuf>,
     /// The true position of all rows [default: the columns truth_longitude and truth_latitude]
     #[arg(long, value_name = "LON,LAT", value_parser = point, allow_negative_numbers = true)]
@@ -76,6 +77,17 @@ pub(super) struct Evaluate {
     /// Folder of the real recordings, with the folders square and plaza, for --paper
     #[arg(long, value_name = "DIR", requires = "paper")]
     shared_data: Option<PathBuf>,
+    /// Evaluate the world tracks of a site instead: a folder with detections_<CAMERA>.csv per camera, fixes.csv,
+    /// identity.csv and truth.csv, such as `simulate site` writes
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["train", "test", "paper"])]
+    site: Option<PathBuf>,
+    /// Number of times that the receivers' errors are drawn again about the true positions, for --site [default: the
+    /// recorded fixes]
+    #[arg(long, value_name = "N", requires = "site", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=MAX_SEEDS))]
+    redraws: u64,
+    /// Seed of the first of these, for --site
+    #[arg(long, value_name = "N", requires = "site", default_value_t = 1)]
+    first_redraw: u64,
     /// Write the page to this file, for --paper
     #[arg(long, value_name = "FILE", requires = "paper", default_value = "docs/accuracy.md")]
     out: PathBuf,
@@ -89,6 +101,11 @@ impl Evaluate {
     pub(super) fn run(self) -> anyhow::Result<()> {
         if self.paper {
             return self.write_paper_page();
+        }
+        if let Some(folder) = &self.site {
+            let draws = Draws { count: self.redraws, first_seed: self.first_redraw };
+            let report = evaluate_site::evaluate(folder, self.image_size, &draws)?;
+            return self.json.as_ref().map_or(Ok(()), |path| write(path, &report.to_json()?));
         }
         let (Some(train), Some(test)) = (&self.train, &self.test) else {
             anyhow::bail!("give --train and --test")

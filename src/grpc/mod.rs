@@ -12,6 +12,7 @@ mod cancel_on_shutdown;
 pub mod client;
 mod convert;
 mod fusion;
+mod idempotency;
 mod keys;
 mod mask;
 mod models;

@@ -16,8 +16,5 @@ pub use box_figures::{BoxFigures, BoxRecord};
 pub use degradation::Degradation;
 pub use recording::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording};
 pub use report::{SiteCase, SiteReport};
-pub use runner::{
-    Identities, SiteOutcome, SiteTraining, TrainedSite, run_site, single_box_error_m, site_fit_rows,
-    track_site, train_site,
-};
+pub use runner::{Identities, SiteOutcome, SiteTraining, TrainedSite, site_fit_rows, track_site, train_site};
 pub use world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};

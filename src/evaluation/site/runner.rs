@@ -9,7 +9,7 @@ use super::recording::{LabelledBox, RecordedFix, SiteRecording};
 use super::world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};
 use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation, ReceiverId};
 use crate::fusion::world::{CameraFrame, WorldDetection, WorldTrackSettings, WorldTracker};
-use crate::geo::{EastNorth, PlaneCovariance};
+use crate::geo::PlaneCovariance;
 use crate::model::{SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, fit_site};
 
 /// Correlation of the receivers' errors that the fit assumes.
@@ -52,21 +52,6 @@ pub struct SiteOutcome {
     pub world: WorldFigures,
     /// Errors of the positions.
     pub positions: Option<PositionFigures>,
-}
-
-/// Trains with the known identities of the receivers' carriers and tracks; `cameras` are those whose boxes are
-/// tracked.
-///
-/// # Errors
-/// The maps cannot be trained.
-pub fn run_site(
-    recording: &SiteRecording,
-    training: SiteTraining,
-    identities: Identities,
-    cameras: &[usize],
-) -> Result<SiteOutcome, SiteFitError> {
-    let trained = train_site(recording, training)?;
-    Ok(track_site(recording, recording, &trained, identities, cameras))
 }
 
 /// Trains the maps with the known identities of the receivers' carriers.
@@ -275,15 +260,4 @@ fn reported(tracker: &WorldTracker, time: Timestamp, records: &[BoxRecord]) -> V
             }
         })
         .collect()
-}
-
-/// Mean distance of the boxes' own positions from the truth, without a tracker, m; `None` without any.
-#[must_use]
-pub fn single_box_error_m(recording: &SiteRecording, trained: &TrainedSite, camera: usize) -> Option<f64> {
-    let error_m = |labelled: &LabelledBox| {
-        let truth: &EastNorth = recording.truth.get(&(labelled.time, labelled.target?))?;
-        Some(trained.locate(camera, &labelled.bounding_box).position.distance_m(*truth))
-    };
-    let errors_m: Vec<f64> = recording.cameras[camera].boxes.iter().filter_map(error_m).collect();
-    (!errors_m.is_empty()).then(|| errors_m.iter().sum::<f64>() / errors_m.len() as f64)
 }

@@ -125,8 +125,10 @@ fn a_site_trained_together_keeps_identities_that_cameras_trained_apart_lose() {
     let (mut together, mut apart) = (Vec::new(), Vec::new());
     for seed in 1..=2 {
         let recording = simulated(seed);
-        let run =
-            |training| run_site(&recording, training, Identities::Tracked, &[0, 1, 2]).expect("trained");
+        let run = |training| {
+            let trained = train_site(&recording, training).expect("trained");
+            track_site(&recording, &recording, &trained, Identities::Tracked, &[0, 1, 2])
+        };
         together.push(run(SiteTraining::Together));
         apart.push(run(SiteTraining::Apart));
     }

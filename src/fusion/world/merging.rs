@@ -3,10 +3,10 @@
 
 use std::collections::BTreeMap;
 
+use super::association_cost::difference_m;
 use super::frame::WorldTrackId;
 use super::settings::WorldTrackSettings;
 use super::world_track::{WorldTrack, seconds_from};
-use crate::geo::EastNorth;
 
 /// Squared Mahalanobis distance within which two tracks are at the same place: the 95 % quantile of chi-square
 /// with 2 degrees of freedom.
@@ -75,8 +75,7 @@ fn is_comparable(one: &WorldTrack, other: &WorldTrack) -> bool {
 }
 
 fn are_at_one_place(one: &WorldTrack, other: &WorldTrack) -> bool {
-    let (a, b) = (one.filter.position(), other.filter.position());
-    let difference = EastNorth { east_m: a.east_m - b.east_m, north_m: a.north_m - b.north_m };
+    let difference = difference_m(one.filter.position(), other.filter.position());
     let covariance = one.gating_covariance().plus(other.gating_covariance());
     covariance.mahalanobis_squared(difference) <= SAME_PLACE
 }

@@ -7,6 +7,7 @@
 //! only, for it does not average out. What never happens here: I/O, clocks, randomness, pixels, degrees.
 
 pub mod assignment;
+mod association_cost;
 mod constant_velocity;
 mod frame;
 mod merging;

@@ -3,6 +3,7 @@
 use jiff::Timestamp;
 
 use super::assignment::{Candidate, assign};
+use super::association_cost::{PredictedTrack, difference_m};
 use super::frame::{
     CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };
@@ -11,10 +12,6 @@ use super::settings::WorldTrackSettings;
 use super::world_track::{WorldTrack, seconds_from};
 use crate::domain::ReceiverId;
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
-
-/// Log-likelihood by which the track of a detection's own receiver is preferred to every other: the identity of
-/// a receiver is decided before.
-const RECEIVER_BONUS: f64 = 1_000.0;
 
 /// The tracks of all targets of a site, from the detections of all its cameras and the fixes of its receivers.
 #[derive(Debug, Clone)]
@@ -163,45 +160,15 @@ impl WorldTracker {
         FixOutcome { track: Some(id), events }
     }
 
-    /// The pairs of detection and track within the gates. The cost of a pair is its negative log-likelihood but for
-    /// a constant, `(d^2 + ln |S|) / 2`, less a bonus for the track's own tracker id; that of a detection without a
-    /// track is `-ln` of the density of new targets and false detections (Blackman and Popoli 1999, 6.4).
+    /// The pairs of detection and track within the gates.
     fn candidates(&self, frame: &CameraFrame, detections: &[WorldDetection]) -> Vec<Candidate> {
-        let settings = &self.settings;
         let mut candidates = Vec::new();
-        for (index, track) in self.tracks.iter().enumerate() {
-            let predicted = track.gating_covariance();
-            let at = track.filter.position();
-            for (number, detection) in detections.iter().enumerate() {
-                let same_receiver = match (&track.receiver, &detection.receiver) {
-                    (Some(own), Some(other)) if own != other => continue,
-                    (Some(_), Some(_)) => true,
-                    // Whose fix it is must be decided from more than one box.
-                    _ if track.is_measured_by_receiver() => continue,
-                    _ => false,
-                };
-                let s = predicted.plus(detection.covariance_m2);
-                let position = track.moved_to_state_time(detection.position, frame.time);
-                let difference = difference(position, at);
-                // d^2 is at least the squared distance divided by the trace of S.
-                let least =
-                    (difference.east_m.powi(2) + difference.north_m.powi(2)) / (s.east_m2 + s.north_m2);
-                if least > settings.own_id_gate && !same_receiver {
-                    continue;
+        for (column, track) in self.tracks.iter().enumerate() {
+            let predicted = PredictedTrack::new(track, frame, &self.settings);
+            for (row, detection) in detections.iter().enumerate() {
+                if let Some(cost) = predicted.cost(detection, &self.settings) {
+                    candidates.push(Candidate { row, column, cost });
                 }
-                let is_own_id = detection
-                    .tracker_id
-                    .as_ref()
-                    .is_some_and(|tracker_id| track.has_tracker_id(&frame.camera, tracker_id));
-                let distance = s.mahalanobis_squared(difference);
-                let gate = if is_own_id { settings.own_id_gate } else { settings.gate };
-                if distance > gate && !same_receiver {
-                    continue;
-                }
-                let bonus = if is_own_id { settings.own_id_bonus } else { 0.0 }
-                    + if same_receiver { RECEIVER_BONUS } else { 0.0 };
-                let cost = 0.5 * (distance.min(RECEIVER_BONUS) + s.determinant().ln()) - bonus;
-                candidates.push(Candidate { row: number, column: index, cost });
             }
         }
         candidates
@@ -218,7 +185,7 @@ impl WorldTracker {
     ) {
         let track = &mut self.tracks[index];
         let s = track.gating_covariance().plus(detection.covariance_m2);
-        let difference = difference(detection.position, track.filter.position());
+        let difference = difference_m(detection.position, track.filter.position());
         if s.mahalanobis_squared(difference) > self.settings.own_id_gate {
             track.filter.inflate_position(PlaneCovariance::outer(difference.east_m, difference.north_m));
         }
@@ -319,8 +286,4 @@ impl WorldTracker {
         self.next_id += 1;
         id
     }
-}
-
-fn difference(one: EastNorth, other: EastNorth) -> EastNorth {
-    EastNorth { east_m: one.east_m - other.east_m, north_m: one.north_m - other.north_m }
 }

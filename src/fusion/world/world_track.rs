@@ -292,11 +292,6 @@ impl WorldTrack {
         seconds_from(self.last_seen, now) > allowed_s
     }
 
-    /// Whether a camera's tracker last gave the target that id.
-    pub(super) fn has_tracker_id(&self, camera: &CameraId, tracker_id: &TargetId) -> bool {
-        self.sightings.iter().any(|it| it.camera == *camera && it.tracker_id.as_ref() == Some(tracker_id))
-    }
-
     /// Takes over what another track of the same target knows.
     pub(super) fn absorb(&mut self, other: Self) {
         if other.last_seen > self.last_seen {

@@ -148,6 +148,8 @@ def annotation(schema: Schema) -> str:
         return " | ".join(sorted(members, key=lambda member: member == "None"))
     if "enum" in schema:
         return f"Literal[{', '.join(map(repr, schema['enum']))}]"
+    if "type" not in schema and "properties" not in schema:
+        return "Any"
     kinds = schema.get("type", "object")
     if isinstance(kinds, list):
         members = [annotation(schema | {"type": kind}) for kind in kinds]

@@ -222,6 +222,28 @@ def test_tracks_are_followed_and_watched(trained: ServerProcess) -> None:
         assert len(client.tracks.history("square", "walker")) >= 1
 
 
+def test_a_site_tracks_targets_over_its_cameras(trained: ServerProcess) -> None:
+    fix = Fix(longitude_deg=24.745, latitude_deg=59.437)
+    with Client(trained.url) as client:
+        site = client.sites.create(id="harbour", labels={"owner": "port"})
+        changed = client.sites.update("harbour", revision=site.revision, display_name="Harbour", labels={"owner": None})
+        assert (changed.display_name, changed.labels) == ("Harbour", {})
+        with pytest.raises(RevisionMismatchError):
+            client.sites.update("harbour", revision=site.revision, display_name="again")
+        client.cameras.update("square", site="harbour")
+        assert [it.cameras for it in client.sites.list()] == [1]
+        tracks = client.sites.tracks("harbour")
+        while not tracks:
+            now = datetime.now(UTC)
+            client.tracks.follow("square", [Observation(time=now, target_id="visitor", fix=fix)])
+            tracks = client.sites.tracks("harbour")
+        assert client.sites.history("harbour", tracks[0].id)
+        client.cameras.update("square", site=None)
+        client.sites.delete("harbour")
+        with pytest.raises(NotFoundError):
+            client.sites.get("harbour")
+
+
 def test_keys_have_roles_and_can_be_revoked(tmp_path: Path) -> None:
     secret = admin_key()
     server = ServerProcess(tmp_path, environment={"SIGHTFIX_ADMIN_KEY": secret})

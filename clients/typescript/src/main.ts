@@ -192,6 +192,38 @@ async function positions(): Promise<void> {
   await events.data?.cancel();
 }
 
+async function sites(): Promise<void> {
+  const site = "harbour";
+  const created = await client.POST("/v1/sites", { body: { id: site } });
+  expect(body(created).revision === 1, "a new site has revision 1");
+  const changed = await client.PATCH("/v1/sites/{site}", {
+    params: { path: { site }, header: { "if-match": created.response.headers.get("etag") ?? "" } },
+    body: { display_name: "Harbour" },
+  });
+  expect(body(changed).display_name === "Harbour", "the name is stored");
+  body(await client.GET("/v1/sites"));
+  body(await client.GET("/v1/sites/{site}", { params: { path: { site } } }));
+  body(
+    await client.PATCH("/v1/cameras/{camera}", { params: { path, header: { "if-match": "*" } }, body: { site } }),
+  );
+  body(await client.GET("/v1/sites/{site}/tracks", { params: { path: { site } } }));
+  const events = await client.GET("/v1/sites/{site}/events", { params: { path: { site } }, parseAs: "stream" });
+  await events.response.body?.cancel();
+  const unknown = { site, track: "00000000-0000-7000-8000-000000000000" };
+  const missing = await client.GET("/v1/sites/{site}/tracks/{track}", { params: { path: unknown } });
+  expect(missing.response.status === 404, "an unknown track is not found");
+  const used = await client.DELETE("/v1/sites/{site}", { params: { path: { site } } });
+  expect(used.response.status === 409, "a site with cameras cannot be deleted");
+  body(
+    await client.PATCH("/v1/cameras/{camera}", {
+      params: { path, header: { "if-match": "*" } },
+      body: { site: null },
+    }),
+  );
+  const deleted = await client.DELETE("/v1/sites/{site}", { params: { path: { site } } });
+  expect(deleted.response.ok, "the site is deleted");
+}
+
 async function evaluations(): Promise<void> {
   const started = body(
     await client.POST("/v1/evaluations", { body: { camera_id: camera, seeds: 1, methods: ["gnss"] } }),
@@ -230,7 +262,7 @@ async function keys(): Promise<void> {
   await client.DELETE("/v1/keys/{key}", { params: { path: key }, headers });
 }
 
-for (const part of [cameras, samples, models, positions, evaluations, service, keys]) await part();
+for (const part of [cameras, samples, models, positions, sites, evaluations, service, keys]) await part();
 
 const operations = description.operations();
 const unused = operations.filter((operation) => !description.seen.has(operation));

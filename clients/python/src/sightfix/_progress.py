@@ -16,7 +16,7 @@ class ProgressBar:
                 from tqdm.auto import tqdm  # noqa: PLC0415, an optional dependency
             except ImportError as error:
                 raise ImportError("a progress bar needs `pip install sightfix[progress]`") from error
-            self._bar = tqdm(leave=True)
+            self._bar = tqdm(total=1, bar_format="{desc} {percentage:3.0f} % |{bar:30}| {elapsed}")
 
     def __enter__(self) -> "ProgressBar":
         return self
@@ -32,7 +32,7 @@ class ProgressBar:
         if self._bar is None:
             return
         self._bar.n, self._bar.total = steps(job)
-        self._bar.set_description(f"{job.state}: {job.progress.phase}", refresh=False)
+        self._bar.set_description_str(" ".join([job.state, job.progress.phase]).rstrip(), refresh=False)
         self._bar.refresh()
 
 
@@ -42,4 +42,6 @@ def steps(job: TrainingRun | Evaluation) -> tuple[int, int]:
         done, total = job.progress.epoch, job.progress.epochs
     else:
         done, total = job.progress.steps_done, job.progress.steps
+    # How many there are is unknown before the first one.
+    total = max(total, 1)
     return (total, total) if job.state == "succeeded" else (min(done, total), total)

@@ -211,7 +211,7 @@ test.describe('the phone page', () => {
     expect(rowsOf(readFileSync(await (await downloading).path(), 'utf8'))).toHaveLength(2);
   });
 
-  test('its positions become samples with the boxes that the camera sends', async ({ console: page, server }) => {
+  test('its positions become samples with the boxes that the camera sends', async ({ console: page, server, context }) => {
     await server.request('POST', '/v1/cameras', { id: 'gate', receivers: [{ receiver_id: 'phone-7', target_id: 'walker' }] });
     await page.goto(`${server.url}/walk#camera=gate&receiver=phone-7`);
     let left_px = 100;
@@ -222,10 +222,13 @@ test.describe('the phone page', () => {
       sending.push(server.request('POST', '/v1/cameras/gate/tracks?store_samples=true', box));
     }, 200);
     await page.getByRole('button', { name: 'Start recording' }).click();
+    await expect(page.locator('dl div', { hasText: 'Latest position' }).locator('dd')).not.toHaveText('–');
+    // The browser's first position is from before the camera sent anything.
+    await context.setGeolocation({ longitude: 11.0001, latitude: 48.0001, accuracy: 5 });
     await expect(page.locator('dl div', { hasText: 'In samples' }).locator('dd')).toHaveText('1');
     clearInterval(camera);
     await Promise.all(sending);
     const samples = await server.request<{ items: { target_id: string; fix: { longitude_deg: number } }[] }>('GET', '/v1/cameras/gate/samples');
-    expect(samples.items.map(({ target_id, fix }) => [target_id, fix.longitude_deg])).toEqual([['walker', 11]]);
+    expect(samples.items.map(({ target_id, fix }) => [target_id, fix.longitude_deg])).toEqual([['walker', 11.0001]]);
   });
 });

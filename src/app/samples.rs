@@ -261,7 +261,7 @@ impl<'a> Import<'a> {
         let ImportReport { accepted, duplicate, rejected, .. } = self.report;
         self.app.metrics.imported(accepted, duplicate, rejected);
         stored?;
-        end.map_err(|error| told_what_is_stored(error, &self.report))?;
+        end.map_err(|error| with_stored_rows(error, &self.report))?;
         // The answer that was stored: that of another request with the same key, if it came first.
         Ok(self.app.repeated_import(&self.options).await?.unwrap_or(self.report))
     }
@@ -285,7 +285,7 @@ impl<'a> Import<'a> {
         let ImportOptions { durability, on_conflict, .. } = self.options;
         let options = InsertOptions { durability, on_conflict, completion, now: self.app.clock.now() };
         let inserted = self.app.store.insert_samples(self.id, samples, options).await;
-        let inserted = inserted.map_err(|error| told_what_is_stored(error, &self.report))?;
+        let inserted = inserted.map_err(|error| with_stored_rows(error, &self.report))?;
         self.report = std::mem::take(&mut self.report).and(&inserted);
         Ok(())
     }
@@ -341,7 +341,7 @@ fn read_batches(
     Ok(())
 }
 
-pub(super) fn told_what_is_stored(error: Error, report: &ImportReport) -> Error {
+fn with_stored_rows(error: Error, report: &ImportReport) -> Error {
     match error {
         Error::Refused(mut refusal) if report.accepted + report.duplicate > 0 => {
             refusal.message = format!(

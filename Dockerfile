@@ -1,21 +1,24 @@
 # syntax=docker/dockerfile:1
-FROM rust:1.95-slim-bookworm AS build
+FROM rust:1.95.0-slim-bookworm AS build
 RUN apt-get update && apt-get install -y --no-install-recommends gcc g++ libc6-dev make \
     && rm -rf /var/lib/apt/lists/*
 WORKDIR /build
 COPY . .
 RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/build/target \
-    cargo build --release --locked && cp target/release/sightfix /usr/local/bin/sightfix
+    cargo build --release --locked \
+    && objcopy --strip-debug target/release/sightfix /usr/local/bin/sightfix && mkdir /data
 
-FROM debian:bookworm-slim
-RUN useradd --system --uid 10001 --home-dir /data --create-home sightfix
+# The C library, certificates and nothing else: no shell, no package manager.
+FROM gcr.io/distroless/cc-debian12
 COPY --from=build /usr/local/bin/sightfix /usr/local/bin/sightfix
+COPY --from=build --chown=10001:10001 --chmod=700 /data /data
 USER 10001
+WORKDIR /data
 VOLUME /data
 ENV SIGHTFIX_DATA=/data SIGHTFIX_LISTEN=0.0.0.0:8080
 # Reachable by others: give it a key (SIGHTFIX_ADMIN_KEY or --admin-key-file), or start it with --insecure.
 EXPOSE 8080
-HEALTHCHECK --interval=10s --timeout=3s --start-period=10s CMD ["sightfix", "health"]
+HEALTHCHECK --interval=10s --timeout=3s --start-period=10s CMD ["/usr/local/bin/sightfix", "health"]
 STOPSIGNAL SIGTERM
-ENTRYPOINT ["sightfix"]
+ENTRYPOINT ["/usr/local/bin/sightfix"]
 CMD ["serve"]

@@ -8,7 +8,7 @@ use std::{env, fs};
 use protox::prost::Message as _;
 
 const FOLDER: &str = "proto";
-const FILES: [&str; 8] = [
+const FILES: [&str; 9] = [
     "sightfix/v1/values.proto",
     "sightfix/v1/camera_service.proto",
     "sightfix/v1/sample_service.proto",
@@ -17,6 +17,7 @@ const FILES: [&str; 8] = [
     "sightfix/v1/fusion_service.proto",
     "sightfix/v1/key_service.proto",
     "sightfix/v1/audit_service.proto",
+    "sightfix/v1/site_service.proto",
 ];
 
 /// What `npm run build` in `console/` writes.

@@ -1,37 +1,48 @@
-//! Admission control: how much of each bounded resource all clients together, and one client
-//! address, may hold at a time.
+//! Admission control: how much of each bounded resource all clients together, and one client, may hold at
+//! a time, and how many requests per second one client may send.
 //!
 //! What never happens here: waiting. A request beyond a quota is refused at once and may be tried again.
+
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Duration;
+
+use tokio::time::Instant;
 
 use crate::config::Limits;
-use crate::domain::{Error, ErrorKind, Refusal, Result};
+use crate::domain::{Error, ErrorKind, KeyId, Refusal, Result};
 
 /// What a request costs while it is open, besides its body: connection buffers and its task. Charged
 /// to [`Quotas::request_memory`].
 const REQUEST_OVERHEAD_BYTES: u64 = 16 << 10;
 
-/// A client as limits count it: an IPv4 address, or the first 64 bits of an IPv6 address, of which one
-/// host commonly has all the rest.
+/// A client as limits count it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct ClientAddress(IpAddr);
-
-impl ClientAddress {
-    /// Stands for requests that came over no connection.
-    pub const UNKNOWN: Self = Self(IpAddr::V4(Ipv4Addr::UNSPECIFIED));
+pub enum ClientId {
+    /// The holder of a key, from whatever address.
+    Key(KeyId),
+    /// Without a key, an IPv4 address, or the first 64 bits of an IPv6 address, of which one host commonly
+    /// has all the rest.
+    Address(IpAddr),
 }
 
-impl From<IpAddr> for ClientAddress {
+impl ClientId {
+    /// Stands for requests that came over no connection.
+    pub const UNKNOWN: Self = Self::Address(IpAddr::V4(Ipv4Addr::UNSPECIFIED));
+}
+
+impl From<IpAddr> for ClientId {
     fn from(address: IpAddr) -> Self {
         match address.to_canonical() {
             IpAddr::V6(address) => {
                 let prefix = address.to_bits() & !u128::from(u64::MAX);
-                Self(IpAddr::V6(Ipv6Addr::from_bits(prefix)))
+                Self::Address(IpAddr::V6(Ipv6Addr::from_bits(prefix)))
             }
-            address @ IpAddr::V4(_) => Self(address),
+            address @ IpAddr::V4(_) => Self::Address(address),
         }
     }
 }
@@ -85,7 +96,7 @@ struct QuotaState {
 #[derive(Default)]
 struct Held {
     total: u64,
-    by_client: HashMap<ClientAddress, u64>,
+    by_client: HashMap<ClientId, u64>,
 }
 
 impl Quota {
@@ -101,10 +112,14 @@ impl Quota {
     ///
     /// # Errors
     /// `Overloaded`, naming the limit that is reached.
-    pub fn try_acquire(&self, client: ClientAddress, amount: u64) -> Result<Lease> {
+    pub fn try_acquire(&self, client: ClientId, amount: u64) -> Result<Lease> {
         let mut lease = Lease { quota: self.clone(), client, amount: 0 };
         lease.try_grow(amount)?;
         Ok(lease)
+    }
+
+    fn usage(&self) -> QuotaUsage {
+        QuotaUsage { held: self.lock().total, limit: self.0.total }
     }
 
     fn lock(&self) -> MutexGuard<'_, Held> {
@@ -120,10 +135,19 @@ impl Quota {
     }
 }
 
+/// How much of a [`Quota`] all clients hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct QuotaUsage {
+    /// Held now.
+    pub held: u64,
+    /// At most.
+    pub limit: u64,
+}
+
 /// What one holder has of a [`Quota`].
 pub struct Lease {
     quota: Quota,
-    client: ClientAddress,
+    client: ClientId,
     amount: u64,
 }
 
@@ -143,7 +167,7 @@ impl Lease {
             if *of_client == 0 {
                 held.by_client.remove(&self.client);
             }
-            return Err(self.quota.exceeded(per_client, "this client address"));
+            return Err(self.quota.exceeded(per_client, "this client"));
         }
         *of_client += amount;
         held.total += amount;
@@ -174,8 +198,77 @@ impl Drop for Lease {
     }
 }
 
+/// A rate as a bucket that holds one second's worth of tokens and is refilled continuously.
+#[derive(Debug, Clone, Copy)]
+pub struct TokenBucket {
+    tokens: f64,
+    refilled_at: Instant,
+}
+
+impl TokenBucket {
+    /// A full bucket.
+    #[must_use]
+    pub const fn full(per_s: f64, now: Instant) -> Self {
+        Self { tokens: per_s, refilled_at: now }
+    }
+
+    /// Takes tokens; false, and none taken, if there are too few.
+    pub fn take(&mut self, count: f64, per_s: f64, now: Instant) -> bool {
+        let refill = now.saturating_duration_since(self.refilled_at).as_secs_f64() * per_s;
+        self.tokens = (self.tokens + refill).min(per_s);
+        self.refilled_at = now;
+        let is_enough = self.tokens >= count;
+        if is_enough {
+            self.tokens -= count;
+        }
+        is_enough
+    }
+}
+
+/// Requests per second of each client. Unlike a [`Quota`] it does not depend on how long they take.
+pub struct RateLimit {
+    per_s: u32,
+    buckets: Mutex<HashMap<ClientId, TokenBucket>>,
+}
+
+/// Buckets beyond which those that are full again are dropped before one is added.
+const MOST_BUCKETS: usize = 4_096;
+/// Time in which an empty bucket is full again.
+const REFILL_TIME: Duration = Duration::from_secs(1);
+
+impl RateLimit {
+    /// A limit of so many; 0 is no limit.
+    #[must_use]
+    pub fn new(per_s: u32) -> Self {
+        Self { per_s, buckets: Mutex::default() }
+    }
+
+    /// Counts a request.
+    ///
+    /// # Errors
+    /// `RateLimited`.
+    pub fn count(&self, client: ClientId, now: Instant) -> Result<()> {
+        if self.per_s == 0 {
+            return Ok(());
+        }
+        let per_s = f64::from(self.per_s);
+        let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
+        if buckets.len() >= MOST_BUCKETS && !buckets.contains_key(&client) {
+            buckets.retain(|_, bucket| now.saturating_duration_since(bucket.refilled_at) < REFILL_TIME);
+        }
+        let bucket = buckets.entry(client).or_insert_with(|| TokenBucket::full(per_s, now));
+        if bucket.take(1.0, per_s, now) {
+            return Ok(());
+        }
+        let message = format!("one client may send {} requests per second; send fewer", self.per_s);
+        Err(Error::refused(ErrorKind::RateLimited, message))
+    }
+}
+
 /// The quotas of a server.
 pub struct Quotas {
+    /// Requests per second of one client.
+    pub request_rate: RateLimit,
     /// Requests that are worked on, but for the reserved places.
     requests: Quota,
     /// Places that only fusions take.
@@ -199,6 +292,7 @@ impl Quotas {
     pub fn new(limits: &Limits) -> Self {
         let quota = |what, total| Quota::new(what, total, limits.client_share);
         Self {
+            request_rate: RateLimit::new(limits.requests_per_s),
             requests: quota("requests at work", limits.requests.saturating_sub(limits.reserved_requests)),
             reserved_requests: quota("requests at work", limits.reserved_requests),
             import_streams: quota("import streams", limits.import_streams),
@@ -210,11 +304,41 @@ impl Quotas {
         }
     }
 
+    /// How many there are.
+    pub const COUNT: usize = 8;
+    /// Their names in the metrics, in the order of [`Quotas::usages`].
+    pub const NAMES: [&str; Self::COUNT] = [
+        "requests",
+        "reserved_requests",
+        "import_streams",
+        "request_memory_bytes",
+        "import_memory_bytes",
+        "import_disk_bytes",
+        "live_streams",
+        "event_streams",
+    ];
+
+    /// How much of each is held.
+    #[must_use]
+    pub fn usages(&self) -> [QuotaUsage; Self::COUNT] {
+        [
+            &self.requests,
+            &self.reserved_requests,
+            &self.import_streams,
+            &self.request_memory,
+            &self.import_memory,
+            &self.import_disk,
+            &self.live_streams,
+            &self.event_streams,
+        ]
+        .map(Quota::usage)
+    }
+
     /// Memory for a request that begins; grows with its body.
     ///
     /// # Errors
     /// `Overloaded`.
-    pub fn open_request(&self, client: ClientAddress) -> Result<Lease> {
+    pub fn open_request(&self, client: ClientId) -> Result<Lease> {
         self.request_memory.try_acquire(client, REQUEST_OVERHEAD_BYTES)
     }
 
@@ -222,7 +346,7 @@ impl Quotas {
     ///
     /// # Errors
     /// `Overloaded`.
-    pub fn begin_work(&self, class: RequestClass, client: ClientAddress) -> Result<Option<Lease>> {
+    pub fn begin_work(&self, class: RequestClass, client: ClientId) -> Result<Option<Lease>> {
         match class {
             RequestClass::Probe | RequestClass::LiveStream => Ok(None),
             RequestClass::ImportStream => self.import_streams.try_acquire(client, 1).map(Some),
@@ -239,7 +363,7 @@ impl Quotas {
 mod tests {
     use super::*;
 
-    fn client(last: u8) -> ClientAddress {
+    fn client(last: u8) -> ClientId {
         IpAddr::from([127, 0, 0, last]).into()
     }
 
@@ -249,7 +373,7 @@ mod tests {
         let first = quota.try_acquire(client(1), 2).expect("half is free");
         let refused = quota.try_acquire(client(1), 1).err().expect("the client's share is used up");
         assert_eq!(refused.kind(), ErrorKind::Overloaded);
-        assert!(refused.to_string().contains("this client address"), "{refused}");
+        assert!(refused.to_string().contains("this client"), "{refused}");
         let mut second = quota.try_acquire(client(2), 1).expect("another client");
         second.try_grow(1).expect("up to its share");
         assert!(quota.try_acquire(client(3), 1).is_err(), "all is used up");
@@ -281,8 +405,34 @@ mod tests {
     }
 
     #[test]
+    fn a_client_has_one_seconds_worth_of_requests() {
+        let limit = RateLimit::new(3);
+        let begin = Instant::now();
+        let allowed = |client, now| (0..10).filter(|_| limit.count(client, now).is_ok()).count();
+        assert_eq!(allowed(client(1), begin), 3);
+        assert_eq!(allowed(client(2), begin), 3, "another client has its own");
+        assert_eq!(allowed(client(1), begin + Duration::from_millis(340)), 1);
+        assert_eq!(allowed(client(1), begin + 100 * REFILL_TIME), 3, "a pause saves up no more");
+        let refused = limit.count(client(1), begin + 100 * REFILL_TIME).expect_err("the bucket is empty");
+        assert_eq!(refused.kind(), ErrorKind::RateLimited);
+        let unlimited = RateLimit::new(0);
+        assert!((0..1_000).all(|_| unlimited.count(client(1), begin).is_ok()));
+    }
+
+    #[test]
+    fn buckets_of_clients_that_are_gone_are_dropped() {
+        let limit = RateLimit::new(1);
+        let begin = Instant::now();
+        for address in 0..3 * MOST_BUCKETS as u32 {
+            let client = ClientId::from(IpAddr::from(address.to_be_bytes()));
+            limit.count(client, begin + Duration::from_millis(address.into())).expect("its first");
+        }
+        assert!(limit.buckets.lock().expect("no panic").len() <= MOST_BUCKETS);
+    }
+
+    #[test]
     fn one_host_is_one_client() {
-        let of = |text: &str| ClientAddress::from(text.parse::<IpAddr>().expect("an address"));
+        let of = |text: &str| ClientId::from(text.parse::<IpAddr>().expect("an address"));
         assert_eq!(of("::ffff:192.0.2.1"), of("192.0.2.1"));
         assert_eq!(of("2001:db8::1"), of("2001:db8::2:3:4:5"));
         assert_ne!(of("2001:db8::1"), of("2001:db8:0:1::1"));

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
-use crate::domain::{CameraId, Role, Scope};
+use crate::domain::{CameraId, Role, SampleOverflow, Scope};
 
 /// Everything that can be set.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -17,9 +17,16 @@ pub struct Config {
     pub data: PathBuf,
     /// Address of the one port for REST and gRPC.
     pub listen: SocketAddr,
+    /// Address of a second port, for probes and metrics alone, without keys and without TLS; none if left out.
+    pub metrics_listen: Option<SocketAddr>,
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
     pub allowed_hosts: Vec<String>,
+    /// Origins of other servers' pages that may use the REST interface from a browser, with a key, such as
+    /// `https://maps.example.org`; none by default.
+    pub cors_origins: Vec<String>,
+    /// Addresses or networks (`10.0.0.0/8`) of proxies in front, whose `X-Forwarded-For` names the client.
+    pub trusted_proxies: Vec<String>,
     /// Serve everybody on an address that other machines reach, while no key exists.
     pub insecure: bool,
     /// Secret of an administrator's key (`sightfix keys generate`), for the first start of a container.
@@ -34,6 +41,9 @@ pub struct Config {
     pub log_format: LogFormat,
     /// What is logged, as `tracing`'s env filter reads it.
     pub log_filter: String,
+    /// Collector of OpenTelemetry traces (OTLP over gRPC), such as `http://localhost:4317`; needs the cargo feature
+    /// `otel`.
+    pub trace_endpoint: Option<String>,
     /// Workers of training runs.
     pub training: Workers,
     /// Workers of evaluations.
@@ -203,8 +213,10 @@ pub struct Limits {
     pub requests: usize,
     /// How many of `requests` are reserved for fusions.
     pub reserved_requests: usize,
-    /// Share of each limit on connections, requests, streams and bytes that one client address may
-    /// hold, above 0 and up to 1.
+    /// Requests per second of one client, which is a key, or an address without one; 0 is no limit.
+    pub requests_per_s: u32,
+    /// Share of each limit on requests, streams and bytes that one client (a key, or an address without
+    /// one) may hold, and of the limit on connections that one address may hold; above 0 and up to 1.
     pub client_share: f64,
     /// Event streams open at a time.
     pub event_streams: usize,
@@ -245,8 +257,24 @@ pub struct Limits {
     pub truth_line_positions: usize,
     /// Cameras; more are refused.
     pub cameras: u32,
-    /// Samples of one camera; more are refused.
+    /// Sites; more are refused.
+    pub sites: u32,
+    /// Boxes and fixes of one site that wait for its tracker; beyond, they are dropped.
+    pub site_queue: usize,
+    /// Frames of one site that wait for earlier ones of other cameras; beyond, the oldest is tracked.
+    pub site_frames: usize,
+    /// Boxes of one frame; beyond, they are dropped.
+    pub boxes_per_frame: usize,
+    /// Milliseconds that a frame waits for the rest of its boxes, and for earlier frames of other cameras.
+    pub site_wait_ms: u64,
+    /// World tracks of one site.
+    pub tracks_per_site: usize,
+    /// Events of one site that a reader may continue behind; a slower one loses the oldest.
+    pub site_events: usize,
+    /// Samples of one camera.
     pub samples_per_camera: u64,
+    /// What happens beyond `samples_per_camera`: `refuse`, or `delete_oldest`.
+    pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
     pub samples: u64,
     /// Model versions of one camera; beyond, the oldest that is not active is deleted.
@@ -259,6 +287,10 @@ pub struct Limits {
     pub keys: u32,
     /// Entries of the audit log; beyond, the oldest is deleted.
     pub audit_entries: u32,
+    /// Answers that are stored under idempotency keys; beyond, the oldest is deleted.
+    pub idempotency_keys: u32,
+    /// Seconds for which an answer is repeated under its idempotency key.
+    pub idempotency_key_s: u32,
     /// Bytes of the database, beyond which nothing is stored; 0 is no limit but the disk's.
     pub database_bytes: u64,
     /// Bytes on the disk that are reserved for deletions when it is full; 0 reserves none.
@@ -276,11 +308,13 @@ impl Console {
     }
 }
 
-/// Scheme and host of a URL, which end up in a header; empty for a path of this server.
+/// The origin of tiles; empty for a path of this server.
 fn tile_origin(url: &str) -> Option<&str> {
-    if url.starts_with('/') && !url.starts_with("//") {
-        return Some("");
-    }
+    if url.starts_with('/') && !url.starts_with("//") { Some("") } else { url_origin(url) }
+}
+
+/// Scheme and host of a URL, which end up in a header.
+fn url_origin(url: &str) -> Option<&str> {
     let host_at = url.find("://")? + 3;
     let host = url[host_at..].split('/').next()?;
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b".-:[]".contains(&byte);
@@ -294,7 +328,10 @@ impl Default for Config {
         Self {
             data: PathBuf::from("data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            metrics_listen: None,
             allowed_hosts: Vec::new(),
+            cors_origins: Vec::new(),
+            trusted_proxies: Vec::new(),
             insecure: false,
             admin_key: None,
             admin_key_file: None,
@@ -302,6 +339,7 @@ impl Default for Config {
             api_key: None,
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
+            trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
             console: Console::default(),
@@ -345,6 +383,7 @@ impl Default for Limits {
             streams_per_connection: 256,
             requests: 1_024,
             reserved_requests: 256,
+            requests_per_s: 0,
             client_share: 0.5,
             event_streams: 256,
             tracks_per_camera: 256,
@@ -365,13 +404,23 @@ impl Default for Limits {
             rows_per_evaluation: 100_000,
             truth_line_positions: 1_000,
             cameras: 10_000,
+            sites: 1_000,
+            site_queue: 16_384,
+            site_frames: 1_024,
+            boxes_per_frame: 256,
+            site_wait_ms: 300,
+            tracks_per_site: 1_024,
+            site_events: 4_096,
             samples_per_camera: 10_000_000,
+            sample_overflow: SampleOverflow::Refuse,
             samples: 100_000_000,
             models_per_camera: 100,
             ended_runs_per_camera: 100,
             ended_evaluations: 1_000,
             keys: 1_000,
             audit_entries: 100_000,
+            idempotency_keys: 100_000,
+            idempotency_key_s: 86_400,
             database_bytes: 0,
             reserve_bytes: 32 << 20,
             drain_s: 8,
@@ -442,6 +491,8 @@ impl Config {
             .separator("__")
             .list_separator(",")
             .with_list_parse_key("allowed_hosts")
+            .with_list_parse_key("cors_origins")
+            .with_list_parse_key("trusted_proxies")
             .with_list_parse_key("tls.client_camera_ids")
             .try_parsing(true);
         let mut loaded: Self = config::Config::builder()
@@ -490,6 +541,12 @@ impl Config {
         );
         self.tls.certificate_and_key()?;
         self.tls.client_scope()?;
+        for origin in &self.cors_origins {
+            anyhow::ensure!(
+                url_origin(origin) == Some(origin.as_str()),
+                "cors_origins must be origins like https://maps.example.org, without a path; `{origin}` is none"
+            );
+        }
         anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
         if let Some(url) = &self.console.tile_url {
             anyhow::ensure!(
@@ -518,6 +575,15 @@ impl Config {
         for (name, workers) in [("training", &self.training), ("evaluation", &self.evaluation)] {
             anyhow::ensure!(workers.workers >= 1, "{name}.workers must be at least 1");
             anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
+        }
+        for (name, limit) in [
+            ("site_queue", limits.site_queue),
+            ("site_frames", limits.site_frames),
+            ("boxes_per_frame", limits.boxes_per_frame),
+            ("tracks_per_site", limits.tracks_per_site),
+            ("site_events", limits.site_events),
+        ] {
+            anyhow::ensure!(limit >= 1, "limits.{name} must be at least 1");
         }
         anyhow::ensure!(self.limits.page_items >= 1, "limits.page_items must be at least 1");
         // One active version and the one that a training run adds.

@@ -1,11 +1,15 @@
 //! sightfix estimates the positions of targets from the bounding boxes of an uncalibrated fixed camera
 //! and from GNSS fixes. `docs/architecture.md` describes the structure of this crate.
 
+// They panic where the output is closed or its device is full.
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod admission;
 pub mod app;
 pub mod cli;
 pub mod clock;
 pub mod config;
+pub mod doctor;
 pub mod domain;
 pub mod evaluation;
 pub mod exchange;

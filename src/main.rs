@@ -1,5 +1,6 @@
 //! The binary: parse, run, exit code.
 
+use std::io::Write as _;
 use std::process::ExitCode;
 
 /// Small, short-lived allocations are most of what a request does.
@@ -10,8 +11,9 @@ fn main() -> ExitCode {
     match sightfix::cli::Cli::from_arguments().run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::FAILURE
+            // Unlike `eprintln!`, no panic where standard error is closed or full.
+            let _ = writeln!(std::io::stderr(), "error: {error:#}");
+            sightfix::cli::exit_code(&error)
         }
     }
 }

@@ -3,13 +3,18 @@
 //! A request enters here once, whatever its transport: it gets its id, its span, its place among
 //! the requests at work and its deadline, then goes to `http` or `grpc` by its content type.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod activity;
 mod connection;
+mod cors;
 mod credentials;
 mod frame_limit;
 mod guarded_stream;
 mod host_check;
 mod pipeline;
+mod proxies;
 mod request_body;
 mod revocable_body;
 mod tls;
@@ -24,14 +29,15 @@ use tokio::net::TcpListener;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
-use crate::domain::KeySecret;
+use crate::domain::{Error, KeySecret};
 use crate::shutdown::Shutdown;
-use crate::store::{Store, StoreOptions};
+use crate::store::{Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
 use crate::worker;
 
 use host_check::HostCheck;
 use pipeline::RequestPipeline;
+use proxies::TrustedProxies;
 use tls::Tls;
 
 /// How often metrics are gathered, and the registry looks for what another process on the same file
@@ -43,7 +49,10 @@ pub struct Server {
     config: Config,
     app: App,
     listener: TcpListener,
+    /// For probes and metrics alone.
+    monitoring: Option<TcpListener>,
     tls: Option<Arc<Tls>>,
+    proxies: TrustedProxies,
     shutdown: Shutdown,
 }
 
@@ -76,7 +85,12 @@ impl Server {
     /// # Errors
     /// Names the folder or the address that cannot be used.
     pub async fn bind(config: Config, clock: Clock, randomness: Randomness) -> anyhow::Result<Self> {
-        let options = StoreOptions { limits: store_limits(&config.limits), role: "server".to_owned() };
+        let proxies = TrustedProxies::new(&config.trusted_proxies)?;
+        let options = StoreOptions {
+            limits: store_limits(&config.limits),
+            role: "server".to_owned(),
+            sharing: Sharing::OneServer,
+        };
         let store = Store::open_with(&config.data, options)
             .await
             .with_context(|| format!("cannot open the data folder {}", config.data.display()))?;
@@ -89,7 +103,12 @@ impl Server {
         prepare_access(&app, &config).await?;
         let listener = connection::listen(config.listen)
             .with_context(|| format!("cannot listen on {}", config.listen))?;
-        Ok(Self { config, app, listener, tls, shutdown: Shutdown::new() })
+        let monitoring = config.metrics_listen.map(|address| {
+            connection::listen(address)
+                .with_context(|| format!("cannot listen on {address}, the setting metrics_listen"))
+        });
+        let monitoring = monitoring.transpose()?;
+        Ok(Self { config, app, listener, monitoring, tls, proxies, shutdown: Shutdown::new() })
     }
 
     /// The address that was taken; with port 0 in the settings, the system's choice.
@@ -98,6 +117,12 @@ impl Server {
     /// The system does not report it.
     pub fn address(&self) -> std::io::Result<SocketAddr> {
         self.listener.local_addr()
+    }
+
+    /// The address of probes and metrics alone, if there is one.
+    #[must_use]
+    pub fn monitoring_address(&self) -> Option<SocketAddr> {
+        self.monitoring.as_ref()?.local_addr().ok()
     }
 
     /// The application behind both transports.
@@ -131,13 +156,24 @@ impl Server {
     /// The system does not report the address.
     pub async fn run(self) -> anyhow::Result<()> {
         let reloader = self.reloader();
-        let Self { config, app, listener, tls, shutdown } = self;
+        let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
-        let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
-        let pipeline = Arc::new(RequestPipeline::new(app.clone(), config.console, hosts, &shutdown));
-        connection::accept(listener, pipeline, tls, &config.limits, &shutdown).await;
+        let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
+        let cors = cors::layer(&config.cors_origins);
+        let pipeline = RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, &shutdown);
+        let pipeline = Arc::new(pipeline);
+        let monitored = async {
+            let Some(listener) = monitoring else { return anyhow::Ok(()) };
+            let hosts = HostCheck::new(&config.allowed_hosts, &[], listener.local_addr()?);
+            let pipeline = Arc::new(RequestPipeline::monitoring(app.clone(), hosts, &shutdown));
+            connection::accept(listener, pipeline, None, &config.limits, &shutdown).await;
+            Ok(())
+        };
+        let served = connection::accept(listener, pipeline, tls, &config.limits, &shutdown);
+        let (monitored, ()) = tokio::join!(monitored, served);
+        monitored?;
         tracing::info!("shutting down");
         if !shutdown.drain_with_timeout(config.limits.drain_time()).await {
             tracing::warn!("requests that did not end within limits.drain_s were dropped");
@@ -187,10 +223,10 @@ async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
         }
         app.metrics.upkeep();
         reloader.reload_certificate(false).await;
-        match app.store.maintain().await {
-            Ok(status) => app.metrics.storage(&status),
-            Err(error) => tracing::error!(%error, "the maintenance of the store failed"),
+        if let Err(error) = app.site_registry.refresh(&app.store).await {
+            tracing::error!(%error, "cannot look for changed sites");
         }
+        gather_figures(app).await;
         if let Err(error) = app.registry.refresh(&app.store).await {
             tracing::error!(%error, "cannot look for changed cameras");
         }
@@ -206,5 +242,20 @@ async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
         if let Err(error) = app.retrain_moved().await {
             tracing::error!(%error, "cannot retrain moved cameras");
         }
+    }
+}
+
+/// Maintains the store, and takes the figures of store, quotas and queues into the metrics.
+async fn gather_figures(app: &App) {
+    app.metrics.quotas(&app.quotas.usages());
+    app.metrics.models_unusable(app.registry.model_faults().len());
+    let maintained = async {
+        app.metrics.storage(&app.store.maintain().await?);
+        app.metrics.jobs(&app.store.job_counts().await?);
+        Ok::<_, Error>(())
+    };
+    if let Err(error) = maintained.await {
+        app.metrics.maintenance_failed();
+        tracing::error!(%error, "the maintenance of the store failed");
     }
 }

@@ -13,6 +13,8 @@ pub struct Status {
     pub slug: &'static str,
     /// Title of the problem, the same for every occurrence.
     pub title: &'static str,
+    /// Seconds after which the same request may succeed; `None` if it will not by itself.
+    pub retry_after_s: Option<u32>,
 }
 
 /// Where the problem types are described; a slug follows.
@@ -53,13 +55,19 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ModelNotFound => (404, code::NOT_FOUND, "There is no such model version"),
         Kind::KeyNotFound => (404, code::NOT_FOUND, "There is no such key"),
         Kind::CameraExists => (409, code::ALREADY_EXISTS, "A camera of that id exists already"),
-        Kind::RevisionMismatch => (412, code::ABORTED, "The camera was changed in the meantime"),
+        Kind::SiteNotFound => (404, code::NOT_FOUND, "There is no such site"),
+        Kind::SiteExists => (409, code::ALREADY_EXISTS, "A site of that id exists already"),
+        Kind::SiteInUse => (409, code::FAILED_PRECONDITION, "The site has cameras"),
+        Kind::RevisionMismatch => (412, code::ABORTED, "The resource was changed in the meantime"),
         Kind::RevisionRequired => {
             (428, code::FAILED_PRECONDITION, "The change needs the revision it is based on")
         }
         Kind::NoModel => (409, code::FAILED_PRECONDITION, "The camera has no active model"),
         Kind::NoEarlierModel => (409, code::FAILED_PRECONDITION, "No other model version was active before"),
         Kind::ModelUnusable => (409, code::FAILED_PRECONDITION, "The stored model version cannot be used"),
+        Kind::IdempotencyKeyReused => {
+            (422, code::INVALID_ARGUMENT, "The idempotency key was used for another request")
+        }
         Kind::RunLive => (409, code::FAILED_PRECONDITION, "The camera has a training run that has not ended"),
         Kind::RunEnded => (409, code::FAILED_PRECONDITION, "The training run has ended"),
         Kind::EvaluationEnded => (409, code::FAILED_PRECONDITION, "The evaluation has ended"),
@@ -71,6 +79,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::UnusableSamples => (422, code::FAILED_PRECONDITION, "The samples cannot support a fit"),
         Kind::Cancelled => (499, code::CANCELLED, "The request was cancelled"),
         Kind::Overloaded => (503, code::UNAVAILABLE, "The server has too much to do"),
+        Kind::RateLimited => (429, code::RESOURCE_EXHAUSTED, "The client sends too many requests"),
         Kind::Timeout => (408, code::DEADLINE_EXCEEDED, "The request took too long"),
         Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
         Kind::Unauthenticated => (401, code::UNAUTHENTICATED, "The request needs a key that works"),
@@ -81,5 +90,6 @@ pub fn of(kind: ErrorKind) -> Status {
         }
         Kind::Internal => (500, code::INTERNAL, "The server failed"),
     };
-    Status { http, grpc, slug: kind.as_str(), title }
+    let is_temporary = matches!(kind, Kind::Overloaded | Kind::RateLimited | Kind::ShuttingDown);
+    Status { http, grpc, slug: kind.as_str(), title, retry_after_s: is_temporary.then_some(1) }
 }

@@ -3,6 +3,7 @@
 //!
 //! `cargo bench` runs all parts; `cargo bench -- fuse http` some of them.
 
+mod attacks;
 mod beside;
 mod fuse;
 mod import;
@@ -12,6 +13,7 @@ mod served;
 mod streams;
 mod train;
 mod transports;
+mod world;
 
 /// As in the binary itself.
 #[global_allocator]
@@ -20,14 +22,16 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
-    let parts: [(&str, fn()); 7] = [
+    let parts: [(&str, fn()); 9] = [
         ("fuse", fuse::run),
         ("http", transports::http),
         ("grpc", transports::grpc),
         ("streams", streams::run),
         ("import", import::run),
         ("train", train::run),
+        ("world", world::run),
         ("beside", beside::run),
+        ("attacks", attacks::run),
     ];
     for (name, part) in parts {
         if wanted.is_empty() || wanted.iter().any(|wish| wish == name) {

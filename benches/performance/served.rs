@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 
 use sightfix::app::{App, RunRequest};
 use sightfix::clock::{Clock, Randomness};
-use sightfix::config::Config;
+use sightfix::config::{Config, Limits};
 use sightfix::domain::{CameraId, Durability, NewCamera, Observation};
 use sightfix::server::Server;
 use sightfix::shutdown::Shutdown;
@@ -28,8 +28,13 @@ impl Served {
 
     /// Starts with so many training workers.
     pub(crate) async fn start_with(workers: usize) -> Self {
+        Self::start_limited(workers, Limits::default()).await
+    }
+
+    /// Starts with these limits.
+    pub(crate) async fn start_limited(workers: usize, limits: Limits) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
-        let mut config = Config { data: folder.path().to_owned(), ..Config::default() };
+        let mut config = Config { data: folder.path().to_owned(), limits, ..Config::default() };
         config.listen.set_port(0);
         config.training.workers = workers;
         let server = Server::bind(config, Clock::system(), Randomness::seeded(1)).await.expect("a free port");

@@ -1,7 +1,7 @@
 //! Camera profiles.
 
 use super::{App, Page, page_of};
-use crate::domain::{Camera, CameraChange, CameraId, ExpectedVersion, NewCamera, Result};
+use crate::domain::{Camera, CameraChange, CameraId, ExpectedVersion, NewCamera, Result, SiteId};
 
 impl App {
     /// Stores a new camera.
@@ -22,12 +22,20 @@ impl App {
         self.store.camera(id).await
     }
 
-    /// Cameras by id, from behind a cursor on.
+    /// Cameras, of a site or of all, by id, from behind a cursor on.
     ///
     /// # Errors
-    /// A fault of the store.
-    pub async fn cameras(&self, after: Option<&CameraId>, limit: u32) -> Result<Page<Camera, CameraId>> {
-        let cameras = self.store.cameras(after, limit + 1).await?;
+    /// `SiteNotFound`.
+    pub async fn cameras(
+        &self,
+        site: Option<&SiteId>,
+        after: Option<&CameraId>,
+        limit: u32,
+    ) -> Result<Page<Camera, CameraId>> {
+        if let Some(site) = site {
+            self.store.site(site).await?;
+        }
+        let cameras = self.store.cameras(site, after, limit + 1).await?;
         Ok(page_of(cameras, limit, |camera| camera.id().clone()))
     }
 

@@ -2,12 +2,16 @@
 //!
 //! What never happens here: SQL, status codes, wire formats, reading the wall clock.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 pub mod access;
 mod audit;
 mod camera_statuses;
 mod cameras;
 mod evaluations;
 mod fusion;
+mod idempotency;
 mod keys;
 mod live;
 mod matching;
@@ -16,6 +20,8 @@ mod paired_import;
 mod recording;
 mod registry;
 mod samples;
+mod site_registry;
+mod sites;
 mod training;
 
 use std::sync::Arc;
@@ -34,15 +40,17 @@ use crate::telemetry::Metrics;
 pub use camera_statuses::CameraStatus;
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use live::{
-    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream,
-    LostEvents, NotStored, NotStoredReason, TargetUpdate, TrackPoint,
+    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
+    LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind,
+    SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate, TrackPoint, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
-pub use samples::{ImportReport, RejectedRow};
+pub use samples::{ImportOptions, ImportReport, RejectedRow};
+pub use site_registry::{ActiveSite, SiteRegistry};
 pub use training::RunRequest;
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.
@@ -59,6 +67,8 @@ pub struct Parts {
     opened_store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
+    /// Sites, ready to track.
+    pub site_registry: SiteRegistry,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -102,12 +112,16 @@ impl App {
         limits: Limits,
         metrics: Metrics,
     ) -> crate::domain::Result<Self> {
-        let registry = Registry::default();
+        let mut run_id = [0; 8];
+        randomness.fill(&mut run_id);
+        let registry = Registry::of_run(u64::from_le_bytes(run_id));
         let filled = store.fill_in_model_checksums().await?;
         if filled > 0 {
             tracing::info!(models = filled, "stored checksums of model versions of an earlier release");
         }
         registry.refresh(&store).await?;
+        let site_registry = SiteRegistry::new(randomness.clone(), limits.site_events);
+        site_registry.refresh(&store).await?;
         let access = Access::default();
         access.refresh(&store, clock.now()).await?;
         let pairings = Semaphore::new(limits.pairings);
@@ -116,6 +130,7 @@ impl App {
         let parts = Parts {
             opened_store: store,
             registry,
+            site_registry,
             access,
             clock,
             randomness,
@@ -160,6 +175,7 @@ impl App {
             tracing::warn!(%error, "when keys were used last could not be stored");
         }
         self.residuals.close();
+        self.site_registry.close();
         self.tasks.close();
         if tokio::time::timeout(CLOSE_TIME, self.tasks.wait()).await.is_err() {
             tracing::warn!("samples or residuals of live streams were still under way at the end");
@@ -197,13 +213,17 @@ impl std::ops::Deref for App {
 pub const fn store_limits(limits: &Limits) -> StoreLimits {
     StoreLimits {
         cameras: limits.cameras,
+        sites: limits.sites,
         samples_per_camera: limits.samples_per_camera,
+        sample_overflow: limits.sample_overflow,
         samples: limits.samples,
         models_per_camera: limits.models_per_camera,
         ended_runs_per_camera: limits.ended_runs_per_camera,
         ended_evaluations: limits.ended_evaluations,
         keys: limits.keys,
         audit_entries: limits.audit_entries,
+        idempotency_keys: limits.idempotency_keys,
+        idempotency_key_s: limits.idempotency_key_s,
         database_bytes: match limits.database_bytes {
             0 => None,
             bytes => Some(bytes),

@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::Args;
 
+use super::evaluate_site::{self, Draws};
 use super::import::{gnss_bias_sigma, image_size};
-use super::output::print_line;
+use super::output::{print_line, print_note};
 use super::progress::Progress;
 use super::recordings;
 use super::{format_of, open_file};
@@ -30,10 +31,10 @@ const MAX_SEEDS: u64 = 100;
 #[derive(Args)]
 pub(super) struct Evaluate {
     /// Training rows, as CSV, NDJSON or JSON; boxes without a fix serve the geometry of the camera
-    #[arg(long, value_name = "FILE", required_unless_present = "paper")]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["paper", "site"])]
     train: Option<PathBuf>,
     /// Test rows; boxes and fixes may be empty
-    #[arg(long, value_name = "FILE", required_unless_present = "paper")]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["paper", "site"])]
     test: Option<PathBuf>,
     /// The true position of all rows [default: the columns truth_longitude and truth_latitude]
     #[arg(long, value_name = "LON,LAT", value_parser = point, allow_negative_numbers = true)]
@@ -76,6 +77,17 @@ pub(super) struct Evaluate {
     /// Folder of the real recordings, with the folders square and plaza, for --paper
     #[arg(long, value_name = "DIR", requires = "paper")]
     shared_data: Option<PathBuf>,
+    /// Evaluate the world tracks of a site instead: a folder with detections_<CAMERA>.csv per camera, fixes.csv,
+    /// identity.csv and truth.csv, such as `simulate site` writes
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["train", "test", "paper"])]
+    site: Option<PathBuf>,
+    /// Number of times that the receivers' errors are drawn again about the true positions, for --site [default: the
+    /// recorded fixes]
+    #[arg(long, value_name = "N", requires = "site", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=MAX_SEEDS))]
+    redraws: u64,
+    /// Seed of the first of these, for --site
+    #[arg(long, value_name = "N", requires = "site", default_value_t = 1)]
+    first_redraw: u64,
     /// Write the page to this file, for --paper
     #[arg(long, value_name = "FILE", requires = "paper", default_value = "docs/accuracy.md")]
     out: PathBuf,
@@ -89,6 +101,11 @@ impl Evaluate {
     pub(super) fn run(self) -> anyhow::Result<()> {
         if self.paper {
             return self.write_paper_page();
+        }
+        if let Some(folder) = &self.site {
+            let draws = Draws { count: self.redraws, first_seed: self.first_redraw };
+            let report = evaluate_site::evaluate(folder, self.image_size, &draws)?;
+            return self.json.as_ref().map_or(Ok(()), |path| write(path, &report.to_json()?));
         }
         let (Some(train), Some(test)) = (&self.train, &self.test) else {
             anyhow::bail!("give --train and --test")
@@ -188,7 +205,7 @@ impl paper_experiments::Runner for PaperRunner {
     }
 
     fn begin(&mut self, experiment: &str) {
-        eprintln!("{experiment}");
+        print_note(format_args!("{experiment}"));
     }
 }
 
@@ -234,10 +251,10 @@ fn read_train(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Trai
         }
     }
     if ignored > 0 {
-        eprintln!("{}: {ignored} rows without a box are ignored", path.display());
+        print_note(format_args!("{}: {ignored} rows without a box are ignored", path.display()));
     }
     if !file.unpaired.is_empty() {
-        eprintln!("{}: {} rows are boxes without a fix", path.display(), file.unpaired.len());
+        print_note(format_args!("{}: {} rows are boxes without a fix", path.display(), file.unpaired.len()));
     }
     Ok(file)
 }
@@ -271,13 +288,19 @@ fn read(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<Observ
             Err(error) => {
                 invalid += 1;
                 if invalid <= MAX_REPORTED_ROWS {
-                    eprintln!("{}: line {}: {}: {}", path.display(), error.line, error.field, error.reason);
+                    print_note(format_args!(
+                        "{}: line {}: {}: {}",
+                        path.display(),
+                        error.line,
+                        error.field,
+                        error.reason
+                    ));
                 }
             }
         }
     }
     if invalid > MAX_REPORTED_ROWS {
-        eprintln!("{}: and {} more invalid rows", path.display(), invalid - MAX_REPORTED_ROWS);
+        print_note(format_args!("{}: and {} more invalid rows", path.display(), invalid - MAX_REPORTED_ROWS));
     }
     Ok(rows)
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::Args;
 
-use super::output::print_line;
+use super::output::{print_line, print_note};
 use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime};
 use crate::clock::Clock;
 use crate::domain::{CameraId, ImageSize, TimeBounds};
@@ -60,7 +60,7 @@ impl Fuse {
                 Ok(row) => row,
                 Err(row) => {
                     rejected += 1;
-                    eprintln!("line {}: {}: {}", row.line, row.field, row.reason);
+                    print_note(format_args!("line {}: {}: {}", row.line, row.field, row.reason));
                     continue;
                 }
             };

@@ -6,7 +6,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::open_file;
-use super::output::print_line;
+use super::output::{print_line, print_note};
 use crate::app::GnssErrorEstimate;
 use crate::clock::Clock;
 use crate::config::Limits;
@@ -29,7 +29,7 @@ impl EstimateGnssError {
         let rows = exchange::read_fixes(open_file(&self.file)?, format, time_bounds)?;
         let estimate = GnssErrorEstimate::from_rows(rows, Limits::default().rejected_rows)?;
         for row in &estimate.rejected_rows {
-            eprintln!("line {}: {}: {}", row.line, row.field, row.reason);
+            print_note(format_args!("line {}: {}: {}", row.line, row.field, row.reason));
         }
         print_line(&format_args!("fixes              {}, rejected {}", estimate.fixes, estimate.rejected))?;
         print_line(&format_args!(

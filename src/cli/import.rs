@@ -5,11 +5,17 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
+use super::layout::LayoutFlags;
 use super::output::print_line;
 use super::progress::Progress;
-use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime};
-use crate::app::{App, ImportReport};
-use crate::domain::{CameraId, Durability, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera};
+use super::{
+    DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime, site_id, target_id,
+};
+use crate::app::{App, ImportOptions, ImportReport};
+use crate::domain::{
+    CameraId, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera, NewSite, OnConflict, SiteId, TargetId,
+};
+use crate::exchange::CsvLayout;
 
 /// Import samples from a file into a camera
 #[derive(Args)]
@@ -31,6 +37,17 @@ pub(super) struct Import {
     /// model's own prior]
     #[arg(long, value_name = "S", value_parser = gnss_bias_sigma, requires = "create")]
     gnss_bias_sigma_m: Option<GnssBiasSigma>,
+    /// Site of the camera, for --create; it is created, too, if it does not exist
+    #[arg(long, value_name = "ID", value_parser = site_id, requires = "create")]
+    site: Option<SiteId>,
+    /// Let each sample take the place of a stored one of the same target and time
+    #[arg(long)]
+    replace: bool,
+    /// The target of rows that name none
+    #[arg(long, value_name = "ID", value_parser = target_id)]
+    target_id: Option<TargetId>,
+    #[command(flatten)]
+    layout: LayoutFlags,
     #[command(flatten)]
     folder: DataFolder,
 }
@@ -51,19 +68,12 @@ impl Import {
         let report = runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix import", missing).await?;
             if self.create {
-                let profile = NewCamera {
-                    image_size: self.image_size,
-                    gnss_bias_sigma: self.gnss_bias_sigma_m,
-                    ..NewCamera::named(self.camera.clone())
-                };
-                match app.create_camera(profile).await {
-                    Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {
-                        self.check_image_size(&app).await?;
-                    }
-                    created => drop(created?),
-                }
+                self.create_camera(&app).await?;
             }
-            let report = app.import_file(&self.camera, source, format, Durability::Synced).await;
+            let layout = CsvLayout { target_id: self.target_id.clone(), ..self.layout.to_layout() };
+            let on_conflict = if self.replace { OnConflict::Replace } else { OnConflict::Keep };
+            let options = ImportOptions { on_conflict, ..ImportOptions::default() };
+            let report = app.import_file(&self.camera, source, (format, layout), options).await;
             app.store.close().await;
             anyhow::Ok(report?)
         })?;
@@ -77,9 +87,39 @@ impl Import {
 }
 
 impl Import {
-    /// Boxes of another image would be stored as if they were of this one.
-    async fn check_image_size(&self, app: &App) -> anyhow::Result<()> {
-        let stored = app.camera(&self.camera).await?.profile.image_size;
+    /// Creates the camera and its site, as far as they do not exist.
+    async fn create_camera(&self, app: &App) -> anyhow::Result<()> {
+        if let Some(site) = &self.site {
+            match app.create_site(NewSite::named(site.clone())).await {
+                Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::SiteExists => {}
+                created => drop(created?),
+            }
+        }
+        let profile = NewCamera {
+            image_size: self.image_size,
+            gnss_bias_sigma: self.gnss_bias_sigma_m,
+            site: self.site.clone(),
+            ..NewCamera::named(self.camera.clone())
+        };
+        match app.create_camera(profile).await {
+            Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {
+                self.check_profile(app).await
+            }
+            Err(error) => Err(error.into()),
+            Ok(_) => Ok(()),
+        }
+    }
+
+    /// Boxes of another image, or of a camera elsewhere, would be stored as if they were of this one.
+    async fn check_profile(&self, app: &App) -> anyhow::Result<()> {
+        let profile = app.camera(&self.camera).await?.profile;
+        anyhow::ensure!(
+            self.site.is_none() || profile.site == self.site,
+            "camera {} exists and belongs to {}; leave --site out, or change the profile",
+            self.camera,
+            profile.site.map_or_else(|| "no site".to_owned(), |site| format!("site {site}"))
+        );
+        let stored = profile.image_size;
         let Some(wanted) = self.image_size.filter(|_| stored != self.image_size) else { return Ok(()) };
         let shown = |size: ImageSize| format!("{}x{}", size.width_px(), size.height_px());
         anyhow::bail!(
@@ -92,10 +132,13 @@ impl Import {
 }
 
 fn print(report: &ImportReport) -> anyhow::Result<()> {
-    let ImportReport { accepted, without_fix, duplicate, rejected, rejected_rows } = report;
+    let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows } = report;
     print_line(&format_args!(
         "accepted {accepted} (without a fix {without_fix}), duplicate {duplicate}, rejected {rejected}"
     ))?;
+    if *replaced > 0 {
+        print_line(&format_args!("replaced {replaced}"))?;
+    }
     for row in rejected_rows {
         print_line(&format_args!("line {}: {}: {}", row.line, row.field, row.reason))?;
     }

@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use clap::{Args, Subcommand};
 use jiff::Timestamp;
 
-use super::output::print_line;
+use super::output::{print_line, print_note};
 use super::{DataFolder, MissingData, camera_id, open_app, runtime};
 use crate::app::App;
 use crate::clock::{Clock, Randomness};
@@ -96,7 +96,7 @@ impl Create {
             let created = app.create_key(&key).await;
             app.close().await;
             let (key, secret) = created?;
-            eprintln!("key {} for {}; its secret is not shown again:", key.id, key.name);
+            print_note(format_args!("key {} for {}; its secret is not shown again:", key.id, key.name));
             print_line(&secret.reveal())
         })
     }

@@ -3,21 +3,29 @@
 //!
 //! What never happens here: rules of the domain.
 
+mod backup;
 mod config;
+mod doctor;
 mod evaluate;
+mod evaluate_site;
+mod exit_code;
 mod fuse;
 mod gnss_error;
 mod health;
 mod import;
 mod keys;
+mod layout;
 mod openapi;
 mod output;
 mod pair;
 mod progress;
 mod recordings;
 mod replay;
+mod restore;
 mod serve;
 mod simulate;
+mod simulate_site;
+mod site_recording;
 mod train;
 
 use std::fs::File;
@@ -30,10 +38,12 @@ use crate::app::access::Caller;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
-use crate::domain::{CameraId, ReceiverId, TargetId};
+use crate::domain::{CameraId, ReceiverId, SiteId, TargetId};
 use crate::exchange::Format;
-use crate::store::{Store, StoreOptions};
+use crate::store::{Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
+
+pub use exit_code::exit_code;
 
 /// Positions of targets from the bounding boxes of an uncalibrated fixed camera and from GNSS fixes
 #[derive(Parser)]
@@ -68,6 +78,12 @@ enum Command {
     Replay(replay::Replay),
     /// Create, list and revoke the keys that clients of a server present
     Keys(keys::Keys),
+    /// Copy the database into one verified file, also while a server uses it
+    Backup(backup::Backup),
+    /// Put a backup in the place of the database
+    Restore(restore::Restore),
+    /// Check folder, database, models, clock, port and system, and say what to do
+    Doctor(doctor::Doctor),
     /// Check whether a server is alive
     Health(health::Health),
     /// Print the effective settings
@@ -100,6 +116,9 @@ impl Cli {
             Command::Simulate(command) => command.run(),
             Command::Replay(command) => command.run(file),
             Command::Keys(command) => command.run(file),
+            Command::Backup(command) => command.run(file),
+            Command::Restore(command) => command.run(file),
+            Command::Doctor(command) => command.run(file),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),
@@ -137,12 +156,16 @@ async fn open_app(settings: &Config, role: &str, missing: MissingData) -> anyhow
         missing == MissingData::Create || settings.data.is_dir(),
         "there is no data folder {folder}; `sightfix serve` and `sightfix import --create` make one"
     );
-    let options = StoreOptions { limits: store_limits(&settings.limits), role: role.to_owned() };
+    let options = StoreOptions {
+        limits: store_limits(&settings.limits),
+        role: role.to_owned(),
+        sharing: Sharing::Command,
+    };
     let store = Store::open_with(&settings.data, options)
         .await
         .with_context(|| format!("cannot open the data folder {folder}"))?;
     for other in store.newcomers() {
-        eprintln!("note: another process uses the same data folder: {other}");
+        output::print_note(format_args!("note: another process uses the same data folder: {other}"));
     }
     let app = App::new(store, Clock::system(), Randomness::system(), settings.limits.clone(), Metrics::new());
     Ok(app.await?.on_behalf_of(Caller::program(role)))
@@ -155,6 +178,10 @@ fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
 
 fn camera_id(text: &str) -> Result<CameraId, String> {
     CameraId::new(text).map_err(|error| error.to_string())
+}
+
+fn site_id(text: &str) -> Result<SiteId, String> {
+    SiteId::new(text).map_err(|error| error.to_string())
 }
 
 fn receiver_id(text: &str) -> Result<ReceiverId, String> {

@@ -1,4 +1,4 @@
-//! Standard output, whose reader may go away and whose device may be full.
+//! Standard output and standard error, whose readers may go away and whose devices may be full.
 
 use std::fmt::Display;
 use std::io::{self, Write as _};
@@ -16,4 +16,10 @@ pub(super) fn print_line(text: &impl Display) -> anyhow::Result<()> {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         written => written.context("standard output cannot be written"),
     }
+}
+
+/// Prints a line on standard error; unlike `eprintln!` it does not panic. Where standard error is closed or its
+/// device is full, there is nowhere left to report that.
+pub(super) fn print_note(text: impl Display) {
+    let _ = writeln!(io::stderr().lock(), "{text}");
 }

@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::output::print_note;
+
 /// Interval between plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(2);
 
@@ -37,7 +39,7 @@ impl Progress {
             Self::Lines { printed_at } => {
                 if printed_at.is_none_or(|at| at.elapsed() >= LINE_INTERVAL) {
                     *printed_at = Some(Instant::now());
-                    eprintln!("{done}/{total} {message}");
+                    print_note(format_args!("{done}/{total} {message}"));
                 }
             }
         }

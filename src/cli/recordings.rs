@@ -82,14 +82,14 @@ fn rules() -> RowRules {
     RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: None }
 }
 
-fn read_boxes(path: &Path) -> anyhow::Result<Vec<Detection>> {
+pub(super) fn read_boxes(path: &Path) -> anyhow::Result<Vec<Detection>> {
     let rows = exchange::read_detections(open_file(path)?, format_of(path)?, &rules(), None)?;
     rows.map(|row| row?.map_err(|error| anyhow::anyhow!("line {}: {}", error.line, error.reason)))
         .collect::<anyhow::Result<_>>()
         .with_context(|| format!("cannot read {}", path.display()))
 }
 
-fn read_fixes(path: &Path) -> anyhow::Result<Vec<ReceivedFix>> {
+pub(super) fn read_fixes(path: &Path) -> anyhow::Result<Vec<ReceivedFix>> {
     let rows = exchange::read_received_fixes(open_file(path)?, FixFormat::Csv, rules().time_bounds)?;
     rows.map(|row| row?.map_err(|error| anyhow::anyhow!("line {}: {}", error.line, error.reason)))
         .collect::<anyhow::Result<_>>()
@@ -105,7 +105,7 @@ fn people_by_track(path: &Path) -> anyhow::Result<BTreeMap<(String, String), Tar
 }
 
 /// The position by instant and person: columns time, person, longitude, latitude.
-fn read_truth(path: &Path) -> anyhow::Result<BTreeMap<(Timestamp, TargetId), Position>> {
+pub(super) fn read_truth(path: &Path) -> anyhow::Result<BTreeMap<(Timestamp, TargetId), Position>> {
     let position = |[time, person, longitude_deg, latitude_deg]: [&str; 4]| {
         let position = Position::new(longitude_deg.parse()?, latitude_deg.parse()?)?;
         Ok(((time.parse()?, TargetId::new(person)?), position))
@@ -114,7 +114,7 @@ fn read_truth(path: &Path) -> anyhow::Result<BTreeMap<(Timestamp, TargetId), Pos
 }
 
 /// The rows of a CSV file without quotes, after its header.
-fn read_columns<const N: usize, T, C: FromIterator<T>>(
+pub(super) fn read_columns<const N: usize, T, C: FromIterator<T>>(
     path: &Path,
     row: impl Fn([&str; N]) -> anyhow::Result<T>,
 ) -> anyhow::Result<C> {

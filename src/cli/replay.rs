@@ -11,7 +11,7 @@ use clap::{Args, value_parser};
 use jiff::SignedDuration;
 use tokio_util::sync::CancellationToken;
 
-use super::output::print_line;
+use super::output::{print_line, print_note};
 use super::progress::Progress;
 use super::{camera_id, format_of, open_file, receiver_id, runtime, target_id};
 use crate::clock::Clock;
@@ -221,7 +221,13 @@ fn rows(path: &Path, rules: &RowRules) -> anyhow::Result<Vec<ObservedRow>> {
     for row in exchange::read_observations(open_file(path)?, format_of(path)?, rules)? {
         match row? {
             Ok(row) => valid.push(row),
-            Err(row) => eprintln!("{}: line {}: {}: {}", path.display(), row.line, row.field, row.reason),
+            Err(row) => print_note(format_args!(
+                "{}: line {}: {}: {}",
+                path.display(),
+                row.line,
+                row.field,
+                row.reason
+            )),
         }
     }
     Ok(valid)

@@ -13,7 +13,7 @@ use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
 use crate::server::{Reloader, Server};
 use crate::shutdown::Shutdown;
-use crate::telemetry;
+use crate::telemetry::{self, LogControl};
 
 /// Serve REST and gRPC on one port
 #[derive(Args)]
@@ -54,24 +54,29 @@ impl Serve {
             tls_key: self.tls_key,
             tls_client_ca: self.tls_client_ca,
         };
-        let settings = Config::load(file, overrides)?;
-        telemetry::start_log(&settings)?;
+        let settings = Config::load(file, overrides.clone())?;
+        let source = SettingsSource { file: file.map(Path::to_owned), overrides };
         runtime()?.block_on(async {
+            let log = telemetry::start_log(&settings)?;
             let server = Server::bind(settings.clone(), Clock::system(), Randomness::system()).await?;
             let address = server.address().context("cannot determine the address")?;
             let (app, shutdown) = (server.app().clone(), server.shutdown());
             tokio::spawn(shut_down_on_signal(shutdown.clone()));
             #[cfg(unix)]
-            reload_on_hangup(server.reloader());
+            reload_on_hangup(source, log.clone(), server.reloader());
             tracing::info!(
                 %address, folder = %settings.data.display(), tls = server.has_tls(), "serving REST and gRPC"
             );
+            if let Some(monitoring) = server.monitoring_address() {
+                tracing::info!(%monitoring, "serving probes and metrics, without keys");
+            }
             let serving = tokio::spawn(server.run());
             let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
             if shown.is_err() {
                 shutdown.drain();
             }
             serving.await.context("the server task panicked")??;
+            log.close();
             shown
         })
     }
@@ -105,18 +110,39 @@ async fn wait_for_signal() {
     let _ = tokio::signal::ctrl_c().await;
 }
 
-/// Loads certificate and keys again with each SIGHUP, which would else end the process: a closed terminal
-/// must not stop a server.
+/// Where the settings came from, to read them again.
 #[cfg(unix)]
-fn reload_on_hangup(reloader: Reloader) {
+struct SettingsSource {
+    file: Option<PathBuf>,
+    overrides: Overrides,
+}
+
+#[cfg(unix)]
+impl SettingsSource {
+    /// Takes the log's filter of the settings as they are now; settings that cannot be read change nothing.
+    fn reload_filter(&self, log: &LogControl) {
+        let settings = Config::load(self.file.as_deref(), self.overrides.clone());
+        match settings.and_then(|settings| log.set_filter(&settings.log_filter)) {
+            Ok(()) => {}
+            Err(error) => tracing::error!(error = format!("{error:#}"), "the log's filter stays"),
+        }
+    }
+}
+
+/// Loads certificate, keys and the log's filter again with each SIGHUP, which would else end the process: a
+/// closed terminal must not stop a server.
+#[cfg(unix)]
+fn reload_on_hangup(source: SettingsSource, log: LogControl, reloader: Reloader) {
     use tokio::signal::unix::{SignalKind, signal};
     match signal(SignalKind::hangup()) {
         Ok(mut hangups) => {
             tokio::spawn(async move {
                 while hangups.recv().await.is_some() {
                     tracing::info!(
-                        "SIGHUP received: certificate and keys are loaded again, settings at the start only"
+                        "SIGHUP received: certificate, keys and log_filter are loaded again, other settings at the \
+                         start only"
                     );
+                    source.reload_filter(&log);
                     reloader.reload().await;
                 }
             });

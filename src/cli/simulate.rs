@@ -5,20 +5,24 @@ use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use clap::Args;
+use clap::{Args, Subcommand};
 
+use super::simulate_site::SimulateSite;
 use crate::exchange::{self, Format};
 use crate::simulation::{Options, Route, Scene, TargetShape, World, simulate};
 
 /// Write a simulated world with its truth, as CSV
 #[derive(Args)]
+#[command(subcommand_negates_reqs = true, args_conflicts_with_subcommands = true)]
 pub(super) struct Simulate {
+    #[command(subcommand)]
+    site: Option<Site>,
     /// The scene: airport or square
-    #[arg(value_name = "SCENE")]
-    scene: Scene,
+    #[arg(value_name = "SCENE", required = true)]
+    scene: Option<Scene>,
     /// Output file of the training rows
-    #[arg(long, value_name = "FILE")]
-    out: PathBuf,
+    #[arg(long, value_name = "FILE", required = true)]
+    out: Option<PathBuf>,
     /// Number of training rows
     #[arg(long, value_name = "N", default_value_t = 10_000)]
     samples: usize,
@@ -94,10 +98,22 @@ pub(super) struct Simulate {
     tracker_id_lifetime_s: Option<f64>,
 }
 
+/// Worlds of more than one camera.
+#[derive(Subcommand)]
+enum Site {
+    Site(SimulateSite),
+}
+
 impl Simulate {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let base = Options::new(self.scene);
-        let target_shape = self.target_shape();
+        if let Some(Site::Site(command)) = self.site {
+            return command.run();
+        }
+        let (Some(scene), Some(out)) = (self.scene, &self.out) else {
+            anyhow::bail!("give the scene and --out")
+        };
+        let base = Options::new(scene);
+        let target_shape = self.target_shape(scene);
         let options = Options {
             seed: self.seed,
             camera_seed: self.camera_seed,
@@ -122,7 +138,7 @@ impl Simulate {
             ..base
         };
         check(&options)?;
-        let out = create(&self.out)?;
+        let out = create(out)?;
         exchange::write_samples(out, Format::Csv, &simulate(&options).training_samples())?;
         if let Some(path) = &self.test_out {
             let test =
@@ -133,8 +149,8 @@ impl Simulate {
     }
 
     /// The scene's shape with the extents and the antenna that were given; `None` for neither.
-    fn target_shape(&self) -> Option<TargetShape> {
-        let nominal = self.scene.nominal_shape();
+    fn target_shape(&self, scene: Scene) -> Option<TargetShape> {
+        let nominal = scene.nominal_shape();
         let TargetShape { length_m, width_m, height_m, antenna_ahead_m, antenna_left_m } = nominal;
         (self.target_size_m.is_some() || self.antenna_m.is_some()).then(|| {
             let [length_m, width_m, height_m] = self.target_size_m.unwrap_or([length_m, width_m, height_m]);

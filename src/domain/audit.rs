@@ -41,8 +41,16 @@ pub enum AuditAction {
     CameraChanged,
     /// A camera was deleted with all that belongs to it.
     CameraDeleted,
+    /// A site was created.
+    SiteCreated,
+    /// A site was changed.
+    SiteChanged,
+    /// A site was deleted.
+    SiteDeleted,
     /// Samples were deleted.
     SamplesDeleted,
+    /// Stored samples were replaced by those of an import.
+    SamplesReplaced,
     /// A training run was queued.
     RunStarted,
     /// A training run was cancelled.

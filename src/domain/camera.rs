@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use super::bounding_box::ImageSize;
 use super::error::{Error, ErrorKind, Result};
 use super::gnss_error::{GnssBiasSigma, GnssError};
-use super::names::{CameraId, TargetClass, check_labels, check_text};
+use super::names::{CameraId, SiteId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
 use super::recipe::Recipe;
 use super::sample::SampleCount;
@@ -39,6 +39,8 @@ pub struct NewCamera {
     pub receivers: Receivers,
     /// Whether a training run starts automatically after the camera has moved.
     pub retrain_when_moved: bool,
+    /// The site whose tracks the camera contributes to.
+    pub site: Option<SiteId>,
 }
 
 impl NewCamera {
@@ -56,6 +58,7 @@ impl NewCamera {
             labels: BTreeMap::new(),
             receivers: Receivers::default(),
             retrain_when_moved: false,
+            site: None,
         }
     }
 
@@ -122,11 +125,13 @@ pub struct CameraChange {
     pub receivers: Option<Receivers>,
     /// Whether to retrain automatically.
     pub retrain_when_moved: Option<bool>,
+    /// New site; `Some(None)` removes the camera from its site.
+    pub site: Option<Option<SiteId>>,
 }
 
 impl CameraChange {
     /// Names of the fields that can be changed, on both transports.
-    pub const FIELDS: [&str; 9] = [
+    pub const FIELDS: [&str; 10] = [
         "display_name",
         "image_size",
         "gnss_error",
@@ -136,6 +141,7 @@ impl CameraChange {
         "labels",
         "receivers",
         "retrain_when_moved",
+        "site",
     ];
 
     /// The fields of a profile that are named, by [`Self::FIELDS`].
@@ -151,6 +157,7 @@ impl CameraChange {
             labels: is_named("labels").then_some(profile.labels),
             receivers: is_named("receivers").then_some(profile.receivers),
             retrain_when_moved: is_named("retrain_when_moved").then_some(profile.retrain_when_moved),
+            site: is_named("site").then_some(profile.site),
         }
     }
 
@@ -170,6 +177,7 @@ impl CameraChange {
             labels: self.labels.unwrap_or(profile.labels),
             receivers: self.receivers.unwrap_or(profile.receivers),
             retrain_when_moved: self.retrain_when_moved.unwrap_or(profile.retrain_when_moved),
+            site: self.site.unwrap_or(profile.site),
         }
         .check()
     }
@@ -180,32 +188,46 @@ impl CameraChange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct CameraKey(pub i64);
 
-/// What a change is based on: refused if the camera is another one by now, or has been changed.
+impl From<i64> for CameraKey {
+    fn from(key: i64) -> Self {
+        Self(key)
+    }
+}
+
+impl From<CameraKey> for i64 {
+    fn from(key: CameraKey) -> Self {
+        key.0
+    }
+}
+
+/// What a change of a camera or a site is based on: refused if it is another one by now, or has been changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ExpectedVersion {
-    /// The camera, if the caller knows which of those that had the id it means.
-    pub key: Option<CameraKey>,
+pub struct ExpectedVersion<K = CameraKey> {
+    /// The key, if the caller knows which of those that had the id it means.
+    pub key: Option<K>,
     /// The revision of its profile.
     pub revision: Revision,
 }
 
-impl ExpectedVersion {
+impl<K: PartialEq> ExpectedVersion<K> {
+    /// `what` names the resource (`camera`, `site`) whose stored key and revision are checked.
+    ///
     /// # Errors
-    /// `RevisionMismatch` if a camera is not the expected one.
-    pub fn check(self, camera: &Camera) -> Result<()> {
-        if self.revision == camera.revision && self.key.is_none_or(|key| key == camera.key) {
+    /// `RevisionMismatch` if they are not the expected ones.
+    pub fn check(self, what: &str, key: K, revision: Revision) -> Result<()> {
+        if self.revision == revision && self.key.is_none_or(|expected| expected == key) {
             return Ok(());
         }
         let message = format!(
-            "the camera is at revision {} and was changed, or created again, since it was read; read it again and \
+            "the {what} is at revision {} and was changed, or created again, since it was read; read it again and \
              repeat the change",
-            camera.revision.0
+            revision.0
         );
         Err(Error::refused(ErrorKind::RevisionMismatch, message))
     }
 }
 
-impl From<Revision> for ExpectedVersion {
+impl<K> From<Revision> for ExpectedVersion<K> {
     fn from(revision: Revision) -> Self {
         Self { key: None, revision }
     }

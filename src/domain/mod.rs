@@ -4,6 +4,9 @@
 //! it and do not check again. What never happens here: I/O, clocks,
 //! randomness, wire formats, status codes.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod access;
 mod audit;
 mod bounding_box;
@@ -13,15 +16,20 @@ mod durability;
 mod error;
 mod evaluation;
 mod gnss_error;
+mod idempotency;
 mod job;
+mod live_id;
 mod method;
 mod names;
 mod noise;
 mod observation;
+mod on_conflict;
 mod receiver;
 mod recipe;
 mod sample;
+mod sample_overflow;
 mod score;
+mod site;
 mod time;
 mod training;
 
@@ -31,18 +39,23 @@ pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, ExpectedVersion, NewCamera, Revision};
 pub use checksum::model_sha256;
 pub use durability::Durability;
-pub use error::{Error, ErrorKind, Fault, Refusal, Result, Violation, convert_all};
+pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssBiasSigma, GnssError, SigmaM};
+pub use idempotency::{IdempotencyKey, IdempotentRequest, RequestDigest, RequestHasher};
 pub use job::{EvaluationId, JobState, RunId};
+pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
-pub use names::{CameraId, ReceiverId, TargetClass, TargetId, check_labels, check_text};
+pub use names::{CameraId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
+pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use sample::{Association, Sample, SampleCount, StoredSample};
+pub use sample_overflow::SampleOverflow;
 pub use score::Score;
+pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,

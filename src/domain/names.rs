@@ -9,37 +9,61 @@ use super::error::{Error, Result};
 /// Largest length of a name, bytes.
 const MAX_NAME_BYTES: usize = 128;
 
-/// Id of a camera: a slug of 1 to 63 of `a-z0-9-`, beginning and ending with a letter or digit.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct CameraId(Arc<str>);
+/// A newtype for an id that the operator chooses: a slug of 1 to 63 of `a-z0-9-`, beginning and ending with a
+/// letter or digit.
+macro_rules! slug {
+    ($(#[$doc:meta])* $name:ident) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+        pub struct $name(Arc<str>);
 
-impl CameraId {
-    /// # Errors
-    /// Refuses what is not such a slug; the field is named `id`.
-    pub fn new(id: &str) -> Result<Self> {
-        let inner = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
-        let well_formed = (1..=63).contains(&id.len())
-            && id.bytes().all(inner)
-            && !id.starts_with('-')
-            && !id.ends_with('-');
-        if well_formed {
-            Ok(Self(id.into()))
-        } else {
-            Err(Error::invalid("id", "must be 1 to 63 of a-z, 0-9 and -, not beginning or ending with -"))
+        impl $name {
+            /// # Errors
+            /// Refuses what is not such a slug; the field is named `id`.
+            pub fn new(id: &str) -> Result<Self> {
+                check_slug(id)?;
+                Ok(Self(id.into()))
+            }
+
+            /// The slug.
+            #[must_use]
+            pub fn as_str(&self) -> &str {
+                &self.0
+            }
         }
-    }
 
-    /// The slug.
-    #[must_use]
-    pub fn as_str(&self) -> &str {
-        &self.0
-    }
+        /// Lets maps keyed by such ids be queried with text.
+        impl std::borrow::Borrow<str> for $name {
+            fn borrow(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+                out.write_str(&self.0)
+            }
+        }
+    };
 }
 
-/// Lets maps keyed by camera ids be queried with text.
-impl std::borrow::Borrow<str> for CameraId {
-    fn borrow(&self) -> &str {
-        &self.0
+slug!(
+    /// Id of a camera: a slug of 1 to 63 of `a-z0-9-`, beginning and ending with a letter or digit.
+    CameraId
+);
+slug!(
+    /// Id of a site: a slug like that of a camera.
+    SiteId
+);
+
+fn check_slug(id: &str) -> Result<()> {
+    let inner = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
+    let well_formed =
+        (1..=63).contains(&id.len()) && id.bytes().all(inner) && !id.starts_with('-') && !id.ends_with('-');
+    if well_formed {
+        Ok(())
+    } else {
+        Err(Error::invalid("id", "must be 1 to 63 of a-z, 0-9 and -, not beginning or ending with -"))
     }
 }
 
@@ -96,9 +120,10 @@ impl From<ReceiverId> for TargetId {
     }
 }
 
-impl fmt::Display for CameraId {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(&self.0)
+/// Where all receivers of a target count as one, the target's id names it.
+impl From<TargetId> for ReceiverId {
+    fn from(target_id: TargetId) -> Self {
+        Self(target_id.0)
     }
 }
 

@@ -12,6 +12,7 @@ pub(crate) mod plots;
 mod predictors;
 mod report;
 mod runner;
+pub mod site;
 #[cfg(test)]
 mod tests;
 mod traces;

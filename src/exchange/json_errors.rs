@@ -16,22 +16,42 @@ pub(super) fn refusal_of(path: &str, error: &serde_json::Error) -> Error {
     Error::field(ErrorKind::MalformedBody, path, format!("not JSON: {what}{place}"))
 }
 
+/// The name at the begin of the parser's message, and what follows it.
+fn quoted<'m>(message: &'m str, begin: &str) -> Option<(&'m str, &'m str)> {
+    message.strip_prefix(begin).and_then(|rest| rest.split_once('`'))
+}
+
+/// The field that the parser's message says is missing.
+pub(super) fn missing_field(message: &str) -> Option<&str> {
+    quoted(message, "missing field `").map(|(name, _)| name)
+}
+
+/// The field that the parser's message says is not known.
+pub(super) fn unknown_field(message: &str) -> Option<&str> {
+    quoted(message, "unknown field `").map(|(name, _)| name)
+}
+
+/// The first of the names that the parser's message says could be there.
+pub(super) fn first_variant(message: &str) -> Option<&str> {
+    let (_, rest) = quoted(message, "unknown variant `")?;
+    rest.split('`').nth(1)
+}
+
 /// serde reports a missing or unknown field at its parent; this returns the path of the field itself.
 fn field_and_reason(path: &str, what: &str) -> (String, String) {
     let join = |name: &str| if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
-    let quoted = |begin: &str| what.strip_prefix(begin).and_then(|rest| rest.split_once('`'));
-    if let Some((name, _)) = quoted("missing field `") {
+    if let Some(name) = missing_field(what) {
         return (join(name), "is required".to_owned());
     }
-    if let Some((name, _)) = quoted("duplicate field `") {
+    if let Some((name, _)) = quoted(what, "duplicate field `") {
         return (join(name), "appears twice".to_owned());
     }
-    if let Some((name, rest)) = quoted("unknown field `") {
+    if let Some((name, rest)) = quoted(what, "unknown field `") {
         let is_named = path == name || path.ends_with(&format!(".{name}"));
         let field = if is_named { path.to_owned() } else { join(name) };
         return (field, format!("is not a known field{rest}"));
     }
-    if let Some((_, rest)) = quoted("unknown variant `") {
+    if let Some((_, rest)) = quoted(what, "unknown variant `") {
         return (path.to_owned(), rest.replacen(", expected", "must be", 1).replace('`', ""));
     }
     (path.to_owned(), type_mismatch(what).unwrap_or_else(|| what.to_owned()))

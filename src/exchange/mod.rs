@@ -7,10 +7,15 @@
 //! line, field and reason takes its place. Numbers are checked by the constructors of
 //! [`crate::domain`] only. What never happens here: transports, storage, clocks.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod columns;
+mod csv_layout;
 mod csv_rows;
 mod cursor;
 mod elements;
+mod feature;
 mod file_row;
 mod fix_row;
 mod fixes;
@@ -19,6 +24,7 @@ mod formula_guard;
 mod gpsd;
 mod gpx;
 mod json_errors;
+mod json_violations;
 mod lines;
 mod nmea_fixes;
 mod objects_only;
@@ -28,11 +34,14 @@ mod tests;
 pub mod wire;
 mod write;
 
+pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
-pub use rows::{ObservedRow, RowRules, read_detections, read_observations, read_samples};
+pub use rows::{
+    ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
+};
 pub use write::{FusedWriter, MatchedSampleWriter, SampleWriter, write_fused, write_samples};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.

@@ -3,6 +3,9 @@
 //! Degrees are in [`Position`], metres in [`EastNorth`]; only a [`LocalPlane`] converts between them.
 //! What never happens here: imports from other modules, I/O, f32.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod plane;
 mod plane_covariance;
 mod position;

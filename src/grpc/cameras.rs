@@ -1,6 +1,7 @@
 //! `CameraService`.
 
-use super::convert::{camera_id, of_field, recipe, required, timestamp};
+use super::convert::{camera_id, of_field, recipe, required, site_id, timestamp};
+use super::mask::named_fields;
 use super::pages;
 use super::proto;
 use super::proto::camera_service_server::CameraService;
@@ -8,7 +9,7 @@ use super::statuses::{Reply, answer};
 use crate::app::App;
 use crate::domain::{
     Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, NewCamera,
-    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, TargetClass, TargetId,
+    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, TargetClass, TargetId,
 };
 
 pub(super) struct Cameras {
@@ -32,7 +33,7 @@ impl CameraService for Cameras {
             let profile = new_camera(id, asked.profile.unwrap_or_default())
                 .and_then(NewCamera::check)
                 .map_err(|error| error.under("profile"))?;
-            let camera = app.create_camera(profile).await?;
+            let camera = app.create_camera(profile).await.map_err(|error| of_field(error, "profile"))?;
             Ok(proto::CreateCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
         .await
@@ -56,7 +57,8 @@ impl CameraService for Cameras {
         answer(&self.app, request, |app, asked| async move {
             let size = pages::size(asked.page_size, &app.limits)?;
             let after = pages::cursor::<CameraId>(&asked.page_token)?;
-            let page = app.cameras(after.as_ref(), size).await?;
+            let site = Some(&asked.site_id).filter(|id| !id.is_empty()).map(|id| site_id(id)).transpose()?;
+            let page = app.cameras(site.as_ref(), after.as_ref(), size).await?;
             Ok(proto::ListCamerasResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 cameras: page.items.into_iter().map(|camera| proto::Camera::of(&app, camera)).collect(),
@@ -111,6 +113,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
         labels: profile.labels.into_iter().collect(),
         receivers: receivers(&profile.receivers)?,
         retrain_when_moved: profile.retrain_when_moved.unwrap_or(named.retrain_when_moved),
+        site: profile.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
         id: named.id,
     })
 }
@@ -162,20 +165,9 @@ fn camera_change(
     profile: proto::CameraProfile,
     mask: Option<prost_types::FieldMask>,
 ) -> Result<CameraChange> {
-    let paths = match mask {
-        Some(mask) => mask.paths,
-        None => present(&profile).into_iter().map(str::to_owned).collect(),
-    };
-    let unknown = |path: &String| path != "*" && !CameraChange::FIELDS.contains(&path.as_str());
-    if let Some(index) = paths.iter().position(unknown) {
-        let known = CameraChange::FIELDS.join(", ");
-        return Err(Error::invalid(
-            format!("update_mask.paths[{index}]"),
-            format!("must be one of {known}, or * for all"),
-        ));
-    }
+    let is_named = named_fields(mask, &CameraChange::FIELDS, present(&profile))?;
     let profile = new_camera(id.clone(), profile).map_err(|error| error.under("profile"))?;
-    Ok(CameraChange::of_fields(profile, |field| paths.iter().any(|path| path == field || path == "*")))
+    Ok(CameraChange::of_fields(profile, is_named))
 }
 
 /// Names of the fields that a profile has.
@@ -190,6 +182,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         ("labels", !profile.labels.is_empty()),
         ("receivers", !profile.receivers.is_empty()),
         ("retrain_when_moved", profile.retrain_when_moved.is_some()),
+        ("site", profile.site.is_some()),
     ];
     has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
 }
@@ -230,6 +223,7 @@ impl From<NewCamera> for proto::CameraProfile {
             receivers: profile.receivers.iter().map(Into::into).collect(),
             retrain_when_moved: Some(profile.retrain_when_moved),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
+            site: profile.site.map(|site| site.as_str().to_owned()),
         }
     }
 }

@@ -141,6 +141,7 @@ impl Connection {
             .http2_keep_alive_interval(PING_AFTER)
             .keep_alive_timeout(PING_TIME);
         let authorization = key.map(|key| {
+            #[expect(clippy::expect_used, reason = "the secret was parsed")]
             let mut value =
                 AsciiMetadataValue::try_from(format!("Bearer {}", key.reveal())).expect("a key is ASCII");
             value.set_sensitive(true);

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use super::proto;
 use crate::domain::{
     self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Score,
-    StoredSample, TargetClass, TargetId, TimeRange,
+    SiteId, StoredSample, TargetClass, TargetId, TimeRange,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -27,6 +27,14 @@ pub(super) fn camera_id(id: &str) -> Result<CameraId> {
     CameraId::new(required_text(id, "camera_id")?).map_err(|_| {
         let shown: String = id.chars().take(80).collect();
         Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera"))
+    })
+}
+
+/// The site that a request names. What is no slug names no site.
+pub(super) fn site_id(id: &str) -> Result<SiteId> {
+    SiteId::new(required_text(id, "site_id")?).map_err(|_| {
+        let shown: String = id.chars().take(80).collect();
+        Error::refused(ErrorKind::SiteNotFound, format!("`{shown}` is not the id of a site"))
     })
 }
 
@@ -54,6 +62,22 @@ pub(super) fn durability(durability: i32) -> Result<domain::Durability> {
         Ok(proto::Durability::Synced) => Ok(domain::Durability::Synced),
         Ok(proto::Durability::Relaxed) => Ok(domain::Durability::Relaxed),
         Err(_) => Err(Error::invalid("durability", format!("has no value {durability}"))),
+    }
+}
+
+impl From<geo::PlaneCovariance> for proto::PlaneCovariance {
+    fn from(covariance: geo::PlaneCovariance) -> Self {
+        let geo::PlaneCovariance { east_m2, north_m2, east_north_m2 } = covariance;
+        Self { east_m2, north_m2, east_north_m2 }
+    }
+}
+
+/// What becomes of samples that are stored already.
+pub(super) fn on_conflict(on_conflict: i32) -> Result<domain::OnConflict> {
+    match proto::OnConflict::try_from(on_conflict) {
+        Ok(proto::OnConflict::Unspecified | proto::OnConflict::Keep) => Ok(domain::OnConflict::Keep),
+        Ok(proto::OnConflict::Replace) => Ok(domain::OnConflict::Replace),
+        Err(_) => Err(Error::invalid("on_conflict", format!("has no value {on_conflict}"))),
     }
 }
 
@@ -129,7 +153,7 @@ pub(super) fn fix(fix: proto::Fix) -> Result<domain::Fix> {
     .to_domain()
 }
 
-fn position(position: proto::Position) -> Result<geo::Position> {
+pub(super) fn position(position: proto::Position) -> Result<geo::Position> {
     wire::Position {
         longitude_deg: required(position.longitude_deg, "longitude_deg")?,
         latitude_deg: required(position.latitude_deg, "latitude_deg")?,

@@ -6,7 +6,7 @@ use super::convert::{camera_id, observation, timestamp};
 use super::outbox::Responses;
 use super::proto;
 use super::proto::fusion_service_server::FusionService;
-use super::statuses::{Reply, answer, callers_app, client_address, request_id, to_status};
+use super::statuses::{Reply, answer, callers_app, client_id, request_id, to_status};
 use super::stream;
 use crate::app::App;
 use crate::domain::{Flag, FusedFix, TargetId, convert_all};
@@ -32,7 +32,7 @@ impl FusionService for Fusion {
         request: tonic::Request<Streaming<proto::StreamRequest>>,
     ) -> Reply<Self::StreamStream> {
         let id = request_id(request.extensions());
-        let client = client_address(request.extensions());
+        let client = client_id(request.extensions());
         let app = callers_app(&self.app, request.extensions()).map_err(|error| to_status(&error, &id))?;
         let responses = stream::serve(&app, &self.shutdown, id, client, request.into_inner());
         Ok(tonic::Response::new(responses))
@@ -66,6 +66,8 @@ impl From<FusedFix> for proto::FusedFix {
             e_regression_m2: fused.e_regression_m2,
             e_gnss_m2: fused.e_gnss_m2,
             r95_m: fused.r95_m,
+            covariance: Some(fused.covariance.into()),
+            regressed_covariance: fused.regressed_covariance.map(Into::into),
             reconstruction_error: fused.reconstruction_error,
             model_version: fused.model_version,
             flags: fused.flags.into_iter().map(|flag| proto::Flag::from(flag).into()).collect(),

@@ -3,20 +3,27 @@
 //! What never happens here: checks on numbers (the constructors of [`crate::domain`] make them), status
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod audit;
 mod cameras;
 mod cancel_on_shutdown;
 pub mod client;
 mod convert;
 mod fusion;
+mod idempotency;
 mod keys;
+mod mask;
 mod models;
 mod outbox;
 mod pages;
 mod samples;
+mod sites;
 mod statuses;
 mod stream;
 mod training;
+mod world_tracks;
 
 use futures_util::FutureExt as _;
 use hyper::Response;
@@ -37,12 +44,14 @@ use proto::fusion_service_server::FusionServiceServer;
 use proto::key_service_server::KeyServiceServer;
 use proto::model_service_server::ModelServiceServer;
 use proto::sample_service_server::SampleServiceServer;
+use proto::site_service_server::SiteServiceServer;
 use proto::training_service_server::TrainingServiceServer;
 
 pub use statuses::{explain, trailers};
 
 /// Messages, services and clients generated from `proto/`.
 #[expect(clippy::allow_attributes, reason = "generated code")]
+#[expect(clippy::large_enum_variant, reason = "answers with a position, the large variant, are nearly all")]
 pub mod proto {
     tonic::include_proto!("sightfix.v1");
 
@@ -64,13 +73,16 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
     let fusion = FusionServiceServer::new(fusion::Fusion::new(app, shutdown)).max_decoding_message_size(most);
     let keys = KeyServiceServer::new(keys::Keys::new(app)).max_decoding_message_size(most);
     let audit = AuditServiceServer::new(audit::Audit::new(app)).max_decoding_message_size(most);
+    let sites = SiteServiceServer::new(sites::Sites::new(app, shutdown)).max_decoding_message_size(most);
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
+    #[expect(clippy::expect_used, reason = "every start tests it")]
     let reflection_v1 = reflection().build_v1().expect("the build wrote the descriptors");
     // All that Python's client speaks, and older releases of others.
+    #[expect(clippy::expect_used, reason = "every start tests it")]
     let reflection_v1alpha = reflection().build_v1alpha().expect("the build wrote the descriptors");
     Routes::default()
         .add_service(health(shutdown))
@@ -83,6 +95,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .add_service(fusion)
         .add_service(keys)
         .add_service(audit)
+        .add_service(sites)
         .prepare()
 }
 
@@ -105,7 +118,7 @@ pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
 }
 
 /// The services whose health is reported; the empty name is the server as a whole.
-const HEALTHY: [&str; 8] = [
+const HEALTHY: [&str; 9] = [
     "",
     CameraServiceServer::<()>::NAME,
     SampleServiceServer::<()>::NAME,
@@ -114,6 +127,7 @@ const HEALTHY: [&str; 8] = [
     FusionServiceServer::<()>::NAME,
     KeyServiceServer::<()>::NAME,
     AuditServiceServer::<()>::NAME,
+    SiteServiceServer::<()>::NAME,
 ];
 
 /// Serving until the end begins; then watchers get a last status, and their streams end.
@@ -154,6 +168,7 @@ mod tests {
             "FusionService",
             "KeyService",
             "AuditService",
+            "SiteService",
         ];
         assert_eq!(names, own);
     }

@@ -1,6 +1,7 @@
 //! Errors as gRPC statuses. The only place of this transport that makes a status.
 
 use std::collections::HashMap;
+use std::time::Duration;
 
 use hyper::http::Extensions;
 use hyper::http::HeaderValue;
@@ -8,7 +9,7 @@ use hyper::{HeaderMap, Response};
 use tonic::{Code, Request, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
 
-use crate::admission::ClientAddress;
+use crate::admission::ClientId;
 use crate::app::App;
 use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Refusal, Result, Violation};
@@ -71,16 +72,23 @@ pub(super) fn request_id(extensions: &Extensions) -> RequestId {
 }
 
 /// Who sends the request.
-pub(super) fn client_address(extensions: &Extensions) -> ClientAddress {
-    extensions.get().copied().unwrap_or(ClientAddress::UNKNOWN)
+pub(super) fn client_id(extensions: &Extensions) -> ClientId {
+    extensions.get().copied().unwrap_or(ClientId::UNKNOWN)
 }
 
 /// An error with its code and details: `ErrorInfo` with the problem's slug as reason, `RequestInfo`,
-/// and `BadRequest` where fields are at fault. A fault is logged here and nothing of it is shown.
+/// `RetryInfo` where a later try may succeed, and `BadRequest` where fields are at fault. A fault is logged here and nothing of it is shown.
 pub(super) fn to_status(error: &Error, id: &RequestId) -> Status {
     let row = status::of(error.kind());
-    let mut details = ErrorDetails::with_error_info(row.slug, DOMAIN, HashMap::new());
+    let mut metadata = HashMap::new();
+    if let Error::Refused(Refusal { conflicting_id: Some(id), .. }) = error {
+        metadata.insert("conflicting_id".to_owned(), id.clone());
+    }
+    let mut details = ErrorDetails::with_error_info(row.slug, DOMAIN, metadata);
     details.set_request_info(id.as_str(), "");
+    if let Some(seconds) = row.retry_after_s {
+        details.set_retry_info(Some(Duration::from_secs(seconds.into())));
+    }
     let message = match error {
         Error::Refused(refusal) => {
             if !refusal.violations.is_empty() {

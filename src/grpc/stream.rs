@@ -12,7 +12,7 @@ use super::proto;
 use super::proto::stream_answer::Outcome;
 use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
-use crate::admission::ClientAddress;
+use crate::admission::ClientId;
 use crate::app::{Acknowledgement, App, ItemResult, LiveStream, NotStored, NotStoredReason, TrackPoint};
 use crate::domain::{CameraMoved, Error, ErrorKind, Flag, Result};
 use crate::fusion::track::{MeasurementSource, Rejection, RejectionReason};
@@ -32,12 +32,12 @@ pub(super) fn serve(
     app: &App,
     shutdown: &Shutdown,
     id: RequestId,
-    client_address: ClientAddress,
+    client_id: ClientId,
     requests: Streaming<proto::StreamRequest>,
 ) -> Responses {
     let (outbox, responses) = outbox(app.limits.live_answers);
     let mut session =
-        StreamSession { app: app.clone(), shutdown: shutdown.clone(), client_address, requests, outbox };
+        StreamSession { app: app.clone(), shutdown: shutdown.clone(), client_id, requests, outbox };
     shutdown.spawn(async move {
         let ended = session.run().await;
         let status = ended.err().map(|error| to_status(&error, &id));
@@ -49,7 +49,7 @@ pub(super) fn serve(
 struct StreamSession {
     app: App,
     shutdown: Shutdown,
-    client_address: ClientAddress,
+    client_id: ClientId,
     requests: Streaming<proto::StreamRequest>,
     outbox: Outbox,
 }
@@ -130,7 +130,7 @@ impl StreamSession {
             .open_stream(
                 &camera,
                 &opening.client_name,
-                self.client_address,
+                self.client_id,
                 opening.resume_after_seq,
                 store_samples,
             )
@@ -291,6 +291,7 @@ fn answer_of(seq: u64, item: ItemResult) -> proto::StreamAnswer {
         track: item.track.map(|point| point.as_ref().into()),
         flags,
         lost_answers: 0,
+        world_track_id: item.world_track.map(|id| id.to_string()),
     }
 }
 
@@ -338,6 +339,7 @@ impl From<&TrackPoint> for proto::TrackPoint {
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
+            covariance: Some(state.normal_covariance().into()),
             still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),

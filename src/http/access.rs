@@ -19,11 +19,12 @@ use super::body::discard;
 use super::extract::Params;
 use super::problem::{ApiError, ApiResult};
 use crate::app::App;
-use crate::app::access::{Caller, Permission};
+use crate::app::access::{Caller, Permission, RoutePermission};
 use crate::domain::{Error, Result};
+use crate::telemetry::{MatchedRoute, Route};
 
 /// The query parameters of the operations, as the description names them.
-struct QueryParameters(HashMap<(String, &'static str), HashSet<String>>);
+struct QueryParameters(HashMap<(String, String), HashSet<String>>);
 
 impl QueryParameters {
     fn of(description: &OpenApi) -> Self {
@@ -37,32 +38,35 @@ impl QueryParameters {
                 ("DELETE", &item.delete),
             ];
             for (method, operation) in operations {
-                let described = operation.iter().flat_map(|operation| operation.parameters.iter().flatten());
-                let names = described.filter_map(|parameter| match parameter {
+                let Some(operation) = operation else { continue };
+                let names = operation.parameters.iter().flatten().filter_map(|parameter| match parameter {
                     RefOr::T(parameter) if parameter.parameter_in == ParameterIn::Query => {
                         Some(parameter.name.clone())
                     }
                     _ => None,
                 });
-                parameters.insert((template.clone(), method), names.collect());
+                parameters.insert((template.clone(), method.to_owned()), names.collect());
             }
         }
         Self(parameters)
     }
 
+    /// A method that the route does not have is left to the router to refuse.
+    ///
     /// # Errors
     /// `InvalidArgument` naming a parameter that the operation does not have.
     fn check(&self, template: &str, method: &Method, uri: &Uri) -> Result<()> {
         if uri.query().is_none_or(str::is_empty) {
             return Ok(());
         }
-        let method = METHODS.into_iter().find(|name| *name == method.as_str()).unwrap_or("GET");
-        let known = self.0.get(&(template.to_owned(), method));
-        Params::of(uri)?.check_names(|name| known.is_some_and(|known| known.contains(name)))
+        // The router answers HEAD by the handler of GET.
+        let method = if method == Method::HEAD { &Method::GET } else { method };
+        match self.0.get(&(template.to_owned(), method.to_string())) {
+            Some(known) => Params::of(uri)?.check_names(|name| known.contains(name)),
+            None => Ok(()),
+        }
     }
 }
-
-const METHODS: [&str; 5] = ["GET", "POST", "PUT", "PATCH", "DELETE"];
 
 /// Refuses a request before its handler runs, if the caller may not use the matched route, or the query has
 /// what the operation does not know.
@@ -96,7 +100,11 @@ impl<S> Authorize<S> {
     fn check(&self, request: &Request) -> Result<()> {
         let template = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
         let caller = request.extensions().get::<Caller>().ok_or_else(no_caller)?;
-        caller.authorize(Permission::of_route(request.method().as_str(), template))?;
+        let route = RoutePermission::of(request.method().as_str(), template);
+        if let (Some(matched), Some(route)) = (request.extensions().get::<MatchedRoute>(), route) {
+            matched.set(Route { method: route.method, template: route.template });
+        }
+        caller.authorize(route.map_or(Permission::Administer, |route| route.permission))?;
         self.parameters.check(template, request.method(), request.uri())
     }
 }

@@ -10,7 +10,7 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::access::CallerApp;
 use super::extract::{Params, camera_of};
-use super::problem::ApiResult;
+use super::problem::{ApiResult, Problem};
 use super::wire::json;
 use crate::domain;
 use crate::exchange::write_cursor;
@@ -89,7 +89,10 @@ struct AuditPage {
         ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
     ),
-    responses((status = 200, description = "A page of entries", body = AuditPage))
+    responses(
+        (status = 200, description = "A page of entries", body = AuditPage),
+        (status = 404, description = "There is no such camera", body = Problem, content_type = "application/problem+json"),
+    )
 )]
 async fn list_audit_entries(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;

@@ -11,11 +11,13 @@ use http_body_util::BodyExt as _;
 use hyper::HeaderMap;
 use hyper::header::{CONTENT_LENGTH, EXPECT};
 use hyper::http::request::Parts;
+use sha2::{Digest as _, Sha256};
 use tokio::io::AsyncWriteExt as _;
 
-use crate::admission::{ClientAddress, Lease};
+use super::body_coding::is_undecodable;
+use crate::admission::{ClientId, Lease};
 use crate::app::App;
-use crate::domain::{Error, ErrorKind, Result};
+use crate::domain::{Error, ErrorKind, IdempotentRequest, RequestHasher, Result};
 
 /// What is read and thrown away of a body that is too large, so that the client gets its answer
 /// and not a broken connection, and for how long.
@@ -80,6 +82,41 @@ pub(super) struct Spooled {
     pub(super) leases: SpoolLeases,
 }
 
+impl Spooled {
+    /// Adds the content to what a request asks for, and goes back to its begin.
+    ///
+    /// # Errors
+    /// A fault if the temporary file cannot be read.
+    pub(super) async fn hash_into(self, request: &IdempotentRequest) -> Result<Self> {
+        let hasher = request.hasher.clone();
+        let Self { content, leases } = self;
+        let hashing = tokio::task::spawn_blocking(move || content.hash(&hasher));
+        Ok(Self { content: hashing.await.map_err(Error::fault)?.map_err(Error::fault)?, leases })
+    }
+}
+
+impl Content {
+    fn hash(mut self, hasher: &RequestHasher) -> io::Result<Self> {
+        // The pieces in which a body comes differ from time to time, so it is hashed by itself first.
+        let mut hash = Sha256::new();
+        match &mut self {
+            Self::Memory(parts) => parts.iter().for_each(|part| hash.update(part)),
+            Self::File(file) => {
+                let mut buffer = vec![0; 64 * 1024];
+                loop {
+                    match file.read(&mut buffer)? {
+                        0 => break,
+                        read => hash.update(&buffer[..read]),
+                    }
+                }
+                file.rewind()?;
+            }
+        }
+        hasher.update(&hash.finalize());
+        Ok(self)
+    }
+}
+
 /// Where a spooled body is: in memory, or in a temporary file without a name.
 pub(super) enum Content {
     Memory(VecDeque<Bytes>),
@@ -110,7 +147,7 @@ pub(super) struct SpoolLeases {
 }
 
 impl SpoolLeases {
-    fn new(app: &App, client: ClientAddress) -> Result<Self> {
+    fn new(app: &App, client: ClientId) -> Result<Self> {
         let memory = app.quotas.import_memory.try_acquire(client, 0)?;
         Ok(Self { memory, disk: app.quotas.import_disk.try_acquire(client, 0)? })
     }
@@ -124,7 +161,7 @@ impl SpoolLeases {
 pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
     let limit = app.limits.import_bytes;
     check_announced(&head.headers, &mut body, limit).await?;
-    let mut spool = Spool::new(app, client_address(head))?;
+    let mut spool = Spool::new(app, client_id(head))?;
     while let Some(part) = next(&mut body).await? {
         let pushed =
             if spool.length + part.len() > limit { Err(too_large(limit)) } else { spool.push(part).await };
@@ -137,8 +174,8 @@ pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<S
 }
 
 /// Who sends a request.
-pub(super) fn client_address(head: &Parts) -> ClientAddress {
-    head.extensions.get().copied().unwrap_or(ClientAddress::UNKNOWN)
+pub(super) fn client_id(head: &Parts) -> ClientId {
+    head.extensions.get().copied().unwrap_or(ClientId::UNKNOWN)
 }
 
 /// Gathers what comes piece by piece, in memory up to a size and in a temporary file beyond, or where
@@ -152,7 +189,7 @@ pub(super) struct Spool {
 }
 
 impl Spool {
-    pub(super) fn new(app: &App, client: ClientAddress) -> Result<Self> {
+    pub(super) fn new(app: &App, client: ClientId) -> Result<Self> {
         Ok(Self {
             memory_bytes: app.limits.import_memory_bytes,
             length: 0,
@@ -225,6 +262,12 @@ async fn next(body: &mut Body) -> Result<Option<Bytes>> {
     loop {
         match body.frame().await {
             None => return Ok(None),
+            Some(Err(error)) if is_undecodable(&error) => {
+                return Err(Error::refused(
+                    ErrorKind::MalformedBody,
+                    "the body is not of its content-encoding, or is cut off",
+                ));
+            }
             // Why a body was refused is known, and reported, where requests are admitted.
             Some(Err(_)) => return Err(Error::refused(ErrorKind::Cancelled, "the body broke off")),
             Some(Ok(frame)) => {

@@ -2,31 +2,24 @@
 
 use std::collections::BTreeMap;
 
-use axum::body::Body;
-use axum::response::Response;
-use http_body_util::BodyExt as _;
-use hyper::header::{CONTENT_TYPE, ETAG, IF_MATCH, IF_NONE_MATCH};
-use hyper::http::HeaderValue;
 use hyper::{HeaderMap, StatusCode, Uri};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
 use super::access::CallerApp;
-use super::extract::{CameraPath, JsonBody, Params};
+use super::etag::{self, unless_known, with_etag};
+use super::extract::{CameraPath, JsonBody, Params, site_of};
+use super::merge_patch::{self, JsonObject};
 use super::problem::{ApiResult, Problem};
 use super::receivers::{Receiver, receivers, shown};
 use super::wire::{Recipe, created, empty, json};
 use crate::app::App;
-use crate::domain::{
-    self, CameraId, CameraKey, Error, ErrorKind, ExpectedVersion, GnssBiasSigma, NewCamera, Result, Revision,
-    SigmaM, TargetClass,
-};
-use crate::exchange::wire::parse_json;
+use crate::domain::{self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass};
+use crate::exchange::wire::parse_document;
 use crate::exchange::write_cursor;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -120,6 +113,9 @@ struct CameraDraft {
     /// Whether a training run is started by itself once the camera is found to have moved.
     #[serde(default)]
     retrain_when_moved: bool,
+    /// The site whose world tracks the camera contributes to; it must exist.
+    #[schema(example = "harbour")]
+    site: Option<String>,
 }
 
 impl CameraDraft {
@@ -135,6 +131,7 @@ impl CameraDraft {
             labels: self.labels,
             receivers: receivers(&self.receivers)?,
             retrain_when_moved: self.retrain_when_moved,
+            site: self.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
             id: blank.id,
         })
     }
@@ -177,42 +174,15 @@ struct CameraChange {
     receivers: Option<Vec<Receiver>>,
     /// Whether to start a training run once the camera is found to have moved; null is not to.
     retrain_when_moved: Option<bool>,
+    /// New site; null removes the camera from its site.
+    site: Option<String>,
 }
-
-type JsonObject = serde_json::Map<String, Value>;
 
 /// The change that a merge patch makes of a stored camera.
 fn patched(app: &App, camera: domain::Camera, patch: &JsonObject) -> Result<domain::CameraChange> {
-    if let Some(name) = patch.keys().find(|name| !domain::CameraChange::FIELDS.contains(&name.as_str())) {
-        let known = domain::CameraChange::FIELDS.join(", ");
-        return Err(Error::invalid(name, format!("is not a field that can be changed; those are {known}")));
-    }
-    let shown = serde_json::to_value(Camera::of(app, camera)).map_err(Error::fault)?;
-    let Value::Object(mut document) = shown else { return Err(Error::fault("a camera is an object")) };
-    document.retain(|name, _| name == "id" || domain::CameraChange::FIELDS.contains(&name.as_str()));
-    merge(&mut document, patch);
-    let document = serde_json::to_vec(&document).map_err(Error::fault)?;
-    let profile = parse_json::<CameraDraft>(&document)?.into_domain()?;
+    let document = merge_patch::merged(&Camera::of(app, camera), patch, &domain::CameraChange::FIELDS)?;
+    let profile = parse_document::<CameraDraft>(&document)?.into_domain()?;
     Ok(domain::CameraChange::of_fields(profile, |field| patch.contains_key(field)))
-}
-
-/// RFC 7396, section 2.
-fn merge(target: &mut JsonObject, patch: &JsonObject) {
-    for (name, value) in patch {
-        match value {
-            Value::Null => drop(target.remove(name)),
-            Value::Object(patch) => {
-                let nested = target.entry(name.clone()).or_insert_with(|| Value::Object(JsonObject::new()));
-                if !nested.is_object() {
-                    *nested = Value::Object(JsonObject::new());
-                }
-                if let Value::Object(nested) = nested {
-                    merge(nested, patch);
-                }
-            }
-            other => drop(target.insert(name.clone(), other.clone())),
-        }
-    }
 }
 
 /// A stored camera.
@@ -241,6 +211,9 @@ pub(super) struct Camera {
     receivers: Vec<Receiver>,
     /// Whether a training run is started by itself once the camera is found to have moved.
     retrain_when_moved: bool,
+    /// The site whose world tracks the camera contributes to, if any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    site: Option<String>,
     /// Counts the changes of the profile, from 1.
     revision: u64,
     /// When it was made.
@@ -286,6 +259,7 @@ impl Camera {
             labels: profile.labels,
             receivers: shown(&profile.receivers),
             retrain_when_moved: profile.retrain_when_moved,
+            site: profile.site.map(|site| site.as_str().to_owned()),
             revision: revision.0,
             created_at,
             updated_at,
@@ -360,6 +334,7 @@ async fn create_camera(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
     params(
         ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
+        ("site" = Option<String>, Query, description = "Only the cameras of this site"),
     ),
     responses((status = 200, description = "A page of cameras", body = CameraPage))
 )]
@@ -367,8 +342,9 @@ async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;
     let limit = params.limit(app.limits.page_items)?;
     let after = params.cursor()?;
+    let site = params.take("site", site_of)?;
     params.end()?;
-    let page = app.cameras(after.as_ref(), limit).await?;
+    let page = app.cameras(site.as_ref(), after.as_ref(), limit).await?;
     Ok(json(&CameraPage {
         items: page.items.into_iter().map(|camera| Camera::of(&app, camera)).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -418,39 +394,16 @@ async fn change_camera(
     headers: HeaderMap,
     body: JsonBody,
 ) -> ApiResult {
-    let expected = if_match(&headers)?.ok_or_else(|| {
-        let message =
-            "the header must name the revision that the change is based on, as `etag` gave it, or be *";
-        Error::field(ErrorKind::RevisionRequired, "if-match", message)
-    })?;
+    let expected = etag::required(&headers)?;
     let patch = body.read::<JsonObject>()?;
-    let changed = apply(&app, &id, &patch, expected.version()).await?;
+    let change = || async {
+        let camera = app.camera(&id).await?;
+        let version = expected.unwrap_or(camera.version());
+        app.change_camera(&id, patched(&app, camera, &patch)?, Some(version)).await
+    };
+    let changed = merge_patch::retried(expected.is_some(), change).await?;
     let version = changed.version();
     Ok(with_etag(json(&Camera::of(&app, changed))?, version).await?)
-}
-
-/// Changes what was read, so another change in between would be undone: it is read again then, unless the
-/// client named a version.
-async fn apply(
-    app: &App,
-    id: &CameraId,
-    patch: &JsonObject,
-    expected: Option<ExpectedVersion>,
-) -> Result<domain::Camera> {
-    let mut attempts = 0;
-    loop {
-        attempts += 1;
-        let camera = app.camera(id).await?;
-        let read = camera.version();
-        let change = patched(app, camera, patch)?;
-        match app.change_camera(id, change, Some(expected.unwrap_or(read))).await {
-            Err(error)
-                if error.kind() == ErrorKind::RevisionMismatch
-                    && expected.is_none()
-                    && attempts < PATCH_ATTEMPTS => {}
-            changed => return changed,
-        }
-    }
 }
 
 /// Delete a camera with its samples, runs and models
@@ -471,84 +424,6 @@ async fn delete_camera(
     CameraPath(id): CameraPath,
     headers: HeaderMap,
 ) -> ApiResult {
-    let expected = if_match(&headers)?.and_then(IfMatch::version);
-    app.delete_camera(&id, expected).await?;
+    app.delete_camera(&id, etag::optional(&headers)?).await?;
     Ok(empty())
 }
-
-/// What `If-Match` says.
-#[derive(Clone, Copy)]
-enum IfMatch {
-    Any,
-    One(ExpectedVersion),
-}
-
-impl IfMatch {
-    const fn version(self) -> Option<ExpectedVersion> {
-        match self {
-            Self::Any => None,
-            Self::One(version) => Some(version),
-        }
-    }
-}
-
-fn if_match(headers: &HeaderMap) -> Result<Option<IfMatch>> {
-    let Some(value) = headers.get(IF_MATCH) else { return Ok(None) };
-    let text = value.to_str().unwrap_or_default().trim();
-    if text == "*" {
-        return Ok(Some(IfMatch::Any));
-    }
-    let quoted = text.strip_prefix('"').and_then(|rest| rest.strip_suffix('"'));
-    match quoted.and_then(version_of) {
-        Some(version) => Ok(Some(IfMatch::One(version))),
-        // No version of ours ever looked like this, so none can match it.
-        None => Err(Error::field(
-            ErrorKind::RevisionMismatch,
-            "if-match",
-            "must be an `etag` as this server gave it, quotes included, or *",
-        )),
-    }
-}
-
-/// The version in an `etag`; a revision alone is understood, too.
-fn version_of(etag: &str) -> Option<ExpectedVersion> {
-    let mut parts = etag.split('.');
-    match (parts.next(), parts.next(), parts.next(), parts.next()) {
-        (Some(revision), None, ..) => Some(Revision(revision.parse().ok()?).into()),
-        (Some(key), Some(revision), Some(_), None) => Some(ExpectedVersion {
-            key: Some(CameraKey(key.parse().ok()?)),
-            revision: Revision(revision.parse().ok()?),
-        }),
-        _ => None,
-    }
-}
-
-/// Names what is shown: which camera of that id, its revision, and a digest, for the active model and alarms
-/// change without a revision.
-async fn with_etag(response: Response, version: ExpectedVersion) -> Result<Response> {
-    let (mut head, body) = response.into_parts();
-    let body = body.collect().await.map_err(Error::fault)?.to_bytes();
-    let key = version.key.map_or(0, |CameraKey(key)| key);
-    let etag = format!("\"{key}.{}.{:08x}\"", version.revision.0, crc32fast::hash(&body));
-    head.headers.insert(ETAG, HeaderValue::from_str(&etag).map_err(Error::fault)?);
-    Ok(Response::from_parts(head, Body::from(body)))
-}
-
-/// A 304 in the place of what the client has shown already.
-fn unless_known(headers: &HeaderMap, response: Response) -> Response {
-    let Some(etag) = response.headers().get(ETAG).and_then(|etag| etag.to_str().ok()) else {
-        return response;
-    };
-    let known = headers.get_all(IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
-    let mut known = known.flat_map(|list| list.split(',')).map(str::trim);
-    if !known.any(|known| known == "*" || known.strip_prefix("W/").unwrap_or(known) == etag) {
-        return response;
-    }
-    let (mut head, _) = response.into_parts();
-    head.status = StatusCode::NOT_MODIFIED;
-    head.headers.remove(CONTENT_TYPE);
-    Response::from_parts(head, Body::empty())
-}
-
-/// Times that a patch without a version is made of what was read.
-const PATCH_ATTEMPTS: u32 = 8;

@@ -17,8 +17,9 @@ use crate::app::access::Permission;
 use crate::domain::{ErrorKind, Role};
 use crate::status;
 
-const TAGS: [(&str, &str); 8] = [
+const TAGS: [(&str, &str); 9] = [
     ("cameras", "Profiles of cameras that nobody calibrated"),
+    ("sites", "Cameras whose targets are tracked together"),
     ("samples", "Boxes and fixes that cameras learn from"),
     ("training", "Background fits of a camera's model"),
     ("models", "Model versions that runs yield"),
@@ -29,10 +30,11 @@ const TAGS: [(&str, &str); 8] = [
 ];
 
 /// Refusals that any operation may meet.
-const ANY: [ErrorKind; 5] = [
+const ANY: [ErrorKind; 6] = [
     ErrorKind::Timeout,
     ErrorKind::Internal,
     ErrorKind::Overloaded,
+    ErrorKind::RateLimited,
     ErrorKind::InvalidArgument,
     ErrorKind::HostNotAllowed,
 ];
@@ -43,6 +45,8 @@ const WITH_BODY: [ErrorKind; 3] =
     [ErrorKind::MalformedBody, ErrorKind::TooLarge, ErrorKind::UnsupportedMediaType];
 /// Refusals of operations below a camera.
 const BELOW_CAMERA: [ErrorKind; 1] = [ErrorKind::CameraNotFound];
+/// Refusals of operations below a site.
+const BELOW_SITE: [ErrorKind; 1] = [ErrorKind::SiteNotFound];
 
 pub(super) fn head() -> OpenApi {
     let info = InfoBuilder::new()
@@ -79,6 +83,9 @@ pub(super) fn add_problems(openapi: &mut OpenApi) {
             }
             if is_below_camera {
                 kinds.extend(BELOW_CAMERA);
+            }
+            if path.contains("{site}") {
+                kinds.extend(BELOW_SITE);
             }
             add(&mut operation.responses.responses, &kinds);
         }

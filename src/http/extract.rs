@@ -12,23 +12,40 @@ use serde::de::DeserializeOwned;
 use super::Rest;
 use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
-use crate::admission::ClientAddress;
+use crate::admission::ClientId;
 use crate::domain::{
-    CameraId, Durability, Error, ErrorKind, EvaluationId, Result, RunId, TargetId, parse_time,
+    CameraId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId, SiteId,
+    TargetId, parse_time,
 };
-use crate::exchange::{Cursor, read_cursor, wire};
+use crate::exchange::{CsvLayout, Cursor, Format, read_cursor, wire};
 
 /// Items on a page whose length the client leaves open.
 const PAGE_ITEMS: u32 = 100;
 
 /// Who sends the request.
-pub(super) struct Client(pub(super) ClientAddress);
+pub(super) struct Client(pub(super) ClientId);
 
 impl<S: Send + Sync> FromRequestParts<S> for Client {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
-        Ok(Self(body::client_address(parts)))
+        Ok(Self(body::client_id(parts)))
+    }
+}
+
+/// The id of the last event that the client of an event stream has seen: of the header that browsers send by
+/// themselves, or of the parameter `last_event_id`, for a page that opens the stream again.
+pub(super) struct LastEventId(pub(super) Option<String>);
+
+impl<S: Send + Sync> FromRequestParts<S> for LastEventId {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
+        let mut params = Params::of(&parts.uri)?;
+        let given = params.take("last_event_id", |text| Ok(text.to_owned()))?;
+        params.end()?;
+        let header = parts.headers.get("last-event-id").and_then(|value| value.to_str().ok());
+        Ok(Self(header.map(str::to_owned).or(given)))
     }
 }
 
@@ -40,6 +57,32 @@ impl<S: Send + Sync> FromRequestParts<S> for CameraPath {
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         Ok(Self(camera_of(&path::<CameraSegment, S>(parts, state).await?.camera)?))
+    }
+}
+
+/// A site of the path. What is no slug names no site.
+pub(super) struct SitePath(pub(super) SiteId);
+
+impl<S: Send + Sync> FromRequestParts<S> for SitePath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        Ok(Self(site_of(&path::<SiteSegment, S>(parts, state).await?.site)?))
+    }
+}
+
+/// A world track of the path. What is no id of a track names none that there is.
+pub(super) struct WorldTrackPath(pub(super) SiteId, pub(super) LiveId);
+
+impl<S: Send + Sync> FromRequestParts<S> for WorldTrackPath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        let WorldTrackSegments { site, track } = path(parts, state).await?;
+        let track = track.parse().map_err(|_: Error| {
+            Error::refused(ErrorKind::TrackNotFound, "that is not the id of a world track")
+        })?;
+        Ok(Self(site_of(&site)?, track))
     }
 }
 
@@ -101,6 +144,17 @@ struct CameraSegment {
 }
 
 #[derive(Deserialize)]
+struct SiteSegment {
+    site: String,
+}
+
+#[derive(Deserialize)]
+struct WorldTrackSegments {
+    site: String,
+    track: String,
+}
+
+#[derive(Deserialize)]
 struct RunSegments {
     camera: String,
     run: String,
@@ -139,6 +193,14 @@ pub(super) fn camera_of(id: &str) -> Result<CameraId> {
     CameraId::new(id).map_err(|_| {
         let shown: String = id.chars().take(80).collect();
         Error::refused(ErrorKind::CameraNotFound, format!("`{shown}` is not the id of a camera"))
+    })
+}
+
+/// A site by its id in a path, parameter or body.
+pub(super) fn site_of(id: &str) -> Result<SiteId> {
+    SiteId::new(id).map_err(|_| {
+        let shown: String = id.chars().take(80).collect();
+        Error::refused(ErrorKind::SiteNotFound, format!("`{shown}` is not the id of a site"))
     })
 }
 
@@ -194,6 +256,19 @@ impl Params {
         Ok(self.take("durability", str::parse)?.unwrap_or_default())
     }
 
+    /// `on_conflict`: what becomes of samples that are stored already.
+    pub(super) fn on_conflict(&mut self) -> Result<OnConflict> {
+        Ok(self.take("on_conflict", str::parse)?.unwrap_or_default())
+    }
+
+    /// `columns`, `box_form` and `box_unit`: the layout of a CSV file.
+    pub(super) fn csv_layout(&mut self) -> Result<CsvLayout> {
+        let columns = self.take("columns", str::parse)?;
+        let box_form = self.take("box_form", str::parse)?;
+        let box_unit = self.take("box_unit", str::parse)?;
+        Ok(CsvLayout::new(columns, box_form, box_unit))
+    }
+
     /// # Errors
     /// `InvalidArgument` naming a parameter that is none.
     pub(super) fn check_names(&self, is_known: impl Fn(&str) -> bool) -> Result<()> {
@@ -207,6 +282,17 @@ impl Params {
     pub(super) fn end(self) -> Result<()> {
         self.check_names(|_| false)
     }
+}
+
+/// The layout of a body, which only CSV has.
+///
+/// # Errors
+/// `InvalidArgument` if there is one for another format.
+pub(super) fn layout_of(format: Format, layout: &CsvLayout) -> Result<()> {
+    if format == Format::Csv || *layout == CsvLayout::default() {
+        return Ok(());
+    }
+    Err(Error::invalid("columns", "columns, box_form, box_unit and target_id are for CSV alone"))
 }
 
 /// A body of JSON, not yet read.
@@ -232,18 +318,45 @@ impl FromRequest<Rest> for JsonBody {
 
 impl JsonBody {
     /// # Errors
-    /// `MalformedBody` for what is not JSON; `InvalidArgument` naming the path of a field of the
+    /// `MalformedBody` for what is not JSON; `InvalidArgument` naming the paths of all fields of the
     /// wrong type, missing or unknown.
     pub(super) fn read<'a, T: Deserialize<'a>>(&'a self) -> Result<T> {
         if self.0.is_empty() {
             return Err(Error::refused(ErrorKind::MalformedBody, "the operation needs a body of JSON"));
         }
-        wire::parse_json(&self.0)
+        wire::parse_document(&self.0)
+    }
+
+    /// What was sent.
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.0
     }
 
     /// The same where all of the body may be left out.
     pub(super) fn read_or_default<'a, T: Deserialize<'a> + Default>(&'a self) -> Result<T> {
         if self.0.is_empty() { Ok(T::default()) } else { self.read() }
+    }
+}
+
+/// A body of JSON, or of rows in another format, not yet read.
+pub(super) enum FormattedBody {
+    Json(JsonBody),
+    Rows(Bytes, Format),
+}
+
+impl FromRequest<Rest> for FormattedBody {
+    type Rejection = ApiError;
+
+    async fn from_request(request: Request, rest: &Rest) -> ApiResult<Self> {
+        let format = media_type(request.headers()).and_then(Format::from_media_type);
+        match format {
+            None | Some(Format::Json) => JsonBody::from_request(request, rest).await.map(Self::Json),
+            Some(format) => {
+                let (parts, content) = request.into_parts();
+                let content = body::whole(&parts.headers, content, rest.app.limits.body_bytes).await?;
+                Ok(Self::Rows(content, format))
+            }
+        }
     }
 }
 

@@ -4,18 +4,25 @@
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod access;
 mod audit;
 mod body;
+mod body_coding;
 mod camera_statuses;
 mod cameras;
 mod console;
 mod description;
+mod etag;
 mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
+mod idempotency;
 mod keys;
+mod merge_patch;
 mod models;
 mod pairings;
 mod parts;
@@ -25,11 +32,13 @@ mod samples;
 mod server_info;
 mod service;
 mod session;
+mod sites;
 #[cfg(test)]
 mod tests;
 mod tracks;
 mod training_runs;
 mod wire;
+mod world_tracks;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
@@ -84,15 +93,27 @@ impl Transport {
         Self(routes.route_layer(authorize).merge(page).merge(console_routes).with_state(rest))
     }
 
+    /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
+    #[must_use]
+    pub fn monitoring(app: App, shutdown: Shutdown) -> Self {
+        let rest = Rest { app, console: Arc::default(), shutdown };
+        let (routes, described) = service::routes().split_for_parts();
+        Self(routes.route_layer(access::AuthorizeLayer::of(&described)).with_state(rest))
+    }
+
     /// Answers a request, which carries its [`RequestId`] and its [`Caller`](crate::app::access::Caller) as
     /// extensions. Whatever part of the router refuses it, or panics, the answer is a problem.
     pub async fn answer(&self, request: Request<Body>) -> Response<Body> {
         // Not as layers of the router: axum would box the service and the future of every request for each.
+        let coding = body_coding::AcceptedCoding::of(&request);
         let refused = problem::Refused::of(&request);
-        let answer = AssertUnwindSafe(self.0.clone().call(request)).catch_unwind().await;
+        let answer = match body_coding::decoded(request).await {
+            Ok(request) => AssertUnwindSafe(self.0.clone().call(request)).catch_unwind().await,
+            Err(refusal) => Ok(Ok(refusal)),
+        };
         let answer =
             answer.map_or_else(problem::panicked, |answer| answer.unwrap_or_else(|never| match never {}));
-        refused.explain(answer)
+        coding.encode(refused.explain(answer)).await
     }
 }
 
@@ -144,6 +165,8 @@ fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
         .merge(camera_statuses::routes())
+        .merge(sites::routes())
+        .merge(world_tracks::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())

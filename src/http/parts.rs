@@ -20,7 +20,7 @@ use hyper::header::CONTENT_TYPE;
 use hyper::http::request::Parts;
 use tokio::io::AsyncReadExt as _;
 
-use super::body::{self, Content, Spool, SpoolLeases, Spooled, client_address};
+use super::body::{self, Content, Spool, SpoolLeases, Spooled, client_id};
 use super::extract::{media_type, not_read};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind, Result};
@@ -97,7 +97,7 @@ pub(super) async fn parts<const N: usize>(
         if place.is_some() {
             return Err(Error::invalid(name, "the part appears twice"));
         }
-        *place = Some(spooled(field, Spool::new(app, client_address(head))?, &since).await?);
+        *place = Some(spooled(field, Spool::new(app, client_id(head))?, &since).await?);
     }
     let mut missing = None;
     let found = found.into_iter().zip(names).map(|(part, name)| part.ok_or(name));

@@ -13,7 +13,7 @@ use super::Rest;
 use super::access::CallerApp;
 use super::extract::JsonBody;
 use super::keys::{Role, camera_ids};
-use super::problem::ApiResult;
+use super::problem::{ApiResult, Problem};
 use super::wire::{empty, json};
 use crate::app::access::{Principal, SESSION_TIME};
 use crate::domain::{Error, Result};
@@ -75,7 +75,10 @@ impl Session {
 /// from pages of this server only.
 #[utoipa::path(
     post, path = "/v1/session", tag = "access", request_body = SessionDraft,
-    responses((status = 200, description = "Who has signed in", body = Session, headers(("set-cookie" = String, description = "The session"))))
+    responses(
+        (status = 200, description = "Who has signed in", body = Session, headers(("set-cookie" = String, description = "The session"))),
+        (status = 401, description = "The key does not work", body = Problem, content_type = "application/problem+json"),
+    )
 )]
 async fn start_session(CallerApp(app): CallerApp, headers: HeaderMap, body: JsonBody) -> ApiResult {
     let SessionDraft { key } = body.read()?;

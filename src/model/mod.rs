@@ -13,6 +13,7 @@ mod probe;
 mod progress;
 mod regressor;
 mod samples;
+mod site;
 mod uncertainty;
 mod view_area;
 
@@ -26,6 +27,7 @@ pub use progress::{FitError, FitEvent};
 pub use regressor::{Regression, Regressor};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use samples::sequences::fix_sequences;
+pub use site::{SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, fit_site};
 pub use view_area::ViewArea;
 
 #[cfg(test)]

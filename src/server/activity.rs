@@ -12,7 +12,10 @@ use bytes::Bytes;
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
 use tokio::time::Instant;
 
-use crate::telemetry::CloseReason;
+use crate::telemetry::{CloseReason, RpcCall};
+
+/// Header and trailer with the status of an RPC.
+pub(super) const GRPC_STATUS: &str = "grpc-status";
 
 /// Requests, responses and written bytes of one connection.
 pub(super) struct Activity {
@@ -155,17 +158,19 @@ impl Drop for OpenRequest {
 pub(super) struct ObservedBody<G> {
     body: Body,
     request: OpenRequest,
+    /// Counted by the status in the trailers.
+    call: Option<RpcCall>,
     /// What the request holds until its response has ended.
     _held: G,
 }
 
 impl<G> ObservedBody<G> {
-    pub(super) fn new(body: Body, mut request: OpenRequest, held: G) -> Self {
+    pub(super) fn new(body: Body, mut request: OpenRequest, call: Option<RpcCall>, held: G) -> Self {
         // A body of known length is handed over at once; the deadline of writes covers it.
         if body.size_hint().exact().is_none() {
             request.streams();
         }
-        Self { body, request, _held: held }
+        Self { body, request, call, _held: held }
     }
 }
 
@@ -181,6 +186,12 @@ impl<G: Unpin> HttpBody for ObservedBody<G> {
         let polled = Pin::new(&mut self.body).poll_frame(context);
         if polled.is_ready() {
             self.request.handed_over();
+        }
+        if let Poll::Ready(Some(Ok(frame))) = &polled
+            && let Some(status) = frame.trailers_ref().and_then(|trailers| trailers.get(GRPC_STATUS))
+            && let Some(call) = &mut self.call
+        {
+            call.ended(status.as_bytes());
         }
         polled
     }

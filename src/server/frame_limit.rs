@@ -5,6 +5,8 @@
 
 use tokio::time::Instant;
 
+use crate::admission::TokenBucket;
+
 /// What a client begins an HTTP/2 connection with (RFC 9113, 3.4).
 pub(super) const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
@@ -12,12 +14,11 @@ const FRAME_HEADER_BYTES: usize = 9;
 const DATA: u8 = 0;
 const HEADERS: u8 = 1;
 
-/// Counts control frames by a token bucket that holds one second's worth.
+/// Counts control frames by a token bucket.
 pub(super) struct FrameLimit {
     position: Position,
     per_s: f64,
-    tokens: f64,
-    refilled_at: Instant,
+    bucket: TokenBucket,
 }
 
 /// Where among frames the client's next byte belongs.
@@ -35,23 +36,15 @@ enum Position {
 impl FrameLimit {
     pub(super) fn new(per_s: u32) -> Self {
         let per_s = f64::from(per_s);
-        Self { position: Position::Preface(0), per_s, tokens: per_s, refilled_at: Instant::now() }
+        Self { position: Position::Preface(0), per_s, bucket: TokenBucket::full(per_s, Instant::now()) }
     }
 
     /// Takes note of bytes that were read; whether the limit still holds.
     pub(super) fn allows(&mut self, bytes: &[u8]) -> bool {
         match self.control_frames(bytes) {
             0 => true,
-            frames => self.take(frames, Instant::now()),
+            frames => self.bucket.take(frames.into(), self.per_s, Instant::now()),
         }
-    }
-
-    /// Takes a token for each frame; whether there were enough.
-    fn take(&mut self, frames: u32, now: Instant) -> bool {
-        let refill = now.duration_since(self.refilled_at).as_secs_f64() * self.per_s;
-        self.tokens = (self.tokens + refill).min(self.per_s) - f64::from(frames);
-        self.refilled_at = now;
-        self.tokens >= 0.0
     }
 
     /// How many control frames begin in these bytes.
@@ -142,16 +135,5 @@ mod tests {
         let mut limit = FrameLimit::new(1);
         let request = b"PUT / HTTP/1.1\r\nhost: a\r\n\r\n".repeat(100);
         assert!(request.chunks(7).all(|part| limit.allows(part)));
-    }
-
-    #[test]
-    fn the_limit_is_one_of_frames_per_second() {
-        let mut limit = FrameLimit::new(10);
-        let begin = limit.refilled_at;
-        assert!(limit.take(10, begin), "a second's worth at once");
-        assert!(!limit.take(1, begin));
-        let second_later = begin + std::time::Duration::from_secs(1);
-        assert!(limit.take(9, second_later));
-        assert!(!limit.take(1, second_later));
     }
 }

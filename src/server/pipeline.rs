@@ -1,34 +1,37 @@
 //! What every request goes through, whatever its transport: id, span, host and origin, admission,
 //! deadline, then the transport.
 
+use std::convert::Infallible;
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Body;
 use http_body_util::BodyExt as _;
 use hyper::body::{Body as _, Incoming};
-use hyper::header::{CONNECTION, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
+use hyper::header::{CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
 use hyper::http::HeaderValue;
 use hyper::{Method, Request, Response, Version};
 use tokio::sync::Semaphore;
-use tower::Service as _;
+use tower::{Layer as _, Service as _, ServiceExt as _, service_fn};
+use tower_http::cors::CorsLayer;
 use tracing::field::{Empty, display};
 use tracing::{Instrument as _, Span};
 
-use super::activity::{ObservedBody, OpenRequest};
+use super::activity::{GRPC_STATUS, ObservedBody, OpenRequest};
 use super::credentials::credential;
 use super::host_check::HostCheck;
+use super::proxies::TrustedProxies;
 use super::request_body::{AdmittedBody, RateGuard, Ticket};
 use super::revocable_body::RevocableBody;
-use crate::admission::{BodyRefusal, ClientAddress, RequestClass};
+use crate::admission::{BodyRefusal, ClientId, RequestClass};
 use crate::app::App;
 use crate::app::access::{Caller, CertificateHolder, Credential, Permission, Principal};
 use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
-use crate::telemetry::{Metrics, REQUEST_ID, RequestId};
+use crate::telemetry::{MatchedRoute, Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
 use crate::{grpc, http};
 
 /// Longest request id that is taken from a client, in bytes.
@@ -38,21 +41,45 @@ const DISCARDED_BODIES: usize = 256;
 /// How long the body of a refused request is read.
 const DISCARD_TIME: Duration = Duration::from_secs(10);
 
+/// Whom a listener serves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Audience {
+    /// Clients, each with what its credential allows.
+    Clients,
+    /// Whoever reaches the address of the setting `metrics_listen`, with probes and metrics alone.
+    Monitoring,
+}
+
+/// How a request is counted.
+enum Counted {
+    Http(MatchedRoute),
+    Grpc(RpcCall),
+}
+
+impl Counted {
+    const fn is_grpc(&self) -> bool {
+        matches!(self, Self::Grpc(_))
+    }
+}
+
 /// The way from a connection to the transports.
 pub(super) struct RequestPipeline {
     app: App,
     http: http::Transport,
     grpc: Router,
     hosts: HostCheck,
+    proxies: TrustedProxies,
     shutdown: Shutdown,
     discards: Semaphore,
+    audience: Audience,
+    cors: Option<CorsLayer>,
 }
 
 /// The connection that a request came over.
 #[derive(Clone)]
 pub(super) struct Peer {
-    /// As limits count it.
-    pub(super) client: ClientAddress,
+    /// As limits count it while it presents no key.
+    pub(super) client: ClientId,
     /// As the audit log names it.
     pub(super) address: IpAddr,
     /// Whose certificate was verified, if one was presented.
@@ -65,19 +92,46 @@ pub(super) struct Peer {
 struct Granted {
     ticket: Ticket,
     caller: Caller,
+    /// As limits count the caller.
+    client: ClientId,
 }
 
 /// The body of every response; it holds the request's memory until its end.
 pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
 
 impl RequestPipeline {
-    pub(super) fn new(app: App, console: Console, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+    pub(super) fn new(
+        app: App,
+        console: Console,
+        hosts: HostCheck,
+        proxies: TrustedProxies,
+        cors: Option<CorsLayer>,
+        shutdown: &Shutdown,
+    ) -> Self {
         Self {
             http: http::Transport::new(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
+            proxies,
+            cors,
             shutdown: shutdown.clone(),
             discards: Semaphore::new(DISCARDED_BODIES),
+            audience: Audience::Clients,
+            app,
+        }
+    }
+
+    /// Probes and metrics alone, without keys.
+    pub(super) fn monitoring(app: App, hosts: HostCheck, shutdown: &Shutdown) -> Self {
+        Self {
+            http: http::Transport::monitoring(app.clone(), shutdown.clone()),
+            grpc: Router::new(),
+            hosts,
+            proxies: TrustedProxies::default(),
+            cors: None,
+            shutdown: shutdown.clone(),
+            discards: Semaphore::new(DISCARDED_BODIES),
+            audience: Audience::Monitoring,
             app,
         }
     }
@@ -94,40 +148,105 @@ impl RequestPipeline {
         open: OpenRequest,
     ) -> Response<ResponseBody> {
         let began = Instant::now();
+        let peer = &*self.proxies.original(peer, request.headers());
         let is_http_1 = request.version() < Version::HTTP_2;
         let id = self.request_id(&request);
-        let is_grpc = request
-            .headers()
-            .get(CONTENT_TYPE)
-            .is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"));
+        let counted = self.begin_count(&request);
         let span = tracing::debug_span!(
-            "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
+            target: REQUESTS, "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
-        let (mut response, ticket) = async {
-            match self.admit(request, is_grpc, peer, &id).await {
-                Ok((request, granted)) => {
-                    (self.route(is_grpc, request, &granted, &id).await, Some(granted.ticket))
-                }
-                Err(error) => {
-                    if error.kind() == ErrorKind::Overloaded {
-                        self.app.metrics.refused();
-                    }
-                    (refuse(is_grpc, &error, &id), None)
-                }
-            }
-        }
-        .instrument(span)
-        .await;
+        #[cfg(feature = "otel")]
+        crate::telemetry::continue_trace(&span, request.headers());
+        let (mut response, ticket) =
+            self.respond(request, &counted, peer, &id).instrument(span.clone()).await;
         let headers = response.headers_mut();
         headers.insert(REQUEST_ID, id.header().clone());
         headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
         if peer.refusal.is_some() && is_http_1 {
             headers.insert(CONNECTION, HeaderValue::from_static("close"));
         }
-        let time = began.elapsed();
-        self.app.metrics.answered(response.status().as_u16(), time);
-        tracing::debug!(id = %id, status = response.status().as_u16(), duration_ms = time.as_secs_f64() * 1e3);
-        response.map(|body| ObservedBody::new(body, open, ticket))
+        let call = span.in_scope(|| self.count(counted, &response, peer, began.elapsed()));
+        response.map(|body| ObservedBody::new(body, open, call, ticket))
+    }
+
+    /// Which transport a request is for, and how it is counted.
+    fn begin_count(&self, request: &Request<Incoming>) -> Counted {
+        if self.audience == Audience::Clients && has_grpc_content(request) {
+            let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
+            Counted::Grpc(self.app.metrics.call(rpc))
+        } else {
+            Counted::Http(MatchedRoute::default())
+        }
+    }
+
+    /// Counts and logs an answer. A call of an RPC is counted when it ends.
+    fn count(
+        &self,
+        counted: Counted,
+        response: &Response<Body>,
+        peer: &Peer,
+        time: Duration,
+    ) -> Option<RpcCall> {
+        let (status, duration_ms, client) =
+            (response.status().as_u16(), time.as_secs_f64() * 1e3, peer.address);
+        match counted {
+            Counted::Http(matched) => {
+                let route = matched.get();
+                self.app.metrics.answered(route, status, time);
+                tracing::debug!(target: REQUESTS, route = route.template, status, %client, duration_ms, "answered");
+                None
+            }
+            Counted::Grpc(mut call) => {
+                call.answered(time);
+                let grpc_status = response.headers().get(GRPC_STATUS);
+                if let Some(grpc_status) = grpc_status {
+                    call.ended(grpc_status.as_bytes());
+                }
+                tracing::debug!(target: REQUESTS, ?grpc_status, %client, duration_ms, "answered");
+                Some(call)
+            }
+        }
+    }
+
+    /// The response, and the ticket of a request that was admitted.
+    async fn respond(
+        &self,
+        request: Request<Incoming>,
+        counted: &Counted,
+        peer: &Peer,
+        id: &RequestId,
+    ) -> (Response<Body>, Option<Ticket>) {
+        let Some(cors) = &self.cors else { return self.admit_and_route(request, counted, peer, id).await };
+        let granted = OnceLock::new();
+        let service = service_fn(|request| async {
+            let (response, ticket) = self.admit_and_route(request, counted, peer, id).await;
+            // The service is called once.
+            let _ = granted.set(ticket);
+            Ok::<_, Infallible>(response)
+        });
+        let Ok(response) = cors.layer(service).oneshot(request).await;
+        (response, granted.into_inner().flatten())
+    }
+
+    async fn admit_and_route(
+        &self,
+        request: Request<Incoming>,
+        counted: &Counted,
+        peer: &Peer,
+        id: &RequestId,
+    ) -> (Response<Body>, Option<Ticket>) {
+        let is_grpc = counted.is_grpc();
+        match self.admit(request, counted, peer, id).await {
+            Ok((request, granted)) => {
+                (self.route(is_grpc, request, &granted, id).await, Some(granted.ticket))
+            }
+            Err(error) => {
+                if error.kind() == ErrorKind::Overloaded {
+                    self.app.metrics.refused();
+                }
+                (refuse(is_grpc, &error, id), None)
+            }
+        }
     }
 
     /// The request as the transports get it, with what it was granted; the body of a refused one is
@@ -135,14 +254,16 @@ impl RequestPipeline {
     async fn admit(
         &self,
         request: Request<Incoming>,
-        is_grpc: bool,
+        counted: &Counted,
         peer: &Peer,
         id: &RequestId,
     ) -> Result<(Request<Body>, Granted)> {
         let path = request.uri().path();
+        let is_grpc = counted.is_grpc();
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
         match self.grant(&request, class, is_grpc, peer, id) {
-            Ok(Granted { ticket, caller }) => {
+            Ok(granted) => {
+                let Granted { ticket, caller, client } = &granted;
                 let limits = &self.app.limits;
                 // A live stream may be silent for longer, and looks after that itself.
                 let pace = (class != RequestClass::LiveStream)
@@ -151,12 +272,15 @@ impl RequestPipeline {
                     .map(|body| Body::new(AdmittedBody::new(body, ticket.clone(), caller.clone(), pace)));
                 let extensions = request.extensions_mut();
                 extensions.insert(id.clone());
-                extensions.insert(peer.client);
+                extensions.insert(*client);
                 extensions.insert(caller.clone());
+                if let Counted::Http(matched) = counted {
+                    extensions.insert(matched.clone());
+                }
                 if class == RequestClass::ImportStream {
                     extensions.insert(ticket.refusal());
                 }
-                Ok((request, Granted { ticket, caller }))
+                Ok((request, granted))
             }
             Err(error) => {
                 self.discard(request).await;
@@ -179,7 +303,15 @@ impl RequestPipeline {
             return Err(Error::Refused(refusal.clone()));
         }
         self.hosts.check(request)?;
-        let caller = self.caller(request, class, is_grpc, peer, id)?;
+        let now = tokio::time::Instant::now();
+        let caller = self.caller(request, class, is_grpc, peer, id).map_err(|error| {
+            // Guesses of keys count for the address that they come from.
+            self.app.quotas.request_rate.count(peer.client, now).err().unwrap_or(error)
+        })?;
+        let client = caller.actor().key_id.map_or(peer.client, ClientId::Key);
+        if class != RequestClass::Probe {
+            self.app.quotas.request_rate.count(client, now)?;
+        }
         if is_grpc {
             // `http` compares a route's permission itself: it knows the template of the path.
             caller.authorize(Permission::of_rpc(request.uri().path()))?;
@@ -191,13 +323,17 @@ impl RequestPipeline {
             _ if is_grpc => limits.message_bytes,
             _ => limits.body_bytes,
         };
-        let ticket = Ticket::open(&self.app, class, peer.client, held_bytes)?;
+        let ticket = Ticket::open(&self.app, class, client, held_bytes)?;
+        if request.headers().contains_key(CONTENT_ENCODING) {
+            // What it decodes to is not known before it has been read.
+            ticket.charge(held_bytes as u64)?;
+        }
         let has_no_body = request.body().is_end_stream()
             || matches!(*request.method(), Method::GET | Method::HEAD | Method::DELETE | Method::OPTIONS);
         if has_no_body || class == RequestClass::ImportStream {
             ticket.begin_work()?;
         }
-        Ok(Granted { ticket, caller })
+        Ok(Granted { ticket, caller, client })
     }
 
     /// Who makes the request.
@@ -209,6 +345,9 @@ impl RequestPipeline {
         peer: &Peer,
         id: &RequestId,
     ) -> Result<Caller> {
+        if self.audience == Audience::Monitoring {
+            return Ok(Caller::program("monitoring"));
+        }
         let credential = credential(request, peer.certificate.as_ref(), is_grpc);
         if let Credential::Session(_) = credential {
             self.hosts.check_same_origin(request)?;
@@ -232,7 +371,7 @@ impl RequestPipeline {
         granted: &Granted,
         id: &RequestId,
     ) -> Response<Body> {
-        let Granted { ticket, caller } = granted;
+        let Granted { ticket, caller, .. } = granted;
         let time = Duration::from_secs(self.app.limits.request_s);
         // An import stream reports by itself what it has stored of a body that was refused.
         let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
@@ -286,10 +425,17 @@ impl RequestPipeline {
         let id = own.cloned().unwrap_or_else(|| {
             let uuid = self.app.randomness.uuid_v7(self.app.clock.now());
             let mut text = [0; uuid::fmt::Hyphenated::LENGTH];
-            HeaderValue::from_str(uuid.hyphenated().encode_lower(&mut text)).expect("a UUID is ASCII")
+            let text = uuid.hyphenated().encode_lower(&mut text);
+            #[expect(clippy::expect_used, reason = "its form is fixed")]
+            HeaderValue::from_str(text).expect("a UUID is ASCII")
         });
         RequestId::new(id)
     }
+}
+
+fn has_grpc_content(request: &Request<Incoming>) -> bool {
+    let content_type = request.headers().get(CONTENT_TYPE);
+    content_type.is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"))
 }
 
 /// A response that may be open for long ends when the key of its request does.

@@ -14,7 +14,7 @@ use bytes::Bytes;
 use hyper::body::{Body, Frame, Incoming, SizeHint};
 use tokio::time::{Instant, Sleep};
 
-use crate::admission::{BodyRefusal, ClientAddress, Lease, RequestClass};
+use crate::admission::{BodyRefusal, ClientId, Lease, RequestClass};
 use crate::app::App;
 use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Result};
@@ -30,7 +30,7 @@ pub(super) struct Ticket(Arc<Mutex<Grant>>);
 struct Grant {
     app: App,
     class: RequestClass,
-    client: ClientAddress,
+    client: ClientId,
     /// Most bytes of the body that are held in memory and charged for.
     charged_bytes: u64,
     memory: Option<Lease>,
@@ -46,7 +46,7 @@ impl Ticket {
     pub(super) fn open(
         app: &App,
         class: RequestClass,
-        client: ClientAddress,
+        client: ClientId,
         charged_bytes: usize,
     ) -> Result<Self> {
         let memory = match class {
@@ -91,7 +91,11 @@ impl Ticket {
         self.lock().refusal.clone()
     }
 
-    fn charge(&self, bytes: u64) -> Result<()> {
+    /// Charges for bytes that are held in memory, up to the most that are charged for.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub(super) fn charge(&self, bytes: u64) -> Result<()> {
         let mut grant = self.lock();
         let charged = bytes.min(grant.charged_bytes);
         grant.charged_bytes -= charged;

@@ -14,14 +14,17 @@ mod positions;
 mod row;
 mod scene;
 mod shape;
+mod site;
 mod target;
 mod tracker;
 mod world;
 
+pub use noise::SimulatedReceiver;
 pub use options::{Options, Route};
 pub use row::SimulatedRow;
 pub use scene::Scene;
 pub use shape::TargetShape;
+pub use site::{LabelledDetection, SimulatedCamera, SimulatedSite, SiteOptions, simulate_site};
 pub use world::{World, simulate, simulate_split};
 
 #[cfg(test)]

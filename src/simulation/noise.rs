@@ -43,7 +43,7 @@ impl GaussMarkov {
 
 /// One receiver with independent errors on both axes.
 #[derive(Debug)]
-pub(super) struct SimulatedReceiver {
+pub struct SimulatedReceiver {
     error: GaussMarkovNoise,
     bias: EastNorth,
     east: GaussMarkov,
@@ -59,8 +59,14 @@ impl SimulatedReceiver {
         Self { error, bias, east, north, random }
     }
 
+    /// A receiver without a constant bias, drawn from a numbered stream of a seed.
+    #[must_use]
+    pub fn seeded(error: GaussMarkovNoise, seed: u64, number: u64) -> Self {
+        Self::new(error, EastNorth::default(), stream(seed, number))
+    }
+
     /// The measured position, that many seconds after the previous one.
-    pub(super) fn measure(&mut self, truth: EastNorth, seconds: f64) -> EastNorth {
+    pub fn measure(&mut self, truth: EastNorth, seconds: f64) -> EastNorth {
         let (white_m, coloured_m) = (self.error.white_sigma_m(), self.error.coloured_sigma_m());
         let east_m = coloured_m * self.east.advance(seconds, &mut self.random);
         let north_m = coloured_m * self.north.advance(seconds, &mut self.random);

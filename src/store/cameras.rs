@@ -9,12 +9,12 @@ use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 
 use super::Store;
 use super::audit::Change;
-use super::errors::{failed, no_camera};
+use super::errors::{failed, no_camera, unknown_site};
 use super::row_decoder::RowDecoder;
 use crate::domain::{
     AuditAction, Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssBiasSigma,
     GnssError, ImageSize, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SampleCount, SigmaM,
-    TargetClass, TargetId,
+    SiteId, TargetClass, TargetId,
 };
 
 macro_rules! columns {
@@ -22,7 +22,8 @@ macro_rules! columns {
         "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, gnss_bias_sigma_m, recipe, \
          target_classes, labels, receivers, retrain_when_moved, revision, created_at_us, updated_at_us, \
          active_model, (SELECT samples FROM sample_counts WHERE camera_key = key) AS samples_with_fix, \
-         (SELECT without_fix FROM sample_counts WHERE camera_key = key) AS samples_without_fix"
+         (SELECT without_fix FROM sample_counts WHERE camera_key = key) AS samples_without_fix, \
+         (SELECT sites.id FROM sites WHERE sites.key = site_key) AS site"
     };
 }
 
@@ -32,14 +33,16 @@ impl Store {
     /// Stores a new camera with revision 1.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraExists`]; [`ErrorKind::InsufficientStorage`] beyond the limit of cameras.
+    /// [`ErrorKind::CameraExists`]; [`ErrorKind::InvalidArgument`] naming `site` if there is no such site;
+    /// [`ErrorKind::InsufficientStorage`] beyond the limit of cameras.
     pub async fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera> {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
         let insert = sqlx::query(concat!(
             "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, \
-             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, updated_at_us, \
-             id, created_at_us, revision) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
+             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, site_key, \
+             updated_at_us, id, created_at_us, revision) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, \
+             (SELECT key FROM sites WHERE id = ?), ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
         let row = bind_profile(insert, profile, now)?
@@ -53,6 +56,7 @@ impl Store {
             return Err(Error::field(ErrorKind::CameraExists, "id", taken));
         };
         let camera = read_camera(&row)?;
+        check_site(&camera, profile)?;
         check_limit(&mut transaction, self.limits().cameras).await?;
         let change = Change::of_camera(AuditAction::CameraCreated, &profile.id, None);
         self.record(&mut transaction, change, now).await?;
@@ -68,13 +72,29 @@ impl Store {
         find_camera(self.readers(), id).await
     }
 
-    /// A page of cameras ordered by id, after an id.
+    /// A page of cameras, of a site or of all, ordered by id, after an id.
     ///
     /// # Errors
     /// Faults only.
-    pub async fn cameras(&self, after: Option<&CameraId>, limit: u32) -> Result<Vec<Camera>> {
-        let page = concat!("SELECT ", columns!(), " FROM cameras WHERE id > ? ORDER BY id LIMIT ?");
-        let rows = sqlx::query(page)
+    pub async fn cameras(
+        &self,
+        site: Option<&SiteId>,
+        after: Option<&CameraId>,
+        limit: u32,
+    ) -> Result<Vec<Camera>> {
+        let query = match site {
+            None => {
+                sqlx::query(concat!("SELECT ", columns!(), " FROM cameras WHERE id > ? ORDER BY id LIMIT ?"))
+            }
+            Some(site) => sqlx::query(concat!(
+                "SELECT ",
+                columns!(),
+                " FROM cameras WHERE site_key = (SELECT key FROM sites WHERE id = ?) AND id > ? \
+                 ORDER BY id LIMIT ?"
+            ))
+            .bind(site.as_str().to_owned()),
+        };
+        let rows = query
             .bind(after.map_or("", CameraId::as_str).to_owned())
             .bind(limit)
             .fetch_all(self.readers())
@@ -106,7 +126,8 @@ impl Store {
     /// revision is the expected one.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`].
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`]; [`ErrorKind::InvalidArgument`] naming
+    /// `site` if there is no such site.
     pub async fn replace_camera(
         &self,
         profile: &NewCamera,
@@ -119,7 +140,8 @@ impl Store {
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
              gnss_sigma_m = ?, gnss_bias_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, \
-             retrain_when_moved = ?, updated_at_us = ?, revision = revision + 1 WHERE id = ? RETURNING ",
+             retrain_when_moved = ?, site_key = (SELECT key FROM sites WHERE id = ?), updated_at_us = ?, \
+             revision = revision + 1 WHERE id = ? RETURNING ",
             columns!()
         ));
         let row = bind_profile(update, profile, now)?
@@ -128,6 +150,7 @@ impl Store {
             .await
             .map_err(failed)?;
         let camera = read_camera(&row)?;
+        check_site(&camera, profile)?;
         let revision = Some(format!("revision {}", camera.revision.0));
         let change = Change::of_camera(AuditAction::CameraChanged, &profile.id, revision);
         self.record(&mut transaction, change, now).await?;
@@ -212,7 +235,15 @@ pub(super) async fn camera_key(executor: impl SqliteExecutor<'_>, id: &CameraId)
 }
 
 fn check_version(camera: &Camera, expected: Option<ExpectedVersion>) -> Result<()> {
-    expected.map_or(Ok(()), |expected| expected.check(camera))
+    expected.map_or(Ok(()), |expected| expected.check("camera", camera.key, camera.revision))
+}
+
+/// Refuses a stored camera whose site was looked up and not found.
+fn check_site(stored: &Camera, wanted: &NewCamera) -> Result<()> {
+    match &wanted.site {
+        Some(site) if stored.profile.site.is_none() => Err(unknown_site(site)),
+        _ => Ok(()),
+    }
 }
 
 /// Binds the changeable columns in the order that INSERT and UPDATE share.
@@ -233,6 +264,7 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
         .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
         .bind(write_receivers(&profile.receivers)?)
         .bind(profile.retrain_when_moved)
+        .bind(profile.site.as_ref().map(|site| site.as_str().to_owned()))
         .bind(now.as_microsecond()))
 }
 
@@ -258,6 +290,7 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
     let mut samples = || fields.parse(|stored: Option<i64>| u64::try_from(stored.unwrap_or_default()));
     let (with_fix, without_fix) = (samples()?, samples()?);
     let samples = SampleCount { all: with_fix + without_fix, without_fix };
+    let site = fields.parse_optional(SiteId::new)?;
     let profile = NewCamera {
         id,
         display_name,
@@ -269,6 +302,7 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
         labels,
         receivers,
         retrain_when_moved,
+        site,
     };
     Ok(Camera { key, profile, revision, created_at, updated_at, active_model, samples })
 }

@@ -8,17 +8,19 @@ use sqlx::sqlite::{
     SqliteAutoVacuum, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
 };
 use sqlx::{ConnectOptions, Connection, SqliteConnection, SqlitePool};
+use tokio::time::Instant;
 
 use super::errors::{is_busy, primary_code};
-use super::folder;
+use super::folder_fault::{FolderFault, FolderFaultKind};
 use super::writer::Writer;
 use crate::domain::{Error, Result};
 
 /// How long to wait for another process that writes.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Turning on the write-ahead log does not wait for other processes by itself, so it is tried again.
-const OPEN_ATTEMPTS: u32 = 20;
+/// How long opening is tried again while another process holds the file. Turning on the write-ahead log does
+/// not wait by itself.
+const OPEN_TIME: Duration = Duration::from_secs(8);
 const OPEN_PAUSE: Duration = Duration::from_millis(50);
 
 /// Reads that run at once; more wait.
@@ -27,12 +29,11 @@ const READER_WAIT: Duration = Duration::from_secs(10);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
 
-/// Opens the database of a folder with its schema brought up to date. `max_pages` limits its size.
-pub(super) async fn open(folder: &Path, max_pages: Option<u32>) -> Result<(Writer, SqlitePool)> {
-    let path = folder::prepare(folder).await?;
-    let options = options(&path);
+/// Opens a database with its schema brought up to date. `max_pages` limits its size.
+pub(super) async fn open(path: &Path, max_pages: Option<u32>) -> Result<(Writer, SqlitePool)> {
+    let options = options(path);
     let writer = writer_options(options.clone());
-    let connection = open_writer(&writer).await.map_err(|cause| unusable(&path, &cause))?;
+    let connection = open_writer(&writer).await.map_err(|cause| unusable(path, &cause))?;
     let readers = SqlitePoolOptions::new()
         .max_connections(READERS)
         .acquire_timeout(READER_WAIT)
@@ -67,11 +68,10 @@ fn writer_options(options: SqliteConnectOptions) -> SqliteConnectOptions {
 }
 
 async fn open_writer(options: &SqliteConnectOptions) -> Result<SqliteConnection, MigrateError> {
-    let mut attempt = 1;
+    let began = Instant::now();
     loop {
         match connect_and_migrate(options).await {
-            Err(MigrateError::Execute(error)) if is_busy(&error) && attempt < OPEN_ATTEMPTS => {
-                attempt += 1;
+            Err(MigrateError::Execute(error)) if is_busy(&error) && began.elapsed() < OPEN_TIME => {
                 tokio::time::sleep(OPEN_PAUSE).await;
             }
             other => return other,
@@ -89,29 +89,53 @@ async fn connect_and_migrate(options: &SqliteConnectOptions) -> Result<SqliteCon
     Ok(connection)
 }
 
+/// The step that brings a schema to what this version knows.
+pub(super) fn newest_step() -> i64 {
+    MIGRATIONS.iter().map(|step| step.version).max().unwrap_or_default()
+}
+
 /// Why the file cannot be used, for the person who started the program.
 fn unusable(path: &Path, cause: &MigrateError) -> Error {
-    let path = path.display();
-    let code = match cause {
-        MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => primary_code(error),
-        _ => None,
-    };
-    Error::fault(match (cause, code) {
-        (MigrateError::VersionMissing(step), _) => format!(
-            "{path} was written by a newer version of sightfix (its schema has step {step}); start that \
-             version, or another folder"
-        ),
-        (MigrateError::VersionMismatch(step), _) => {
+    match cause {
+        MigrateError::VersionMissing(step) => newer(path, *step),
+        MigrateError::VersionMismatch(step) => FolderFault::error(
+            FolderFaultKind::OtherSchema,
             format!(
-                "{path} has another schema in step {step}; it was made by a build that was never released"
-            )
+                "{} has another schema in step {step}; it was made by a build that was never released",
+                path.display()
+            ),
+        ),
+        MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => cannot_open(path, error),
+        _ => FolderFault::error(FolderFaultKind::Other, format!("cannot open {}: {cause}", path.display())),
+    }
+}
+
+pub(super) fn newer(path: &Path, step: i64) -> Error {
+    FolderFault::error(
+        FolderFaultKind::OtherSchema,
+        format!(
+            "{} was written by a newer version of sightfix (its schema has step {step}); start that version, or \
+             another folder",
+            path.display()
+        ),
+    )
+}
+
+/// Why a database file cannot be opened or read, by SQLite's result code.
+pub(super) fn cannot_open(path: &Path, error: &sqlx::Error) -> Error {
+    use FolderFaultKind::{Damaged, InUse, NoSpace, NotWritable, Other};
+    let path = path.display();
+    let (kind, message) = match primary_code(error) {
+        Some(8 | 14) => {
+            (NotWritable, format!("{path} cannot be opened for writing; check the owner of folder and file"))
         }
-        (_, Some(8 | 14)) => {
-            format!("{path} cannot be opened for writing; check the owner of folder and file")
+        Some(26) => (Damaged, format!("{path} is not a database; move it away, or choose another folder")),
+        Some(11) => {
+            (Damaged, format!("{path} is damaged ({error}); restore a backup: sightfix restore FILE"))
         }
-        (_, Some(26)) => format!("{path} is not a database; move it away, or choose another folder"),
-        (_, Some(5 | 6)) => format!("{path} is held by another process"),
-        (_, Some(13)) => format!("no space is left for {path}"),
-        _ => format!("cannot open {path}: {cause}"),
-    })
+        Some(5 | 6) => (InUse, format!("{path} is held by another process")),
+        Some(13) => (NoSpace, format!("no space is left for {path}")),
+        _ => (Other, format!("cannot open {path}: {error}")),
+    };
+    FolderFault::error(kind, message)
 }

@@ -2,7 +2,8 @@
 
 use sqlx::error::DatabaseError;
 
-use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, KeyId, RunId};
+use super::folder_fault::{FolderFault, FolderFaultKind};
+use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, KeyId, RunId, SiteId};
 
 /// A row that does not hold what was written: another program or the disk has changed it.
 #[derive(Debug, thiserror::Error)]
@@ -47,8 +48,17 @@ pub(super) fn failed(error: sqlx::Error) -> Error {
             "the disk is full, or the database has reached limits.database_bytes; delete samples, models or \
              training runs, or give it more space",
         ),
+        damaged if is_damaged(&damaged) => FolderFault::error(
+            FolderFaultKind::Damaged,
+            format!("the database is damaged ({damaged}); restore a backup: sightfix restore FILE"),
+        ),
         other => Error::fault(other),
     }
+}
+
+/// SQLITE_CORRUPT and SQLITE_NOTADB.
+fn is_damaged(error: &sqlx::Error) -> bool {
+    matches!(primary_code(error), Some(11 | 26))
 }
 
 /// A copy of an error, for another caller of the same transaction.
@@ -65,6 +75,15 @@ pub(super) fn closed() -> Error {
 
 pub(super) fn no_camera(id: &CameraId) -> Error {
     Error::refused(ErrorKind::CameraNotFound, format!("no camera has the id {id}"))
+}
+
+pub(super) fn no_site(id: &SiteId) -> Error {
+    Error::refused(ErrorKind::SiteNotFound, format!("no site has the id {id}"))
+}
+
+/// The refusal of a camera's profile that names a site.
+pub(super) fn unknown_site(id: &SiteId) -> Error {
+    Error::invalid("site", format!("is {id}, and no site has that id; create the site first"))
 }
 
 pub(super) fn no_run(id: RunId) -> Error {

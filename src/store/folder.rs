@@ -4,9 +4,11 @@ use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use super::folder_fault::{FolderFault, FolderFaultKind};
 use crate::domain::{Error, Result};
 
-const DATABASE: &str = "sightfix.db";
+/// Name of the database in its folder.
+pub(super) const DATABASE: &str = "sightfix.db";
 
 /// Files that SQLite keeps beside the database, with the permissions of the database itself.
 const COMPANIONS: [&str; 2] = ["sightfix.db-wal", "sightfix.db-shm"];
@@ -22,13 +24,30 @@ pub(super) async fn prepare(folder: &Path) -> Result<PathBuf> {
     tokio::task::spawn_blocking(move || prepare_blocking(&folder)).await.map_err(Error::fault)?
 }
 
-fn prepare_blocking(folder: &Path) -> Result<PathBuf> {
+/// Creates the folder (mode 0700) if it is missing, and takes the permissions of group and others from an
+/// existing one.
+///
+/// # Errors
+/// A fault that names the folder.
+pub(super) async fn prepare_folder(folder: &Path) -> Result<()> {
+    let folder = folder.to_owned();
+    tokio::task::spawn_blocking(move || prepare_folder_blocking(&folder)).await.map_err(Error::fault)?
+}
+
+fn prepare_folder_blocking(folder: &Path) -> Result<()> {
     let existed = folder.is_dir();
-    create_folder(folder)
-        .map_err(|error| Error::fault(format!("cannot make the folder {}: {error}", folder.display())))?;
+    create_folder(folder).map_err(|error| {
+        let message = format!("cannot make the folder {}: {error}", folder.display());
+        FolderFault::error(FolderFaultKind::NotWritable, message)
+    })?;
     if existed {
         restrict_to_owner(folder);
     }
+    Ok(())
+}
+
+fn prepare_blocking(folder: &Path) -> Result<PathBuf> {
+    prepare_folder_blocking(folder)?;
     let database = folder.join(DATABASE);
     match create_file(&database) {
         Ok(_) => {
@@ -47,7 +66,8 @@ fn prepare_blocking(folder: &Path) -> Result<PathBuf> {
     Ok(database)
 }
 
-fn parent_of(folder: &Path) -> &Path {
+/// The folder that contains a path.
+pub(super) fn parent_of(folder: &Path) -> &Path {
     folder.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
 }
 
@@ -68,13 +88,14 @@ fn create_file(path: &Path) -> io::Result<File> {
     options.open(path)
 }
 
+/// Flushes the entries of a folder, so that a file that was created or renamed survives a power cut.
 #[cfg(unix)]
-fn flush_entries(folder: &Path) -> io::Result<()> {
+pub(super) fn flush_entries(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
 
 #[cfg(not(unix))]
-fn flush_entries(_folder: &Path) -> io::Result<()> {
+pub(super) fn flush_entries(_folder: &Path) -> io::Result<()> {
     Ok(())
 }
 

@@ -15,6 +15,7 @@ use jiff::Timestamp;
 use sqlx::{AssertSqlSafe, SqliteConnection};
 use uuid::Uuid;
 
+use super::Store;
 use super::errors::failed;
 use crate::domain::{Error, ErrorKind, JobState, Result};
 
@@ -43,6 +44,47 @@ pub enum Heartbeat {
     CancelRequested,
     /// The lease is lost: another worker has the job, or it has ended or was deleted. Stop.
     Lost,
+}
+
+/// Jobs of one kind that have not ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LiveJobs {
+    /// They wait for a worker.
+    pub queued: u64,
+    /// A worker has claimed them.
+    pub running: u64,
+}
+
+/// Jobs that have not ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct JobCounts {
+    /// Training runs.
+    pub training: LiveJobs,
+    /// Evaluations.
+    pub evaluation: LiveJobs,
+}
+
+impl Store {
+    /// How many jobs have not ended.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn job_counts(&self) -> Result<JobCounts> {
+        let rows: Vec<(String, String, i64)> = sqlx::query_as(
+            "SELECT 'training', state, count(*) FROM training_runs WHERE state IN ('queued', 'running') GROUP BY 2 \
+             UNION ALL \
+             SELECT 'evaluation', state, count(*) FROM evaluations WHERE state IN ('queued', 'running') GROUP BY 2",
+        )
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        let count = |kind: &str, state: &str| {
+            let row = rows.iter().find(|row| row.0 == kind && row.1 == state);
+            row.map_or(0, |row| row.2.unsigned_abs())
+        };
+        let live = |kind| LiveJobs { queued: count(kind, "queued"), running: count(kind, "running") };
+        Ok(JobCounts { training: live("training"), evaluation: live("evaluation") })
+    }
 }
 
 /// How a worker finishes a job.
@@ -269,6 +311,24 @@ impl Jobs {
         Ok(())
     }
 }
+
+/// The state as clients see it, of the jobs that a statement calls `name`: that of a running job whose
+/// cancellation was requested is not stored, so that every rule of leases stays one of running jobs.
+macro_rules! job_state {
+    ($name:literal) => {
+        concat!(
+            "CASE WHEN ",
+            $name,
+            ".state = 'running' AND ",
+            $name,
+            ".cancel_requested <> 0 ",
+            "THEN 'cancelling' ELSE ",
+            $name,
+            ".state END"
+        )
+    };
+}
+pub(super) use job_state;
 
 pub(super) fn read_state(name: &str) -> Result<JobState, &'static str> {
     JobState::ALL.iter().copied().find(|state| state.as_str() == name).ok_or("is not the state of a job")

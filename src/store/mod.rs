@@ -9,25 +9,36 @@
 //! a transaction is held across anything but statements, a type of the database library becomes public.
 //! Rows that the constructors of `domain` refuse are faults that name table, column and row.
 
+// What clients send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
 mod audit;
+mod backup;
 mod camera_moves;
 mod cameras;
 mod connection;
 mod errors;
 mod evaluations;
+mod file_check;
 mod folder;
+mod folder_fault;
 mod group_commit;
+mod idempotency;
 mod jobs;
 mod keys;
 mod latest_runs;
 mod models;
 mod occupants;
 mod reserve;
+mod restore;
 mod retention;
 mod row_decoder;
 mod runs;
+mod sample_retention;
 mod sample_table;
 mod samples;
+mod server_lock;
+mod sites;
 mod space;
 #[cfg(test)]
 mod tests;
@@ -42,19 +53,27 @@ use sqlx::sqlite::SqlitePoolOptions;
 
 use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 
-pub use group_commit::Inserted;
-pub use jobs::{Claim, Heartbeat, JobEnd};
+pub use backup::{ExistingFile, back_up};
+pub use file_check::{DatabaseReport, has_database, inspect};
+pub use folder_fault::{FolderFault, FolderFaultKind};
+pub use group_commit::{InsertOptions, Inserted};
+pub use idempotency::{Completion, IdempotencyRecord, StoredAnswer};
+pub use jobs::{Claim, Heartbeat, JobCounts, JobEnd, LiveJobs};
 pub use keys::KeysVersion;
 pub use models::{NewModel, StoredHeldOutError};
 pub use occupants::Occupant;
+pub use reserve::available_bytes as disk_available_bytes;
+pub use restore::{Restored, restore};
 pub use runs::{RunEnd, RunOutput};
 pub use samples::{SampleFilter, SampleKey};
+pub use server_lock::holder as server_of;
 pub use space::{StorageStatus, StoreLimits};
 
 use errors::failed;
 use group_commit::GroupCommit;
 use occupants::Presence;
 use reserve::Reserve;
+use server_lock::ServerLock;
 use space::Space;
 use writer::{Growth, Writer, WriterGuard};
 
@@ -80,6 +99,8 @@ struct Inner {
     space: Arc<Space>,
     /// `None` where the process could not announce itself, and after closing.
     presence: Mutex<Option<Presence>>,
+    /// Of a server, until it is closed.
+    server_lock: Mutex<Option<ServerLock>>,
 }
 
 /// How a store is opened.
@@ -89,11 +110,22 @@ pub struct StoreOptions {
     pub limits: StoreLimits,
     /// What this process does, for the logs of others that use the same folder.
     pub role: String,
+    /// Whether other processes may use the folder in the same way.
+    pub sharing: Sharing,
+}
+
+/// Whether several processes may use a folder in the same way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sharing {
+    /// A server: there is at most one, beside any number of commands.
+    OneServer,
+    /// A command, which works beside a server and other commands.
+    Command,
 }
 
 impl Default for StoreOptions {
     fn default() -> Self {
-        Self { limits: StoreLimits::default(), role: "sightfix".to_owned() }
+        Self { limits: StoreLimits::default(), role: "sightfix".to_owned(), sharing: Sharing::Command }
     }
 }
 
@@ -110,12 +142,18 @@ impl Store {
     /// to date. Must be called within a tokio runtime; the group-commit task lives on it.
     ///
     /// # Errors
-    /// A fault that says what is wrong with folder or file: not writable, not a database, or written
-    /// by a newer version.
+    /// A [`FolderFault`] that says what is wrong with folder or file: in use by another server, not writable,
+    /// not a database, damaged, or written by a newer version.
     pub async fn open_with(folder: &Path, options: StoreOptions) -> Result<Self> {
-        let StoreOptions { limits, role } = options;
+        let StoreOptions { limits, role, sharing } = options;
         let actor = Arc::new(Actor::program(&role));
-        let (writer, readers) = connection::open(folder, Space::max_pages(&limits)).await?;
+        let path = folder::prepare(folder).await?;
+        // Before the schema is touched: a server of another version may be using it.
+        let server_lock = match sharing {
+            Sharing::OneServer => Some(ServerLock::acquire(folder, &role)?),
+            Sharing::Command => None,
+        };
+        let (writer, readers) = connection::open(&path, Space::max_pages(&limits)).await?;
         let writer = Arc::new(writer);
         let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
         let samples = GroupCommit::start(Arc::clone(&writer), Arc::clone(&space));
@@ -128,7 +166,8 @@ impl Store {
         let probe = SqlitePoolOptions::new()
             .max_connections(1)
             .connect_lazy_with(readers.connect_options().as_ref().clone());
-        let inner = Inner { writer, readers, probe, samples, space, presence };
+        let server_lock = Mutex::new(server_lock);
+        let inner = Inner { writer, readers, probe, samples, space, presence, server_lock };
         let store = Self { inner: Arc::new(inner), actor };
         store.reserve_space().await;
         store.count_all_samples().await?;
@@ -149,6 +188,7 @@ impl Store {
         self.inner.probe.close().await;
         self.inner.writer.close().await;
         self.presence().take();
+        self.inner.server_lock.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
     /// Other processes that have begun to use the data folder since the last call; at the first, all

@@ -27,6 +27,12 @@ pub struct Occupant {
     pub role: String,
 }
 
+impl Occupant {
+    pub(super) fn this_process(role: &str) -> Self {
+        Self { pid: std::process::id(), host: host(), role: role.to_owned() }
+    }
+}
+
 impl fmt::Display for Occupant {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "{} with process id {} on host {}", self.role, self.pid, self.host)
@@ -44,8 +50,7 @@ pub(super) struct Presence {
 impl Presence {
     /// Announces this process to the others of a folder.
     pub(super) fn announce(folder: &Path, role: &str) -> io::Result<Self> {
-        let me = Occupant { pid: std::process::id(), host: host(), role: role.to_owned() };
-        let name = serde_json::to_vec(&me)?;
+        let name = serde_json::to_vec(&Occupant::this_process(role))?;
         loop {
             let mut lock = tempfile::Builder::new().prefix(PREFIX).suffix(SUFFIX).tempfile_in(folder)?;
             lock.as_file().lock()?;

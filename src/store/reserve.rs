@@ -109,13 +109,18 @@ fn allocate(file: &File, bytes: u64) -> io::Result<()> {
     file.set_len(bytes)
 }
 
+/// Bytes that are left on the disk of a folder; `None` where the system does not tell.
+///
+/// # Errors
+/// The folder does not exist.
 #[cfg(unix)]
-fn available_bytes(folder: &Path) -> io::Result<Option<u64>> {
+pub fn available_bytes(folder: &Path) -> io::Result<Option<u64>> {
     let system = rustix::fs::statvfs(folder)?;
     Ok(Some(system.f_bavail.saturating_mul(system.f_frsize)))
 }
 
+/// `None`: the system does not tell.
 #[cfg(not(unix))]
-fn available_bytes(_folder: &Path) -> io::Result<Option<u64>> {
+pub fn available_bytes(_folder: &Path) -> io::Result<Option<u64>> {
     Ok(None)
 }

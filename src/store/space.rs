@@ -10,7 +10,7 @@ use super::Store;
 use super::errors::failed;
 use super::reserve::Reserve;
 use super::writer::{Growth, WriterGuard};
-use crate::domain::{CameraId, Durability, Error, ErrorKind, Result};
+use crate::domain::{CameraId, Durability, Error, ErrorKind, Result, SampleOverflow};
 
 /// SQLite's own; the files of this store have never had another.
 const PAGE_BYTES: u64 = 4_096;
@@ -26,8 +26,12 @@ const ROOM_BYTES: u64 = 1 << 20;
 pub struct StoreLimits {
     /// Cameras; more are refused.
     pub cameras: u32,
-    /// Samples of one camera; more are refused.
+    /// Sites; more are refused.
+    pub sites: u32,
+    /// Samples of one camera.
     pub samples_per_camera: u64,
+    /// What happens beyond that.
+    pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
     pub samples: u64,
     /// Model versions of one camera; beyond, the oldest that is not active is deleted.
@@ -40,6 +44,10 @@ pub struct StoreLimits {
     pub keys: u32,
     /// Entries of the audit log; beyond, the oldest is deleted.
     pub audit_entries: u32,
+    /// Stored answers of repeatable changes; beyond, the oldest is deleted.
+    pub idempotency_keys: u32,
+    /// Seconds for which such an answer is repeated.
+    pub idempotency_key_s: u32,
     /// Bytes of the database, if limited.
     pub database_bytes: Option<u64>,
     /// Bytes on the disk that are reserved for deletions when it is full.
@@ -50,13 +58,17 @@ impl Default for StoreLimits {
     fn default() -> Self {
         Self {
             cameras: u32::MAX,
+            sites: u32::MAX,
             samples_per_camera: u64::MAX,
+            sample_overflow: SampleOverflow::Refuse,
             samples: u64::MAX,
             models_per_camera: u32::MAX,
             ended_runs_per_camera: u32::MAX,
             ended_evaluations: u32::MAX,
             keys: u32::MAX,
             audit_entries: u32::MAX,
+            idempotency_keys: u32::MAX,
+            idempotency_key_s: u32::MAX,
             database_bytes: None,
             reserve_bytes: 0,
         }
@@ -74,6 +86,8 @@ pub struct StorageStatus {
     pub disk_available_bytes: Option<u64>,
     /// Samples of all cameras.
     pub samples: u64,
+    /// Samples that wait to be stored, or are being stored.
+    pub queued_rows: u32,
     /// The latest import was refused for want of space, and none has become free since.
     pub is_full: bool,
 }
@@ -130,8 +144,9 @@ impl SampleQuota<'_> {
     /// Admits a batch of a camera that has so many samples, and counts it. Rows that will turn out to
     /// be duplicates count, too.
     pub(super) fn admit(&mut self, id: &CameraId, of_camera: &mut u64, rows: u64) -> Result<()> {
-        let StoreLimits { samples_per_camera, samples, .. } = *self.limits;
-        if of_camera.saturating_add(rows) > samples_per_camera {
+        let StoreLimits { samples_per_camera, sample_overflow, samples, .. } = *self.limits;
+        let is_refused = sample_overflow == SampleOverflow::Refuse;
+        if is_refused && of_camera.saturating_add(rows) > samples_per_camera {
             return Err(limit_reached(format!(
                 "camera {id} has {of_camera} samples, and limits.samples_per_camera is {samples_per_camera}"
             )));
@@ -238,6 +253,7 @@ impl Store {
             free_bytes: free_pages * PAGE_BYTES,
             disk_available_bytes,
             samples: space.samples.load(Ordering::Relaxed),
+            queued_rows: self.inner.samples.queued_rows(),
             is_full: self.is_full(),
         })
     }

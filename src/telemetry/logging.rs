@@ -2,25 +2,86 @@
 
 use std::io::IsTerminal as _;
 
+use anyhow::Context as _;
 use hyper::http::{HeaderName, HeaderValue};
+#[cfg(feature = "otel")]
+use tracing::Level;
+#[cfg(feature = "otel")]
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{EnvFilter, Layer as _, Registry, fmt, reload};
 
+#[cfg(feature = "otel")]
+use super::traces;
 use crate::config::{Config, LogFormat};
 
-/// Starts the log of the process, on standard error.
+/// Changes what is logged while the process runs.
+#[derive(Clone)]
+pub struct LogControl {
+    filter: reload::Handle<EnvFilter, Registry>,
+    #[cfg(feature = "otel")]
+    traces: Option<opentelemetry_sdk::trace::SdkTracerProvider>,
+}
+
+impl LogControl {
+    /// Logs what another filter selects.
+    ///
+    /// # Errors
+    /// A filter that cannot be read; the one before stays.
+    pub fn set_filter(&self, filter: &str) -> anyhow::Result<()> {
+        self.filter.reload(EnvFilter::try_new(filter)?).context("cannot change the log's filter")
+    }
+
+    /// Sends the traces that are not sent yet, before the process ends.
+    pub fn close(&self) {
+        #[cfg(feature = "otel")]
+        if let Some(Err(error)) = self.traces.as_ref().map(|traces| traces.shutdown()) {
+            tracing::warn!(%error, "the latest traces could not be sent");
+        }
+    }
+}
+
+/// Target of the spans and the log lines of requests.
+pub const REQUESTS: &str = "sightfix::requests";
+
+/// Starts the log of the process, on standard error, and its traces where they are set up. Must be called within a
+/// tokio runtime.
 ///
 /// # Errors
 /// A filter that cannot be read, or a log that was started before.
-pub fn start_log(config: &Config) -> anyhow::Result<()> {
-    let filter = tracing_subscriber::EnvFilter::try_new(&config.log_filter)?;
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+pub fn start_log(config: &Config) -> anyhow::Result<LogControl> {
+    let (filter, control) = reload::Layer::new(EnvFilter::try_new(&config.log_filter)?);
+    let lines = fmt::layer()
         .with_ansi(std::io::stderr().is_terminal())
-        .with_writer(std::io::stderr);
-    match config.log_format {
-        LogFormat::Text => log.try_init(),
-        LogFormat::Json => log.json().flatten_event(true).try_init(),
-    }
-    .map_err(|error| anyhow::anyhow!("cannot start the log: {error}"))
+        .with_writer(std::io::stderr)
+        // A line that cannot be written is lost: reported by `eprintln!`, it would end the server.
+        .log_internal_errors(false);
+    let lines = match config.log_format {
+        LogFormat::Text => lines.boxed(),
+        LogFormat::Json => lines.json().flatten_event(true).boxed(),
+    };
+    let log = tracing_subscriber::registry().with(lines.with_filter(filter));
+    #[cfg(feature = "otel")]
+    let (log, traces) = {
+        let traces = config.trace_endpoint.as_deref().map(traces::exporter).transpose()?;
+        let spans = traces.as_ref().map(|traces| {
+            let requests = Targets::new().with_target(REQUESTS, Level::DEBUG);
+            tracing_opentelemetry::layer().with_tracer(traces::tracer(traces)).with_filter(requests)
+        });
+        (log.with(spans), traces)
+    };
+    #[cfg(not(feature = "otel"))]
+    anyhow::ensure!(
+        config.trace_endpoint.is_none(),
+        "the setting trace_endpoint needs a build with the cargo feature otel"
+    );
+    log.try_init().context("cannot start the log")?;
+    Ok(LogControl {
+        filter: control,
+        #[cfg(feature = "otel")]
+        traces,
+    })
 }
 
 /// Header that carries the request id, in and out.

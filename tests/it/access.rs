@@ -122,6 +122,8 @@ fn path_of(route: &str) -> (&str, String) {
     let id = "019a0000-0000-7000-8000-000000000000";
     let path = template
         .replace("{camera}", "c")
+        .replace("{site}", "s")
+        .replace("{track}", "00000000-1")
         .replace("{model}", "99")
         .replace("{target}", "nobody")
         .replace("{run}", id)

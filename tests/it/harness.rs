@@ -109,16 +109,19 @@ impl TestServer {
     }
 
     /// Starts a command that ends up as a server, and waits until it listens.
-    pub(crate) fn run(mut command: Command) -> Self {
+    pub(crate) fn run(command: Command) -> Self {
+        Self::try_run(command).unwrap_or_else(|log| panic!("the server does not listen: {log:?}"))
+    }
+
+    /// The same; the log of a process that ends before it listens.
+    pub(crate) fn try_run(mut command: Command) -> Result<Self, Vec<Value>> {
         let command = command.env("SIGHTFIX_LOG_FORMAT", "json").stderr(Stdio::piped());
         let mut process = command.spawn().expect("the binary starts");
         let mut lines = BufReader::new(process.stderr.take().expect("piped")).lines();
         let mut address = None;
         let log = Arc::new(Mutex::new(Vec::new()));
         for line in lines.by_ref() {
-            let line = line.expect("UTF-8");
-            let entry: Value =
-                serde_json::from_str(&line).unwrap_or_else(|_| panic!("not a JSON log line: {line}"));
+            let entry = log_entry(line.expect("UTF-8"));
             if let Some(text) = entry["address"].as_str() {
                 address = Some(text.parse().expect("an address"));
                 break;
@@ -129,11 +132,15 @@ impl TestServer {
         let rest = log.clone();
         std::thread::spawn(move || {
             for line in lines.map_while(Result::ok) {
-                rest.lock().expect("no panic").extend(serde_json::from_str::<Value>(&line).ok());
+                rest.lock().expect("no panic").push(log_entry(line));
             }
         });
+        let Some(address) = address else {
+            process.wait().expect("the process has ended");
+            return Err(std::mem::take(&mut log.lock().expect("no panic")));
+        };
         let client = Client::builder(TokioExecutor::new()).build_http();
-        Self { process, address: address.expect("the server logs its address"), client, log }
+        Ok(Self { process, address, client, log })
     }
 
     /// Entries of the server's log, as text, that contain a text.
@@ -160,8 +167,18 @@ impl TestServer {
 
     /// Kills the process with SIGKILL.
     pub(crate) fn kill(mut self) {
+        self.kill_now();
+    }
+
+    /// The same; its log can still be read. Nothing happens if it has ended.
+    pub(crate) fn kill_now(&mut self) {
         self.process.kill().expect("the server can be killed");
         self.process.wait().expect("the server is gone");
+    }
+
+    /// Whether the process has ended by itself.
+    pub(crate) fn has_ended(&mut self) -> bool {
+        self.process.try_wait().expect("the process can be asked").is_some()
     }
 
     /// Sends SIGTERM and waits; returns whether the server exited successfully.
@@ -214,12 +231,17 @@ impl TestServer {
         let path = started.header("location").to_owned();
         loop {
             let run = self.get(&path).await.expect(200).json();
-            if !matches!(run["state"].as_str(), Some("queued" | "running")) {
+            if !matches!(run["state"].as_str(), Some("queued" | "running" | "cancelling")) {
                 return run;
             }
             tokio::time::sleep(std::time::Duration::from_millis(100)).await;
         }
     }
+}
+
+/// A line of the log. The message of a panic, and the reason of a start that fails, are no JSON.
+fn log_entry(line: String) -> Value {
+    serde_json::from_str(&line).unwrap_or(Value::String(line))
 }
 
 impl Drop for TestServer {

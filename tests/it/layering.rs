@@ -31,6 +31,7 @@ const LAYERS: &[(&str, u32)] = &[
     ("grpc", 8),
     ("server", 9),
     ("replay", 9),
+    ("doctor", 9),
     ("cli", 10),
 ];
 

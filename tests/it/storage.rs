@@ -2,8 +2,9 @@
 //! processes in the same data folder.
 
 use std::fmt::Write as _;
+use std::io::Write as _;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use futures_util::stream;
@@ -342,40 +343,67 @@ async fn the_data_folder_is_private_to_its_owner() {
     assert_eq!(logged["path"], folder.to_str().expect("UTF-8"), "{logged}");
 }
 
+#[cfg(unix)]
 #[tokio::test]
-async fn processes_in_one_data_folder_know_of_each_other() {
+async fn a_server_and_the_commands_beside_it_know_of_each_other() {
     let folder = data_folder();
-    let first = TestServer::start(folder.path());
-    create_camera(&first, "c").await.expect(201);
-    let second = TestServer::start(folder.path());
-    let is_other = |entry: &Value| entry["message"] == "another process uses the same data folder";
-    for (server, other) in [(&second, &first), (&first, &second)] {
-        let logged = server.logged(is_other).await;
-        assert_eq!((&logged["pid"], &logged["role"]), (&json!(other.pid()), &json!("server")), "{logged}");
-        assert!(logged["host"].as_str().is_some_and(|host| !host.is_empty()), "{logged}");
-    }
-    let pid = second.pid();
-    second.kill();
-
-    let file = folder.path().join("samples.csv");
-    std::fs::write(&file, csv(0..20)).expect("written");
+    let server = TestServer::start(folder.path());
+    create_camera(&server, "c").await.expect(201);
+    // A file that does not end before the test lets it.
+    let path = folder.path().join("samples.csv");
+    assert!(Command::new("mkfifo").arg(&path).status().expect("mkfifo runs").success());
+    let mut pipe = std::fs::OpenOptions::new().read(true).write(true).open(&path).expect("a pipe");
     let mut import = sightfix();
-    import.args(["import", "--camera", "c", "--data"]).arg(folder.path()).arg(&file);
-    let output = import.output().expect("the command runs");
+    import.args(["import", "--camera", "c", "--data"]).arg(folder.path()).arg(&path);
+    let import = import.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("the command runs");
+    let is_other = |entry: &Value| entry["message"] == "another process uses the same data folder";
+    let logged = server.logged(is_other).await;
+    assert_eq!(
+        (&logged["pid"], &logged["role"]),
+        (&json!(import.id()), &json!("sightfix import")),
+        "{logged}"
+    );
+    assert!(logged["host"].as_str().is_some_and(|host| !host.is_empty()), "{logged}");
+    // The command has opened the pipe: its end is the end of the file.
+    pipe.write_all(csv(0..20).as_bytes()).expect("written");
+    drop(pipe);
+    let output = import.wait_with_output().expect("the command ends");
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{errors}");
-    let note = format!("server with process id {}", first.pid());
-    assert!(errors.contains(&note), "{errors}");
-    assert!(!errors.contains(&format!("process id {pid} ")), "a killed server is no longer there: {errors}");
-    let count = first.get("/v1/cameras/c/samples/count").await.expect(200).json();
+    assert!(errors.contains(&format!("server with process id {}", server.pid())), "{errors}");
+    let count = server.get("/v1/cameras/c/samples/count").await.expect(200).json();
     assert_eq!(count["count"], 20);
-    first.kill();
-    let third = TestServer::start(folder.path());
-    assert!(third.terminate());
+    server.kill();
+    let server = TestServer::start(folder.path());
+    assert!(server.terminate());
     let locks = std::fs::read_dir(folder.path()).expect("listed").filter_map(Result::ok);
-    let locks: Vec<_> = locks
-        .map(|entry| entry.file_name())
-        .filter(|name| name.to_string_lossy().ends_with(".lock"))
-        .collect();
-    assert!(locks.is_empty(), "{locks:?}");
+    let names = locks.map(|entry| entry.file_name().to_string_lossy().into_owned());
+    let locks: Vec<_> =
+        names.filter(|name| name.starts_with("sightfix.") && name.ends_with(".lock")).collect();
+    assert!(locks.is_empty(), "stale files are removed: {locks:?}");
+}
+
+#[tokio::test]
+async fn the_oldest_samples_give_way_where_the_settings_say_so() {
+    let folder = data_folder();
+    let settings = [
+        ("SIGHTFIX_LIMITS__SAMPLES_PER_CAMERA", "1000"),
+        ("SIGHTFIX_LIMITS__SAMPLE_OVERFLOW", "delete_oldest"),
+    ];
+    let server = TestServer::start_with(folder.path(), &settings);
+    create_camera(&server, "c").await.expect(201);
+    create_camera(&server, "d").await.expect(201);
+    import(&server, "/v1/cameras/d/samples", csv(0..10)).await.expect(200);
+    let count = async || server.get(&format!("{SAMPLES}/count")).await.expect(200).json()["count"].clone();
+    import(&server, SAMPLES, csv(0..1_000)).await.expect(200);
+    assert_eq!(count().await, 1_000, "what fits is kept");
+    import(&server, SAMPLES, csv(500..1_000)).await.expect(200);
+    assert_eq!(count().await, 1_000, "duplicates delete nothing");
+    let report = import(&server, SAMPLES, csv(1_000..1_005)).await.expect(200).json();
+    assert_eq!((&report["accepted"], count().await), (&json!(5), json!(990)), "{report}");
+    let first = server.get(&format!("{SAMPLES}?limit=1")).await.expect(200).json();
+    let oldest = jiff::Timestamp::from_second(1_600_000_000 + 15).expect("in range");
+    assert_eq!(first["items"][0]["time"], oldest.to_string(), "{first}");
+    let other = server.get("/v1/cameras/d/samples/count").await.expect(200).json();
+    assert_eq!(other["count"], 10, "other cameras keep theirs");
 }

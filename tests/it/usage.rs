@@ -1,6 +1,7 @@
 //! Mistakes that people make with the interfaces, and what they are told.
 
 use std::fs::File;
+use std::io::{Read as _, Write as _};
 use std::process::Stdio;
 
 use futures_util::stream;
@@ -10,7 +11,7 @@ use tonic_reflection::pb::v1alpha::server_reflection_client::ServerReflectionCli
 use tonic_reflection::pb::v1alpha::server_reflection_request::MessageRequest;
 use tonic_reflection::pb::v1alpha::server_reflection_response::MessageResponse;
 
-use crate::harness::{TestServer, data_folder, run, sightfix, simulated_csv};
+use crate::harness::{TestServer, data_folder, own_address, run, sightfix, simulated_csv};
 
 const MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.safetensors");
 const JSON: [(&str, &str); 1] = [("content-type", "application/json")];
@@ -50,6 +51,64 @@ async fn an_array_is_no_object_and_types_are_named_as_in_json() {
 }
 
 #[tokio::test]
+async fn all_fields_at_fault_are_named_at_once() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
+    let fields = async |path: &str, body: serde_json::Value| {
+        let problem = server.post(path, &body).await.expect(422).json();
+        let violations = problem["violations"].as_array().expect("violations").clone();
+        let mut fields: Vec<String> =
+            violations.iter().map(|at| at["field"].as_str().expect("a field").to_owned()).collect();
+        fields.sort_unstable();
+        (fields, problem)
+    };
+    let camera = json!({
+        "id": 5, "labels": [], "recipe": "x", "bogus": 1, "target_classes": [true, "person", null],
+        "image_size": {"width_px": "wide"},
+    });
+    let (named, problem) = fields("/v1/cameras", camera).await;
+    let expected = [
+        "bogus",
+        "id",
+        "image_size.height_px",
+        "image_size.width_px",
+        "labels",
+        "recipe",
+        "target_classes[0]",
+        "target_classes[2]",
+    ];
+    assert_eq!(named, expected, "{problem}");
+    assert!(problem["detail"].as_str().is_some_and(|text| text.starts_with("8 fields")), "{problem}");
+    let observations = json!({"observations": [
+        {"time": "2026-01-01T00:00:00Z", "fix": {"longitude_deg": "x", "latitude_deg": null}},
+        {"target_id": 7, "fix": {"longitude_deg": 1, "latitude_deg": 2}},
+    ]});
+    let (named, problem) = fields("/v1/cameras/c/fusions", observations).await;
+    let expected = [
+        "observations[0].fix.latitude_deg",
+        "observations[0].fix.longitude_deg",
+        "observations[1].target_id",
+        "observations[1].time",
+    ];
+    assert_eq!(named, expected, "{problem}");
+    let (named, problem) = fields("/v1/cameras", json!({})).await;
+    assert_eq!(named, ["id"], "{problem}");
+}
+
+#[tokio::test]
+async fn a_method_that_a_path_does_not_have_is_refused_as_such() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    for (method, path) in
+        [("PUT", "/v1/cameras?limit=5"), ("PUT", "/v1/audit?camera=c"), ("TRACE", "/v1/keys?x=1")]
+    {
+        let answer = server.send(method, path, &[], "").await.expect(405);
+        assert!(answer.header("allow").contains("GET"), "{method} {path}");
+    }
+}
+
+#[tokio::test]
 async fn a_parameter_that_an_operation_does_not_have_is_refused() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
@@ -83,6 +142,58 @@ fn a_closed_or_full_output_is_no_panic() {
         assert_eq!(ended.status.code(), Some(1), "{arguments:?}: {told}");
         assert!(told.contains("standard output cannot be written"), "{arguments:?}: {told}");
     }
+}
+
+#[test]
+fn a_full_standard_error_is_no_panic() {
+    let folder = data_folder();
+    let typo = folder.path().join("typo");
+    let full = || File::options().write(true).open("/dev/full").expect("Linux has it");
+    let train = ["train", "--camera", "c", "--data", typo.to_str().expect("UTF-8")];
+    let ended = sightfix().args(train).stderr(full()).output().expect("runs");
+    assert_eq!(ended.status.code(), Some(1), "the error itself, not a panic: {ended:?}");
+    let keys = [
+        "keys",
+        "create",
+        "--name",
+        "n",
+        "--role",
+        "admin",
+        "--data",
+        folder.path().to_str().expect("UTF-8"),
+    ];
+    let ended = sightfix().args(keys).stderr(full()).output().expect("runs");
+    assert!(ended.status.success() && ended.stdout.starts_with(b"sf_"), "{ended:?}");
+}
+
+/// The device of the log is full, as a disk may be; the log is lost, and nothing else.
+#[tokio::test]
+async fn a_server_whose_log_cannot_be_written_serves_on() {
+    let folder = data_folder();
+    let address = own_address();
+    let mut command = sightfix();
+    command.args(["serve", "--listen", &address.to_string(), "--data"]).arg(folder.path());
+    command
+        .stdout(Stdio::null())
+        .stderr(File::options().write(true).open("/dev/full").expect("Linux has it"));
+    let mut server = command.spawn().expect("the binary starts");
+    let request = b"GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
+    let mut answered = 0;
+    // Each SIGHUP is logged.
+    while answered < 3 {
+        assert_eq!(server.try_wait().expect("it can be asked"), None, "the server has ended");
+        if let Ok(mut stream) = std::net::TcpStream::connect(address) {
+            let mut answer = String::new();
+            stream.write_all(request).and_then(|()| stream.read_to_string(&mut answer)).expect("an answer");
+            assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+            let hangup = std::process::Command::new("kill").args(["-HUP", &server.id().to_string()]).status();
+            assert!(hangup.expect("kill runs").success());
+            answered += 1;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    server.kill().expect("it can be killed");
+    server.wait().expect("it has ended");
 }
 
 #[test]

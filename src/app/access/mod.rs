@@ -20,7 +20,7 @@ use crate::store::Store;
 
 pub use caller::{Caller, CertificateHolder, Principal};
 pub use key_table::ActiveKey;
-pub use permission::{OPERATIONS, Operation, Permission};
+pub use permission::{OPERATIONS, Operation, Permission, RoutePermission};
 pub use sessions::{SESSION_TIME, SessionToken};
 
 /// What a client presents.

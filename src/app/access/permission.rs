@@ -39,10 +39,13 @@ impl Permission {
     /// the table is for administrators only.
     #[must_use]
     pub fn of_route(method: &str, template: &str) -> Self {
-        // The router answers HEAD by the handler of GET.
-        let method = if method == "HEAD" { "GET" } else { method };
-        let row = ROUTES.get(template).and_then(|methods| methods.iter().find(|row| row.0 == method));
-        row.map_or(Self::Administer, |row| row.1)
+        RoutePermission::of(method, template).map_or(Self::Administer, |route| route.permission)
+    }
+
+    /// An RPC's name as the table has it, by its path; `None` if it is missing there.
+    #[must_use]
+    pub fn named_rpc(path: &str) -> Option<&'static str> {
+        RPCS.get_key_value(path.strip_prefix('/').unwrap_or(path)).map(|(name, _)| *name)
     }
 
     /// What an RPC needs, by its path. One that is missing in the table is for administrators only.
@@ -93,6 +96,14 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Read, "GET /v1/cameras/{camera}", "sightfix.v1.CameraService/GetCamera"),
     operation(Operate, "PATCH /v1/cameras/{camera}", "sightfix.v1.CameraService/UpdateCamera"),
     operation(Operate, "DELETE /v1/cameras/{camera}", "sightfix.v1.CameraService/DeleteCamera"),
+    operation(Operate, "POST /v1/sites", "sightfix.v1.SiteService/CreateSite"),
+    operation(Read, "GET /v1/sites", "sightfix.v1.SiteService/ListSites"),
+    operation(Read, "GET /v1/sites/{site}", "sightfix.v1.SiteService/GetSite"),
+    operation(Operate, "PATCH /v1/sites/{site}", "sightfix.v1.SiteService/UpdateSite"),
+    operation(Operate, "DELETE /v1/sites/{site}", "sightfix.v1.SiteService/DeleteSite"),
+    operation(Read, "GET /v1/sites/{site}/tracks", "sightfix.v1.SiteService/ListWorldTracks"),
+    operation(Read, "GET /v1/sites/{site}/tracks/{track}", "sightfix.v1.SiteService/GetWorldTrack"),
+    operation(Read, "GET /v1/sites/{site}/events", "sightfix.v1.SiteService/WatchTracks"),
     operation(Operate, "POST /v1/cameras/{camera}/gnss-error", "sightfix.v1.ModelService/EstimateGnssError"),
     operation(Ingest, "POST /v1/cameras/{camera}/samples", "sightfix.v1.SampleService/ImportSamples"),
     operation(Ingest, "POST /v1/cameras/{camera}/samples/pairings", ""),
@@ -159,13 +170,33 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Operate, "DELETE /v1/evaluations/{evaluation}", ""),
 ];
 
-type Methods = Vec<(&'static str, Permission)>;
+/// A REST route with the permission that it needs.
+#[derive(Debug, Clone, Copy)]
+pub struct RoutePermission {
+    /// Its method.
+    pub method: &'static str,
+    /// The template of its path.
+    pub template: &'static str,
+    /// What it needs.
+    pub permission: Permission,
+}
 
-static ROUTES: LazyLock<HashMap<&'static str, Methods>> = LazyLock::new(|| {
-    let mut routes: HashMap<_, Methods> = HashMap::new();
+impl RoutePermission {
+    /// The row of a route in the table; `None` if it is missing there.
+    #[must_use]
+    pub fn of(method: &str, template: &str) -> Option<Self> {
+        // The router answers HEAD by the handler of GET.
+        let method = if method == "HEAD" { "GET" } else { method };
+        ROUTES.get(template)?.iter().find(|route| route.method == method).copied()
+    }
+}
+
+static ROUTES: LazyLock<HashMap<&'static str, Vec<RoutePermission>>> = LazyLock::new(|| {
+    let mut routes: HashMap<_, Vec<_>> = HashMap::new();
     for operation in OPERATIONS {
         if let Some((method, template)) = operation.route.split_once(' ') {
-            routes.entry(template).or_default().push((method, operation.permission));
+            let route = RoutePermission { method, template, permission: operation.permission };
+            routes.entry(template).or_default().push(route);
         }
     }
     routes

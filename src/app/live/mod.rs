@@ -8,10 +8,14 @@
 mod acknowledgements;
 mod alarms;
 pub(super) mod camera;
+mod camera_events;
 mod drift;
+mod event_log;
+mod history;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
+pub(super) mod site;
 mod stream;
 mod sync;
 mod tracks;
@@ -19,16 +23,16 @@ mod tracks;
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use tokio::sync::broadcast;
 
 use self::camera::CameraLive;
+use self::camera_events::CameraEventReader;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
 use super::fusion::fuse_observed;
 use super::registry::ActiveCamera;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, Observation, Result, TargetId, TimeBounds,
+    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, Result, TargetId, TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
@@ -36,7 +40,12 @@ use crate::fusion::observed::ObservedPositions;
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
+pub use camera_events::{EventId, LostEvents};
 pub(super) use retraining::RetrainSchedule;
+pub use site::{
+    LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
+    WorldSighting, WorldTrackPoint,
+};
 pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};
 pub use tracks::TrackPoint;
@@ -48,6 +57,8 @@ pub struct ItemResult {
     pub fused: Option<FusedFix>,
     /// The target's track with it; `None` without a target or anything usable.
     pub track: Option<Arc<TrackPoint>>,
+    /// The target's world track in the camera's site, as of the latest frame that was tracked there.
+    pub world_track: Option<LiveId>,
 }
 
 /// What happens in a camera's view, since the server was started.
@@ -63,27 +74,17 @@ pub struct CameraActivity {
 
 /// The events of one camera from some instant on; they end when it is deleted.
 pub struct CameraEvents {
-    events: broadcast::Receiver<CameraEvent>,
+    reader: CameraEventReader<CameraEvent>,
     live: Arc<CameraLive>,
 }
 
-/// Events that were lost because the reader was too slow.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LostEvents(pub u64);
-
 impl CameraEvents {
     /// The next event; `None` once the camera is deleted.
-    pub async fn next(&mut self) -> Option<Result<CameraEvent, LostEvents>> {
-        use broadcast::error::RecvError;
-        let event = tokio::select! {
+    pub async fn next(&mut self) -> Option<Result<(EventId, Arc<CameraEvent>), LostEvents>> {
+        tokio::select! {
             biased;
-            () = self.live.deleted() => return None,
-            event = self.events.recv() => event,
-        };
-        match event {
-            Ok(event) => Some(Ok(event)),
-            Err(RecvError::Lagged(lost)) => Some(Err(LostEvents(lost))),
-            Err(RecvError::Closed) => None,
+            () = self.live.deleted() => None,
+            event = self.reader.next() => Some(event),
         }
     }
 }
@@ -100,7 +101,8 @@ impl App {
         RowRules { time_bounds: self.live_time_bounds(), image_size: camera.image_size }
     }
 
-    /// Answers an observation, feeds its target's track and compares box and fix.
+    /// Answers an observation, feeds its target's track and the tracker of the camera's site, and compares box
+    /// and fix.
     ///
     /// # Errors
     /// `InvalidArgument` naming `time` for a time ahead of the server's clock; `Overloaded` if the camera
@@ -127,6 +129,7 @@ impl App {
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(self.clock.now());
+        let world_track = self.feed_site(camera, observation, &observed);
         let (track, residual) = match (target, observation.target_id()) {
             (Some(mut target), Some(target_id)) => {
                 target.update(&TargetObservation { target_id, observed, model, now }, &self.limits)
@@ -135,7 +138,7 @@ impl App {
         };
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
-            camera.live.announce_track(|| TargetUpdate {
+            camera.live.announce_track(now, || TargetUpdate {
                 point: point.clone(),
                 bounding_box: observation.bounding_box(),
                 fused: fused.clone(),
@@ -144,7 +147,7 @@ impl App {
         if let Some(residual) = residual {
             self.hand_over(camera, residual);
         }
-        Ok(ItemResult { fused, track })
+        Ok(ItemResult { fused, track, world_track })
     }
 
     /// What happens in a camera's view.
@@ -178,14 +181,14 @@ impl App {
         })
     }
 
-    /// Everything that happens in a camera's view from now on. A reader that is too slow misses the
-    /// oldest of what it has not read.
+    /// Everything that happens in a camera's view from now on, or after the last event that the reader has
+    /// seen. A reader that is too slow, or was away for too long, misses the oldest of what it has not read.
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn camera_events(&self, id: &CameraId) -> Result<CameraEvents> {
+    pub async fn camera_events(&self, id: &CameraId, last_seen: Option<EventId>) -> Result<CameraEvents> {
         let live = self.active_camera(id).await?.live.clone();
-        Ok(CameraEvents { events: live.events.subscribe(), live })
+        Ok(CameraEvents { reader: live.events.reader(last_seen), live })
     }
 
     /// Whether a camera's active model no longer fits what the camera sees.

@@ -4,12 +4,11 @@
 //! is waited for, and everything is bounded by the limits. Ages are read from the monotonic clock, so a
 //! step of the wall clock neither hides targets nor keeps them.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use jiff::SignedDuration;
-
+use super::history::History;
 use super::sync::lock;
 use crate::config::Limits;
 use crate::domain::{CameraId, Error, ErrorKind, ImageSize, Observation, Result, TargetId};
@@ -20,8 +19,6 @@ use crate::fusion::track::{TrackSettings, TrackState};
 use crate::geo::Position;
 use crate::model::Regressor;
 
-/// Points of a history are at least this far apart in time; the latest is always there.
-const HISTORY_STEP: SignedDuration = SignedDuration::from_millis(500);
 /// A target without an observation for this long gives way to a new one where there is no room.
 const EVICT_AFTER: Duration = Duration::from_secs(2);
 
@@ -47,8 +44,7 @@ pub(super) struct TrackedTarget {
     track: TargetTrack,
     /// Reading of the monotonic clock at the last observation.
     last_item_at: Duration,
-    /// In order of time; the last is the latest.
-    history: VecDeque<Arc<TrackPoint>>,
+    history: History<TrackPoint>,
     residuals: ResidualSource,
 }
 
@@ -67,7 +63,7 @@ impl Tracks {
         let mut targets = lock(&self.targets);
         remove_expired(&mut targets, now);
         let mut points: Vec<_> =
-            targets.values().filter_map(|target| lock(target).history.back().cloned()).collect();
+            targets.values().filter_map(|target| lock(target).history.latest().cloned()).collect();
         points.sort_by(|a, b| a.target_id.cmp(&b.target_id));
         points
     }
@@ -79,8 +75,8 @@ impl Tracks {
             remove_expired(&mut targets, now);
             targets.get(target_id).cloned()?
         };
-        let target = lock(&target);
-        Some(target.history.iter().cloned().collect::<Vec<_>>()).filter(|points| !points.is_empty())
+        let points = lock(&target).history.points();
+        Some(points).filter(|points| !points.is_empty())
     }
 
     /// The target's entry, made if there is room for it.
@@ -163,7 +159,7 @@ impl TrackedTarget {
         let residual = self.residuals.observe(seen);
         let Some(TrackEstimate { position, state }) = estimate else { return (None, residual) };
         let point = Arc::new(TrackPoint { target_id: seen.target_id.clone(), position, state });
-        self.remember(&point, limits.track_points);
+        self.history.push(&point, |point| point.state.time, limits.track_points);
         (Some(point), residual)
     }
 
@@ -171,29 +167,9 @@ impl TrackedTarget {
         Self {
             track: TargetTrack::default(),
             last_item_at: now,
-            history: VecDeque::new(),
+            history: History::default(),
             residuals: ResidualSource::default(),
         }
-    }
-
-    /// Keeps the latest point, and before it only points some time apart.
-    fn remember(&mut self, point: &Arc<TrackPoint>, most: usize) {
-        if self.history.back().is_some_and(|latest| point.state.time < latest.state.time) {
-            // The track restarted at an earlier time.
-            self.history.clear();
-        }
-        let time = |at: usize| self.history.get(at).map(|point| point.state.time);
-        let last = self.history.len().saturating_sub(1);
-        let is_close = time(last)
-            .zip(last.checked_sub(1).and_then(time))
-            .is_some_and(|(latest, before)| latest.duration_since(before) < HISTORY_STEP);
-        if is_close {
-            self.history.pop_back();
-        }
-        while self.history.len() >= most.max(2) {
-            self.history.pop_front();
-        }
-        self.history.push_back(point.clone());
     }
 }
 

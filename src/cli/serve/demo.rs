@@ -17,7 +17,7 @@ const CAMERA: &str = "demo";
 pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
     let id = CameraId::new(CAMERA)?;
     let world = simulate(&Options::demo());
-    if app.cameras(None, 1).await?.items.is_empty() {
+    if app.cameras(None, None, 1).await?.items.is_empty() {
         let sigma_m = SigmaM::new(world.gnss_sigma_m)?;
         app.create_camera(NewCamera {
             display_name: "Demonstration: a simulated square".to_owned(),

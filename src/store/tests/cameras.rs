@@ -29,6 +29,7 @@ fn full(name: &str) -> NewCamera {
         ])
         .expect("two receivers"),
         retrain_when_moved: true,
+        site: None,
     }
 }
 
@@ -59,7 +60,7 @@ async fn pages_hold_every_camera_once_in_order() {
     }
     let mut seen: Vec<CameraId> = Vec::new();
     loop {
-        let page = store.cameras(seen.last(), 2).await.expect("a page");
+        let page = store.cameras(None, seen.last(), 2).await.expect("a page");
         if page.is_empty() {
             break;
         }

@@ -121,7 +121,7 @@ async fn futures_can_move_between_threads() {
     movable(Store::open(std::path::Path::new("none")));
     movable(store.close());
     movable(store.ping());
-    movable(store.cameras(Some(&camera), 1));
+    movable(store.cameras(None, Some(&camera), 1));
     movable(store.delete_camera(&camera, None, at(9)));
     movable(store.insert_samples(&camera, Vec::<Sample>::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));

@@ -15,6 +15,7 @@ fn yard() -> proto::CameraProfile {
         labels: [("site".to_owned(), "north".to_owned())].into(),
         receivers: vec![receiver("phone-7", "person-1", -18.35), receiver("tag", "tag", 0.0)],
         retrain_when_moved: Some(true),
+        site: None,
         gnss_bias_sigma_m: Some(1.5),
     }
 }
@@ -84,7 +85,7 @@ async fn cameras_come_page_by_page() {
     let mut pages = Vec::new();
     let mut page_token = String::new();
     loop {
-        let request = proto::ListCamerasRequest { page_size: 2, page_token };
+        let request = proto::ListCamerasRequest { page_size: 2, page_token, ..Default::default() };
         let page = cameras.list_cameras(request).await.expect("a page").into_inner();
         pages.push(page.cameras.iter().map(|camera| camera.id.clone()).collect::<Vec<_>>().join(""));
         page_token = page.next_page_token;
@@ -93,10 +94,10 @@ async fn cameras_come_page_by_page() {
         }
     }
     assert_eq!(pages, ["ab", "cd", "e"]);
-    let request = proto::ListCamerasRequest { page_size: 0, page_token: "!".to_owned() };
+    let request = proto::ListCamerasRequest { page_token: "!".to_owned(), ..Default::default() };
     let status = cameras.list_cameras(request).await.expect_err("no token");
     assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["page_token"]);
-    let request = proto::ListCamerasRequest { page_size: 1_000_000, page_token: String::new() };
+    let request = proto::ListCamerasRequest { page_size: 1_000_000, ..Default::default() };
     let status = cameras.list_cameras(request).await.expect_err("too many");
     assert_eq!(refusal_of(&status, Code::InvalidArgument, "invalid-argument").1, ["page_size"]);
 }

@@ -21,7 +21,7 @@ mod map_rows;
 mod noise;
 mod posterior;
 mod predictor;
-mod projective_mean;
+pub(crate) mod projective_mean;
 mod recipe;
 mod sessions;
 mod stored;

@@ -1,0 +1,73 @@
+//! What live observations hand to the tracker of their camera's site.
+
+use tokio::sync::mpsc;
+
+use super::item::{ItemSource, SiteItem};
+use super::task;
+use crate::app::App;
+use crate::app::registry::ActiveCamera;
+use crate::domain::{LiveId, Observation};
+use crate::fusion::observed::ObservedPositions;
+use crate::telemetry::SiteItemOutcome;
+
+impl App {
+    /// Hands what an observation measured to the tracker of its camera's site, and returns the world track of
+    /// its target as of the latest frame. A full queue drops it, counted.
+    pub(in crate::app::live) fn feed_site(
+        &self,
+        camera: &ActiveCamera,
+        observation: &Observation,
+        observed: &ObservedPositions<'_>,
+    ) -> Option<LiveId> {
+        let site = self.site_registry.get(camera.site.as_ref()?)?;
+        let queue = site.live.queue.get_or_init(|| {
+            let (sender, receiver) = mpsc::channel(self.limits.site_queue.max(1));
+            let task = task::run(site.live.clone(), receiver, self.site_resources());
+            self.tasks.spawn(task);
+            sender
+        });
+        for item in items_of(camera, observation, observed) {
+            if queue.try_send(item).is_err() {
+                self.metrics.site_item(SiteItemOutcome::Overflow);
+            }
+        }
+        site.live.track_of(&camera.id, observation.target_id()?)
+    }
+
+    fn site_resources(&self) -> task::SiteResources {
+        task::SiteResources {
+            clock: self.clock.clone(),
+            limits: self.limits.clone(),
+            metrics: self.metrics.clone(),
+        }
+    }
+}
+
+/// The box and the fix of an observation, each if it gives a position. A fix without a target names no receiver,
+/// so nothing can be tracked by it.
+fn items_of<'a>(
+    camera: &'a ActiveCamera,
+    observation: &'a Observation,
+    observed: &'a ObservedPositions<'_>,
+) -> impl Iterator<Item = SiteItem> + 'a {
+    let item = |position, source| SiteItem {
+        camera: camera.id.clone(),
+        time: observation.time(),
+        target_id: observation.target_id().cloned(),
+        position,
+        source,
+    };
+    let by_box = observed.usable_box().zip(observed.plane).map(|(observed_box, plane)| {
+        let regression = &observed_box.independent;
+        let (covariance, scale) = (regression.covariance, regression.normal_scale());
+        let source = ItemSource::Box {
+            covariance_m2: covariance.scaled(scale),
+            map_covariance_m2: covariance.minus(regression.box_noise).scaled(scale),
+            model_origin: plane.origin(),
+        };
+        item(plane.to_position(regression.regressed), source)
+    });
+    let fix = observed.fix.filter(|_| observation.target_id().is_some());
+    let by_fix = fix.map(|fix| item(fix.position, ItemSource::Fix { variance_m2: fix.variance_m2 }));
+    by_box.into_iter().chain(by_fix)
+}

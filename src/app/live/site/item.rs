@@ -1,0 +1,38 @@
+//! Measured positions on their way to the tracker of a site.
+
+use jiff::Timestamp;
+
+use crate::domain::{CameraId, TargetId};
+use crate::geo::{PlaneCovariance, Position};
+
+/// One measured position of one target.
+#[derive(Debug)]
+pub(super) struct SiteItem {
+    /// The camera whose observation it was.
+    pub(super) camera: CameraId,
+    pub(super) time: Timestamp,
+    pub(super) target_id: Option<TargetId>,
+    pub(super) position: Position,
+    pub(super) source: ItemSource,
+}
+
+/// What measured a position.
+#[derive(Debug)]
+pub(super) enum ItemSource {
+    /// A box, through the camera's model.
+    Box {
+        /// Covariance of the error, m2, axes east and north of the model's plane, which those of the site's plane
+        /// are to within its range.
+        covariance_m2: PlaneCovariance,
+        /// Of it, the error of the map from pixels to the ground, which is the same from frame to frame at a
+        /// place, m2.
+        map_covariance_m2: PlaneCovariance,
+        /// Origin of the model's plane.
+        model_origin: Position,
+    },
+    /// A receiver.
+    Fix {
+        /// Error variance per axis, m2.
+        variance_m2: f64,
+    },
+}

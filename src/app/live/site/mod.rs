@@ -1,0 +1,76 @@
+//! World tracks of a site: one set of tracks, fed by all its cameras.
+//!
+//! Answers put what they measured into a bounded queue and never wait; one task per site assembles frames, runs
+//! the world tracker and publishes its tracks and events. Everything is in memory: tracks describe the present.
+
+mod events;
+mod feed;
+mod item;
+mod published;
+mod reader;
+pub(in crate::app) mod state;
+mod task;
+mod tracker;
+
+use std::sync::Arc;
+
+use super::sync::lock;
+use crate::app::App;
+use crate::app::site_registry::ActiveSite;
+use crate::domain::{Error, ErrorKind, LiveId, Result, SiteId};
+
+pub use events::{SiteEvent, SiteEventKind};
+pub use published::{WorldSighting, WorldTrackPoint};
+pub use reader::{LossReason, LostSiteEvents, SiteEvents, StoredSiteEvent};
+
+/// The tracks of a site at one instant.
+#[derive(Debug)]
+pub struct SiteTracks {
+    /// The latest point of every track, in the order of the ids.
+    pub points: Vec<Arc<WorldTrackPoint>>,
+    /// The event behind which a reader misses nothing that is not among the points.
+    pub last_event: LiveId,
+}
+
+impl App {
+    /// Where every target of a site is now.
+    ///
+    /// # Errors
+    /// `SiteNotFound`.
+    pub async fn world_tracks(&self, id: &SiteId) -> Result<SiteTracks> {
+        let live = &self.active_site(id).await?.live;
+        // The event first: what is published in between is in both.
+        let last_event = live.id_of(live.events.latest());
+        Ok(SiteTracks { points: lock(&live.tracks).latest(), last_event })
+    }
+
+    /// Where a target was, oldest first, as far back as the history reaches.
+    ///
+    /// # Errors
+    /// `SiteNotFound`; `TrackNotFound` if the track has ended.
+    pub async fn world_track_history(&self, id: &SiteId, track: LiveId) -> Result<Vec<Arc<WorldTrackPoint>>> {
+        let site = self.active_site(id).await?;
+        let history = lock(&site.live.tracks).history(track);
+        history.ok_or_else(|| {
+            let message = format!("site {id} has no world track {track} now");
+            Error::refused(ErrorKind::TrackNotFound, message)
+        })
+    }
+
+    /// What happens at a site: behind an event, or from now on.
+    ///
+    /// # Errors
+    /// `SiteNotFound`.
+    pub async fn site_events(&self, id: &SiteId, after: Option<LiveId>) -> Result<SiteEvents> {
+        let site = self.active_site(id).await?;
+        Ok(SiteEvents::new(site.live.clone(), after, self.metrics.clone()))
+    }
+
+    /// A site in memory; looks into the store for one that another process has created.
+    async fn active_site(&self, id: &SiteId) -> Result<Arc<ActiveSite>> {
+        match self.site_registry.get(id) {
+            Some(site) => Ok(site),
+            None => self.site_registry.refresh_site(&self.store, id).await,
+        }
+    }
+}

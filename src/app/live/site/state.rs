@@ -1,0 +1,59 @@
+//! The state in memory of one site, from its creation (or the start of the server) to its deletion.
+
+use std::sync::{Arc, Mutex, OnceLock};
+
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use super::events::SiteEvent;
+use super::item::SiteItem;
+use super::published::PublishedTracks;
+use crate::app::live::event_log::EventLog;
+use crate::app::live::sync::lock;
+use crate::domain::{CameraId, LiveId, TargetId};
+use crate::geo::Position;
+
+/// Queue, tracks and events of one site.
+pub(in crate::app) struct SiteLive {
+    /// Of the ids of tracks and events.
+    pub(super) epoch: u32,
+    /// Origin of the plane, if the operator states it.
+    pub(super) origin: Mutex<Option<Position>>,
+    /// The way to the task, which starts with the first item.
+    pub(super) queue: OnceLock<mpsc::Sender<SiteItem>>,
+    pub(super) tracks: Mutex<PublishedTracks>,
+    pub(super) events: Arc<EventLog<SiteEvent>>,
+    pub(super) ended: CancellationToken,
+}
+
+impl SiteLive {
+    pub(in crate::app) fn new(epoch: u32, events: usize) -> Arc<Self> {
+        Arc::new(Self {
+            epoch,
+            origin: Mutex::default(),
+            queue: OnceLock::new(),
+            tracks: Mutex::default(),
+            events: Arc::new(EventLog::new(events)),
+            ended: CancellationToken::new(),
+        })
+    }
+
+    /// Changes the origin of the plane; tracks start again where it differs.
+    pub(in crate::app) fn set_origin(&self, origin: Option<Position>) {
+        *lock(&self.origin) = origin;
+    }
+
+    /// Ends the task and the readers of a site that is deleted, or of a server that ends.
+    pub(in crate::app) fn end(&self) {
+        self.ended.cancel();
+    }
+
+    pub(super) const fn id_of(&self, number: u64) -> LiveId {
+        LiveId { epoch: self.epoch, number }
+    }
+
+    /// The world track of which a camera's tracker saw the target lately.
+    pub(super) fn track_of(&self, camera: &CameraId, target_id: &TargetId) -> Option<LiveId> {
+        lock(&self.tracks).track_of(camera, target_id)
+    }
+}

@@ -1,0 +1,507 @@
+//! Frames of a site's cameras through the world tracker, and what is published of it.
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::events::{SiteEvent, SiteEventKind};
+use super::item::{ItemSource, SiteItem};
+use super::published::{WorldSighting, WorldTrackPoint};
+use super::state::SiteLive;
+use crate::app::live::sync::lock;
+use crate::config::Limits;
+use crate::domain::{CameraId, LiveId, ReceiverId, TargetId};
+use crate::fusion::frame_assembler::{AssembledFrame, FrameAssembler, FrameLimits, PushOutcome};
+use crate::fusion::world::{
+    CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
+    WorldTracker,
+};
+use crate::geo::LocalPlane;
+use crate::telemetry::{Metrics, SiteItemOutcome};
+
+/// Positions of a track are announced at least this far apart in time; readers follow people, not frames.
+const ANNOUNCE_STEP: SignedDuration = SignedDuration::from_millis(200);
+/// A target counts as the carrier of a receiver until this long after its latest fix.
+const CARRIER_FOR: Duration = Duration::from_secs(60);
+
+/// Where frames come from. Cameras sort before receivers, so that a box is tracked before the fix of its instant.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+enum Source {
+    Camera(CameraId),
+    Receiver(TargetId),
+}
+
+/// The tracker of one site.
+pub(super) struct SiteTracker {
+    live: Arc<SiteLive>,
+    limits: Limits,
+    metrics: Metrics,
+    frames: FrameAssembler<Source, SiteItem>,
+    /// Time by which a fix may be older than the latest frame.
+    fix_lateness: SignedDuration,
+    active: Option<ActiveTracker>,
+    /// Added to the numbers of the tracker's tracks, so that none is announced twice when it starts again.
+    number_offset: u64,
+    /// The highest number that was announced.
+    highest_number: u64,
+    /// Targets of which fixes came.
+    carriers: HashMap<TargetId, Carrier>,
+    /// The tracks whose start was announced and whose end was not, each with the latest instant at which its
+    /// position was announced.
+    announced: HashMap<LiveId, Option<Timestamp>>,
+}
+
+/// A target that carries a receiver.
+struct Carrier {
+    /// Time of its latest fix; the same one may come again with the boxes of another camera.
+    fixed_at: Timestamp,
+    /// Reading of the monotonic clock when it came.
+    noted_at: Duration,
+    /// The cameras through which its fixes came: a box of theirs with the target's id is of this target.
+    cameras: BTreeSet<CameraId>,
+}
+
+/// A world tracker with its plane.
+struct ActiveTracker {
+    tracker: WorldTracker,
+    /// Whether the plane is that of the operator or of a model; a fix alone may be anywhere.
+    has_trusted_plane: bool,
+    /// Reading of the monotonic clock when a frame was tracked last.
+    tracked_at: Duration,
+    /// The latest time of a frame.
+    latest: Timestamp,
+}
+
+impl SiteTracker {
+    pub(super) fn new(live: Arc<SiteLive>, limits: Limits, metrics: Metrics) -> Self {
+        let max_late_s = WorldTrackSettings::default().max_late_s;
+        let fix_lateness = SignedDuration::try_from_secs_f64(max_late_s).unwrap_or_default();
+        let frames = FrameAssembler::new(FrameLimits {
+            wait: Duration::from_millis(limits.site_wait_ms),
+            lateness: fix_lateness,
+            frames: limits.site_frames,
+            items_per_frame: limits.boxes_per_frame,
+        });
+        Self {
+            live,
+            limits,
+            metrics,
+            frames,
+            fix_lateness,
+            active: None,
+            number_offset: 0,
+            highest_number: 0,
+            carriers: HashMap::new(),
+            announced: HashMap::new(),
+        }
+    }
+
+    /// Takes an item; [`Self::advance`] tracks what is complete.
+    pub(super) fn push(&mut self, item: SiteItem, now: Duration) {
+        let (source, is_pacing) = match (&item.source, &item.target_id) {
+            (ItemSource::Box { .. }, _) => (Source::Camera(item.camera.clone()), true),
+            (ItemSource::Fix { .. }, Some(target_id)) => {
+                if !self.note_carrier(&item.camera, target_id, item.time, now) {
+                    return;
+                }
+                (Source::Receiver(target_id.clone()), false)
+            }
+            (ItemSource::Fix { .. }, None) => return,
+        };
+        let time = item.time;
+        match self.frames.push(&source, is_pacing, time, item, now) {
+            PushOutcome::Waiting => {}
+            PushOutcome::Late => self.metrics.site_item(SiteItemOutcome::Late),
+            PushOutcome::FrameFull => self.metrics.site_item(SiteItemOutcome::Overflow),
+        }
+    }
+
+    /// Notes a fix of a target; whether it is a new one.
+    fn note_carrier(
+        &mut self,
+        camera: &CameraId,
+        target_id: &TargetId,
+        time: Timestamp,
+        now: Duration,
+    ) -> bool {
+        if let Some(carrier) = self.carriers.get_mut(target_id) {
+            carrier.cameras.insert(camera.clone());
+            carrier.noted_at = now;
+            // Of a recording that is played again the times are far behind.
+            let behind = carrier.fixed_at.duration_since(time);
+            let is_new = behind.is_negative() || behind > self.fix_lateness;
+            if is_new {
+                carrier.fixed_at = time;
+            }
+            return is_new;
+        }
+        if self.carriers.len() >= self.limits.tracks_per_site {
+            self.carriers.retain(|_, carrier| !carrier.is_outdated(now));
+        }
+        if self.carriers.len() < self.limits.tracks_per_site {
+            let carrier = Carrier { fixed_at: time, noted_at: now, cameras: [camera.clone()].into() };
+            self.carriers.insert(target_id.clone(), carrier);
+        }
+        true
+    }
+
+    /// Whether time changes anything: frames wait, or tracks may end.
+    pub(super) fn is_busy(&self) -> bool {
+        !self.frames.is_empty() || self.active.as_ref().is_some_and(|it| it.tracker.tracks().next().is_some())
+    }
+
+    /// Tracks the frames that are complete. Where none came for a while, the time of the cameras goes on by the
+    /// monotonic clock, so that tracks end.
+    pub(super) fn advance(&mut self, now: Duration) {
+        self.follow_origin();
+        while let Some(frame) = self.frames.release(now) {
+            self.track(frame, now);
+        }
+        let wait = Duration::from_millis(self.limits.site_wait_ms);
+        let Some(active) = &mut self.active else { return };
+        let idle = now.saturating_sub(active.tracked_at);
+        if idle > wait
+            && self.frames.is_empty()
+            && let Ok(idle) = SignedDuration::try_from(idle)
+            && let Ok(time) = active.latest.checked_add(idle)
+        {
+            let events = active.tracker.advance(time);
+            self.announce(events);
+        }
+    }
+
+    /// Ends all tracks, for the site has ended.
+    pub(super) fn end(&mut self) {
+        self.restart();
+    }
+
+    /// Starts again where the operator has moved the origin.
+    fn follow_origin(&mut self) {
+        let Some(origin) = *lock(&self.live.origin) else { return };
+        if self.active.as_ref().is_some_and(|active| active.tracker.plane().origin() != origin) {
+            self.restart();
+        }
+    }
+
+    /// Ends the tracker and its tracks; the next frame starts another.
+    fn restart(&mut self) {
+        let Some(active) = self.active.take() else { return };
+        let tracks: Vec<LiveId> = self.announced.keys().copied().collect();
+        for track in tracks {
+            self.announce_end(track, active.latest, SiteEventKind::Ended(track));
+        }
+        self.number_offset = self.highest_number;
+    }
+
+    fn track(&mut self, frame: AssembledFrame<Source, SiteItem>, now: Duration) {
+        let is_rewound = self.active.as_ref().is_some_and(|active| {
+            let late = active.latest.duration_since(frame.time);
+            late.as_secs_f64() > active.tracker.settings().max_late_s
+        });
+        if is_rewound {
+            // The assembler releases such a frame only after the clock of the sources went back.
+            self.restart();
+        }
+        if !self.prepare(&frame.items) {
+            let dropped = frame.items.len();
+            (0..dropped).for_each(|_| self.metrics.site_item(SiteItemOutcome::OutOfRange));
+            return;
+        }
+        let Some(active) = &mut self.active else { return };
+        active.tracked_at = now;
+        active.latest = active.latest.max(frame.time);
+        match frame.source {
+            Source::Camera(camera) => self.track_boxes(camera, frame.time, &frame.items),
+            Source::Receiver(target_id) => self.track_fix(&target_id, frame.time, &frame.items),
+        }
+    }
+
+    /// Makes sure that there is a tracker whose plane holds the first of these; false if none can.
+    fn prepare(&mut self, items: &[SiteItem]) -> bool {
+        let Some(first) = items.first() else { return false };
+        let model_origin = match &first.source {
+            ItemSource::Box { model_origin, .. } => Some(*model_origin),
+            ItemSource::Fix { .. } => None,
+        };
+        let holds =
+            |active: &ActiveTracker| active.tracker.plane().to_plane_within_range(first.position).is_some();
+        match &self.active {
+            Some(active) if holds(active) => return true,
+            // A fix that was wrong by far must not keep the boxes out.
+            Some(active) if !active.has_trusted_plane && model_origin.is_some() => self.restart(),
+            Some(_) => return false,
+            None => {}
+        }
+        let stated = *lock(&self.live.origin);
+        let origin = stated.or(model_origin).unwrap_or(first.position);
+        let settings = WorldTrackSettings {
+            max_tracks: self.limits.tracks_per_site,
+            max_detections: self.limits.boxes_per_frame,
+            ..WorldTrackSettings::default()
+        };
+        let active = ActiveTracker {
+            tracker: WorldTracker::new(LocalPlane::new(origin), settings),
+            has_trusted_plane: stated.or(model_origin).is_some(),
+            tracked_at: Duration::ZERO,
+            latest: first.time,
+        };
+        let is_held = holds(&active);
+        self.active = Some(active);
+        is_held
+    }
+
+    fn track_boxes(&mut self, camera: CameraId, time: Timestamp, items: &[SiteItem]) {
+        let Some(active) = &mut self.active else { return };
+        let plane = *active.tracker.plane();
+        let now = active.tracked_at;
+        let carries = |camera: &CameraId, target_id: &TargetId| {
+            let carrier = self.carriers.get(target_id).filter(|carrier| !carrier.is_outdated(now));
+            carrier.is_some_and(|carrier| carrier.cameras.contains(camera))
+        };
+        let mut detections = Vec::with_capacity(items.len());
+        for item in items {
+            let detection = detection_of(item, &plane, carries);
+            let outcome =
+                if detection.is_some() { SiteItemOutcome::Tracked } else { SiteItemOutcome::OutOfRange };
+            self.metrics.site_item(outcome);
+            detections.extend(detection);
+        }
+        let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
+        self.announce(outcome.events);
+        let mut measured: Vec<WorldTrackId> = outcome.tracks.into_iter().flatten().collect();
+        measured.sort_unstable();
+        measured.dedup();
+        for track in measured {
+            self.publish(track);
+        }
+    }
+
+    fn track_fix(&mut self, target_id: &TargetId, time: Timestamp, items: &[SiteItem]) {
+        let (Some(active), Some(item)) = (&mut self.active, items.first()) else { return };
+        let ItemSource::Fix { variance_m2 } = item.source else { return };
+        let position = active.tracker.plane().to_plane(item.position);
+        self.metrics.site_item(SiteItemOutcome::Tracked);
+        let receiver = ReceiverId::from(target_id.clone());
+        let outcome = active.tracker.observe_fix(&receiver, time, position, variance_m2.sqrt());
+        self.announce(outcome.events);
+        if let Some(track) = outcome.track {
+            self.publish(track);
+        }
+    }
+
+    /// Publishes a track that was measured, and announces its position from time to time.
+    fn publish(&mut self, track: WorldTrackId) {
+        let Some(active) = &self.active else { return };
+        let Some(track) = active.tracker.track(track).filter(|track| track.is_confirmed()) else { return };
+        let point = Arc::new(self.point_of(track, active.tracker.plane()));
+        lock(&self.live.tracks).publish(&point, self.limits.track_points);
+        let Some(announced_at) = self.announced.get_mut(&point.id) else { return };
+        if announced_at.is_none_or(|last| point.time.duration_since(last).abs() >= ANNOUNCE_STEP) {
+            *announced_at = Some(point.time);
+            self.live.events.push(SiteEvent { time: point.time, kind: SiteEventKind::Measured(point) });
+        }
+    }
+
+    fn point_of(&self, track: &WorldTrack, plane: &LocalPlane) -> WorldTrackPoint {
+        let state = track.state();
+        let [velocity_east_m_s, velocity_north_m_s] = state.velocity_m_s;
+        let current = track
+            .sightings()
+            .iter()
+            .filter(|sighting| WorldSighting::is_current(sighting.last_seen, track.last_seen()));
+        WorldTrackPoint {
+            id: self.id_of(track.id()),
+            target_id: track.receiver().cloned().map(TargetId::from),
+            time: track.last_seen(),
+            started_at: track.born(),
+            position: plane.to_position(state.position),
+            velocity_east_m_s,
+            velocity_north_m_s,
+            covariance_m2: state.covariance_m2,
+            sightings: current
+                .map(|sighting| WorldSighting {
+                    camera_id: sighting.camera.clone(),
+                    tracker_id: sighting.tracker_id.clone(),
+                    last_seen_at: sighting.last_seen,
+                })
+                .collect(),
+        }
+    }
+
+    fn id_of(&self, track: WorldTrackId) -> LiveId {
+        self.live.id_of(self.number_offset + track.0)
+    }
+
+    fn announce(&mut self, events: Vec<TimedEvent>) {
+        for TimedEvent { time, event } in events {
+            let kind = match event {
+                WorldEvent::Born { track } => {
+                    let track = self.id_of(track);
+                    self.announced.insert(track, None);
+                    self.highest_number = self.highest_number.max(track.number);
+                    self.metrics.world_track_started();
+                    SiteEventKind::Started(track)
+                }
+                WorldEvent::HandedOver { track, from, to } => {
+                    self.metrics.handed_over();
+                    SiteEventKind::HandedOver { track: self.id_of(track), from, to }
+                }
+                WorldEvent::Identified { track, receiver } => {
+                    SiteEventKind::Identified { track: self.id_of(track), target_id: receiver.into() }
+                }
+                WorldEvent::Merged { track, ended } => {
+                    let (track, ended) = (self.id_of(track), self.id_of(ended));
+                    self.announce_end(ended, time, SiteEventKind::Merged { track, ended });
+                    continue;
+                }
+                WorldEvent::Lost { track } => {
+                    let track = self.id_of(track);
+                    self.announce_end(track, time, SiteEventKind::Ended(track));
+                    continue;
+                }
+            };
+            self.live.events.push(SiteEvent { time, kind });
+        }
+    }
+
+    /// Nobody knows of a track that was never announced.
+    fn announce_end(&mut self, track: LiveId, time: Timestamp, kind: SiteEventKind) {
+        if self.announced.remove(&track).is_some() {
+            lock(&self.live.tracks).remove(track);
+            self.metrics.world_track_ended();
+            self.live.events.push(SiteEvent { time, kind });
+        }
+    }
+}
+
+impl Carrier {
+    fn is_outdated(&self, now: Duration) -> bool {
+        now.saturating_sub(self.noted_at) >= CARRIER_FOR
+    }
+}
+
+/// A box in the plane of the tracker; `None` beyond its range. `carries` tells whether a receiver of the target is
+/// known.
+fn detection_of(
+    item: &SiteItem,
+    plane: &LocalPlane,
+    carries: impl Fn(&CameraId, &TargetId) -> bool,
+) -> Option<WorldDetection> {
+    let ItemSource::Box { covariance_m2, map_covariance_m2, .. } = &item.source else { return None };
+    let carrier = item.target_id.clone().filter(|target_id| carries(&item.camera, target_id));
+    Some(WorldDetection {
+        tracker_id: item.target_id.clone(),
+        receiver: carrier.map(ReceiverId::from),
+        position: plane.to_plane_within_range(item.position)?,
+        covariance_m2: *covariance_m2,
+        // The error of a map does not average out over frames. How much of it other cameras share is unknown as long
+        // as the maps of a site are not fitted together: all of it is stated, so averaging over cameras gains
+        // nothing in the stated error.
+        common_covariance_m2: *map_covariance_m2,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geo::{PlaneCovariance, Position};
+
+    const START_S: i64 = 1_800_000_000;
+
+    struct Site {
+        live: Arc<SiteLive>,
+        tracker: SiteTracker,
+        now: Duration,
+    }
+
+    impl Site {
+        fn new() -> Self {
+            let live = SiteLive::new(1, 100);
+            let tracker = SiteTracker::new(live.clone(), Limits::default(), Metrics::new());
+            Self { live, tracker, now: Duration::ZERO }
+        }
+
+        /// A box of a target at the origin of its camera's model, each a tenth of a second after the one before.
+        fn see(&mut self, tracker_id: &str, ms: i64) {
+            self.now += Duration::from_millis(100);
+            let origin = Position::new(8.0, 47.0).expect("valid");
+            let item = SiteItem {
+                camera: CameraId::new("a").expect("a slug"),
+                time: Timestamp::from_millisecond(1_000 * START_S + ms).expect("in range"),
+                target_id: Some(TargetId::new(tracker_id).expect("a name")),
+                position: origin,
+                source: ItemSource::Box {
+                    covariance_m2: PlaneCovariance::isotropic(0.25),
+                    map_covariance_m2: PlaneCovariance::isotropic(0.16),
+                    model_origin: origin,
+                },
+            };
+            self.tracker.push(item, self.now);
+            self.tracker.advance(self.now);
+        }
+
+        fn numbers(&self) -> Vec<u64> {
+            lock(&self.live.tracks).latest().iter().map(|point| point.id.number).collect()
+        }
+
+        fn wait(&mut self, time: Duration) {
+            self.now += time;
+            self.tracker.advance(self.now);
+        }
+    }
+
+    #[test]
+    fn a_track_ends_by_the_monotonic_clock_where_nothing_comes() {
+        let mut site = Site::new();
+        (0..10).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [1]);
+        site.wait(Duration::from_secs(1));
+        assert_eq!(site.numbers(), [1], "it may be seen again");
+        assert!(site.tracker.is_busy());
+        site.wait(Duration::from_secs(3));
+        assert!(site.numbers().is_empty() && !site.tracker.is_busy());
+    }
+
+    #[test]
+    fn tracks_start_again_with_other_numbers_when_the_origin_is_changed() {
+        let mut site = Site::new();
+        (0..10).for_each(|frame| site.see("7", 100 * frame));
+        site.live.set_origin(Some(Position::new(8.001, 47.0).expect("valid")));
+        (10..20).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [2], "a number names one track only");
+        site.live.set_origin(Some(Position::new(9.0, 48.0).expect("valid")));
+        (20..30).for_each(|frame| site.see("7", 100 * frame));
+        assert!(site.numbers().is_empty(), "the camera is out of the plane's range");
+    }
+
+    #[test]
+    fn tracks_start_again_where_a_recording_is_played_again() {
+        let mut site = Site::new();
+        (0..100).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [1]);
+        // Late for five seconds, then the recording is taken to have begun again.
+        (0..100).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers(), [2]);
+    }
+
+    #[test]
+    fn a_box_is_of_the_target_whose_fixes_came_through_its_camera() {
+        let mut site = Site::new();
+        let fix = SiteItem {
+            camera: CameraId::new("a").expect("a slug"),
+            time: Timestamp::from_second(START_S).expect("in range"),
+            target_id: Some(TargetId::new("walker").expect("a name")),
+            position: Position::new(8.0, 47.0).expect("valid"),
+            source: ItemSource::Fix { variance_m2: 4.0 },
+        };
+        site.tracker.push(fix, site.now);
+        (1..10).for_each(|frame| site.see("walker", 100 * frame));
+        let points = lock(&site.live.tracks).latest();
+        let identity = points[0].target_id.as_ref().map(TargetId::as_str);
+        assert_eq!((points.len(), identity), (1, Some("walker")));
+        let camera = &points[0].sightings[0];
+        assert_eq!(camera.tracker_id.as_ref().map(TargetId::as_str), Some("walker"));
+    }
+}

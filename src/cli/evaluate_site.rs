@@ -1,0 +1,111 @@
+//! `sightfix evaluate --site`
+
+use std::path::Path;
+
+use super::output::print_line;
+use super::progress::Progress;
+use super::site_recording;
+use crate::domain::{GaussMarkovNoise, ImageSize, NoiseCorrelation};
+use crate::evaluation::site::{
+    Degradation, Identities, SiteCase, SiteOutcome, SiteRecording, SiteReport, SiteTraining, TrainedSite,
+    track_site, train_site,
+};
+
+/// Noise of redrawn receivers: 2.5 m per axis with a time constant of 30 s, and 0.75 m white.
+const REDRAWN_COLOURED_M: f64 = 2.5;
+const REDRAWN_WHITE_M: f64 = 0.75;
+const REDRAWN_TIME_CONSTANT_S: f64 = 30.0;
+
+/// Seeds of the redraws, and whether the recorded fixes come first.
+pub(super) struct Draws {
+    pub(super) count: u64,
+    pub(super) first_seed: u64,
+}
+
+/// Trains and tracks a recorded site in several ways and prints a table of figures.
+pub(super) fn evaluate(
+    folder: &Path,
+    image_size: Option<ImageSize>,
+    draws: &Draws,
+) -> anyhow::Result<SiteReport> {
+    let recording = site_recording::read(folder, image_size)?;
+    let cases = cases(&recording);
+    let mut outcomes: Vec<Vec<SiteOutcome>> = vec![Vec::new(); cases.len()];
+    let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
+    let count = draws.count.max(1);
+    for draw in 0..count {
+        let drawn = if draws.count == 0 {
+            recording.clone()
+        } else {
+            recording.with_redrawn_fixes(redrawn_noise(), draws.first_seed + draw)
+        };
+        let trained =
+            [SiteTraining::Together, SiteTraining::Apart].map(|training| train_site(&drawn, training));
+        let [together, apart] = trained;
+        let (together, apart) = (together?, apart?);
+        for (case, outcomes) in cases.iter().zip(&mut outcomes) {
+            progress.set(draw, count, &case.name);
+            let trained = if case.training == SiteTraining::Together { &together } else { &apart };
+            outcomes.push(case.run(&drawn, trained, draws.first_seed + draw));
+        }
+    }
+    progress.finish();
+    let report = SiteReport {
+        cases: cases
+            .iter()
+            .zip(&outcomes)
+            .filter_map(|(case, outcomes)| SiteCase::over_draws(&case.name, outcomes))
+            .collect(),
+    };
+    print_line(&report.table().trim_end())?;
+    Ok(report)
+}
+
+fn redrawn_noise() -> GaussMarkovNoise {
+    let variance_m2 = REDRAWN_COLOURED_M.powi(2) + REDRAWN_WHITE_M.powi(2);
+    let white_share = REDRAWN_WHITE_M.powi(2) / variance_m2;
+    let correlation = NoiseCorrelation { white_share, time_constant_s: REDRAWN_TIME_CONSTANT_S };
+    GaussMarkovNoise { variance_m2, correlation }
+}
+
+/// One row of the table.
+struct Case {
+    name: String,
+    training: SiteTraining,
+    identities: Identities,
+    degradation: Option<Degradation>,
+    cameras: Vec<usize>,
+}
+
+impl Case {
+    fn run(&self, recording: &SiteRecording, trained: &TrainedSite, seed: u64) -> SiteOutcome {
+        let degraded = self.degradation.map(|degradation| degradation.apply(recording, seed));
+        let boxes = degraded.as_ref().unwrap_or(recording);
+        track_site(boxes, recording, trained, self.identities, &self.cameras)
+    }
+}
+
+/// All cameras trained together and apart, with the true identities, with degraded boxes, and each camera alone.
+fn cases(recording: &SiteRecording) -> Vec<Case> {
+    let all: Vec<usize> = (0..recording.cameras.len()).collect();
+    let case = |name: &str, training, identities, degradation| Case {
+        name: name.to_owned(),
+        training,
+        identities,
+        degradation,
+        cameras: all.clone(),
+    };
+    let rough = Some(Degradation::ROUGH);
+    let mut cases = vec![
+        case("trained together", SiteTraining::Together, Identities::Tracked, None),
+        case("the same, true identities", SiteTraining::Together, Identities::Oracle, None),
+        case("the same, degraded boxes", SiteTraining::Together, Identities::Tracked, rough),
+        case("trained apart", SiteTraining::Apart, Identities::Tracked, None),
+        case("the same, true identities", SiteTraining::Apart, Identities::Oracle, None),
+    ];
+    cases.extend(recording.cameras.iter().enumerate().map(|(camera, recorded)| Case {
+        cameras: vec![camera],
+        ..case(&format!("camera {} alone", recorded.id), SiteTraining::Apart, Identities::Tracked, None)
+    }));
+    cases
+}

@@ -1,0 +1,25 @@
+//! The exit code of a command that failed, so that a supervisor knows whether to start it again.
+
+use std::process::ExitCode;
+
+use crate::domain::Error;
+use crate::store::{FolderFault, FolderFaultKind};
+
+/// The data folder is in use; trying again later may help. Invalid flags are 2.
+const IN_USE: u8 = 3;
+/// The data folder cannot be used until somebody does something about it.
+const UNUSABLE: u8 = 4;
+
+/// The exit code for an error: 3 and 4 for a data folder, else 1.
+#[must_use]
+pub fn exit_code(error: &anyhow::Error) -> ExitCode {
+    let fault = error.downcast_ref::<Error>().and_then(|error| match error {
+        Error::Fault(fault) => fault.cause::<FolderFault>(),
+        Error::Refused(_) => None,
+    });
+    match fault.map(|fault| fault.kind) {
+        None => ExitCode::FAILURE,
+        Some(FolderFaultKind::InUse) => ExitCode::from(IN_USE),
+        Some(_) => ExitCode::from(UNUSABLE),
+    }
+}

@@ -1,0 +1,34 @@
+//! `sightfix restore`
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+
+use super::backup::contents;
+use super::output::print_line;
+use super::{DataFolder, runtime};
+use crate::clock::Clock;
+use crate::store::restore;
+
+/// Put a backup in the place of the database, which is kept under another name; no server may run
+#[derive(Args)]
+pub(super) struct Restore {
+    /// A file of `sightfix backup`
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    #[command(flatten)]
+    folder: DataFolder,
+}
+
+impl Restore {
+    pub(super) fn run(self, settings_file: Option<&Path>) -> anyhow::Result<()> {
+        let settings = self.folder.settings(settings_file)?;
+        let now = Clock::system().now();
+        let restored = runtime()?.block_on(restore(&settings.data, &self.file, now))?;
+        print_line(&format_args!("restored {}: {}", self.file.display(), contents(&restored.report)))?;
+        match restored.kept {
+            Some(kept) => print_line(&format_args!("the database before it is kept as {}", kept.display())),
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,85 @@
+//! What may keep a server from working on this machine: a list of checks, each with its remedy.
+//!
+//! What never happens here: a repair, a change of settings, an older schema brought up to date.
+
+mod database;
+mod folder;
+mod port;
+mod system;
+
+use serde::Serialize;
+
+use crate::clock::Clock;
+use crate::config::Config;
+
+pub use port::request_liveness;
+
+/// How serious a finding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CheckStatus {
+    /// Nothing to do.
+    Ok,
+    /// The server works, though not for ever or not in full.
+    Warning,
+    /// The server does not start, or refuses work.
+    Failed,
+}
+
+impl CheckStatus {
+    /// The word in the output.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Warning => "warning",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+/// One check.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Check {
+    /// What was looked at.
+    pub name: &'static str,
+    /// How serious it is.
+    pub status: CheckStatus,
+    /// What was found.
+    pub finding: String,
+    /// What to do, unless nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub remedy: Option<String>,
+}
+
+impl Check {
+    fn ok(name: &'static str, finding: impl Into<String>) -> Self {
+        Self { name, status: CheckStatus::Ok, finding: finding.into(), remedy: None }
+    }
+
+    fn warning(name: &'static str, finding: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { name, status: CheckStatus::Warning, finding: finding.into(), remedy: Some(remedy.into()) }
+    }
+
+    fn failed(name: &'static str, finding: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { name, status: CheckStatus::Failed, finding: finding.into(), remedy: Some(remedy.into()) }
+    }
+}
+
+/// Makes all checks of a server with these settings. Reads the whole database, which takes seconds per gigabyte.
+pub async fn examine(config: &Config, clock: &Clock) -> Vec<Check> {
+    let mut checks = vec![folder::writable(config), folder::space(config), folder::lock(config)];
+    let (of_database, report) = database::check(config, clock).await;
+    checks.extend(of_database);
+    checks.push(system::clock(clock, report.as_ref()).await);
+    checks.push(port::check(config).await);
+    checks.push(system::open_files(config));
+    checks.push(system::memory(config));
+    checks
+}
+
+/// Bytes in a unit that people read.
+fn in_units(bytes: u64) -> String {
+    const MIB: u64 = 1 << 20;
+    if bytes < 10 * MIB { format!("{} KiB", bytes >> 10) } else { format!("{} MiB", bytes / MIB) }
+}

@@ -1,0 +1,94 @@
+//! The database and the models in it.
+
+use super::{Check, in_units};
+use crate::app::{App, store_limits};
+use crate::clock::{Clock, Randomness};
+use crate::config::Config;
+use crate::domain::Result;
+use crate::store::{self, DatabaseReport, Sharing, Store, StoreOptions};
+use crate::telemetry::Metrics;
+
+const DATABASE: &str = "database";
+const MODELS: &str = "models";
+
+pub(super) async fn check(config: &Config, clock: &Clock) -> (Vec<Check>, Option<DatabaseReport>) {
+    if !store::has_database(&config.data) {
+        let check = Check::warning(DATABASE, "there is none yet", "`sightfix serve` makes it; check --data");
+        return (vec![check], None);
+    }
+    let report = match store::inspect(&config.data).await {
+        Ok(report) => report,
+        Err(error) => {
+            let remedy = "docs/operations.md, Exit codes, says what to do";
+            return (vec![Check::failed(DATABASE, error.to_string(), remedy)], None);
+        }
+    };
+    let of_file = file(&report);
+    let mut checks = vec![of_file];
+    if report.problems.is_empty() {
+        checks.push(models(config, clock, &report).await);
+    }
+    (checks, Some(report))
+}
+
+fn file(report: &DatabaseReport) -> Check {
+    let DatabaseReport { schema_step, newest_step, bytes, cameras, samples, .. } = report;
+    if let Some(problem) = report.problems.first() {
+        let finding = format!("{} problems, the first: {problem}", report.problems.len());
+        return Check::failed(
+            DATABASE,
+            finding,
+            "stop the server and restore a backup: sightfix restore FILE",
+        );
+    }
+    if schema_step < newest_step {
+        return Check::warning(
+            DATABASE,
+            format!("sound, of an earlier version (schema step {schema_step} of {newest_step})"),
+            "make a backup; the next start brings the schema up to date",
+        );
+    }
+    Check::ok(
+        DATABASE,
+        format!(
+            "sound, schema step {schema_step}, {}, {cameras} cameras, {samples} samples",
+            in_units(*bytes)
+        ),
+    )
+}
+
+async fn models(config: &Config, clock: &Clock, report: &DatabaseReport) -> Check {
+    let remedy = "activate another version, import the file again, or train";
+    if let Some(model) = report.damaged_models.first() {
+        let finding = format!("{} damaged, the first: {model}", report.damaged_models.len());
+        return Check::failed(MODELS, finding, remedy);
+    }
+    if report.schema_step < report.newest_step {
+        return Check::ok(MODELS, format!("{} with sound checksums; not loaded", report.models));
+    }
+    match faults(config, clock).await {
+        Ok(faults) => match faults.first() {
+            None => Check::ok(MODELS, format!("{} with sound checksums; active ones answer", report.models)),
+            Some(fault) => {
+                let finding = format!("{} cannot be used, the first: {fault}", faults.len());
+                Check::failed(MODELS, finding, remedy)
+            }
+        },
+        Err(error) => Check::failed(MODELS, format!("cannot be loaded: {error}"), remedy),
+    }
+}
+
+/// Loads every active model, with its checks, as a server does at its start.
+async fn faults(config: &Config, clock: &Clock) -> Result<Vec<String>> {
+    let options = StoreOptions {
+        limits: store_limits(&config.limits),
+        role: "sightfix doctor".to_owned(),
+        sharing: Sharing::Command,
+    };
+    let store = Store::open_with(&config.data, options).await?;
+    let app =
+        App::new(store, clock.clone(), Randomness::system(), config.limits.clone(), Metrics::new()).await?;
+    let faults = app.registry.model_faults();
+    app.close().await;
+    Ok(faults.into_iter().map(|(camera, fault)| format!("camera {camera}: {}", fault.reason)).collect())
+}

@@ -1,0 +1,107 @@
+//! Worse detections than those recorded: missed ones, false ones, and ids that swap.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::recording::{LabelledBox, RecordedCamera, SiteRecording};
+use crate::domain::{BoundingBox, ImageSize, TargetId};
+
+/// What goes wrong, and how often.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Degradation {
+    /// Share of the boxes that are missed.
+    pub missed_share: f64,
+    /// Mean number of false detections per frame.
+    pub false_per_frame: f64,
+    /// Mean time between two swaps of ids in a camera, s.
+    pub swap_s: f64,
+}
+
+impl Degradation {
+    /// 10 % missed, a false detection in every second frame, a swap every ten seconds.
+    pub const ROUGH: Self = Self { missed_share: 0.1, false_per_frame: 0.5, swap_s: 10.0 };
+
+    /// The recording with these errors, drawn from a seed.
+    #[must_use]
+    pub fn apply(&self, recording: &SiteRecording, seed: u64) -> SiteRecording {
+        let mut degraded = recording.clone();
+        for (index, camera) in degraded.cameras.iter_mut().enumerate() {
+            let mut random = ChaCha8Rng::seed_from_u64(seed);
+            random.set_stream(index as u64);
+            self.degrade(camera, recording.image_size, &mut random);
+        }
+        degraded
+    }
+
+    fn degrade(&self, camera: &mut RecordedCamera, image_size: Option<ImageSize>, random: &mut ChaCha8Rng) {
+        let mut frames: BTreeMap<Timestamp, Vec<LabelledBox>> = BTreeMap::new();
+        for labelled in camera.boxes.drain(..) {
+            frames.entry(labelled.time).or_default().push(labelled);
+        }
+        let mut swaps = IdSwaps::default();
+        let mut latest: Option<Timestamp> = None;
+        let mut false_count = 0_u64;
+        for (time, mut boxes) in frames {
+            let elapsed_s = latest.map_or(0.0, |latest| time.duration_since(latest).as_secs_f64());
+            latest = Some(time);
+            if random.random::<f64>() < 1.0 - (-elapsed_s / self.swap_s).exp() {
+                swaps.swap_nearest(&boxes);
+            }
+            let shape = boxes[random.random_range(0..boxes.len())].bounding_box;
+            boxes.retain(|_| random.random::<f64>() >= self.missed_share);
+            for labelled in &mut boxes {
+                labelled.tracker_id = swaps.id_of(&labelled.tracker_id);
+            }
+            if random.random::<f64>() < self.false_per_frame {
+                false_count += 1;
+                boxes.extend(false_box(time, shape, image_size, false_count, random));
+            }
+            camera.boxes.extend(boxes);
+        }
+    }
+}
+
+/// A box of a given size anywhere in the image.
+fn false_box(
+    time: Timestamp,
+    shape: BoundingBox,
+    image_size: Option<ImageSize>,
+    number: u64,
+    random: &mut ChaCha8Rng,
+) -> Option<LabelledBox> {
+    let size = image_size?;
+    let left_px = random.random::<f64>() * (f64::from(size.width_px()) - shape.width_px()).max(0.0);
+    let top_px = random.random::<f64>() * (f64::from(size.height_px()) - shape.height_px()).max(0.0);
+    let bounding_box = BoundingBox::new(left_px, top_px, shape.width_px(), shape.height_px()).ok()?;
+    let tracker_id = TargetId::new(&format!("false-{number}")).ok()?;
+    Some(LabelledBox { time, tracker_id, bounding_box, target: None })
+}
+
+/// Ids that a tracker has exchanged so far.
+#[derive(Default)]
+struct IdSwaps(BTreeMap<TargetId, TargetId>);
+
+impl IdSwaps {
+    fn id_of(&self, original: &TargetId) -> TargetId {
+        self.0.get(original).unwrap_or(original).clone()
+    }
+
+    /// Exchanges the ids of the two boxes whose feet are nearest to each other.
+    fn swap_nearest(&mut self, boxes: &[LabelledBox]) {
+        let foot_distance_px = |one: &LabelledBox, other: &LabelledBox| {
+            let foot = |it: &BoundingBox| [it.left_px() + 0.5 * it.width_px(), it.top_px() + it.height_px()];
+            let (a, b) = (foot(&one.bounding_box), foot(&other.bounding_box));
+            (a[0] - b[0]).hypot(a[1] - b[1])
+        };
+        let pairs = boxes.iter().enumerate().flat_map(|(index, one)| {
+            boxes[index + 1..].iter().map(move |other| (foot_distance_px(one, other), one, other))
+        });
+        let Some((_, one, other)) = pairs.min_by(|a, b| a.0.total_cmp(&b.0)) else { return };
+        let (first, second) = (self.id_of(&one.tracker_id), self.id_of(&other.tracker_id));
+        self.0.insert(one.tracker_id.clone(), second);
+        self.0.insert(other.tracker_id.clone(), first);
+    }
+}

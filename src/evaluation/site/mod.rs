@@ -1,0 +1,20 @@
+//! How well a site is tracked: the maps of its cameras trained together or apart, the world tracks over all
+//! cameras or one, against the true targets.
+//!
+//! Definitions are in docs/world-tracks.md, with their sources.
+
+mod box_figures;
+mod degradation;
+mod recording;
+mod report;
+mod runner;
+#[cfg(test)]
+mod tests;
+mod world_figures;
+
+pub use box_figures::{BoxFigures, BoxRecord};
+pub use degradation::Degradation;
+pub use recording::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording};
+pub use report::{SiteCase, SiteReport};
+pub use runner::{Identities, SiteOutcome, SiteTraining, TrainedSite, site_fit_rows, track_site, train_site};
+pub use world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};

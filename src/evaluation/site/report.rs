@@ -1,0 +1,106 @@
+//! The figures of a site as a table and as JSON.
+
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+use super::runner::SiteOutcome;
+
+/// The figures of one way to track a site, or their means over draws.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SiteCase {
+    /// What was done.
+    pub name: String,
+    /// Identity F1 by boxes.
+    pub identity_f1_by_boxes: f64,
+    /// Association precision.
+    pub association_precision: f64,
+    /// Association recall.
+    pub association_recall: f64,
+    /// Hand-over rate.
+    pub handover_rate: Option<f64>,
+    /// IDF1 of positions within 1 m.
+    pub idf1: f64,
+    /// MOTA of positions within 1 m.
+    pub mota: f64,
+    /// GOSPA, m.
+    pub gospa_m: f64,
+    /// Mean error of the positions, m.
+    pub mean_error_m: Option<f64>,
+    /// Share of true positions inside the stated 95 % radius.
+    pub coverage95: Option<f64>,
+    /// Number of draws.
+    pub draws: usize,
+}
+
+impl SiteCase {
+    /// The means over draws; `None` without any.
+    #[must_use]
+    pub fn over_draws(name: &str, outcomes: &[SiteOutcome]) -> Option<Self> {
+        let count = outcomes.len();
+        let mean = |figure: &dyn Fn(&SiteOutcome) -> f64| {
+            outcomes.iter().map(figure).sum::<f64>() / count.max(1) as f64
+        };
+        let optional = |figure: &dyn Fn(&SiteOutcome) -> Option<f64>| {
+            outcomes.iter().map(figure).sum::<Option<f64>>().map(|sum| sum / count.max(1) as f64)
+        };
+        (count > 0).then(|| Self {
+            name: name.to_owned(),
+            identity_f1_by_boxes: mean(&|it| it.boxes.identity_f1),
+            association_precision: mean(&|it| it.boxes.association_precision),
+            association_recall: mean(&|it| it.boxes.association_recall),
+            handover_rate: optional(&|it| it.boxes.handover_rate),
+            idf1: mean(&|it| it.world.idf1),
+            mota: mean(&|it| it.world.mota),
+            gospa_m: mean(&|it| it.world.gospa_m),
+            mean_error_m: optional(&|it| it.positions.map(|positions| positions.mean_error_m)),
+            coverage95: optional(&|it| it.positions.map(|positions| positions.coverage95)),
+            draws: count,
+        })
+    }
+}
+
+/// All cases of an evaluation.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct SiteReport {
+    /// In the order in which they were run.
+    pub cases: Vec<SiteCase>,
+}
+
+impl SiteReport {
+    /// As a Markdown table.
+    #[must_use]
+    pub fn table(&self) -> String {
+        let mut table = String::from(
+            "| case | identity F1 by boxes | association precision | recall | hand-over | IDF1 1 m | MOTA 1 m | GOSPA \
+             m | mean error m | coverage 95 % |\n|---|---|---|---|---|---|---|---|---|---|\n",
+        );
+        let or_dash = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
+        for case in &self.cases {
+            // Writing to a string cannot fail.
+            let _ = writeln!(
+                table,
+                "| {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.2} | {} | {} |",
+                case.name,
+                case.identity_f1_by_boxes,
+                case.association_precision,
+                case.association_recall,
+                or_dash(case.handover_rate),
+                case.idf1,
+                case.mota,
+                case.gospa_m,
+                or_dash(case.mean_error_m),
+                or_dash(case.coverage95),
+            );
+        }
+        table
+    }
+
+    /// As JSON.
+    ///
+    /// # Errors
+    /// That of the serializer.
+    pub fn to_json(&self) -> serde_json::Result<String> {
+        serde_json::to_string_pretty(self)
+    }
+}

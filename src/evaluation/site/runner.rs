@@ -1,0 +1,263 @@
+//! Trains the maps of a recorded site, tracks its targets, and scores the tracks.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use jiff::Timestamp;
+
+use super::box_figures::{BoxFigures, BoxRecord};
+use super::recording::{LabelledBox, RecordedFix, SiteRecording};
+use super::world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};
+use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation, ReceiverId};
+use crate::fusion::world::{CameraFrame, WorldDetection, WorldTrackSettings, WorldTracker};
+use crate::geo::PlaneCovariance;
+use crate::model::{SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, fit_site};
+
+/// Correlation of the receivers' errors that the fit assumes.
+const RECEIVER_CORRELATION: NoiseCorrelation = NoiseCorrelation { white_share: 0.08, time_constant_s: 30.0 };
+/// Boxes on both sides of a fix are joined by a line over at most this long a gap, s.
+const LONGEST_BOX_GAP_S: f64 = 1.1;
+/// A track is reported at an instant if a camera measured it within this time, s.
+const REPORTED_WITHIN_S: f64 = 0.05;
+
+/// How the cameras' maps are trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SiteTraining {
+    /// All cameras in one problem, held to each other where they see one target at one time.
+    Together,
+    /// Each camera on the fixes of the receivers that it sees.
+    Apart,
+}
+
+/// Who says which boxes belong together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Identities {
+    /// The tracker.
+    Tracked,
+    /// The truth: every box names its target. What remains is the maps' error.
+    Oracle,
+}
+
+/// The maps of a site's cameras.
+pub struct TrainedSite {
+    maps: Vec<SiteMaps>,
+    training: SiteTraining,
+}
+
+/// The tracks of a recording and their figures.
+#[derive(Debug, Clone)]
+pub struct SiteOutcome {
+    /// Identity of the boxes.
+    pub boxes: BoxFigures,
+    /// Positions within 1 m.
+    pub world: WorldFigures,
+    /// Errors of the positions.
+    pub positions: Option<PositionFigures>,
+}
+
+/// Trains the maps with the known identities of the receivers' carriers.
+///
+/// # Errors
+/// A camera has too few rows, or there is no solution.
+pub fn train_site(recording: &SiteRecording, training: SiteTraining) -> Result<TrainedSite, SiteFitError> {
+    let (fixes, pairs) = site_fit_rows(recording);
+    let maps = match training {
+        SiteTraining::Together => {
+            let image_sizes = vec![recording.image_size; recording.cameras.len()];
+            vec![fit(&image_sizes, &fixes, &pairs)?]
+        }
+        SiteTraining::Apart => (0..recording.cameras.len())
+            .map(|camera| {
+                let of_camera = |fix: &SiteFix| {
+                    let (_, bounding_box) = fix.boxes.iter().find(|(at, _)| *at == camera)?;
+                    Some(SiteFix { boxes: vec![(0, *bounding_box)], ..fix.clone() })
+                };
+                let own: Vec<SiteFix> = fixes.iter().filter_map(of_camera).collect();
+                fit(&[recording.image_size], &own, &[]).map_err(|error| match error {
+                    SiteFitError::TooFewRows { .. } => SiteFitError::TooFewRows { camera },
+                    other => other,
+                })
+            })
+            .collect::<Result<_, _>>()?,
+    };
+    Ok(TrainedSite { maps, training })
+}
+
+fn fit(
+    image_sizes: &[Option<ImageSize>],
+    fixes: &[SiteFix],
+    pairs: &[SitePair],
+) -> Result<SiteMaps, SiteFitError> {
+    fit_site(&SiteFitInput { image_sizes, fixes, pairs, correlation: RECEIVER_CORRELATION })
+}
+
+impl TrainedSite {
+    /// A box as a detection of the world. Maps trained apart do not know what they have in common: all of their
+    /// error then counts as the camera's own.
+    fn locate(&self, camera: usize, bounding_box: &BoundingBox) -> SitePosition {
+        match self.training {
+            SiteTraining::Together => self.maps[0].locate(camera, bounding_box),
+            SiteTraining::Apart => {
+                let located = self.maps[camera].locate(0, bounding_box);
+                let relative_m2 = located.relative_m2.plus(located.common_m2);
+                SitePosition { relative_m2, common_m2: PlaneCovariance::default(), ..located }
+            }
+        }
+    }
+}
+
+/// The training rows of a recording: every fix with its carrier's boxes at that instant, and the carriers in two
+/// cameras at one time. Only targets with a receiver are known by name.
+#[must_use]
+pub fn site_fit_rows(recording: &SiteRecording) -> (Vec<SiteFix>, Vec<SitePair>) {
+    let carriers: BTreeSet<usize> = recording.receivers.iter().map(|(_, target)| *target).collect();
+    let mut by_camera: Vec<BTreeMap<usize, Vec<&LabelledBox>>> =
+        vec![BTreeMap::new(); recording.cameras.len()];
+    for (camera, own) in recording.cameras.iter().enumerate() {
+        for labelled in &own.boxes {
+            if let Some(target) = labelled.target.filter(|target| carriers.contains(target)) {
+                by_camera[camera].entry(target).or_default().push(labelled);
+            }
+        }
+    }
+    let start = recording.fixes.first().map(|fix| fix.time).unwrap_or_default();
+    let site_fix = |fix: &RecordedFix| {
+        let target = recording.receivers[fix.receiver].1;
+        let boxes: Vec<(usize, BoundingBox)> = by_camera
+            .iter()
+            .enumerate()
+            .filter_map(|(camera, targets)| Some((camera, box_at(targets.get(&target)?, fix.time)?)))
+            .collect();
+        (!boxes.is_empty()).then(|| SiteFix {
+            receiver: fix.receiver as u32,
+            time_s: fix.time.duration_since(start).as_secs_f64(),
+            position: fix.position,
+            boxes,
+        })
+    };
+    let mut at_once: BTreeMap<(Timestamp, usize), Vec<(usize, BoundingBox)>> = BTreeMap::new();
+    for (camera, targets) in by_camera.iter().enumerate() {
+        for (target, boxes) in targets {
+            for labelled in boxes {
+                at_once.entry((labelled.time, *target)).or_default().push((camera, labelled.bounding_box));
+            }
+        }
+    }
+    let pairs = at_once.values().flat_map(|seen| {
+        seen.iter().enumerate().flat_map(move |(index, one)| {
+            seen[index + 1..]
+                .iter()
+                .map(move |other| SitePair { cameras: [one.0, other.0], boxes: [one.1, other.1] })
+        })
+    });
+    (recording.fixes.iter().filter_map(site_fix).collect(), pairs.collect())
+}
+
+/// The box of a target at an instant, on the line between those before and after.
+fn box_at(boxes: &[&LabelledBox], time: Timestamp) -> Option<BoundingBox> {
+    let next = boxes.partition_point(|labelled| labelled.time < time);
+    let after = boxes.get(next)?;
+    if after.time == time {
+        return Some(after.bounding_box);
+    }
+    let before = boxes[next.checked_sub(1)?];
+    let gap_s = after.time.duration_since(before.time).as_secs_f64();
+    if gap_s > LONGEST_BOX_GAP_S {
+        return None;
+    }
+    let part = time.duration_since(before.time).as_secs_f64() / gap_s;
+    let (from, to) = (before.bounding_box.sides_px(), after.bounding_box.sides_px());
+    let [left_px, top_px, width_px, height_px] =
+        std::array::from_fn(|side| from[side] + part * (to[side] - from[side]));
+    BoundingBox::new(left_px, top_px, width_px, height_px).ok()
+}
+
+/// Tracks the boxes of some cameras and scores the tracks against the truth; `visible` is the recording whose boxes
+/// say which targets can be seen at all.
+#[must_use]
+pub fn track_site(
+    recording: &SiteRecording,
+    visible: &SiteRecording,
+    trained: &TrainedSite,
+    identities: Identities,
+    cameras: &[usize],
+) -> SiteOutcome {
+    let mut frames: BTreeMap<Timestamp, BTreeMap<usize, Vec<&LabelledBox>>> = BTreeMap::new();
+    for &camera in cameras {
+        for labelled in &recording.cameras[camera].boxes {
+            frames.entry(labelled.time).or_default().entry(camera).or_default().push(labelled);
+        }
+    }
+    let in_view = visible.visible_to(cameras);
+    let mut tracker = WorldTracker::new(recording.plane, WorldTrackSettings::default());
+    let (mut records, mut instants) = (Vec::new(), Vec::new());
+    for (time, by_camera) in frames {
+        let first = records.len();
+        for (camera, boxes) in by_camera {
+            let detections = boxes
+                .iter()
+                .map(|labelled| detection(recording, trained, identities, camera, labelled))
+                .collect();
+            let id = recording.cameras[camera].id.clone();
+            let outcome = tracker.observe(&CameraFrame { camera: id, time, detections });
+            records.extend(boxes.iter().zip(outcome.tracks).map(|(labelled, track)| BoxRecord {
+                camera,
+                time,
+                target: labelled.target,
+                track,
+            }));
+        }
+        let targets = in_view.get(&time).into_iter().flatten();
+        let position = |target: &usize| Some((*target, *recording.truth.get(&(time, *target))?));
+        instants.push(WorldInstant {
+            targets: targets.filter_map(position).collect(),
+            tracks: reported(&tracker, time, &records[first..]),
+        });
+    }
+    SiteOutcome {
+        boxes: BoxFigures::of(&records),
+        world: WorldFigures::of(&instants),
+        positions: PositionFigures::of(&instants),
+    }
+}
+
+fn detection(
+    recording: &SiteRecording,
+    trained: &TrainedSite,
+    identities: Identities,
+    camera: usize,
+    labelled: &LabelledBox,
+) -> WorldDetection {
+    let located = trained.locate(camera, &labelled.bounding_box);
+    let named = labelled.target.filter(|_| identities == Identities::Oracle);
+    WorldDetection {
+        tracker_id: Some(labelled.tracker_id.clone()),
+        receiver: named.and_then(|target| ReceiverId::new(recording.targets[target].as_str()).ok()),
+        position: located.position,
+        covariance_m2: located.box_noise_m2.plus(located.relative_m2),
+        common_covariance_m2: located.common_m2,
+    }
+}
+
+/// The confirmed tracks that a camera measured at an instant, each with the target of most of its boxes.
+fn reported(tracker: &WorldTracker, time: Timestamp, records: &[BoxRecord]) -> Vec<ReportedTrack> {
+    let is_reported =
+        |last_seen: Timestamp| time.duration_since(last_seen).as_secs_f64() <= REPORTED_WITHIN_S;
+    tracker
+        .tracks()
+        .filter(|track| track.is_confirmed() && is_reported(track.last_seen()))
+        .map(|track| {
+            let mut boxes: BTreeMap<usize, usize> = BTreeMap::new();
+            for target in records.iter().filter(|it| it.track == Some(track.id())).filter_map(|it| it.target)
+            {
+                *boxes.entry(target).or_default() += 1;
+            }
+            let state = track.state();
+            ReportedTrack {
+                track: track.id(),
+                position: state.position,
+                r95_m: state.covariance_m2.r95_m(),
+                target: boxes.into_iter().max_by_key(|(_, count)| *count).map(|(target, _)| target),
+            }
+        })
+        .collect()
+}

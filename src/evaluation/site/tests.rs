@@ -1,0 +1,155 @@
+//! The figures against cases computed by hand, and the gain of training a site together.
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::*;
+use crate::fusion::world::WorldTrackId;
+use crate::geo::EastNorth;
+use crate::simulation::{SiteOptions, simulate_site};
+
+fn at_s(seconds: f64) -> Timestamp {
+    Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(seconds)
+}
+
+fn record(camera: usize, seconds: f64, target: Option<usize>, track: u64) -> BoxRecord {
+    BoxRecord { camera, time: at_s(seconds), target, track: Some(WorldTrackId(track)) }
+}
+
+fn near(one: f64, other: f64) -> bool {
+    (one - other).abs() < 1e-9
+}
+
+#[test]
+fn identity_by_boxes_of_a_broken_track_and_a_false_box() {
+    // Target 0: six boxes on track 1, two on track 2. Target 1: four boxes on track 2. One false box on track 1.
+    let mut records: Vec<BoxRecord> = (0..6).map(|at| record(0, f64::from(at), Some(0), 1)).collect();
+    records.extend((6..8).map(|at| record(0, f64::from(at), Some(0), 2)));
+    records.extend((0..4).map(|at| record(0, f64::from(at), Some(1), 2)));
+    records.push(record(0, 0.0, None, 1));
+    let figures = BoxFigures::of(&records);
+    // Most in common: 6 + 4; boxes of targets 12, of tracks 13.
+    assert!(near(figures.identity_f1, 20.0 / 25.0), "{figures:?}");
+    // 6 boxes of 6/7, 2 of 2/6, 4 of 4/6; then 6 of 6/8, 2 of 2/8, 4 of 4/4.
+    let precision = (6.0 * 6.0 / 7.0 + 2.0 * 2.0 / 6.0 + 4.0 * 4.0 / 6.0) / 12.0;
+    assert!(near(figures.association_precision, precision), "{figures:?}");
+    assert!(near(figures.association_recall, (6.0 * 0.75 + 2.0 * 0.25 + 4.0) / 12.0), "{figures:?}");
+    assert_eq!((figures.handovers, figures.handover_rate), (0, None));
+}
+
+#[test]
+fn handovers_that_keep_and_that_lose_the_identity() {
+    let mut records = Vec::new();
+    for step in 0..20 {
+        let seconds = 0.5 * f64::from(step);
+        // Target 0 stays on its track, target 1 gets another one in camera 1, target 2 is merged within 2 s.
+        for (target, in_first, in_second) in [(0, 1, 1), (1, 2, 3), (2, 4, if seconds < 6.0 { 5 } else { 4 })]
+        {
+            if seconds <= 6.0 {
+                records.push(record(0, seconds, Some(target), in_first));
+            }
+            if seconds >= 4.5 {
+                records.push(record(1, seconds, Some(target), in_second));
+            }
+        }
+        // Never in a second camera.
+        records.push(record(0, seconds, Some(3), 6));
+    }
+    // Target 4 was away for longer than 2 s: no hand-over.
+    records.extend([record(0, 0.0, Some(4), 7), record(1, 5.0, Some(4), 8)]);
+    let figures = BoxFigures::of(&records);
+    assert_eq!(figures.handovers, 3);
+    assert!(figures.handover_rate.is_some_and(|rate| near(rate, 2.0 / 3.0)), "{figures:?}");
+}
+
+fn instant(targets: &[(usize, f64)], tracks: &[(u64, f64)]) -> WorldInstant {
+    let at = |east_m: f64| EastNorth { east_m, north_m: 0.0 };
+    WorldInstant {
+        targets: targets.iter().map(|(target, east_m)| (*target, at(*east_m))).collect(),
+        tracks: tracks
+            .iter()
+            .map(|(track, east_m)| ReportedTrack {
+                track: WorldTrackId(*track),
+                position: at(*east_m),
+                r95_m: 0.5,
+                target: None,
+            })
+            .collect(),
+    }
+}
+
+#[test]
+fn errors_of_tracks_in_the_world_by_hand() {
+    let instants = [
+        instant(&[(0, 0.0), (1, 10.0)], &[(1, 0.3), (2, 10.4)]),
+        // Track 1 keeps target 0 though track 3 is nearer; target 1 is missed, track 3 is false.
+        instant(&[(0, 0.0), (1, 10.0)], &[(1, 0.6), (3, 0.1)]),
+        // Target 1 changes to track 3: a switch.
+        instant(&[(0, 0.0), (1, 10.0)], &[(1, 0.0), (3, 9.5)]),
+    ];
+    let figures = WorldFigures::of(&instants);
+    // One miss, one false track, one switch of six targets.
+    assert!(near(figures.mota, 0.5), "{figures:?}");
+    // Targets 0 with 1: three, 1 with 2 or 3: one; six targets, six tracks.
+    assert!(near(figures.idf1, 8.0 / 12.0), "{figures:?}");
+    let first = (0.09f64 + 0.16).sqrt();
+    // The nearer track matches; a target and a track without a match cost 2 m2 each.
+    let second = (0.01f64 + 4.0).sqrt();
+    let third = 0.5;
+    assert!(near(figures.gospa_m, (first + second + third) / 3.0), "{figures:?}");
+}
+
+#[test]
+fn errors_and_coverage_of_positions_by_hand() {
+    let mut both = instant(&[(0, 0.0), (1, 10.0)], &[(1, 0.3), (2, 10.9), (3, 50.0)]);
+    both.tracks[0].target = Some(0);
+    both.tracks[1].target = Some(1);
+    let figures = PositionFigures::of(&[both]).expect("two positions");
+    assert!(near(figures.mean_error_m, 0.6) && near(figures.coverage95, 0.5), "{figures:?}");
+    assert_eq!((figures.positions, PositionFigures::of(&[])), (2, None));
+}
+
+/// Many walkers and vehicles before two overlapping cameras and a third one beyond a gap.
+fn simulated(seed: u64) -> SiteRecording {
+    let options = SiteOptions {
+        seed,
+        receiver_seed: seed,
+        camera_seed: seed,
+        tracker_id_lifetime_s: Some(20.0),
+        ..SiteOptions::default()
+    };
+    SiteRecording::simulated(&simulate_site(&options))
+}
+
+#[test]
+fn a_site_trained_together_keeps_identities_that_cameras_trained_apart_lose() {
+    let (mut together, mut apart) = (Vec::new(), Vec::new());
+    for seed in 1..=2 {
+        let recording = simulated(seed);
+        let run = |training| {
+            let trained = train_site(&recording, training).expect("trained");
+            track_site(&recording, &recording, &trained, Identities::Tracked, &[0, 1, 2])
+        };
+        together.push(run(SiteTraining::Together));
+        apart.push(run(SiteTraining::Apart));
+    }
+    let together = SiteCase::over_draws("together", &together).expect("draws");
+    let apart = SiteCase::over_draws("apart", &apart).expect("draws");
+    println!("{}", SiteReport { cases: vec![together.clone(), apart.clone()] }.table());
+    assert!(together.handover_rate > Some(0.85), "{together:?}");
+    assert!(together.identity_f1_by_boxes > 0.9, "{together:?}");
+    assert!(together.mean_error_m < apart.mean_error_m, "{together:?} {apart:?}");
+}
+
+#[test]
+fn degraded_boxes_cost_some_identity_not_most_of_it() {
+    let recording = simulated(3);
+    let trained = train_site(&recording, SiteTraining::Together).expect("trained");
+    let degraded = Degradation::ROUGH.apply(&recording, 1);
+    let boxes =
+        |recording: &SiteRecording| -> usize { recording.cameras.iter().map(|it| it.boxes.len()).sum() };
+    assert_ne!(boxes(&recording), boxes(&degraded));
+    let clean = track_site(&recording, &recording, &trained, Identities::Tracked, &[0, 1, 2]);
+    let rough = track_site(&degraded, &recording, &trained, Identities::Tracked, &[0, 1, 2]);
+    println!("{clean:?}\n{rough:?}");
+    assert!(rough.boxes.identity_f1 > clean.boxes.identity_f1 - 0.1, "{rough:?}");
+}

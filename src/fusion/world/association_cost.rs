@@ -1,0 +1,88 @@
+//! How unlikely it is that a detection is of a track: the cost of the pair in the assignment.
+//!
+//! ```text
+//! cost = -ln(exp(-c) + kappa)      c = (d^2 + ln |S|) / 2 - bonus of the own id
+//! ```
+//!
+//! d^2 is the squared Mahalanobis distance of detection and prediction, S its covariance (Blackman and Popoli
+//! 1999, 6.4). `kappa` is 0 but for a target that the camera's own tracker follows without a gap: it may move
+//! beyond the motion model.
+
+use super::frame::{CameraFrame, WorldDetection};
+use super::settings::WorldTrackSettings;
+use super::world_track::{WorldTrack, seconds_from};
+use crate::domain::TargetId;
+use crate::geo::{EastNorth, PlaneCovariance};
+
+/// Log-likelihood by which the track of a detection's own receiver is preferred to every other: the identity of
+/// a receiver is decided before.
+const RECEIVER_BONUS: f64 = 1_000.0;
+/// Largest gap in which a tracker is taken to follow its target, s.
+const FOLLOWED_WITHIN_S: f64 = 1.0;
+/// Distance that a box's noise adds to that of a followed target, m.
+const FOLLOWED_MARGIN_M: f64 = 1.0;
+
+/// A track at the time of a frame.
+pub(super) struct PredictedTrack<'a> {
+    track: &'a WorldTrack,
+    frame: &'a CameraFrame,
+    /// The id that the camera's tracker gave the target last.
+    tracker_id: Option<&'a TargetId>,
+    position: EastNorth,
+    covariance_m2: PlaneCovariance,
+    /// Distance within which the camera's tracker may follow the target, m; 0 if it does not.
+    followed_within_m: f64,
+}
+
+impl<'a> PredictedTrack<'a> {
+    pub(super) fn new(track: &'a WorldTrack, frame: &'a CameraFrame, settings: &WorldTrackSettings) -> Self {
+        let sighting = track.sightings().iter().find(|sighting| sighting.camera == frame.camera);
+        let since_s = sighting.map_or(f64::INFINITY, |it| seconds_from(it.last_seen, frame.time));
+        let followed_within_m = if since_s <= FOLLOWED_WITHIN_S {
+            settings.largest_speed_m_s * since_s.max(0.0) + FOLLOWED_MARGIN_M
+        } else {
+            0.0
+        };
+        let (position, covariance_m2) = (track.filter.position(), track.gating_covariance());
+        let tracker_id = sighting.and_then(|sighting| sighting.tracker_id.as_ref());
+        Self { track, frame, tracker_id, position, covariance_m2, followed_within_m }
+    }
+
+    /// The cost of a detection; `None` beyond the gates.
+    pub(super) fn cost(&self, detection: &WorldDetection, settings: &WorldTrackSettings) -> Option<f64> {
+        let same_receiver = match (&self.track.receiver, &detection.receiver) {
+            (Some(own), Some(other)) if own != other => return None,
+            (Some(_), Some(_)) => true,
+            // Whose fix it is must be decided from more than one box.
+            _ if self.track.is_measured_by_receiver() => return None,
+            _ => false,
+        };
+        let s = self.covariance_m2.plus(detection.covariance_m2);
+        let position = self.track.moved_to_state_time(detection.position, self.frame.time);
+        let difference = difference_m(position, self.position);
+        let distance_m2 = difference.east_m.powi(2) + difference.north_m.powi(2);
+        // d^2 is at least the squared distance divided by the trace of S.
+        let least = distance_m2 / (s.east_m2 + s.north_m2);
+        let is_far = least > settings.own_id_gate && distance_m2 > self.followed_within_m.powi(2);
+        if is_far && !same_receiver {
+            return None;
+        }
+        let is_own = self.tracker_id.is_some() && self.tracker_id == detection.tracker_id.as_ref();
+        let squared = s.mahalanobis_squared(difference);
+        let is_followed = is_own && distance_m2 <= self.followed_within_m.powi(2);
+        let gate = if is_own { settings.own_id_gate } else { settings.gate };
+        if squared > gate && !is_followed && !same_receiver {
+            return None;
+        }
+        let bonus = if is_own { settings.own_id_bonus } else { 0.0 };
+        let gaussian = 0.5 * (squared.min(RECEIVER_BONUS) + s.determinant().ln()) - bonus;
+        let kappa = if is_followed { settings.followed_density_per_m2 } else { 0.0 };
+        let cost = if kappa > 0.0 { -((-gaussian).exp() + kappa).ln() } else { gaussian };
+        Some(if same_receiver { cost - RECEIVER_BONUS } else { cost })
+    }
+}
+
+/// `one - other`, m.
+pub(super) fn difference_m(one: EastNorth, other: EastNorth) -> EastNorth {
+    EastNorth { east_m: one.east_m - other.east_m, north_m: one.north_m - other.north_m }
+}

@@ -1,0 +1,116 @@
+//! What goes into a world tracker and what comes out of it.
+
+use std::fmt;
+
+use jiff::Timestamp;
+
+use crate::domain::{CameraId, ReceiverId, TargetId};
+use crate::geo::{EastNorth, PlaneCovariance};
+
+/// Number of a world track, unique within its tracker and never used again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct WorldTrackId(pub u64);
+
+impl fmt::Display for WorldTrackId {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "{}", self.0)
+    }
+}
+
+/// The detections of one camera at one instant.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraFrame {
+    /// The camera.
+    pub camera: CameraId,
+    /// When.
+    pub time: Timestamp,
+    /// What it saw; none is a frame too.
+    pub detections: Vec<WorldDetection>,
+}
+
+/// One detection as a position in the site's plane. Its error has three parts: the box's noise, the error of the
+/// camera's own map, and the error that the maps of all cameras of the site have in common because they were
+/// trained on the same receivers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WorldDetection {
+    /// The id that the camera's own tracker gave the target.
+    pub tracker_id: Option<TargetId>,
+    /// The receiver that the target is known to carry.
+    pub receiver: Option<ReceiverId>,
+    /// Regressed position, m.
+    pub position: EastNorth,
+    /// Covariance of the error that differs between cameras: the box's noise and the camera's own part of its
+    /// map's error (V_rel), m2.
+    pub covariance_m2: PlaneCovariance,
+    /// Covariance of the error that all cameras have in common at that place (V_com), m2; zero if unknown.
+    pub common_covariance_m2: PlaneCovariance,
+}
+
+/// A change of the set of tracks.
+#[derive(Debug, Clone, PartialEq)]
+pub enum WorldEvent {
+    /// A track is confirmed: from now on it is reported.
+    Born {
+        /// The track.
+        track: WorldTrackId,
+    },
+    /// A camera sees a track that another camera saw before.
+    HandedOver {
+        /// The track.
+        track: WorldTrackId,
+        /// The camera that saw it last.
+        from: CameraId,
+        /// The camera that sees it now.
+        to: CameraId,
+    },
+    /// A track got the identity of a receiver.
+    Identified {
+        /// The track.
+        track: WorldTrackId,
+        /// The receiver.
+        receiver: ReceiverId,
+    },
+    /// Two tracks were of one target; the second one ends.
+    Merged {
+        /// The track that goes on.
+        track: WorldTrackId,
+        /// The track that ends.
+        ended: WorldTrackId,
+    },
+    /// A confirmed track ends without a measurement for too long.
+    Lost {
+        /// The track.
+        track: WorldTrackId,
+    },
+}
+
+/// A [`WorldEvent`] with the instant at which it was noticed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TimedEvent {
+    /// When.
+    pub time: Timestamp,
+    /// What.
+    pub event: WorldEvent,
+}
+
+/// What became of a frame.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct FrameOutcome {
+    /// The track of each detection, in their order; `None` for one that was not processed.
+    pub tracks: Vec<Option<WorldTrackId>>,
+    /// Detections beyond the bounds of [`super::WorldTrackSettings`].
+    pub dropped: usize,
+    /// Whether the whole frame was refused because it came too late.
+    pub too_late: bool,
+    /// What changed, in order.
+    pub events: Vec<TimedEvent>,
+}
+
+/// What became of a fix.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct FixOutcome {
+    /// The track of the receiver.
+    pub track: Option<WorldTrackId>,
+    /// What changed, in order.
+    pub events: Vec<TimedEvent>,
+}

@@ -1,0 +1,25 @@
+//! World tracks: one track per target of a site, from the detections of all its cameras and the fixes of its
+//! receivers.
+//!
+//! Each camera's frame is assigned to the tracks as a whole (global nearest neighbour), tracks have two
+//! constant-velocity modes, and two tracks that turn out to be of one target are merged. The filter uses the part
+//! of a detection's error that differs between cameras; the part that they have in common is added to the output
+//! only, for it does not average out. What never happens here: I/O, clocks, randomness, pixels, degrees.
+
+pub mod assignment;
+mod association_cost;
+mod constant_velocity;
+mod frame;
+mod merging;
+mod settings;
+#[cfg(test)]
+mod tests;
+mod tracker;
+mod world_track;
+
+pub use frame::{
+    CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
+};
+pub use settings::WorldTrackSettings;
+pub use tracker::WorldTracker;
+pub use world_track::{Sighting, TrackStatus, WorldState, WorldTrack};

@@ -1,0 +1,172 @@
+//! The fit of a site: robust starts per camera, then all cameras together.
+
+use super::ground_map::GroundMap;
+use super::input::{FEWEST_ROWS, SiteFitError, SiteFitInput, SiteFix, foot_and_size, is_foot_cut};
+use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
+use super::maps::SiteMaps;
+use crate::domain::GaussMarkovNoise;
+use crate::model::encoder::gaussian_process::projective_mean::Box4;
+use crate::statistics::median;
+
+/// Standard deviation per axis of the fixes and of the feet before they are estimated, m and px.
+const FIRST_SIGMA_M: f64 = 3.0;
+const FIRST_FOOT_SIGMA_PX: f64 = 4.0;
+/// Ranges of the estimates.
+const SIGMA_RANGE_M: [f64; 2] = [0.02, 100.0];
+const FOOT_SIGMA_RANGE_PX: [f64; 2] = [0.5, 50.0];
+/// Rounds of solution and noise estimate.
+const ROUNDS: usize = 3;
+/// Share of the transfers that counts as independent: a detector's error lasts for some frames.
+const INDEPENDENT_TRANSFERS: f64 = 0.25;
+/// Most fixes of one receiver, and most transfers between two cameras: more are thinned evenly.
+const MAX_RECEIVER_ROWS: usize = 300;
+const MAX_TRANSFERS: usize = 4_000;
+/// Median of a chi-square variable with 2 degrees of freedom: 2 ln 2.
+const MEDIAN_CHI_SQUARE: f64 = 1.386;
+
+/// Fits the maps of all cameras of a site together.
+///
+/// # Errors
+/// A camera has too few rows, or there is no finite solution.
+pub fn fit_site(input: &SiteFitInput<'_>) -> Result<SiteMaps, SiteFitError> {
+    let receivers = receiver_rows(input);
+    let transfers = transfers(input);
+    let mut maps = initial_maps(input.image_sizes.len(), &receivers, &transfers)?;
+    let mut problem = LeastSquaresProblem {
+        receivers,
+        transfers,
+        noise: GaussMarkovNoise::new(FIRST_SIGMA_M, input.correlation),
+        foot_sigma_px: FIRST_FOOT_SIGMA_PX,
+        transfer_weight: INDEPENDENT_TRANSFERS,
+    };
+    let mut covariance = problem.solve(&mut maps).ok_or(SiteFitError::NoSolution)?;
+    for _ in 1..ROUNDS {
+        problem.estimate_noise(&maps);
+        covariance = problem.solve(&mut maps).ok_or(SiteFitError::NoSolution)?;
+    }
+    let views_px = (0..maps.len()).map(|camera| view_px(&problem, camera)).collect();
+    Ok(SiteMaps {
+        maps,
+        covariance,
+        foot_sigma_px: problem.foot_sigma_px,
+        noise: problem.noise,
+        image_sizes: input.image_sizes.to_vec(),
+        views_px,
+    })
+}
+
+impl LeastSquaresProblem {
+    /// Estimates the variance of the fixes from their whitened residuals and that of the feet from the median of
+    /// the transfers.
+    fn estimate_noise(&mut self, maps: &[GroundMap]) {
+        let residuals = self.fix_residuals(maps);
+        let freedom = residuals.count as f64 - 8.0 * maps.len() as f64;
+        if freedom > 0.0 {
+            let scale = residuals.square_sum / freedom;
+            let sigma_m = (self.noise.variance_m2 * scale).sqrt().clamp(SIGMA_RANGE_M[0], SIGMA_RANGE_M[1]);
+            self.noise = GaussMarkovNoise::new(sigma_m, self.noise.correlation);
+        }
+        let distances = self.transfer_distances(maps);
+        if distances.len() >= FEWEST_ROWS {
+            let sigma_px = (median(distances) / MEDIAN_CHI_SQUARE).sqrt();
+            self.foot_sigma_px = sigma_px.clamp(FOOT_SIGMA_RANGE_PX[0], FOOT_SIGMA_RANGE_PX[1]);
+        }
+    }
+}
+
+/// The fixes by receiver, without cut boxes.
+fn receiver_rows(input: &SiteFitInput<'_>) -> Vec<Vec<FixRow>> {
+    let mut fixes: Vec<&SiteFix> = input.fixes.iter().collect();
+    fixes.sort_by(|one, other| {
+        (one.receiver, one.time_s)
+            .partial_cmp(&(other.receiver, other.time_s))
+            .unwrap_or(std::cmp::Ordering::Equal)
+    });
+    let row = |fix: &&SiteFix| {
+        let whole = fix
+            .boxes
+            .iter()
+            .filter(|(camera, bounding_box)| !is_foot_cut(bounding_box, input.image_sizes[*camera]));
+        let feet: Vec<(usize, Box4)> = whole.map(|(camera, it)| (*camera, foot_and_size(it))).collect();
+        let position = [fix.position.east_m, fix.position.north_m];
+        (!feet.is_empty()).then_some(FixRow { time_s: fix.time_s, position, feet })
+    };
+    let of_receiver = |own: &[&SiteFix]| thinned(own.iter().filter_map(row).collect(), MAX_RECEIVER_ROWS);
+    let all = fixes.chunk_by(|one, next| one.receiver == next.receiver).map(of_receiver);
+    all.filter(|rows| !rows.is_empty()).collect()
+}
+
+/// Every pair in both directions, without cut boxes.
+fn transfers(input: &SiteFitInput<'_>) -> Vec<Transfer> {
+    let mut both_ways = Vec::with_capacity(2 * input.pairs.len());
+    for pair in input.pairs {
+        let [from, to] = pair.cameras;
+        let is_cut = [0, 1].map(|at| is_foot_cut(&pair.boxes[at], input.image_sizes[pair.cameras[at]]));
+        if from == to || is_cut.contains(&true) {
+            continue;
+        }
+        let feet = pair.boxes.map(|it| foot_and_size(&it));
+        both_ways.push(Transfer { cameras: [from, to], feet });
+        both_ways.push(Transfer { cameras: [to, from], feet: [feet[1], feet[0]] });
+    }
+    both_ways.sort_by_key(|transfer| transfer.cameras);
+    both_ways
+        .chunk_by(|one, next| one.cameras == next.cameras)
+        .flat_map(|own| thinned(own.to_vec(), MAX_TRANSFERS))
+        .collect()
+}
+
+fn thinned<T>(rows: Vec<T>, most: usize) -> Vec<T> {
+    let stride = rows.len().div_ceil(most).max(1);
+    rows.into_iter().step_by(stride).collect()
+}
+
+/// Robust starts: from fixes where a camera has enough, else from targets in common with cameras that have a
+/// map.
+fn initial_maps(
+    cameras: usize,
+    receivers: &[Vec<FixRow>],
+    transfers: &[Transfer],
+) -> Result<Vec<GroundMap>, SiteFitError> {
+    let mut maps: Vec<Option<GroundMap>> = (0..cameras)
+        .map(|camera| {
+            let rows = receivers.iter().flatten();
+            let own = rows.flat_map(|row| row.feet.iter().map(move |foot| (foot, row.position)));
+            start(own.filter(|((at, _), _)| *at == camera).map(|((_, foot), position)| (*foot, position)))
+        })
+        .collect();
+    while let Some(camera) = maps.iter().position(Option::is_none) {
+        let from_known = |camera: usize| {
+            let known = transfers.iter().filter(|transfer| transfer.cameras[1] == camera);
+            start(known.filter_map(|transfer| {
+                let position = maps[transfer.cameras[0]].as_ref()?.position(&transfer.feet[0]);
+                Some((transfer.feet[1], [position.east_m, position.north_m]))
+            }))
+        };
+        let unknown = (0..cameras).filter(|&camera| maps[camera].is_none());
+        let Some((next, map)) = unknown.filter_map(|camera| Some((camera, from_known(camera)?))).next()
+        else {
+            return Err(SiteFitError::TooFewRows { camera });
+        };
+        maps[next] = Some(map);
+    }
+    Ok(maps.into_iter().flatten().collect())
+}
+
+fn start(rows: impl Iterator<Item = (Box4, [f64; 2])>) -> Option<GroundMap> {
+    let (feet, positions): (Vec<Box4>, Vec<[f64; 2]>) = rows.unzip();
+    (feet.len() >= FEWEST_ROWS).then(|| GroundMap::start(&feet, &positions))
+}
+
+/// Extent of the feet of a camera.
+fn view_px(problem: &LeastSquaresProblem, camera: usize) -> [[f64; 2]; 2] {
+    let by_fixes = problem.receivers.iter().flatten().flat_map(|row| row.feet.iter().copied());
+    let by_pairs = problem.transfers.iter().map(|transfer| (transfer.cameras[0], transfer.feet[0]));
+    let mut extent = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
+    for (_, foot) in by_fixes.chain(by_pairs).filter(|(at, _)| *at == camera) {
+        for (side, range) in extent.iter_mut().enumerate() {
+            *range = [range[0].min(foot[side]), range[1].max(foot[side])];
+        }
+    }
+    extent
+}

@@ -1,0 +1,79 @@
+//! What a site is trained on.
+
+use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation};
+use crate::geo::EastNorth;
+
+/// A fix with the boxes of its carrier at the same instant, in all cameras that see it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SiteFix {
+    /// Number of the receiver; errors of one receiver are correlated over time.
+    pub receiver: u32,
+    /// Since any fixed instant, s.
+    pub time_s: f64,
+    /// In the site's plane, m.
+    pub position: EastNorth,
+    /// Index of the camera and box; at least one.
+    pub boxes: Vec<(usize, BoundingBox)>,
+}
+
+/// One target in two cameras at one instant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SitePair {
+    /// Indexes of the cameras.
+    pub cameras: [usize; 2],
+    /// The target's box in each.
+    pub boxes: [BoundingBox; 2],
+}
+
+/// Training rows of all cameras of a site.
+#[derive(Debug, Clone)]
+pub struct SiteFitInput<'a> {
+    /// Size of each camera's image, where it is known: boxes that its border cuts are left out.
+    pub image_sizes: &'a [Option<ImageSize>],
+    /// Fixes; those of one receiver in the order of time.
+    pub fixes: &'a [SiteFix],
+    /// Targets in two cameras at once.
+    pub pairs: &'a [SitePair],
+    /// Correlation over time of the receivers' errors; their variance is estimated.
+    pub correlation: NoiseCorrelation,
+}
+
+/// Why there are no maps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum SiteFitError {
+    /// A camera has neither enough fixes nor enough targets in common with a camera that has.
+    #[error("camera {camera} has fewer than {FEWEST_ROWS} fixes or targets in common with the other cameras")]
+    TooFewRows {
+        /// Index of the camera.
+        camera: usize,
+    },
+    /// The least-squares problem has no finite solution.
+    #[error("the cameras' maps have no finite solution: the fixes and boxes do not fit one ground plane")]
+    NoSolution,
+}
+
+/// Fewest fixes, or targets in common with cameras whose map is known, that start a camera's map.
+pub(super) const FEWEST_ROWS: usize = 12;
+
+/// Foot u, foot v, width, height of a box, px: the features of a ground map.
+pub(super) fn foot_and_size(bounding_box: &BoundingBox) -> [f64; 4] {
+    [
+        bounding_box.left_px() + 0.5 * bounding_box.width_px(),
+        bounding_box.top_px() + bounding_box.height_px(),
+        bounding_box.width_px(),
+        bounding_box.height_px(),
+    ]
+}
+
+/// Whether the border of the image hides the foot of a box or a side of it. The upper border hides the head
+/// only.
+pub(super) fn is_foot_cut(bounding_box: &BoundingBox, image_size: Option<ImageSize>) -> bool {
+    const NEAR_PX: f64 = 1.0;
+    let [right_px, bottom_px] =
+        [bounding_box.left_px() + bounding_box.width_px(), bounding_box.top_px() + bounding_box.height_px()];
+    bounding_box.left_px() < NEAR_PX
+        || image_size.is_some_and(|size| {
+            right_px > f64::from(size.width_px()) - NEAR_PX
+                || bottom_px > f64::from(size.height_px()) - NEAR_PX
+        })
+}

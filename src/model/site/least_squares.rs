@@ -1,0 +1,294 @@
+//! The least-squares problem of all cameras' maps, by Levenberg and Marquardt's method.
+//!
+//! ```text
+//! cost = sum_receivers |W (z - mean_c f_c(box_c))|^2            fixes, whitened per receiver
+//!      + w sum_pairs rho(|f_b^-1(f_a(box_a)) - box_b|^2 / s^2)  feet carried from view a to view b, px
+//!      + sum (p / sigma_prior)^2
+//! ```
+//!
+//! `rho(x) = k^2 ln(1 + x / k^2)` is Cauchy's loss. In metres the pairs would pull all maps together to a point;
+//! in pixels they do not.
+
+use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
+
+use super::ground_map::{GroundMap, GroundTangent, PARAMETERS};
+use crate::domain::GaussMarkovNoise;
+use crate::model::encoder::gaussian_process::projective_mean::Box4;
+
+/// Standardised distance at which a pair has half its weight.
+const CAUCHY_SCALE: f64 = 2.0;
+/// Cost of a pair whose foot cannot be carried over, in squared standard deviations.
+const LOST_PAIR: f64 = 400.0;
+const STEPS: usize = 30;
+const LEAST_GAIN: f64 = 1e-6;
+
+/// A fix with the feet of its carrier.
+#[derive(Debug, Clone)]
+pub(super) struct FixRow {
+    pub(super) time_s: f64,
+    pub(super) position: [f64; 2],
+    pub(super) feet: Vec<(usize, Box4)>,
+}
+
+/// Feet of one target in two cameras: carried from the first to the second.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Transfer {
+    pub(super) cameras: [usize; 2],
+    pub(super) feet: [Box4; 2],
+}
+
+/// All rows with their noise.
+#[derive(Debug, Clone)]
+pub(super) struct LeastSquaresProblem {
+    /// Fixes by receiver, in the order of time.
+    pub(super) receivers: Vec<Vec<FixRow>>,
+    pub(super) transfers: Vec<Transfer>,
+    /// Noise of the fixes per axis.
+    pub(super) noise: GaussMarkovNoise,
+    /// Standard deviation of a foot per axis, px.
+    pub(super) foot_sigma_px: f64,
+    /// Weight of a transfer: neighbours in time are not independent.
+    pub(super) transfer_weight: f64,
+}
+
+/// Gauss-Newton matrix and gradient.
+struct NormalEquations {
+    matrix: DMatrix<f64>,
+    /// Minus half the gradient.
+    right: DVector<f64>,
+    cost: f64,
+}
+
+/// Whitened residuals of the fixes, both axes of all receivers.
+pub(super) struct FixResiduals {
+    pub(super) square_sum: f64,
+    pub(super) count: usize,
+}
+
+impl LeastSquaresProblem {
+    /// Refines the maps; returns their parameters' covariance, `None` if there is no finite solution.
+    pub(super) fn solve(&self, maps: &mut Vec<GroundMap>) -> Option<DMatrix<f64>> {
+        let mut damping = 1e-3;
+        let mut normal = self.normal_equations(maps);
+        for _ in 0..STEPS {
+            let mut damped = normal.matrix.clone();
+            for at in 0..damped.nrows() {
+                damped[(at, at)] *= 1.0 + damping;
+            }
+            let step = damped.cholesky()?.solve(&normal.right);
+            let moved: Vec<GroundMap> = maps
+                .iter()
+                .zip(step.as_slice().chunks(PARAMETERS))
+                .map(|(map, step)| map.moved_by(step))
+                .collect();
+            let cost = self.cost(&moved);
+            if cost.is_finite() && cost <= normal.cost {
+                let gain = normal.cost - cost;
+                *maps = moved;
+                let converged = gain <= LEAST_GAIN * cost;
+                normal = self.normal_equations(maps);
+                damping = (damping * 0.1).max(1e-9);
+                if converged {
+                    break;
+                }
+            } else {
+                damping *= 10.0;
+                if damping > 1e9 {
+                    break;
+                }
+            }
+        }
+        let covariance = normal.matrix.cholesky()?.inverse();
+        covariance.iter().all(|value| value.is_finite()).then_some(covariance)
+    }
+
+    /// Sum of squares of the whitened residuals of the fixes.
+    pub(super) fn fix_residuals(&self, maps: &[GroundMap]) -> FixResiduals {
+        let mut residuals = FixResiduals { square_sum: 0.0, count: 0 };
+        for rows in &self.receivers {
+            let Some(factor) = self.receiver_covariance(rows).cholesky() else { continue };
+            for axis in 0..2 {
+                let misfit = DVector::from_iterator(
+                    rows.len(),
+                    rows.iter().map(|row| row.position[axis] - mean_position(maps, row)[axis]),
+                );
+                residuals.square_sum += factor.solve(&misfit).dot(&misfit);
+                residuals.count += rows.len();
+            }
+        }
+        residuals
+    }
+
+    /// Squared standardised distances of the transfers that can be made, with unit foot noise.
+    pub(super) fn transfer_distances(&self, maps: &[GroundMap]) -> Vec<f64> {
+        let squared = |transfer: &Transfer| {
+            let carried = Carried::new(maps, transfer)?;
+            Some(carried.residual_px.norm_squared() / carried.variance_factor)
+        };
+        self.transfers.iter().filter_map(squared).collect()
+    }
+
+    fn receiver_covariance(&self, rows: &[FixRow]) -> DMatrix<f64> {
+        DMatrix::from_fn(rows.len(), rows.len(), |one, other| {
+            let lag_s = (rows[one].time_s - rows[other].time_s).abs();
+            let coloured = self.noise.coloured_variance_m2() * self.noise.correlation.decay(lag_s);
+            if one == other { coloured + self.noise.white_variance_m2().max(1e-4) } else { coloured }
+        })
+    }
+
+    fn cost(&self, maps: &[GroundMap]) -> f64 {
+        let transfers: f64 = self.transfers.iter().map(|it| self.transfer_cost(maps, it)).sum();
+        self.fix_residuals(maps).square_sum + transfers + prior_cost(maps)
+    }
+
+    fn transfer_cost(&self, maps: &[GroundMap], transfer: &Transfer) -> f64 {
+        let squared = Carried::new(maps, transfer)
+            .map_or(LOST_PAIR, |it| it.residual_px.norm_squared() / self.carried_variance_px2(&it));
+        let scale = CAUCHY_SCALE * CAUCHY_SCALE;
+        self.transfer_weight * scale * (squared.min(LOST_PAIR) / scale).ln_1p()
+    }
+
+    fn carried_variance_px2(&self, carried: &Carried) -> f64 {
+        self.foot_sigma_px * self.foot_sigma_px * carried.variance_factor
+    }
+
+    fn normal_equations(&self, maps: &[GroundMap]) -> NormalEquations {
+        let size = PARAMETERS * maps.len();
+        let mut normal =
+            NormalEquations { matrix: DMatrix::zeros(size, size), right: DVector::zeros(size), cost: 0.0 };
+        for (camera, map) in maps.iter().enumerate() {
+            let parameters = map.parameters().iter().zip(map.prior_variances());
+            for (at, (parameter, variance)) in parameters.enumerate() {
+                let index = PARAMETERS * camera + at;
+                normal.matrix[(index, index)] += variance.recip();
+                normal.right[index] -= parameter / variance;
+            }
+        }
+        for rows in &self.receivers {
+            self.add_receiver(maps, rows, &mut normal);
+        }
+        for transfer in &self.transfers {
+            self.add_transfer(maps, transfer, &mut normal);
+        }
+        normal.cost = self.cost(maps);
+        normal
+    }
+
+    fn add_receiver(&self, maps: &[GroundMap], rows: &[FixRow], normal: &mut NormalEquations) {
+        let Some(factor) = self.receiver_covariance(rows).cholesky() else { return };
+        let cameras = cameras_of(rows);
+        let column_of = |camera: usize| cameras.partition_point(|&other| other < camera) * PARAMETERS;
+        for axis in 0..2 {
+            let mut jacobian = DMatrix::<f64>::zeros(rows.len(), PARAMETERS * cameras.len());
+            let mut misfit = DVector::<f64>::zeros(rows.len());
+            for (at, row) in rows.iter().enumerate() {
+                let share = 1.0 / row.feet.len() as f64;
+                misfit[at] = row.position[axis];
+                for (camera, foot) in &row.feet {
+                    let tangent = maps[*camera].tangent(foot);
+                    misfit[at] -= share * tangent.position[axis];
+                    for (offset, slope) in tangent.by_parameters[axis].iter().enumerate() {
+                        jacobian[(at, column_of(*camera) + offset)] += share * slope;
+                    }
+                }
+            }
+            let weighted = factor.solve(&jacobian);
+            let (matrix, right) = (jacobian.transpose() * &weighted, weighted.transpose() * misfit);
+            for one in 0..matrix.nrows() {
+                let row = global_index(&cameras, one);
+                normal.right[row] += right[one];
+                for other in 0..matrix.ncols() {
+                    normal.matrix[(row, global_index(&cameras, other))] += matrix[(one, other)];
+                }
+            }
+        }
+    }
+
+    fn add_transfer(&self, maps: &[GroundMap], transfer: &Transfer, normal: &mut NormalEquations) {
+        let Some(carried) = Carried::new(maps, transfer) else { return };
+        let variance_px2 = self.carried_variance_px2(&carried);
+        let squared = carried.residual_px.norm_squared() / variance_px2;
+        if squared > LOST_PAIR {
+            return;
+        }
+        let weight = self.transfer_weight / (1.0 + squared / (CAUCHY_SCALE * CAUCHY_SCALE)) / variance_px2;
+        let [from, to] = transfer.cameras.map(|camera| PARAMETERS * camera);
+        let slopes = carried.slopes();
+        let index = |at: usize| if at < PARAMETERS { from + at } else { to + at - PARAMETERS };
+        for (slopes, residual_px) in slopes.iter().zip(&carried.residual_px) {
+            for (one, slope) in slopes.iter().enumerate() {
+                normal.right[index(one)] -= weight * slope * residual_px;
+                for (other, other_slope) in slopes.iter().enumerate() {
+                    normal.matrix[(index(one), index(other))] += weight * slope * other_slope;
+                }
+            }
+        }
+    }
+}
+
+/// A foot carried from one view into another.
+struct Carried {
+    from: GroundTangent,
+    /// At the carried foot.
+    to: GroundTangent,
+    /// Pixels of the second view per metre.
+    px_per_m: Matrix2<f64>,
+    residual_px: Vector2<f64>,
+    /// Mean variance per axis of the residual for unit noise of both feet.
+    variance_factor: f64,
+}
+
+impl Carried {
+    fn new(maps: &[GroundMap], transfer: &Transfer) -> Option<Self> {
+        let [from_camera, to_camera] = transfer.cameras;
+        let from = maps[from_camera].tangent(&transfer.feet[0]);
+        let [u_px, v_px] = maps[to_camera].foot_at(from.position)?;
+        let [.., width_px, height_px] = transfer.feet[1];
+        let to = maps[to_camera].tangent(&[u_px, v_px, width_px, height_px]);
+        let px_per_m = to.by_foot.try_inverse()?;
+        let residual_px = Vector2::new(u_px - transfer.feet[1][0], v_px - transfer.feet[1][1]);
+        let variance_factor = 1.0 + 0.5 * (px_per_m * from.by_foot).norm_squared();
+        Some(Self { from, to, px_per_m, residual_px, variance_factor })
+    }
+
+    /// Derivatives of the residual by the parameters of the first, then of the second map, px.
+    fn slopes(&self) -> [[f64; 2 * PARAMETERS]; 2] {
+        [0, 1].map(|axis| {
+            std::array::from_fn(|at| {
+                let (tangent, parameter, sign) =
+                    if at < PARAMETERS { (&self.from, at, 1.0) } else { (&self.to, at - PARAMETERS, -1.0) };
+                let [east, north] = tangent.by_parameters;
+                sign * (self.px_per_m[(axis, 0)] * east[parameter]
+                    + self.px_per_m[(axis, 1)] * north[parameter])
+            })
+        })
+    }
+}
+
+fn mean_position(maps: &[GroundMap], row: &FixRow) -> [f64; 2] {
+    let share = 1.0 / row.feet.len() as f64;
+    row.feet.iter().fold([0.0; 2], |sum, (camera, foot)| {
+        let position = maps[*camera].position(foot);
+        [sum[0] + share * position.east_m, sum[1] + share * position.north_m]
+    })
+}
+
+fn prior_cost(maps: &[GroundMap]) -> f64 {
+    let of_map = |map: &GroundMap| -> f64 {
+        let parameters = map.parameters().iter().zip(map.prior_variances());
+        parameters.map(|(parameter, variance)| parameter * parameter / variance).sum()
+    };
+    maps.iter().map(of_map).sum()
+}
+
+fn cameras_of(rows: &[FixRow]) -> Vec<usize> {
+    let mut cameras: Vec<usize> =
+        rows.iter().flat_map(|row| row.feet.iter().map(|(camera, _)| *camera)).collect();
+    cameras.sort_unstable();
+    cameras.dedup();
+    cameras
+}
+
+fn global_index(cameras: &[usize], local: usize) -> usize {
+    PARAMETERS * cameras[local / PARAMETERS] + local % PARAMETERS
+}

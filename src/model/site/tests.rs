@@ -1,0 +1,141 @@
+//! A site of known cameras: what the fit recovers, and whether its stated errors are honest.
+
+use super::*;
+use crate::domain::GaussMarkovNoise;
+use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation};
+use crate::geo::EastNorth;
+use crate::simulation::{SimulatedReceiver, standard_normal, stream};
+
+const CORRELATION: NoiseCorrelation = NoiseCorrelation { white_share: 0.08, time_constant_s: 30.0 };
+const FOOT_SIGMA_PX: f64 = 2.0;
+
+/// A pinhole camera on a mast, 7 m high, looking north from (east, 0), 13 degrees down.
+fn foot_px(east_m: f64, at: EastNorth) -> [f64; 2] {
+    let (sin_tilt, cos_tilt) = 13.0f64.to_radians().sin_cos();
+    let depth_m = cos_tilt * at.north_m + sin_tilt * 7.0;
+    let below_m = cos_tilt * 7.0 - sin_tilt * at.north_m;
+    [640.0 + 1000.0 * (at.east_m - east_m) / depth_m, 360.0 + 1000.0 * below_m / depth_m]
+}
+
+fn is_in_view([u, v]: [f64; 2]) -> bool {
+    (30.0..1250.0).contains(&u) && (30.0..700.0).contains(&v)
+}
+
+struct World {
+    fixes: Vec<SiteFix>,
+    pairs: Vec<SitePair>,
+    /// Camera, box and true position.
+    boxes: Vec<(usize, BoundingBox, EastNorth)>,
+}
+
+/// Walkers with phones that cross the views of two cameras 10 m apart.
+fn world(seed: u64) -> World {
+    let mut random = stream(seed, 0);
+    let mut world = World { fixes: Vec::new(), pairs: Vec::new(), boxes: Vec::new() };
+    for receiver in 0..12 {
+        let error = GaussMarkovNoise::new(2.6, CORRELATION);
+        let mut phone = SimulatedReceiver::seeded(error, seed, 100 + u64::from(receiver));
+        let north_m = 14.0 + 1.6 * f64::from(receiver);
+        for second in 0..30 {
+            let truth = EastNorth { east_m: -12.0 + 1.3 * f64::from(second), north_m };
+            let mut boxes = Vec::new();
+            for (camera, east_m) in [0.0, 10.0].into_iter().enumerate() {
+                let mut foot = foot_px(east_m, truth);
+                if !is_in_view(foot) {
+                    continue;
+                }
+                foot = foot.map(|side| side + FOOT_SIGMA_PX * standard_normal(&mut random));
+                let bounding_box =
+                    BoundingBox::new(foot[0] - 10.0, foot[1] - 60.0, 20.0, 60.0).expect("valid");
+                boxes.push((camera, bounding_box));
+                world.boxes.push((camera, bounding_box, truth));
+            }
+            if let [one, other] = boxes[..] {
+                world.pairs.push(SitePair { cameras: [one.0, other.0], boxes: [one.1, other.1] });
+            }
+            let position = phone.measure(truth, 1.0);
+            if !boxes.is_empty() {
+                world.fixes.push(SiteFix { receiver, time_s: f64::from(second), position, boxes });
+            }
+        }
+    }
+    world
+}
+
+fn fitted(world: &World, pairs: &[SitePair]) -> SiteMaps {
+    let size = Some(ImageSize::new(1280, 720).expect("valid"));
+    let input =
+        SiteFitInput { image_sizes: &[size, size], fixes: &world.fixes, pairs, correlation: CORRELATION };
+    fit_site(&input).expect("a solution")
+}
+
+fn disagreement_m(maps: &SiteMaps, world: &World) -> f64 {
+    let apart = |pair: &SitePair| {
+        let [one, other] = [0, 1].map(|at| maps.locate(pair.cameras[at], &pair.boxes[at]).position);
+        one.distance_m(other)
+    };
+    world.pairs.iter().map(apart).sum::<f64>() / world.pairs.len() as f64
+}
+
+#[test]
+fn cameras_that_are_held_to_each_other_agree() {
+    for seed in 1..=3 {
+        let world = world(seed);
+        let (held, free) = (fitted(&world, &world.pairs), fitted(&world, &[]));
+        let (held_m, free_m) = (disagreement_m(&held, &world), disagreement_m(&free, &world));
+        assert!(held_m < 0.2 && held_m < 0.7 * free_m, "seed {seed}: {held_m} m, {free_m} m without pairs");
+        assert!((held.foot_sigma_px() / FOOT_SIGMA_PX - 1.0).abs() < 0.3, "{}", held.foot_sigma_px());
+    }
+}
+
+/// Over redrawn errors, 95 % of true positions lie within the stated ellipse, and the difference of two cameras
+/// within that of the parts which they do not share.
+#[test]
+fn the_stated_parts_of_the_error_are_honest() {
+    let (mut inside, mut relative_inside) = ([0.0, 0.0], [0.0, 0.0]);
+    for seed in 1..=12 {
+        let world = world(seed);
+        let maps = fitted(&world, &world.pairs);
+        for (camera, bounding_box, truth) in &world.boxes {
+            let located = maps.locate(*camera, bounding_box);
+            let error = minus(located.position, *truth);
+            inside[0] += f64::from(u8::from(located.covariance_m2().mahalanobis_squared(error) <= 5.99));
+            inside[1] += 1.0;
+        }
+        for pair in &world.pairs {
+            let [one, other] = [0, 1].map(|at| maps.locate(pair.cameras[at], &pair.boxes[at]));
+            let parts = |it: &SitePosition| it.box_noise_m2.plus(it.relative_m2);
+            let covariance = parts(&one).plus(parts(&other));
+            let squared = covariance.mahalanobis_squared(minus(one.position, other.position));
+            relative_inside[0] += f64::from(u8::from(squared <= 5.99));
+            relative_inside[1] += 1.0;
+            assert!(one.common_m2.per_axis_m2() > 0.05, "{one:?}");
+        }
+    }
+    let [coverage, relative] = [inside, relative_inside].map(|[hits, all]| hits / all);
+    println!("coverage {coverage:.3}, of differences between cameras {relative:.3}");
+    assert!((0.85..=1.0).contains(&coverage), "{coverage}");
+    assert!((0.88..=1.0).contains(&relative), "{relative}");
+}
+
+#[test]
+fn a_camera_without_fixes_is_fitted_by_its_neighbour() {
+    let world = world(4);
+    let only_first = |fix: &SiteFix| {
+        let boxes: Vec<(usize, BoundingBox)> =
+            fix.boxes.iter().copied().filter(|(camera, _)| *camera == 0).collect();
+        (!boxes.is_empty()).then(|| SiteFix { boxes, ..fix.clone() })
+    };
+    let fixes = world.fixes.iter().filter_map(only_first).collect();
+    let one_sided = World { fixes, pairs: world.pairs.clone(), boxes: Vec::new() };
+    let maps = fitted(&one_sided, &one_sided.pairs);
+    assert!(disagreement_m(&maps, &one_sided) < 0.2);
+    let size = [None, None];
+    let input =
+        SiteFitInput { image_sizes: &size, fixes: &one_sided.fixes, pairs: &[], correlation: CORRELATION };
+    assert_eq!(fit_site(&input).err(), Some(SiteFitError::TooFewRows { camera: 1 }));
+}
+
+fn minus(one: EastNorth, other: EastNorth) -> EastNorth {
+    EastNorth { east_m: one.east_m - other.east_m, north_m: one.north_m - other.north_m }
+}

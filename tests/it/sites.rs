@@ -1,0 +1,5 @@
+//! Sites: the resource, and one set of tracks over all cameras.
+
+mod resource;
+mod tracks;
+mod two_cameras;

@@ -1,0 +1,116 @@
+//! `sightfix simulate site` and `sightfix evaluate --site`, through the real binary.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::harness::{data_folder, run, shared, sightfix};
+
+fn simulate(folder: &Path, flags: &[&str]) {
+    run(&[&["simulate", "site", "--out", folder.to_str().expect("UTF-8")][..], flags].concat());
+}
+
+/// The cases of an evaluation by name, the first of each.
+fn evaluate(folder: &Path, image_size: &str, flags: &[&str]) -> Vec<Value> {
+    let site = folder.to_str().expect("UTF-8");
+    let out = data_folder();
+    let json = out.path().join("report.json");
+    let arguments =
+        ["evaluate", "--site", site, "--image-size", image_size, "--json", json.to_str().expect("UTF-8")];
+    let printed = run(&[&arguments[..], flags].concat());
+    println!("{printed}");
+    let report: Value = serde_json::from_str(&fs::read_to_string(json).expect("written")).expect("JSON");
+    let cases = report["cases"].as_array().expect("cases").clone();
+    assert!(cases.iter().all(|case| printed.contains(case["name"].as_str().expect("a name"))));
+    cases
+}
+
+fn figure(case: &Value, name: &str) -> f64 {
+    case[name].as_f64().unwrap_or_else(|| panic!("{name} of {case}"))
+}
+
+/// What one camera's tracker and one site's trained maps are worth: the identity kept from camera to camera, and
+/// positions that are closer than those of cameras trained apart.
+#[test]
+fn a_simulated_site_is_tracked_over_all_its_cameras() {
+    let folder = data_folder();
+    simulate(folder.path(), &["--duration-s", "240", "--tracker-id-lifetime-s", "20", "--seed", "11"]);
+    let cases = evaluate(folder.path(), "1280x720", &["--redraws", "3"]);
+    let [together, oracle, degraded, apart, ..] = &cases[..] else { panic!("{cases:?}") };
+    assert!(figure(together, "identity_f1_by_boxes") >= 0.95, "{together}");
+    assert!(figure(together, "handover_rate") >= 0.85, "{together}");
+    assert!(figure(together, "handover_rate") > figure(apart, "handover_rate"), "{apart}");
+    assert!(figure(oracle, "mota") - figure(together, "mota") <= 0.02, "{oracle}");
+    assert!(figure(oracle, "idf1") - figure(together, "idf1") <= 0.02, "{oracle}");
+    assert!(figure(degraded, "identity_f1_by_boxes") >= 0.85, "{degraded}");
+    assert!((0.85..=1.0).contains(&figure(together, "coverage95")), "{together}");
+    // Each camera alone follows the five common cases.
+    let alone = cases[5..].iter().map(|case| figure(case, "mean_error_m")).fold(f64::INFINITY, f64::min);
+    assert!(figure(together, "mean_error_m") < alone, "{together}: the best camera has {alone} m");
+}
+
+#[test]
+fn the_same_seeds_give_the_same_files_and_figures() {
+    let flags = ["--duration-s", "60", "--false-detections", "0.5", "--missed", "0.1"];
+    let folders = [data_folder(), data_folder()];
+    let reports = folders.each_ref().map(|folder| {
+        simulate(folder.path(), &flags);
+        evaluate(folder.path(), "1280x720", &[])
+    });
+    assert_eq!(reports[0], reports[1]);
+    for name in ["detections_c1.csv", "detections_c3.csv", "fixes.csv", "identity.csv", "truth.csv"] {
+        let read = |at: usize| fs::read_to_string(folders[at].path().join(name)).expect("written");
+        assert_eq!(read(0), read(1), "{name}");
+        assert!(read(0).lines().count() > 50, "{name}");
+    }
+}
+
+#[test]
+fn the_files_of_a_site_are_those_that_pairing_reads() {
+    let folder = data_folder();
+    simulate(folder.path(), &["--duration-s", "60"]);
+    let file = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
+    let out = file("samples.csv");
+    let (detections, fixes) = (file("detections_c1.csv"), file("fixes.csv"));
+    let files = ["--detections", &detections, "--fixes", &fixes, "--out", &out];
+    run(&[&["pair", "--receiver", "phone-0=track-1"][..], &files].concat());
+    assert!(fs::read_to_string(out).expect("written").lines().count() > 1);
+}
+
+#[test]
+fn folders_and_flags_that_cannot_be_used_are_refused() {
+    let folder = data_folder();
+    let path = folder.path().to_str().expect("UTF-8");
+    for (arguments, told) in [
+        (vec!["evaluate", "--site", path], "fixes.csv"),
+        (vec!["evaluate", "--site", path, "--paper"], "cannot be used"),
+        (vec!["evaluate", "--redraws", "3"], "--site"),
+        (vec!["simulate", "site", "--out", path, "--missed", "2"], "--missed"),
+        (vec!["simulate", "site", "--out", path, "--walkers", "0", "--vehicles", "0"], "at least one"),
+        (vec!["simulate", "site"], "--out"),
+        (vec!["simulate"], "SCENE"),
+    ] {
+        let output = sightfix().args(&arguments).output().expect("runs");
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && error.contains(told), "{arguments:?}: {error}");
+    }
+}
+
+/// The real recording with the recorded phones and with redrawn ones.
+#[test]
+#[ignore = "needs ../shared/data"]
+fn shared_plaza_is_tracked_over_three_cameras() {
+    let plaza = shared("plaza");
+    let cases = evaluate(&plaza, "1920x1080", &[]);
+    let [together, oracle, degraded, ..] = &cases[..] else { panic!("{cases:?}") };
+    assert!(figure(together, "identity_f1_by_boxes") >= 0.97, "{together}");
+    assert!(figure(together, "handover_rate") >= 0.85, "{together}");
+    assert!(figure(oracle, "mota") - figure(together, "mota") <= 0.02, "{oracle}");
+    assert!(figure(oracle, "idf1") - figure(together, "idf1") <= 0.02, "{oracle}");
+    assert!(figure(degraded, "identity_f1_by_boxes") >= 0.92, "{degraded}");
+    let redrawn = evaluate(&plaza, "1920x1080", &["--redraws", "20"]);
+    assert!((0.88..=0.99).contains(&figure(&redrawn[0], "coverage95")), "{}", redrawn[0]);
+    let alone = redrawn[5..].iter().map(|case| figure(case, "mean_error_m")).fold(f64::INFINITY, f64::min);
+    assert!(figure(&redrawn[0], "mean_error_m") < alone, "the best camera has {alone} m: {}", redrawn[0]);
+}

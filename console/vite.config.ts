@@ -20,6 +20,7 @@ export default defineConfig({
     modulePreload: { polyfill: false },
     rollupOptions: { input: { index: resolve('index.html'), walk: resolve('walk.html') } },
   },
-  server: { proxy },
+  // The names of columns are those of the importer.
+  server: { proxy, fs: { allow: ['.', '../src/exchange'] } },
   preview: { proxy, headers: { 'content-security-policy': policy } },
 });

@@ -22,6 +22,9 @@ pub struct Config {
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
     pub allowed_hosts: Vec<String>,
+    /// Origins of other servers' pages that may use the REST interface from a browser, with a key, such as
+    /// `https://maps.example.org`; none by default.
+    pub cors_origins: Vec<String>,
     /// Addresses or networks (`10.0.0.0/8`) of proxies in front, whose `X-Forwarded-For` names the client.
     pub trusted_proxies: Vec<String>,
     /// Serve everybody on an address that other machines reach, while no key exists.
@@ -284,6 +287,10 @@ pub struct Limits {
     pub keys: u32,
     /// Entries of the audit log; beyond, the oldest is deleted.
     pub audit_entries: u32,
+    /// Answers that are stored under idempotency keys; beyond, the oldest is deleted.
+    pub idempotency_keys: u32,
+    /// Seconds for which an answer is repeated under its idempotency key.
+    pub idempotency_key_s: u32,
     /// Bytes of the database, beyond which nothing is stored; 0 is no limit but the disk's.
     pub database_bytes: u64,
     /// Bytes on the disk that are reserved for deletions when it is full; 0 reserves none.
@@ -301,11 +308,13 @@ impl Console {
     }
 }
 
-/// Scheme and host of a URL, which end up in a header; empty for a path of this server.
+/// The origin of tiles; empty for a path of this server.
 fn tile_origin(url: &str) -> Option<&str> {
-    if url.starts_with('/') && !url.starts_with("//") {
-        return Some("");
-    }
+    if url.starts_with('/') && !url.starts_with("//") { Some("") } else { url_origin(url) }
+}
+
+/// Scheme and host of a URL, which end up in a header.
+fn url_origin(url: &str) -> Option<&str> {
     let host_at = url.find("://")? + 3;
     let host = url[host_at..].split('/').next()?;
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b".-:[]".contains(&byte);
@@ -321,6 +330,7 @@ impl Default for Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             metrics_listen: None,
             allowed_hosts: Vec::new(),
+            cors_origins: Vec::new(),
             trusted_proxies: Vec::new(),
             insecure: false,
             admin_key: None,
@@ -409,6 +419,8 @@ impl Default for Limits {
             ended_evaluations: 1_000,
             keys: 1_000,
             audit_entries: 100_000,
+            idempotency_keys: 100_000,
+            idempotency_key_s: 86_400,
             database_bytes: 0,
             reserve_bytes: 32 << 20,
             drain_s: 8,
@@ -479,6 +491,7 @@ impl Config {
             .separator("__")
             .list_separator(",")
             .with_list_parse_key("allowed_hosts")
+            .with_list_parse_key("cors_origins")
             .with_list_parse_key("trusted_proxies")
             .with_list_parse_key("tls.client_camera_ids")
             .try_parsing(true);
@@ -528,6 +541,12 @@ impl Config {
         );
         self.tls.certificate_and_key()?;
         self.tls.client_scope()?;
+        for origin in &self.cors_origins {
+            anyhow::ensure!(
+                url_origin(origin) == Some(origin.as_str()),
+                "cors_origins must be origins like https://maps.example.org, without a path; `{origin}` is none"
+            );
+        }
         anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
         if let Some(url) = &self.console.tile_url {
             anyhow::ensure!(

@@ -8,6 +8,7 @@
 
 mod activity;
 mod connection;
+mod cors;
 mod credentials;
 mod frame_limit;
 mod guarded_stream;
@@ -159,12 +160,13 @@ impl Server {
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
-        let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
-        let pipeline = RequestPipeline::new(app.clone(), config.console, hosts, proxies, &shutdown);
+        let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
+        let cors = cors::layer(&config.cors_origins);
+        let pipeline = RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, &shutdown);
         let pipeline = Arc::new(pipeline);
         let monitored = async {
             let Some(listener) = monitoring else { return anyhow::Ok(()) };
-            let hosts = HostCheck::new(&config.allowed_hosts, listener.local_addr()?);
+            let hosts = HostCheck::new(&config.allowed_hosts, &[], listener.local_addr()?);
             let pipeline = Arc::new(RequestPipeline::monitoring(app.clone(), hosts, &shutdown));
             connection::accept(listener, pipeline, None, &config.limits, &shutdown).await;
             Ok(())

@@ -65,6 +65,9 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::NoModel => (409, code::FAILED_PRECONDITION, "The camera has no active model"),
         Kind::NoEarlierModel => (409, code::FAILED_PRECONDITION, "No other model version was active before"),
         Kind::ModelUnusable => (409, code::FAILED_PRECONDITION, "The stored model version cannot be used"),
+        Kind::IdempotencyKeyReused => {
+            (422, code::INVALID_ARGUMENT, "The idempotency key was used for another request")
+        }
         Kind::RunLive => (409, code::FAILED_PRECONDITION, "The camera has a training run that has not ended"),
         Kind::RunEnded => (409, code::FAILED_PRECONDITION, "The training run has ended"),
         Kind::EvaluationEnded => (409, code::FAILED_PRECONDITION, "The evaluation has ended"),

@@ -1,8 +1,20 @@
 // Files as people have them.
 import { expect, test } from '@playwright/test';
-import { guessMapping, isRejected, mapRow, missingFields, outputColumns, parseTable, toCsv, type MappedRow } from '../src/lib/csv';
+import { guessMapping, isRejected, mapRow, missingFields, outputColumns, parseTable, toCsv, type BoxForm, type MappedRow } from '../src/lib/csv';
 import { curlLine, grpcurlLine } from '../src/lib/request_lines';
 import { sigmaOf, walkCsv } from '../src/walk/queue';
+import cases from '../../tests/cases/column_mapping.json' with { type: 'json' };
+
+interface Case {
+  name: string;
+  csv: string;
+  box_form?: BoxForm;
+  box_unit?: 'px' | 'share';
+  box_px: number[];
+  fix_deg: number[];
+  sigma_m?: number;
+  time: string;
+}
 
 function mapped(text: string, image?: { width_px: number; height_px: number }): string {
   const table = parseTable(text);
@@ -61,4 +73,21 @@ test('a walk is saved in the columns of the importer', () => {
   // 68 % of a circular normal distribution lie within 1.5096 standard deviations.
   expect(fix.sigma_m).toBeCloseTo(5 / 1.5096, 3);
   expect(walkCsv('phone', [fix])).toBe('time,receiver_id,longitude,latitude,sigma_m\n2026-01-01T00:00:00.000Z,phone,11.00000000,48.00000000,3.312\n');
+});
+
+test('the cases of the importer are mapped alike', () => {
+  for (const { name, csv, box_form, box_unit, box_px, fix_deg, sigma_m, time } of cases as Case[]) {
+    const table = parseTable(csv);
+    const mapping = guessMapping(table);
+    if (box_form) mapping.boxForm = box_form;
+    expect(mapping.normalised, name).toBe(box_unit === 'share');
+    const row = mapRow(table.rows[0]!, mapping, { width_px: 1000, height_px: 500 });
+    if (isRejected(row)) throw new Error(`${name}: ${row.field}: ${row.reason}`);
+    const cell = (field: string): string => row.cells[outputColumns(mapping).indexOf(field)] ?? '';
+    expect(['left', 'top', 'width', 'height'].map((field) => Number(cell(field))), name).toEqual(box_px);
+    expect(['longitude', 'latitude'].map((field) => Number(cell(field))), name).toEqual(fix_deg);
+    expect(cell('sigma_m'), name).toBe(sigma_m === undefined ? '' : String(sigma_m));
+    expect(Date.parse(cell('time')), name).toBe(Date.parse(time));
+    expect(cell('target_id'), name).toBe('a');
+  }
 });

@@ -49,6 +49,29 @@ test('bad rows are named with their lines, and can be downloaded', async ({ cons
   expect(saved[2]).toMatch(/^"","4","latitude/);
 });
 
+test.describe('an import whose answer is lost', () => {
+  test.use({ allowed: /ERR_FAILED/ });
+
+  test('is sent again under its key, and counts as made once', async ({ console: page, server }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate' });
+    await page.goto(`${server.url}/#/cameras/gate/data`);
+    const keys: string[] = [];
+    await page.route('**/v1/cameras/gate/samples', async (route) => {
+      if (route.request().method() !== 'POST') return route.fallback();
+      keys.push(route.request().headers()['idempotency-key']!);
+      if (keys.length > 1) return route.fallback();
+      expect((await route.fetch()).status()).toBe(200);
+      return route.abort('failed');
+    });
+    const csv = [header, '2026-01-01T00:00:00Z,a,10,20,30,40,11.0,48.0', '2026-01-01T00:00:01Z,a,11,20,30,40,11.0,48.0'].join('\n');
+    await page.locator('input[type=file]').setInputFiles({ name: 'walk.csv', mimeType: 'text/csv', buffer: Buffer.from(csv) });
+    await page.getByRole('button', { name: 'Import', exact: true }).click();
+    await expect(page.getByText('2 samples stored, 0 stored before, 0 rows rejected.')).toBeVisible();
+    expect(keys).toHaveLength(2);
+    expect(keys[0]).toBe(keys[1]);
+  });
+});
+
 test('what is no table, and what has no fixes, is said before anything is sent', async ({ console: page, server }) => {
   await server.request('POST', '/v1/cameras', { id: 'gate' });
   await page.goto(`${server.url}/#/cameras/gate/data`);
@@ -186,5 +209,26 @@ test.describe('the phone page', () => {
     const downloading = page.waitForEvent('download');
     await page.getByRole('button', { name: 'Save as CSV' }).click();
     expect(rowsOf(readFileSync(await (await downloading).path(), 'utf8'))).toHaveLength(2);
+  });
+
+  test('its positions become samples with the boxes that the camera sends', async ({ console: page, server, context }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate', receivers: [{ receiver_id: 'phone-7', target_id: 'walker' }] });
+    await page.goto(`${server.url}/walk#camera=gate&receiver=phone-7`);
+    let left_px = 100;
+    const sending: Promise<unknown>[] = [];
+    const camera = setInterval(() => {
+      left_px += 1;
+      const box = { time: new Date().toISOString(), target_id: 'walker', bounding_box: { left_px, top_px: 20, width_px: 30, height_px: 60 } };
+      sending.push(server.request('POST', '/v1/cameras/gate/tracks?store_samples=true', box));
+    }, 200);
+    await page.getByRole('button', { name: 'Start recording' }).click();
+    await expect(page.locator('dl div', { hasText: 'Latest position' }).locator('dd')).not.toHaveText('–');
+    // The browser's first position is from before the camera sent anything.
+    await context.setGeolocation({ longitude: 11.0001, latitude: 48.0001, accuracy: 5 });
+    await expect(page.locator('dl div', { hasText: 'In samples' }).locator('dd')).toHaveText('1');
+    clearInterval(camera);
+    await Promise.all(sending);
+    const samples = await server.request<{ items: { target_id: string; fix: { longitude_deg: number } }[] }>('GET', '/v1/cameras/gate/samples');
+    expect(samples.items.map(({ target_id, fix }) => [target_id, fix.longitude_deg])).toEqual([['walker', 11.0001]]);
   });
 });

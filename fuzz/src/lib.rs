@@ -7,7 +7,7 @@ use std::sync::LazyLock;
 use prost::Message as _;
 use sightfix::config::{Config, Overrides};
 use sightfix::domain::{
-    AuditNumber, BoundingBox, CameraId, EvaluationId, Fix, KeyId, KeySecret, Observation, RunId,
+    AuditNumber, BoundingBox, CameraId, EvaluationId, Fix, KeyId, KeySecret, Observation, Receivers, RunId,
     StoredSample, TimeBounds, parse_time,
 };
 use sightfix::exchange::{
@@ -132,7 +132,7 @@ fn ndjson(input: &[u8]) {
 fn json(input: &[u8]) {
     read_rows(input, Format::Json);
     if let Ok(observation) = wire::parse_document::<wire::Observation<'_>>(input)
-        && let Ok(observation) = observation.to_domain(&rules().time_bounds, None)
+        && let Ok(observation) = observation.to_domain(&rules().time_bounds, None, &Receivers::default())
     {
         check_fusion(&observation);
     }

@@ -11,6 +11,7 @@ mod camera_statuses;
 mod cameras;
 mod evaluations;
 mod fusion;
+mod idempotency;
 mod keys;
 mod live;
 mod matching;
@@ -39,16 +40,16 @@ use crate::telemetry::Metrics;
 pub use camera_statuses::CameraStatus;
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use live::{
-    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, ItemResult, LiveStream,
-    LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind, SiteEvents,
-    SiteTracks, StoredSiteEvent, TargetUpdate, TrackPoint, WorldSighting, WorldTrackPoint,
+    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
+    LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind,
+    SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate, TrackPoint, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
-pub use samples::{ImportReport, RejectedRow};
+pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
 pub use training::RunRequest;
 
@@ -111,7 +112,9 @@ impl App {
         limits: Limits,
         metrics: Metrics,
     ) -> crate::domain::Result<Self> {
-        let registry = Registry::default();
+        let mut run_id = [0; 8];
+        randomness.fill(&mut run_id);
+        let registry = Registry::of_run(u64::from_le_bytes(run_id));
         let filled = store.fill_in_model_checksums().await?;
         if filled > 0 {
             tracing::info!(models = filled, "stored checksums of model versions of an earlier release");
@@ -219,6 +222,8 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
         ended_evaluations: limits.ended_evaluations,
         keys: limits.keys,
         audit_entries: limits.audit_entries,
+        idempotency_keys: limits.idempotency_keys,
+        idempotency_key_s: limits.idempotency_key_s,
         database_bytes: match limits.database_bytes {
             0 => None,
             bytes => Some(bytes),

@@ -5,12 +5,12 @@ use std::sync::Arc;
 
 use super::matching::{MatchReport, MatchRequest};
 use super::recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
-use super::samples::{BATCH_ROWS, told_what_is_stored};
+use super::samples::{BATCH_ROWS, Import, ImportOptions};
 use super::{App, ImportReport};
 use crate::domain::{
-    CameraId, Durability, Error, ImageSize, Receiver, ReceiverId, Receivers, Result, StoredSample, TargetId,
+    CameraId, Error, ImageSize, Receiver, ReceiverId, Receivers, Result, StoredSample, TargetId,
 };
-use crate::exchange::{self, FixFormat, Format, RowRules};
+use crate::exchange::{self, CsvLayout, FixFormat, Format, RowRules};
 use crate::fusion::association::MatchSettings;
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::PairingSettings;
@@ -34,8 +34,10 @@ pub struct PairedImport<D, F> {
     pub receiver_id: Option<ReceiverId>,
     /// Whether boxes that find no fix are stored as samples without one.
     pub keeps_unpaired: bool,
-    /// When the samples are acknowledged.
-    pub durability: Durability,
+    /// How the samples are stored.
+    pub options: ImportOptions,
+    /// How CSV files are laid out.
+    pub layout: CsvLayout,
     /// Whether the clock offsets are estimated, too. They are reported, never applied.
     pub estimates_offsets: bool,
     /// How boxes are matched with receivers first; `None` where their targets have the same ids.
@@ -99,29 +101,48 @@ impl App {
         };
         let limits =
             RecordingLimits { rows: self.limits.pairing_rows, rejected_rows: self.limits.rejected_rows };
-        let durability = import.durability;
+        let options = import.options.clone();
         let _place = self.pairings.acquire().await.map_err(Error::fault)?;
         let pairing = tokio::task::spawn_blocking(move || import.paired(&rules, &camera, limits));
-        let Work { mut samples, mut report } = pairing.await.map_err(Error::fault)??;
+        let Work { samples, mut report } = pairing.await.map_err(Error::fault)??;
+        // The same files pair alike, so of a repeated import only what became of the samples is stored.
+        report.samples = match self.repeated_import(&options).await? {
+            Some(first) => first,
+            None => self.store_paired(id, samples, options).await?,
+        };
+        self.metrics.imported(0, 0, report.rejected.count);
+        Ok(report)
+    }
+
+    async fn store_paired(
+        &self,
+        id: &CameraId,
+        mut samples: Vec<StoredSample>,
+        options: ImportOptions,
+    ) -> Result<ImportReport> {
+        let mut import = Import::new(self, id, options)?;
         while !samples.is_empty() {
             let rest = samples.split_off(samples.len().min(BATCH_ROWS));
-            let batch = std::mem::replace(&mut samples, rest).into_iter().map(Ok).collect();
-            let stored = self.store_batch(id, batch, durability, &mut report.samples).await;
-            stored.map_err(|error| told_what_is_stored(error, &report.samples))?;
+            let batch = std::mem::replace(&mut samples, rest);
+            import.push(batch.into_iter().map(Ok).collect()).await?;
         }
-        let ImportReport { accepted, duplicate, .. } = report.samples;
-        self.metrics.imported(accepted, duplicate, report.rejected.count);
-        Ok(report)
+        import.finish(Ok(())).await
     }
 }
 
 impl<D: Read, F: Read> PairedImport<D, F> {
     fn paired(self, rules: &RowRules, camera: &CameraContext, limits: RecordingLimits) -> Result<Work> {
         let receivers = &camera.receivers;
-        let boxes = exchange::read_detections(self.detections, self.detections_format, rules, self.target_id)
-            .map_err(|error| of_part(Part::Detections, error))?;
-        let fixes = exchange::read_received_fixes(self.fixes, self.fixes_format, rules.time_bounds)
-            .map_err(|error| of_part(Part::Fixes, error))?;
+        let boxes = exchange::read_detections(
+            self.detections,
+            (self.detections_format, &self.layout),
+            rules,
+            self.target_id,
+        )
+        .map_err(|error| of_part(Part::Detections, error))?;
+        let fixes =
+            exchange::read_received_fixes(self.fixes, (self.fixes_format, &self.layout), rules.time_bounds)
+                .map_err(|error| of_part(Part::Fixes, error))?;
         let mut recording = Recording::read(boxes, fixes, limits)?;
         let unnamed_fixes_of = recording.name_fixes(self.fixes_format, receivers, self.receiver_id)?;
         let clock_offsets =

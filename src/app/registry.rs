@@ -87,9 +87,22 @@ pub struct Registry {
     cameras: ArcSwap<HashMap<CameraId, Arc<ActiveCamera>>>,
     /// Held from reading the store to replacing the map, so that no change undoes a later one.
     change: Mutex<()>,
+    /// Tells this run of the server apart from others.
+    run_id: u64,
 }
 
 impl Registry {
+    /// An empty registry of one run of the server.
+    #[must_use]
+    pub fn of_run(run_id: u64) -> Self {
+        Self { run_id, ..Self::default() }
+    }
+
+    /// Number of the event log of a camera; keys are never used twice.
+    const fn event_log(&self, key: CameraKey) -> u64 {
+        self.run_id.wrapping_add(key.0.cast_unsigned())
+    }
+
     /// What answers for a camera.
     #[must_use]
     pub fn get(&self, id: &CameraId) -> Option<Arc<ActiveCamera>> {
@@ -234,7 +247,8 @@ impl Registry {
                 GnssError::Known(sigma) => Some(sigma.variance_m2()),
                 GnssError::Unknown => None,
             },
-            live: same.map_or_else(CameraLive::new, |known| known.live.clone()),
+            live: same
+                .map_or_else(|| CameraLive::new(self.event_log(camera.key)), |known| known.live.clone()),
             retrain_when_moved: camera.profile.retrain_when_moved,
             site: camera.profile.site,
             receivers: camera.profile.receivers,

@@ -1,23 +1,40 @@
 //! Samples: import, list, count, delete.
 
 use std::io::Read;
+use std::sync::Arc;
 
 use futures_util::{Stream, StreamExt as _};
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
 
+use super::access::Permission;
+use super::idempotency::record_of;
 use super::{App, Page, page_of};
-use crate::domain::{CameraId, Durability, Error, Result, SampleCount, StoredSample, TargetId};
-use crate::exchange::{self, Cursor, Format, RowError, RowRules};
-use crate::store::{SampleFilter, SampleKey};
+use crate::domain::{
+    CameraId, Durability, Error, IdempotentRequest, OnConflict, Result, SampleCount, StoredSample, TargetId,
+};
+use crate::exchange::{self, CsvLayout, Cursor, Format, RowError, RowRules};
+use crate::store::{Completion, InsertOptions, Inserted, SampleFilter, SampleKey};
 
 /// Rows that go to the store at once.
 pub(super) const BATCH_ROWS: usize = 1_000;
 /// Batches that are read ahead of the store.
 const BATCHES_AHEAD: usize = 8;
 
+/// How rows are imported.
+#[derive(Debug, Clone, Default)]
+pub struct ImportOptions {
+    /// When they are acknowledged.
+    pub durability: Durability,
+    /// What becomes of samples that are stored already.
+    pub on_conflict: OnConflict,
+    /// Given if the client may send the same import again.
+    pub idempotent: Option<IdempotentRequest>,
+}
+
 /// What became of an import's rows.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ImportReport {
     /// Stored now.
     pub accepted: u64,
@@ -25,6 +42,8 @@ pub struct ImportReport {
     pub without_fix: u64,
     /// The same camera, target and time were stored before, or stand twice in the import.
     pub duplicate: u64,
+    /// Of the accepted ones, those that took the place of a stored sample on request.
+    pub replaced: u64,
     /// Not stored for a fault of their own.
     pub rejected: u64,
     /// The first of them, with their reasons.
@@ -35,6 +54,22 @@ pub struct ImportReport {
 pub type RejectedRow = RowError;
 
 impl ImportReport {
+    /// The report with a batch more.
+    fn and(self, inserted: &Inserted) -> Self {
+        Self {
+            accepted: self.accepted + inserted.accepted,
+            without_fix: self.without_fix + inserted.without_fix,
+            duplicate: self.duplicate + inserted.duplicate,
+            replaced: self.replaced + inserted.replaced,
+            ..self
+        }
+    }
+
+    fn to_json(&self) -> String {
+        // Numbers and texts are always JSON.
+        serde_json::to_string(self).unwrap_or_default()
+    }
+
     fn reject(&mut self, row: RowError, tell_at_most: usize) {
         self.rejected += 1;
         if self.rejected_rows.len() < tell_at_most {
@@ -53,67 +88,86 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, before anything is read; `MalformedBody` for a file that cannot be read as
     /// its format, `InsufficientStorage`: batches before that place are stored, and the message tells
-    /// how many rows.
+    /// how many rows; `PermissionDenied` for a caller who may not replace; `IdempotencyKeyReused`.
     pub async fn import_file(
         &self,
         id: &CameraId,
         file: impl Read + Send + 'static,
-        format: Format,
-        durability: Durability,
+        (format, layout): (Format, CsvLayout),
+        options: ImportOptions,
     ) -> Result<ImportReport> {
         let rules = self.row_rules(id).await?;
+        if let Some(first) = self.repeated_import(&options).await? {
+            return Ok(first);
+        }
+        let mut import = Import::new(self, id, options)?;
         let (sender, mut batches) = mpsc::channel(BATCHES_AHEAD);
-        let reading = tokio::task::spawn_blocking(move || read_batches(file, format, &rules, &sender));
-        let mut report = ImportReport::default();
+        let reading =
+            tokio::task::spawn_blocking(move || read_batches(file, format, &layout, &rules, &sender));
         while let Some(mut batch) = batches.recv().await {
             // What was read while the last batch was stored goes into one transaction.
             while let Ok(more) = batches.try_recv() {
                 batch.extend(more);
             }
-            let stored = self.store_batch(id, batch, durability, &mut report).await;
-            stored.map_err(|error| told_what_is_stored(error, &report))?;
+            import.push(batch).await?;
         }
         let read = reading.await.map_err(Error::fault)?;
-        self.metrics.imported(report.accepted, report.duplicate, report.rejected);
-        read.map_err(|error| told_what_is_stored(error, &report))?;
-        Ok(report)
+        import.finish(read).await
     }
 
     /// Stores rows that come one by one over a transport that has parsed them.
     ///
     /// # Errors
     /// `CameraNotFound`; the stream's own error, after the rows before it were stored; its message
-    /// tells how many.
+    /// tells how many; `PermissionDenied` for a caller who may not replace; `IdempotencyKeyReused`.
     pub async fn import_rows(
         &self,
         id: &CameraId,
         rows: impl Stream<Item = Result<Result<StoredSample, RowError>>> + Send,
-        durability: Durability,
+        options: ImportOptions,
     ) -> Result<ImportReport> {
         self.active_camera(id).await?;
-        let mut report = ImportReport::default();
         let mut batches = std::pin::pin!(rows.ready_chunks(BATCH_ROWS));
+        if let Some(request) = &options.idempotent
+            && self.stored_answer(request).await?.is_some()
+        {
+            // What is asked for is known once all of it has come.
+            while let Some(chunk) = batches.next().await {
+                chunk.into_iter().try_for_each(|row| row.map(drop))?;
+            }
+        }
+        if let Some(first) = self.repeated_import(&options).await? {
+            return Ok(first);
+        }
+        let mut import = Import::new(self, id, options)?;
+        let mut end = Ok(());
         while let Some(chunk) = batches.next().await {
-            let mut broken = None;
             let mut batch = Vec::with_capacity(chunk.len());
             for row in chunk {
                 match row {
                     Ok(row) => batch.push(row),
                     Err(error) => {
-                        broken = Some(error);
+                        end = Err(error);
                         break;
                     }
                 }
             }
-            let stored = self.store_batch(id, batch, durability, &mut report).await;
-            stored.map_err(|error| told_what_is_stored(error, &report))?;
-            if let Some(error) = broken {
-                self.metrics.imported(report.accepted, report.duplicate, report.rejected);
-                return Err(told_what_is_stored(error, &report));
+            import.push(batch).await?;
+            if end.is_err() {
+                break;
             }
         }
-        self.metrics.imported(report.accepted, report.duplicate, report.rejected);
-        Ok(report)
+        import.finish(end).await
+    }
+
+    /// What became of an import that was made under the same key before, if any.
+    ///
+    /// # Errors
+    /// `IdempotencyKeyReused` if that was another one.
+    pub(super) async fn repeated_import(&self, options: &ImportOptions) -> Result<Option<ImportReport>> {
+        let Some(request) = &options.idempotent else { return Ok(None) };
+        let first = self.first_answer(request).await?;
+        first.map(|report| serde_json::from_str(&report).map_err(Error::fault)).transpose()
     }
 
     /// What the rows of a camera must keep.
@@ -163,28 +217,81 @@ impl App {
     pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
         self.store.delete_samples(id, filter, self.clock.now()).await
     }
+}
 
-    pub(super) async fn store_batch(
-        &self,
-        id: &CameraId,
-        batch: Vec<Result<StoredSample, RowError>>,
-        durability: Durability,
-        report: &mut ImportReport,
-    ) -> Result<()> {
+/// An import under way. The latest batch waits, so that the last one is known when it is stored: with it goes
+/// the answer, if the client may repeat the import.
+pub(super) struct Import<'a> {
+    app: &'a App,
+    id: &'a CameraId,
+    options: ImportOptions,
+    waiting: Option<Batch>,
+    report: ImportReport,
+}
+
+impl<'a> Import<'a> {
+    /// # Errors
+    /// `PermissionDenied` for a caller who may not replace samples.
+    pub(super) fn new(app: &'a App, id: &'a CameraId, options: ImportOptions) -> Result<Self> {
+        if options.on_conflict == OnConflict::Replace {
+            // As whoever deletes them.
+            app.caller().authorize(Permission::Operate)?;
+        }
+        Ok(Self { app, id, options, waiting: None, report: ImportReport::default() })
+    }
+
+    /// Stores the batch before this one.
+    ///
+    /// # Errors
+    /// As the store; the message tells how many rows are stored.
+    pub(super) async fn push(&mut self, batch: Batch) -> Result<()> {
+        match self.waiting.replace(batch) {
+            Some(before) => self.store(before, false).await,
+            None => Ok(()),
+        }
+    }
+
+    /// Stores the last batch, after which the rows ended as `end` says.
+    ///
+    /// # Errors
+    /// That of `end`, and as the store; the message tells how many rows are stored.
+    pub(super) async fn finish(mut self, end: Result<()>) -> Result<ImportReport> {
+        let last = self.waiting.take().unwrap_or_default();
+        let stored = self.store(last, end.is_ok()).await;
+        let ImportReport { accepted, duplicate, rejected, .. } = self.report;
+        self.app.metrics.imported(accepted, duplicate, rejected);
+        stored?;
+        end.map_err(|error| with_stored_rows(error, &self.report))?;
+        // The answer that was stored: that of another request with the same key, if it came first.
+        Ok(self.app.repeated_import(&self.options).await?.unwrap_or(self.report))
+    }
+
+    async fn store(&mut self, batch: Batch, is_last: bool) -> Result<()> {
         let mut samples = Vec::with_capacity(batch.len());
         for row in batch {
             match row {
                 Ok(sample) => samples.push(sample),
-                Err(row) => report.reject(row, self.limits.rejected_rows),
+                Err(row) => self.reject(row),
             }
         }
-        if !samples.is_empty() {
-            let inserted = self.store.insert_samples(id, samples, durability).await?;
-            report.accepted += inserted.accepted;
-            report.duplicate += inserted.duplicate;
-            report.without_fix += inserted.without_fix;
+        let completion = self.options.idempotent.as_ref().filter(|_| is_last).map(|request| {
+            let before = self.report.clone();
+            let answer = move |inserted: &Inserted| before.clone().and(inserted).to_json();
+            Completion { record: record_of(request), answer: Arc::new(answer) }
+        });
+        if samples.is_empty() && completion.is_none() {
+            return Ok(());
         }
+        let ImportOptions { durability, on_conflict, .. } = self.options;
+        let options = InsertOptions { durability, on_conflict, completion, now: self.app.clock.now() };
+        let inserted = self.app.store.insert_samples(self.id, samples, options).await;
+        let inserted = inserted.map_err(|error| with_stored_rows(error, &self.report))?;
+        self.report = std::mem::take(&mut self.report).and(&inserted);
         Ok(())
+    }
+
+    fn reject(&mut self, row: RowError) {
+        self.report.reject(row, self.app.limits.rejected_rows);
     }
 }
 
@@ -205,16 +312,17 @@ impl Cursor for SampleKey {
     }
 }
 
-type Batch = Vec<Result<StoredSample, RowError>>;
+pub(super) type Batch = Vec<Result<StoredSample, RowError>>;
 
 fn read_batches(
     file: impl Read,
     format: Format,
+    layout: &CsvLayout,
     rules: &RowRules,
     batches: &mpsc::Sender<Batch>,
 ) -> Result<()> {
     let mut batch = Vec::with_capacity(BATCH_ROWS);
-    for row in exchange::read_samples(file, format, rules)? {
+    for row in exchange::read_samples(file, (format, layout), rules)? {
         match row {
             Ok(row) => batch.push(row),
             Err(error) => {
@@ -233,7 +341,7 @@ fn read_batches(
     Ok(())
 }
 
-pub(super) fn told_what_is_stored(error: Error, report: &ImportReport) -> Error {
+fn with_stored_rows(error: Error, report: &ImportReport) -> Error {
     match error {
         Error::Refused(mut refusal) if report.accepted + report.duplicate > 0 => {
             refusal.message = format!(

@@ -5,9 +5,11 @@ use std::time::Duration;
 use futures_util::{Stream, StreamExt as _, stream};
 use jiff::Timestamp;
 
+use super::idempotency::record_of;
 use super::{App, Page, page_of};
 use crate::domain::{
-    CameraId, EpochReport, Error, ErrorKind, Recipe, Result, RunId, TimeRange, TrainingOptions, TrainingRun,
+    CameraId, EpochReport, Error, ErrorKind, IdempotentRequest, Recipe, Result, RunId, TimeRange,
+    TrainingOptions, TrainingRun,
 };
 use crate::geo::{Position, distance_m};
 use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
@@ -38,6 +40,25 @@ impl App {
     /// `CameraNotFound`; `InvalidArgument` naming the field; `UnusableSamples` if there is none;
     /// `RunLive`; `Overloaded` beyond the limit of live runs.
     pub async fn start_run(&self, id: &CameraId, request: RunRequest) -> Result<TrainingRun> {
+        self.start_run_once(id, request, None).await
+    }
+
+    /// As [`App::start_run`]; if the client has made the same request before, it gets the run of then as it is
+    /// now.
+    ///
+    /// # Errors
+    /// As [`App::start_run`]; `IdempotencyKeyReused`; `RunNotFound` if the run was deleted since.
+    pub async fn start_run_once(
+        &self,
+        id: &CameraId,
+        request: RunRequest,
+        idempotent: Option<IdempotentRequest>,
+    ) -> Result<TrainingRun> {
+        if let Some(request) = &idempotent
+            && let Some(first) = self.first_answer(request).await?
+        {
+            return self.run(id, first.parse()?).await;
+        }
         let camera = self.store.camera(id).await?;
         let most = self.limits.epochs;
         if request.epochs.is_some_and(|epochs| !(1..=most).contains(&epochs)) {
@@ -55,7 +76,11 @@ impl App {
         check_extent(id, count, extent)?;
         let now = self.clock.now();
         let run = RunId(self.randomness.uuid_v7(now));
-        let run = self.store.insert_run(run, id, &options, self.limits.live_runs, now).await?;
+        let record = idempotent.as_ref().map(record_of);
+        let run = self
+            .store
+            .insert_run_once(run, id, &options, self.limits.live_runs, record.as_ref(), now)
+            .await?;
         self.training_queue.notify();
         Ok(run)
     }

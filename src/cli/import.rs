@@ -5,13 +5,17 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
+use super::layout::LayoutFlags;
 use super::output::print_line;
 use super::progress::Progress;
-use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime, site_id};
-use crate::app::{App, ImportReport};
-use crate::domain::{
-    CameraId, Durability, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera, NewSite, SiteId,
+use super::{
+    DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime, site_id, target_id,
 };
+use crate::app::{App, ImportOptions, ImportReport};
+use crate::domain::{
+    CameraId, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera, NewSite, OnConflict, SiteId, TargetId,
+};
+use crate::exchange::CsvLayout;
 
 /// Import samples from a file into a camera
 #[derive(Args)]
@@ -36,6 +40,14 @@ pub(super) struct Import {
     /// Site of the camera, for --create; it is created, too, if it does not exist
     #[arg(long, value_name = "ID", value_parser = site_id, requires = "create")]
     site: Option<SiteId>,
+    /// Let each sample take the place of a stored one of the same target and time
+    #[arg(long)]
+    replace: bool,
+    /// The target of rows that name none
+    #[arg(long, value_name = "ID", value_parser = target_id)]
+    target_id: Option<TargetId>,
+    #[command(flatten)]
+    layout: LayoutFlags,
     #[command(flatten)]
     folder: DataFolder,
 }
@@ -58,7 +70,10 @@ impl Import {
             if self.create {
                 self.create_camera(&app).await?;
             }
-            let report = app.import_file(&self.camera, source, format, Durability::Synced).await;
+            let layout = CsvLayout { target_id: self.target_id.clone(), ..self.layout.to_layout() };
+            let on_conflict = if self.replace { OnConflict::Replace } else { OnConflict::Keep };
+            let options = ImportOptions { on_conflict, ..ImportOptions::default() };
+            let report = app.import_file(&self.camera, source, (format, layout), options).await;
             app.store.close().await;
             anyhow::Ok(report?)
         })?;
@@ -117,10 +132,13 @@ impl Import {
 }
 
 fn print(report: &ImportReport) -> anyhow::Result<()> {
-    let ImportReport { accepted, without_fix, duplicate, rejected, rejected_rows } = report;
+    let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows } = report;
     print_line(&format_args!(
         "accepted {accepted} (without a fix {without_fix}), duplicate {duplicate}, rejected {rejected}"
     ))?;
+    if *replaced > 0 {
+        print_line(&format_args!("replaced {replaced}"))?;
+    }
     for row in rejected_rows {
         print_line(&format_args!("line {}: {}: {}", row.line, row.field, row.reason))?;
     }

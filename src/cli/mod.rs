@@ -14,6 +14,7 @@ mod gnss_error;
 mod health;
 mod import;
 mod keys;
+mod layout;
 mod openapi;
 mod output;
 mod pair;

@@ -9,6 +9,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::import::image_size;
+use super::layout::LayoutFlags;
 use super::output::{print_line, print_note};
 use super::{
     DataFolder, MissingData, camera_id, format_of, open_app, open_file, receiver_id, runtime, target_id,
@@ -74,6 +75,8 @@ pub(super) struct Pair {
     #[arg(long)]
     keep_unpaired: bool,
     #[command(flatten)]
+    layout: LayoutFlags,
+    #[command(flatten)]
     matching: MatchFlags,
 }
 
@@ -90,8 +93,8 @@ struct MatchFlags {
     /// The camera whose active model is used to match
     #[arg(long, value_name = "ID", value_parser = camera_id, requires = "matches")]
     camera: Option<CameraId>,
-    /// Size of the image, to match without a model
-    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size, requires = "matches")]
+    /// Size of the image, to match without a model, and for --box-unit share
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size)]
     image_size: Option<ImageSize>,
     /// Leave out samples whose match is less probable than this
     #[arg(long, value_name = "P", requires = "matches", default_value_t = 0.9)]
@@ -208,16 +211,20 @@ impl Pair {
         if let Some(out) = &self.out {
             format_of(out)?; // fail early
         }
-        let rules = RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size: None };
+        let rules = RowRules {
+            time_bounds: TimeBounds::at(Clock::system().now()),
+            image_size: self.matching.image_size,
+        };
+        let layout = self.layout.to_layout();
         let (detections, fixes) = (open_file(&self.detections)?, open_file(&self.fixes)?);
         let boxes = exchange::read_detections(
             detections,
-            format_of(&self.detections)?,
+            (format_of(&self.detections)?, &layout),
             &rules,
             self.target_id.clone(),
         )
         .map_err(|error| of_part(Part::Detections, error))?;
-        let fixes = exchange::read_received_fixes(fixes, format, rules.time_bounds)
+        let fixes = exchange::read_received_fixes(fixes, (format, &layout), rules.time_bounds)
             .map_err(|error| of_part(Part::Fixes, error))?;
         let limits = RecordingLimits { rows: usize::MAX, rejected_rows: Limits::default().rejected_rows };
         Ok((Recording::read(boxes, fixes, limits)?, format))

@@ -49,6 +49,8 @@ pub enum AuditAction {
     SiteDeleted,
     /// Samples were deleted.
     SamplesDeleted,
+    /// Stored samples were replaced by those of an import.
+    SamplesReplaced,
     /// A training run was queued.
     RunStarted,
     /// A training run was cancelled.

@@ -62,6 +62,8 @@ pub enum ErrorKind {
     ModelUnusable,
     /// The camera has a training run that has not ended.
     RunLive,
+    /// The idempotency key was used for another request.
+    IdempotencyKeyReused,
     /// The training run has ended already.
     RunEnded,
     /// The evaluation has ended already.
@@ -140,7 +142,8 @@ pub fn convert_all<T, R>(
         return Ok(converted);
     }
     let message = format!("nothing was done, for the {list} at fault");
-    Err(Error::Refused(Refusal { kind: ErrorKind::InvalidArgument, message, violations }))
+    let kind = ErrorKind::InvalidArgument;
+    Err(Error::Refused(Refusal { kind, message, violations, conflicting_id: None }))
 }
 
 /// One invalid field.
@@ -171,6 +174,8 @@ pub struct Refusal {
     pub message: String,
     /// The invalid fields, if any.
     pub violations: Vec<Violation>,
+    /// Id of what stands in the way, for a conflict with something that the caller can look at.
+    pub conflicting_id: Option<String>,
 }
 
 impl fmt::Display for Refusal {
@@ -223,7 +228,7 @@ pub enum Error {
 impl Error {
     /// A refusal without a field.
     pub fn refused(kind: ErrorKind, message: impl Into<String>) -> Self {
-        Self::Refused(Refusal { kind, message: message.into(), violations: Vec::new() })
+        Self::Refused(Refusal { kind, message: message.into(), violations: Vec::new(), conflicting_id: None })
     }
 
     /// An invalid field.
@@ -234,12 +239,41 @@ impl Error {
     /// A refusal that names one field.
     pub fn field(kind: ErrorKind, field: impl Into<String>, message: impl Into<String>) -> Self {
         let violation = Violation { field: field.into(), message: message.into() };
-        Self::Refused(Refusal { kind, message: violation.message.clone(), violations: vec![violation] })
+        Self::Refused(Refusal {
+            kind,
+            message: violation.message.clone(),
+            violations: vec![violation],
+            conflicting_id: None,
+        })
+    }
+
+    /// A refusal for something of that id, which stands in the way.
+    pub fn conflict(kind: ErrorKind, id: impl Into<String>, message: impl Into<String>) -> Self {
+        Self::Refused(Refusal {
+            kind,
+            message: message.into(),
+            violations: Vec::new(),
+            conflicting_id: Some(id.into()),
+        })
     }
 
     /// A fault with its cause.
     pub fn fault(cause: impl Into<Box<dyn StdError + Send + Sync>>) -> Self {
         Self::Fault(Fault(cause.into()))
+    }
+
+    /// A refusal for all of these fields, given with what is wrong with them; nothing if there are none.
+    ///
+    /// # Errors
+    /// `InvalidArgument`.
+    pub fn check_all(message: &str, fields: impl Iterator<Item = (String, String)>) -> Result<()> {
+        let violations = fields.map(|(field, message)| Violation { field, message });
+        let violations: Vec<_> = violations.take(MOST_VIOLATIONS).collect();
+        if violations.is_empty() {
+            return Ok(());
+        }
+        let (kind, message) = (ErrorKind::InvalidArgument, message.to_owned());
+        Err(Self::Refused(Refusal { kind, message, violations, conflicting_id: None }))
     }
 
     /// The kind that `status.rs` maps.

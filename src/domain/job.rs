@@ -44,7 +44,7 @@ job_id!(
     "an evaluation's id is a UUID"
 );
 
-/// State of a job. Queued and running jobs are live; the others have ended.
+/// State of a job. Queued, running and cancelling jobs are live; the others have ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "snake_case")]
 pub enum JobState {
@@ -52,6 +52,8 @@ pub enum JobState {
     Queued,
     /// Claimed by a worker.
     Running,
+    /// Claimed by a worker, which ends it at its next heartbeat: its cancellation was requested.
+    Cancelling,
     /// Completed.
     Succeeded,
     /// Ended by an error, which the outcome describes.

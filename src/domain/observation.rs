@@ -8,7 +8,7 @@ use super::error::{Error, Result};
 use super::gnss_error::SigmaM;
 use super::names::{ReceiverId, TargetClass, TargetId};
 use super::score::Score;
-use crate::geo::Position;
+use crate::geo::{PlaneCovariance, Position};
 
 /// A GNSS position; its time is that of the [`Observation`] or [`super::Sample`] that holds it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -204,6 +204,10 @@ pub struct FusedFix {
     pub e_gnss_m2: Option<f64>,
     /// Radius about `fused` that contains the true position with 95 % probability, m.
     pub r95_m: f64,
+    /// Covariance of the normal distribution about `fused` that has this radius, m2.
+    pub covariance: PlaneCovariance,
+    /// The same of the regressed position, if there is one.
+    pub regressed_covariance: Option<PlaneCovariance>,
     /// eX of (1): the auto-encoder's reconstruction error, in the recipe's units.
     pub reconstruction_error: Option<f64>,
     /// Number of the model version used.

@@ -1,5 +1,6 @@
 //! Columns of CSV files.
 
+use super::csv_layout::CsvLayout;
 use crate::domain::{Error, ErrorKind, Result};
 
 /// A column: its two names and the path of the same value in a JSON row.
@@ -19,6 +20,8 @@ const fn column(plain: &'static str, with_unit: &'static str, path: &'static str
 pub(super) const TIME: usize = 0;
 pub(super) const TARGET_ID: usize = 1;
 pub(super) const LEFT: usize = 2;
+pub(super) const TOP: usize = 3;
+pub(super) const WIDTH: usize = 4;
 pub(super) const HEIGHT: usize = 5;
 pub(super) const LONGITUDE: usize = 6;
 pub(super) const LATITUDE: usize = 7;
@@ -55,15 +58,20 @@ pub(super) const COLUMNS: [Column; COUNT] = [
     column("receiver_id", "receiver_id", "receiver_id"),
 ];
 
+/// The field of a documented name.
+pub(super) fn index_of(name: &str) -> Option<usize> {
+    COLUMNS.iter().position(|column| column.plain == name || column.with_unit == name)
+}
+
 /// Groups of columns that must occur together.
 const GROUPS: [&[usize]; 3] =
     [&[LEFT, LEFT + 1, LEFT + 2, HEIGHT], &[LONGITUDE, LATITUDE], &[TRUTH_LONGITUDE, TRUTH_LATITUDE]];
 
-/// Position of each column in a file, and the name that the file uses.
+/// The fields of a file's columns, and the names that the file uses.
 pub(super) struct Header {
-    positions: [Option<usize>; COUNT],
-    names: [&'static str; COUNT],
-    width: usize,
+    /// The field of each column of the file.
+    fields: Vec<Option<usize>>,
+    names: [String; COUNT],
 }
 
 impl Header {
@@ -75,24 +83,24 @@ impl Header {
         names: impl Iterator<Item = &'a str>,
         required: &[usize],
         known: usize,
+        layout: &CsvLayout,
     ) -> Result<Self> {
-        let known = COLUMNS.get(..known).unwrap_or(&COLUMNS);
-        let mut header =
-            Self { positions: [None; COUNT], names: COLUMNS.each_ref().map(|column| column.plain), width: 0 };
-        for name in names {
-            let name = name.trim();
-            let index = known
-                .iter()
-                .position(|column| column.plain == name || column.with_unit == name)
-                .ok_or_else(|| unknown(name, known))?;
-            if header.positions[index].is_some() {
+        let names: Vec<String> = names.map(|name| name.trim().to_owned()).collect();
+        let fields = match layout.is_documented() {
+            true => names.iter().map(|name| documented(name, known).map(Some)).collect::<Result<_>>()?,
+            false => layout.fields(&names),
+        };
+        let mut header = Self {
+            fields: vec![None; names.len()],
+            names: COLUMNS.each_ref().map(|column| column.plain.to_owned()),
+        };
+        for (position, (name, field)) in names.into_iter().zip(fields).enumerate() {
+            let Some(index) = field.filter(|index| *index < known) else { continue };
+            if header.has(index) {
                 return Err(refused(COLUMNS[index].plain, "the column is a duplicate".to_owned()));
             }
-            header.positions[index] = Some(header.width);
-            if COLUMNS[index].with_unit == name {
-                header.names[index] = COLUMNS[index].with_unit;
-            }
-            header.width += 1;
+            header.fields[position] = Some(index);
+            header.names[index] = name;
         }
         header.check(required)?;
         Ok(header)
@@ -115,33 +123,41 @@ impl Header {
         Ok(())
     }
 
-    pub(super) const fn has(&self, index: usize) -> bool {
-        self.positions[index].is_some()
+    pub(super) fn has(&self, index: usize) -> bool {
+        self.fields.contains(&Some(index))
     }
 
-    pub(super) const fn position(&self, index: usize) -> Option<usize> {
-        self.positions[index]
+    /// The field of a column of the file.
+    pub(super) fn field_at(&self, position: usize) -> Option<usize> {
+        self.fields.get(position).copied().flatten()
     }
 
     /// Number of columns.
-    pub(super) const fn width(&self) -> usize {
-        self.width
+    pub(super) fn width(&self) -> usize {
+        self.fields.len()
     }
 
     /// The name that the file uses for a column.
-    pub(super) const fn name(&self, index: usize) -> &'static str {
-        self.names[index]
+    pub(super) fn name(&self, index: usize) -> &str {
+        &self.names[index]
     }
 
     /// The name that the file uses for the value at a path of a JSON row; that of its first column for
     /// the path of a group.
-    pub(super) fn name_of_path<'a>(&self, path: &'a str) -> &'a str {
+    pub(super) fn name_of_path<'a>(&'a self, path: &'a str) -> &'a str {
         let at_path = |column: &Column| {
             let below = column.path.strip_prefix(path);
             !path.is_empty() && below.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
         };
-        COLUMNS.iter().position(at_path).map_or(path, |index| self.names[index])
+        COLUMNS.iter().position(at_path).map_or(path, |index| self.names[index].as_str())
     }
+}
+
+/// The field of a documented column.
+fn documented(name: &str, known: usize) -> Result<usize> {
+    let known = COLUMNS.get(..known).unwrap_or(&COLUMNS);
+    let index = index_of(name).filter(|index| *index < known.len());
+    index.ok_or_else(|| unknown(name, known))
 }
 
 fn unknown(name: &str, known: &[Column]) -> Error {

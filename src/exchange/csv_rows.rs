@@ -5,54 +5,87 @@
 
 use std::io::Read;
 
+use jiff::Timestamp;
+
 use super::columns::{
     CLASS, COUNT, HEIGHT, Header, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA,
-    TARGET_ID, TIME, TRUTH_LATITUDE, TRUTH_LONGITUDE,
+    TARGET_ID, TIME, TOP, TRUTH_LATITUDE, TRUTH_LONGITUDE, WIDTH,
 };
+use super::csv_layout::{BoxForm, CsvLayout};
 use super::file_row::{FileRow, RowError};
 use super::formula_guard::unguarded;
 use super::lines::{Line, Lines};
 use super::wire::{self, Text};
-use crate::domain::{Error, ErrorKind, Result};
+use crate::domain::{Error, ErrorKind, ImageSize, Result};
 
 /// Reads a CSV file's rows.
 pub(super) struct CsvRows<R> {
     lines: Lines<R>,
     header: Box<Header>,
     fields: FieldSplitter,
+    values: ValueRules,
+}
+
+/// How the cells of a file are read.
+struct ValueRules {
+    is_documented: bool,
+    has_decimal_comma: bool,
+    box_form: BoxForm,
+    /// What the sides of boxes are multiplied by, in x and y.
+    scale_px: [f64; 2],
 }
 
 impl<R: Read> CsvRows<R> {
     /// # Errors
     /// Refuses a file without a header, or with missing, duplicated or unknown columns.
-    pub(super) fn new(reader: R, required: &[usize]) -> Result<Self> {
-        Self::with_columns(reader, required, OF_SAMPLES)
+    pub(super) fn new(
+        reader: R,
+        required: &[usize],
+        layout: &CsvLayout,
+        image_size: Option<ImageSize>,
+    ) -> Result<Self> {
+        let scale_px = layout.scale_px(image_size)?;
+        Self::with_columns(reader, required, OF_SAMPLES, layout, scale_px)
     }
 
     /// Rows of a file of fixes, which may have a receiver column.
     ///
     /// # Errors
     /// As [`CsvRows::new`].
-    pub(super) fn of_fixes(reader: R, required: &[usize]) -> Result<Self> {
-        Self::with_columns(reader, required, COUNT)
+    pub(super) fn of_fixes(reader: R, required: &[usize], layout: &CsvLayout) -> Result<Self> {
+        Self::with_columns(reader, required, COUNT, layout, [1.0, 1.0])
     }
 
-    fn with_columns(reader: R, required: &[usize], known: usize) -> Result<Self> {
+    fn with_columns(
+        reader: R,
+        required: &[usize],
+        known: usize,
+        layout: &CsvLayout,
+        scale_px: [f64; 2],
+    ) -> Result<Self> {
         let mut lines = Lines::new(reader);
         let mut fields = FieldSplitter::default();
         let header = loop {
             match lines.next_line().map_err(Error::fault)? {
                 Some((_, Line::Text(text))) if text.trim().is_empty() => {}
                 Some((_, Line::Text(text))) => {
+                    fields.separator = layout.separator(text);
                     let split = fields.split(text).map_err(|reason| malformed(&reason))?;
-                    break Box::new(Header::read(split, required, known)?);
+                    break Box::new(Header::read(split, required, known, layout)?);
                 }
                 Some((_, Line::NotUtf8)) => return Err(malformed("the header is not UTF-8")),
                 Some((_, Line::TooLong)) => return Err(malformed("the header is longer than 64 KiB")),
                 None => return Err(malformed("the file is empty; the first line must name the columns")),
             }
         };
-        Ok(Self { lines, header, fields })
+        let name = |index| header.has(index).then(|| header.name(index).to_owned());
+        let values = ValueRules {
+            is_documented: layout.is_documented(),
+            has_decimal_comma: fields.separator != ',',
+            box_form: layout.form(name),
+            scale_px,
+        };
+        Ok(Self { lines, header, fields, values })
     }
 
     /// Number of the latest line, from 1.
@@ -78,9 +111,9 @@ impl<R: Read> CsvRows<R> {
                     return Some(Ok(Err(RowError::whole(line, "is longer than 64 KiB"))));
                 }
             };
-            let header = &self.header;
+            let (header, values) = (&self.header, &self.values);
             let row = self.fields.split(text).map_err(CsvRowError::Row).and_then(|fields| {
-                let cells = CsvCells::of(header, fields)?;
+                let cells = CsvCells::of(header, values, fields)?;
                 let row = cells.row().map_err(|(index, reason)| CsvRowError::Column(index, reason))?;
                 convert(row).map_err(CsvRowError::Value)
             });
@@ -116,17 +149,22 @@ fn malformed(reason: &str) -> Error {
 /// The cells of one line in the order of the known columns.
 struct CsvCells<'a> {
     cells: [&'a str; COUNT],
+    values: &'a ValueRules,
 }
 
 type CellResult<T> = std::result::Result<T, (usize, String)>;
 
 impl<'a> CsvCells<'a> {
-    fn of(header: &Header, fields: impl Iterator<Item = &'a str>) -> Result<Self, CsvRowError> {
-        let mut in_file = [""; COUNT];
+    fn of(
+        header: &Header,
+        values: &'a ValueRules,
+        fields: impl Iterator<Item = &'a str>,
+    ) -> Result<Self, CsvRowError> {
+        let mut cells = [""; COUNT];
         let mut count = 0;
         for field in fields {
-            if let Some(cell) = in_file.get_mut(count) {
-                *cell = field.trim();
+            if let Some(index) = header.field_at(count) {
+                cells[index] = field.trim();
             }
             count += 1;
         }
@@ -134,23 +172,19 @@ impl<'a> CsvCells<'a> {
             let width = header.width();
             return Err(CsvRowError::Row(format!("has {count} fields where the header names {width}")));
         }
-        let cells =
-            std::array::from_fn(|index| header.position(index).map_or("", |position| in_file[position]));
-        Ok(Self { cells })
+        Ok(Self { cells, values })
     }
 
     fn row(&self) -> CellResult<FileRow<'a>> {
         Ok(FileRow {
-            time: self.text(TIME),
+            time: self.time()?,
             target_id: self.name(TARGET_ID),
-            bounding_box: self.numbers([LEFT, LEFT + 1, LEFT + 2, HEIGHT])?.map(
-                |[left_px, top_px, width_px, height_px]| wire::BoundingBox {
-                    left_px,
-                    top_px,
-                    width_px,
-                    height_px,
-                },
-            ),
+            bounding_box: self.numbers([LEFT, TOP, WIDTH, HEIGHT])?.map(|columns| {
+                let ValueRules { box_form, scale_px, .. } = self.values;
+                let [left_px, top_px, width_px, height_px] =
+                    box_form.left_top_width_height(columns, *scale_px);
+                wire::BoundingBox { left_px, top_px, width_px, height_px }
+            }),
             fix: self.fix()?,
             class: self.name(CLASS),
             score: self.number(SCORE)?,
@@ -169,9 +203,19 @@ impl<'a> CsvCells<'a> {
         Ok(degrees.map(|[longitude_deg, latitude_deg]| wire::Fix { longitude_deg, latitude_deg, sigma_m }))
     }
 
-    fn text(&self, index: usize) -> Option<Text<'a>> {
-        let cell = self.cells[index];
-        (!cell.is_empty()).then(|| Text::from(cell))
+    fn time(&self) -> CellResult<Option<Text<'a>>> {
+        let cell = self.cells[TIME];
+        let is_unix = !self.values.is_documented
+            && cell.starts_with(|first: char| first.is_ascii_digit())
+            && cell.bytes().all(|byte| byte.is_ascii_digit() || b".,".contains(&byte));
+        if is_unix {
+            let value = self.number(TIME)?.unwrap_or_default();
+            let time_s = if value < 1e11 { value } else { value / 1e3 };
+            let time = Timestamp::from_microsecond((time_s * 1e6).round() as i64);
+            let time = time.map_err(|_| (TIME, format!("`{cell}` is no Unix time")))?;
+            return Ok(Some(Text::from(time.to_string())));
+        }
+        Ok((!cell.is_empty()).then(|| Text::from(cell)))
     }
 
     /// A name, without the guard that keeps spreadsheets from running it as a formula.
@@ -185,7 +229,11 @@ impl<'a> CsvCells<'a> {
         if cell.is_empty() {
             return Ok(None);
         }
-        cell.parse().map(Some).map_err(|_| {
+        let parsed = match cell.split_once(',') {
+            Some((whole, part)) if self.values.has_decimal_comma => format!("{whole}.{part}").parse(),
+            _ => cell.parse(),
+        };
+        parsed.map(Some).map_err(|_| {
             let shown: String = cell.chars().take(40).collect();
             (index, format!("must be a number, not `{shown}`"))
         })
@@ -214,15 +262,21 @@ impl<'a> CsvCells<'a> {
 }
 
 /// The fields of one line, as in RFC 4180 but without line breaks within quotes.
-#[derive(Default)]
 struct FieldSplitter {
+    separator: char,
     /// Text of the fields without quotes.
     unquoted: String,
     /// Range of every field in `unquoted`.
     spans: Vec<(usize, usize)>,
 }
 
-/// FieldSplitter borrowed from the line, or from the unquoted text.
+impl Default for FieldSplitter {
+    fn default() -> Self {
+        Self { separator: ',', unquoted: String::new(), spans: Vec::new() }
+    }
+}
+
+/// Fields borrowed from the line, or from the unquoted text.
 enum SplitFields<'a> {
     Plain(std::str::Split<'a, char>),
     Quoted(&'a str, std::slice::Iter<'a, (usize, usize)>),
@@ -242,7 +296,7 @@ impl<'a> Iterator for SplitFields<'a> {
 impl FieldSplitter {
     fn split<'a>(&'a mut self, line: &'a str) -> Result<SplitFields<'a>, String> {
         if !line.contains('"') {
-            return Ok(SplitFields::Plain(line.split(',')));
+            return Ok(SplitFields::Plain(line.split(self.separator)));
         }
         self.unquoted.clear();
         self.spans.clear();
@@ -255,11 +309,11 @@ impl FieldSplitter {
         Ok(SplitFields::Quoted(&self.unquoted, self.spans.iter()))
     }
 
-    /// Appends the first field of the text; returns the rest after the comma.
+    /// Appends the first field of the text; returns the rest after the separator.
     fn take_field<'a>(&mut self, text: &'a str) -> Result<Option<&'a str>, String> {
         let Some(mut quoted) = text.strip_prefix('"') else {
             let (field, rest) =
-                text.split_once(',').map_or((text, None), |(field, rest)| (field, Some(rest)));
+                text.split_once(self.separator).map_or((text, None), |(field, rest)| (field, Some(rest)));
             self.unquoted.push_str(field);
             return Ok(rest);
         };
@@ -274,7 +328,7 @@ impl FieldSplitter {
             } else if after.is_empty() {
                 return Ok(None);
             } else {
-                let rest = after.strip_prefix(',').ok_or("has text after a closing quote")?;
+                let rest = after.strip_prefix(self.separator).ok_or("has text after a closing quote")?;
                 return Ok(Some(rest));
             }
         }

@@ -1,12 +1,12 @@
 //! One row of a file as it was read, before it is checked, and the error of an invalid row.
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::wire::{self, Text};
 use crate::domain::{Error, Result};
 
 /// Why a row of a file is invalid.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RowError {
     /// Line of the file from 1 (a CSV file's header is line 1), or element of a JSON array from 1.
     pub line: u64,

@@ -5,6 +5,7 @@ use std::io::Read;
 use jiff::Timestamp;
 
 use super::columns::{LATITUDE, LONGITUDE};
+use super::csv_layout::LaidOut;
 use super::csv_rows::CsvRows;
 use super::file_row::{FileRow, RowError, shared};
 use super::fix_row::FixRow;
@@ -33,7 +34,7 @@ pub fn read_fixes<R: Read>(
     format: FixFormat,
     time_bounds: TimeBounds,
 ) -> Result<impl Iterator<Item = Result<Result<TimedFix, RowError>>> + use<R>> {
-    let mut rows = FixRows::new(reader, format, time_bounds)?;
+    let mut rows = FixRows::new(reader, &format.into(), time_bounds)?;
     Ok(std::iter::from_fn(move || {
         let row = rows.next_row()?;
         Some(row.map(|row| row.map(|FixRow { time, fix, .. }| TimedFix { time, fix })))
@@ -44,12 +45,14 @@ pub fn read_fixes<R: Read>(
 ///
 /// # Errors
 /// As [`read_fixes`].
-pub fn read_received_fixes<R: Read>(
+pub fn read_received_fixes<R: Read, F: Into<LaidOut<FixFormat>>>(
     reader: R,
-    format: FixFormat,
+    format: F,
     time_bounds: TimeBounds,
-) -> Result<impl Iterator<Item = Result<Result<ReceivedFix, RowError>>> + use<R>> {
-    let mut rows = FixRows::new(reader, format, time_bounds)?;
+) -> Result<impl Iterator<Item = Result<Result<ReceivedFix, RowError>>> + use<R, F>> {
+    let laid_out = format.into();
+    let format = laid_out.format;
+    let mut rows = FixRows::new(reader, &laid_out, time_bounds)?;
     Ok(std::iter::from_fn(move || {
         let row = rows.next_row()?;
         Some(row.map(|row| row.and_then(|row| row.received(format))))
@@ -64,10 +67,10 @@ enum FixRows<R> {
 }
 
 impl<R: Read> FixRows<R> {
-    fn new(reader: R, format: FixFormat, time_bounds: TimeBounds) -> Result<Self> {
-        Ok(match format {
+    fn new(reader: R, laid_out: &LaidOut<FixFormat>, time_bounds: TimeBounds) -> Result<Self> {
+        Ok(match laid_out.format {
             FixFormat::Csv => {
-                let rows = CsvRows::of_fixes(reader, &[LONGITUDE, LATITUDE])?;
+                let rows = CsvRows::of_fixes(reader, &[LONGITUDE, LATITUDE], &laid_out.layout)?;
                 Self::Csv { rows, time_bounds, receiver_id: None }
             }
             FixFormat::Nmea => Self::Nmea(NmeaFixes::new(reader, time_bounds)),

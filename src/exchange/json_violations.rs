@@ -14,7 +14,8 @@ const MAX_BYTES: usize = 64 * 1024;
 
 /// The refusal of a document that cannot be parsed as `T`, with all fields at fault, given its first error.
 pub(super) fn all_violations<'de, T: Deserialize<'de>>(json: &[u8], first: Error) -> Error {
-    let Error::Refused(Refusal { kind: ErrorKind::InvalidArgument, message, mut violations }) = first else {
+    let Error::Refused(Refusal { kind: ErrorKind::InvalidArgument, message, mut violations, .. }) = first
+    else {
         return first;
     };
     if json.len() <= MAX_BYTES
@@ -26,7 +27,8 @@ pub(super) fn all_violations<'de, T: Deserialize<'de>>(json: &[u8], first: Error
         0 | 1 => message,
         count => format!("{count} fields cannot be used"),
     };
-    Error::Refused(Refusal { kind: ErrorKind::InvalidArgument, message, violations })
+    let kind = ErrorKind::InvalidArgument;
+    Error::Refused(Refusal { kind, message, violations, conflicting_id: None })
 }
 
 fn collect<'de, T: Deserialize<'de>>(document: &mut Value, violations: &mut Vec<Violation>) {

@@ -11,9 +11,11 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod columns;
+mod csv_layout;
 mod csv_rows;
 mod cursor;
 mod elements;
+mod feature;
 mod file_row;
 mod fix_row;
 mod fixes;
@@ -32,11 +34,14 @@ mod tests;
 pub mod wire;
 mod write;
 
+pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
-pub use rows::{ObservedRow, RowRules, read_detections, read_observations, read_samples};
+pub use rows::{
+    ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
+};
 pub use write::{FusedWriter, MatchedSampleWriter, SampleWriter, write_fused, write_samples};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.

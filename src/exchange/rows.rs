@@ -2,16 +2,18 @@
 
 use std::io::Read;
 
-use super::columns::{HEIGHT, LEFT, TARGET_ID, TIME};
+use super::columns::{HEIGHT, LEFT, TARGET_ID, TIME, TOP, WIDTH};
+use super::csv_layout::LaidOut;
 use super::csv_rows::CsvRows;
 use super::elements::Elements;
+use super::feature::FeatureCollection;
 use super::file_row::{FileRow, RowError, shared};
 use super::format::Format;
 use super::lines::{Line, Lines};
 use super::wire::{self, box_within};
 use crate::domain::{
     Detection, Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, StoredSample, TargetClass,
-    TargetId, TimeBounds, parse_time,
+    TargetId, TimeBounds, convert_all, parse_time,
 };
 use crate::geo::Position;
 
@@ -41,8 +43,8 @@ pub struct ObservedRow {
 ///
 /// CSV has the columns `time`, `target_id`, `left`, `top`, `width`, `height` in any order, also with their
 /// units (`left_px`), and optionally `longitude` and `latitude` (`longitude_deg`), `sigma_m`, `class`,
-/// `score`, `truth_longitude` and `truth_latitude`. NDJSON has a [`wire::Sample`] per line; JSON is an array
-/// of them, or an object `{"samples": [...]}`.
+/// `score`, `truth_longitude` and `truth_latitude`, or others by its [`CsvLayout`](super::CsvLayout). NDJSON has
+/// a [`wire::Sample`] per line; JSON is an array of them, or an object `{"samples": [...]}`.
 ///
 /// A row whose longitude and latitude are both empty (in JSON: without `fix`, or with null) is a sample
 /// without a fix; its `sigma_m` is ignored. One of the two alone is invalid, as is a file with one of the two
@@ -52,15 +54,16 @@ pub struct ObservedRow {
 /// The outer error: the file cannot be read at all (no header, a column missing or unknown, not JSON, a
 /// format that is only written). The error of an item: the file is truncated or cannot be read further;
 /// nothing follows. The inner error of an item: that row is invalid.
-pub fn read_samples<R: Read>(
+pub fn read_samples<R: Read, F: Into<LaidOut<Format>>>(
     reader: R,
-    format: Format,
+    format: F,
     rules: &RowRules,
-) -> Result<impl Iterator<Item = Result<Result<StoredSample, RowError>>> + use<R>> {
-    let required = [TIME, TARGET_ID, LEFT, LEFT + 1, LEFT + 2, HEIGHT];
-    let mut rows = Rows::new(reader, format, &required)?;
+) -> Result<impl Iterator<Item = Result<Result<StoredSample, RowError>>> + use<R, F>> {
+    let laid_out = format.into();
+    let target_id = laid_out.layout.target_id.clone();
+    let mut rows = Rows::new(reader, &laid_out, &required(target_id.is_none()), rules)?;
     let mut converter = RowConverter::new(*rules);
-    Ok(std::iter::from_fn(move || rows.next_row(|row| converter.sample(&row))))
+    Ok(std::iter::from_fn(move || rows.next_row(|row| converter.sample(&row, target_id.as_ref()))))
 }
 
 /// Observations of a file: rows as those of [`read_samples`] with a box, a fix, or both; target and class
@@ -73,9 +76,20 @@ pub fn read_observations<R: Read>(
     format: Format,
     rules: &RowRules,
 ) -> Result<impl Iterator<Item = Result<Result<ObservedRow, RowError>>> + use<R>> {
-    let mut rows = Rows::new(reader, format, &[TIME])?;
+    let mut rows = Rows::new(reader, &format.into(), &[TIME], rules)?;
     let mut converter = RowConverter::new(*rules);
     Ok(std::iter::from_fn(move || rows.next_row(|row| converter.observed(&row))))
+}
+
+/// Observations of a GeoJSON feature collection (RFC 7946): the properties of a feature are those of a row,
+/// and its point is the fix, with the property `sigma_m`. Any fault refuses them all.
+///
+/// # Errors
+/// `MalformedBody` for what is no JSON, `InvalidArgument` naming the fields at fault.
+pub fn read_observation_features(json: &[u8], rules: &RowRules) -> Result<Vec<Observation>> {
+    let features = wire::parse_json::<FeatureCollection<'_>>(json)?.into_features()?;
+    let mut converter = RowConverter::new(*rules);
+    convert_all("features", features, |feature| Ok(converter.observed(&feature.into_row()?)?.observation))
 }
 
 /// Detections of a file: rows as those of [`read_samples`], whose fixes and true positions are ignored.
@@ -83,16 +97,21 @@ pub fn read_observations<R: Read>(
 ///
 /// # Errors
 /// As [`read_samples`].
-pub fn read_detections<R: Read>(
+pub fn read_detections<R: Read, F: Into<LaidOut<Format>>>(
     reader: R,
-    format: Format,
+    format: F,
     rules: &RowRules,
     target_id: Option<TargetId>,
-) -> Result<impl Iterator<Item = Result<Result<Detection, RowError>>> + use<R>> {
-    let required = [TIME, LEFT, LEFT + 1, LEFT + 2, HEIGHT];
-    let mut rows = Rows::new(reader, format, &required)?;
+) -> Result<impl Iterator<Item = Result<Result<Detection, RowError>>> + use<R, F>> {
+    let mut rows = Rows::new(reader, &format.into(), &required(false), rules)?;
     let mut converter = RowConverter::new(*rules);
     Ok(std::iter::from_fn(move || rows.next_row(|row| converter.detection(&row, target_id.as_ref()))))
+}
+
+/// Columns of a file with boxes.
+fn required(with_target: bool) -> Vec<usize> {
+    let columns = [TIME, LEFT, TOP, WIDTH, HEIGHT];
+    columns.into_iter().chain(with_target.then_some(TARGET_ID)).collect()
 }
 
 /// Converts rows into domain values. Adjacent rows mostly have the same target and class, whose text is
@@ -108,12 +127,12 @@ impl RowConverter {
         Self { rules, target_id: None, class: None }
     }
 
-    fn sample(&mut self, row: &FileRow<'_>) -> Result<StoredSample> {
+    fn sample(&mut self, row: &FileRow<'_>, default_target: Option<&TargetId>) -> Result<StoredSample> {
         let ObservedRow { observation, class, score, truth } = self.observed(row)?;
         let (time, target_id, bounding_box, fix) = observation.into_parts();
         Ok(Sample {
             time,
-            target_id: target_id.ok_or_else(|| missing("target_id"))?,
+            target_id: target_id.or_else(|| default_target.cloned()).ok_or_else(|| missing("target_id"))?,
             bounding_box: bounding_box.ok_or_else(|| missing("bounding_box"))?,
             fix,
             class,
@@ -166,9 +185,10 @@ enum Rows<R> {
 }
 
 impl<R: Read> Rows<R> {
-    fn new(reader: R, format: Format, required: &[usize]) -> Result<Self> {
+    fn new(reader: R, laid_out: &LaidOut<Format>, required: &[usize], rules: &RowRules) -> Result<Self> {
+        let LaidOut { format, layout } = laid_out;
         match format {
-            Format::Csv => CsvRows::new(reader, required).map(Self::Csv),
+            Format::Csv => CsvRows::new(reader, required, layout, rules.image_size).map(Self::Csv),
             Format::Ndjson => Ok(Self::Lines(Lines::new(reader))),
             Format::Json => Elements::new(reader, "samples").map(Self::Elements),
             Format::GeoJson => Err(Error::refused(

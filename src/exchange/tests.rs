@@ -13,7 +13,7 @@ use crate::domain::{
     BoundingBox, Confidences, ErrorKind, Fix, Flag, FusedFix, ImageSize, Score, SigmaM, StoredSample,
     TargetClass, TargetId, TimeBounds,
 };
-use crate::geo::Position;
+use crate::geo::{PlaneCovariance, Position};
 
 fn rules() -> RowRules {
     let now: Timestamp = "2026-01-01T00:00:00Z".parse().expect("an instant");
@@ -358,6 +358,8 @@ fn fused_positions_are_written_in_every_format() {
         e_regression_m2: Some(0.25),
         e_gnss_m2: None,
         r95_m: 1.5,
+        covariance: PlaneCovariance::isotropic(0.4),
+        regressed_covariance: None,
         reconstruction_error: Some(0.5),
         model_version: Some(3),
         flags: vec![Flag::GnssDenied, Flag::BoxAtBorder],

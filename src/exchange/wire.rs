@@ -36,6 +36,12 @@ impl<'a> From<&'a str> for Text<'a> {
     }
 }
 
+impl From<String> for Text<'_> {
+    fn from(text: String) -> Self {
+        Self(Cow::Owned(text))
+    }
+}
+
 /// A position on WGS 84.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -109,6 +115,24 @@ impl From<domain::Fix> for Fix {
             latitude_deg: fix.position.latitude_deg(),
             sigma_m: fix.sigma_m.map(SigmaM::metres),
         }
+    }
+}
+
+/// A covariance on the ground in m2, axes east and north.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, ToSchema)]
+pub struct PlaneCovariance {
+    /// Variance along east.
+    pub east_m2: f64,
+    /// Variance along north.
+    pub north_m2: f64,
+    /// Covariance of east and north.
+    pub east_north_m2: f64,
+}
+
+impl From<geo::PlaneCovariance> for PlaneCovariance {
+    fn from(covariance: geo::PlaneCovariance) -> Self {
+        let geo::PlaneCovariance { east_m2, north_m2, east_north_m2 } = covariance;
+        Self { east_m2, north_m2, east_north_m2 }
     }
 }
 
@@ -199,6 +223,11 @@ pub struct Observation<'a> {
     #[serde(borrow, default)]
     #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "person-1")]
     pub target_id: Option<Text<'a>>,
+    /// The receiver of a fix that does not name its target: the camera's `receivers` say whose it is and how far
+    /// its clock is off.
+    #[serde(borrow, default)]
+    #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "phone-1")]
+    pub receiver_id: Option<Text<'a>>,
     /// The detection.
     #[serde(default)]
     pub bounding_box: Option<BoundingBox>,
@@ -214,10 +243,22 @@ impl Observation<'_> {
         &self,
         bounds: &TimeBounds,
         image_size: Option<domain::ImageSize>,
+        receivers: &domain::Receivers,
     ) -> Result<domain::Observation> {
+        let time = bounds.check(parse_time(self.time.as_str())?)?;
+        let target_id = self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?;
+        let receiver_id =
+            self.receiver_id.as_ref().map(|id| domain::ReceiverId::new(id.as_str())).transpose()?;
+        let (target_id, time) = match (target_id, receiver_id) {
+            (None, Some(receiver_id)) => {
+                let (target_id, time) = receivers.resolve(&receiver_id, time);
+                (Some(target_id), time)
+            }
+            (target_id, _) => (target_id, time),
+        };
         domain::Observation::new(
-            bounds.check(parse_time(self.time.as_str())?)?,
-            self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?,
+            time,
+            target_id,
             self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
             self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
         )
@@ -264,6 +305,11 @@ pub struct FusedFix<'a> {
     pub e_gnss_m2: Option<f64>,
     /// Radius about `fused` that contains the true position with 95 % probability, m.
     pub r95_m: f64,
+    /// Covariance of the normal distribution about `fused` that has this radius: its 95 % ellipse.
+    pub covariance: PlaneCovariance,
+    /// The same about `regressed`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub regressed_covariance: Option<PlaneCovariance>,
     /// Reconstruction error of the auto-encoder, in the recipe's units.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reconstruction_error: Option<f64>,
@@ -288,6 +334,8 @@ impl<'a> From<&'a domain::FusedFix> for FusedFix<'a> {
             e_regression_m2: fused.e_regression_m2,
             e_gnss_m2: fused.e_gnss_m2,
             r95_m: fused.r95_m,
+            covariance: fused.covariance.into(),
+            regressed_covariance: fused.regressed_covariance.map(PlaneCovariance::from),
             reconstruction_error: fused.reconstruction_error,
             model_version: fused.model_version,
             flags: Flags(&fused.flags),

@@ -3,13 +3,14 @@
 //! A frame is what one source reports for one instant. A frame is released when no earlier one can come from the
 //! sources that are active: each has reported a later instant, or the frame has waited as long as it may. This is
 //! the watermark of stream processing (Akidau et al., The Dataflow Model, 2015) with idle sources left out. A
-//! frame older than one that was released is late and dropped.
+//! frame older than one that was released is late and dropped, but for sources that set no pace: their items come
+//! with delays of their own, and are released out of order while these are short.
 
 use std::collections::{BTreeMap, HashMap};
 use std::hash::Hash;
 use std::time::Duration;
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 
 /// If only late items come for this long, the clock of the sources went back for good: a recording is played
 /// again. Frames are then released from there on.
@@ -21,6 +22,8 @@ pub struct FrameLimits {
     /// Longest time that a frame waits for the rest of its items and for earlier frames; a source without an item
     /// for this long is idle, and no frame waits for it.
     pub wait: Duration,
+    /// Time by which an item of a source that sets no pace may be older than the latest frame that was released.
+    pub lateness: SignedDuration,
     /// Most frames that wait; beyond, the oldest is released.
     pub frames: usize,
     /// Most items of one frame; beyond, they are dropped.
@@ -32,7 +35,7 @@ pub struct FrameLimits {
 pub enum PushOutcome {
     /// Part of a frame that waits.
     Waiting,
-    /// Its frame, or a later one, was released before.
+    /// Its frame, or a later one, was released before. A source that sets no pace has the lateness of the limits.
     Late,
     /// Its frame is full.
     FrameFull,
@@ -91,7 +94,8 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
         item: T,
         now: Duration,
     ) -> PushOutcome {
-        if self.is_late(source, time) {
+        let lateness = if is_pacing { SignedDuration::ZERO } else { self.limits.lateness };
+        if self.is_late(source, time, lateness) {
             if now.saturating_sub(*self.late_since.get_or_insert(now)) < REWIND_AFTER {
                 return PushOutcome::Late;
             }
@@ -115,9 +119,9 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
         PushOutcome::Waiting
     }
 
-    fn is_late(&self, source: &S, time: Timestamp) -> bool {
+    fn is_late(&self, source: &S, time: Timestamp, lateness: SignedDuration) -> bool {
         self.released.as_ref().is_some_and(|(released, sources)| {
-            time < *released || (time == *released && sources.contains(source))
+            released.duration_since(time) > lateness || (time == *released && sources.contains(source))
         })
     }
 
@@ -137,6 +141,7 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
         }
         let ((time, source), frame) = self.waiting.pop_first()?;
         match &mut self.released {
+            Some((released, _)) if *released > time => {}
             Some((released, sources)) if *released == time => sources.push(source.clone()),
             released => *released = Some((time, vec![source.clone()])),
         }
@@ -154,8 +159,12 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
 mod tests {
     use super::*;
 
-    const LIMITS: FrameLimits =
-        FrameLimits { wait: Duration::from_millis(300), frames: 8, items_per_frame: 3 };
+    const LIMITS: FrameLimits = FrameLimits {
+        wait: Duration::from_millis(300),
+        lateness: SignedDuration::from_secs(1),
+        frames: 8,
+        items_per_frame: 3,
+    };
 
     type Assembler = FrameAssembler<&'static str, u32>;
 
@@ -226,6 +235,20 @@ mod tests {
         }
         assert_eq!(release(&mut frames, 0)[0], ("b", 50, vec![0, 0, 0]));
         assert!(frames.waiting.len() <= LIMITS.frames);
+    }
+
+    #[test]
+    fn a_short_delay_of_a_source_that_sets_no_pace_does_no_harm() {
+        let mut frames = Assembler::new(LIMITS);
+        let fix =
+            |frames: &mut Assembler, ms: i64| frames.push(&"receiver", false, at(ms), 9, Duration::ZERO);
+        push(&mut frames, "a", 5_000, 1, 0);
+        push(&mut frames, "a", 5_200, 2, 0);
+        assert_eq!(release(&mut frames, 0), [("a", 5_000, vec![1])]);
+        assert_eq!(fix(&mut frames, 4_000), PushOutcome::Waiting);
+        assert_eq!(fix(&mut frames, 3_999), PushOutcome::Late);
+        assert_eq!(release(&mut frames, 0), [("receiver", 4_000, vec![9])], "at once");
+        assert_eq!(push(&mut frames, "b", 4_900, 3, 0), PushOutcome::Late, "cameras stay in order");
     }
 
     #[test]

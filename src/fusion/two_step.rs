@@ -5,7 +5,7 @@
 use super::observed::{ObservedBox, ObservedPositions, PAIR_GATE, PairInnovation};
 use super::track::MeasurementSource;
 use crate::domain::{Confidences, Flag, FusedFix, ImageSize, Observation};
-use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, distance_m};
+use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, PlaneCovariance, distance_m};
 use crate::model::{R95_PER_SIGMA, Regression, Regressor};
 
 /// 95 % quantile of chi-square with 2 degrees of freedom, -2 ln(0.05). From here to [`PAIR_GATE`] the
@@ -82,7 +82,7 @@ pub fn fuse_observed(
     if regressed.independent.outside_training {
         flags.push(Flag::OutsideTraining);
     }
-    let Combined { position, confidences, r95_m } = combine(observed, regressed, &mut flags);
+    let Combined { position, confidences, r95_m, shape } = combine(observed, regressed, &mut flags);
     let Regression { e_regression_m2, reconstruction_error, .. } = regressed.one_step;
     Some(FusedFix {
         time: observation.time(),
@@ -94,6 +94,8 @@ pub fn fuse_observed(
         e_regression_m2: Some(e_regression_m2),
         e_gnss_m2: observed.fix.map(|fix| fix.variance_m2),
         r95_m,
+        covariance: shape.with_r95_m(r95_m),
+        regressed_covariance: Some(regressed.one_step.normal_covariance()),
         reconstruction_error: Some(reconstruction_error).filter(|error| error.is_finite()),
         model_version: Some(version),
         flags,
@@ -105,6 +107,8 @@ struct Combined {
     position: EastNorth,
     confidences: Confidences,
     r95_m: f64,
+    /// A multiple of the error's covariance, m2.
+    shape: PlaneCovariance,
 }
 
 /// The position from a box and perhaps a fix; notes in `flags` which of them was not used.
@@ -113,6 +117,7 @@ fn combine(observed: &ObservedPositions<'_>, regressed: &ObservedBox, flags: &mu
         position: regressed.independent.regressed,
         confidences: ALL_REGRESSION,
         r95_m: regressed.independent.r95_m(),
+        shape: regressed.independent.covariance,
     };
     if !regressed.is_usable {
         flags.push(Flag::BoxRejected);
@@ -122,8 +127,12 @@ fn combine(observed: &ObservedPositions<'_>, regressed: &ObservedBox, flags: &mu
         flags.extend([Flag::SourcesDisagree, Flag::FixRejected, Flag::FixOutOfRange]);
         return box_alone();
     };
-    let fix_alone =
-        || Combined { position: fix_point, confidences: ALL_GNSS, r95_m: gnss_r95_m(fix.variance_m2) };
+    let fix_alone = || Combined {
+        position: fix_point,
+        confidences: ALL_GNSS,
+        r95_m: gnss_r95_m(fix.variance_m2),
+        shape: PlaneCovariance::isotropic(fix.variance_m2),
+    };
     let Some(PairInnovation { distance_m, nis }) = observed.innovation() else { return fix_alone() };
     let regression_sigma_m = regressed.independent.variance_m2().sqrt();
     // The radius about a position that holds the truth if the source at that distance is right.
@@ -147,9 +156,16 @@ fn combine(observed: &ObservedPositions<'_>, regressed: &ObservedBox, flags: &mu
                 .max(reaching(to_fix_m, fix.variance_m2.sqrt()))
                 .max(r95_m);
             let share = ((nis - WIDENING_STARTS_AT) / (PAIR_GATE - WIDENING_STARTS_AT)).clamp(0.0, 1.0);
-            Combined { position, confidences, r95_m: r95_m + share * (either_m - r95_m) }
+            let shape = fused_covariance(&regressed.one_step, fix.variance_m2, confidences);
+            Combined { position, confidences, r95_m: r95_m + share * (either_m - r95_m), shape }
         }
     }
+}
+
+/// Covariance of the weighted mean (8) of independent errors, m2.
+fn fused_covariance(regression: &Regression, e_gnss_m2: f64, weights: Confidences) -> PlaneCovariance {
+    let of_fix = PlaneCovariance::isotropic(weights.gnss * weights.gnss * e_gnss_m2);
+    regression.normal_covariance().scaled(weights.regression * weights.regression).plus(of_fix)
 }
 
 fn gnss_r95_m(e_gnss_m2: f64) -> f64 {
@@ -180,6 +196,8 @@ fn pass_through(observation: &Observation, observed: &ObservedPositions<'_>) -> 
         e_regression_m2: None,
         e_gnss_m2: Some(measured.variance_m2),
         r95_m,
+        covariance: PlaneCovariance::isotropic(measured.variance_m2).with_r95_m(r95_m),
+        regressed_covariance: None,
         reconstruction_error: None,
         model_version: None,
         flags,
@@ -189,7 +207,6 @@ fn pass_through(observation: &Observation, observed: &ObservedPositions<'_>) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geo::PlaneCovariance;
     use proptest::prelude::*;
 
     proptest! {
@@ -220,6 +237,10 @@ mod tests {
             let apart = regression.regressed.distance_m(fix);
             prop_assert!(fused.distance_m(fix) + fused.distance_m(regression.regressed) <= apart + 1e-9);
             prop_assert!(r95_m <= R95_PER_SIGMA * e_regression_m2.min(e_gnss_m2).sqrt() + 1e-9);
+            // Of isotropic errors the covariance has the stated radius as it is.
+            let covariance = fused_covariance(&regression, e_gnss_m2, confidences(e_regression_m2, e_gnss_m2));
+            prop_assert!((covariance.r95_m() / r95_m - 1.0).abs() < 2e-3);
+            prop_assert!((covariance.with_r95_m(2.0 * r95_m).r95_m() / r95_m - 2.0).abs() < 1e-9);
         }
     }
 }

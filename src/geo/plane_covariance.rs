@@ -79,6 +79,12 @@ impl PlaneCovariance {
         factor * major_m2.sqrt()
     }
 
+    /// The covariance of the same shape whose 95 % radius is this one, m.
+    #[must_use]
+    pub fn with_r95_m(self, r95_m: f64) -> Self {
+        self.scaled((r95_m / self.r95_m()).powi(2))
+    }
+
     /// Every element multiplied by a factor.
     #[must_use]
     pub fn scaled(self, factor: f64) -> Self {

@@ -65,6 +65,22 @@ pub(super) fn durability(durability: i32) -> Result<domain::Durability> {
     }
 }
 
+impl From<geo::PlaneCovariance> for proto::PlaneCovariance {
+    fn from(covariance: geo::PlaneCovariance) -> Self {
+        let geo::PlaneCovariance { east_m2, north_m2, east_north_m2 } = covariance;
+        Self { east_m2, north_m2, east_north_m2 }
+    }
+}
+
+/// What becomes of samples that are stored already.
+pub(super) fn on_conflict(on_conflict: i32) -> Result<domain::OnConflict> {
+    match proto::OnConflict::try_from(on_conflict) {
+        Ok(proto::OnConflict::Unspecified | proto::OnConflict::Keep) => Ok(domain::OnConflict::Keep),
+        Ok(proto::OnConflict::Replace) => Ok(domain::OnConflict::Replace),
+        Err(_) => Err(Error::invalid("on_conflict", format!("has no value {on_conflict}"))),
+    }
+}
+
 impl From<domain::Durability> for proto::Durability {
     fn from(durability: domain::Durability) -> Self {
         match durability {

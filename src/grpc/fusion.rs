@@ -66,6 +66,8 @@ impl From<FusedFix> for proto::FusedFix {
             e_regression_m2: fused.e_regression_m2,
             e_gnss_m2: fused.e_gnss_m2,
             r95_m: fused.r95_m,
+            covariance: Some(fused.covariance.into()),
+            regressed_covariance: fused.regressed_covariance.map(Into::into),
             reconstruction_error: fused.reconstruction_error,
             model_version: fused.model_version,
             flags: fused.flags.into_iter().map(|flag| proto::Flag::from(flag).into()).collect(),

@@ -12,6 +12,7 @@ mod cancel_on_shutdown;
 pub mod client;
 mod convert;
 mod fusion;
+mod idempotency;
 mod keys;
 mod mask;
 mod models;
@@ -50,6 +51,7 @@ pub use statuses::{explain, trailers};
 
 /// Messages, services and clients generated from `proto/`.
 #[expect(clippy::allow_attributes, reason = "generated code")]
+#[expect(clippy::large_enum_variant, reason = "answers with a position, the large variant, are nearly all")]
 pub mod proto {
     tonic::include_proto!("sightfix.v1");
 

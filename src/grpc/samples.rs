@@ -1,16 +1,18 @@
 //! `SampleService`.
 
 use futures_util::{Stream, StreamExt as _, TryStreamExt as _, stream};
+use prost::Message as _;
 use tonic::Streaming;
 
-use super::convert::{camera_id, durability, sample, sample_filter};
+use super::convert::{camera_id, durability, on_conflict, sample, sample_filter};
+use super::idempotency::idempotent;
 use super::pages;
 use super::proto;
 use super::proto::sample_service_server::SampleService;
 use super::statuses::{Reply, answer, broken};
 use crate::admission::BodyRefusal;
-use crate::app::{App, ImportReport, RejectedRow};
-use crate::domain::{Durability, Error, ErrorKind, Result, SampleCount, StoredSample};
+use crate::app::{App, ImportOptions, ImportReport, RejectedRow};
+use crate::domain::{Durability, Error, ErrorKind, RequestHasher, Result, SampleCount, StoredSample};
 use crate::exchange::RowRules;
 use crate::shutdown::Shutdown;
 use crate::store::{SampleFilter, SampleKey};
@@ -33,6 +35,7 @@ impl SampleService for Samples {
         request: tonic::Request<Streaming<proto::ImportSamplesRequest>>,
     ) -> Reply<proto::ImportSamplesResponse> {
         let refusal = request.extensions().get().cloned().unwrap_or_default();
+        let idempotent = idempotent(&request, "ImportSamples");
         answer(&self.app, request, |app, messages| async move {
             let shutdown = self.shutdown.clone();
             let mut batches = Batches { messages, refusal, shutdown, camera: String::new() };
@@ -41,10 +44,19 @@ impl SampleService for Samples {
             };
             let camera = camera_id(&first.camera_id)?;
             let durability = durability(first.durability)?;
+            let on_conflict = on_conflict(first.on_conflict)?;
+            let idempotent = idempotent?;
+            if let Some(request) = &idempotent {
+                request.hasher.update(first.camera_id.as_bytes());
+                request.hasher.update(durability.to_string().as_bytes());
+                request.hasher.update(on_conflict.to_string().as_bytes());
+            }
             batches.camera = first.camera_id;
             let rules = app.row_rules(&camera).await?;
-            let rows = rows(first.samples, batches, rules);
-            let report = app.import_rows(&camera, rows, durability).await?;
+            let hasher = idempotent.as_ref().map(|request| request.hasher.clone());
+            let rows = rows(first.samples, batches, rules, hasher);
+            let options = ImportOptions { durability, on_conflict, idempotent };
+            let report = app.import_rows(&camera, rows, options).await?;
             Ok(imported(report, durability))
         })
         .await
@@ -141,6 +153,7 @@ fn rows(
     first: Vec<proto::Sample>,
     batches: Batches,
     rules: RowRules,
+    hasher: Option<RequestHasher>,
 ) -> impl Stream<Item = Result<Result<StoredSample, RejectedRow>>> + Send {
     let later = stream::try_unfold(batches, |mut batches| async move {
         Ok(batches.samples().await?.map(|samples| (samples, batches)))
@@ -150,7 +163,11 @@ fn rows(
     all.map_ok(|samples| stream::iter(samples.into_iter().map(Ok::<_, Error>))).try_flatten().map(
         move |message| {
             line += 1;
-            match sample(message?, &rules) {
+            let message = message?;
+            if let Some(hasher) = &hasher {
+                hasher.update(&message.encode_to_vec());
+            }
+            match sample(message, &rules) {
                 Ok(sample) => Ok(Ok(sample)),
                 Err(error) => RejectedRow::of(line, error).map(Err),
             }
@@ -163,6 +180,7 @@ fn imported(report: ImportReport, durability: Durability) -> proto::ImportSample
         accepted: report.accepted,
         accepted_without_fix: report.without_fix,
         duplicate: report.duplicate,
+        replaced: report.replaced,
         rejected: report.rejected,
         rejected_rows: report.rejected_rows.into_iter().map(Into::into).collect(),
         durability: proto::Durability::from(durability).into(),

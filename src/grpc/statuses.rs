@@ -80,7 +80,11 @@ pub(super) fn client_id(extensions: &Extensions) -> ClientId {
 /// `RetryInfo` where a later try may succeed, and `BadRequest` where fields are at fault. A fault is logged here and nothing of it is shown.
 pub(super) fn to_status(error: &Error, id: &RequestId) -> Status {
     let row = status::of(error.kind());
-    let mut details = ErrorDetails::with_error_info(row.slug, DOMAIN, HashMap::new());
+    let mut metadata = HashMap::new();
+    if let Error::Refused(Refusal { conflicting_id: Some(id), .. }) = error {
+        metadata.insert("conflicting_id".to_owned(), id.clone());
+    }
+    let mut details = ErrorDetails::with_error_info(row.slug, DOMAIN, metadata);
     details.set_request_info(id.as_str(), "");
     if let Some(seconds) = row.retry_after_s {
         details.set_retry_info(Some(Duration::from_secs(seconds.into())));

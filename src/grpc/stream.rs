@@ -339,6 +339,7 @@ impl From<&TrackPoint> for proto::TrackPoint {
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
+            covariance: Some(state.normal_covariance().into()),
             still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),

@@ -3,9 +3,11 @@
 use std::pin::Pin;
 
 use futures_util::{Stream, StreamExt as _, stream};
+use prost::Message as _;
 use tonic::Status;
 
 use super::convert::{camera_id, instant, recipe, run_id, timestamp};
+use super::idempotency::idempotent;
 use super::pages;
 use super::proto;
 use super::proto::training_service_server::TrainingService;
@@ -36,7 +38,12 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::StartTrainingRunRequest>,
     ) -> Reply<proto::StartTrainingRunResponse> {
+        let idempotent = idempotent(&request, "StartTrainingRun");
         answer(&self.app, request, |app, asked| async move {
+            let idempotent = idempotent?;
+            if let Some(request) = &idempotent {
+                request.hasher.update(&asked.encode_to_vec());
+            }
             let options = RunRequest {
                 recipe: recipe(asked.recipe)?,
                 seed: asked.seed,
@@ -44,7 +51,7 @@ impl TrainingService for Training {
                 from: instant(asked.from, "from")?,
                 until: instant(asked.until, "until")?,
             };
-            let run = app.start_run(&camera_id(&asked.camera_id)?, options).await?;
+            let run = app.start_run_once(&camera_id(&asked.camera_id)?, options, idempotent).await?;
             Ok(proto::StartTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -228,6 +235,7 @@ impl From<JobState> for proto::TrainingRunState {
         match state {
             JobState::Queued => Self::Queued,
             JobState::Running => Self::Running,
+            JobState::Cancelling => Self::Cancelling,
             JobState::Succeeded => Self::Succeeded,
             JobState::Failed => Self::Failed,
             JobState::Cancelled => Self::Cancelled,

@@ -12,7 +12,6 @@ use super::statuses::to_status;
 use crate::admission::Lease;
 use crate::app::{LossReason, LostSiteEvents, SiteEventKind, SiteEvents, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{Error, ErrorKind, SiteId, TargetId};
-use crate::geo::PlaneCovariance;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -120,7 +119,6 @@ impl From<LostSiteEvents> for proto::WatchTracksResponse {
 
 impl From<&WorldTrackPoint> for proto::WorldTrackPoint {
     fn from(point: &WorldTrackPoint) -> Self {
-        let PlaneCovariance { east_m2, north_m2, east_north_m2 } = point.covariance_m2;
         Self {
             id: point.id.to_string(),
             target_id: point.target_id.as_ref().map(ToString::to_string),
@@ -129,7 +127,7 @@ impl From<&WorldTrackPoint> for proto::WorldTrackPoint {
             position: Some(point.position.into()),
             velocity_east_m_s: point.velocity_east_m_s,
             velocity_north_m_s: point.velocity_north_m_s,
-            covariance: Some(proto::PlaneCovariance { east_m2, north_m2, east_north_m2 }),
+            covariance: Some(point.covariance_m2.into()),
             r95_m: point.r95_m(),
             sightings: point
                 .sightings

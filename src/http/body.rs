@@ -9,13 +9,15 @@ use axum::body::Body;
 use bytes::{Buf as _, Bytes, BytesMut};
 use http_body_util::BodyExt as _;
 use hyper::HeaderMap;
-use hyper::header::{CONTENT_ENCODING, CONTENT_LENGTH, EXPECT};
+use hyper::header::{CONTENT_LENGTH, EXPECT};
 use hyper::http::request::Parts;
+use sha2::{Digest as _, Sha256};
 use tokio::io::AsyncWriteExt as _;
 
+use super::body_coding::is_undecodable;
 use crate::admission::{ClientId, Lease};
 use crate::app::App;
-use crate::domain::{Error, ErrorKind, Result};
+use crate::domain::{Error, ErrorKind, IdempotentRequest, RequestHasher, Result};
 
 /// What is read and thrown away of a body that is too large, so that the client gets its answer
 /// and not a broken connection, and for how long.
@@ -27,7 +29,7 @@ const DISCARD_TIME: Duration = Duration::from_secs(10);
 /// # Errors
 /// `TooLarge` beyond the limit; `Timeout` and `Cancelled` for a body that does not come.
 pub(super) async fn whole(headers: &HeaderMap, mut body: Body, limit: usize) -> Result<Bytes> {
-    check_headers(headers, &mut body, limit).await?;
+    check_announced(headers, &mut body, limit).await?;
     let Some(first) = next(&mut body).await? else { return Ok(Bytes::new()) };
     let mut gathered = Gathered::One(first);
     while let Some(part) = next(&mut body).await? {
@@ -80,6 +82,41 @@ pub(super) struct Spooled {
     pub(super) leases: SpoolLeases,
 }
 
+impl Spooled {
+    /// Adds the content to what a request asks for, and goes back to its begin.
+    ///
+    /// # Errors
+    /// A fault if the temporary file cannot be read.
+    pub(super) async fn hash_into(self, request: &IdempotentRequest) -> Result<Self> {
+        let hasher = request.hasher.clone();
+        let Self { content, leases } = self;
+        let hashing = tokio::task::spawn_blocking(move || content.hash(&hasher));
+        Ok(Self { content: hashing.await.map_err(Error::fault)?.map_err(Error::fault)?, leases })
+    }
+}
+
+impl Content {
+    fn hash(mut self, hasher: &RequestHasher) -> io::Result<Self> {
+        // The pieces in which a body comes differ from time to time, so it is hashed by itself first.
+        let mut hash = Sha256::new();
+        match &mut self {
+            Self::Memory(parts) => parts.iter().for_each(|part| hash.update(part)),
+            Self::File(file) => {
+                let mut buffer = vec![0; 64 * 1024];
+                loop {
+                    match file.read(&mut buffer)? {
+                        0 => break,
+                        read => hash.update(&buffer[..read]),
+                    }
+                }
+                file.rewind()?;
+            }
+        }
+        hasher.update(&hash.finalize());
+        Ok(self)
+    }
+}
+
 /// Where a spooled body is: in memory, or in a temporary file without a name.
 pub(super) enum Content {
     Memory(VecDeque<Bytes>),
@@ -123,7 +160,7 @@ impl SpoolLeases {
 /// temporary file cannot be written.
 pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
     let limit = app.limits.import_bytes;
-    check_headers(&head.headers, &mut body, limit).await?;
+    check_announced(&head.headers, &mut body, limit).await?;
     let mut spool = Spool::new(app, client_id(head))?;
     while let Some(part) = next(&mut body).await? {
         let pushed =
@@ -225,6 +262,12 @@ async fn next(body: &mut Body) -> Result<Option<Bytes>> {
     loop {
         match body.frame().await {
             None => return Ok(None),
+            Some(Err(error)) if is_undecodable(&error) => {
+                return Err(Error::refused(
+                    ErrorKind::MalformedBody,
+                    "the body is not of its content-encoding, or is cut off",
+                ));
+            }
             // Why a body was refused is known, and reported, where requests are admitted.
             Some(Err(_)) => return Err(Error::refused(ErrorKind::Cancelled, "the body broke off")),
             Some(Ok(frame)) => {
@@ -241,19 +284,12 @@ fn too_large(limit: usize) -> Error {
 }
 
 /// Refuses a body by the length that its header announces, before any of it is read.
-/// Refuses a body by its headers: too long, or compressed, which is not read since a few bytes could become many.
-async fn check_headers(headers: &HeaderMap, body: &mut Body, limit: usize) -> Result<()> {
-    let is_encoded = headers.get_all(CONTENT_ENCODING).iter().any(|encoding| encoding != "identity");
-    let refusal = if announced(headers).is_some_and(|length| length > limit as u64) {
-        too_large(limit)
-    } else if is_encoded {
-        let message = "compressed bodies are not read; send it as it is, without this header";
-        Error::field(ErrorKind::UnsupportedMediaType, "content-encoding", message)
-    } else {
-        return Ok(());
-    };
-    discard(headers, body).await;
-    Err(refusal)
+async fn check_announced(headers: &HeaderMap, body: &mut Body, limit: usize) -> Result<()> {
+    if announced(headers).is_some_and(|length| length > limit as u64) {
+        discard(headers, body).await;
+        return Err(too_large(limit));
+    }
+    Ok(())
 }
 
 fn announced(headers: &HeaderMap) -> Option<u64> {

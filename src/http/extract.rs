@@ -14,9 +14,10 @@ use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
 use crate::admission::ClientId;
 use crate::domain::{
-    CameraId, Durability, Error, ErrorKind, EvaluationId, LiveId, Result, RunId, SiteId, TargetId, parse_time,
+    CameraId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId, SiteId,
+    TargetId, parse_time,
 };
-use crate::exchange::{Cursor, read_cursor, wire};
+use crate::exchange::{CsvLayout, Cursor, Format, read_cursor, wire};
 
 /// Items on a page whose length the client leaves open.
 const PAGE_ITEMS: u32 = 100;
@@ -29,6 +30,22 @@ impl<S: Send + Sync> FromRequestParts<S> for Client {
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
         Ok(Self(body::client_id(parts)))
+    }
+}
+
+/// The id of the last event that the client of an event stream has seen: of the header that browsers send by
+/// themselves, or of the parameter `last_event_id`, for a page that opens the stream again.
+pub(super) struct LastEventId(pub(super) Option<String>);
+
+impl<S: Send + Sync> FromRequestParts<S> for LastEventId {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
+        let mut params = Params::of(&parts.uri)?;
+        let given = params.take("last_event_id", |text| Ok(text.to_owned()))?;
+        params.end()?;
+        let header = parts.headers.get("last-event-id").and_then(|value| value.to_str().ok());
+        Ok(Self(header.map(str::to_owned).or(given)))
     }
 }
 
@@ -239,6 +256,19 @@ impl Params {
         Ok(self.take("durability", str::parse)?.unwrap_or_default())
     }
 
+    /// `on_conflict`: what becomes of samples that are stored already.
+    pub(super) fn on_conflict(&mut self) -> Result<OnConflict> {
+        Ok(self.take("on_conflict", str::parse)?.unwrap_or_default())
+    }
+
+    /// `columns`, `box_form` and `box_unit`: the layout of a CSV file.
+    pub(super) fn csv_layout(&mut self) -> Result<CsvLayout> {
+        let columns = self.take("columns", str::parse)?;
+        let box_form = self.take("box_form", str::parse)?;
+        let box_unit = self.take("box_unit", str::parse)?;
+        Ok(CsvLayout::new(columns, box_form, box_unit))
+    }
+
     /// # Errors
     /// `InvalidArgument` naming a parameter that is none.
     pub(super) fn check_names(&self, is_known: impl Fn(&str) -> bool) -> Result<()> {
@@ -252,6 +282,17 @@ impl Params {
     pub(super) fn end(self) -> Result<()> {
         self.check_names(|_| false)
     }
+}
+
+/// The layout of a body, which only CSV has.
+///
+/// # Errors
+/// `InvalidArgument` if there is one for another format.
+pub(super) fn layout_of(format: Format, layout: &CsvLayout) -> Result<()> {
+    if format == Format::Csv || *layout == CsvLayout::default() {
+        return Ok(());
+    }
+    Err(Error::invalid("columns", "columns, box_form, box_unit and target_id are for CSV alone"))
 }
 
 /// A body of JSON, not yet read.
@@ -286,9 +327,36 @@ impl JsonBody {
         wire::parse_document(&self.0)
     }
 
+    /// What was sent.
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.0
+    }
+
     /// The same where all of the body may be left out.
     pub(super) fn read_or_default<'a, T: Deserialize<'a> + Default>(&'a self) -> Result<T> {
         if self.0.is_empty() { Ok(T::default()) } else { self.read() }
+    }
+}
+
+/// A body of JSON, or of rows in another format, not yet read.
+pub(super) enum FormattedBody {
+    Json(JsonBody),
+    Rows(Bytes, Format),
+}
+
+impl FromRequest<Rest> for FormattedBody {
+    type Rejection = ApiError;
+
+    async fn from_request(request: Request, rest: &Rest) -> ApiResult<Self> {
+        let format = media_type(request.headers()).and_then(Format::from_media_type);
+        match format {
+            None | Some(Format::Json) => JsonBody::from_request(request, rest).await.map(Self::Json),
+            Some(format) => {
+                let (parts, content) = request.into_parts();
+                let content = body::whole(&parts.headers, content, rest.app.limits.body_bytes).await?;
+                Ok(Self::Rows(content, format))
+            }
+        }
     }
 }
 

@@ -10,6 +10,7 @@
 mod access;
 mod audit;
 mod body;
+mod body_coding;
 mod camera_statuses;
 mod cameras;
 mod console;
@@ -19,6 +20,7 @@ mod evaluations;
 mod extract;
 mod fusions;
 mod gnss_error;
+mod idempotency;
 mod keys;
 mod merge_patch;
 mod models;
@@ -103,11 +105,15 @@ impl Transport {
     /// extensions. Whatever part of the router refuses it, or panics, the answer is a problem.
     pub async fn answer(&self, request: Request<Body>) -> Response<Body> {
         // Not as layers of the router: axum would box the service and the future of every request for each.
+        let coding = body_coding::AcceptedCoding::of(&request);
         let refused = problem::Refused::of(&request);
-        let answer = AssertUnwindSafe(self.0.clone().call(request)).catch_unwind().await;
+        let answer = match body_coding::decoded(request).await {
+            Ok(request) => AssertUnwindSafe(self.0.clone().call(request)).catch_unwind().await,
+            Err(refusal) => Ok(Ok(refusal)),
+        };
         let answer =
             answer.map_or_else(problem::panicked, |answer| answer.unwrap_or_else(|never| match never {}));
-        refused.explain(answer)
+        coding.encode(refused.explain(answer)).await
     }
 }
 

@@ -9,11 +9,12 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::access::CallerApp;
 use super::extract::{CameraPath, Params};
+use super::idempotency::idempotent;
 use super::parts::parts;
 use super::problem::{ApiResult, Problem};
 use super::receivers::Receiver;
 use super::wire::{Durability, json};
-use crate::app::{self, App, MatchReport, PairedImport, PairedReport, PairingCounts, Part};
+use crate::app::{self, App, ImportOptions, MatchReport, PairedImport, PairedReport, PairingCounts, Part};
 use crate::domain::{self, Error, ReceiverId, Result, TargetId};
 use crate::exchange::{FixFormat, Format, RowError};
 use crate::fusion::association::MatchSettings;
@@ -47,6 +48,8 @@ struct PairedSamples {
     accepted_without_fix: u64,
     /// Samples of which the same camera, target and time were stored before.
     duplicate: u64,
+    /// Of the accepted ones, those that took the place of a stored sample (`on_conflict=replace`).
+    replaced: u64,
     /// Rows of both parts that are none.
     rejected: u64,
     /// The first 100 of these in each part.
@@ -213,6 +216,11 @@ struct ClockOffsetEstimate {
         ("min_probability" = Option<f64>, Query, description = "With `match`, leave out samples whose match is less probable, 0.9 if left out; 0.5 to 1"),
         ("clock_window_s" = Option<f64>, Query, description = "With `match`, the receivers' clocks are off by at most this, 0 if left out; 0 to 30"),
         ("durability" = Option<String>, Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
+        ("on_conflict" = Option<String>, Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
+        ("columns" = Option<String>, Query, description = "The columns of CSV parts: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` (such as `time:Timestamp,left:x1`) names them; other columns are ignored"),
+        ("box_form" = Option<String>, Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV part hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
+        ("box_unit" = Option<String>, Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
+        ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters: an import that is sent again under the same key gets the answer of the first; for a day"),
         ("estimate_offset" = Option<bool>, Query, description = "Tell the receivers' clock offsets as the files show them; they are not applied"),
     ),
     request_body(content = PairingParts, content_type = "multipart/form-data"),
@@ -231,11 +239,18 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
     let estimates_offsets = params.flag("estimate_offset")?.unwrap_or(false);
     let keeps_unpaired = params.flag("keep_unpaired")?.unwrap_or(false);
     let durability = params.durability()?;
+    let on_conflict = params.on_conflict()?;
+    let layout = params.csv_layout()?;
     let matching = matching(&mut params, &app)?;
     params.end()?;
+    let idempotent = idempotent(&head)?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let names = [Part::Detections, Part::Fixes].map(Part::as_str);
-    let [detections, fixes] = parts(&app, &head, content, names).await?;
+    let [mut detections, mut fixes] = parts(&app, &head, content, names).await?;
+    if let Some(request) = &idempotent {
+        detections.content = detections.content.hash_into(request).await?;
+        fixes.content = fixes.content.hash_into(request).await?;
+    }
     let readable = |format: &Format| *format != Format::GeoJson;
     let detections_format = detections.format(
         names[0],
@@ -258,7 +273,8 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
         target_id,
         receiver_id,
         keeps_unpaired,
-        durability,
+        options: ImportOptions { durability, on_conflict, idempotent },
+        layout,
         estimates_offsets,
         matching,
     };
@@ -305,6 +321,7 @@ fn paired_samples(report: PairedReport, durability: domain::Durability, with_off
         accepted: samples.accepted,
         accepted_without_fix: samples.without_fix,
         duplicate: samples.duplicate,
+        replaced: samples.replaced,
         rejected: rejected.count,
         rejected_rows: rejected.rows.into_iter().map(|(part, row)| rejected_row(part, row)).collect(),
         durability: durability.into(),

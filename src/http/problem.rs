@@ -67,6 +67,10 @@ pub(super) struct Problem<'a> {
     /// The fields at fault.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     violations: Vec<Violation<'a>>,
+    /// Id of what stands in the way, such as the camera's live training run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    conflicting_id: Option<&'a str>,
 }
 
 /// One field at fault.
@@ -87,15 +91,15 @@ fn status_of(error: &Error) -> StatusCode {
 /// The problem of an error as a response.
 pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) -> Response<Body> {
     let row = status::of(error.kind());
-    let (detail, violations) = match error {
+    let (detail, violations, conflicting_id) = match error {
         Error::Refused(refusal) => {
             let violations = refusal.violations.iter();
             let violations = violations.map(|at| Violation { field: &at.field, message: &at.message });
-            (refusal.to_string(), violations.collect())
+            (refusal.to_string(), violations.collect(), refusal.conflicting_id.as_deref())
         }
         Error::Fault(fault) => {
             tracing::error!(request.id = %id, error = %fault, "a request failed");
-            ("the server failed; its log has more under this trace_id".to_owned(), Vec::new())
+            ("the server failed; its log has more under this trace_id".to_owned(), Vec::new(), None)
         }
     };
     let problem = Problem {
@@ -106,6 +110,7 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
         instance,
         trace_id: id.as_str(),
         violations,
+        conflicting_id,
     };
     let json = serde_json::to_vec(&problem).unwrap_or_default();
     let mut response = Response::new(Body::from(json));

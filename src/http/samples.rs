@@ -14,14 +14,15 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::access::CallerApp;
-use super::extract::{CameraPath, Params, media_type, negotiate, not_read};
+use super::extract::{CameraPath, Params, layout_of, media_type, negotiate, not_read};
+use super::idempotency::idempotent;
 use super::problem::{ApiResult, Problem};
 use super::wire::{Durability, json};
 use super::{Rest, body};
-use crate::app::{App, ImportReport};
+use crate::app::{App, ImportOptions, ImportReport};
 use crate::domain::{self, CameraId, Error, Result, StoredSample, TargetId, TimeRange};
 use crate::exchange::wire;
-use crate::exchange::{Format, SampleWriter, write_cursor};
+use crate::exchange::{CsvLayout, Format, SampleWriter, write_cursor};
 use crate::store::{SampleFilter, SampleKey};
 
 /// Samples read from the store at once for an export.
@@ -42,6 +43,8 @@ pub(super) struct Imported {
     accepted_without_fix: u64,
     /// The same camera, target and time were stored before, or appear twice in the import.
     duplicate: u64,
+    /// Of the accepted ones, those that took the place of a stored sample (`on_conflict=replace`).
+    replaced: u64,
     /// Not stored for a fault of their own.
     rejected: u64,
     /// The first 100 of these.
@@ -70,10 +73,18 @@ impl From<crate::app::RejectedRow> for RejectedRow {
 
 impl Imported {
     fn new(report: ImportReport, durability: domain::Durability) -> Self {
-        let ImportReport { accepted, without_fix, duplicate, rejected, rejected_rows } = report;
+        let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows } = report;
         let rejected_rows = rejected_rows.into_iter().map(RejectedRow::from).collect();
         let durability = durability.into();
-        Self { accepted, accepted_without_fix: without_fix, duplicate, rejected, rejected_rows, durability }
+        Self {
+            accepted,
+            accepted_without_fix: without_fix,
+            duplicate,
+            replaced,
+            rejected,
+            rejected_rows,
+            durability,
+        }
     }
 }
 
@@ -115,11 +126,21 @@ struct DeletedSamples {
 ///
 /// One bad row never loses the others. Samples that are stored already are counted, not stored again, so an
 /// import that broke off can be sent again as it is; but a sample with a fix takes the place of one without.
+/// With `on_conflict=replace`, which is for operators, each sample takes the place of the stored one.
+///
+/// With `columns`, `box_form` or `box_unit` a CSV file may have any separator, decimal commas, Unix times and
+/// columns that nothing asks for.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/samples", tag = "samples",
     params(
         ("camera" = String, Path, description = "The camera's id"),
         ("durability" = Option<String>, Query, description = "When the rows are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
+        ("on_conflict" = Option<String>, Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
+        ("columns" = Option<String>, Query, description = "The columns of a CSV file: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` (such as `time:Timestamp,left:x1`) names them; other columns are ignored"),
+        ("box_form" = Option<String>, Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV file hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
+        ("box_unit" = Option<String>, Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
+        ("target_id" = Option<String>, Query, description = "The target of rows of a CSV file that name none"),
+        ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters: an import that is sent again under the same key gets the answer of the first; for a day"),
     ),
     request_body(content(
         (String = "text/csv", example = "time,target_id,left,top,width,height,longitude,latitude\n2020-12-14T14:41:48+08:00,person-1,475,11,28,77,103.98678,30.6280135\n"),
@@ -139,11 +160,19 @@ async fn import_samples(
     let (parts, content) = request.into_parts();
     let mut params = Params::of(&parts.uri)?;
     let durability = params.durability()?;
+    let on_conflict = params.on_conflict()?;
+    let layout = CsvLayout { target_id: params.take("target_id", TargetId::new)?, ..params.csv_layout()? };
     params.end()?;
     let format = import_format(&parts.headers)?;
+    layout_of(format, &layout)?;
+    let idempotent = idempotent(&parts)?;
     app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
-    let spooled = body::spooled(&app, &parts, content).await?;
-    let report = app.import_file(&id, spooled, format, durability).await?;
+    let mut spooled = body::spooled(&app, &parts, content).await?;
+    if let Some(request) = &idempotent {
+        spooled = spooled.hash_into(request).await?;
+    }
+    let options = ImportOptions { durability, on_conflict, idempotent };
+    let report = app.import_file(&id, spooled, (format, layout), options).await?;
     Ok(json(&Imported::new(report, durability))?)
 }
 

@@ -8,6 +8,7 @@ use axum::extract::State;
 use axum::response::IntoResponse as _;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{StreamExt as _, stream};
+use hyper::Uri;
 use hyper::header::CONTENT_TYPE;
 use hyper::http::HeaderValue;
 use jiff::Timestamp;
@@ -19,11 +20,13 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::access::CallerApp;
 use super::cameras::CameraMoved;
-use super::extract::{CameraPath, Client, JsonBody, TargetPath};
+use super::extract::{CameraPath, Client, JsonBody, LastEventId, Params, TargetPath};
 use super::fusions::{FusionRequest, observations};
 use super::problem::{ApiResult, Problem};
 use super::wire::{json, json_of_about};
-use crate::app::{CameraEvent, ItemResult, LostEvents, TargetUpdate, TrackPoint};
+use crate::app::{
+    Acknowledgement, CameraEvent, EventId, ItemResult, LostEvents, NotStoredReason, TargetUpdate, TrackPoint,
+};
 use crate::domain::Result;
 use crate::exchange::wire;
 use crate::fusion::track;
@@ -115,6 +118,8 @@ struct TrackState {
     velocity_north_m_s: f64,
     /// Radius about the position that holds the true one with 95 % probability, m.
     r95_m: f64,
+    /// Covariance of the normal distribution about the position that has this radius: its 95 % ellipse.
+    covariance: wire::PlaneCovariance,
     /// Probability that the target is stationary, 0 to 1.
     still: f64,
     /// Normalised innovation squared of what was used; 2 on average for each of box and fix.
@@ -135,6 +140,7 @@ impl From<&TrackPoint> for TrackState {
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
+            covariance: state.normal_covariance().into(),
             still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
@@ -273,31 +279,88 @@ impl<'a> From<&'a TargetUpdate> for TrackUpdate<'a> {
 struct FollowedObservations<'a> {
     /// Answers.
     items: Vec<FollowedObservation<'a>>,
+    /// What was stored, if that was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    stored: Option<StoredObservations>,
+}
+
+/// What became of observations that were to be stored.
+#[derive(Default, Serialize, ToSchema)]
+struct StoredObservations {
+    /// Boxes and fixes that are part of a stored sample.
+    in_samples: u64,
+    /// Those that name neither target nor receiver.
+    no_target: u64,
+    /// Those for which no partner came within the pairing window.
+    unpaired: u64,
+    /// Those that came after the pairing of their instant had been decided.
+    too_late: u64,
+    /// Those of which the same target and instant was there before.
+    duplicate: u64,
+}
+
+impl From<Acknowledgement> for StoredObservations {
+    fn from(acknowledgement: Acknowledgement) -> Self {
+        let count = |reason| {
+            let of_reason = acknowledgement.not_stored.iter().filter(|it| it.reason == reason);
+            of_reason.map(|it| it.count).sum()
+        };
+        Self {
+            in_samples: acknowledgement.stored,
+            no_target: count(NotStoredReason::NoTarget),
+            unpaired: count(NotStoredReason::Unpaired),
+            too_late: count(NotStoredReason::TooLate),
+            duplicate: count(NotStoredReason::Duplicate),
+        }
+    }
 }
 
 /// Follow targets
 ///
 /// Takes what `fusions` takes, box and fix together or apart, and feeds each observation to the
 /// track of its target.
+///
+/// With `store_samples` boxes and fixes are paired with those of all live streams of the camera that store
+/// samples, and stored. The answer then comes when it is decided what becomes of each observation, some seconds
+/// later: a client that sends as it measures has several requests open.
 #[utoipa::path(
-    post, path = "/v1/cameras/{camera}/tracks", tag = "tracks", params(("camera" = String, Path, description = "The camera's id")),
+    post, path = "/v1/cameras/{camera}/tracks", tag = "tracks",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("store_samples" = Option<bool>, Query, description = "Pair boxes and fixes by target and time, and store the samples"),
+        ("durability" = Option<String>, Query, description = "When samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
+    ),
     request_body = FusionRequest,
     responses(
         (status = 200, description = "Positions and tracks", body = FollowedObservations<'static>),
         (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn follow(CallerApp(app): CallerApp, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
+async fn follow(
+    CallerApp(app): CallerApp,
+    CameraPath(id): CameraPath,
+    Client(client): Client,
+    uri: Uri,
+    body: JsonBody,
+) -> ApiResult {
+    let mut params = Params::of(&uri)?;
+    let stores_samples = params.flag("store_samples")?.unwrap_or(false);
+    let durability = params.durability()?;
+    params.end()?;
     let camera = app.active_camera(&id).await?;
     // Times ahead of the clock are refused before any track has changed.
-    let observations = observations(&app, &body.read()?, &app.live_rules(&camera))?;
+    let observations = observations(&app, &body.read()?, &app.live_rules(&camera), &camera.receivers)?;
     app.check_batch(observations.len())?;
-    let followed = observations
-        .iter()
-        .map(|observation| app.follow(&camera, observation))
-        .collect::<Result<Vec<_>>>()?;
+    let (followed, stored) = if stores_samples {
+        let (followed, acknowledgement) =
+            app.follow_and_store(&camera, observations, client, durability).await?;
+        (followed, Some(StoredObservations::from(acknowledgement)))
+    } else {
+        let follow = |observation| app.follow(&camera, observation);
+        (observations.iter().map(follow).collect::<Result<Vec<_>>>()?, None)
+    };
     let items = followed.iter().map(Into::into).collect();
-    Ok(json_of_about(&FollowedObservations { items }, 64 + ITEM_BYTES * followed.len())?)
+    Ok(json_of_about(&FollowedObservations { items, stored }, 64 + ITEM_BYTES * followed.len())?)
 }
 
 /// Watch a camera
@@ -305,9 +368,17 @@ async fn follow(CallerApp(app): CallerApp, CameraPath(id): CameraPath, body: Jso
 /// Server-sent events from now on: `track` with a position as GeoJSON whenever a target was
 /// measured, `camera_moved` when the camera's pose is found to have changed, and `lost` with the number
 /// of events that were lost because the client read too slowly. They end when the camera is deleted.
+///
+/// A client that comes back with the `last-event-id` of an event goes on behind it. The latest 1,024 events are
+/// kept, up to a minute without a client; of those that are not kept any more, `lost` tells the number, or
+/// `null` where it is not known.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/events", tag = "tracks",
-    params(("camera" = String, Path, description = "The camera's id")),
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("last-event-id" = Option<String>, Header, description = "The id of the last event that the client has seen"),
+        ("last_event_id" = Option<String>, Query, description = "The same, for a page that cannot send the header"),
+    ),
     responses((status = 200, description = "Events", body = TrackUpdate<'static>, content_type = "text/event-stream"))
 )]
 async fn watch_camera(
@@ -315,23 +386,32 @@ async fn watch_camera(
     CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
     Client(client): Client,
+    LastEventId(last_seen): LastEventId,
 ) -> ApiResult {
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
-    let events = app.camera_events(&id).await?;
+    // What is no id of ours names no event that is known.
+    let last_seen = last_seen.map(|text| text.parse().unwrap_or(EventId::UNKNOWN));
+    let events = app.camera_events(&id, last_seen).await?;
     let shutdown = rest.shutdown.clone();
     let sent = stream::unfold(events, |mut events| async move {
-        let event = match events.next().await? {
-            Ok(CameraEvent::Track(update)) => event_of("track", &TrackUpdate::from(&*update)),
-            Ok(CameraEvent::Moved(moved)) => event_of("camera_moved", &CameraMoved::from(&*moved)),
-            Err(LostEvents(lost)) => event_of("lost", &lost),
+        let (id, event) = match events.next().await? {
+            Ok((id, event)) => (id, camera_event(&event)),
+            Err(LostEvents { count, id }) => (id, event_of("lost", &count)),
         };
-        Some((event, events))
+        Some((event.id(id.to_string()), events))
     });
     let sent = sent.take_until(async move { shutdown.draining().await }).map(move |event| {
         let _held = &lease; // until the stream is dropped
         Ok::<_, Infallible>(event)
     });
     Ok(Sse::new(sent).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
+}
+
+fn camera_event(event: &CameraEvent) -> Event {
+    match event {
+        CameraEvent::Track(update) => event_of("track", &TrackUpdate::from(&**update)),
+        CameraEvent::Moved(moved) => event_of("camera_moved", &CameraMoved::from(&**moved)),
+    }
 }
 
 pub(super) fn event_of(name: &str, value: &impl Serialize) -> Event {

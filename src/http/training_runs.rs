@@ -4,19 +4,21 @@ use std::convert::Infallible;
 use std::time::Duration;
 
 use axum::extract::State;
+use axum::response::IntoResponse as _;
 use axum::response::sse::{Event, KeepAlive, Sse};
-use axum::response::{IntoResponse, Response};
-use futures_util::{Stream, StreamExt as _};
-use hyper::{HeaderMap, StatusCode, Uri};
+use futures_util::StreamExt as _;
+use hyper::{StatusCode, Uri};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Rest;
 use super::access::CallerApp;
-use super::extract::{CameraPath, Client, JsonBody, Params, RunPath};
+use super::extract::{CameraPath, Client, JsonBody, LastEventId, Params, RunPath};
+use super::idempotency::Idempotent;
 use super::problem::{ApiResult, Problem};
 use super::wire::{JobState, Recipe, created, empty, instant, json};
 use crate::app::RunRequest;
@@ -161,19 +163,27 @@ struct RunPage {
 ///
 /// The run waits in a queue and is fitted in the background; the answer comes at once.
 #[utoipa::path(
-    post, path = "/v1/cameras/{camera}/training-runs", tag = "training", params(("camera" = String, Path, description = "The camera's id")),
+    post, path = "/v1/cameras/{camera}/training-runs", tag = "training",
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters: a request that is sent again under the same key gets the run of the first; for a day"),
+    ),
     request_body = Option<RunDraft>,
     responses(
         (status = 202, description = "The queued run", body = TrainingRun, headers(("location" = String, description = "Its path"))),
-        (status = 409, description = "The camera has a live run", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The camera has a live run, whose id is `conflicting_id`", body = Problem, content_type = "application/problem+json"),
     )
 )]
 async fn start_training_run(
     CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
+    Idempotent(idempotent): Idempotent,
     body: JsonBody,
 ) -> ApiResult {
-    let run = app.start_run(&id, body.read_or_default::<RunDraft>()?.to_domain()?).await?;
+    if let Some(request) = &idempotent {
+        request.hasher.update(body.bytes());
+    }
+    let run = app.start_run_once(&id, body.read_or_default::<RunDraft>()?.to_domain()?, idempotent).await?;
     let location = format!("/v1/cameras/{id}/training-runs/{}", run.id);
     Ok(created(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
 }
@@ -245,10 +255,17 @@ async fn cancel_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPat
 /// Watch a training run
 ///
 /// Server-sent events `run`, each with the whole run as JSON: now, at each change, and the last
-/// one, with the id `ended`, when it has ended. A browser that comes back after that gets 204.
+/// one, with the id `ended`, when it has ended. A client that comes back with the `last-event-id` of an event
+/// gets the run when it is another than it was then, and 204 after the last event.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/training-runs/{run}/events", tag = "training",
-    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, description = "The run's id")),
+
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("run" = String, Path, description = "The run's id"),
+        ("last-event-id" = Option<String>, Header, description = "The id of the last event that the client has seen"),
+        ("last_event_id" = Option<String>, Query, description = "The same, for a page that cannot send the header"),
+    ),
     responses(
         (status = 200, description = "Events", body = TrainingRun, content_type = "text/event-stream"),
         (status = 204, description = "The client has seen the last event"),
@@ -259,34 +276,39 @@ async fn watch_training_run(
     CallerApp(app): CallerApp,
     RunPath(id, run): RunPath,
     Client(client): Client,
-    headers: HeaderMap,
+    LastEventId(last_seen): LastEventId,
 ) -> ApiResult {
-    if headers.get("last-event-id").is_some_and(|last| last == ENDED) {
+    if last_seen.as_deref() == Some(ENDED) {
         return Ok(empty());
     }
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
     let changes = app.watch_run(&id, run).await?;
     let shutdown = rest.shutdown.clone();
-    let events = changes.take_until(async move { shutdown.draining().await }).map(move |change| {
+    let events = changes.take_until(async move { shutdown.draining().await }).filter_map(move |change| {
         let _held = &lease; // until the stream is dropped
-        Ok(event_of(change))
+        std::future::ready(event_of(change, last_seen.as_deref()).map(Ok::<_, Infallible>))
     });
-    Ok(event_stream(events))
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response())
 }
 
-fn event_stream(events: impl Stream<Item = Result<Event, Infallible>> + Send + 'static) -> Response {
-    Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response()
-}
-
-fn event_of(change: Result<domain::TrainingRun>) -> Event {
+/// The event of a change; `None` for what the client has seen last.
+fn event_of(change: Result<domain::TrainingRun>, last_seen: Option<&str>) -> Option<Event> {
     let event = change.and_then(|run| {
-        let event = if run.state.has_ended() { Event::default().id(ENDED) } else { Event::default() };
-        event.event("run").json_data(TrainingRun::from(run)).map_err(Error::fault)
+        let has_ended = run.state.has_ended();
+        let json = serde_json::to_string(&TrainingRun::from(run)).map_err(Error::fault)?;
+        // The event is the whole run, so what it says is all that tells two of them apart.
+        let id = if has_ended { ENDED.to_owned() } else { content_id(json.as_bytes()) };
+        Ok((last_seen != Some(id.as_str())).then(|| Event::default().id(id).event("run").data(json)))
     });
     event.unwrap_or_else(|error| {
         tracing::error!(%error, "a watched run cannot be read");
-        Event::default().event("error").data("the server failed; read the run again")
+        Some(Event::default().event("error").data("the server failed; read the run again"))
     })
+}
+
+/// The beginning of the content's SHA-256.
+fn content_id(content: &[u8]) -> String {
+    Sha256::digest(content).iter().take(8).map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// A line of a run's log.

@@ -70,7 +70,7 @@ impl From<domain::Durability> for Durability {
     }
 }
 
-/// State of a job. Queued and running jobs are live; the others have ended.
+/// State of a job. Queued, running and cancelling jobs are live; the others have ended.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum JobState {
@@ -78,6 +78,8 @@ pub(super) enum JobState {
     Queued,
     /// A worker carries it out.
     Running,
+    /// A worker carries it out and will end it soon: its cancellation was requested.
+    Cancelling,
     /// Yielded what it was asked for.
     Succeeded,
     /// Ended by an error.
@@ -91,6 +93,7 @@ impl From<domain::JobState> for JobState {
         match state {
             domain::JobState::Queued => Self::Queued,
             domain::JobState::Running => Self::Running,
+            domain::JobState::Cancelling => Self::Cancelling,
             domain::JobState::Succeeded => Self::Succeeded,
             domain::JobState::Failed => Self::Failed,
             domain::JobState::Cancelled => Self::Cancelled,

@@ -25,8 +25,7 @@ use super::tracks::{KEEP_ALIVE, PointGeometry, event_of};
 use super::wire::json;
 use crate::app::{LostSiteEvents, SiteEventKind, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{Error, LiveId, Result, TargetId};
-use crate::exchange::wire::Position;
-use crate::geo;
+use crate::exchange::wire::{PlaneCovariance, Position};
 
 /// Header and query parameter that name the event to continue behind.
 const LAST_EVENT_HEADER: &str = "last-event-id";
@@ -39,24 +38,6 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(list_world_tracks))
         .routes(routes!(get_world_track))
         .routes(routes!(watch_site))
-}
-
-/// A covariance on the ground in m2, axes east and north.
-#[derive(Serialize, ToSchema)]
-struct PlaneCovariance {
-    /// Variance along east.
-    east_m2: f64,
-    /// Variance along north.
-    north_m2: f64,
-    /// Covariance of east and north.
-    east_north_m2: f64,
-}
-
-impl From<geo::PlaneCovariance> for PlaneCovariance {
-    fn from(covariance: geo::PlaneCovariance) -> Self {
-        let geo::PlaneCovariance { east_m2, north_m2, east_north_m2 } = covariance;
-        Self { east_m2, north_m2, east_north_m2 }
-    }
 }
 
 /// A camera that sees a target.

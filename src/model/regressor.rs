@@ -55,6 +55,12 @@ impl Regression {
     pub fn normal_scale(&self) -> f64 {
         (self.r95_m() / self.covariance.r95_m()).powi(2)
     }
+
+    /// Covariance, m2, of the normal distribution that has the stated 95 % radius.
+    #[must_use]
+    pub fn normal_covariance(&self) -> PlaneCovariance {
+        self.covariance.scaled(self.normal_scale())
+    }
 }
 
 /// A loaded model: flat weights, which threads may share.

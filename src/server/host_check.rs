@@ -14,16 +14,19 @@ use crate::domain::{Error, ErrorKind, Result};
 /// The hosts that a server answers for.
 pub(super) struct HostCheck {
     configured: Vec<String>,
+    /// Origins whose pages may ask for changes, with a key.
+    origins: Vec<String>,
     accepts_all: bool,
     /// Only this machine reaches the server.
     is_loopback: bool,
 }
 
 impl HostCheck {
-    /// From the setting `allowed_hosts` and the address that the server listens on.
-    pub(super) fn new(allowed_hosts: &[String], listen: SocketAddr) -> Self {
+    /// From the settings `allowed_hosts` and `cors_origins`, and the address that the server listens on.
+    pub(super) fn new(allowed_hosts: &[String], cors_origins: &[String], listen: SocketAddr) -> Self {
         Self {
             configured: allowed_hosts.to_vec(),
+            origins: cors_origins.to_vec(),
             accepts_all: allowed_hosts.iter().any(|host| host == "*"),
             is_loopback: listen.ip().is_loopback(),
         }
@@ -105,12 +108,12 @@ impl HostCheck {
         let is_own = authority.is_some_and(|authority| {
             host.is_some_and(|host| authority.eq_ignore_ascii_case(host)) || self.is_configured(authority)
         });
-        if is_own || self.accepts_all {
+        if is_own || self.accepts_all || self.origins.iter().any(|allowed| allowed == origin) {
             return Ok(());
         }
         let shown: String = origin.chars().take(80).collect();
         let message = format!(
-            "pages of `{shown}` may not ask for changes; add its host to the setting allowed_hosts if they may"
+            "pages of `{shown}` may not ask for changes; add it to the setting cors_origins, or its host to allowed_hosts, if they may"
         );
         Err(Error::field(ErrorKind::OriginNotAllowed, "origin", message))
     }
@@ -141,7 +144,7 @@ mod tests {
 
     fn check(listen: &str, allowed: &[&str]) -> HostCheck {
         let allowed: Vec<String> = allowed.iter().map(|&host| host.to_owned()).collect();
-        HostCheck::new(&allowed, listen.parse().expect("an address"))
+        HostCheck::new(&allowed, &[], listen.parse().expect("an address"))
     }
 
     #[test]

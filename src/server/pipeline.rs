@@ -1,19 +1,21 @@
 //! What every request goes through, whatever its transport: id, span, host and origin, admission,
 //! deadline, then the transport.
 
+use std::convert::Infallible;
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Body;
 use http_body_util::BodyExt as _;
 use hyper::body::{Body as _, Incoming};
-use hyper::header::{CONNECTION, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
+use hyper::header::{CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
 use hyper::http::HeaderValue;
 use hyper::{Method, Request, Response, Version};
 use tokio::sync::Semaphore;
-use tower::Service as _;
+use tower::{Layer as _, Service as _, ServiceExt as _, service_fn};
+use tower_http::cors::CorsLayer;
 use tracing::field::{Empty, display};
 use tracing::{Instrument as _, Span};
 
@@ -54,6 +56,12 @@ enum Counted {
     Grpc(RpcCall),
 }
 
+impl Counted {
+    const fn is_grpc(&self) -> bool {
+        matches!(self, Self::Grpc(_))
+    }
+}
+
 /// The way from a connection to the transports.
 pub(super) struct RequestPipeline {
     app: App,
@@ -64,6 +72,7 @@ pub(super) struct RequestPipeline {
     shutdown: Shutdown,
     discards: Semaphore,
     audience: Audience,
+    cors: Option<CorsLayer>,
 }
 
 /// The connection that a request came over.
@@ -96,6 +105,7 @@ impl RequestPipeline {
         console: Console,
         hosts: HostCheck,
         proxies: TrustedProxies,
+        cors: Option<CorsLayer>,
         shutdown: &Shutdown,
     ) -> Self {
         Self {
@@ -103,6 +113,7 @@ impl RequestPipeline {
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
             proxies,
+            cors,
             shutdown: shutdown.clone(),
             discards: Semaphore::new(DISCARDED_BODIES),
             audience: Audience::Clients,
@@ -117,6 +128,7 @@ impl RequestPipeline {
             grpc: Router::new(),
             hosts,
             proxies: TrustedProxies::default(),
+            cors: None,
             shutdown: shutdown.clone(),
             discards: Semaphore::new(DISCARDED_BODIES),
             audience: Audience::Monitoring,
@@ -139,33 +151,14 @@ impl RequestPipeline {
         let peer = &*self.proxies.original(peer, request.headers());
         let is_http_1 = request.version() < Version::HTTP_2;
         let id = self.request_id(&request);
-        let is_grpc = self.audience == Audience::Clients && has_grpc_content(&request);
+        let counted = self.begin_count(&request);
         let span = tracing::debug_span!(
             target: REQUESTS, "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
         );
         #[cfg(feature = "otel")]
         crate::telemetry::continue_trace(&span, request.headers());
-        let counted = if is_grpc {
-            let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
-            Counted::Grpc(self.app.metrics.call(rpc))
-        } else {
-            Counted::Http(MatchedRoute::default())
-        };
-        let (mut response, ticket) = async {
-            match self.admit(request, &counted, peer, &id).await {
-                Ok((request, granted)) => {
-                    (self.route(is_grpc, request, &granted, &id).await, Some(granted.ticket))
-                }
-                Err(error) => {
-                    if error.kind() == ErrorKind::Overloaded {
-                        self.app.metrics.refused();
-                    }
-                    (refuse(is_grpc, &error, &id), None)
-                }
-            }
-        }
-        .instrument(span.clone())
-        .await;
+        let (mut response, ticket) =
+            self.respond(request, &counted, peer, &id).instrument(span.clone()).await;
         let headers = response.headers_mut();
         headers.insert(REQUEST_ID, id.header().clone());
         headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
@@ -174,6 +167,16 @@ impl RequestPipeline {
         }
         let call = span.in_scope(|| self.count(counted, &response, peer, began.elapsed()));
         response.map(|body| ObservedBody::new(body, open, call, ticket))
+    }
+
+    /// Which transport a request is for, and how it is counted.
+    fn begin_count(&self, request: &Request<Incoming>) -> Counted {
+        if self.audience == Audience::Clients && has_grpc_content(request) {
+            let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
+            Counted::Grpc(self.app.metrics.call(rpc))
+        } else {
+            Counted::Http(MatchedRoute::default())
+        }
     }
 
     /// Counts and logs an answer. A call of an RPC is counted when it ends.
@@ -205,6 +208,47 @@ impl RequestPipeline {
         }
     }
 
+    /// The response, and the ticket of a request that was admitted.
+    async fn respond(
+        &self,
+        request: Request<Incoming>,
+        counted: &Counted,
+        peer: &Peer,
+        id: &RequestId,
+    ) -> (Response<Body>, Option<Ticket>) {
+        let Some(cors) = &self.cors else { return self.admit_and_route(request, counted, peer, id).await };
+        let granted = OnceLock::new();
+        let service = service_fn(|request| async {
+            let (response, ticket) = self.admit_and_route(request, counted, peer, id).await;
+            // The service is called once.
+            let _ = granted.set(ticket);
+            Ok::<_, Infallible>(response)
+        });
+        let Ok(response) = cors.layer(service).oneshot(request).await;
+        (response, granted.into_inner().flatten())
+    }
+
+    async fn admit_and_route(
+        &self,
+        request: Request<Incoming>,
+        counted: &Counted,
+        peer: &Peer,
+        id: &RequestId,
+    ) -> (Response<Body>, Option<Ticket>) {
+        let is_grpc = counted.is_grpc();
+        match self.admit(request, counted, peer, id).await {
+            Ok((request, granted)) => {
+                (self.route(is_grpc, request, &granted, id).await, Some(granted.ticket))
+            }
+            Err(error) => {
+                if error.kind() == ErrorKind::Overloaded {
+                    self.app.metrics.refused();
+                }
+                (refuse(is_grpc, &error, id), None)
+            }
+        }
+    }
+
     /// The request as the transports get it, with what it was granted; the body of a refused one is
     /// read to its end before.
     async fn admit(
@@ -215,7 +259,7 @@ impl RequestPipeline {
         id: &RequestId,
     ) -> Result<(Request<Body>, Granted)> {
         let path = request.uri().path();
-        let is_grpc = matches!(counted, Counted::Grpc(_));
+        let is_grpc = counted.is_grpc();
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
         match self.grant(&request, class, is_grpc, peer, id) {
             Ok(granted) => {
@@ -280,6 +324,10 @@ impl RequestPipeline {
             _ => limits.body_bytes,
         };
         let ticket = Ticket::open(&self.app, class, client, held_bytes)?;
+        if request.headers().contains_key(CONTENT_ENCODING) {
+            // What it decodes to is not known before it has been read.
+            ticket.charge(held_bytes as u64)?;
+        }
         let has_no_body = request.body().is_end_stream()
             || matches!(*request.method(), Method::GET | Method::HEAD | Method::DELETE | Method::OPTIONS);
         if has_no_body || class == RequestClass::ImportStream {

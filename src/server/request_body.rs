@@ -91,7 +91,11 @@ impl Ticket {
         self.lock().refusal.clone()
     }
 
-    fn charge(&self, bytes: u64) -> Result<()> {
+    /// Charges for bytes that are held in memory, up to the most that are charged for.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub(super) fn charge(&self, bytes: u64) -> Result<()> {
         let mut grant = self.lock();
         let charged = bytes.min(grant.charged_bytes);
         grant.charged_bytes -= charged;

@@ -9,6 +9,7 @@ use sqlx::sqlite::SqliteRow;
 use super::Store;
 use super::errors::failed;
 use super::row_decoder::RowDecoder;
+use super::space::StoreLimits;
 use crate::domain::{Actor, AuditAction, AuditEntry, AuditNumber, CameraId, KeyId, Result};
 
 /// A change, for the audit log.
@@ -44,27 +45,7 @@ impl Store {
         change: Change<'_>,
         now: Timestamp,
     ) -> Result<()> {
-        let number: i64 = sqlx::query_scalar(
-            "INSERT INTO audit_log (time_us, actor, key_id, address, request_id, action, camera_id, subject) \
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?) RETURNING number",
-        )
-        .bind(now.as_microsecond())
-        .bind(&*self.actor.name)
-        .bind(self.actor.key_id.map(|id| id.to_string()))
-        .bind(self.actor.address.map(|address| address.to_string()))
-        .bind(self.actor.request_id.as_deref())
-        .bind(change.action.as_str())
-        .bind(change.camera.map(CameraId::as_str))
-        .bind(change.subject)
-        .fetch_one(&mut *connection)
-        .await
-        .map_err(failed)?;
-        sqlx::query("DELETE FROM audit_log WHERE number <= ?")
-            .bind(number.saturating_sub(self.limits().audit_entries.into()))
-            .execute(connection)
-            .await
-            .map_err(failed)?;
-        Ok(())
+        record(connection, (&self.actor, self.limits()), change, now).await
     }
 
     /// A page of the audit log, of a camera or of all, newest first, before a number.
@@ -108,4 +89,34 @@ fn read_entry(row: &SqliteRow) -> Result<AuditEntry> {
         camera_id: fields.parse_optional(CameraId::new)?,
         subject: fields.get()?,
     })
+}
+
+/// As [`Store::record`].
+pub(super) async fn record(
+    connection: &mut SqliteConnection,
+    (actor, limits): (&Actor, &StoreLimits),
+    change: Change<'_>,
+    now: Timestamp,
+) -> Result<()> {
+    let number: i64 = sqlx::query_scalar(
+        "INSERT INTO audit_log (time_us, actor, key_id, address, request_id, action, camera_id, subject) \
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?) RETURNING number",
+    )
+    .bind(now.as_microsecond())
+    .bind(&*actor.name)
+    .bind(actor.key_id.map(|id| id.to_string()))
+    .bind(actor.address.map(|address| address.to_string()))
+    .bind(actor.request_id.as_deref())
+    .bind(change.action.as_str())
+    .bind(change.camera.map(CameraId::as_str))
+    .bind(change.subject)
+    .fetch_one(&mut *connection)
+    .await
+    .map_err(failed)?;
+    sqlx::query("DELETE FROM audit_log WHERE number <= ?")
+        .bind(number.saturating_sub(limits.audit_entries.into()))
+        .execute(connection)
+        .await
+        .map_err(failed)?;
+    Ok(())
 }

@@ -11,7 +11,7 @@ use super::Store;
 use super::audit::Change;
 use super::cameras::camera_key;
 use super::errors::{failed, no_evaluation};
-use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
+use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, job_state, read_state};
 use super::retention::prune_evaluations;
 use super::row_decoder::RowDecoder;
 use crate::domain::{
@@ -28,7 +28,7 @@ macro_rules! select {
         concat!(
             "SELECT jobs.id, cameras.id, jobs.train_from_us, jobs.train_until_us, jobs.test_from_us, \
              jobs.test_until_us, jobs.truth_longitude_deg, jobs.truth_latitude_deg, jobs.truth_lines, \
-             jobs.methods, jobs.recipe, jobs.seeds, jobs.box_shift_px, jobs.gnss_sigma_m, jobs.state, \
+             jobs.methods, jobs.recipe, jobs.seeds, jobs.box_shift_px, jobs.gnss_sigma_m, ", job_state!("jobs"), ", \
              jobs.attempt, jobs.phase, jobs.steps_done, jobs.steps_planned, jobs.remaining_s, jobs.outcome, \
              jobs.created_at_us, jobs.started_at_us, jobs.ended_at_us \
              FROM evaluations AS jobs JOIN cameras ON cameras.key = jobs.camera_key ",

@@ -8,15 +8,21 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
+use super::audit::{Change, record};
 use super::errors::{closed, copy_of, failed, no_camera};
+use super::idempotency::{Completion, insert_answer};
 use super::sample_retention::delete_oldest;
-use super::sample_table::{Insert, Row, SampleTable, delete_replaced, statements};
+use super::sample_table::{Insert, Row, SampleTable, delete_replaced, delete_stored, keep_last, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
-use crate::domain::{CameraId, CameraKey, Durability, Error, Result, SampleOverflow, StoredSample};
+use crate::domain::{
+    Actor, AuditAction, CameraId, CameraKey, Durability, Error, OnConflict, Result, SampleOverflow,
+    StoredSample,
+};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -36,6 +42,28 @@ pub struct Inserted {
     pub duplicate: u64,
     /// Of the accepted ones, those without a fix.
     pub without_fix: u64,
+    /// Of the accepted ones, those that took the place of a stored sample on request.
+    pub replaced: u64,
+}
+
+/// How a batch of samples is stored.
+#[derive(Debug, Clone)]
+pub struct InsertOptions {
+    /// When it is acknowledged.
+    pub durability: Durability,
+    /// What becomes of samples that are stored already.
+    pub on_conflict: OnConflict,
+    /// For the last batch of an import that its client may repeat.
+    pub completion: Option<Completion>,
+    /// The time now.
+    pub now: Timestamp,
+}
+
+impl From<Durability> for InsertOptions {
+    /// A batch of which nothing is recorded.
+    fn from(durability: Durability) -> Self {
+        Self { durability, on_conflict: OnConflict::Keep, completion: None, now: Timestamp::UNIX_EPOCH }
+    }
 }
 
 /// Queues batches for the task.
@@ -55,7 +83,11 @@ struct SampleBatch {
     /// The camera must still be this one; `None` for whichever has the id.
     key: Option<CameraKey>,
     samples: Vec<StoredSample>,
-    durability: Durability,
+    options: InsertOptions,
+    /// Samples that were left out because a later one of the batch takes their place.
+    repeated: u64,
+    /// On whose behalf.
+    actor: Arc<Actor>,
     reply: oneshot::Sender<Result<Inserted>>,
     /// Limits the rows in flight; released when the batch is done.
     _permit: OwnedSemaphorePermit,
@@ -70,15 +102,19 @@ impl GroupCommit {
 
     pub(super) async fn insert(
         &self,
-        camera: CameraId,
-        key: Option<CameraKey>,
-        samples: Vec<StoredSample>,
-        durability: Durability,
+        (camera, key): (CameraId, Option<CameraKey>),
+        mut samples: Vec<StoredSample>,
+        options: InsertOptions,
+        actor: Arc<Actor>,
     ) -> Result<Inserted> {
+        let repeated = match options.on_conflict {
+            OnConflict::Keep => 0,
+            OnConflict::Replace => keep_last(&mut samples),
+        };
         let rows = u32::try_from(samples.len()).unwrap_or(u32::MAX).clamp(1, ROWS_IN_FLIGHT);
         let permit = Arc::clone(&self.rows).acquire_many_owned(rows).await.map_err(|_| closed())?;
         let (reply, answer) = oneshot::channel();
-        let batch = SampleBatch { camera, key, samples, durability, reply, _permit: permit };
+        let batch = SampleBatch { camera, key, samples, options, repeated, actor, reply, _permit: permit };
         self.queue.send(WriteRequest::Insert(batch)).await.map_err(|_| self.task_ended())?;
         answer.await.map_err(|_| self.task_ended())?
     }
@@ -121,7 +157,9 @@ async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receive
         match guard {
             Ok(mut guard) => {
                 guard.set_durability(durability_of(&group));
-                answer_all(&mut guard, &space, group).await;
+                for group in transactions(group) {
+                    answer_all(&mut guard, &space, group).await;
+                }
             }
             Err(error) => refuse_all(group, &error),
         }
@@ -135,7 +173,26 @@ async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receive
 
 /// The strongest that a caller of the group asks for: one flush is enough for all of them.
 fn durability_of(group: &[SampleBatch]) -> Durability {
-    group.iter().map(|batch| batch.durability).max().unwrap_or_default()
+    group.iter().map(|batch| batch.options.durability).max().unwrap_or_default()
+}
+
+/// Splits a group, in its order, into those of one transaction each: a batch that replaces samples must find
+/// what the batches before it have stored, so it has its own.
+fn transactions(group: Vec<SampleBatch>) -> Vec<Vec<SampleBatch>> {
+    let mut transactions: Vec<Vec<SampleBatch>> = Vec::new();
+    for batch in group {
+        match transactions.last_mut() {
+            Some(last) if !batch.replaces() && !last.iter().any(SampleBatch::replaces) => last.push(batch),
+            _ => transactions.push(vec![batch]),
+        }
+    }
+    transactions
+}
+
+impl SampleBatch {
+    fn replaces(&self) -> bool {
+        self.options.on_conflict == OnConflict::Replace
+    }
 }
 
 /// What is in the queue now, up to the rows of one transaction.
@@ -204,7 +261,8 @@ async fn commit(
 ) -> Result<Vec<Result<Inserted>>, Failure> {
     let committed = try_commit(guard, space, group).await;
     match &committed {
-        Ok(outcomes) => space.stored(outcomes.iter().flatten().map(|inserted| inserted.accepted).sum()),
+        Ok(outcomes) => space
+            .stored(outcomes.iter().flatten().map(|inserted| inserted.accepted - inserted.replaced).sum()),
         Err(Failure::Statement(error) | Failure::Transaction(error)) => space.failed(error),
     }
     committed
@@ -219,6 +277,10 @@ async fn try_commit(
         let mut transaction = guard.begin().await.map_err(Failure::Transaction)?;
         let outcomes = store(&mut transaction, space, group, counting).await.map_err(Failure::Statement)?;
         if let Some(outcomes) = outcomes {
+            if group.iter().zip(&outcomes).any(|(batch, outcome)| batch.replaces() && outcome.is_err()) {
+                // What was to be replaced stays.
+                return Ok(outcomes);
+            }
             transaction.commit().await.map_err(|error| Failure::Transaction(failed(error)))?;
             return Ok(outcomes);
         }
@@ -244,9 +306,19 @@ async fn store(
     counting: Counting,
 ) -> Result<Option<Vec<Result<Inserted>>>> {
     let mut cameras = cameras_of(connection, group).await?;
+    let replaced = match group {
+        [batch] if batch.replaces() => replace(connection, batch, &mut cameras, space).await?,
+        _ => 0,
+    };
     let admitted = admit(&mut cameras, space, group);
-    let mut outcomes: Vec<Result<Inserted>> =
-        admitted.iter().map(|camera| camera.as_ref().map(|_| Inserted::default()).map_err(copy_of)).collect();
+    let mut outcomes: Vec<Result<Inserted>> = admitted
+        .iter()
+        .zip(group)
+        .map(|(camera, batch)| {
+            let begun = Inserted { replaced, duplicate: batch.repeated, ..Inserted::default() };
+            camera.as_ref().map(|_| begun).map_err(copy_of)
+        })
+        .collect();
     // Those with a fix first: of two rows of one key, the one with a fix is stored.
     for table in [SampleTable::WithFix, SampleTable::WithoutFix] {
         let (rows, borders) = rows_of(table, group, &admitted, counting);
@@ -267,7 +339,45 @@ async fn store(
             delete_oldest(connection, camera.key, space.limits.samples_per_camera).await?;
         }
     }
+    complete(connection, space, group, &outcomes).await?;
     Ok(Some(outcomes))
+}
+
+/// Deletes the stored samples whose place those of a batch take; returns how many.
+async fn replace(
+    connection: &mut SqliteConnection,
+    batch: &SampleBatch,
+    cameras: &mut HashMap<String, Known>,
+    space: &Space,
+) -> Result<u64> {
+    let Some(camera) = cameras.get_mut(batch.camera.as_str()) else { return Ok(0) };
+    let with_fix = delete_stored(connection, SampleTable::WithFix, camera.key, &batch.samples).await?;
+    let without_fix = delete_stored(connection, SampleTable::WithoutFix, camera.key, &batch.samples).await?;
+    let replaced = with_fix + without_fix;
+    camera.samples = camera.samples.saturating_sub(replaced);
+    camera.without_fix = camera.without_fix.saturating_sub(without_fix);
+    if replaced > 0 {
+        let subject = Some(format!("{replaced} samples"));
+        let change = Change::of_camera(AuditAction::SamplesReplaced, &batch.camera, subject);
+        record(connection, (&batch.actor, &space.limits), change, batch.options.now).await?;
+    }
+    Ok(replaced)
+}
+
+/// Stores the answers of the imports that end with a batch of the group.
+async fn complete(
+    connection: &mut SqliteConnection,
+    space: &Space,
+    group: &[SampleBatch],
+    outcomes: &[Result<Inserted>],
+) -> Result<()> {
+    for (batch, outcome) in group.iter().zip(outcomes) {
+        if let (Some(Completion { record, answer }), Ok(inserted)) = (&batch.options.completion, outcome) {
+            let (actor, now) = (&*batch.actor, batch.options.now);
+            insert_answer(connection, &space.limits, (actor, record), &answer(inserted), now).await?;
+        }
+    }
+    Ok(())
 }
 
 /// The key of each batch's camera, or why the batch is not stored.

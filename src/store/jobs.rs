@@ -312,6 +312,24 @@ impl Jobs {
     }
 }
 
+/// The state as clients see it, of the jobs that a statement calls `name`: that of a running job whose
+/// cancellation was requested is not stored, so that every rule of leases stays one of running jobs.
+macro_rules! job_state {
+    ($name:literal) => {
+        concat!(
+            "CASE WHEN ",
+            $name,
+            ".state = 'running' AND ",
+            $name,
+            ".cancel_requested <> 0 ",
+            "THEN 'cancelling' ELSE ",
+            $name,
+            ".state END"
+        )
+    };
+}
+pub(super) use job_state;
+
 pub(super) fn read_state(name: &str) -> Result<JobState, &'static str> {
     JobState::ALL.iter().copied().find(|state| state.as_str() == name).ok_or("is not the state of a job")
 }

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use super::Store;
 use super::errors::failed;
-use super::jobs::read_state;
+use super::jobs::{job_state, read_state};
 use super::row_decoder::RowDecoder;
 use crate::domain::{Camera, CameraId, JobState, Result, RunId};
 
@@ -21,11 +21,13 @@ impl Store {
         let cameras = self.cameras(None, after, limit).await?;
         let Some(last) = cameras.last() else { return Ok(Vec::new()) };
         // Ids of runs are UUIDs of version 7: the largest is the latest.
-        let rows = sqlx::query(
-            "SELECT cameras.id, runs.id, runs.state FROM cameras JOIN training_runs AS runs ON runs.id = \
+        let rows = sqlx::query(concat!(
+            "SELECT cameras.id, runs.id, ",
+            job_state!("runs"),
+            " FROM cameras JOIN training_runs AS runs ON runs.id = \
                  (SELECT max(id) FROM training_runs WHERE training_runs.camera_key = key) \
-             WHERE cameras.id > ? AND cameras.id <= ?",
-        )
+                 WHERE cameras.id > ? AND cameras.id <= ?"
+        ))
         .bind(after.map_or("", CameraId::as_str).to_owned())
         .bind(last.id().as_str().to_owned())
         .fetch_all(self.readers())

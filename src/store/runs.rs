@@ -11,7 +11,8 @@ use super::Store;
 use super::audit::{Change, version};
 use super::cameras::camera_key;
 use super::errors::{failed, no_run};
-use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, read_state};
+use super::idempotency::{IdempotencyRecord, find_answer, insert_answer};
+use super::jobs::{Claim, Heartbeat, JobEnd, Jobs, job_state, read_state};
 use super::models::{NewModel, activate, add_model};
 use super::retention::{prune_models, prune_runs};
 use super::row_decoder::RowDecoder;
@@ -41,7 +42,7 @@ macro_rules! select {
     ($rest:literal) => {
         concat!(
             "SELECT runs.id, cameras.id, runs.recipe, runs.seed, runs.epochs, runs.from_us, runs.until_us, \
-             runs.state, runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
+             ", job_state!("runs"), ", runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
              runs.reconstruction_error, runs.regression_error, runs.error_scale, runs.remaining_s, \
              runs.model_version, (SELECT json_extract(models.metadata, '$.report') FROM models \
              WHERE models.camera_key = runs.camera_key AND models.number = runs.model_version \
@@ -66,9 +67,35 @@ impl Store {
         max_live: u32,
         now: Timestamp,
     ) -> Result<TrainingRun> {
+        self.insert_run_once(run, camera, options, max_live, None, now).await
+    }
+
+    /// As [`Store::insert_run`]; of several requests with the same record, the first queues a run and the
+    /// others get it.
+    ///
+    /// # Errors
+    /// As [`Store::insert_run`]; [`ErrorKind::IdempotencyKeyReused`] for a key of another request.
+    pub async fn insert_run_once(
+        &self,
+        run: RunId,
+        camera: &CameraId,
+        options: &TrainingOptions,
+        max_live: u32,
+        record: Option<&IdempotencyRecord>,
+        now: Timestamp,
+    ) -> Result<TrainingRun> {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
+        if let Some(record) = record {
+            let caller = (&*self.actor, &record.key);
+            if let Some(answer) = find_answer(&mut *transaction, self.limits(), caller, now).await? {
+                let first = answer.to_request(&record.digest)?.parse()?;
+                return run_of(find_run(&mut *transaction, first).await?, camera, first);
+            }
+            insert_answer(&mut transaction, self.limits(), (&self.actor, record), &run.to_string(), now)
+                .await?;
+        }
         prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
         check_no_live_run(&mut transaction, key).await?;
         RUNS.check_capacity(&mut transaction, max_live).await?;
@@ -253,20 +280,17 @@ impl Store {
 
 /// A camera has one live run at most.
 async fn check_no_live_run(connection: &mut SqliteConnection, camera_key: i64) -> Result<()> {
-    let live: Option<i64> = sqlx::query_scalar(
-        "SELECT 1 FROM training_runs WHERE camera_key = ? AND state IN ('queued', 'running')",
+    let live: Option<String> = sqlx::query_scalar(
+        "SELECT id FROM training_runs WHERE camera_key = ? AND state IN ('queued', 'running')",
     )
     .bind(camera_key)
     .fetch_optional(connection)
     .await
     .map_err(failed)?;
-    if live.is_some() {
-        return Err(Error::refused(
-            ErrorKind::RunLive,
-            "the camera has a training run that has not ended; wait for it or cancel it",
-        ));
-    }
-    Ok(())
+    let Some(live) = live else { return Ok(()) };
+    let message =
+        format!("the camera has training run {live}, which has not ended; wait for it or cancel it");
+    Err(Error::conflict(ErrorKind::RunLive, live, message))
 }
 
 async fn find_run(executor: impl SqliteExecutor<'_>, run: RunId) -> Result<Option<TrainingRun>> {

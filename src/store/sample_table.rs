@@ -1,6 +1,6 @@
 //! The two tables of samples and the statements that fill them.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fmt;
 use std::ops::Range;
 use std::sync::{Arc, LazyLock};
@@ -175,18 +175,79 @@ pub(super) async fn delete_replaced(
 ) -> Result<HashMap<i64, u64>> {
     let mut keys: HashMap<i64, Vec<(i64, &str)>> = HashMap::new();
     for Row { camera_key, sample, .. } in stored.iter().filter(|row| has_boxes(row.camera_key)) {
-        let key = (sample.time.as_microsecond(), sample.target_id.as_str());
-        keys.entry(*camera_key).or_default().push(key);
+        keys.entry(*camera_key).or_default().push(key(sample));
     }
     let mut deleted = HashMap::new();
     for (camera_key, keys) in keys {
-        let query = sqlx::query(
-            "DELETE FROM samples_without_fix WHERE camera_key = ? AND (time_us, target_id) IN \
-             (SELECT json_extract(value, '$[0]'), json_extract(value, '$[1]') FROM json_each(?))",
-        );
-        let query = query.bind(camera_key).bind(serde_json::to_string(&keys).map_err(Error::fault)?);
-        let rows = query.execute(&mut *connection).await.map_err(failed)?.rows_affected();
+        let rows = delete_keys(connection, SampleTable::WithoutFix, camera_key, &keys).await?;
         deleted.insert(camera_key, rows);
     }
     Ok(deleted)
+}
+
+/// Deletes the samples of a camera in a table that have the keys of these, and counts them no more; returns
+/// how many.
+pub(super) async fn delete_stored(
+    connection: &mut SqliteConnection,
+    table: SampleTable,
+    camera_key: i64,
+    samples: &[StoredSample],
+) -> Result<u64> {
+    let keys: Vec<_> = samples.iter().map(key).collect();
+    let rows = delete_keys(connection, table, camera_key, &keys).await?;
+    if rows > 0 {
+        subtract(connection, table, camera_key, rows).await?;
+    }
+    Ok(rows)
+}
+
+/// Time and target of a sample, as they are stored.
+fn key(sample: &StoredSample) -> (i64, &str) {
+    (sample.time.as_microsecond(), sample.target_id.as_str())
+}
+
+async fn delete_keys(
+    connection: &mut SqliteConnection,
+    table: SampleTable,
+    camera_key: i64,
+    keys: &[(i64, &str)],
+) -> Result<u64> {
+    let query = sqlx::query(AssertSqlSafe(format!(
+        "DELETE FROM {table} WHERE camera_key = ? AND (time_us, target_id) IN \
+         (SELECT json_extract(value, '$[0]'), json_extract(value, '$[1]') FROM json_each(?))"
+    )));
+    let query = query.bind(camera_key).bind(serde_json::to_string(keys).map_err(Error::fault)?);
+    Ok(query.execute(connection).await.map_err(failed)?.rows_affected())
+}
+
+/// Counts so many samples of a table no more.
+pub(super) async fn subtract(
+    connection: &mut SqliteConnection,
+    table: SampleTable,
+    camera_key: i64,
+    rows: u64,
+) -> Result<()> {
+    let counter = table.counter();
+    sqlx::query(AssertSqlSafe(format!(
+        "UPDATE sample_counts SET {counter} = max({counter} - ?, 0) WHERE camera_key = ?"
+    )))
+    .bind(i64::try_from(rows).unwrap_or(i64::MAX))
+    .bind(camera_key)
+    .execute(connection)
+    .await
+    .map_err(failed)?;
+    Ok(())
+}
+
+/// Keeps the last of samples that have the same key; returns how many others there were.
+pub(super) fn keep_last(samples: &mut Vec<StoredSample>) -> u64 {
+    let before = samples.len();
+    let mut seen = HashSet::with_capacity(before);
+    let mut is_last: Vec<bool> = samples
+        .iter()
+        .rev()
+        .map(|sample| seen.insert((sample.time.as_microsecond(), sample.target_id.clone())))
+        .collect();
+    samples.retain(|_| is_last.pop().unwrap_or(true));
+    (before - samples.len()) as u64
 }

@@ -1,5 +1,7 @@
 //! Reading, counting and deleting samples; `group_commit` stores them.
 
+use std::sync::Arc;
+
 use jiff::Timestamp;
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{AssertSqlSafe, Row as _, Sqlite};
@@ -8,9 +10,9 @@ use super::Store;
 use super::audit::Change;
 use super::cameras::camera_key;
 use super::errors::failed;
-use super::group_commit::Inserted;
+use super::group_commit::{InsertOptions, Inserted};
 use super::row_decoder::RowDecoder;
-use super::sample_table::SampleTable;
+use super::sample_table::{SampleTable, subtract};
 use crate::domain::{
     AuditAction, BoundingBox, CameraId, CameraKey, Detection, Durability, Fix, Result, Sample, Score, SigmaM,
     StoredSample, TargetClass, TargetId, TimeRange,
@@ -67,7 +69,8 @@ impl Store {
     /// Stores samples of a camera and returns after their commit, and with [`Durability::Synced`] after
     /// they have been flushed to the disk; all of them are stored, or none. A sample whose camera, target
     /// and time are stored already is left as it is and counted as a duplicate, but a sample with a fix
-    /// takes the place of one without. Many callers at once share a transaction; a caller who goes away
+    /// takes the place of one without, and with [`OnConflict::Replace`](crate::domain::OnConflict) each takes
+    /// the place of a stored one. Many callers at once share a transaction; a caller who goes away
     /// does not stop it.
     ///
     /// # Errors
@@ -76,9 +79,10 @@ impl Store {
         &self,
         id: &CameraId,
         samples: Vec<impl Into<StoredSample>>,
-        durability: Durability,
+        options: impl Into<InsertOptions>,
     ) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), None, stored(samples), durability).await
+        let actor = Arc::clone(&self.actor);
+        self.inner.samples.insert((id.clone(), None), stored(samples), options.into(), actor).await
     }
 
     /// As [`Store::insert_samples`], for the camera of that key alone: if it was deleted and created again
@@ -93,7 +97,8 @@ impl Store {
         samples: Vec<impl Into<StoredSample>>,
         durability: Durability,
     ) -> Result<Inserted> {
-        self.inner.samples.insert(id.clone(), Some(key), stored(samples), durability).await
+        let actor = Arc::clone(&self.actor);
+        self.inner.samples.insert((id.clone(), Some(key)), stored(samples), durability.into(), actor).await
     }
 
     /// A page of samples ordered by time and target, after a key.
@@ -230,15 +235,7 @@ impl Store {
             let sql = range.sql(&format!("DELETE FROM {table}"));
             let rows =
                 range.bind(query(&sql)).execute(&mut *transaction).await.map_err(failed)?.rows_affected();
-            let counter = table.counter();
-            query(&format!(
-                "UPDATE sample_counts SET {counter} = max({counter} - ?, 0) WHERE camera_key = ?"
-            ))
-            .bind(i64::try_from(rows).unwrap_or(i64::MAX))
-            .bind(key)
-            .execute(&mut *transaction)
-            .await
-            .map_err(failed)?;
+            subtract(&mut transaction, *table, key, rows).await?;
             deleted += rows;
         }
         let subject = Some(format!("{deleted} samples"));

@@ -44,6 +44,10 @@ pub struct StoreLimits {
     pub keys: u32,
     /// Entries of the audit log; beyond, the oldest is deleted.
     pub audit_entries: u32,
+    /// Stored answers of repeatable changes; beyond, the oldest is deleted.
+    pub idempotency_keys: u32,
+    /// Seconds for which such an answer is repeated.
+    pub idempotency_key_s: u32,
     /// Bytes of the database, if limited.
     pub database_bytes: Option<u64>,
     /// Bytes on the disk that are reserved for deletions when it is full.
@@ -63,6 +67,8 @@ impl Default for StoreLimits {
             ended_evaluations: u32::MAX,
             keys: u32::MAX,
             audit_entries: u32::MAX,
+            idempotency_keys: u32::MAX,
+            idempotency_key_s: u32::MAX,
             database_bytes: None,
             reserve_bytes: 0,
         }

@@ -174,7 +174,7 @@ impl JobMetrics {
             JobState::Succeeded => self.succeeded.increment(1),
             JobState::Failed => self.failed.increment(1),
             JobState::Cancelled => self.cancelled.increment(1),
-            JobState::Queued | JobState::Running => return,
+            JobState::Queued | JobState::Running | JobState::Cancelling => return,
         }
         self.duration_s.record(time.as_secs_f64());
     }

@@ -26,7 +26,10 @@ async fn every_change_has_its_entry() {
     let started = server.post("/v1/cameras/c/training-runs", &json!({})).await.expect(202);
     let run_path = started.header("location").to_owned();
     server.send("POST", &format!("{run_path}/cancel"), &[], "").await;
-    while matches!(server.get(&run_path).await.json()["state"].as_str(), Some("queued" | "running")) {
+    while matches!(
+        server.get(&run_path).await.json()["state"].as_str(),
+        Some("queued" | "running" | "cancelling")
+    ) {
         tokio::time::sleep(std::time::Duration::from_millis(50)).await;
     }
     server.send("DELETE", &run_path, &[], "").await.expect(204);

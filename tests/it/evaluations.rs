@@ -55,7 +55,7 @@ async fn until(server: &TestServer, path: &str, condition: impl Fn(&Value) -> bo
 }
 
 fn has_ended(evaluation: &Value) -> bool {
-    !matches!(evaluation["state"].as_str(), Some("queued" | "running"))
+    !matches!(evaluation["state"].as_str(), Some("queued" | "running" | "cancelling"))
 }
 
 /// Whether its worker has reported a phase.

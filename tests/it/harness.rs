@@ -231,7 +231,7 @@ impl TestServer {
         let path = started.header("location").to_owned();
         loop {
             let run = self.get(&path).await.expect(200).json();
-            if !matches!(run["state"].as_str(), Some("queued" | "running")) {
+            if !matches!(run["state"].as_str(), Some("queued" | "running" | "cancelling")) {
                 return run;
             }
             tokio::time::sleep(std::time::Duration::from_millis(100)).await;

@@ -74,6 +74,25 @@ export async function post<T>(path: string, body?: unknown, options: Options = {
   return (response.status === 204 ? undefined : await response.json()) as T;
 }
 
+/** Pauses before an import is sent again when the server cannot be reached. */
+const RETRY_AFTER_MS = [500, 2_000, 5_000];
+
+/** Posts once, however often it must be sent: the server gives what comes under the same key one answer. */
+export async function postOnce<T>(path: string, body: unknown, options: Options): Promise<T> {
+  const bytes = crypto.getRandomValues(new Uint8Array(16));
+  const key = Array.from(bytes, (byte) => byte.toString(16).padStart(2, '0')).join('');
+  const headers = { ...options.headers, 'idempotency-key': key };
+  for (const pause_ms of RETRY_AFTER_MS) {
+    try {
+      return await post<T>(path, body, { ...options, headers });
+    } catch (error) {
+      if (!(error instanceof ServerUnreachable)) throw error;
+      await new Promise((resolve) => setTimeout(resolve, pause_ms));
+    }
+  }
+  return post<T>(path, body, { ...options, headers });
+}
+
 export async function put<T>(path: string, body: unknown): Promise<T> {
   return (await send('PUT', path, { body })).json() as Promise<T>;
 }

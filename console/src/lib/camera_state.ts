@@ -1,5 +1,5 @@
 // One word for each camera, by the first rule that holds.
-import type { CameraStatus } from './types';
+import { isLive, type CameraStatus } from './types';
 import type { TextKey } from './i18n.svelte';
 
 export const CAMERA_STATES = ['moved', 'fault', 'training', 'live', 'stale', 'idle', 'ready', 'empty'] as const;
@@ -14,7 +14,7 @@ export function stateOf(status: CameraStatus, now_ms: number): CameraState {
   const { camera, latest_run, last_observed_at } = status;
   if (camera.moved) return 'moved';
   if (camera.model_fault) return 'fault';
-  if (latest_run?.state === 'queued' || latest_run?.state === 'running') return 'training';
+  if (latest_run && isLive(latest_run.state)) return 'training';
   if (camera.active_model === undefined) return camera.samples - camera.samples_without_fix < FEWEST_SAMPLES ? 'empty' : 'ready';
   const silent_ms = last_observed_at ? now_ms - Date.parse(last_observed_at) : undefined;
   if (silent_ms === undefined) return 'idle';

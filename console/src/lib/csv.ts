@@ -1,5 +1,6 @@
 // Files of rows as people have them: any separator, any column names, any convention of boxes. Mapped here to the
 // columns that the importer documents.
+import columnNames from '../../../src/exchange/column_names.json' with { type: 'json' };
 import type { ImageSize, RejectedRow } from './types';
 
 export type FileKind = 'samples' | 'detections' | 'fixes';
@@ -63,21 +64,8 @@ export function parseTable(text: string): Table {
   return { header, separator, rows };
 }
 
-/** Names that columns of each field have in the wild, lower case without units and signs. */
-const NAMES: Record<string, string[]> = {
-  time: ['time', 'timestamp', 'datetime', 'date', 't', 'zeit', 'utc', 'timeutc'],
-  target_id: ['targetid', 'target', 'trackid', 'track', 'id', 'objectid', 'object', 'personid', 'name'],
-  receiver_id: ['receiverid', 'receiver', 'deviceid', 'device', 'phone'],
-  left: ['left', 'x', 'x1', 'xmin', 'bbleft', 'bboxleft', 'bboxx', 'boxleft', 'cx', 'xcenter', 'xcentre', 'centerx', 'centrex'],
-  top: ['top', 'y', 'y1', 'ymin', 'bbtop', 'bboxtop', 'bboxy', 'boxtop', 'cy', 'ycenter', 'ycentre', 'centery', 'centrey'],
-  width: ['width', 'w', 'bbwidth', 'bboxwidth', 'bboxw', 'boxwidth', 'x2', 'xmax', 'right'],
-  height: ['height', 'h', 'bbheight', 'bboxheight', 'bboxh', 'boxheight', 'y2', 'ymax', 'bottom'],
-  longitude: ['longitude', 'lon', 'lng', 'long', 'laenge', 'länge'],
-  latitude: ['latitude', 'lat', 'breite'],
-  sigma_m: ['sigmam', 'sigma', 'accuracy', 'horizontalaccuracy', 'std', 'hacc'],
-  class: ['class', 'label', 'category', 'klasse'],
-  score: ['score', 'confidence', 'conf', 'probability'],
-};
+/** Names that columns of each field have in the wild, lower case without units and signs; the importer has the same. */
+const NAMES: Record<string, string[]> = columnNames;
 
 export const REQUIRED: Record<FileKind, string[]> = {
   samples: ['time', 'target_id', 'left', 'top', 'width', 'height', 'longitude', 'latitude'],

@@ -1,5 +1,7 @@
 // What is drawn on both planes, as plain functions of a canvas: tested by what they call.
 
+import type { Covariance } from './types';
+
 export interface Pixel {
   x: number;
   y: number;
@@ -10,6 +12,11 @@ export interface Ellipse {
   a_m: number;
   b_m: number;
   angle_rad: number;
+}
+
+/** The 95 % ellipse of a covariance that the server states. */
+export function ellipse95({ east_m2, north_m2, east_north_m2 }: Covariance): Ellipse {
+  return ellipseOf(east_m2, north_m2, east_north_m2);
 }
 
 /** The 95 % ellipse of a horizontal covariance, m2. */

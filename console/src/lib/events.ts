@@ -12,10 +12,12 @@ export function listen(path: string, handlers: EventHandlers): () => void {
   let source: EventSource | undefined;
   let timer: ReturnType<typeof setTimeout> | undefined;
   let pause_ms = 500;
+  let lastEventId = '';
   let closed = false;
 
   function open(): void {
-    source = new EventSource(path);
+    // Behind the last event that was seen: a new source does not send its id by itself.
+    source = new EventSource(lastEventId ? `${path}?last_event_id=${encodeURIComponent(lastEventId)}` : path);
     source.onopen = () => {
       pause_ms = 500;
       connection.regain();
@@ -30,7 +32,11 @@ export function listen(path: string, handlers: EventHandlers): () => void {
       pause_ms = Math.min(pause_ms * 2, 8000);
     };
     for (const [name, handle] of Object.entries(handlers.on)) {
-      source.addEventListener(name, (event) => handle(JSON.parse((event as MessageEvent<string>).data)));
+      source.addEventListener(name, (event) => {
+        const message = event as MessageEvent<string>;
+        lastEventId = message.lastEventId || lastEventId;
+        handle(JSON.parse(message.data));
+      });
     }
   }
 

@@ -1,5 +1,5 @@
 // Sends mapped files to the importer in parts, so that there is progress and one bad row costs nothing.
-import { cameraPath, post } from './api';
+import { cameraPath, postOnce } from './api';
 import { isRejected, mapRow, outputColumns, toCsv, type MappedRow, type Mapping, type Table } from './csv';
 import type { ImageSize, Imported, PairedSamples, RejectedRow } from './types';
 
@@ -50,7 +50,7 @@ export async function importSamples(
   const columns = outputColumns(source.mapping);
   for (let from = 0; from < rows.length; from += ROWS_PER_PART) {
     const part = rows.slice(from, from + ROWS_PER_PART);
-    const report = await post<Imported>(cameraPath(camera, 'samples'), toCsv(columns, part), {
+    const report = await postOnce<Imported>(cameraPath(camera, 'samples'), toCsv(columns, part), {
       headers: { 'content-type': 'text/csv' },
       signal,
     });
@@ -88,7 +88,7 @@ export async function importPair(
     const csv = toCsv(outputColumns(source.mapping), mapped.rows);
     form.append(part, new Blob([csv], { type: 'text/csv' }), `${part}.csv`);
   }
-  const report = await post<PairedSamples>(`${cameraPath(camera, 'samples', 'pairings')}?keep_unpaired=${keepUnpaired}`, form, { signal });
+  const report = await postOnce<PairedSamples>(`${cameraPath(camera, 'samples', 'pairings')}?keep_unpaired=${keepUnpaired}`, form, { signal });
   const reported = report.rejected_rows.flatMap((row) => atOriginalLines([row], mappedRows[row.part ?? ''] ?? []));
   return {
     accepted: report.accepted,

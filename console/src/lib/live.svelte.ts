@@ -41,7 +41,8 @@ export class Live {
       on: {
         track: (data) => this.#take(data as TrackUpdate, Date.now()),
         camera_moved: (data) => (this.moved = data as CameraMoved),
-        lost: (data) => (this.lostEvents += Number(data)),
+        // Without a number after a restart of the server.
+        lost: (data) => (this.lostEvents += Number(data ?? 0)),
       },
       state: (isOpen) => {
         this.isOpen = isOpen;

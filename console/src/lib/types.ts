@@ -18,7 +18,12 @@ export interface ImageSize {
   height_px: number;
 }
 export type Recipe = 'auto' | 'gaussian_process' | 'projective' | 'hybrid' | 'paper';
-export type JobState = 'queued' | 'running' | 'succeeded' | 'failed' | 'cancelled';
+export type JobState = 'queued' | 'running' | 'cancelling' | 'succeeded' | 'failed' | 'cancelled';
+
+/** Whether a job has not ended. */
+export function isLive(state: JobState): boolean {
+  return state === 'queued' || state === 'running' || state === 'cancelling';
+}
 export type GnssError = 'unknown' | { sigma_m: number };
 
 export interface Receiver {
@@ -160,6 +165,12 @@ export interface ModelVersion {
     parameters: Record<string, number>;
   };
 }
+/** Covariance of a position's error, m2. */
+export interface Covariance {
+  east_m2: number;
+  north_m2: number;
+  east_north_m2: number;
+}
 export interface FusedFix {
   time: string;
   target_id?: string;
@@ -171,6 +182,8 @@ export interface FusedFix {
   e_regression_m2?: number;
   e_gnss_m2?: number;
   r95_m: number;
+  covariance: Covariance;
+  regressed_covariance?: Covariance;
   reconstruction_error?: number;
   model_version?: number;
   flags: string[];
@@ -183,6 +196,7 @@ export interface TrackFeature {
     velocity_east_m_s: number;
     velocity_north_m_s: number;
     r95_m: number;
+    covariance: Covariance;
     still: number;
     nis?: number;
     rejections: { source: string; reason: string; nis?: number }[];

@@ -131,7 +131,7 @@ impl App {
                 "the camera's pose has changed since its model was trained"
             );
             self.metrics.camera_moved();
-            camera.live.announce_move(Arc::new(moved));
+            camera.live.announce_move(self.clock.monotonic(), Arc::new(moved));
         }
         Ok(())
     }

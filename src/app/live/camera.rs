@@ -2,19 +2,18 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
+use std::time::Duration;
 
 use jiff::Timestamp;
-use tokio::sync::{broadcast, watch};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use super::camera_events::CameraEventLog;
 use super::drift::DriftMonitor;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
 use crate::domain::{BoundingBox, CameraMoved, FusedFix};
-
-/// Events that a slow reader may lag behind before it loses some.
-const EVENTS_BEHIND: usize = 256;
 
 /// What happens in a camera's view.
 #[derive(Debug, Clone)]
@@ -40,7 +39,7 @@ pub struct TargetUpdate {
 pub(in crate::app) struct CameraLive {
     pub(super) tracks: Tracks,
     pub(super) drift: DriftMonitor,
-    pub(super) events: broadcast::Sender<CameraEvent>,
+    pub(super) events: CameraEventLog<CameraEvent>,
     pub(super) moved: watch::Sender<Option<Arc<CameraMoved>>>,
     pub(super) recorder: Mutex<Weak<SampleRecorder>>,
     last_observed_at: Mutex<Option<Timestamp>>,
@@ -49,11 +48,12 @@ pub(in crate::app) struct CameraLive {
 }
 
 impl CameraLive {
-    pub(in crate::app) fn new() -> Arc<Self> {
+    /// `event_log` names its events; another number for every run of the server.
+    pub(in crate::app) fn new(event_log: u64) -> Arc<Self> {
         Arc::new(Self {
             tracks: Tracks::default(),
             drift: DriftMonitor::default(),
-            events: broadcast::channel(EVENTS_BEHIND).0,
+            events: CameraEventLog::new(event_log),
             moved: watch::channel(None).0,
             recorder: Mutex::new(Weak::new()),
             last_observed_at: Mutex::new(None),
@@ -78,12 +78,9 @@ impl CameraLive {
         self.deleted.cancelled().await;
     }
 
-    /// Makes the update only if somebody listens.
-    pub(super) fn announce_track(&self, update: impl FnOnce() -> TargetUpdate) {
-        if self.events.receiver_count() > 0 {
-            // An error means that nobody listens any more.
-            let _ = self.events.send(CameraEvent::Track(Arc::new(update())));
-        }
+    /// Makes the update only if somebody listens, or may come back. `now` is a reading of the monotonic clock.
+    pub(super) fn announce_track(&self, now: Duration, update: impl FnOnce() -> TargetUpdate) {
+        self.events.push(now, || CameraEvent::Track(Arc::new(update())));
     }
 
     /// Remembers that something was observed at that time of the server.
@@ -107,8 +104,8 @@ impl CameraLive {
         StreamCount(self.clone())
     }
 
-    pub(super) fn announce_move(&self, moved: Arc<CameraMoved>) {
-        let _ = self.events.send(CameraEvent::Moved(moved.clone()));
+    pub(super) fn announce_move(&self, now: Duration, moved: Arc<CameraMoved>) {
+        self.events.push(now, || CameraEvent::Moved(moved.clone()));
         self.moved.send_replace(Some(moved));
     }
 }

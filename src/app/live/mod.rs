@@ -8,6 +8,7 @@
 mod acknowledgements;
 mod alarms;
 pub(super) mod camera;
+mod camera_events;
 mod drift;
 mod event_log;
 mod history;
@@ -22,9 +23,9 @@ mod tracks;
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use tokio::sync::broadcast;
 
 use self::camera::CameraLive;
+use self::camera_events::CameraEventReader;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
@@ -39,6 +40,7 @@ use crate::fusion::observed::ObservedPositions;
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
+pub use camera_events::{EventId, LostEvents};
 pub(super) use retraining::RetrainSchedule;
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
@@ -72,27 +74,17 @@ pub struct CameraActivity {
 
 /// The events of one camera from some instant on; they end when it is deleted.
 pub struct CameraEvents {
-    events: broadcast::Receiver<CameraEvent>,
+    reader: CameraEventReader<CameraEvent>,
     live: Arc<CameraLive>,
 }
 
-/// Events that were lost because the reader was too slow.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LostEvents(pub u64);
-
 impl CameraEvents {
     /// The next event; `None` once the camera is deleted.
-    pub async fn next(&mut self) -> Option<Result<CameraEvent, LostEvents>> {
-        use broadcast::error::RecvError;
-        let event = tokio::select! {
+    pub async fn next(&mut self) -> Option<Result<(EventId, Arc<CameraEvent>), LostEvents>> {
+        tokio::select! {
             biased;
-            () = self.live.deleted() => return None,
-            event = self.events.recv() => event,
-        };
-        match event {
-            Ok(event) => Some(Ok(event)),
-            Err(RecvError::Lagged(lost)) => Some(Err(LostEvents(lost))),
-            Err(RecvError::Closed) => None,
+            () = self.live.deleted() => None,
+            event = self.reader.next() => Some(event),
         }
     }
 }
@@ -146,7 +138,7 @@ impl App {
         };
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
-            camera.live.announce_track(|| TargetUpdate {
+            camera.live.announce_track(now, || TargetUpdate {
                 point: point.clone(),
                 bounding_box: observation.bounding_box(),
                 fused: fused.clone(),
@@ -189,14 +181,14 @@ impl App {
         })
     }
 
-    /// Everything that happens in a camera's view from now on. A reader that is too slow misses the
-    /// oldest of what it has not read.
+    /// Everything that happens in a camera's view from now on, or after the last event that the reader has
+    /// seen. A reader that is too slow, or was away for too long, misses the oldest of what it has not read.
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn camera_events(&self, id: &CameraId) -> Result<CameraEvents> {
+    pub async fn camera_events(&self, id: &CameraId, last_seen: Option<EventId>) -> Result<CameraEvents> {
         let live = self.active_camera(id).await?.live.clone();
-        Ok(CameraEvents { events: live.events.subscribe(), live })
+        Ok(CameraEvents { reader: live.events.reader(last_seen), live })
     }
 
     /// Whether a camera's active model no longer fits what the camera sees.

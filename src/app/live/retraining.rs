@@ -68,7 +68,9 @@ impl App {
         let id = &camera.id;
         match self.store.retraining_state(id, moved.model_version).await? {
             // A run under way, or the operator's decision against one.
-            Some(JobState::Queued | JobState::Running | JobState::Cancelled) => return Ok(()),
+            Some(JobState::Queued | JobState::Running | JobState::Cancelling | JobState::Cancelled) => {
+                return Ok(());
+            }
             // The camera still answers by the version that no longer fits.
             None | Some(JobState::Failed | JobState::Succeeded) => {}
         }

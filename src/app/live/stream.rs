@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use tokio::sync::watch;
 
@@ -19,6 +20,10 @@ use crate::domain::{
     Score, TargetClass, check_text,
 };
 
+/// How long a request waits until its items are decided by what comes after them; then they are decided.
+/// Silent targets are decided after the allowed lateness, so this is reached only if another client goes on
+/// sending earlier times.
+const PAIRING_PATIENCE: Duration = Duration::from_secs(10);
 /// Longest name of a client, in bytes.
 const LONGEST_CLIENT_NAME: usize = 128;
 
@@ -116,6 +121,34 @@ impl App {
             _slot: slot,
             _client_lease: client_lease,
         })
+    }
+
+    /// Answers observations as [`App::follow`] and stores samples of them, and of what the camera's streams
+    /// bring. Returns when it is decided what becomes of each.
+    ///
+    /// # Errors
+    /// As [`App::open_stream`] and [`App::follow`]; the samples could not be stored.
+    pub async fn follow_and_store(
+        &self,
+        camera: &Arc<ActiveCamera>,
+        observations: Vec<Observation>,
+        client: ClientId,
+        durability: Durability,
+    ) -> Result<(Vec<ItemResult>, Acknowledgement)> {
+        let name = format!("requests of {}", camera.id);
+        let mut stream = self.open_stream(&camera.id, &name, client, 0, Some(durability)).await?;
+        let mut followed = Vec::with_capacity(observations.len());
+        for (seq, observation) in (1..).zip(observations) {
+            let (time, target_id, bounding_box, fix) = observation.into_parts();
+            let item =
+                LiveItem { time, target_id, receiver_id: None, bounding_box, fix, class: None, score: None };
+            stream.check_seq(seq)?;
+            followed.push(stream.take(camera, seq, item).await?);
+        }
+        // Deciding early would take other requests' and streams' items from each other.
+        stream.settle_within(PAIRING_PATIENCE).await?;
+        let acknowledgement = stream.acknowledgement()?;
+        Ok((followed, acknowledgement.ok_or_else(|| Error::fault("a stream that stores nothing"))?))
     }
 
     /// The pairing that all storing streams of the camera share.
@@ -276,12 +309,16 @@ impl LiveStream {
     /// # Errors
     /// The samples could not be stored.
     pub async fn settle(&self) -> Result<()> {
-        let Some(StreamRecording { recorder, tracker }) = &self.recording else { return Ok(()) };
+        let Some(StreamRecording { recorder, .. }) = &self.recording else { return Ok(()) };
         let is_alone = Arc::strong_count(recorder) == 1;
-        if !is_alone {
-            // Elapsed is no failure: the rest is decided below.
-            let _ = tokio::time::timeout(recorder.allowed_lateness(), tracker.settled()).await;
-        }
+        self.settle_within(if is_alone { Duration::ZERO } else { recorder.allowed_lateness() }).await
+    }
+
+    /// Waits for so long until everything is settled, then decides the rest.
+    async fn settle_within(&self, patience: Duration) -> Result<()> {
+        let Some(StreamRecording { recorder, tracker }) = &self.recording else { return Ok(()) };
+        // Elapsed is no failure: the rest is decided below.
+        let _ = tokio::time::timeout(patience, tracker.settled()).await;
         if !tracker.is_settled()? {
             recorder.end_stream(tracker).await?;
         }

@@ -61,3 +61,11 @@ pub struct TrackState {
     /// explains.
     pub reinitialized: bool,
 }
+
+impl TrackState {
+    /// Covariance, m2, of the normal distribution that has the stated 95 % radius.
+    #[must_use]
+    pub fn normal_covariance(&self) -> PlaneCovariance {
+        self.covariance.with_r95_m(self.r95_m)
+    }
+}

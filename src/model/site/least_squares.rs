@@ -214,11 +214,11 @@ impl LeastSquaresProblem {
         let weight = self.transfer_weight / (1.0 + squared / (CAUCHY_SCALE * CAUCHY_SCALE)) / variance_px2;
         let [from, to] = transfer.cameras.map(|camera| PARAMETERS * camera);
         let slopes = carried.slopes();
-        for axis in 0..2 {
-            let index = |at: usize| if at < PARAMETERS { from + at } else { to + at - PARAMETERS };
-            for (one, slope) in slopes[axis].iter().enumerate() {
-                normal.right[index(one)] -= weight * slope * carried.residual_px[axis];
-                for (other, other_slope) in slopes[axis].iter().enumerate() {
+        let index = |at: usize| if at < PARAMETERS { from + at } else { to + at - PARAMETERS };
+        for (slopes, residual_px) in slopes.iter().zip(&carried.residual_px) {
+            for (one, slope) in slopes.iter().enumerate() {
+                normal.right[index(one)] -= weight * slope * residual_px;
+                for (other, other_slope) in slopes.iter().enumerate() {
                     normal.matrix[(index(one), index(other))] += weight * slope * other_slope;
                 }
             }

@@ -130,7 +130,7 @@ async fn what_was_cancelled_has_no_report() {
 
     fixture.queue_evaluation(2).await;
     let claim = fixture.claim_evaluation(8).await;
-    assert_eq!(store.cancel_evaluation(nth(2), at(9)).await.expect("flagged").state, JobState::Running);
+    assert_eq!(store.cancel_evaluation(nth(2), at(9)).await.expect("flagged").state, JobState::Cancelling);
     let beat = store.heartbeat_evaluation(nth(2), claim.fence, &progress(), LEASE, at(10)).await;
     assert_eq!(beat.expect("works"), Heartbeat::CancelRequested);
     let ended = store.finish_evaluation(nth(2), claim.fence, success(), at(11)).await.expect("works");

@@ -48,11 +48,11 @@ async fn callers_of_one_transaction_are_each_counted_right() {
     }
     let pair: u64 = answers[..2].iter().map(|it| it.expect("stored").accepted).sum();
     assert_eq!(pair, 1, "one of two equal samples is new");
-    assert_eq!(answers[2], Ok(Inserted { accepted: 1, duplicate: 1, without_fix: 0 }));
+    assert_eq!(answers[2], Ok(Inserted { accepted: 1, duplicate: 1, without_fix: 0, replaced: 0 }));
     assert_eq!(answers[3], Err(ErrorKind::CameraNotFound));
     assert_eq!(answers[4], Ok(Inserted::default()));
-    assert_eq!(answers[5], Ok(Inserted { accepted: 1497, duplicate: 0, without_fix: 0 }));
-    assert_eq!(answers[6], Ok(Inserted { accepted: 1, duplicate: 2, without_fix: 0 }));
+    assert_eq!(answers[5], Ok(Inserted { accepted: 1497, duplicate: 0, without_fix: 0, replaced: 0 }));
+    assert_eq!(answers[6], Ok(Inserted { accepted: 1, duplicate: 2, without_fix: 0, replaced: 0 }));
     assert_eq!(count(&store, &camera).await, 1 + 1 + 1 + 1497 + 1);
 }
 
@@ -145,7 +145,7 @@ async fn concurrent_callers_lose_and_duplicate_nothing() {
         sum.accepted += inserted.accepted;
         sum.duplicate += inserted.duplicate;
     }
-    assert_eq!(sum, Inserted { accepted: 1_000, duplicate: 1_000, without_fix: 0 });
+    assert_eq!(sum, Inserted { accepted: 1_000, duplicate: 1_000, without_fix: 0, replaced: 0 });
     assert_eq!(count(&store, &camera).await, 1_000);
 }
 
@@ -252,7 +252,7 @@ proptest! {
                 let asked = keys.len() as u64;
                 let accepted = keys.into_iter().map(|key| u64::from(known.insert(key))).sum();
                 let inserted = task.await.expect("no panic").expect("stored");
-                prop_assert_eq!(inserted, Inserted { accepted, duplicate: asked - accepted, without_fix: 0 });
+                prop_assert_eq!(inserted, Inserted { accepted, duplicate: asked - accepted, without_fix: 0, replaced: 0 });
             }
             prop_assert_eq!(count(&store, &camera).await, known.len() as u64);
             Ok(())

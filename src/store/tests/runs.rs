@@ -149,7 +149,7 @@ async fn a_cancelled_run_stores_no_model() {
     fixture.queue(2).await;
     let claim = fixture.claim(8).await;
     let flagged = store.cancel_run(&fixture.camera, run_id(2), at(9)).await.expect("flagged");
-    assert_eq!(flagged.state, JobState::Running);
+    assert_eq!(flagged.state, JobState::Cancelling);
     let beat = store.heartbeat_run(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
     assert_eq!(beat.expect("works"), Heartbeat::CancelRequested);
     let taken_over = fixture.claim(100).await;

@@ -39,11 +39,14 @@ async fn a_key_is_stored_once_and_the_first_stays() {
     let first = store
         .insert_samples(&camera, vec![sample(1, "a"), twin.clone(), sample(1, "b")], Durability::Synced)
         .await;
-    assert_eq!(first.expect("stored"), Inserted { accepted: 2, duplicate: 1, without_fix: 0 });
+    assert_eq!(first.expect("stored"), Inserted { accepted: 2, duplicate: 1, without_fix: 0, replaced: 0 });
     let again = store.insert_samples(&camera, vec![twin.clone(), sample(2, "a")], Durability::Synced).await;
-    assert_eq!(again.expect("stored"), Inserted { accepted: 1, duplicate: 1, without_fix: 0 });
+    assert_eq!(again.expect("stored"), Inserted { accepted: 1, duplicate: 1, without_fix: 0, replaced: 0 });
     let elsewhere = store.insert_samples(&other, vec![twin], Durability::Synced).await;
-    assert_eq!(elsewhere.expect("stored"), Inserted { accepted: 1, duplicate: 0, without_fix: 0 });
+    assert_eq!(
+        elsewhere.expect("stored"),
+        Inserted { accepted: 1, duplicate: 0, without_fix: 0, replaced: 0 }
+    );
     assert_eq!(
         store.insert_samples(&camera, Vec::<Sample>::new(), Durability::Synced).await.expect("empty"),
         Inserted::default()
@@ -61,7 +64,7 @@ async fn many_rows_of_any_number_are_counted_right() {
         let inserted =
             store.insert_samples(&camera, rows(0..count), Durability::Synced).await.expect("stored");
         let (accepted, duplicate) = ((count - stored) as u64, stored as u64);
-        assert_eq!(inserted, Inserted { accepted, duplicate, without_fix: 0 });
+        assert_eq!(inserted, Inserted { accepted, duplicate, without_fix: 0, replaced: 0 });
         stored = count;
     }
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 10_000);
@@ -130,9 +133,9 @@ async fn a_sample_with_a_fix_takes_the_place_of_one_without_and_never_the_revers
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     let boxes = || (0..10).map(|second| without_fix(second, "a")).collect::<Vec<_>>();
     let inserted = store.insert_samples(&camera, boxes(), Durability::Synced).await.expect("stored");
-    assert_eq!(inserted, Inserted { accepted: 10, duplicate: 0, without_fix: 10 });
+    assert_eq!(inserted, Inserted { accepted: 10, duplicate: 0, without_fix: 10, replaced: 0 });
     let again = store.insert_samples(&camera, boxes(), Durability::Synced).await.expect("stored");
-    assert_eq!(again, Inserted { accepted: 0, duplicate: 10, without_fix: 0 });
+    assert_eq!(again, Inserted { accepted: 0, duplicate: 10, without_fix: 0, replaced: 0 });
     let count = async || store.camera(&camera).await.expect("known").samples;
     assert_eq!(count().await, SampleCount { all: 10, without_fix: 10 });
 
@@ -140,11 +143,11 @@ async fn a_sample_with_a_fix_takes_the_place_of_one_without_and_never_the_revers
     let mixed =
         vec![without_fix(20, "a"), sample(20, "a").into(), sample(3, "a").into(), sample(4, "b").into()];
     let inserted = store.insert_samples(&camera, mixed, Durability::Synced).await.expect("stored");
-    assert_eq!(inserted, Inserted { accepted: 3, duplicate: 1, without_fix: 0 });
+    assert_eq!(inserted, Inserted { accepted: 3, duplicate: 1, without_fix: 0, replaced: 0 });
     assert_eq!(count().await, SampleCount { all: 12, without_fix: 9 });
     assert_eq!(with_fix(&store, &camera).await, [sample(3, "a"), sample(4, "b"), sample(20, "a")]);
     let late = store.insert_samples(&camera, vec![without_fix(3, "a")], Durability::Synced).await;
-    assert_eq!(late.expect("stored"), Inserted { accepted: 0, duplicate: 1, without_fix: 0 });
+    assert_eq!(late.expect("stored"), Inserted { accepted: 0, duplicate: 1, without_fix: 0, replaced: 0 });
 
     let all = store.samples(&camera, &SampleFilter::default(), None, 100).await.expect("read");
     let fixes: Vec<bool> = all.iter().take(6).map(|sample| sample.fix.is_some()).collect();

@@ -1,7 +1,7 @@
 //! Poles, antimeridian, huge and denormal numbers.
 
 use proptest::prelude::*;
-use sightfix::domain::TimeBounds;
+use sightfix::domain::{Receivers, TimeBounds};
 use sightfix::exchange::wire;
 use sightfix::geo::{EastNorth, LocalPlane, Position, distance_m};
 
@@ -71,10 +71,10 @@ proptest! {
         fix in prop::option::of(wire_fix()),
     ) {
         let observation = wire::Observation {
-            time: "2026-01-01T00:00:00Z".into(), target_id: None, bounding_box, fix,
+            time: "2026-01-01T00:00:00Z".into(), target_id: None, receiver_id: None, bounding_box, fix,
         };
         let bounds = TimeBounds::at("2026-06-01T00:00:00Z".parse().expect("an instant"));
-        if let Ok(observation) = observation.to_domain(&bounds, None) {
+        if let Ok(observation) = observation.to_domain(&bounds, None, &Receivers::default()) {
             check_fusion(&observation);
         }
     }

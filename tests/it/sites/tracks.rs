@@ -194,8 +194,8 @@ async fn resumes_alike(server: &TestServer, events: &[SiteEvent]) {
     }
 }
 
-/// Feeds fixes of a receiver, one a second, through a camera without a model; the second of the last one.
-async fn feed_fixes(server: &TestServer, target: &str, from: usize, count: usize) {
+/// Feeds fixes of a receiver, one a second, through a camera without a model.
+async fn feed_fixes(server: &TestServer, camera: &str, target: &str, from: usize, count: usize) {
     let crossing = crossing(1);
     for second in from..from + count {
         let fix = plane().to_position(crossing.position(0, 5 * second));
@@ -203,7 +203,7 @@ async fn feed_fixes(server: &TestServer, target: &str, from: usize, count: usize
             "time": crossing.time(5 * second), "target_id": target,
             "fix": {"longitude_deg": fix.longitude_deg(), "latitude_deg": fix.latitude_deg(), "sigma_m": 1.5},
         });
-        server.post("/v1/cameras/west/tracks", &observation).await.expect(200);
+        server.post(&format!("/v1/cameras/{camera}/tracks"), &observation).await.expect(200);
     }
 }
 
@@ -219,7 +219,7 @@ async fn receivers_alone_are_tracked_and_read_in_both_forms() {
     // Tracks end two seconds after their last fix, so this goes on until one was read.
     let mut second = 0;
     let (track, id) = loop {
-        feed_fixes(&server, "phone-1", second, 2).await;
+        feed_fixes(&server, "west", "phone-1", second, 2).await;
         second += 2;
         let tracks = server.get("/v1/sites/square/tracks").await.expect(200).json();
         let Some(track) = tracks["items"].get(0).cloned() else { continue };
@@ -264,7 +264,7 @@ async fn a_reader_that_comes_back_too_late_is_told() {
     let begin = server.get("/v1/sites/square/tracks").await.expect(200).json();
     let begin = begin["last_event_id"].as_str().expect("an id").to_owned();
     let mut live = Events::open(&server, &begin).await;
-    feed_fixes(&server, "phone-1", 0, 60).await;
+    feed_fixes(&server, "west", "phone-1", 0, 60).await;
     let last = live.until("track_ended", 1).await.pop().expect("events");
     let number =
         |event: &SiteEvent| event.id.split_once('-').expect("an id").1.parse::<u64>().expect("a number");
@@ -293,7 +293,7 @@ async fn a_reader_that_comes_back_too_late_is_told() {
     let mut resumed = Events::open(&server, &last.id).await;
     let lost = resumed.next().await.expect("an event");
     assert_eq!((lost.name.as_str(), lost.data), ("lost", json!({"reason": "restarted"})));
-    feed_fixes(&server, "phone-1", 0, 4).await;
+    feed_fixes(&server, "west", "phone-1", 0, 4).await;
     let started = resumed.next().await.expect("an event");
     assert_eq!(started.name, "track_started");
     assert_ne!(started.id.split_once('-').expect("an id").0, last.id.split_once('-').expect("an id").0);
@@ -308,7 +308,7 @@ async fn readers_end_with_their_site() {
     let mut client = SiteServiceClient::new(channel(&server).await);
     let request = proto::WatchTracksRequest { site_id: "square".to_owned(), ..Default::default() };
     let mut watched = client.watch_tracks(request).await.expect("a stream").into_inner();
-    feed_fixes(&server, "phone-1", 0, 3).await;
+    feed_fixes(&server, "west", "phone-1", 0, 3).await;
     assert_eq!(events.next().await.expect("an event").name, "track_started");
 
     for camera in CAMERAS {
@@ -337,10 +337,11 @@ async fn what_comes_late_or_out_of_range_is_counted_and_harms_nothing() {
     let server = TestServer::start(folder.path());
     create(&server, false).await;
     let mut events = Events::open(&server, "").await;
-    feed_fixes(&server, "phone-1", 100, 2).await;
+    feed_fixes(&server, "west", "phone-1", 100, 2).await;
     events.until("track", 2).await;
-    // Of the time before, and far away.
-    feed_fixes(&server, "phone-2", 10, 3).await;
+    // The same fixes once more, fixes of the time before, and one far away.
+    feed_fixes(&server, "east", "phone-1", 100, 2).await;
+    feed_fixes(&server, "west", "phone-2", 10, 3).await;
     let far = json!({
         "time": crossing(1).time(520), "target_id": "phone-3",
         "fix": {"longitude_deg": 0.0, "latitude_deg": 0.0},

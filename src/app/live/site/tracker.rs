@@ -1,6 +1,6 @@
 //! Frames of a site's cameras through the world tracker, and what is published of it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -39,17 +39,28 @@ pub(super) struct SiteTracker {
     limits: Limits,
     metrics: Metrics,
     frames: FrameAssembler<Source, SiteItem>,
+    /// Time by which a fix may be older than the latest frame.
+    fix_lateness: SignedDuration,
     active: Option<ActiveTracker>,
     /// Added to the numbers of the tracker's tracks, so that none is announced twice when it starts again.
     number_offset: u64,
     /// The highest number that was announced.
     highest_number: u64,
-    /// Targets of a camera of which fixes came, with the reading of the monotonic clock at the latest: a box of the
-    /// same camera and target id is of the receiver's carrier.
-    carriers: HashMap<(CameraId, TargetId), Duration>,
+    /// Targets of which fixes came.
+    carriers: HashMap<TargetId, Carrier>,
     /// The tracks whose start was announced and whose end was not, each with the latest instant at which its
     /// position was announced.
     announced: HashMap<LiveId, Option<Timestamp>>,
+}
+
+/// A target that carries a receiver.
+struct Carrier {
+    /// Time of its latest fix; the same one may come again with the boxes of another camera.
+    fixed_at: Timestamp,
+    /// Reading of the monotonic clock when it came.
+    noted_at: Duration,
+    /// The cameras through which its fixes came: a box of theirs with the target's id is of this target.
+    cameras: BTreeSet<CameraId>,
 }
 
 /// A world tracker with its plane.
@@ -65,8 +76,11 @@ struct ActiveTracker {
 
 impl SiteTracker {
     pub(super) fn new(live: Arc<SiteLive>, limits: Limits, metrics: Metrics) -> Self {
+        let max_late_s = WorldTrackSettings::default().max_late_s;
+        let fix_lateness = SignedDuration::try_from_secs_f64(max_late_s).unwrap_or_default();
         let frames = FrameAssembler::new(FrameLimits {
             wait: Duration::from_millis(limits.site_wait_ms),
+            lateness: fix_lateness,
             frames: limits.site_frames,
             items_per_frame: limits.boxes_per_frame,
         });
@@ -75,6 +89,7 @@ impl SiteTracker {
             limits,
             metrics,
             frames,
+            fix_lateness,
             active: None,
             number_offset: 0,
             highest_number: 0,
@@ -88,7 +103,9 @@ impl SiteTracker {
         let (source, is_pacing) = match (&item.source, &item.target_id) {
             (ItemSource::Box { .. }, _) => (Source::Camera(item.camera.clone()), true),
             (ItemSource::Fix { .. }, Some(target_id)) => {
-                self.note_carrier(&item.camera, target_id, now);
+                if !self.note_carrier(&item.camera, target_id, item.time, now) {
+                    return;
+                }
                 (Source::Receiver(target_id.clone()), false)
             }
             (ItemSource::Fix { .. }, None) => return,
@@ -101,13 +118,33 @@ impl SiteTracker {
         }
     }
 
-    fn note_carrier(&mut self, camera: &CameraId, target_id: &TargetId, now: Duration) {
+    /// Notes a fix of a target; whether it is a new one.
+    fn note_carrier(
+        &mut self,
+        camera: &CameraId,
+        target_id: &TargetId,
+        time: Timestamp,
+        now: Duration,
+    ) -> bool {
+        if let Some(carrier) = self.carriers.get_mut(target_id) {
+            carrier.cameras.insert(camera.clone());
+            carrier.noted_at = now;
+            // Of a recording that is played again the times are far behind.
+            let behind = carrier.fixed_at.duration_since(time);
+            let is_new = behind.is_negative() || behind > self.fix_lateness;
+            if is_new {
+                carrier.fixed_at = time;
+            }
+            return is_new;
+        }
         if self.carriers.len() >= self.limits.tracks_per_site {
-            self.carriers.retain(|_, noted| now.saturating_sub(*noted) < CARRIER_FOR);
+            self.carriers.retain(|_, carrier| !carrier.is_outdated(now));
         }
         if self.carriers.len() < self.limits.tracks_per_site {
-            self.carriers.insert((camera.clone(), target_id.clone()), now);
+            let carrier = Carrier { fixed_at: time, noted_at: now, cameras: [camera.clone()].into() };
+            self.carriers.insert(target_id.clone(), carrier);
         }
+        true
     }
 
     /// Whether time changes anything: frames wait, or tracks may end.
@@ -220,8 +257,8 @@ impl SiteTracker {
         let plane = *active.tracker.plane();
         let now = active.tracked_at;
         let carries = |camera: &CameraId, target_id: &TargetId| {
-            let noted = self.carriers.get(&(camera.clone(), target_id.clone()));
-            noted.is_some_and(|noted| now.saturating_sub(*noted) < CARRIER_FOR)
+            let carrier = self.carriers.get(target_id).filter(|carrier| !carrier.is_outdated(now));
+            carrier.is_some_and(|carrier| carrier.cameras.contains(camera))
         };
         let mut detections = Vec::with_capacity(items.len());
         for item in items {
@@ -241,7 +278,6 @@ impl SiteTracker {
         }
     }
 
-    /// One fix per receiver and instant: the same one may come with the boxes of several cameras.
     fn track_fix(&mut self, target_id: &TargetId, time: Timestamp, items: &[SiteItem]) {
         let (Some(active), Some(item)) = (&mut self.active, items.first()) else { return };
         let ItemSource::Fix { variance_m2 } = item.source else { return };
@@ -337,6 +373,12 @@ impl SiteTracker {
             self.metrics.world_track_ended();
             self.live.events.push(SiteEvent { time, kind });
         }
+    }
+}
+
+impl Carrier {
+    fn is_outdated(&self, now: Duration) -> bool {
+        now.saturating_sub(self.noted_at) >= CARRIER_FOR
     }
 }
 

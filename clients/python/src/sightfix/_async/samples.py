@@ -1,0 +1,260 @@
+"""Samples for training."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterable, Mapping
+from dataclasses import fields, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from sightfix._async.transport import Transport
+from sightfix._json import dump, to_json
+from sightfix._request import Request, delete, get, in_chunks, path
+from sightfix._tables import Table, sample_columns, sample_rows, to_arrays, to_frame
+from sightfix.models import (
+    DeletedSamples,
+    Durability,
+    Imported,
+    PairedSamples,
+    Sample,
+    SampleCount,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+
+MEDIA_TYPES = {
+    ".csv": "text/csv",
+    ".ndjson": "application/x-ndjson",
+    ".jsonl": "application/x-ndjson",
+    ".json": "application/json",
+    ".geojson": "application/geo+json",
+}
+ROWS_PER_REQUEST = 20_000
+
+
+class Samples:
+    """Stored boxes and fixes, from which cameras are trained.
+
+    Importing the same rows again does no harm: what is stored already is counted as `duplicate`.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    async def import_file(self, camera_id: str, file: str | Path, *, durability: Durability = "synced") -> Imported:
+        """Imports a file of CSV, NDJSON or JSON, by its name's ending.
+
+        `line` of a rejected row is the line of the file.
+
+        Raises:
+            ValueError: The name has another ending.
+        """
+        file = Path(file)
+        return await self._import(camera_id, file, media_type(file), durability)
+
+    async def import_samples(
+        self, camera_id: str, samples: Iterable[Sample], *, durability: Durability = "synced"
+    ) -> Imported:
+        """Imports samples in requests of 20,000. `line` of a rejected row counts the samples from 1."""
+        return await self._import_rows(camera_id, (to_json(sample) for sample in samples), durability)
+
+    async def import_table(self, camera_id: str, table: Table, *, durability: Durability = "synced") -> Imported:
+        """Imports the columns of a pandas DataFrame, or a mapping of names to arrays.
+
+        The columns are those of a CSV file, with or without their units: `time`, `target_id`, `left_px`, `top_px`,
+        `width_px`, `height_px`, `longitude_deg`, `latitude_deg`; optional are `sigma_m`, `class`, `score`,
+        `truth_longitude_deg` and `truth_latitude_deg`. Times are RFC 3339 or have a time zone; `datetime64` of
+        numpy is UTC. A row that the server rejects does not affect the others; its `line` counts the rows from 1.
+
+        Raises:
+            ValueError: A column is unknown, or a time has no UTC offset.
+        """
+        return await self._import_rows(camera_id, sample_rows(table), durability)
+
+    async def pair_files(
+        self,
+        camera_id: str,
+        detections: str | Path,
+        fixes: str | Path,
+        *,
+        method: Literal["nearest", "interpolate"] | None = None,
+        window_s: float | None = None,
+        longest_gap_s: float | None = None,
+        target_id: str | None = None,
+        receiver_id: str | None = None,
+        keep_unpaired: bool | None = None,
+        estimate_offset: bool | None = None,
+        durability: Durability | None = None,
+    ) -> PairedSamples:
+        """Pairs boxes and fixes that were recorded apart by time, and stores the pairs.
+
+        Args:
+            camera_id: The camera.
+            detections: Boxes as CSV or NDJSON.
+            fixes: Fixes as CSV, NMEA, GPX or reports of gpsd.
+            method: `nearest` by default.
+            window_s: Box and fix are at most this far apart (nearest).
+            longest_gap_s: Fixes are joined over at most this long a gap (interpolate).
+            target_id: The target of boxes that name none.
+            receiver_id: The receiver of fixes that name none.
+            keep_unpaired: Store boxes without a fix as samples without one.
+            estimate_offset: Estimate the clock offsets of the receivers; they are not applied.
+            durability: When the samples are acknowledged.
+        """
+        request = Request(
+            method="POST",
+            path=path("cameras", camera_id, "samples", "pairings"),
+            query={
+                "method": method,
+                "window_s": window_s,
+                "longest_gap_s": longest_gap_s,
+                "target_id": target_id,
+                "receiver_id": receiver_id,
+                "keep_unpaired": keep_unpaired,
+                "estimate_offset": estimate_offset,
+                "durability": durability,
+            },
+            files={"detections": Path(detections), "fixes": Path(fixes)},
+            is_idempotent=True,
+        )
+        return await self._transport.json(request, PairedSamples)
+
+    def list(
+        self,
+        camera_id: str,
+        *,
+        from_: datetime | None = None,
+        until: datetime | None = None,
+        target_id: str | None = None,
+        has_fix: bool | None = None,
+        page_size: int | None = None,
+    ) -> AsyncIterator[Sample]:
+        """Samples by time and target."""
+        return self._transport.items(
+            path("cameras", camera_id, "samples"),
+            Sample,
+            from_=from_,
+            until=until,
+            target_id=target_id,
+            has_fix=has_fix,
+            limit=page_size,
+        )
+
+    async def to_arrays(self, camera_id: str, **selection: Any) -> dict[str, np.ndarray[Any, Any]]:
+        """Samples as numpy arrays by column; the arguments are those of `list`."""
+        return to_arrays(sample_columns([sample async for sample in self.list(camera_id, **selection)]))
+
+    async def to_frame(self, camera_id: str, **selection: Any) -> pd.DataFrame:
+        """Samples as a pandas DataFrame; the arguments are those of `list`."""
+        return to_frame(sample_columns([sample async for sample in self.list(camera_id, **selection)]))
+
+    async def export(
+        self,
+        camera_id: str,
+        file: str | Path,
+        *,
+        from_: datetime | None = None,
+        until: datetime | None = None,
+        target_id: str | None = None,
+        has_fix: bool | None = None,
+    ) -> None:
+        """Writes samples to a file as CSV, NDJSON or GeoJSON, by its name's ending.
+
+        Raises:
+            ValueError: The name has another ending.
+        """
+        file = Path(file)
+        request = Request(
+            method="GET",
+            path=path("cameras", camera_id, "samples"),
+            query={"from": from_, "until": until, "target_id": target_id, "has_fix": has_fix},
+            headers={"accept": media_type(file)},
+            is_idempotent=True,
+        )
+        async with self._transport.open(request) as response:
+            with file.open("wb") as output:  # noqa: ASYNC230, short writes of what has arrived
+                async for part in response.aiter_bytes():
+                    output.write(part)
+
+    async def count(
+        self,
+        camera_id: str,
+        *,
+        from_: datetime | None = None,
+        until: datetime | None = None,
+        target_id: str | None = None,
+        has_fix: bool | None = None,
+    ) -> SampleCount:
+        """How many samples there are."""
+        request = get(
+            path("cameras", camera_id, "samples", "count"),
+            from_=from_,
+            until=until,
+            target_id=target_id,
+            has_fix=has_fix,
+        )
+        return await self._transport.json(request, SampleCount)
+
+    async def delete(
+        self,
+        camera_id: str,
+        *,
+        from_: datetime | None = None,
+        until: datetime | None = None,
+        target_id: str | None = None,
+        has_fix: bool | None = None,
+    ) -> int:
+        """Deletes the selected samples; returns how many there were. The selection must not be empty."""
+        request = delete(
+            path("cameras", camera_id, "samples"),
+            from_=from_,
+            until=until,
+            target_id=target_id,
+            has_fix=has_fix,
+        )
+        return (await self._transport.json(request, DeletedSamples)).deleted
+
+    async def _import(self, camera_id: str, body: bytes | Path, media_type: str, durability: Durability) -> Imported:
+        request = Request(
+            method="POST",
+            path=path("cameras", camera_id, "samples"),
+            query={"durability": durability},
+            headers={"content-type": media_type},
+            body=body,
+            is_idempotent=True,
+        )
+        return await self._transport.json(request, Imported)
+
+    async def _import_rows(self, camera_id: str, rows: Iterable[Mapping[str, Any]], durability: Durability) -> Imported:
+        imported: Imported | None = None
+        rows_before = 0
+        for chunk in in_chunks(rows, ROWS_PER_REQUEST):
+            body = b"\n".join(dump(row) for row in chunk)
+            part = await self._import(camera_id, body, MEDIA_TYPES[".ndjson"], durability)
+            imported = part if imported is None else added(imported, part, rows_before)
+            rows_before += len(chunk)
+        # Without rows the server says what no rows become.
+        return imported or await self._import(camera_id, b"", MEDIA_TYPES[".ndjson"], durability)
+
+
+def added(imported: Imported, part: Imported, rows_before: int) -> Imported:
+    """One report of an import that took several requests; the rows of `part` come after `rows_before` others."""
+    counts = {
+        it.name: getattr(imported, it.name) + getattr(part, it.name)
+        for it in fields(Imported)
+        if isinstance(getattr(part, it.name), int)
+    }
+    rejected = [replace(row, line=rows_before + row.line) for row in part.rejected_rows]
+    return replace(imported, rejected_rows=[*imported.rejected_rows, *rejected], **counts)
+
+
+def media_type(file: Path) -> str:
+    """The media type of a file by the ending of its name."""
+    try:
+        return MEDIA_TYPES[file.suffix.lower()]
+    except KeyError:
+        endings = ", ".join(MEDIA_TYPES)
+        raise ValueError(f"the name of {file} must end with one of {endings}") from None

@@ -1,0 +1,26 @@
+"""Items of a live stream."""
+
+from dataclasses import dataclass
+from datetime import datetime
+
+from sightfix.models import BoundingBox, Fix
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LiveItem:
+    """A box, a fix, or both, of one target at one instant."""
+
+    time: datetime
+    """Time of the measurement by the device's clock, with a UTC offset."""
+    target_id: str | None = None
+    """The target. Without it there is a fused position but no track."""
+    receiver_id: str | None = None
+    """Which receiver measured the fix; instead of `target_id` for a fix alone."""
+    bounding_box: BoundingBox | None = None
+    """What the camera saw."""
+    fix: Fix | None = None
+    """What the receiver said."""
+    class_: str | None = None
+    """The detector's class."""
+    score: float | None = None
+    """The detector's confidence, 0 to 1."""

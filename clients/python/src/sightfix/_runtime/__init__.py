@@ -1,0 +1,1 @@
+"""What the asynchronous and the synchronous client do differently; the rest of them is one code."""

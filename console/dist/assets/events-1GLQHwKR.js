@@ -1,1 +1,0 @@
-import{E as e}from"./app-BDNsqjIw.js";function t(t,n){let r,i,a=500,o=!1;function s(){r=new EventSource(t),r.onopen=()=>{a=500,e.regain(),n.state(!0)},r.onerror=()=>{r?.close(),o||(n.state(!1),i=setTimeout(s,a),a=Math.min(a*2,8e3))};for(let[e,t]of Object.entries(n.on))r.addEventListener(e,e=>t(JSON.parse(e.data)))}return s(),()=>{o=!0,clearTimeout(i),r?.close()}}export{t};

@@ -1,0 +1,1 @@
+function e(e){return e===`queued`||e===`running`||e===`cancelling`}export{e as t};

@@ -1,0 +1,29 @@
+//! Flags for the layout of CSV files.
+
+use clap::Args;
+
+use crate::exchange::{BoxForm, BoxUnit, ColumnNames, CsvLayout};
+
+/// How CSV files name their columns and write their boxes.
+#[derive(Args)]
+pub(super) struct LayoutFlags {
+    /// Columns of CSV files: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` names them
+    /// (such as time:Timestamp,left:x1); other columns are ignored, and any separator, decimal commas and Unix
+    /// times are read [default: the documented columns, separated by commas]
+    #[arg(long, value_name = "COLUMNS")]
+    columns: Option<ColumnNames>,
+    /// What the columns left, top, width and height hold: left_top, centre (of the box, and its size) or
+    /// corners (the last two are right and bottom) [default: by the names of the columns]
+    #[arg(long, value_name = "FORM")]
+    box_form: Option<BoxForm>,
+    /// Unit of the sides of boxes: px, or share (of the image's width and height) [default: px]
+    #[arg(long, value_name = "UNIT")]
+    box_unit: Option<BoxUnit>,
+}
+
+impl LayoutFlags {
+    /// The layout that the flags say.
+    pub(super) fn to_layout(&self) -> CsvLayout {
+        CsvLayout::new(self.columns.clone(), self.box_form, self.box_unit)
+    }
+}

@@ -1,0 +1,21 @@
+//! What an import does with samples that are stored already.
+
+use strum::{Display, EnumString, IntoStaticStr};
+
+use super::error::Error;
+
+/// What becomes of a sample whose camera, target and time are stored already.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Display, EnumString, IntoStaticStr)]
+#[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_choice)]
+pub enum OnConflict {
+    /// It is counted as a duplicate and the stored one stays; but a sample with a fix takes the place of one
+    /// without.
+    #[default]
+    Keep,
+    /// It takes the place of the stored one.
+    Replace,
+}
+
+fn unknown_choice(_: &str) -> Error {
+    Error::invalid("on_conflict", "must be keep or replace")
+}

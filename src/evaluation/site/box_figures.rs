@@ -20,7 +20,7 @@ pub struct BoxRecord {
     pub camera: usize,
     /// When.
     pub time: Timestamp,
-    /// Index of the target; `None` for a false detection.
+    /// Number of the target, or of its visit; `None` for a false detection.
     pub target: Option<usize>,
     /// The track; `None` for a box that was not processed.
     pub track: Option<WorldTrackId>,

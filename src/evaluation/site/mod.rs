@@ -14,7 +14,7 @@ mod world_figures;
 
 pub use box_figures::{BoxFigures, BoxRecord};
 pub use degradation::Degradation;
-pub use recording::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording};
+pub use recording::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording, Visits};
 pub use report::{SiteCase, SiteReport};
 pub use runner::{Identities, SiteOutcome, SiteTraining, TrainedSite, site_fit_rows, track_site, train_site};
 pub use world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};

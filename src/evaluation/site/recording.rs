@@ -8,6 +8,9 @@ use crate::domain::{BoundingBox, CameraId, GaussMarkovNoise, ImageSize, Received
 use crate::geo::{EastNorth, LocalPlane};
 use crate::simulation::{SimulatedReceiver, SimulatedSite};
 
+/// A target that no camera sees for longer than this begins another visit, s.
+const VISIT_GAP_S: f64 = 5.0;
+
 /// A detection with the target that it is of.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledBox {
@@ -116,6 +119,30 @@ impl SiteRecording {
         visible
     }
 
+    /// The visits of all targets: a target that no camera saw for longer than [`VISIT_GAP_S`] comes back as another
+    /// one, for no tracker that knows positions alone could recognise it.
+    #[must_use]
+    pub fn visits(&self) -> Visits {
+        let all: Vec<usize> = (0..self.cameras.len()).collect();
+        let mut by_target: BTreeMap<usize, Vec<Timestamp>> = BTreeMap::new();
+        for (time, targets) in self.visible_to(&all) {
+            for target in targets {
+                by_target.entry(target).or_default().push(time);
+            }
+        }
+        let mut visits = Visits::default();
+        let mut count = 0;
+        for (target, times) in by_target {
+            let gap_s = |pair: &[Timestamp]| pair[1].duration_since(pair[0]).as_secs_f64();
+            let returns = times.windows(2).filter(|pair| gap_s(pair) > VISIT_GAP_S).map(|pair| pair[1]);
+            for begin in times.first().copied().into_iter().chain(returns) {
+                visits.begins.insert((target, begin), count);
+                count += 1;
+            }
+        }
+        visits
+    }
+
     /// The same fixes with other errors: those of receivers of that noise, drawn from a seed, at the true
     /// positions of their carriers.
     #[must_use]
@@ -140,6 +167,22 @@ impl SiteRecording {
             true
         });
         redrawn
+    }
+}
+
+/// The visits of targets, numbered.
+#[derive(Debug, Clone, Default)]
+pub struct Visits {
+    /// Number of the visit by target and first instant.
+    begins: BTreeMap<(usize, Timestamp), usize>,
+}
+
+impl Visits {
+    /// The visit of a target at an instant.
+    #[must_use]
+    pub fn at(&self, target: usize, time: Timestamp) -> Option<usize> {
+        let earlier = self.begins.range((target, Timestamp::MIN)..=(target, time));
+        earlier.map(|(_, number)| *number).next_back()
     }
 }
 

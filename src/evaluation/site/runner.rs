@@ -188,6 +188,7 @@ pub fn track_site(
         }
     }
     let in_view = visible.visible_to(cameras);
+    let visits = visible.visits();
     let mut tracker = WorldTracker::new(recording.plane, WorldTrackSettings::default());
     let (mut records, mut instants) = (Vec::new(), Vec::new());
     for (time, by_camera) in frames {
@@ -202,12 +203,13 @@ pub fn track_site(
             records.extend(boxes.iter().zip(outcome.tracks).map(|(labelled, track)| BoxRecord {
                 camera,
                 time,
-                target: labelled.target,
+                target: labelled.target.and_then(|target| visits.at(target, time)),
                 track,
             }));
         }
         let targets = in_view.get(&time).into_iter().flatten();
-        let position = |target: &usize| Some((*target, *recording.truth.get(&(time, *target))?));
+        let position =
+            |target: &usize| Some((visits.at(*target, time)?, *recording.truth.get(&(time, *target))?));
         instants.push(WorldInstant {
             targets: targets.filter_map(position).collect(),
             tracks: reported(&tracker, time, &records[first..]),

@@ -57,7 +57,7 @@ impl<'a> PredictedTrack<'a> {
             _ if self.track.is_measured_by_receiver() => return None,
             _ => false,
         };
-        let s = self.covariance_m2.plus(detection.covariance_m2);
+        let s = self.covariance_m2.plus(settings.measurement_covariance(detection));
         let position = self.track.moved_to_state_time(detection.position, self.frame.time);
         let difference = difference_m(position, self.position);
         let distance_m2 = difference.east_m.powi(2) + difference.north_m.powi(2);

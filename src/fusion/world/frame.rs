@@ -98,7 +98,7 @@ pub struct TimedEvent {
 pub struct FrameOutcome {
     /// The track of each detection, in their order; `None` for one that was not processed.
     pub tracks: Vec<Option<WorldTrackId>>,
-    /// Detections beyond the bounds of [`super::WorldTrackSettings`].
+    /// Detections beyond the bounds of the settings.
     pub dropped: usize,
     /// Whether the whole frame was refused because it came too late.
     pub too_late: bool,

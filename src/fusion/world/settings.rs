@@ -1,6 +1,9 @@
 //! Settings of the world tracker.
 
-/// Noise, gates and bounds of a [`super::WorldTracker`].
+use super::frame::WorldDetection;
+use crate::geo::PlaneCovariance;
+
+/// Noise, gates and bounds of a world tracker.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldTrackSettings {
     /// Spectral density of the white acceleration noise of the two motion modes, m2/s3: steady and
@@ -10,6 +13,9 @@ pub struct WorldTrackSettings {
     pub mode_sojourn_s: f64,
     /// Standard deviation per axis of the velocity of a new track, m/s.
     pub birth_speed_sigma_m_s: f64,
+    /// Factor on the covariance of a detection: its error is not independent from frame to frame, so a filter that
+    /// takes it for white must take it for larger.
+    pub correlated_noise_inflation: f64,
     /// Largest squared Mahalanobis distance of a detection to a track.
     pub gate: f64,
     /// The same where the detection has the tracker id that the track last had in that camera.
@@ -46,6 +52,13 @@ pub struct WorldTrackSettings {
     pub max_detections: usize,
 }
 
+impl WorldTrackSettings {
+    /// The covariance of a detection's error for the filter, m2.
+    pub(super) fn measurement_covariance(&self, detection: &WorldDetection) -> PlaneCovariance {
+        detection.covariance_m2.scaled(self.correlated_noise_inflation)
+    }
+}
+
 impl Default for WorldTrackSettings {
     /// People and slow vehicles, detectors of 2 to 25 frames a second.
     fn default() -> Self {
@@ -53,6 +66,7 @@ impl Default for WorldTrackSettings {
             acceleration_noise_m2_s3: [0.1, 2.5],
             mode_sojourn_s: 5.0,
             birth_speed_sigma_m_s: 1.5,
+            correlated_noise_inflation: 1.8,
             gate: 16.0,
             own_id_gate: 28.8,
             own_id_bonus: 3.0,

@@ -184,7 +184,7 @@ impl WorldTracker {
         events: &mut Vec<TimedEvent>,
     ) {
         let track = &mut self.tracks[index];
-        let s = track.gating_covariance().plus(detection.covariance_m2);
+        let s = track.gating_covariance().plus(self.settings.measurement_covariance(detection));
         let difference = difference_m(detection.position, track.filter.position());
         if s.mahalanobis_squared(difference) > self.settings.own_id_gate {
             track.filter.inflate_position(PlaneCovariance::outer(difference.east_m, difference.north_m));

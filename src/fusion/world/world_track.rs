@@ -69,7 +69,8 @@ impl WorldTrack {
         detection: &WorldDetection,
         settings: &WorldTrackSettings,
     ) -> Self {
-        let mut track = Self::at(id, time, detection.position, detection.covariance_m2, settings);
+        let covariance_m2 = settings.measurement_covariance(detection);
+        let mut track = Self::at(id, time, detection.position, covariance_m2, settings);
         track.receiver.clone_from(&detection.receiver);
         track.common_covariance_m2 = detection.common_covariance_m2;
         track.detections = 1;
@@ -228,7 +229,7 @@ impl WorldTrack {
             self.measured_by_receiver = false;
         }
         let position = self.moved_to_state_time(detection.position, time);
-        self.filter.update(position, detection.covariance_m2);
+        self.filter.update(position, settings.measurement_covariance(detection));
         self.common_covariance_m2 = detection.common_covariance_m2;
         self.detections += 1;
         let from = self.handed_over_from(camera, time, settings);

@@ -112,11 +112,17 @@ impl SiteMaps {
         if pairs == 0.0 { own } else { bounded(sum / pairs, own) }
     }
 
+    /// Whether a camera's image has a foot point: by the image size, or by the feet of training where that is unknown.
     fn is_in_view(&self, camera: usize, foot: [f64; 2]) -> bool {
-        foot.iter().zip(self.views_px[camera]).all(|(value, [least, greatest])| {
-            let margin = VIEW_MARGIN * (greatest - least);
-            (least - margin..=greatest + margin).contains(value)
-        })
+        let [u_range, v_range] = match self.image_sizes[camera] {
+            Some(size) => [[0.0, f64::from(size.width_px())], [0.0, f64::from(size.height_px())]],
+            None => self.views_px[camera].map(|[least, greatest]| {
+                let margin = VIEW_MARGIN * (greatest - least);
+                [least - margin, greatest + margin]
+            }),
+        };
+        let is_within = |value: f64, [least, greatest]: [f64; 2]| (least..=greatest).contains(&value);
+        is_within(foot[0], u_range) && is_within(foot[1], v_range)
     }
 
     /// `J_a P_ab J_b'` of the parameters' covariance P, m2.

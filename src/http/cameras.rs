@@ -336,7 +336,10 @@ async fn create_camera(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
         ("site" = Option<String>, Query, description = "Only the cameras of this site"),
     ),
-    responses((status = 200, description = "A page of cameras", body = CameraPage))
+    responses(
+        (status = 200, description = "A page of cameras", body = CameraPage),
+        (status = 404, description = "There is no such site", body = Problem, content_type = "application/problem+json"),
+    )
 )]
 async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let mut params = Params::of(&uri)?;

@@ -132,6 +132,12 @@ async fn delete_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPat
     Ok(empty())
 }
 
+/// A model's file, as bytes.
+#[derive(ToSchema)]
+#[schema(value_type = String, format = Binary)]
+#[expect(dead_code, reason = "for the description alone")]
+struct ModelFile(Vec<u8>);
+
 /// Download a model version
 ///
 /// A safetensors file: the weights, and the metadata in its header. It can be imported on another
@@ -139,7 +145,7 @@ async fn delete_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPat
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/models/{model}/file", tag = "models",
     params(("camera" = String, Path, description = "The camera's id"), ("model" = u32, Path, description = "The version's number")),
-    responses((status = 200, description = "The file", body = Vec<u8>, content_type = "application/vnd.safetensors"))
+    responses((status = 200, description = "The file", body = ModelFile, content_type = "application/vnd.safetensors"))
 )]
 async fn download_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) -> ApiResult {
     let mut response = Response::new(Body::from(app.download_model(&id, number).await?));
@@ -156,7 +162,7 @@ async fn download_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelP
 /// itself.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/models", tag = "models", params(("camera" = String, Path, description = "The camera's id")),
-    request_body(content((Vec<u8> = "application/vnd.safetensors"), (Vec<u8> = "application/octet-stream"))),
+    request_body(content((ModelFile = "application/vnd.safetensors"), (ModelFile = "application/octet-stream"))),
     responses((status = 201, description = "The stored version", body = ModelVersion, headers(("location" = String, description = "Its path"))))
 )]
 async fn import_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, request: Request) -> ApiResult {

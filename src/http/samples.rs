@@ -190,8 +190,8 @@ fn import_format(headers: &HeaderMap) -> Result<Format> {
     get, path = "/v1/cameras/{camera}/samples", tag = "samples",
     params(
         ("camera" = String, Path, description = "The camera's id"),
-        ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
-        ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
+        ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
+        ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
         ("target_id" = Option<String>, Query, description = "Of this target alone"),
         ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
         ("limit" = Option<u32>, Query, description = "Items on a page of JSON, 100 if left out"),
@@ -302,8 +302,8 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
     get, path = "/v1/cameras/{camera}/samples/count", tag = "samples",
     params(
         ("camera" = String, Path, description = "The camera's id"),
-        ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
-        ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
+        ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
+        ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
         ("target_id" = Option<String>, Query, description = "Of this target alone"),
         ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
     ),
@@ -324,8 +324,8 @@ async fn count_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, ur
     delete, path = "/v1/cameras/{camera}/samples", tag = "samples",
     params(
         ("camera" = String, Path, description = "The camera's id"),
-        ("from" = Option<String>, Query, description = "From this instant on (RFC 3339)"),
-        ("until" = Option<String>, Query, description = "Before this instant (RFC 3339)"),
+        ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
+        ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
         ("target_id" = Option<String>, Query, description = "Of this target alone"),
         ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
     ),

@@ -25,7 +25,6 @@ struct Server {
     #[schema(example = "0.1.0")]
     version: &'static str,
     /// The limits in force, by the name of the setting below `limits`.
-    #[schema(value_type = BTreeMap<String, f64>)]
     limits: BTreeMap<String, Value>,
     /// Map tiles that the operator's console may show, if they are set.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -48,10 +47,13 @@ struct Tiles {
 )]
 async fn get_server(State(rest): State<Rest>) -> ApiResult {
     let limits = serde_json::to_value(&rest.app.limits).and_then(serde_json::from_value);
+    let mut limits: BTreeMap<String, Value> = limits.map_err(Error::fault)?;
+    // The others are policies, such as `sample_overflow`.
+    limits.retain(|_, value| value.is_number());
     let tiles = rest
         .console
         .tile_url
         .clone()
         .map(|url| Tiles { url, attribution: rest.console.tile_attribution.clone().unwrap_or_default() });
-    Ok(json(&Server { version: env!("CARGO_PKG_VERSION"), limits: limits.map_err(Error::fault)?, tiles })?)
+    Ok(json(&Server { version: env!("CARGO_PKG_VERSION"), limits, tiles })?)
 }

@@ -21,10 +21,14 @@ const END_HEADERS: u8 = 4;
 const REFUSED_STREAM: u32 = 7;
 const MAX_CONCURRENT_STREAMS: u16 = 3;
 
-/// `GET` (or `POST`) of `/livez` from `localhost`, by the static table of RFC 7541.
-fn request(is_post: bool) -> Vec<u8> {
-    let method = if is_post { 0x83 } else { 0x82 };
-    [&[method, 0x86, 0x04, 6][..], b"/livez", &[0x41, 9], b"localhost"].concat()
+/// `GET /livez` from `localhost`, by the static table of RFC 7541.
+fn probe() -> Vec<u8> {
+    [&[0x82, 0x86, 0x04, 6][..], b"/livez", &[0x41, 9], b"localhost"].concat()
+}
+
+/// `POST /v1/cameras`, which is open until its body has come.
+fn creation() -> Vec<u8> {
+    [&[0x83, 0x86, 0x04, 11][..], b"/v1/cameras", &[0x41, 9], b"localhost"].concat()
 }
 
 fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
@@ -99,7 +103,7 @@ async fn requests_that_are_reset_at_once_end_the_connection() {
     ends(&server, &[], |round| {
         let streams = (0..500).map(|index| 2 * (500 * round + index) + 1);
         let reset = |stream| {
-            let opened = frame(HEADERS, END_HEADERS | END_STREAM, stream, &request(false));
+            let opened = frame(HEADERS, END_HEADERS | END_STREAM, stream, &probe());
             [opened, frame(RST_STREAM, 0, stream, &8_u32.to_be_bytes())].concat()
         };
         streams.flat_map(reset).collect()
@@ -114,7 +118,7 @@ async fn headers_without_end_end_the_connection() {
     // Literal fields that are not indexed, so that each costs memory; and empty frames.
     let field = [&[0x00, 1, b'x', 100][..], &[b'y'; 100]].concat().repeat(100);
     for payload in [field, Vec::new()] {
-        let begin = frame(HEADERS, 0, 1, &request(false));
+        let begin = frame(HEADERS, 0, 1, &probe());
         ends(&server, &begin, |_| frame(CONTINUATION, 0, 1, &payload).repeat(50));
         server.get("/livez").await.expect(200);
     }
@@ -134,7 +138,7 @@ fn streams_beyond_the_limit_of_a_connection_are_refused() {
     assert_eq!(announced, Some(2));
     // Open requests, whose bodies do not come.
     for id in [1, 3, 5] {
-        stream.write_all(&frame(HEADERS, END_HEADERS, id, &request(true))).expect("the server reads");
+        stream.write_all(&frame(HEADERS, END_HEADERS, id, &creation())).expect("the server reads");
     }
     let reset = std::iter::from_fn(|| receive(&mut stream)).find(|frame| frame.kind == RST_STREAM);
     let reset = reset.expect("one stream is refused");

@@ -46,11 +46,11 @@ impl Default for ChainSettings {
     fn default() -> Self {
         Self {
             min_fixes: 3,
-            max_pieces: 8,
+            max_pieces: 100,
             max_chains: 60,
             max_gap_s: 2.5,
             max_overlap_s: 0.6,
-            tempering: 1.0,
+            tempering: 0.7,
             seen_probability: 0.8,
             seen_per_s: 0.2,
             max_continuation: 0.7,

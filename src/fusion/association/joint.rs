@@ -15,19 +15,19 @@ use super::evidence::EvidenceModel;
 use super::matching::{
     Located, MatchSettings, Matching, check_size, match_located, match_scene, receiver_noise,
 };
-use super::placement::{Placement, PlacementSearch, SEEN_PROBABILITY};
+use super::placement::{Placement, PlacementSearch};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{
-    Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, Receivers, Recipe, Result, Sample,
-    TargetClass, TargetId,
+    BoundingBox, Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, Receivers, Recipe, Result,
+    Sample, TargetClass, TargetId,
 };
 use crate::fusion::pairing::{PairingRule, PairingSettings, pair};
-use crate::geo::EastNorth;
-use crate::model::{Artifact, FitError, FitInput, FitOptions, GroundCamera, fit};
+use crate::geo::{EastNorth, LocalPlane};
+use crate::model::{Artifact, FitError, FitInput, FitOptions, GroundCamera, Regressor, fit};
 
 /// Shifts of the receivers' clocks as shares of the recording, for identities that are certainly wrong.
-const SHIFTS: [f64; 6] = [0.15, -0.2, 0.27, -0.33, 0.4, -0.45];
+const SHIFTS: [f64; 6] = [0.21, 0.33, 0.45, 0.57, 0.69, 0.81];
 /// Shifts are at least this long, s: beyond the memory of walks and of receivers' errors.
 const LEAST_SHIFT_S: f64 = 25.0;
 /// The score of the best world exceeds that of all wrong ones by at least this.
@@ -36,10 +36,11 @@ const MIN_MARGIN: f64 = 6.0;
 const MIN_MODE_MARGIN: f64 = 3.0;
 /// Two placements closer than this are one world, m.
 const SAME_WORLD_M: f64 = 6.0;
-/// Receivers with sure pieces at least.
-const MIN_RECEIVERS: usize = 3;
-/// Of the gain in score, one receiver has at most this share: a world must not hang on one of them.
-const MAX_RECEIVER_SHARE: f64 = 0.5;
+/// Sure pieces at least: one or two straight walks fit more than one place and direction.
+const MIN_PIECES: usize = 3;
+/// The trained model departs from the placement by at most so many standard deviations of the latter in the
+/// mean.
+const MAX_DEPARTURE: f64 = 5.0;
 /// What is known about the ground of targets whose height is known: people and cars.
 const GROUND_OF_KNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06 };
 /// The same of all others, such as ships: the antenna stands somewhere on a large target.
@@ -47,7 +48,7 @@ const GROUND_OF_UNKNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 8.0, sc
 /// Rounds of training and matching.
 const ROUNDS: usize = 2;
 /// Placements kept per ground camera.
-const MODES: usize = 4;
+const MODES: usize = 12;
 
 /// What was found, and the model that was trained on it.
 #[derive(Debug, Clone)]
@@ -104,8 +105,7 @@ pub fn match_without_model(
     check_size(&scene, settings)?;
     let search = JointSearch::new(&scene, image_size, settings)?;
     let (world, scores) = search.accepted_world()?;
-    let matching = search.matched(&world, random);
-    search.trained(matching, scores, random)
+    search.trained(&world, scores, random)
 }
 
 struct JointSearch<'a> {
@@ -116,6 +116,7 @@ struct JointSearch<'a> {
     ground: GroundPrior,
     cameras: Vec<GroundCamera>,
     fixes: Vec<Vec<TimedFix>>,
+    plane: LocalPlane,
 }
 
 impl<'a> JointSearch<'a> {
@@ -152,6 +153,7 @@ impl<'a> JointSearch<'a> {
             ground,
             cameras,
             fixes,
+            plane,
         })
     }
 
@@ -159,115 +161,95 @@ impl<'a> JointSearch<'a> {
         on_ground(self.scene, &self.cameras[camera], &self.ground)
     }
 
-    /// The best worlds of these cameras with the receivers' clocks shifted, the best first.
-    fn worlds(&self, cameras: impl IntoIterator<Item = usize>, shift_s: f64) -> Vec<World> {
+    /// The best worlds of these cameras for such fixes, the best first.
+    fn worlds(&self, cameras: impl IntoIterator<Item = usize>, fixes: &[Vec<TimedFix>]) -> Vec<World> {
         let mut worlds = Vec::new();
         for camera in cameras {
-            let search = self.search(camera, shift_s);
+            let search = self.search(camera, fixes);
             worlds.extend(search.search(MODES).into_iter().map(|placement| World { camera, placement }));
         }
         worlds.sort_by(|one, other| other.placement.score.total_cmp(&one.placement.score));
         worlds
     }
 
-    fn search(&self, camera: usize, shift_s: f64) -> PlacementSearch {
+    fn search(&self, camera: usize, fixes: &[Vec<TimedFix>]) -> PlacementSearch {
         let tracklets = self.on_ground(camera);
         let prior = (self.ground.scale_sigma, self.cameras[camera].log_prior());
-        PlacementSearch::new(&tracklets, &self.fixes, shift_s, &self.model, self.ground.map_sigma_m, prior)
+        PlacementSearch::new(&tracklets, fixes, &self.model, self.ground.map_sigma_m, prior)
     }
 
     /// The best world, if it is better than all that must be wrong and all others that may be right.
     fn accepted_world(&self) -> Result<(World, WorldScores)> {
-        let worlds = self.worlds(0..self.cameras.len(), 0.0);
+        let worlds = self.worlds(0..self.cameras.len(), &self.fixes);
         let Some(best) = worlds.first().copied() else {
             return Err(not_identifiable(
                 "no receiver has three fixes while a tracklet is seen",
                 "record boxes and fixes at the same time, with targets in view for 20 s and more",
             ));
         };
-        let shifted = self.shifts_s().into_iter().filter_map(|shift_s| {
+        let shifted = self.shifts_s().filter_map(|shift_s| {
             // The focal length hardly changes how well wrong identities fit.
-            self.worlds([best.camera], shift_s).first().map(|world| world.placement.score)
+            self.worlds([best.camera], &self.shifted_fixes(shift_s))
+                .first()
+                .map(|world| world.placement.score)
         });
         let scores = WorldScores {
             best: best.placement.score,
             best_shifted: shifted.fold(f64::NEG_INFINITY, f64::max),
             second: self.second(&best, &worlds),
         };
-        self.check(&best, &scores)?;
+        check_scores(&scores)?;
         Ok((best, scores))
-    }
-
-    fn check(&self, best: &World, scores: &WorldScores) -> Result<()> {
-        if scores.best < scores.best_shifted + MIN_MARGIN {
-            return Err(not_identifiable(
-                &format!(
-                    "identities shifted in time explain it about as well (score {:.1} against {:.1}): too few \
-                     or too short visits, or too many candidates",
-                    scores.best, scores.best_shifted
-                ),
-                "record longer, with receivers carried across the whole view, best while few others are there",
-            ));
-        }
-        if scores.best < scores.second + MIN_MODE_MARGIN {
-            return Err(not_identifiable(
-                &format!(
-                    "another place and direction of the camera explains it about as well (score {:.1} against \
-                     {:.1}): paths are parallel or too much alike",
-                    scores.best, scores.second
-                ),
-                "record walks in different directions, with turns",
-            ));
-        }
-        let search = self.search(best.camera, 0.0);
-        let by_receiver = search.scores_of(&best.placement);
-        let empty = (1.0 - SEEN_PROBABILITY).ln();
-        let gains: Vec<f64> = by_receiver.iter().map(|score| (score - empty).max(0.0)).collect();
-        let all: f64 = gains.iter().sum();
-        let largest = gains.iter().copied().fold(0.0, f64::max);
-        if self.fixes.len() > 1 && largest > MAX_RECEIVER_SHARE * all.max(1e-9) {
-            return Err(not_identifiable(
-                "it hangs on one receiver",
-                "record more receivers, or the same one on several visits",
-            ));
-        }
-        Ok(())
     }
 
     /// Score of the best world that is another one than the best.
     fn second(&self, best: &World, worlds: &[World]) -> f64 {
-        let points = |world: &World| -> Vec<[f64; 2]> {
-            let tracklets = self.on_ground(world.camera);
-            let all = tracklets.iter().flat_map(|own| &own.points);
-            all.step_by(50)
-                .map(|point| world.placement.apply(point.position.east_m, point.position.north_m))
-                .collect()
-        };
-        let at_best = points(best);
-        worlds[1..]
-            .iter()
-            .find(|world| {
-                let at = points(world);
-                let distances = at_best.iter().zip(&at).map(|(a, b)| (a[0] - b[0]).hypot(a[1] - b[1]));
-                distances.sum::<f64>() > SAME_WORLD_M * at_best.len().max(1) as f64
-            })
-            .map_or(f64::NEG_INFINITY, |world| world.placement.score)
+        let other = worlds.iter().find(|world| {
+            self.mean_distance_m(|own| Some(self.placed(world, own)?.distance_m(self.placed(best, own)?)))
+                > SAME_WORLD_M
+        });
+        other.map_or(f64::NEG_INFINITY, |world| world.placement.score)
+    }
+
+    /// Position of a box in a world; `None` where its foot is not on the ground.
+    fn placed(&self, world: &World, bounding_box: &BoundingBox) -> Option<EastNorth> {
+        let point = self.cameras[world.camera].ground_point(bounding_box)?;
+        let [east_m, north_m] = world.placement.apply(point.right_m, point.forward_m);
+        Some(EastNorth { east_m, north_m })
+    }
+
+    /// Mean of a distance over some of the boxes, m.
+    fn mean_distance_m(&self, distance_m: impl Fn(&BoundingBox) -> Option<f64>) -> f64 {
+        let some = self.scene.detections.iter().step_by(20);
+        let distances: Vec<f64> = some.filter_map(|own| distance_m(&own.bounding_box)).collect();
+        distances.iter().sum::<f64>() / distances.len().max(1) as f64
     }
 
     /// Shifts of clocks that leave no true identity.
-    fn shifts_s(&self) -> Vec<f64> {
-        let times = || self.scene.detections.iter().map(|own| own.time);
-        let (Some(first), Some(last)) = (times().min(), times().max()) else { return Vec::new() };
-        let length_s = last.duration_since(first).as_secs_f64();
-        SHIFTS.iter().map(|share| (share * length_s).abs().max(LEAST_SHIFT_S).copysign(*share)).collect()
+    fn shifts_s(&self) -> impl Iterator<Item = f64> {
+        let length_s = self.scene.length_s();
+        SHIFTS.iter().map(move |share| (share * length_s).max(LEAST_SHIFT_S))
+    }
+
+    /// The fixes with all clocks shifted, around the recording's end: as many meet boxes as without.
+    fn shifted_fixes(&self, shift_s: f64) -> Vec<Vec<TimedFix>> {
+        let length_s = self.scene.length_s().max(2.0 * LEAST_SHIFT_S);
+        let shifted = |fixes: &Vec<TimedFix>| {
+            let mut own: Vec<TimedFix> = fixes
+                .iter()
+                .filter(|fix| (0.0..=length_s).contains(&fix.time_s))
+                .map(|fix| TimedFix { time_s: (fix.time_s + shift_s) % length_s, ..*fix })
+                .collect();
+            own.sort_by(|one, other| one.time_s.total_cmp(&other.time_s));
+            own
+        };
+        self.fixes.iter().map(shifted).collect()
     }
 
     fn matched(&self, world: &World, random: &mut impl Rng) -> Matching {
-        let camera = &self.cameras[world.camera];
         let (tracklets, points) = self.scene.located(|bounding_box| {
-            let point = camera.ground_point(bounding_box)?;
-            let [east_m, north_m] = world.placement.apply(point.right_m, point.forward_m);
-            Some((EastNorth { east_m, north_m }, point.box_variance_m2, self.ground.map_sigma_m.powi(2)))
+            let box_variance_m2 = self.cameras[world.camera].ground_point(bounding_box)?.box_variance_m2;
+            Some((self.placed(world, bounding_box)?, box_variance_m2, self.ground.map_sigma_m.powi(2)))
         });
         let located =
             Located { tracklets: &tracklets, detections: &points, fixes: &self.fixes, gnss: self.model.gnss };
@@ -275,37 +257,39 @@ impl<'a> JointSearch<'a> {
     }
 
     /// Trains on the sure pieces and matches by the model, in turn.
-    fn trained(
-        &self,
-        mut matching: Matching,
-        scores: WorldScores,
-        random: &mut impl Rng,
-    ) -> Result<JointMatch> {
-        let mut latest = None;
-        for _ in 0..ROUNDS {
-            let artifact = self.fit(&matching)?;
-            let regressor = artifact.load()?;
-            matching = match_scene(self.scene, &regressor, self.settings, random);
-            latest = Some(artifact);
+    fn trained(&self, world: &World, scores: WorldScores, random: &mut impl Rng) -> Result<JointMatch> {
+        let mut matching = self.matched(world, random);
+        for _ in 1..ROUNDS {
+            let regressor = self.fit(&matching)?.load()?;
+            matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random);
         }
-        self.check_receivers(&matching)?;
-        let model = latest.ok_or_else(|| Error::fault("no round of training"))?;
-        Ok(JointMatch { matching, model, scores })
-    }
-
-    fn check_receivers(&self, matching: &Matching) -> Result<()> {
-        let mut sure: Vec<_> =
-            matching.sure(self.settings.min_probability).map(|piece| &piece.receiver_id).collect();
-        sure.sort();
-        sure.dedup();
-        let least = MIN_RECEIVERS.min(self.fixes.len());
-        if sure.len() < least {
+        let model = self.fit(&matching)?;
+        let regressor = model.load()?;
+        matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random);
+        let departure_m = self.departure_m(world, &regressor);
+        if departure_m > MAX_DEPARTURE * self.ground.map_sigma_m {
             return Err(not_identifiable(
-                &format!("only {} of {} receivers have a sure box", sure.len(), self.fixes.len()),
+                &format!("training leads {departure_m:.0} m away from the place that was found"),
                 "record longer, with receivers carried across the whole view",
             ));
         }
-        Ok(())
+        let pieces = matching.sure(self.settings.min_probability).count();
+        if pieces < MIN_PIECES {
+            return Err(not_identifiable(
+                &format!("only {pieces} tracklets have a sure receiver"),
+                "record longer, with receivers carried across the whole view",
+            ));
+        }
+        Ok(JointMatch { matching, model, scores })
+    }
+
+    /// Mean distance between placed and regressed positions, m.
+    fn departure_m(&self, world: &World, regressor: &Regressor) -> f64 {
+        self.mean_distance_m(|own| {
+            let placed = self.plane.to_position(self.placed(world, own)?);
+            let regressed = regressor.regress(own, None).regressed;
+            Some(regressor.plane().to_plane(placed).distance_m(regressed))
+        })
     }
 
     fn fit(&self, matching: &Matching) -> Result<Artifact> {
@@ -328,6 +312,31 @@ impl<'a> JointSearch<'a> {
             error => Error::fault(error),
         })
     }
+}
+
+/// Whether a world is better than those that must be wrong and all others.
+fn check_scores(scores: &WorldScores) -> Result<()> {
+    if scores.best < scores.best_shifted + MIN_MARGIN {
+        return Err(not_identifiable(
+            &format!(
+                "identities shifted in time explain it about as well (score {:.1} against {:.1}): too few \
+                 or too short visits, or too many candidates",
+                scores.best, scores.best_shifted
+            ),
+            "record longer, with receivers carried across the whole view, best while few others are there",
+        ));
+    }
+    if scores.best < scores.second + MIN_MODE_MARGIN {
+        return Err(not_identifiable(
+            &format!(
+                "another place and direction of the camera explains it about as well (score {:.1} against \
+                 {:.1}): paths are parallel or too much alike",
+                scores.best, scores.second
+            ),
+            "record walks in different directions, with turns",
+        ));
+    }
+    Ok(())
 }
 
 /// Tracklets on the ground of a camera: right and forward in the place of east and north.
@@ -380,7 +389,8 @@ fn training_samples(
     }
     let settings = PairingSettings {
         rule: PairingRule::Interpolated,
-        window: SignedDuration::from_secs(1),
+        // Ships report every few seconds and move straight in between.
+        longest_gap: SignedDuration::from_secs(10),
         ..PairingSettings::default()
     };
     let receivers = matching.receivers_of(scene.received, scene.receivers);

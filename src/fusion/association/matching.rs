@@ -145,22 +145,20 @@ pub fn match_with_model(
 ) -> Result<Matching> {
     let scene = Scene::new(detections, fixes, receivers);
     check_size(&scene, settings)?;
-    Ok(match_scene(&scene, regressor, settings, random))
+    let gnss = settings.gnss.unwrap_or_else(|| receiver_noise(Some(regressor)));
+    Ok(match_scene(&scene, regressor, gnss, settings, random))
 }
 
 pub(super) fn match_scene(
     scene: &Scene<'_>,
     regressor: &Regressor,
+    gnss: GaussMarkovNoise,
     settings: &MatchSettings,
     random: &mut impl Rng,
 ) -> Matching {
     let (tracklets, points) = scene.regressed(regressor);
-    let located = Located {
-        tracklets: &tracklets,
-        detections: &points,
-        fixes: &scene.fixes(regressor.plane()),
-        gnss: settings.gnss.unwrap_or_else(|| receiver_noise(Some(regressor))),
-    };
+    let located =
+        Located { tracklets: &tracklets, detections: &points, fixes: &scene.fixes(regressor.plane()), gnss };
     match_located(scene, &located, settings, random)
 }
 

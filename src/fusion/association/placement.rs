@@ -19,10 +19,12 @@ type C = Complex<f64>;
 const MAX_FIXES: usize = 40;
 /// Fixes of a pair at least.
 const MIN_FIXES: usize = 3;
+/// Largest gap between two points of a tracklet to interpolate over, s.
+const MAX_GAP_S: f64 = 2.5;
 /// Correlation time of the map's error along a walk, s.
 const MAP_TIME_CONSTANT_S: f64 = 20.0;
 /// Probability that the carrier of a receiver is among the boxes.
-pub(super) const SEEN_PROBABILITY: f64 = 0.8;
+const SEEN_PROBABILITY: f64 = 0.8;
 /// Largest factor between the ground by usual heights and the true one.
 const MAX_SCALE: f64 = 100.0;
 /// Log weights below it add nothing to the prior of a receiver whose carrier is not seen.
@@ -127,7 +129,6 @@ impl PlacementSearch {
     pub(super) fn new(
         tracklets: &[Tracklet],
         receivers: &[Vec<TimedFix>],
-        offset_s: f64,
         model: &EvidenceModel,
         map_sigma_m: f64,
         (scale_sigma, log_prior): (f64, f64),
@@ -136,7 +137,7 @@ impl PlacementSearch {
         for (receiver, fixes) in receivers.iter().enumerate() {
             let of_receiver = pairs.len();
             for tracklet in tracklets {
-                pairs.extend(pair(receiver, tracklet, fixes, offset_s, model, map_sigma_m));
+                pairs.extend(pair(receiver, tracklet, fixes, model, map_sigma_m));
             }
             let candidates = (pairs.len() - of_receiver).max(1) as f64;
             for own in &mut pairs[of_receiver..] {
@@ -156,11 +157,6 @@ impl PlacementSearch {
             log_prior,
             points: all.into_iter().step_by(stride).collect(),
         }
-    }
-
-    /// Score by receiver of a placement.
-    pub(super) fn scores_of(&self, placement: &Placement) -> Vec<f64> {
-        self.scores(placement.turn, placement.shift_m)
     }
 
     /// Log-likelihood ratio of each pair where ground and plane are the same.
@@ -315,11 +311,10 @@ fn pair(
     receiver: usize,
     tracklet: &Tracklet,
     fixes: &[TimedFix],
-    offset_s: f64,
     model: &EvidenceModel,
     map_sigma_m: f64,
 ) -> Option<Pair> {
-    let residuals = tracklet.residuals(fixes, offset_s, 2.5);
+    let residuals = tracklet.residuals(fixes, 0.0, MAX_GAP_S);
     let stride = residuals.len().div_ceil(MAX_FIXES).max(1);
     let rows: Vec<_> = residuals.into_iter().step_by(stride).collect();
     if rows.len() < MIN_FIXES {

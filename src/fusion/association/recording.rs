@@ -80,6 +80,12 @@ impl<'a> Scene<'a> {
         }
     }
 
+    /// Time from the first to the last box, s.
+    pub(super) fn length_s(&self) -> f64 {
+        let last = self.detections.iter().map(|own| own.time).max();
+        last.map_or(0.0, |last| self.seconds(last))
+    }
+
     fn seconds(&self, time: Timestamp) -> f64 {
         time.duration_since(self.origin).as_secs_f64()
     }

@@ -65,7 +65,6 @@ fn the_recursive_ratio_is_that_of_the_dense_covariance() {
         let dense = PlacementSearch::new(
             std::slice::from_ref(&track),
             std::slice::from_ref(&fixes),
-            0.0,
             &MODEL,
             0.5,
             (0.06, 0.0),
@@ -147,7 +146,7 @@ fn place_and_direction_are_found_by_fixes_of_unknown_carriers() {
     };
     let ground: Vec<Tracklet> = tracks.iter().map(seen).collect();
     let receivers: Vec<Vec<TimedFix>> = (0..3).map(|at| carried(&tracks[at], 20 + at as u64)).collect();
-    let search = PlacementSearch::new(&ground, &receivers, 0.0, &MODEL, 1.0, (0.06, 0.0));
+    let search = PlacementSearch::new(&ground, &receivers, &MODEL, 1.0, (0.06, 0.0));
     let best = search.search(1)[0];
     for (track, ground) in tracks.iter().zip(&ground) {
         let (truth, point) = (track.points[60].position, ground.points[60].position);

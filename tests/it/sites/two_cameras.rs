@@ -110,7 +110,7 @@ pub(super) async fn create(server: &TestServer, is_trained: bool) {
     server.post("/v1/sites", &json!({"id": "square"})).await.expect(201);
     for (index, camera) in CAMERAS.into_iter().enumerate() {
         let profile = json!({
-            "id": camera, "site": "square", "image_size": {"width_px": IMAGE_PX[0], "height_px": IMAGE_PX[1]},
+            "id": camera, "site": "square", "image_size": {"width_px": IMAGE_PX[0] as u32, "height_px": IMAGE_PX[1] as u32},
             "gnss_error": {"sigma_m": FIX_NOISE_M},
         });
         server.post("/v1/cameras", &profile).await.expect(201);

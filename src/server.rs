@@ -13,6 +13,7 @@ mod credentials;
 mod frame_limit;
 mod guarded_stream;
 mod host_check;
+mod peer;
 mod pipeline;
 mod proxies;
 mod request_body;

@@ -219,8 +219,8 @@ impl App {
     }
 }
 
-/// An import under way. The latest batch waits, so that the last one is known when it is stored: with it goes
-/// the answer, if the client may repeat the import.
+/// An import under way. If the client may repeat it, the latest batch waits, so that the last one is known when
+/// it is stored: with it goes the answer.
 pub(super) struct Import<'a> {
     app: &'a App,
     id: &'a CameraId,
@@ -240,13 +240,15 @@ impl<'a> Import<'a> {
         Ok(Self { app, id, options, waiting: None, report: ImportReport::default() })
     }
 
-    /// Stores the batch before this one.
+    /// Stores the batch, or the one before it if this one may be the last that the answer goes with.
     ///
     /// # Errors
     /// As the store; the message tells how many rows are stored.
     pub(super) async fn push(&mut self, batch: Batch) -> Result<()> {
-        match self.waiting.replace(batch) {
-            Some(before) => self.store(before, false).await,
+        let ready =
+            if self.options.idempotent.is_some() { self.waiting.replace(batch) } else { Some(batch) };
+        match ready {
+            Some(ready) => self.store(ready, false).await,
             None => Ok(()),
         }
     }

@@ -292,7 +292,7 @@ async fn list_evaluations(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
 /// Read an evaluation, with its report once it has succeeded
 #[utoipa::path(
     get, path = "/v1/evaluations/{evaluation}", tag = "evaluations",
-    params(("evaluation" = String, Path, format = Uuid, description = "The evaluation's id")),
+    params(("evaluation" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The evaluation's id")),
     responses(
         (status = 200, description = "The evaluation", body = Evaluation),
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),
@@ -309,7 +309,7 @@ async fn get_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): Evaluatio
 /// At once if it waits, at its next step if it runs. It stays in the list.
 #[utoipa::path(
     post, path = "/v1/evaluations/{evaluation}/cancel", tag = "evaluations",
-    params(("evaluation" = String, Path, format = Uuid, description = "The evaluation's id")),
+    params(("evaluation" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The evaluation's id")),
     responses(
         (status = 200, description = "The evaluation in its present state", body = Evaluation),
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),
@@ -325,7 +325,7 @@ async fn cancel_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): Evalua
 /// With its report. One that runs stops at its next step.
 #[utoipa::path(
     delete, path = "/v1/evaluations/{evaluation}", tag = "evaluations",
-    params(("evaluation" = String, Path, format = Uuid, description = "The evaluation's id")),
+    params(("evaluation" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The evaluation's id")),
     responses(
         (status = 204, description = "It is gone"),
         (status = 404, description = "There is no such evaluation", body = Problem, content_type = "application/problem+json"),

@@ -25,6 +25,7 @@ struct Server {
     #[schema(example = "0.1.0")]
     version: &'static str,
     /// The limits in force, by the name of the setting below `limits`.
+    #[schema(value_type = BTreeMap<String, f64>)]
     limits: BTreeMap<String, Value>,
     /// Map tiles that the operator's console may show, if they are set.
     #[serde(skip_serializing_if = "Option::is_none")]

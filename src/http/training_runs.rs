@@ -213,7 +213,7 @@ async fn list_training_runs(CallerApp(app): CallerApp, CameraPath(id): CameraPat
 /// Read a training run
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/training-runs/{run}", tag = "training",
-    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, format = Uuid, description = "The run's id")),
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The run's id")),
     responses((status = 200, description = "The run", body = TrainingRun))
 )]
 async fn get_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
@@ -226,7 +226,7 @@ async fn get_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) 
 /// be cancelled first.
 #[utoipa::path(
     delete, path = "/v1/cameras/{camera}/training-runs/{run}", tag = "training",
-    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, format = Uuid, description = "The run's id")),
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The run's id")),
     responses(
         (status = 204, description = "It is deleted"),
         (status = 409, description = "The run has not ended", body = Problem, content_type = "application/problem+json"),
@@ -242,7 +242,7 @@ async fn delete_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPat
 /// At once if it waits, at its next step if it runs.
 #[utoipa::path(
     post, path = "/v1/cameras/{camera}/training-runs/{run}/cancel", tag = "training",
-    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, format = Uuid, description = "The run's id")),
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The run's id")),
     responses(
         (status = 200, description = "The run in its present state", body = TrainingRun),
         (status = 409, description = "The run has ended", body = Problem, content_type = "application/problem+json"),
@@ -262,7 +262,7 @@ async fn cancel_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPat
 
     params(
         ("camera" = String, Path, description = "The camera's id"),
-        ("run" = String, Path, format = Uuid, description = "The run's id"),
+        ("run" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The run's id"),
         ("last-event-id" = Option<String>, Header, description = "The id of the last event that the client has seen"),
         ("last_event_id" = Option<String>, Query, description = "The same, for a page that cannot send the header"),
     ),
@@ -331,7 +331,7 @@ struct TrainingLog {
 /// Read a training run's log
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/training-runs/{run}/log", tag = "training",
-    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, format = Uuid, description = "The run's id")),
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The run's id")),
     responses((status = 200, description = "The log", body = TrainingLog))
 )]
 async fn get_training_log(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
@@ -349,7 +349,7 @@ struct TrainingCurve {
 /// Read a training run's curve
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/training-runs/{run}/curve", tag = "training",
-    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, format = Uuid, description = "The run's id")),
+    params(("camera" = String, Path, description = "The camera's id"), ("run" = String, Path, pattern = "^[0-9a-f-]{36}$", description = "The run's id")),
     responses((status = 200, description = "The curve", body = TrainingCurve))
 )]
 async fn get_training_curve(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {

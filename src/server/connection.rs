@@ -16,7 +16,8 @@ use tokio::time::{Instant, MissedTickBehavior};
 
 use super::activity::Activity;
 use super::guarded_stream::GuardedStream;
-use super::pipeline::{Peer, RequestPipeline};
+use super::peer::Peer;
+use super::pipeline::RequestPipeline;
 use super::tls::{HANDSHAKE_RECORD, Tls};
 use crate::admission::{ClientId, Quota};
 use crate::config::Limits;
@@ -178,10 +179,7 @@ impl ConnectionServer {
         let (pipeline, requests) = (self.pipeline.clone(), activity.clone());
         let service = service_fn(move |request| {
             let (pipeline, peer, open) = (pipeline.clone(), peer.clone(), requests.request());
-            // Boxed: hyper keeps the memory of a request's future as long as an HTTP/1 connection is open.
-            Box::pin(
-                async move { Ok::<_, std::convert::Infallible>(pipeline.answer(request, &peer, open).await) },
-            )
+            async move { Ok::<_, std::convert::Infallible>(pipeline.answer(request, &peer, open).await) }
         });
         let mut connection = std::pin::pin!(self.builder.serve_connection(stream, service));
         let mut looks = tokio::time::interval(self.limits.idle_time() / LOOKS_PER_IDLE_TIME);

@@ -2,8 +2,7 @@
 //! deadline, then the transport.
 
 use std::convert::Infallible;
-use std::net::IpAddr;
-use std::sync::{Arc, OnceLock};
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -22,12 +21,13 @@ use tracing::{Instrument as _, Span};
 use super::activity::{GRPC_STATUS, ObservedBody, OpenRequest};
 use super::credentials::credential;
 use super::host_check::HostCheck;
+use super::peer::Peer;
 use super::proxies::TrustedProxies;
 use super::request_body::{AdmittedBody, RateGuard, Ticket};
 use super::revocable_body::RevocableBody;
 use crate::admission::{BodyRefusal, ClientId, RequestClass};
 use crate::app::App;
-use crate::app::access::{Caller, CertificateHolder, Credential, Permission, Principal};
+use crate::app::access::{Caller, Credential, Permission, Principal};
 use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
@@ -73,19 +73,6 @@ pub(super) struct RequestPipeline {
     discards: Semaphore,
     audience: Audience,
     cors: Option<CorsLayer>,
-}
-
-/// The connection that a request came over.
-#[derive(Clone)]
-pub(super) struct Peer {
-    /// As limits count it while it presents no key.
-    pub(super) client: ClientId,
-    /// As the audit log names it.
-    pub(super) address: IpAddr,
-    /// Whose certificate was verified, if one was presented.
-    pub(super) certificate: Option<CertificateHolder>,
-    /// Why only probes are answered on it, if so.
-    pub(super) refusal: Option<Arc<Error>>,
 }
 
 /// What a request was granted.

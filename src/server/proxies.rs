@@ -8,7 +8,7 @@ use anyhow::Context as _;
 use hyper::HeaderMap;
 use hyper::header::HeaderName;
 
-use super::pipeline::Peer;
+use super::peer::Peer;
 use crate::admission::ClientId;
 
 /// Addresses of the client and of the proxies that passed its request on, in this order.

@@ -10,7 +10,7 @@ use super::frame::{
 use super::merging::MergeCandidates;
 use super::settings::WorldTrackSettings;
 use super::world_track::{WorldTrack, seconds_from};
-use crate::domain::ReceiverId;
+use crate::domain::{CameraId, ReceiverId};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
 
 /// The tracks of all targets of a site, from the detections of all its cameras and the fixes of its receivers.
@@ -118,7 +118,7 @@ impl WorldTracker {
         }
         let mut tracks: Vec<Option<WorldTrackId>> =
             indexes.iter().map(|index| index.map(|index| self.tracks[index].id)).collect();
-        let mut merged = self.identify(detections, &indexes, now, &mut events);
+        let mut merged = self.identify(&frame.camera, detections, &indexes, now, &mut events);
         merged.extend(self.merge_candidates.compare(&self.tracks, &measured, &self.settings));
         self.merge(&merged, now, &mut tracks, &mut events);
         tracks.resize(frame.detections.len(), None);
@@ -215,6 +215,7 @@ impl WorldTracker {
     /// Returns the pairs to merge, the track that goes on first.
     fn identify(
         &mut self,
+        camera: &CameraId,
         detections: &[WorldDetection],
         indexes: &[Option<usize>],
         now: Timestamp,
@@ -224,6 +225,13 @@ impl WorldTracker {
         for (detection, index) in detections.iter().zip(indexes) {
             let (Some(receiver), Some(index)) = (&detection.receiver, *index) else { continue };
             if self.tracks[index].receiver.as_ref() == Some(receiver) {
+                // Before the receiver was known, the tracker's number was on a track of its own.
+                let anonymous = self.tracks.iter().enumerate().find(|(at, track)| {
+                    track.receiver.is_none()
+                        && !indexes.contains(&Some(*at))
+                        && track.has_tracker_id(camera, detection.tracker_id.as_ref())
+                });
+                merged.extend(anonymous.map(|(_, track)| (self.tracks[index].id, track.id)));
                 continue;
             }
             match self.tracks.iter().position(|track| track.receiver.as_ref() == Some(receiver)) {

@@ -154,6 +154,12 @@ impl WorldTrack {
         &self.sightings
     }
 
+    /// Whether the camera's tracker gave the track that number last.
+    pub(super) fn has_tracker_id(&self, camera: &CameraId, tracker_id: Option<&TargetId>) -> bool {
+        let sighting = self.sightings.iter().find(|sighting| sighting.camera == *camera);
+        tracker_id.is_some() && sighting.is_some_and(|sighting| sighting.tracker_id.as_ref() == tracker_id)
+    }
+
     /// The cameras that see it: those that saw it within that time (s) before its latest measurement.
     pub fn cameras_within(&self, seconds: f64) -> impl Iterator<Item = &CameraId> {
         let recent = move |sighting: &&Sighting| seconds_from(sighting.last_seen, self.last_seen) <= seconds;

@@ -17,7 +17,7 @@ async fn every_format_is_imported_and_exported() {
     assert_eq!(
         imported,
         json!({
-            "accepted": 2500, "accepted_without_fix": 0, "duplicate": 0, "rejected": 0, "rejected_rows": [],
+            "accepted": 2500, "accepted_without_fix": 0, "duplicate": 0, "replaced": 0, "rejected": 0, "rejected_rows": [],
             "durability": "synced",
         })
     );

@@ -88,11 +88,13 @@ pub enum SiteItemOutcome {
     Overflow,
     /// It is beyond the range of the site's plane.
     OutOfRange,
+    /// Its position is too uncertain to tell targets apart.
+    Uncertain,
 }
 
 impl SiteItemOutcome {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::Tracked, Self::Late, Self::Overflow, Self::OutOfRange];
+    pub const ALL: [Self; 5] = [Self::Tracked, Self::Late, Self::Overflow, Self::OutOfRange, Self::Uncertain];
 
     /// The label in the metrics.
     #[must_use]
@@ -102,6 +104,7 @@ impl SiteItemOutcome {
             Self::Late => "late",
             Self::Overflow => "overflow",
             Self::OutOfRange => "out_of_range",
+            Self::Uncertain => "uncertain",
         }
     }
 }

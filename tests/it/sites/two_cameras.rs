@@ -1,5 +1,6 @@
 //! Two cameras at both ends of a square that see its middle together, and people who walk across.
 
+use std::f64::consts::TAU;
 use std::fmt::Write as _;
 
 use jiff::{SignedDuration, Timestamp};
@@ -41,10 +42,6 @@ impl Noise {
         let sum: f64 = (0..12).map(|_| self.0.random::<f64>()).sum();
         sigma * (sum - 6.0)
     }
-
-    fn uniform(&mut self, from: f64, until: f64) -> f64 {
-        self.0.random_range(from..until)
-    }
 }
 
 /// Left, top, width and height of a person's box as a camera (0 in the west, 1 in the east) sees it, px; `None` out
@@ -76,18 +73,20 @@ pub(super) fn box_json([left, top, width, height]: [f64; 4]) -> Value {
     json!({"left_px": left, "top_px": top, "width_px": width, "height_px": height})
 }
 
-/// Samples of four people who stroll about in the view of a camera.
+/// Samples of four people who stroll about in the view of a camera, one a second.
 fn training_csv(camera: usize) -> String {
     let mut noise = Noise::new(17 + camera as u64);
     let mut csv = "time,target_id,left,top,width,height,longitude,latitude\n".to_owned();
     let start: Timestamp = "2026-01-05T08:00:00Z".parse().expect("an instant");
-    for walker in 0..4 {
-        for second in 0..150 {
-            let ahead_m = noise.uniform(RANGE_M[0] + 1.0, RANGE_M[1] - 1.0);
+    for walker in 0..4_i64 {
+        for second in 0..200_i64 {
+            let swing =
+                |period_s: f64, phase: f64| (TAU * second as f64 / period_s + phase * walker as f64).sin();
+            let ahead_m = 29.0 + 17.0 * swing(110.0, 1.7);
             let east_m = if camera == 0 { ahead_m } else { BASE_M - ahead_m };
-            let at = EastNorth { east_m, north_m: noise.uniform(-0.45, 0.45) * ahead_m };
+            let at = EastNorth { east_m, north_m: 0.42 * ahead_m * swing(83.0, 1.0) };
             let Some([left, top, width, height]) = sides_px(camera, at, &mut noise) else { continue };
-            let time = start + SignedDuration::from_secs(1_000 * walker + 2 * second);
+            let time = start + SignedDuration::from_secs(1_000 * walker + second);
             let measured = EastNorth {
                 east_m: at.east_m + noise.draw(FIX_NOISE_M),
                 north_m: at.north_m + noise.draw(FIX_NOISE_M),
@@ -118,7 +117,7 @@ pub(super) async fn create(server: &TestServer, is_trained: bool) {
             let kind = [("content-type", "text/csv")];
             let path = format!("/v1/cameras/{camera}/samples");
             server.send("POST", &path, &kind, training_csv(index)).await.expect(200);
-            let run = server.train(camera, &json!({"recipe": "projective", "epochs": 300})).await;
+            let run = server.train(camera, &json!({"recipe": "gaussian_process"})).await;
             assert_eq!(run["state"], "succeeded", "{run}");
         }
     }

@@ -1,5 +1,6 @@
 //! Frames of a site's cameras through the world tracker, and what is published of it.
 
+use std::collections::hash_map::Entry;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
@@ -261,11 +262,10 @@ impl SiteTracker {
             carrier.is_some_and(|carrier| carrier.cameras.contains(camera))
         };
         let mut detections = Vec::with_capacity(items.len());
+        let settings = active.tracker.settings();
         for item in items {
-            let detection = detection_of(item, &plane, carries);
-            let outcome =
-                if detection.is_some() { SiteItemOutcome::Tracked } else { SiteItemOutcome::OutOfRange };
-            self.metrics.site_item(outcome);
+            let detection = detection_of(item, &plane, settings, carries);
+            self.metrics.site_item(detection.as_ref().err().copied().unwrap_or(SiteItemOutcome::Tracked));
             detections.extend(detection);
         }
         let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
@@ -294,10 +294,10 @@ impl SiteTracker {
     /// Publishes a track that was measured, and announces its position from time to time.
     fn publish(&mut self, track: WorldTrackId) {
         let Some(active) = &self.active else { return };
-        let Some(track) = active.tracker.track(track).filter(|track| track.is_confirmed()) else { return };
+        let Some(track) = active.tracker.track(track) else { return };
         let point = Arc::new(self.point_of(track, active.tracker.plane()));
-        lock(&self.live.tracks).publish(&point, self.limits.track_points);
         let Some(announced_at) = self.announced.get_mut(&point.id) else { return };
+        lock(&self.live.tracks).publish(&point, self.limits.track_points);
         if announced_at.is_none_or(|last| point.time.duration_since(last).abs() >= ANNOUNCE_STEP) {
             *announced_at = Some(point.time);
             self.live.events.push(SiteEvent { time: point.time, kind: SiteEventKind::Measured(point) });
@@ -338,11 +338,14 @@ impl SiteTracker {
         for TimedEvent { time, event } in events {
             let kind = match event {
                 WorldEvent::Born { track } => {
-                    let track = self.id_of(track);
-                    self.announced.insert(track, None);
-                    self.highest_number = self.highest_number.max(track.number);
-                    self.metrics.world_track_started();
-                    SiteEventKind::Started(track)
+                    self.announce_start(self.id_of(track), time);
+                    continue;
+                }
+                // Nobody knows of a track that is not confirmed yet.
+                WorldEvent::HandedOver { track, .. } | WorldEvent::Identified { track, .. }
+                    if !self.announced.contains_key(&self.id_of(track)) =>
+                {
+                    continue;
                 }
                 WorldEvent::HandedOver { track, from, to } => {
                     self.metrics.handed_over();
@@ -353,6 +356,10 @@ impl SiteTracker {
                 }
                 WorldEvent::Merged { track, ended } => {
                     let (track, ended) = (self.id_of(track), self.id_of(ended));
+                    if self.announced.contains_key(&ended) {
+                        // A track that was not confirmed is, once it has taken up one that was.
+                        self.announce_start(track, time);
+                    }
                     self.announce_end(ended, time, SiteEventKind::Merged { track, ended });
                     continue;
                 }
@@ -363,6 +370,16 @@ impl SiteTracker {
                 }
             };
             self.live.events.push(SiteEvent { time, kind });
+        }
+    }
+
+    /// Announces a track that was not announced yet.
+    fn announce_start(&mut self, track: LiveId, time: Timestamp) {
+        if let Entry::Vacant(entry) = self.announced.entry(track) {
+            entry.insert(None);
+            self.highest_number = self.highest_number.max(track.number);
+            self.metrics.world_track_started();
+            self.live.events.push(SiteEvent { time, kind: SiteEventKind::Started(track) });
         }
     }
 
@@ -382,19 +399,27 @@ impl Carrier {
     }
 }
 
-/// A box in the plane of the tracker; `None` beyond its range. `carries` tells whether a receiver of the target is
+/// A box in the plane of the tracker, or why it is not tracked. `carries` tells whether a receiver of the target is
 /// known.
 fn detection_of(
     item: &SiteItem,
     plane: &LocalPlane,
+    settings: &WorldTrackSettings,
     carries: impl Fn(&CameraId, &TargetId) -> bool,
-) -> Option<WorldDetection> {
-    let ItemSource::Box { covariance_m2, map_covariance_m2, .. } = &item.source else { return None };
+) -> Result<WorldDetection, SiteItemOutcome> {
+    let ItemSource::Box { covariance_m2, map_covariance_m2, .. } = &item.source else {
+        return Err(SiteItemOutcome::OutOfRange);
+    };
+    let position = plane.to_plane_within_range(item.position).ok_or(SiteItemOutcome::OutOfRange)?;
+    // Spread over more than the area of one new target, a box would start a track rather than join any.
+    if covariance_m2.determinant().sqrt() * settings.birth_density_per_m2 >= 1.0 {
+        return Err(SiteItemOutcome::Uncertain);
+    }
     let carrier = item.target_id.clone().filter(|target_id| carries(&item.camera, target_id));
-    Some(WorldDetection {
+    Ok(WorldDetection {
         tracker_id: item.target_id.clone(),
         receiver: carrier.map(ReceiverId::from),
-        position: plane.to_plane_within_range(item.position)?,
+        position,
         covariance_m2: *covariance_m2,
         // The error of a map does not average out over frames. How much of it other cameras share is unknown as long
         // as the maps of a site are not fitted together: all of it is stated, so averaging over cameras gains
@@ -414,13 +439,14 @@ mod tests {
         live: Arc<SiteLive>,
         tracker: SiteTracker,
         now: Duration,
+        box_variance_m2: f64,
     }
 
     impl Site {
         fn new() -> Self {
             let live = SiteLive::new(1, 100);
             let tracker = SiteTracker::new(live.clone(), Limits::default(), Metrics::new());
-            Self { live, tracker, now: Duration::ZERO }
+            Self { live, tracker, now: Duration::ZERO, box_variance_m2: 0.25 }
         }
 
         /// A box of a target at the origin of its camera's model, each a tenth of a second after the one before.
@@ -433,7 +459,7 @@ mod tests {
                 target_id: Some(TargetId::new(tracker_id).expect("a name")),
                 position: origin,
                 source: ItemSource::Box {
-                    covariance_m2: PlaneCovariance::isotropic(0.25),
+                    covariance_m2: PlaneCovariance::isotropic(self.box_variance_m2),
                     map_covariance_m2: PlaneCovariance::isotropic(0.16),
                     model_origin: origin,
                 },
@@ -503,5 +529,37 @@ mod tests {
         assert_eq!((points.len(), identity), (1, Some("walker")));
         let camera = &points[0].sightings[0];
         assert_eq!(camera.tracker_id.as_ref().map(TargetId::as_str), Some("walker"));
+    }
+
+    #[test]
+    fn a_box_that_may_be_anywhere_starts_no_track() {
+        let mut site = Site::new();
+        site.box_variance_m2 = 400.0;
+        (0..20).for_each(|frame| site.see("7", 100 * frame));
+        assert!(site.numbers().is_empty());
+        site.box_variance_m2 = 0.25;
+        (20..40).for_each(|frame| site.see("7", 100 * frame));
+        assert_eq!(site.numbers().len(), 1);
+    }
+
+    #[test]
+    fn a_track_is_announced_before_anything_else_of_it_and_published_only_then() {
+        let mut site = Site::new();
+        (0..3).for_each(|frame| site.see("7", 100 * frame));
+        let time = Timestamp::from_second(START_S).expect("in range");
+        let [announced, unconfirmed] = [WorldTrackId(1), WorldTrackId(9)];
+        let handed_over = |track| {
+            let camera = |name: &str| CameraId::new(name).expect("a slug");
+            WorldEvent::HandedOver { track, from: camera("a"), to: camera("b") }
+        };
+        let merged = WorldEvent::Merged { track: unconfirmed, ended: announced };
+        let events = [handed_over(unconfirmed), merged, handed_over(unconfirmed)];
+        let before = site.live.events.latest();
+        site.tracker.announce(events.map(|event| TimedEvent { time, event }).into());
+        // Its start, the merger, and the second hand-over.
+        assert_eq!(site.live.events.latest() - before, 3);
+        assert!(site.numbers().is_empty(), "the first track has ended");
+        site.tracker.announce(vec![TimedEvent { time, event: WorldEvent::Lost { track: unconfirmed } }]);
+        assert!(site.tracker.announced.is_empty());
     }
 }

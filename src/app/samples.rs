@@ -245,8 +245,7 @@ impl<'a> Import<'a> {
     /// # Errors
     /// As the store; the message tells how many rows are stored.
     pub(super) async fn push(&mut self, batch: Batch) -> Result<()> {
-        let ready =
-            if self.options.idempotent.is_some() { self.waiting.replace(batch) } else { Some(batch) };
+        let ready = if self.options.idempotent.is_some() { self.waiting.replace(batch) } else { Some(batch) };
         match ready {
             Some(ready) => self.store(ready, false).await,
             None => Ok(()),

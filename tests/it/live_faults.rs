@@ -339,35 +339,35 @@ async fn a_wall_clock_that_jumps_back_keeps_no_target_out() {
 
 #[tokio::test]
 async fn streams_and_listeners_of_a_deleted_camera_end() {
-        let folder = data_folder();
-        let server = yard(folder.path(), &[], json!({}), false).await;
-        let rows = rows(&Options { seed: 56, samples: 40, targets: 1, ..Options::demo() });
-        let mut client = open(&channel(&server).await, "edge-1", true).await;
-        let events = server.open("GET", "/v1/cameras/yard/events", &[], "").await.into_body();
-        for row in &rows[..20] {
-            client.item(whole(row)).await;
-            client.answer().await;
-        }
-        server.send("DELETE", "/v1/cameras/yard", &[("if-match", "*")], "").await.expect(204);
-        server.post("/v1/cameras", &json!({"id": "yard"})).await.expect(201);
-        for row in &rows[20..] {
-            client.item(whole(row)).await;
-        }
-        let ended = async {
-            loop {
-                match client.next().await {
-                    Ok(Some(Received::Answer(_) | Received::Acknowledgement(_))) => {}
-                    other => break other,
-                }
+    let folder = data_folder();
+    let server = yard(folder.path(), &[], json!({}), false).await;
+    let rows = rows(&Options { seed: 56, samples: 40, targets: 1, ..Options::demo() });
+    let mut client = open(&channel(&server).await, "edge-1", true).await;
+    let events = server.open("GET", "/v1/cameras/yard/events", &[], "").await.into_body();
+    for row in &rows[..20] {
+        client.item(whole(row)).await;
+        client.answer().await;
+    }
+    server.send("DELETE", "/v1/cameras/yard", &[("if-match", "*")], "").await.expect(204);
+    server.post("/v1/cameras", &json!({"id": "yard"})).await.expect(201);
+    for row in &rows[20..] {
+        client.item(whole(row)).await;
+    }
+    let ended = async {
+        loop {
+            match client.next().await {
+                Ok(Some(Received::Answer(_) | Received::Acknowledgement(_))) => {}
+                other => break other,
             }
-        };
-        let status = ended.await.expect_err("ends with a status");
-        assert_eq!(status.code(), Code::NotFound, "{status:?}");
-        // The events end, too: the body can be read to its end.
-        let body = tokio::time::timeout(Duration::from_secs(30), http_body_util::BodyExt::collect(events));
-        body.await.expect("the events end").expect("in order");
-        let samples = server.get("/v1/cameras/yard/samples/count").await.expect(200).json();
-        assert_eq!(samples["count"], 0, "samples of the old camera are in the new one");
+        }
+    };
+    let status = ended.await.expect_err("ends with a status");
+    assert_eq!(status.code(), Code::NotFound, "{status:?}");
+    // The events end, too: the body can be read to its end.
+    let body = tokio::time::timeout(Duration::from_secs(30), http_body_util::BodyExt::collect(events));
+    body.await.expect("the events end").expect("in order");
+    let samples = server.get("/v1/cameras/yard/samples/count").await.expect(200).json();
+    assert_eq!(samples["count"], 0, "samples of the old camera are in the new one");
 }
 
 #[tokio::test]

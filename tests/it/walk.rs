@@ -36,8 +36,10 @@ async fn fixes_of_a_phone_and_boxes_of_a_stream_become_samples_that_train_the_ca
     let server = yard(folder.path(), &[], json!({ "receivers": receivers }), false).await;
     let world = rows(&Options::demo());
     let walker = &world[0].target_id;
-    let walked: Vec<_> = world.iter().filter(|row| row.target_id == *walker && row.fix.is_some()).collect();
-    assert!(walked.len() >= 50, "{} rows", walked.len());
+    // Each request has one of the camera's 64 places for streams until its fixes are decided, some seconds later.
+    let walked: Vec<_> =
+        world.iter().filter(|row| row.target_id == *walker && row.fix.is_some()).take(50).collect();
+    assert_eq!(walked.len(), 50);
 
     let server = Arc::new(server);
     let channel = channel(&server).await;
@@ -53,8 +55,11 @@ async fn fixes_of_a_phone_and_boxes_of_a_stream_become_samples_that_train_the_ca
         // Its answer comes when it is decided what becomes of the fixes, so the walk goes on meanwhile.
         requests.push(tokio::spawn(async move { sender.post(TRACKS, &body).await.expect(200).json() }));
         let latest = part[part.len() - 1].time;
+        let mut waits = 0;
         while tracked_until(&server).await.is_none_or(|time| time < latest) {
+            assert!(waits < 12_000, "the fixes of {latest} are not tracked");
             tokio::time::sleep(Duration::from_millis(5)).await;
+            waits += 1;
         }
     }
     let mut in_samples = 0;

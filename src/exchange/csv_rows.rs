@@ -8,9 +8,10 @@ use std::io::Read;
 use jiff::Timestamp;
 
 use super::columns::{
-    CLASS, COUNT, HEIGHT, Header, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA,
-    TARGET_ID, TIME, TOP, TRUTH_LATITUDE, TRUTH_LONGITUDE, WIDTH,
+    CLASS, COUNT, HEIGHT, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA, TARGET_ID, TIME,
+    TOP, TRUTH_LATITUDE, TRUTH_LONGITUDE, WIDTH,
 };
+use super::csv_header::Header;
 use super::csv_layout::{BoxForm, CsvLayout};
 use super::file_row::{FileRow, RowError};
 use super::formula_guard::unguarded;

@@ -11,6 +11,7 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod columns;
+mod csv_header;
 mod csv_layout;
 mod csv_rows;
 mod cursor;

@@ -54,7 +54,7 @@ pub struct ObservedBox {
     pub one_step: Regression,
     /// From the box alone, so independent of the fix.
     pub independent: Regression,
-    /// Whether `independent` is finite and within the plane's range. If not, both regressions are
+    /// Whether `independent` and its covariance are finite and within the plane's range. If not, both regressions are
     /// replaced by the plane's origin with [`PLANE_RANGE_M`] as their 95 % radius.
     pub is_usable: bool,
     /// Whether the box is unlike those of training or cut by the image's border.
@@ -124,7 +124,9 @@ impl ObservedBox {
 }
 
 fn is_usable(regression: &Regression) -> bool {
-    regression.regressed.is_within_range() && regression.e_regression_m2.is_finite()
+    regression.regressed.is_within_range()
+        && regression.e_regression_m2.is_finite()
+        && regression.normal_covariance().is_finite()
 }
 
 /// Replaces a regression without a usable position: the origin, with the plane's range as `r95_m`.

@@ -79,6 +79,12 @@ impl PlaneCovariance {
         factor * major_m2.sqrt()
     }
 
+    /// Whether all elements are finite.
+    #[must_use]
+    pub fn is_finite(self) -> bool {
+        [self.east_m2, self.north_m2, self.east_north_m2].into_iter().all(f64::is_finite)
+    }
+
     /// The covariance of the same shape whose 95 % radius is this one, m.
     #[must_use]
     pub fn with_r95_m(self, r95_m: f64) -> Self {

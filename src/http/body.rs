@@ -14,7 +14,7 @@ use hyper::http::request::Parts;
 use sha2::{Digest as _, Sha256};
 use tokio::io::AsyncWriteExt as _;
 
-use super::body_coding::is_undecodable;
+use super::body_error::is_undecodable;
 use crate::admission::{ClientId, Lease};
 use crate::app::App;
 use crate::domain::{Error, ErrorKind, IdempotentRequest, RequestHasher, Result};

@@ -5,8 +5,6 @@
 //! what is compressed already compressed.
 
 use std::convert::Infallible;
-use std::error::Error as StdError;
-use std::fmt;
 use std::io;
 
 use async_compression::tokio::bufread::{GzipDecoder, ZstdDecoder};
@@ -26,6 +24,7 @@ use tower_http::compression::CompressionLayer;
 use tower_http::compression::predicate::{DefaultPredicate, Predicate, SizeAbove};
 
 use super::body::discard;
+use super::body_error::BodyError;
 use super::problem::ApiError;
 use crate::domain::{Error, ErrorKind};
 
@@ -146,36 +145,4 @@ fn chunks(decoder: impl AsyncRead + Send + 'static) -> impl Stream<Item = Result
             if is_of_body { BodyError::Broken } else { BodyError::Undecodable }
         })
     })
-}
-
-/// Why a decoded body ends early.
-#[derive(Debug, PartialEq, Eq)]
-enum BodyError {
-    /// The coded body broke off or was refused.
-    Broken,
-    /// It is not of its coding.
-    Undecodable,
-}
-
-impl fmt::Display for BodyError {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(match self {
-            Self::Broken => "the body broke off",
-            Self::Undecodable => "the body cannot be decoded",
-        })
-    }
-}
-
-impl StdError for BodyError {}
-
-/// Whether a body ended early because it is not of its coding.
-pub(super) fn is_undecodable(error: &axum::Error) -> bool {
-    let mut cause: Option<&(dyn StdError + 'static)> = Some(error);
-    while let Some(error) = cause {
-        if error.downcast_ref() == Some(&BodyError::Undecodable) {
-            return true;
-        }
-        cause = error.source();
-    }
-    false
 }

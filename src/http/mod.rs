@@ -11,6 +11,7 @@ mod access;
 mod audit;
 mod body;
 mod body_coding;
+mod body_error;
 mod camera_statuses;
 mod cameras;
 mod console;

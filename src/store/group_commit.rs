@@ -6,6 +6,7 @@
 //! cancelled caller disturbs the others.
 
 use std::collections::HashMap;
+use std::fmt;
 use std::sync::Arc;
 
 use jiff::Timestamp;
@@ -14,7 +15,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::audit::{Change, record};
 use super::errors::{closed, copy_of, failed, no_camera};
-use super::idempotency::{Completion, insert_answer};
+use super::idempotency::{IdempotencyRecord, insert_answer};
 use super::sample_retention::delete_oldest;
 use super::sample_table::{Insert, Row, SampleTable, delete_replaced, delete_stored, keep_last, statements};
 use super::space::Space;
@@ -44,6 +45,21 @@ pub struct Inserted {
     pub without_fix: u64,
     /// Of the accepted ones, those that took the place of a stored sample on request.
     pub replaced: u64,
+}
+
+/// How the last batch of an import is completed.
+#[derive(Clone)]
+pub struct Completion {
+    /// Under which key the answer is stored.
+    pub record: IdempotencyRecord,
+    /// Writes the answer, from what became of the last batch.
+    pub answer: Arc<dyn Fn(&Inserted) -> String + Send + Sync>,
+}
+
+impl fmt::Debug for Completion {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.record.fmt(out)
+    }
 }
 
 /// How a batch of samples is stored.

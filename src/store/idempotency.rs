@@ -1,14 +1,10 @@
 //! Answers of changes that clients may repeat, written in the transaction of the change.
 
-use std::fmt;
-use std::sync::Arc;
-
 use jiff::{SignedDuration, Timestamp};
 use sqlx::{SqliteConnection, SqliteExecutor};
 
 use super::Store;
 use super::errors::failed;
-use super::group_commit::Inserted;
 use super::space::StoreLimits;
 use crate::domain::{Actor, Error, ErrorKind, IdempotencyKey, RequestDigest, Result};
 
@@ -19,21 +15,6 @@ pub struct IdempotencyRecord {
     pub key: IdempotencyKey,
     /// What the request asks for.
     pub digest: RequestDigest,
-}
-
-/// How the last batch of an import is completed.
-#[derive(Clone)]
-pub struct Completion {
-    /// Under which key the answer is stored.
-    pub record: IdempotencyRecord,
-    /// Writes the answer, from what became of the last batch.
-    pub answer: Arc<dyn Fn(&Inserted) -> String + Send + Sync>,
-}
-
-impl fmt::Debug for Completion {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.record.fmt(out)
-    }
 }
 
 /// An answer that was stored under a key.

@@ -91,9 +91,10 @@ pub(super) fn recorded(seed: u64, passes: usize) -> Recorded {
         }
     }
     for emitter in 0..20 {
-        let (distance_m, bearing) = (random.random_range(2_500.0..9_000.0), random.random_range(0.0..6.28));
+        let (distance_m, bearing) =
+            (random.random_range(2_500.0..9_000.0), random.random_range(0.0..std::f64::consts::TAU));
         let speed_m_s = if emitter % 3 == 0 { 0.0 } else { random.random_range(3.0..9.0) };
-        let heading: f64 = random.random_range(0.0..6.28);
+        let heading: f64 = random.random_range(0.0..std::f64::consts::TAU);
         let way = Way {
             from_s: 0.0,
             from_m: [distance_m * f64::cos(bearing), distance_m * f64::sin(bearing)],

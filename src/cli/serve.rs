@@ -61,7 +61,7 @@ impl Serve {
             let server = Server::bind(settings.clone(), Clock::system(), Randomness::system()).await?;
             let address = server.address().context("cannot determine the address")?;
             let (app, shutdown) = (server.app().clone(), server.shutdown());
-            tokio::spawn(shut_down_on_signal(shutdown.clone()));
+            shut_down_on_signal(shutdown.clone())?;
             #[cfg(unix)]
             reload_on_hangup(source, log.clone(), server.reloader());
             tracing::info!(
@@ -82,32 +82,53 @@ impl Serve {
     }
 }
 
-/// Shuts the server down at the first SIGINT or SIGTERM; a second one exits immediately.
-async fn shut_down_on_signal(shutdown: Shutdown) {
-    wait_for_signal().await;
-    shutdown.drain();
-    wait_for_signal().await;
-    std::process::exit(130);
+/// Shuts the server down at the first SIGINT or SIGTERM; a second one exits immediately. The signals are handled from
+/// the return of this function on.
+fn shut_down_on_signal(shutdown: Shutdown) -> anyhow::Result<()> {
+    let mut signals = EndSignals::listen()?;
+    tokio::spawn(async move {
+        signals.next().await;
+        shutdown.drain();
+        signals.next().await;
+        std::process::exit(130);
+    });
+    Ok(())
 }
 
 #[cfg(unix)]
-async fn wait_for_signal() {
-    use tokio::signal::unix::{SignalKind, signal};
-    match signal(SignalKind::terminate()) {
-        Ok(mut terminate) => tokio::select! {
-            _ = tokio::signal::ctrl_c() => {}
-            _ = terminate.recv() => {}
-        },
-        Err(error) => {
-            tracing::warn!(%error, "cannot handle SIGTERM, only SIGINT");
-            let _ = tokio::signal::ctrl_c().await;
+struct EndSignals {
+    terminate: tokio::signal::unix::Signal,
+    interrupt: tokio::signal::unix::Signal,
+}
+
+#[cfg(unix)]
+impl EndSignals {
+    fn listen() -> anyhow::Result<Self> {
+        use tokio::signal::unix::{SignalKind, signal};
+        let handle = |kind| signal(kind).context("cannot handle SIGTERM and SIGINT");
+        Ok(Self { terminate: handle(SignalKind::terminate())?, interrupt: handle(SignalKind::interrupt())? })
+    }
+
+    async fn next(&mut self) {
+        tokio::select! {
+            _ = self.terminate.recv() => {}
+            _ = self.interrupt.recv() => {}
         }
     }
 }
 
 #[cfg(not(unix))]
-async fn wait_for_signal() {
-    let _ = tokio::signal::ctrl_c().await;
+struct EndSignals;
+
+#[cfg(not(unix))]
+impl EndSignals {
+    fn listen() -> anyhow::Result<Self> {
+        Ok(Self)
+    }
+
+    async fn next(&mut self) {
+        let _ = tokio::signal::ctrl_c().await;
+    }
 }
 
 /// Where the settings came from, to read them again.

@@ -38,13 +38,14 @@ fn a_simulated_site_is_tracked_over_all_its_cameras() {
     simulate(folder.path(), &["--duration-s", "240", "--tracker-id-lifetime-s", "20", "--seed", "11"]);
     let cases = evaluate(folder.path(), "1280x720", &["--redraws", "3"]);
     let [together, oracle, degraded, apart, ..] = &cases[..] else { panic!("{cases:?}") };
-    assert!(figure(together, "identity_f1_by_boxes") >= 0.85, "{together}");
+    let lost = |case, name| figure(oracle, name) - figure(case, name);
+    assert!(lost(together, "identity_f1_by_boxes") <= 0.05, "{together} {oracle}");
+    assert!(figure(together, "association_precision") >= 0.9, "{together}");
     assert!(figure(together, "handover_rate") >= 0.85, "{together}");
-    assert!(figure(oracle, "mota") - figure(together, "mota") <= 0.05, "{oracle}");
-    assert!(figure(oracle, "idf1") - figure(together, "idf1") <= 0.05, "{oracle}");
-    assert!(figure(degraded, "identity_f1_by_boxes") >= 0.7, "{degraded}");
+    assert!(lost(together, "mota") <= 0.05 && lost(together, "idf1") <= 0.05, "{together} {oracle}");
+    assert!(lost(degraded, "identity_f1_by_boxes") <= 0.15, "{degraded} {oracle}");
     assert!(figure(together, "mota") > figure(apart, "mota"), "{apart}");
-    assert!(figure(together, "coverage95") > figure(apart, "coverage95") + 0.1, "{apart}");
+    assert!(figure(together, "coverage95") > figure(apart, "coverage95"), "{apart}");
 }
 
 #[test]

@@ -234,7 +234,7 @@ impl<'a> Import<'a> {
     /// `PermissionDenied` for a caller who may not replace samples.
     pub(super) fn new(app: &'a App, id: &'a CameraId, options: ImportOptions) -> Result<Self> {
         if options.on_conflict == OnConflict::Replace {
-            // As whoever deletes them.
+            // Replacing loses the stored samples, as deleting does.
             app.caller().authorize(Permission::Operate)?;
         }
         Ok(Self { app, id, options, waiting: None, report: ImportReport::default() })

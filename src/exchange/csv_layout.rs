@@ -19,7 +19,7 @@ use crate::domain::{Error, ImageSize, Result, TargetId};
 pub struct CsvLayout {
     /// Which columns hold the values.
     pub columns: ColumnNames,
-    /// What the sides of a box are; told by the names of the columns if `None`.
+    /// What the sides of a box are; derived from the names of the columns if `None`.
     pub box_form: Option<BoxForm>,
     /// The unit of the sides.
     pub box_unit: BoxUnit,

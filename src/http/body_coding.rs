@@ -1,6 +1,6 @@
 //! Content codings of bodies: gzip and zstd, both ways.
 //!
-//! A body is decoded as it is read, so whoever reads it holds it to its limit: of one that decodes to more,
+//! A body is decoded as it is read, so its reader applies the limit: of one that decodes to more,
 //! no more than the limit is ever held. What never happens here: a body decoded at once, an event stream or
 //! what is compressed already compressed.
 

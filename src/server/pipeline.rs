@@ -46,7 +46,7 @@ const DISCARD_TIME: Duration = Duration::from_secs(10);
 enum Audience {
     /// Clients, each with what its credential allows.
     Clients,
-    /// Whoever reaches the address of the setting `metrics_listen`, with probes and metrics alone.
+    /// All clients of the address `metrics_listen`, which serves probes and metrics alone.
     Monitoring,
 }
 

@@ -116,7 +116,7 @@ impl Store {
             let mut fields = RowDecoder::new("cameras", row);
             let id = fields.parse(CameraId::new)?;
             let key = CameraKey(fields.get()?);
-            let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
+            let revision = fields.revision()?;
             Ok((id, key, revision, fields.optional_count()?))
         };
         rows.iter().map(read).collect()
@@ -284,7 +284,7 @@ fn read_camera(row: &SqliteRow) -> Result<Camera> {
     let labels = fields.parse(serde_json::from_str::<BTreeMap<String, String>>)?;
     let receivers = fields.parse(read_receivers)?;
     let retrain_when_moved = fields.get()?;
-    let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
+    let revision = fields.revision()?;
     let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
     let active_model = fields.optional_count()?;
     let mut samples = || fields.parse(|stored: Option<i64>| u64::try_from(stored.unwrap_or_default()));

@@ -7,7 +7,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Column, Decode, Row, Sqlite, Type};
 
 use super::errors::Corrupt;
-use crate::domain::{Error, Result};
+use crate::domain::{Error, Result, Revision};
 
 /// Decodes the columns of one row from left to right. Every SELECT names the key's columns first, so
 /// that a fault can name the row.
@@ -80,6 +80,10 @@ impl<'r> RowDecoder<'r> {
 
     pub(super) fn optional_count(&mut self) -> Result<Option<u32>> {
         self.parse_optional(|stored: i64| u32::try_from(stored))
+    }
+
+    pub(super) fn revision(&mut self) -> Result<Revision> {
+        self.parse(|stored: i64| u64::try_from(stored)).map(Revision)
     }
 
     /// A number that may have been NaN, which SQLite stores as NULL.

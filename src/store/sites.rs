@@ -93,7 +93,7 @@ impl Store {
             let mut fields = RowDecoder::new("sites", row);
             let id = fields.parse(SiteId::new)?;
             let key = SiteKey(fields.get()?);
-            Ok((id, key, Revision(fields.parse(|stored: i64| u64::try_from(stored))?)))
+            Ok((id, key, fields.revision()?))
         };
         rows.iter().map(read).collect()
     }
@@ -208,7 +208,7 @@ fn read_site(row: &SqliteRow) -> Result<Site> {
     let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
     let origin = longitude_deg.zip(latitude_deg);
     let origin = fields.checked(origin.map(|(east, north)| Position::new(east, north)).transpose())?;
-    let revision = Revision(fields.parse(|stored: i64| u64::try_from(stored))?);
+    let revision = fields.revision()?;
     let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
     let cameras = fields.count()?;
     Ok(Site {

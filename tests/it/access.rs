@@ -20,7 +20,7 @@ use sightfix::grpc::proto::key_service_client::KeyServiceClient;
 use tempfile::TempDir;
 use tokio::sync::mpsc;
 use tonic::metadata::AsciiMetadataValue;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::Channel;
 use tonic::{Code, Status};
 
 use crate::harness::{Answer, TestServer, data_folder, run, sightfix};
@@ -65,11 +65,6 @@ async fn create_remotely(server: &TestServer, admin: &str, draft: &Value) -> (St
     let created = send(server, "POST", "/v1/keys", admin, &draft.to_string()).await.expect(201).json();
     let text = |field: &str| created[field].as_str().expect("text").to_owned();
     (text("id"), text("secret"))
-}
-
-async fn channel(server: &TestServer) -> Channel {
-    let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
-    endpoint.connect().await.expect("a connection")
 }
 
 fn with_key<T>(message: T, key: &str) -> tonic::Request<T> {
@@ -245,7 +240,7 @@ async fn a_device_reaches_its_cameras_only() {
             assert_eq!(refused.json()["type"], "urn:sightfix:problem:permission-denied");
         }
     }
-    let mut fusion = FusionServiceClient::new(channel(&server).await);
+    let mut fusion = FusionServiceClient::new(server.channel().await);
     for (camera, denied) in [("c", false), ("other", true)] {
         let request =
             proto::FuseRequest { camera_id: camera.to_owned(), observations: vec![Default::default()] };
@@ -255,7 +250,7 @@ async fn a_device_reaches_its_cameras_only() {
         let is_denied = matches!(&ended, Err(status) if status.code() == Code::PermissionDenied);
         assert_eq!(is_denied, denied, "{camera}: {ended:?}");
         let batch = proto::ImportSamplesRequest { camera_id: camera.to_owned(), ..Default::default() };
-        let mut samples = proto::sample_service_client::SampleServiceClient::new(channel(&server).await);
+        let mut samples = proto::sample_service_client::SampleServiceClient::new(server.channel().await);
         let stored = samples.import_samples(with_key(futures_util::stream::iter([batch]), &key)).await;
         let is_denied = matches!(&stored, Err(status) if status.code() == Code::PermissionDenied);
         assert_eq!(is_denied, denied, "{camera}: {stored:?}");
@@ -287,7 +282,7 @@ async fn revoking_a_key_ends_what_is_open_at_once() {
     let (_folder, server, admin) = with_admin().await;
     let draft = json!({"name": "operator", "role": "operator"});
     let (id, key) = create_remotely(&server, &admin, &draft).await;
-    let mut fusion = FusionServiceClient::new(channel(&server).await);
+    let mut fusion = FusionServiceClient::new(server.channel().await);
     let (_sender, mut responses) = opened_stream(&mut fusion, "c", &key).await;
     responses.message().await.expect("opened").expect("opened");
     let headers = [("authorization", &*bearer(&key))];
@@ -310,7 +305,7 @@ async fn revoking_a_key_ends_what_is_open_at_once() {
     assert!(broken.is_err(), "an event reader sees that its events are not complete");
     send(&server, "GET", "/v1/cameras", &key, "").await.expect(401);
     server.send("GET", "/v1/cameras", &[("cookie", &cookie)], "").await.expect(401);
-    let mut cameras = CameraServiceClient::new(channel(&server).await);
+    let mut cameras = CameraServiceClient::new(server.channel().await);
     let refused = cameras.list_cameras(with_key(proto::ListCamerasRequest::default(), &key)).await;
     assert_eq!(refused.expect_err("revoked").code(), Code::Unauthenticated);
 
@@ -466,7 +461,7 @@ fn run_with(arguments: &[&str], variable: (&str, &str)) -> String {
 #[tokio::test]
 async fn keys_are_managed_over_grpc_as_over_rest() {
     let (_folder, server, admin) = with_admin().await;
-    let mut keys = KeyServiceClient::new(channel(&server).await);
+    let mut keys = KeyServiceClient::new(server.channel().await);
     let draft = proto::CreateKeyRequest {
         name: "gate".to_owned(),
         role: proto::Role::Edge.into(),

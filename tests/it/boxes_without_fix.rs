@@ -9,7 +9,6 @@ use serde_json::{Value, json};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
-use tonic::transport::Channel;
 
 use crate::harness::{TestServer, data_folder, run, sightfix, simulated_csv};
 
@@ -54,11 +53,6 @@ async fn counts(server: &TestServer) -> (u64, u64) {
         (&count["count"], &count["without_fix"])
     );
     (count["count"].as_u64().expect("a number"), count["without_fix"].as_u64().expect("a number"))
-}
-
-async fn channel(server: &TestServer) -> Channel {
-    let endpoint = Channel::from_shared(format!("http://{}", server.address)).expect("an address");
-    endpoint.connect().await.expect("a connection")
 }
 
 #[tokio::test]
@@ -163,7 +157,7 @@ async fn the_limit_of_a_camera_counts_samples_without_a_fix() {
 async fn both_transports_store_list_count_and_reject_alike() {
     let (_folder, server) = with_camera(&json!({"id": "c"})).await;
     server.post("/v1/cameras", &json!({"id": "g"})).await.expect(201);
-    let mut client = SampleServiceClient::new(channel(&server).await);
+    let mut client = SampleServiceClient::new(server.channel().await);
     let sample = |second: i64, fix| proto::Sample {
         time: Some(prost_types::Timestamp { seconds: time(second).as_second(), nanos: 0 }),
         target_id: "person-1".to_owned(),
@@ -233,7 +227,7 @@ async fn both_transports_store_list_count_and_reject_alike() {
         assert_eq!(count.count, by_grpc.len() as u64);
     }
     let request = proto::GetCameraRequest { camera_id: "c".to_owned() };
-    let camera = CameraServiceClient::new(channel(&server).await).get_camera(request).await.expect("known");
+    let camera = CameraServiceClient::new(server.channel().await).get_camera(request).await.expect("known");
     let camera = camera.into_inner().camera.expect("set");
     assert_eq!((camera.samples, camera.samples_without_fix), (2, 1));
 }
@@ -395,7 +389,7 @@ async fn the_common_bias_of_the_fixes_is_part_of_the_profile_and_of_the_stated_e
 #[tokio::test]
 async fn a_common_bias_out_of_range_is_refused_alike() {
     let (_folder, server) = with_camera(&json!({"id": "c"})).await;
-    let mut client = CameraServiceClient::new(channel(&server).await);
+    let mut client = CameraServiceClient::new(server.channel().await);
     for sigma_m in [0.0, -1.0, 100.5, 1e300] {
         let rest = server.post("/v1/cameras", &json!({"id": "new", "gnss_bias_sigma_m": sigma_m})).await;
         let rest = rest.expect(422).json();

@@ -15,7 +15,6 @@ use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tonic::Code;
-use tonic::transport::Endpoint;
 
 use crate::harness::{TestServer, connect_from, data_folder};
 
@@ -221,7 +220,7 @@ async fn one_address_gets_no_more_than_its_share_of_live_streams() {
     server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
     let mut held = Vec::new();
     let mut open = async |address: [u8; 4], name: &str| {
-        let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
+        let endpoint = server.endpoint();
         let endpoint = endpoint.local_address(Some(address.into()));
         let opening = proto::StreamOpening {
             camera_id: "c".to_owned(),

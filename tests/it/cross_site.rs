@@ -4,7 +4,6 @@ use serde_json::json;
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
 use tonic::Code;
-use tonic::transport::Endpoint;
 
 use crate::harness::{TestServer, data_folder};
 
@@ -30,7 +29,7 @@ async fn a_name_that_somebody_else_pointed_here_is_refused() {
     for host in [format!("localhost:{port}"), format!("127.0.0.1:{port}"), "[::1]".to_owned()] {
         server.send("GET", "/v1/cameras", &[("host", &host)], "").await.expect(200);
     }
-    let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
+    let endpoint = server.endpoint();
     let named = |origin: &'static str| {
         let endpoint = endpoint.clone().origin(origin.parse().expect("an origin"));
         async move {

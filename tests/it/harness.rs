@@ -14,8 +14,10 @@ use hyper_util::client::legacy::Client;
 use hyper_util::client::legacy::connect::HttpConnector;
 use hyper_util::rt::TokioExecutor;
 use serde_json::Value;
+use sightfix::grpc::proto;
 use tempfile::TempDir;
 use tokio::net::{TcpSocket, TcpStream};
+use tonic::transport::{Channel, Endpoint};
 
 /// A command of the binary, without arguments.
 pub(crate) fn sightfix() -> Command {
@@ -160,6 +162,16 @@ impl TestServer {
         }
     }
 
+    /// Where gRPC clients connect.
+    pub(crate) fn endpoint(&self) -> Endpoint {
+        Endpoint::from_shared(format!("http://{}", self.address)).expect("an address")
+    }
+
+    /// A connection of a gRPC client.
+    pub(crate) async fn channel(&self) -> Channel {
+        self.endpoint().connect().await.expect("a connection")
+    }
+
     /// Process id of the server.
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
@@ -271,6 +283,24 @@ pub(crate) async fn connect_from(ip: [u8; 4], server: SocketAddr) -> TcpStream {
     let socket = TcpSocket::new_v4().expect("a socket");
     socket.bind(SocketAddr::from((ip, 0))).expect("all of 127.0.0.0/8 is this machine");
     socket.connect(server).await.expect("the server listens")
+}
+
+/// A message of an import stream: one sample of target `a` for camera `c`.
+pub(crate) fn import_message() -> proto::ImportSamplesRequest {
+    let side = Some(20.0);
+    let sample = proto::Sample {
+        time: Some(prost_types::Timestamp { seconds: 1_600_000_000, nanos: 0 }),
+        target_id: "a".to_owned(),
+        bounding_box: Some(proto::BoundingBox {
+            left_px: side,
+            top_px: side,
+            width_px: side,
+            height_px: side,
+        }),
+        fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
+        ..proto::Sample::default()
+    };
+    proto::ImportSamplesRequest { camera_id: "c".to_owned(), samples: vec![sample], ..Default::default() }
 }
 
 pub(crate) fn data_folder() -> TempDir {

@@ -10,11 +10,10 @@ use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
 use tempfile::TempDir;
 use tonic::metadata::AsciiMetadataValue;
-use tonic::transport::Endpoint;
 use tonic::{Code, Status};
 use tonic_types::StatusExt as _;
 
-use crate::harness::{Answer, TestServer, data_folder, run, simulated_csv};
+use crate::harness::{Answer, TestServer, data_folder, import_message, run, simulated_csv};
 
 const JSON: (&str, &str) = ("content-type", "application/json");
 const HEADER: &str = "time,target_id,left,top,width,height,longitude,latitude\n";
@@ -93,8 +92,7 @@ fn with_key<T>(message: T, key: &str) -> tonic::Request<T> {
 }
 
 async fn list_cameras(server: &TestServer, key: &str) -> Result<(), Status> {
-    let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
-    let mut cameras = CameraServiceClient::new(endpoint.connect().await.expect("a connection"));
+    let mut cameras = CameraServiceClient::new(server.channel().await);
     cameras.list_cameras(with_key(proto::ListCamerasRequest::default(), key)).await.map(drop)
 }
 
@@ -145,8 +143,8 @@ async fn each_key_has_its_share_of_streams_and_event_readers() {
     assert_eq!(events(&one).await.status(), 503);
 
     let open = async |key: &str, address: [u8; 4]| {
-        let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
-        let channel = endpoint.local_address(Some(address.into())).connect().await.expect("a connection");
+        let channel =
+            server.endpoint().local_address(Some(address.into())).connect().await.expect("a connection");
         let opening = proto::StreamOpening {
             camera_id: "c".to_owned(),
             client_name: "name".to_owned(),
@@ -211,8 +209,7 @@ async fn a_request_that_takes_too_long_is_answered_in_time() {
 #[tokio::test]
 async fn compressed_messages_of_grpc_are_not_read() {
     let (_folder, server) = with_camera(&[]).await;
-    let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
-    let channel = endpoint.connect().await.expect("a connection");
+    let channel = server.channel().await;
     let mut request = tonic::Request::new(proto::ListCamerasRequest::default());
     request.metadata_mut().insert("grpc-encoding", AsciiMetadataValue::from_static("gzip"));
     let status = CameraServiceClient::new(channel).list_cameras(request).await;
@@ -222,26 +219,8 @@ async fn compressed_messages_of_grpc_are_not_read() {
 #[tokio::test]
 async fn import_streams_have_their_limit() {
     let (_folder, server) = with_camera(&[("SIGHTFIX_LIMITS__IMPORT_STREAMS", "1")]).await;
-    let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
-    let channel = endpoint.connect().await.expect("a connection");
-    let side = Some(20.0);
-    let sample = proto::Sample {
-        time: Some(prost_types::Timestamp { seconds: 1_600_000_000, nanos: 0 }),
-        target_id: "a".to_owned(),
-        bounding_box: Some(proto::BoundingBox {
-            left_px: side,
-            top_px: side,
-            width_px: side,
-            height_px: side,
-        }),
-        fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
-        ..proto::Sample::default()
-    };
-    let message = proto::ImportSamplesRequest {
-        camera_id: "c".to_owned(),
-        samples: vec![sample],
-        ..Default::default()
-    };
+    let channel = server.channel().await;
+    let message = import_message();
     let (sender, receiver) = tokio::sync::oneshot::channel::<()>();
     // One message, and an end that waits.
     let held = stream::iter([message.clone()]).chain(stream::once(receiver).filter_map(async |_| None));

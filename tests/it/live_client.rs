@@ -81,9 +81,9 @@ impl Client {
 }
 
 pub(crate) async fn channel(server: &TestServer) -> Channel {
-    let endpoint = Channel::from_shared(format!("http://{}", server.address)).expect("an address");
     // Small, so that a client that does not read holds the server up soon.
-    let endpoint = endpoint.initial_stream_window_size(65_535).initial_connection_window_size(65_535);
+    let endpoint =
+        server.endpoint().initial_stream_window_size(65_535).initial_connection_window_size(65_535);
     endpoint.connect().await.expect("a connection")
 }
 

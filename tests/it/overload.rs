@@ -12,13 +12,12 @@ use hyper::client::conn::http2;
 use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use serde_json::{Value, json};
-use sightfix::grpc::proto;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::task::JoinSet;
 use tonic::Code;
 
-use crate::harness::{TestServer, connect_from, data_folder};
+use crate::harness::{TestServer, connect_from, data_folder, import_message};
 
 /// An address of a client that is up to no good.
 const GREEDY: [u8; 4] = [127, 0, 0, 2];
@@ -119,26 +118,8 @@ async fn a_body_that_trickles_is_refused() {
 #[tokio::test]
 async fn an_import_stream_that_stalls_reports_what_is_stored() {
     let (_folder, server) = with_camera(&[("SIGHTFIX_LIMITS__BODY_GRACE_S", "1")]).await;
-    let channel = tonic::transport::Channel::from_shared(format!("http://{}", server.address));
-    let channel = channel.expect("an address").connect().await.expect("a connection");
-    let side = Some(20.0);
-    let sample = proto::Sample {
-        time: Some(prost_types::Timestamp { seconds: 1_600_000_000, nanos: 0 }),
-        target_id: "a".to_owned(),
-        bounding_box: Some(proto::BoundingBox {
-            left_px: side,
-            top_px: side,
-            width_px: side,
-            height_px: side,
-        }),
-        fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
-        ..proto::Sample::default()
-    };
-    let first = proto::ImportSamplesRequest {
-        camera_id: "c".to_owned(),
-        samples: vec![sample],
-        ..proto::ImportSamplesRequest::default()
-    };
+    let channel = server.channel().await;
+    let first = import_message();
     let messages = stream::iter([first]).chain(stream::pending());
     let status = SampleServiceClient::new(channel).import_samples(messages).await.expect_err("it stalls");
     assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");

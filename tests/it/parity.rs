@@ -30,8 +30,7 @@ impl Both {
         let server = TestServer::start_with(folder.path(), settings);
         let profile = json!({"id": "c", "image_size": {"width_px": 640, "height_px": 480}});
         server.post("/v1/cameras", &profile).await.expect(201);
-        let channel = Channel::from_shared(format!("http://{}", server.address)).expect("an address");
-        Self { channel: channel.connect().await.expect("a connection"), server, _folder: folder }
+        Self { channel: server.channel().await, server, _folder: folder }
     }
 
     async fn rest_fuse(&self, camera: &str, observations: &[Value]) -> Answer {

@@ -5,7 +5,6 @@ use serde_json::{Value, json};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
 use sightfix::grpc::proto::training_service_client::TrainingServiceClient;
-use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Request};
 use tonic_types::StatusExt as _;
 
@@ -34,11 +33,6 @@ async fn start(server: &TestServer, key: &str, body: &Value) -> Answer {
 
 fn row(second: u32, left_px: u32) -> String {
     format!("2020-12-14T06:41:{second:02}Z,a,{left_px},11,28,77,103.98678,30.6280135\n")
-}
-
-async fn channel(server: &TestServer) -> Channel {
-    let endpoint = Endpoint::from_shared(format!("http://{}", server.address)).expect("an address");
-    endpoint.connect().await.expect("a connection")
 }
 
 fn with_key<T>(message: T, key: &'static str) -> Request<T> {
@@ -154,7 +148,7 @@ async fn one_run_is_started_and_a_second_is_told_which() {
     let refused = start(&server, "other", &wish).await.expect(409).json();
     assert_eq!(refused["conflicting_id"], *id, "{refused}");
 
-    let mut client = TrainingServiceClient::new(channel(&server).await);
+    let mut client = TrainingServiceClient::new(server.channel().await);
     let request = proto::StartTrainingRunRequest { camera_id: "c".to_owned(), ..Default::default() };
     let status = client.start_training_run(request.clone()).await.expect_err("a live run");
     assert_eq!(status.code(), Code::FailedPrecondition);
@@ -218,7 +212,7 @@ fn message(second: i64, left_px: f64, on_conflict: proto::OnConflict) -> proto::
 #[tokio::test]
 async fn a_stream_of_samples_is_repeated_and_replaces_alike() {
     let (_folder, server) = with_camera(&[]).await;
-    let mut client = SampleServiceClient::new(channel(&server).await);
+    let mut client = SampleServiceClient::new(server.channel().await);
     let mut send = async |messages: Vec<proto::ImportSamplesRequest>, key: Option<&'static str>| {
         let messages = stream::iter(messages);
         let request = match key {

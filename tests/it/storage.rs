@@ -66,11 +66,6 @@ fn problem(answer: &Answer, status: u16, kind: &str) -> Value {
     problem
 }
 
-async fn channel(server: &TestServer) -> tonic::transport::Channel {
-    let endpoint = tonic::transport::Channel::from_shared(format!("http://{}", server.address));
-    endpoint.expect("an address").connect().await.expect("a connection")
-}
-
 /// Waits until the metrics have this line.
 async fn metric(server: &TestServer, line: &str) {
     while !server.get("/metrics").await.expect(200).text().lines().any(|found| found == line) {
@@ -94,7 +89,7 @@ async fn imports_say_how_durable_they_are() {
     let refused = import(&server, &format!("{SAMPLES}?durability=some"), csv(6..8)).await;
     assert_eq!(problem(&refused, 422, "invalid-argument")["violations"][0]["field"], "durability");
 
-    let mut samples = SampleServiceClient::new(channel(&server).await);
+    let mut samples = SampleServiceClient::new(server.channel().await);
     for (asked, told) in [
         (proto::Durability::Unspecified, proto::Durability::Synced),
         (proto::Durability::Synced, proto::Durability::Synced),
@@ -109,7 +104,7 @@ async fn imports_say_how_durable_they_are() {
         assert_eq!(report.durability(), told);
     }
 
-    let mut fusion = FusionServiceClient::new(channel(&server).await);
+    let mut fusion = FusionServiceClient::new(server.channel().await);
     for (store_samples, told) in [(true, proto::Durability::Relaxed), (false, proto::Durability::Unspecified)]
     {
         let opening = proto::StreamOpening {
@@ -142,7 +137,7 @@ async fn fill(server: &TestServer) -> Answer {
 async fn check_full_storage(server: &TestServer, refused: &Answer) {
     let said = problem(refused, 507, "insufficient-storage");
     assert!(said["detail"].as_str().is_some_and(|detail| detail.contains("delete")), "{said}");
-    let mut samples = SampleServiceClient::new(channel(server).await);
+    let mut samples = SampleServiceClient::new(server.channel().await);
     let mut lines = 0;
     let batch = (9_000_000..9_005_000).map(|second| {
         lines += 1;
@@ -250,7 +245,7 @@ async fn models_and_runs_can_be_deleted_by_both_transports() {
     let no_other = server.post("/v1/cameras/c/active-model/roll-back", &json!({})).await;
     problem(&no_other, 409, "no-earlier-model");
 
-    let channel = channel(&server).await;
+    let channel = server.channel().await;
     let mut models = ModelServiceClient::new(channel.clone());
     let model = |number| proto::DeleteModelRequest { camera_id: "c".to_owned(), number };
     models.delete_model(model(4)).await.expect("deleted");

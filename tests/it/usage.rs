@@ -253,8 +253,7 @@ async fn a_roll_back_and_a_model_of_another_image_tell_the_truth() {
 async fn reflection_is_served_to_older_clients_too() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
-    let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{}", server.address));
-    let channel = endpoint.expect("an address").connect().await.expect("a connection");
+    let channel = server.channel().await;
     let request = ServerReflectionRequest {
         host: String::new(),
         message_request: Some(MessageRequest::ListServices(String::new())),

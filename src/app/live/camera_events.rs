@@ -105,7 +105,7 @@ impl<E> CameraEventLog<E> {
 pub(super) struct CameraEventReader<E> {
     reader: EventReader<E>,
     log: u64,
-    /// To be told first.
+    /// Reported before the first event.
     lost: Option<LostEvents>,
 }
 

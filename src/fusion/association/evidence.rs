@@ -14,7 +14,7 @@ use super::tracklet::{Residual, SceneMotion, TimedFix};
 use crate::domain::GaussMarkovNoise;
 
 /// Correlation time of the map's error along a walk, s.
-const MAP_TIME_CONSTANT_S: f64 = 20.0;
+pub(super) const MAP_TIME_CONSTANT_S: f64 = 20.0;
 /// Correlation time of a target's velocity, s.
 const VELOCITY_TIME_CONSTANT_S: f64 = 8.0;
 /// A share of the fixes has gross errors; these are as likely under either hypothesis.

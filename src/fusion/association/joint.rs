@@ -1,7 +1,7 @@
 //! Boxes matched with receivers where the camera has no model: both are found together.
 //!
 //! Boxes alone give the ground plane up to place and direction ([`GroundCamera`], one per focal length).
-//! [`PlacementSearch`] finds these by the fixes of all receivers, whoever carries them. Sure pieces then
+//! [`PlacementSearch`] finds these by the fixes of all receivers, without knowing their carriers. Sure pieces then
 //! train a model in the normal way, which matches again, until both stay. A world is accepted only on
 //! evidence that identities which are certainly wrong cannot have.
 

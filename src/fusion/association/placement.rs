@@ -10,7 +10,7 @@
 
 use nalgebra::{Complex, DMatrix};
 
-use super::evidence::{EvidenceModel, free_log_likelihood};
+use super::evidence::{EvidenceModel, MAP_TIME_CONSTANT_S, free_log_likelihood};
 use super::tracklet::{TimedFix, Tracklet};
 
 type C = Complex<f64>;
@@ -21,8 +21,6 @@ const MAX_FIXES: usize = 40;
 const MIN_FIXES: usize = 3;
 /// Largest gap between two points of a tracklet to interpolate over, s.
 const MAX_GAP_S: f64 = 2.5;
-/// Correlation time of the map's error along a walk, s.
-const MAP_TIME_CONSTANT_S: f64 = 20.0;
 /// Probability that the carrier of a receiver is among the boxes.
 const SEEN_PROBABILITY: f64 = 0.8;
 /// Largest factor between the ground by usual heights and the true one.

@@ -15,6 +15,11 @@ use crate::domain::{CameraId, Role, SampleOverflow, Scope};
 pub struct Config {
     /// Folder of the database, created at the first start.
     pub data: PathBuf,
+    /// URL of a PostgreSQL database that takes the place of the folder, such as
+    /// `postgres://user:password@host/sightfix?sslmode=verify-full`; none by default.
+    pub database: Option<Secret>,
+    /// What this process does of the work that all processes with one database share.
+    pub role: NodeRole,
     /// Address of the one port for REST and gRPC.
     pub listen: SocketAddr,
     /// Address of a second port, for probes and metrics alone, without keys and without TLS; none if left out.
@@ -111,6 +116,12 @@ impl Secret {
     }
 }
 
+impl From<String> for Secret {
+    fn from(text: String) -> Self {
+        Self(text)
+    }
+}
+
 const HIDDEN: &str = "(hidden)";
 
 impl std::fmt::Debug for Secret {
@@ -122,6 +133,32 @@ impl std::fmt::Debug for Secret {
 impl Serialize for Secret {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(HIDDEN)
+    }
+}
+
+/// What a process does of the work that all processes with one database share.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum NodeRole {
+    /// Answers clients, and works on training runs and evaluations.
+    Both,
+    /// Answers clients; jobs are left to others.
+    Serve,
+    /// Works on training runs and evaluations; its port has probes and metrics alone.
+    Train,
+}
+
+impl NodeRole {
+    /// Whether it works on training runs and evaluations.
+    #[must_use]
+    pub const fn works_on_jobs(self) -> bool {
+        matches!(self, Self::Both | Self::Train)
+    }
+
+    /// Whether it answers clients.
+    #[must_use]
+    pub const fn answers_clients(self) -> bool {
+        matches!(self, Self::Both | Self::Serve)
     }
 }
 
@@ -327,6 +364,8 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             data: PathBuf::from("data"),
+            database: None,
+            role: NodeRole::Both,
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             metrics_listen: None,
             allowed_hosts: Vec::new(),
@@ -459,6 +498,8 @@ impl Limits {
 pub struct Overrides {
     /// `--data`
     pub data: Option<PathBuf>,
+    /// `--database`
+    pub database: Option<Secret>,
     /// `--listen`
     pub listen: Option<SocketAddr>,
     /// `--insecure`
@@ -503,6 +544,10 @@ impl Config {
             .context("cannot read the settings")?;
         if let Some(data) = overrides.data {
             loaded.data = data;
+            loaded.database = None;
+        }
+        if overrides.database.is_some() {
+            loaded.database = overrides.database;
         }
         if let Some(listen) = overrides.listen {
             loaded.listen = listen;
@@ -538,6 +583,10 @@ impl Config {
         anyhow::ensure!(
             self.admin_key.is_none() || self.admin_key_file.is_none(),
             "give admin_key or admin_key_file, not both"
+        );
+        anyhow::ensure!(
+            self.role == NodeRole::Both || self.database.is_some(),
+            "role = \"serve\" and role = \"train\" need the setting database: a data folder has one server"
         );
         self.tls.certificate_and_key()?;
         self.tls.client_scope()?;

@@ -68,7 +68,10 @@ impl Check {
 
 /// Makes all checks of a server with these settings. Reads the whole database, which takes seconds per gigabyte.
 pub async fn examine(config: &Config, clock: &Clock) -> Vec<Check> {
-    let mut checks = vec![folder::writable(config), folder::space(config), folder::lock(config)];
+    let mut checks = match config.database {
+        None => vec![folder::writable(config), folder::space(config), folder::lock(config)],
+        Some(_) => Vec::new(),
+    };
     let (of_database, report) = database::check(config, clock).await;
     checks.extend(of_database);
     checks.push(system::clock(clock, report.as_ref()).await);

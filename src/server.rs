@@ -27,7 +27,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tokio::net::TcpListener;
 
-use crate::app::{App, store_limits};
+use crate::app::{App, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
 use crate::domain::{Error, KeySecret};
@@ -92,9 +92,9 @@ impl Server {
             role: "server".to_owned(),
             sharing: Sharing::OneServer,
         };
-        let store = Store::open_with(&config.data, options)
-            .await
-            .with_context(|| format!("cannot open the data folder {}", config.data.display()))?;
+        let location = store_location(&config)?;
+        let store =
+            Store::open_at(&location, options).await.with_context(|| format!("cannot open {location}"))?;
         store.log_newcomers();
         let app = App::new(store, clock, randomness, config.limits.clone(), Metrics::new()).await?;
         let tls = Tls::load(&config.tls)?;
@@ -158,13 +158,18 @@ impl Server {
     pub async fn run(self) -> anyhow::Result<()> {
         let reloader = self.reloader();
         let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
-        shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
-        shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
+        if config.role.works_on_jobs() {
+            shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
+            shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
+        }
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
         let cors = cors::layer(&config.cors_origins);
-        let pipeline = RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, &shutdown);
-        let pipeline = Arc::new(pipeline);
+        let pipeline = Arc::new(if config.role.answers_clients() {
+            RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, &shutdown)
+        } else {
+            RequestPipeline::monitoring(app.clone(), hosts, &shutdown)
+        });
         let monitored = async {
             let Some(listener) = monitoring else { return anyhow::Ok(()) };
             let hosts = HostCheck::new(&config.allowed_hosts, &[], listener.local_addr()?);

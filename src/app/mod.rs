@@ -33,8 +33,8 @@ use tokio_util::task::TaskTracker;
 use self::access::{Access, Caller};
 use crate::admission::Quotas;
 use crate::clock::{Clock, Randomness};
-use crate::config::Limits;
-use crate::store::{Store, StoreLimits};
+use crate::config::{Config, Limits, Secret};
+use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
@@ -230,6 +230,14 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
         },
         reserve_bytes: limits.reserve_bytes,
     }
+}
+
+/// Where the settings say that the store is: in a database if they name one, else in the data folder.
+///
+/// # Errors
+/// The setting `database` is no URL of a PostgreSQL database.
+pub fn store_location(config: &Config) -> Result<Location> {
+    Location::new(&config.data, config.database.as_ref().map(Secret::reveal))
 }
 
 /// One page of a list, and the cursor behind which the next begins.

@@ -23,7 +23,7 @@ pub(super) struct Backup {
 
 impl Backup {
     pub(super) fn run(self, settings_file: Option<&Path>) -> anyhow::Result<()> {
-        let settings = self.folder.settings(settings_file)?;
+        let settings = self.folder.folder_settings(settings_file, "backup")?;
         let existing = if self.replace { ExistingFile::Replace } else { ExistingFile::Keep };
         let report = runtime()?.block_on(back_up(&settings.data, &self.file, existing))?;
         print_line(&format_args!("backup {}: {}", self.file.display(), contents(&report)))

@@ -26,7 +26,7 @@ pub(super) struct Doctor {
 
 impl Doctor {
     pub(super) fn run(self, settings_file: Option<&Path>) -> anyhow::Result<()> {
-        let overrides = Overrides { data: self.folder.data, listen: self.listen, ..Overrides::default() };
+        let overrides = Overrides { listen: self.listen, ..self.folder.overrides() };
         let settings = Config::load(settings_file, overrides)?;
         let checks = runtime()?.block_on(examine(&settings, &Clock::system()));
         if self.json {

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use crate::domain::Error;
 use crate::store::{FolderFault, FolderFaultKind};
 
-/// The data folder is in use; trying again later may help. Invalid flags are 2.
+/// The data folder is in use, or the server of the database does not answer; trying again later may help. Invalid flags are 2.
 const IN_USE: u8 = 3;
 /// The data folder cannot be used until somebody does something about it.
 const UNUSABLE: u8 = 4;
@@ -19,7 +19,7 @@ pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     });
     match fault.map(|fault| fault.kind) {
         None => ExitCode::FAILURE,
-        Some(FolderFaultKind::InUse) => ExitCode::from(IN_USE),
+        Some(FolderFaultKind::InUse | FolderFaultKind::Unreachable) => ExitCode::from(IN_USE),
         Some(_) => ExitCode::from(UNUSABLE),
     }
 }

@@ -5,6 +5,7 @@
 
 mod backup;
 mod config;
+mod copy;
 mod doctor;
 mod evaluate;
 mod evaluate_site;
@@ -35,12 +36,12 @@ use anyhow::Context as _;
 use clap::{Args, Parser, Subcommand};
 
 use crate::app::access::Caller;
-use crate::app::{App, store_limits};
+use crate::app::{App, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
-use crate::config::{Config, Overrides};
+use crate::config::{Config, Overrides, Secret};
 use crate::domain::{CameraId, ReceiverId, SiteId, TargetId};
 use crate::exchange::Format;
-use crate::store::{Sharing, Store, StoreOptions};
+use crate::store::{Location, Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
 
 pub use exit_code::exit_code;
@@ -82,6 +83,8 @@ enum Command {
     Backup(backup::Backup),
     /// Put a backup in the place of the database
     Restore(restore::Restore),
+    /// Copy everything from a data folder or database into another one, and compare
+    Copy(copy::Copy),
     /// Check folder, database, models, clock, port and system, and say what to do
     Doctor(doctor::Doctor),
     /// Check whether a server is alive
@@ -118,6 +121,7 @@ impl Cli {
             Command::Keys(command) => command.run(file),
             Command::Backup(command) => command.run(file),
             Command::Restore(command) => command.run(file),
+            Command::Copy(command) => command.run(),
             Command::Doctor(command) => command.run(file),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
@@ -126,17 +130,37 @@ impl Cli {
     }
 }
 
-/// The data folder of a command.
+/// The data folder of a command, or the database in its place.
 #[derive(Args)]
 struct DataFolder {
     /// Folder of the database
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", conflicts_with = "database")]
     data: Option<PathBuf>,
+    /// PostgreSQL database in place of the folder: postgres://user@host/name. Others on this machine see it; set
+    /// SIGHTFIX_DATABASE if it has a password
+    #[arg(long, value_name = "URL")]
+    database: Option<String>,
 }
 
 impl DataFolder {
     fn settings(&self, file: Option<&Path>) -> anyhow::Result<Config> {
-        Config::load(file, Overrides { data: self.data.clone(), ..Overrides::default() })
+        Config::load(file, self.overrides())
+    }
+
+    fn overrides(&self) -> Overrides {
+        let database = self.database.clone().map(Secret::from);
+        Overrides { data: self.data.clone(), database, ..Overrides::default() }
+    }
+
+    /// The settings of a command that works on the files of a data folder.
+    fn folder_settings(&self, file: Option<&Path>, command: &str) -> anyhow::Result<Config> {
+        let settings = self.settings(file)?;
+        anyhow::ensure!(
+            settings.database.is_none(),
+            "sightfix {command} is for data folders, and the setting database names a PostgreSQL database: use the \
+             database's own tools (pg_dump and pg_restore, or base backups with archived WAL)"
+        );
+        Ok(settings)
     }
 }
 
@@ -148,22 +172,24 @@ enum MissingData {
     Refuse,
 }
 
-/// The application on the data folder, without a server. A server may use the same folder; each logs the
+/// The application on the store, without a server. A server may use the same data folder; each logs the
 /// other, this process by its `role`.
 async fn open_app(settings: &Config, role: &str, missing: MissingData) -> anyhow::Result<App> {
-    let folder = settings.data.display();
-    anyhow::ensure!(
-        missing == MissingData::Create || settings.data.is_dir(),
-        "there is no data folder {folder}; `sightfix serve` and `sightfix import --create` make one"
-    );
+    let location = store_location(settings)?;
+    if let (Location::Folder(folder), MissingData::Refuse) = (&location, missing) {
+        anyhow::ensure!(
+            folder.is_dir(),
+            "there is no data folder {}; `sightfix serve` and `sightfix import --create` make one",
+            folder.display()
+        );
+    }
     let options = StoreOptions {
         limits: store_limits(&settings.limits),
         role: role.to_owned(),
         sharing: Sharing::Command,
     };
-    let store = Store::open_with(&settings.data, options)
-        .await
-        .with_context(|| format!("cannot open the data folder {folder}"))?;
+    let store =
+        Store::open_at(&location, options).await.with_context(|| format!("cannot open {location}"))?;
     for other in store.newcomers() {
         output::print_note(format_args!("note: another process uses the same data folder: {other}"));
     }

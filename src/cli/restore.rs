@@ -22,7 +22,7 @@ pub(super) struct Restore {
 
 impl Restore {
     pub(super) fn run(self, settings_file: Option<&Path>) -> anyhow::Result<()> {
-        let settings = self.folder.settings(settings_file)?;
+        let settings = self.folder.folder_settings(settings_file, "restore")?;
         let now = Clock::system().now();
         let restored = runtime()?.block_on(restore(&settings.data, &self.file, now))?;
         print_line(&format_args!("restored {}: {}", self.file.display(), contents(&restored.report)))?;

@@ -9,6 +9,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::{DataFolder, runtime};
+use crate::app::store_location;
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
 use crate::server::{Reloader, Server};
@@ -46,13 +47,13 @@ pub(super) struct Serve {
 impl Serve {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let overrides = Overrides {
-            data: self.folder.data,
             listen: self.listen,
             insecure: self.insecure,
             admin_key_file: self.admin_key_file,
             tls_certificate: self.tls_cert,
             tls_key: self.tls_key,
             tls_client_ca: self.tls_client_ca,
+            ..self.folder.overrides()
         };
         let settings = Config::load(file, overrides.clone())?;
         let source = SettingsSource { file: file.map(Path::to_owned), overrides };
@@ -65,7 +66,7 @@ impl Serve {
             #[cfg(unix)]
             reload_on_hangup(source, log.clone(), server.reloader());
             tracing::info!(
-                %address, folder = %settings.data.display(), tls = server.has_tls(), "serving REST and gRPC"
+                %address, store = %store_location(&settings)?, tls = server.has_tls(), "serving REST and gRPC"
             );
             if let Some(monitoring) = server.monitoring_address() {
                 tracing::info!(%monitoring, "serving probes and metrics, without keys");

@@ -1,7 +1,7 @@
 //! The database and the models in it.
 
 use super::{Check, in_units};
-use crate::app::{App, store_limits};
+use crate::app::{App, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
 use crate::domain::Result;
@@ -12,6 +12,9 @@ const DATABASE: &str = "database";
 const MODELS: &str = "models";
 
 pub(super) async fn check(config: &Config, clock: &Clock) -> (Vec<Check>, Option<DatabaseReport>) {
+    if config.database.is_some() {
+        return (vec![server(config, clock).await], None);
+    }
     if !store::has_database(&config.data) {
         let check = Check::warning(DATABASE, "there is none yet", "`sightfix serve` makes it; check --data");
         return (vec![check], None);
@@ -29,6 +32,23 @@ pub(super) async fn check(config: &Config, clock: &Clock) -> (Vec<Check>, Option
         checks.push(models(config, clock, &report).await);
     }
     (checks, Some(report))
+}
+
+/// The database of a server: reachable, its schema up to date, every active model usable.
+async fn server(config: &Config, clock: &Clock) -> Check {
+    match faults(config, clock).await {
+        Err(error) => {
+            let remedy = "check the URL (SIGHTFIX_DATABASE), the network and the database's log";
+            Check::failed(DATABASE, error.to_string(), remedy)
+        }
+        Ok(faults) => match faults.first() {
+            None => Check::ok(DATABASE, "reachable, schema up to date; active models answer"),
+            Some(fault) => {
+                let finding = format!("{} models cannot be used, the first: {fault}", faults.len());
+                Check::failed(DATABASE, finding, "activate another version, import the file again, or train")
+            }
+        },
+    }
 }
 
 fn file(report: &DatabaseReport) -> Check {
@@ -85,7 +105,7 @@ async fn faults(config: &Config, clock: &Clock) -> Result<Vec<String>> {
         role: "sightfix doctor".to_owned(),
         sharing: Sharing::Command,
     };
-    let store = Store::open_with(&config.data, options).await?;
+    let store = Store::open_at(&store_location(config)?, options).await?;
     let app =
         App::new(store, clock.clone(), Randomness::system(), config.limits.clone(), Metrics::new()).await?;
     let faults = app.registry.model_faults();

@@ -2,11 +2,13 @@
 
 use crate::domain::Error;
 
-/// What is wrong with a data folder.
+/// What is wrong with a data folder, or with the database in its place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FolderFaultKind {
     /// Another process holds it; it may be tried again later.
     InUse,
+    /// The server of the database does not answer; it may be tried again later.
+    Unreachable,
     /// There is no database, or no folder.
     Missing,
     /// The folder or the database cannot be written.

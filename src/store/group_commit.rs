@@ -9,21 +9,15 @@ use std::collections::HashMap;
 use std::fmt;
 use std::sync::Arc;
 
+use futures_util::future::BoxFuture;
 use jiff::Timestamp;
-use sqlx::SqliteConnection;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
-use super::audit::{Change, record};
-use super::errors::{closed, copy_of, failed, no_camera};
-use super::idempotency::{IdempotencyRecord, insert_answer};
-use super::sample_retention::delete_oldest;
-use super::sample_table::{Insert, Row, SampleTable, delete_replaced, delete_stored, keep_last, statements};
-use super::space::Space;
-use super::writer::{Growth, Writer, WriterGuard};
-use crate::domain::{
-    Actor, AuditAction, CameraId, CameraKey, Durability, Error, OnConflict, Result, SampleOverflow,
-    StoredSample,
-};
+use super::limits::Usage;
+use super::refusals::{closed, copy_of, no_camera};
+use super::rows::idempotency::IdempotencyRecord;
+use super::rows::samples::{Row, SampleTable, keep_last};
+use crate::domain::{Actor, CameraId, CameraKey, Durability, Error, OnConflict, Result, StoredSample};
 
 /// A transaction takes no further caller beyond so many rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
@@ -94,25 +88,25 @@ enum WriteRequest {
     End(oneshot::Sender<()>),
 }
 
-struct SampleBatch {
-    camera: CameraId,
+pub(super) struct SampleBatch {
+    pub(super) camera: CameraId,
     /// The camera must still be this one; `None` for whichever has the id.
-    key: Option<CameraKey>,
-    samples: Vec<StoredSample>,
-    options: InsertOptions,
+    pub(super) key: Option<CameraKey>,
+    pub(super) samples: Vec<StoredSample>,
+    pub(super) options: InsertOptions,
     /// Samples that were left out because a later one of the batch takes their place.
-    repeated: u64,
+    pub(super) repeated: u64,
     /// On whose behalf.
-    actor: Arc<Actor>,
+    pub(super) actor: Arc<Actor>,
     reply: oneshot::Sender<Result<Inserted>>,
     /// Limits the rows in flight; released when the batch is done.
     _permit: OwnedSemaphorePermit,
 }
 
 impl GroupCommit {
-    pub(super) fn start(writer: Arc<Writer>, space: Arc<Space>) -> Self {
+    pub(super) fn start(writer: Arc<dyn SampleWriter>) -> Self {
         let (queue, requests) = mpsc::channel(QUEUE);
-        tokio::spawn(run(writer, space, requests));
+        tokio::spawn(run(writer, requests));
         Self { queue, rows: Arc::new(Semaphore::new(ROWS_IN_FLIGHT as usize)) }
     }
 
@@ -165,16 +159,31 @@ impl GroupCommit {
     }
 }
 
-async fn run(writer: Arc<Writer>, space: Arc<Space>, mut requests: mpsc::Receiver<WriteRequest>) {
+/// The right of a backend to write, for one group.
+pub(super) trait WriteSession: Send {
+    /// One transaction for all batches, with an outcome for each, in their order.
+    fn commit<'a>(&'a mut self, durability: Durability, group: &'a [SampleBatch]) -> Committing<'a>;
+}
+
+/// The outcomes of a group.
+pub(super) type Committing<'a> = BoxFuture<'a, Result<Vec<Result<Inserted>>, Failure>>;
+
+/// What stores the groups of a backend.
+pub(super) trait SampleWriter: Send + Sync {
+    /// Waits for the right to write.
+    fn session(&self) -> BoxFuture<'_, Result<Box<dyn WriteSession + '_>>>;
+}
+
+async fn run(writer: Arc<dyn SampleWriter>, mut requests: mpsc::Receiver<WriteRequest>) {
     while let Some(first) = requests.recv().await {
         // The writer first: batches that are queued while it is locked for another change join the group.
-        let guard = writer.lock(Durability::default(), Growth::Limited).await;
+        let session = writer.session().await;
         let (group, end) = gather(first, &mut requests);
-        match guard {
-            Ok(mut guard) => {
-                guard.set_durability(durability_of(&group));
+        match session {
+            Ok(mut session) => {
+                let durability = durability_of(&group);
                 for group in transactions(group) {
-                    answer_all(&mut guard, &space, group).await;
+                    answer_all(&mut *session, durability, group).await;
                 }
             }
             Err(error) => refuse_all(group, &error),
@@ -206,7 +215,7 @@ fn transactions(group: Vec<SampleBatch>) -> Vec<Vec<SampleBatch>> {
 }
 
 impl SampleBatch {
-    fn replaces(&self) -> bool {
+    pub(super) fn replaces(&self) -> bool {
         self.options.on_conflict == OnConflict::Replace
     }
 }
@@ -234,8 +243,8 @@ fn gather(
 
 /// Commits a group and answers each of its callers. If it cannot be stored together, each is tried
 /// alone, so that one bad row fails nobody but its caller.
-async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<SampleBatch>) {
-    match commit(guard, space, &group).await {
+async fn answer_all(session: &mut dyn WriteSession, durability: Durability, group: Vec<SampleBatch>) {
+    match session.commit(durability, &group).await {
         Ok(outcomes) => {
             for (batch, outcome) in group.into_iter().zip(outcomes) {
                 // A cancelled caller needs no answer.
@@ -244,7 +253,7 @@ async fn answer_all(guard: &mut WriterGuard<'_>, space: &Space, group: Vec<Sampl
         }
         Err(Failure::Statement(_)) if group.len() > 1 => {
             for batch in group {
-                let alone = commit(guard, space, std::slice::from_ref(&batch)).await;
+                let alone = session.commit(durability, std::slice::from_ref(&batch)).await;
                 let outcome = match alone {
                     Ok(mut outcomes) => outcomes.swap_remove(0),
                     Err(Failure::Statement(error) | Failure::Transaction(error)) => Err(error),
@@ -262,143 +271,29 @@ fn refuse_all(group: Vec<SampleBatch>, error: &Error) {
     }
 }
 
-enum Failure {
+pub(super) enum Failure {
     /// A statement failed; the group's other callers may do better.
     Statement(Error),
     /// The transaction could not begin or commit; nobody would do better.
     Transaction(Error),
 }
 
-/// One transaction for all batches, with an outcome for each, in their order.
-async fn commit(
-    guard: &mut WriterGuard<'_>,
-    space: &Space,
-    group: &[SampleBatch],
-) -> Result<Vec<Result<Inserted>>, Failure> {
-    let committed = try_commit(guard, space, group).await;
-    match &committed {
-        Ok(outcomes) => space
-            .stored(outcomes.iter().flatten().map(|inserted| inserted.accepted - inserted.replaced).sum()),
-        Err(Failure::Statement(error) | Failure::Transaction(error)) => space.failed(error),
-    }
-    committed
-}
-
-async fn try_commit(
-    guard: &mut WriterGuard<'_>,
-    space: &Space,
-    group: &[SampleBatch],
-) -> Result<Vec<Result<Inserted>>, Failure> {
-    for counting in [Counting::Together, Counting::Apart] {
-        let mut transaction = guard.begin().await.map_err(Failure::Transaction)?;
-        let outcomes = store(&mut transaction, space, group, counting).await.map_err(Failure::Statement)?;
-        if let Some(outcomes) = outcomes {
-            if group.iter().zip(&outcomes).any(|(batch, outcome)| batch.replaces() && outcome.is_err()) {
-                // What was to be replaced stays.
-                return Ok(outcomes);
-            }
-            transaction.commit().await.map_err(|error| Failure::Transaction(failed(error)))?;
-            return Ok(outcomes);
-        }
-        transaction.rollback().await.map_err(|error| Failure::Transaction(failed(error)))?;
-    }
-    Err(Failure::Statement(Error::fault("stored samples could not be counted")))
-}
-
 /// How statements and batches go together.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Counting {
+pub(super) enum Counting {
     /// Statements span batches: fast, and countable as long as all rows of each are new, or none.
     Together,
     /// No statement spans batches.
     Apart,
 }
 
-/// `None` if a statement over several batches met duplicates, so that they cannot be attributed.
-async fn store(
-    connection: &mut SqliteConnection,
-    space: &Space,
-    group: &[SampleBatch],
-    counting: Counting,
-) -> Result<Option<Vec<Result<Inserted>>>> {
-    let mut cameras = cameras_of(connection, group).await?;
-    let replaced = match group {
-        [batch] if batch.replaces() => replace(connection, batch, &mut cameras, space).await?,
-        _ => 0,
-    };
-    let admitted = admit(&mut cameras, space, group);
-    let mut outcomes: Vec<Result<Inserted>> = admitted
-        .iter()
-        .zip(group)
-        .map(|(camera, batch)| {
-            let begun = Inserted { replaced, duplicate: batch.repeated, ..Inserted::default() };
-            camera.as_ref().map(|_| begun).map_err(copy_of)
-        })
-        .collect();
-    // Those with a fix first: of two rows of one key, the one with a fix is stored.
-    for table in [SampleTable::WithFix, SampleTable::WithoutFix] {
-        let (rows, borders) = rows_of(table, group, &admitted, counting);
-        if !insert(connection, table, (&rows, &borders), &mut outcomes).await? {
-            return Ok(None);
-        }
-        if table == SampleTable::WithFix {
-            let has_boxes = |key| cameras.values().any(|camera| camera.key == key && camera.without_fix > 0);
-            let replaced = delete_replaced(connection, &rows, has_boxes).await?;
-            for camera in cameras.values_mut() {
-                camera.replaced = replaced.get(&camera.key).copied().unwrap_or_default();
-            }
-        }
-    }
-    count_stored(connection, &cameras, group, &outcomes).await?;
-    if space.limits.sample_overflow == SampleOverflow::DeleteOldest {
-        for camera in cameras.values() {
-            delete_oldest(connection, camera.key, space.limits.samples_per_camera).await?;
-        }
-    }
-    complete(connection, space, group, &outcomes).await?;
-    Ok(Some(outcomes))
-}
-
-/// Deletes the stored samples whose place those of a batch take; returns how many.
-async fn replace(
-    connection: &mut SqliteConnection,
-    batch: &SampleBatch,
-    cameras: &mut HashMap<String, Known>,
-    space: &Space,
-) -> Result<u64> {
-    let Some(camera) = cameras.get_mut(batch.camera.as_str()) else { return Ok(0) };
-    let with_fix = delete_stored(connection, SampleTable::WithFix, camera.key, &batch.samples).await?;
-    let without_fix = delete_stored(connection, SampleTable::WithoutFix, camera.key, &batch.samples).await?;
-    let replaced = with_fix + without_fix;
-    camera.samples = camera.samples.saturating_sub(replaced);
-    camera.without_fix = camera.without_fix.saturating_sub(without_fix);
-    if replaced > 0 {
-        let subject = Some(format!("{replaced} samples"));
-        let change = Change::of_camera(AuditAction::SamplesReplaced, &batch.camera, subject);
-        record(connection, (&batch.actor, &space.limits), change, batch.options.now).await?;
-    }
-    Ok(replaced)
-}
-
-/// Stores the answers of the imports that end with a batch of the group.
-async fn complete(
-    connection: &mut SqliteConnection,
-    space: &Space,
-    group: &[SampleBatch],
-    outcomes: &[Result<Inserted>],
-) -> Result<()> {
-    for (batch, outcome) in group.iter().zip(outcomes) {
-        if let (Some(Completion { record, answer }), Ok(inserted)) = (&batch.options.completion, outcome) {
-            let (actor, now) = (&*batch.actor, batch.options.now);
-            insert_answer(connection, &space.limits, (actor, record), &answer(inserted), now).await?;
-        }
-    }
-    Ok(())
-}
-
 /// The key of each batch's camera, or why the batch is not stored.
-fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[SampleBatch]) -> Vec<Result<i64>> {
-    let mut quota = space.quota();
+pub(super) fn admit(
+    cameras: &mut HashMap<String, Known>,
+    usage: &Usage,
+    group: &[SampleBatch],
+) -> Vec<Result<i64>> {
+    let mut quota = usage.quota();
     let admitted = group.iter().map(|batch| {
         let camera = cameras
             .get_mut(batch.camera.as_str())
@@ -411,7 +306,7 @@ fn admit(cameras: &mut HashMap<String, Known>, space: &Space, group: &[SampleBat
 }
 
 /// The rows of admitted batches that a table takes, and where statements must end.
-fn rows_of<'a>(
+pub(super) fn rows_of<'a>(
     table: SampleTable,
     group: &'a [SampleBatch],
     admitted: &[Result<i64>],
@@ -431,31 +326,8 @@ fn rows_of<'a>(
     (rows, borders)
 }
 
-/// Inserts rows into a table and counts them; false if duplicates cannot be attributed to their batches.
-async fn insert(
-    connection: &mut SqliteConnection,
-    table: SampleTable,
-    (rows, borders): (&[Row<'_>], &[usize]),
-    outcomes: &mut [Result<Inserted>],
-) -> Result<bool> {
-    let statements = statements(borders);
-    let mut next = statements.first().map(|range| Insert::of(table, &rows[range.clone()])).transpose()?;
-    for (index, range) in statements.iter().enumerate() {
-        let Some(insert) = next.take() else { break };
-        // The next statement's values are bound while the database executes this one.
-        let following =
-            async { statements.get(index + 1).map(|range| Insert::of(table, &rows[range.clone()])) };
-        let (accepted, following) = tokio::join!(insert.execute(connection), following);
-        if !count(outcomes, &rows[range.clone()], accepted?) {
-            return Ok(false);
-        }
-        next = following.transpose()?;
-    }
-    Ok(true)
-}
-
 /// Adds a statement's count to its batches; false if its duplicates cannot be attributed to one.
-fn count(outcomes: &mut [Result<Inserted>], rows: &[Row<'_>], accepted: u64) -> bool {
+pub(super) fn count(outcomes: &mut [Result<Inserted>], rows: &[Row<'_>], accepted: u64) -> bool {
     let all = rows.len() as u64;
     if accepted == all || accepted == 0 {
         for row in rows {
@@ -481,53 +353,27 @@ fn add(outcomes: &mut [Result<Inserted>], row: &Row<'_>, accepted: u64, duplicat
 }
 
 /// A camera of a group.
-struct Known {
-    key: i64,
+pub(super) struct Known {
+    pub(super) key: i64,
     /// Samples stored, and those of the group that are admitted.
-    samples: u64,
+    pub(super) samples: u64,
     /// Samples without a fix that are stored.
-    without_fix: u64,
+    pub(super) without_fix: u64,
     /// Of these, those whose place samples of the group have taken.
-    replaced: u64,
+    pub(super) replaced: u64,
 }
 
-/// The cameras of a group by their ids, read in its own transaction, so that none can vanish before
-/// the commit. One statement for all, since a round trip costs as much as several rows.
-async fn cameras_of(
-    connection: &mut SqliteConnection,
-    group: &[SampleBatch],
-) -> Result<HashMap<String, Known>> {
-    let mut ids: Vec<&str> = group.iter().map(|batch| batch.camera.as_str()).collect();
-    ids.sort_unstable();
-    ids.dedup();
-    let ids = serde_json::to_string(&ids).map_err(Error::fault)?;
-    let cameras: Vec<(String, i64, i64, i64)> = sqlx::query_as(
-        "SELECT id, key, coalesce(samples, 0), coalesce(without_fix, 0) \
-         FROM cameras LEFT JOIN sample_counts ON camera_key = key WHERE id IN (SELECT value FROM json_each(?))",
-    )
-    .bind(ids)
-    .fetch_all(connection)
-    .await
-    .map_err(failed)?;
-    let known = |(id, key, with_fix, without_fix)| {
-        let (with_fix, without_fix) = (as_count(with_fix), as_count(without_fix));
-        (id, Known { key, samples: with_fix + without_fix, without_fix, replaced: 0 })
-    };
-    Ok(cameras.into_iter().map(known).collect())
-}
-
-fn as_count(stored: i64) -> u64 {
+pub(super) fn as_count(stored: i64) -> u64 {
     u64::try_from(stored).unwrap_or_default()
 }
 
-/// Adds what a group has stored to the counts of its cameras, in one statement.
-async fn count_stored(
-    connection: &mut SqliteConnection,
+/// What a group has added to each camera, by its key: samples with a fix, samples without, and boxes whose place
+/// samples with a fix have taken.
+pub(super) fn changed_counts(
     cameras: &HashMap<String, Known>,
     group: &[SampleBatch],
     outcomes: &[Result<Inserted>],
-) -> Result<()> {
-    // Per camera: added with a fix, added without, replaced.
+) -> HashMap<i64, [u64; 3]> {
     let mut changes: HashMap<i64, [u64; 3]> = HashMap::new();
     for (batch, outcome) in group.iter().zip(outcomes) {
         if let (Ok(inserted), Some(camera)) = (outcome, cameras.get(batch.camera.as_str()))
@@ -539,19 +385,33 @@ async fn count_stored(
             *replaced = camera.replaced;
         }
     }
-    if changes.is_empty() {
-        return Ok(());
+    changes
+}
+
+/// The outcomes of a group before any of its rows is stored: of those that were not admitted, why.
+pub(super) fn outcomes_before(
+    admitted: &[Result<i64>],
+    group: &[SampleBatch],
+    replaced: u64,
+) -> Vec<Result<Inserted>> {
+    let begin = |(camera, batch): (&Result<i64>, &SampleBatch)| {
+        let begun = Inserted { replaced, duplicate: batch.repeated, ..Inserted::default() };
+        camera.as_ref().map(|_| begun).map_err(copy_of)
+    };
+    admitted.iter().zip(group).map(begin).collect()
+}
+
+/// Whether a group must be rolled back although its statements worked: what was to be replaced stays where the
+/// batch was refused.
+pub(super) fn must_roll_back(group: &[SampleBatch], outcomes: &[Result<Inserted>]) -> bool {
+    group.iter().zip(outcomes).any(|(batch, outcome)| batch.replaces() && outcome.is_err())
+}
+
+/// Notes in the usage what became of a group.
+pub(super) fn note(usage: &Usage, committed: &Result<Vec<Result<Inserted>>, Failure>) {
+    match committed {
+        Ok(outcomes) => usage
+            .stored(outcomes.iter().flatten().map(|inserted| inserted.accepted - inserted.replaced).sum()),
+        Err(Failure::Statement(error) | Failure::Transaction(error)) => usage.failed(error),
     }
-    // WHERE true: without it the grammar takes ON CONFLICT for the condition of a join.
-    sqlx::query(
-        "INSERT INTO sample_counts (camera_key, samples, without_fix) \
-         SELECT CAST(key AS INTEGER), value ->> 0, (value ->> 1) - (value ->> 2) FROM json_each(?) WHERE true \
-         ON CONFLICT (camera_key) DO UPDATE SET samples = samples + excluded.samples, \
-         without_fix = max(without_fix + excluded.without_fix, 0)",
-    )
-    .bind(serde_json::to_string(&changes).map_err(Error::fault)?)
-    .execute(connection)
-    .await
-    .map_err(failed)?;
-    Ok(())
 }

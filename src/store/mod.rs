@@ -1,9 +1,9 @@
 //! Persistent storage behind one type, [`Store`]; the only module with SQL.
 //!
-//! A file `sightfix.db` (SQLite, write-ahead log) with one writer connection and a few readers.
-//! Samples of many callers share transactions (`group_commit`). A change is flushed to the disk before
-//! it is acknowledged ([`Durability::Synced`]), except for the progress of jobs and for samples whose
-//! sender asks for less.
+//! Two backends, written by hand: a file in a data folder (`sqlite`) and a database of a server (`postgres`). The
+//! methods of [`Store`] are listed once, in `contract`, with what they promise; the suite in `tests` holds both
+//! backends to it. What is in a row (`rows`), the rules of jobs (`jobs`), limits and the queue of samples that are
+//! committed in groups (`group_commit`) are the same for both.
 //!
 //! What never happens here: clocks are read, numbers are checked (they are valid by construction),
 //! a transaction is held across anything but statements, a type of the database library becomes public.
@@ -12,95 +12,56 @@
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
-mod audit;
-mod backup;
-mod camera_moves;
-mod cameras;
-mod connection;
-mod errors;
-mod evaluations;
-mod file_check;
-mod folder;
+mod contract;
+mod copy;
 mod folder_fault;
 mod group_commit;
-mod idempotency;
 mod jobs;
-mod keys;
-mod latest_runs;
-mod models;
-mod occupants;
-mod reserve;
-mod restore;
-mod retention;
+mod limits;
+mod location;
+mod postgres;
+mod refusals;
 mod row_decoder;
-mod runs;
-mod sample_retention;
-mod sample_table;
-mod samples;
-mod server_lock;
-mod sites;
-mod space;
+mod rows;
+mod sqlite;
 #[cfg(test)]
 mod tests;
-mod training;
-mod writer;
 
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
-use sqlx::SqlitePool;
-use sqlx::sqlite::SqlitePoolOptions;
+use crate::domain::{Actor, CameraId, CameraKey, Durability, Result, StoredSample};
 
-use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
-
-pub use backup::{ExistingFile, back_up};
-pub use file_check::{DatabaseReport, has_database, inspect};
+pub use copy::CopiedTable;
 pub use folder_fault::{FolderFault, FolderFaultKind};
 pub use group_commit::{Completion, InsertOptions, Inserted};
-pub use idempotency::{IdempotencyRecord, StoredAnswer};
 pub use jobs::{Claim, Heartbeat, JobCounts, JobEnd, LiveJobs};
-pub use keys::KeysVersion;
-pub use models::{NewModel, StoredHeldOutError};
-pub use occupants::Occupant;
-pub use reserve::available_bytes as disk_available_bytes;
-pub use restore::{Restored, restore};
-pub use runs::{RunEnd, RunOutput};
-pub use samples::{SampleFilter, SampleKey};
-pub use server_lock::holder as server_of;
-pub use space::{StorageStatus, StoreLimits};
+pub use limits::{StorageStatus, StoreLimits};
+pub use location::{DatabaseUrl, Location};
+pub use rows::idempotency::{IdempotencyRecord, StoredAnswer};
+pub use rows::keys::KeysVersion;
+pub use rows::models::{NewModel, StoredHeldOutError};
+pub use rows::runs::{RunEnd, RunOutput};
+pub use rows::samples::{SampleFilter, SampleKey};
+pub use sqlite::{
+    DatabaseReport, ExistingFile, Occupant, Restored, back_up, disk_available_bytes, has_database, inspect,
+    restore, server_of,
+};
 
-use errors::failed;
-use group_commit::GroupCommit;
-use occupants::Presence;
-use reserve::Reserve;
-use server_lock::ServerLock;
-use space::Space;
-use writer::{Growth, Writer, WriterGuard};
-
-/// The storage of one data folder. Clones share one store; it lives until the last clone is dropped or it is closed.
+/// The storage of one data folder, or of one PostgreSQL database. Clones share one store; it lives until the last
+/// clone is dropped or it is closed.
 ///
-/// Every method may fail with a fault of the server (disk, file), with
-/// [`ErrorKind::Overloaded`] when another process holds the file for seconds, with
-/// [`ErrorKind::InsufficientStorage`] when there is no space for what it writes, and with
-/// [`ErrorKind::ShuttingDown`] after [`Store::close`].
+/// Every method may fail with a fault of the server (disk, file, connection), with
+/// [`ErrorKind::Overloaded`](crate::domain::ErrorKind) when another process holds the file for seconds or the
+/// database server does not answer, with `InsufficientStorage` when there is no space for what it writes, and with
+/// `ShuttingDown` after [`Store::close`].
 #[derive(Clone)]
-pub struct Store {
-    inner: Arc<Inner>,
-    /// On whose behalf changes are recorded in the audit log.
-    actor: Arc<Actor>,
-}
+pub struct Store(Backend);
 
-struct Inner {
-    writer: Arc<Writer>,
-    readers: SqlitePool,
-    /// One reader for [`Store::ping`] alone, which slow reads do not keep waiting.
-    probe: SqlitePool,
-    samples: GroupCommit,
-    space: Arc<Space>,
-    /// `None` where the process could not announce itself, and after closing.
-    presence: Mutex<Option<Presence>>,
-    /// Of a server, until it is closed.
-    server_lock: Mutex<Option<ServerLock>>,
+#[derive(Clone)]
+enum Backend {
+    Sqlite(sqlite::Store),
+    Postgres(postgres::Store),
 }
 
 /// How a store is opened.
@@ -129,6 +90,17 @@ impl Default for StoreOptions {
     }
 }
 
+/// The same call on whichever backend the store has.
+macro_rules! on_backend {
+    ($store:expr, $backend:ident => $call:expr) => {
+        match &$store.0 {
+            $crate::store::Backend::Sqlite($backend) => $call,
+            $crate::store::Backend::Postgres($backend) => $call,
+        }
+    };
+}
+use on_backend;
+
 impl Store {
     /// Opens the store of a folder without limits; see [`Store::open_with`].
     ///
@@ -145,74 +117,37 @@ impl Store {
     /// A [`FolderFault`] that says what is wrong with folder or file: in use by another server, not writable,
     /// not a database, damaged, or written by a newer version.
     pub async fn open_with(folder: &Path, options: StoreOptions) -> Result<Self> {
-        let StoreOptions { limits, role, sharing } = options;
-        let actor = Arc::new(Actor::program(&role));
-        let path = folder::prepare(folder).await?;
-        // Before the schema is touched: a server of another version may be using it.
-        let server_lock = match sharing {
-            Sharing::OneServer => Some(ServerLock::acquire(folder, &role)?),
-            Sharing::Command => None,
-        };
-        let (writer, readers) = connection::open(&path, Space::max_pages(&limits)).await?;
-        let writer = Arc::new(writer);
-        let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
-        let samples = GroupCommit::start(Arc::clone(&writer), Arc::clone(&space));
-        let presence = Presence::announce(folder, &role)
-            .inspect_err(
-                |error| tracing::warn!(%error, "others cannot see that this process uses the data folder"),
-            )
-            .ok();
-        let presence = Mutex::new(presence);
-        let probe = SqlitePoolOptions::new()
-            .max_connections(1)
-            .connect_lazy_with(readers.connect_options().as_ref().clone());
-        let server_lock = Mutex::new(server_lock);
-        let inner = Inner { writer, readers, probe, samples, space, presence, server_lock };
-        let store = Self { inner: Arc::new(inner), actor };
-        store.reserve_space().await;
-        store.count_all_samples().await?;
-        Ok(store)
+        Ok(Self(Backend::Sqlite(sqlite::Store::open_with(folder, options).await?)))
+    }
+
+    /// Opens the store of a folder ([`Store::open_with`]), or connects to a database and brings its schema up to
+    /// date. Any number of servers and commands may use one database.
+    ///
+    /// # Errors
+    /// A [`FolderFault`] that says what is wrong with the folder, the file or the database. No part of a URL's
+    /// secrets is in it.
+    pub async fn open_at(location: &Location, options: StoreOptions) -> Result<Self> {
+        match location {
+            Location::Folder(folder) => Self::open_with(folder, options).await,
+            Location::Database(url) => {
+                Ok(Self(Backend::Postgres(postgres::Store::connect(url, options).await?)))
+            }
+        }
     }
 
     /// The same store, whose changes are recorded as those of an actor.
     #[must_use]
     pub fn on_behalf_of(&self, actor: Arc<Actor>) -> Self {
-        Self { inner: Arc::clone(&self.inner), actor }
+        Self(match &self.0 {
+            Backend::Sqlite(store) => Backend::Sqlite(store.on_behalf_of(actor)),
+            Backend::Postgres(store) => Backend::Postgres(store.on_behalf_of(actor)),
+        })
     }
 
-    /// Commits what is queued, copies the log back into the file and closes it. Later calls
-    /// are refused with [`ErrorKind::ShuttingDown`]. Closing twice does nothing.
+    /// Commits what is queued and closes the file or the connections. Later calls are refused with
+    /// [`ErrorKind::ShuttingDown`](crate::domain::ErrorKind). Closing twice does nothing.
     pub async fn close(&self) {
-        self.inner.samples.close().await;
-        self.inner.readers.close().await;
-        self.inner.probe.close().await;
-        self.inner.writer.close().await;
-        self.presence().take();
-        self.inner.server_lock.lock().unwrap_or_else(PoisonError::into_inner).take();
-    }
-
-    /// Other processes that have begun to use the data folder since the last call; at the first, all
-    /// that use it.
-    pub fn newcomers(&self) -> Vec<Occupant> {
-        let newcomers = self.presence().as_mut().map(Presence::newcomers).transpose();
-        newcomers
-            .inspect_err(
-                |error| tracing::warn!(%error, "cannot tell which other processes use the data folder"),
-            )
-            .ok()
-            .flatten()
-            .unwrap_or_default()
-    }
-
-    /// Logs the processes of [`Store::newcomers`].
-    pub fn log_newcomers(&self) {
-        for Occupant { pid, host, role } in self.newcomers() {
-            tracing::warn!(pid, host, role, "another process uses the same data folder");
-        }
-    }
-
-    fn presence(&self) -> std::sync::MutexGuard<'_, Option<Presence>> {
-        self.inner.presence.lock().unwrap_or_else(PoisonError::into_inner)
+        on_backend!(self, store => store.close().await);
     }
 
     /// Whether the store answers.
@@ -220,31 +155,68 @@ impl Store {
     /// # Errors
     /// A fault if it does not.
     pub async fn ping(&self) -> Result<()> {
-        if self.inner.samples.has_ended() {
-            return Err(Error::refused(ErrorKind::ShuttingDown, "the store is closed"));
+        on_backend!(self, store => store.ping().await)
+    }
+
+    /// Other processes that have begun to use the data folder since the last call; at the first, all
+    /// that use it. None for a database, which any number of processes may use.
+    #[must_use]
+    pub fn newcomers(&self) -> Vec<Occupant> {
+        match &self.0 {
+            Backend::Sqlite(store) => store.newcomers(),
+            Backend::Postgres(_) => Vec::new(),
         }
-        sqlx::query_scalar::<_, i64>("SELECT count(*) FROM cameras WHERE key = 0")
-            .fetch_one(&self.inner.probe)
-            .await
-            .map_err(failed)?;
-        Ok(())
     }
 
-    fn readers(&self) -> &SqlitePool {
-        &self.inner.readers
+    /// Logs the processes of [`Store::newcomers`].
+    pub fn log_newcomers(&self) {
+        if let Backend::Sqlite(store) = &self.0 {
+            store.log_newcomers();
+        }
     }
 
-    fn limits(&self) -> &StoreLimits {
-        &self.inner.space.limits
+    /// Whether imports are refused for want of space, as far as is known without looking.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        on_backend!(self, store => store.is_full())
     }
 
-    /// The writer, for a change that must be on the disk before it is acknowledged.
-    async fn synced(&self) -> Result<WriterGuard<'_>> {
-        self.inner.writer.lock(Durability::Synced, Growth::Headroom).await
+    /// Stores samples of a camera and returns after their commit, and with [`Durability::Synced`] after
+    /// they have been flushed to the disk; all of them are stored, or none. A sample whose camera, target
+    /// and time are stored already is left as it is and counted as a duplicate, but a sample with a fix
+    /// takes the place of one without, and with [`OnConflict::Replace`](crate::domain::OnConflict) each takes
+    /// the place of a stored one. Many callers at once share a transaction; a caller who goes away
+    /// does not stop it.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`], [`crate::domain::ErrorKind::InsufficientStorage`].
+    pub async fn insert_samples(
+        &self,
+        id: &CameraId,
+        samples: Vec<impl Into<StoredSample>>,
+        options: impl Into<InsertOptions>,
+    ) -> Result<Inserted> {
+        let samples = stored(samples);
+        on_backend!(self, store => store.insert_samples(id, None, samples, options.into()).await)
     }
 
-    /// The writer, for a change that a power cut (not a crash) may undo.
-    async fn relaxed(&self) -> Result<WriterGuard<'_>> {
-        self.inner.writer.lock(Durability::Relaxed, Growth::Headroom).await
+    /// As [`Store::insert_samples`], for the camera of that key alone: if it was deleted and created again
+    /// under the same id, nothing is stored.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::CameraNotFound`], [`crate::domain::ErrorKind::InsufficientStorage`].
+    pub async fn insert_samples_of(
+        &self,
+        id: &CameraId,
+        key: CameraKey,
+        samples: Vec<impl Into<StoredSample>>,
+        durability: Durability,
+    ) -> Result<Inserted> {
+        let samples = stored(samples);
+        on_backend!(self, store => store.insert_samples(id, Some(key), samples, durability.into()).await)
     }
+}
+
+fn stored(samples: Vec<impl Into<StoredSample>>) -> Vec<StoredSample> {
+    samples.into_iter().map(Into::into).collect()
 }

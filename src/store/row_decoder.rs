@@ -3,23 +3,82 @@
 use std::fmt::Display;
 
 use jiff::Timestamp;
+use sqlx::postgres::PgRow;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Column, Decode, Row, Sqlite, Type};
+use sqlx::{Column, Decode, Postgres, Row, Sqlite, Type, ValueRef};
 
-use super::errors::Corrupt;
+use super::refusals::Corrupt;
 use crate::domain::{Error, Result, Revision};
+
+/// A row of either backend.
+#[derive(Clone, Copy)]
+pub(super) enum StoredRow<'r> {
+    Sqlite(&'r SqliteRow),
+    Postgres(&'r PgRow),
+}
+
+impl<'r> From<&'r SqliteRow> for StoredRow<'r> {
+    fn from(row: &'r SqliteRow) -> Self {
+        Self::Sqlite(row)
+    }
+}
+
+impl<'r> From<&'r PgRow> for StoredRow<'r> {
+    fn from(row: &'r PgRow) -> Self {
+        Self::Postgres(row)
+    }
+}
+
+impl<'r> StoredRow<'r> {
+    fn get<T: Stored<'r>>(self, index: usize) -> sqlx::Result<T> {
+        match self {
+            Self::Sqlite(row) => row.try_get(index),
+            Self::Postgres(row) => row.try_get(index),
+        }
+    }
+
+    /// Whether a column is NULL; one that does not exist is.
+    pub(super) fn is_null(self, index: usize) -> bool {
+        match self {
+            Self::Sqlite(row) => row.try_get_raw(index).map_or(true, |value| value.is_null()),
+            Self::Postgres(row) => row.try_get_raw(index).map_or(true, |value| value.is_null()),
+        }
+    }
+
+    fn column_name(self, index: usize) -> Option<String> {
+        match self {
+            Self::Sqlite(row) => row.columns().get(index).map(|column| column.name().to_owned()),
+            Self::Postgres(row) => row.columns().get(index).map(|column| column.name().to_owned()),
+        }
+    }
+
+    /// A column of the key as text.
+    fn text(self, index: usize) -> Option<String> {
+        let number = |row: Self| row.get::<i64>(index).map(|number| number.to_string());
+        self.get::<String>(index).or_else(|_| number(self)).ok()
+    }
+}
+
+/// What both backends can decode.
+pub(super) trait Stored<'r>:
+    Decode<'r, Sqlite> + Type<Sqlite> + Decode<'r, Postgres> + Type<Postgres>
+{
+}
+
+impl<'r, T> Stored<'r> for T where T: Decode<'r, Sqlite> + Type<Sqlite> + Decode<'r, Postgres> + Type<Postgres>
+{}
 
 /// Decodes the columns of one row from left to right. Every SELECT names the key's columns first, so
 /// that a fault can name the row.
 pub(super) struct RowDecoder<'r> {
     table: &'static str,
-    row: &'r SqliteRow,
+    row: StoredRow<'r>,
     next: usize,
 }
 
 impl<'r> RowDecoder<'r> {
-    pub(super) const fn new(table: &'static str, row: &'r SqliteRow) -> Self {
-        Self { table, row, next: 0 }
+    pub(super) fn new(table: &'static str, row: impl Into<StoredRow<'r>>) -> Self {
+        Self { table, row: row.into(), next: 0 }
     }
 
     /// Skips columns that are selected only to name the row.
@@ -31,17 +90,17 @@ impl<'r> RowDecoder<'r> {
     /// The next column as it is stored.
     pub(super) fn get<T>(&mut self) -> Result<T>
     where
-        T: Decode<'r, Sqlite> + Type<Sqlite>,
+        T: Stored<'r>,
     {
         let index = self.next;
         self.next += 1;
-        self.row.try_get(index).map_err(|error| self.corrupt(index, &error))
+        self.row.get(index).map_err(|error| self.corrupt(index, &error))
     }
 
     /// The next column, converted by a constructor of the domain.
     pub(super) fn parse<T, V, E>(&mut self, parse: impl FnOnce(T) -> Result<V, E>) -> Result<V>
     where
-        T: Decode<'r, Sqlite> + Type<Sqlite>,
+        T: Stored<'r>,
         E: Display,
     {
         let stored = self.get()?;
@@ -54,7 +113,7 @@ impl<'r> RowDecoder<'r> {
         parse: impl FnOnce(T) -> Result<V, E>,
     ) -> Result<Option<V>>
     where
-        T: Decode<'r, Sqlite> + Type<Sqlite>,
+        T: Stored<'r>,
         E: Display,
     {
         let stored: Option<T> = self.get()?;
@@ -86,24 +145,23 @@ impl<'r> RowDecoder<'r> {
         self.parse(|stored: i64| u64::try_from(stored)).map(Revision)
     }
 
-    /// A number that may have been NaN, which SQLite stores as NULL.
+    /// A number that may have been NaN, which is stored as NULL.
     pub(super) fn nullable_f64(&mut self) -> Result<f64> {
         Ok(self.get::<Option<f64>>()?.unwrap_or(f64::NAN))
     }
 
     fn corrupt(&self, index: usize, cause: &dyn Display) -> Error {
-        let column =
-            self.row.columns().get(index).map_or_else(|| index.to_string(), |it| it.name().to_owned());
+        let column = self.row.column_name(index).unwrap_or_else(|| index.to_string());
         Error::fault(Corrupt { table: self.table, column, row: self.row_name(), cause: cause.to_string() })
     }
 
     /// The first columns with their values: the key.
     fn row_name(&self) -> String {
-        let columns = self.row.columns().iter().take(3).map(|column| {
-            let value: Option<String> = self.row.try_get_unchecked(column.ordinal()).unwrap_or_default();
-            let mut value = value.unwrap_or_else(|| "NULL".to_owned());
+        let columns = (0..3).filter_map(|index| {
+            let name = self.row.column_name(index)?;
+            let mut value = self.row.text(index).unwrap_or_else(|| "NULL".to_owned());
             value.truncate(value.floor_char_boundary(64));
-            format!("{}={value}", column.name())
+            Some(format!("{name}={value}"))
         });
         columns.collect::<Vec<_>>().join(" ")
     }

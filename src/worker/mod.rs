@@ -19,7 +19,7 @@ use uuid::Uuid;
 use crate::app::{App, JobQueue};
 use crate::config::Workers;
 use crate::domain::{
-    CameraId, Detection, Error, EvaluationJob, JobState, Result, Sample, StoredSample, TrainingRun,
+    CameraId, Detection, Error, ErrorKind, EvaluationJob, JobState, Result, Sample, StoredSample, TrainingRun,
 };
 use crate::shutdown::Shutdown;
 use crate::store::{Claim, Heartbeat, SampleFilter};
@@ -146,6 +146,11 @@ async fn run_to_end<J: Job>(app: &App, claim: Claim<J>, lease: Duration, shutdow
             tracing::warn!(job.id = %id, "{} lost its lease to another worker, or was deleted", J::NAME);
             return;
         }
+        Err(error) if error.kind() == ErrorKind::Overloaded => {
+            // The store did not answer: the job is not at fault. Its lease expires and it is claimed again.
+            tracing::warn!(job.id = %id, %error, "{} is left to the next worker", J::NAME);
+            return;
+        }
         Err(error) => {
             let outcome = match &error {
                 Error::Refused(refusal) => refusal.to_string(),
@@ -181,6 +186,7 @@ async fn run_attempt<J: Job>(
         thread.cancel();
     }
     let every = HEARTBEAT_INTERVAL.min(lease / 3);
+    let mut renewed = Instant::now();
     let mut shutting_down = false;
     loop {
         tokio::select! {
@@ -191,10 +197,18 @@ async fn run_attempt<J: Job>(
                 thread.cancel();
             }
         }
-        match J::record(app, claim, thread.take_progress(), lease).await? {
-            Heartbeat::Continue => {}
-            Heartbeat::CancelRequested => thread.cancel(),
-            Heartbeat::Lost => return Ok(None),
+        match J::record(app, claim, thread.take_progress(), lease).await {
+            Ok(Heartbeat::Continue) => renewed = Instant::now(),
+            Ok(Heartbeat::CancelRequested) => {
+                renewed = Instant::now();
+                thread.cancel();
+            }
+            Ok(Heartbeat::Lost) => return Ok(None),
+            // A database that restarts answers again before the lease ends.
+            Err(error) if error.kind() == ErrorKind::Overloaded && renewed.elapsed() < lease => {
+                tracing::warn!(%error, "a heartbeat of a {} is late", J::NAME);
+            }
+            Err(error) => return Err(error),
         }
     }
     let (output, progress) = thread.join().await;

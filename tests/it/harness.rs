@@ -22,13 +22,41 @@ use tonic::transport::{Channel, Endpoint};
 /// A command of the binary, without arguments.
 pub(crate) fn sightfix() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sightfix"));
-    command.env_remove("SIGHTFIX_DATA").env_remove("SIGHTFIX_LISTEN").current_dir(std::env::temp_dir());
+    for setting in ["SIGHTFIX_DATA", "SIGHTFIX_DATABASE", "SIGHTFIX_LISTEN"] {
+        command.env_remove(setting);
+    }
+    command.current_dir(std::env::temp_dir());
     command
+}
+
+/// Where the store of a test is: in its folder, or, where `SIGHTFIX_TEST_POSTGRES` is the URL of a server's database, in
+/// a database of that server that belongs to the folder.
+pub(crate) fn store_arguments(folder: &Path) -> [String; 2] {
+    match std::env::var("SIGHTFIX_TEST_POSTGRES") {
+        Ok(server) => ["--database".to_owned(), database_of(&server, folder)],
+        Err(_) => ["--data".to_owned(), folder.to_str().expect("UTF-8").to_owned()],
+    }
+}
+
+/// URL of the database that belongs to a folder; created at its first use.
+fn database_of(server: &str, folder: &Path) -> String {
+    let name: String = folder.to_string_lossy().chars().filter(char::is_ascii_alphanumeric).collect();
+    let create = format!("CREATE DATABASE \"{name}\"");
+    let created = Command::new("psql").args([server, "-qc", &create]).output().expect("psql runs");
+    let errors = String::from_utf8_lossy(&created.stderr).into_owned();
+    assert!(created.status.success() || errors.contains("already exists"), "{errors}");
+    let (server, _) = server.rsplit_once('/').expect("a URL with a database");
+    format!("{server}/{name}")
 }
 
 /// Runs the binary to completion; returns standard output.
 pub(crate) fn run(arguments: &[&str]) -> String {
-    let output = sightfix().args(arguments).output().expect("the binary runs");
+    let mut arguments: Vec<String> = arguments.iter().map(|&argument| argument.to_owned()).collect();
+    if let Some(at) = arguments.iter().position(|argument| argument == "--data") {
+        let store = store_arguments(Path::new(&arguments[at + 1]));
+        arguments[at..at + 2].clone_from_slice(&store);
+    }
+    let output = sightfix().args(&arguments).output().expect("the binary runs");
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{arguments:?}: {errors}");
     String::from_utf8(output.stdout).expect("UTF-8")
@@ -79,7 +107,7 @@ impl TestServer {
     /// Starts a server with settings from the environment.
     pub(crate) fn start_with(folder: &Path, settings: &[(&str, &str)]) -> Self {
         let mut command = sightfix();
-        command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
+        command.args(["serve", "--listen", "127.0.0.1:0"]).args(store_arguments(folder));
         command.envs(settings.iter().copied()).stdout(Stdio::null());
         Self::run(command)
     }
@@ -87,7 +115,7 @@ impl TestServer {
     /// Starts a server at an address of [`own_address`], so that it can be restarted there.
     pub(crate) fn start_at(folder: &Path, address: SocketAddr) -> Self {
         let mut command = sightfix();
-        command.args(["serve", "--listen", &address.to_string(), "--data"]).arg(folder);
+        command.args(["serve", "--listen", &address.to_string()]).args(store_arguments(folder));
         command.stdout(Stdio::null());
         Self::run(command)
     }
@@ -95,7 +123,7 @@ impl TestServer {
     /// Starts the demonstration on an empty folder; returns what it prints once it is ready.
     pub(crate) fn demonstrate(folder: &Path) -> (Self, String) {
         let mut command = sightfix();
-        command.args(["serve", "--demo", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
+        command.args(["serve", "--demo", "--listen", "127.0.0.1:0"]).args(store_arguments(folder));
         command.stdout(Stdio::piped());
         let mut server = Self::run(command);
         let lines = BufReader::new(server.process.stdout.take().expect("piped")).lines();

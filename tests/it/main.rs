@@ -37,6 +37,7 @@ mod operator_files;
 mod overload;
 mod pairing;
 mod parity;
+mod postgres;
 mod power_cut;
 mod promotion;
 mod repeated_requests;

@@ -1,55 +1,108 @@
-//! The rules of the store, each shown on a file of its own.
+//! What both backends promise. Every case has a file of its own, or, where `SIGHTFIX_TEST_POSTGRES` is the URL of a
+//! server's database, a database of its own on that server (`.ci/postgres`).
 
 mod cameras;
+pub(super) mod copy;
 mod evaluations;
-mod file;
-mod group;
+pub(super) mod group;
 mod models;
 mod runs;
 mod samples;
+
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use tempfile::TempDir;
 use uuid::Uuid;
 
-use super::Store;
+use super::{Backend, DatabaseUrl, Location, Store, StoreOptions, on_backend};
 use crate::domain::{
     BoundingBox, CameraId, Durability, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg,
     Recipe, Result, RunId, Sample, TargetId, TrainingOptions,
 };
 use crate::geo::Position;
 
-/// A store with the camera `square`, in a folder that is deleted with it.
-struct Fixture {
-    folder: TempDir,
-    store: Store,
-    camera: CameraId,
+/// Where the store of a case is.
+pub(super) enum Home {
+    Folder(Arc<TempDir>),
+    Database(DatabaseUrl),
+}
+
+impl Home {
+    async fn new() -> Self {
+        match std::env::var("SIGHTFIX_TEST_POSTGRES") {
+            Ok(url) => Self::Database(new_database(&url).await),
+            Err(_) => Self::Folder(Arc::new(TempDir::new().expect("a folder"))),
+        }
+    }
+
+    pub(super) fn location(&self) -> Location {
+        match self {
+            Self::Folder(folder) => Location::Folder(folder.path().to_owned()),
+            Self::Database(url) => Location::Database(url.clone()),
+        }
+    }
+
+    pub(super) async fn open(&self) -> Store {
+        Store::open_at(&self.location(), StoreOptions::default()).await.expect("opens")
+    }
+}
+
+/// A database that nobody else uses.
+pub(super) async fn new_database(server: &str) -> DatabaseUrl {
+    use sqlx::Connection as _;
+
+    static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
+    let number = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+    let name = format!("case_{}_{number}", std::process::id());
+    let mut connection =
+        sqlx::PgConnection::connect(server).await.expect("the server of SIGHTFIX_TEST_POSTGRES");
+    let create = sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"));
+    sqlx::raw_sql(create).execute(&mut connection).await.expect("a database");
+    connection.close().await.expect("closes");
+    let (server, _) = server.rsplit_once('/').expect("a URL with a database");
+    DatabaseUrl::new(&format!("{server}/{name}")).expect("a URL")
+}
+
+/// A store with the camera `square`, in a place of its own.
+pub(super) struct Fixture {
+    pub(super) folder: Home,
+    pub(super) store: Store,
+    pub(super) camera: CameraId,
 }
 
 impl Fixture {
     async fn new() -> Self {
-        let folder = TempDir::new().expect("a folder");
-        let store = Store::open(folder.path()).await.expect("opens");
+        Self::at(Home::new().await).await
+    }
+
+    pub(super) async fn at(folder: Home) -> Self {
+        let store = folder.open().await;
         let camera = id("square");
         store.insert_camera(&NewCamera::named(camera.clone()), at(0)).await.expect("new");
         Self { folder, store, camera }
     }
 
     /// Executes statements without the checks of the store.
-    async fn tamper(&self, sql: &'static str) {
-        let mut writer = self.store.relaxed().await.expect("the writer");
-        let mut transaction = writer.begin().await.expect("begins");
-        sqlx::raw_sql(sql).execute(&mut *transaction).await.expect("runs");
-        transaction.commit().await.expect("commits");
+    pub(super) async fn tamper(&self, sql: &'static str) {
+        on_backend!(self.store, store => store.tamper(sql).await);
+    }
+
+    /// As [`Fixture::tamper`], in the words of each backend.
+    async fn tamper_each(&self, sqlite: &'static str, postgres: &'static str) {
+        match &self.store.0 {
+            Backend::Sqlite(store) => store.tamper(sqlite).await,
+            Backend::Postgres(store) => store.tamper(postgres).await,
+        }
     }
 }
 
-fn id(text: &str) -> CameraId {
+pub(super) fn id(text: &str) -> CameraId {
     CameraId::new(text).expect("a slug")
 }
 
 /// So many seconds into a day of 2020.
-fn at(second: i64) -> Timestamp {
+pub(super) fn at(second: i64) -> Timestamp {
     Timestamp::from_second(1_607_900_000 + second).expect("in range")
 }
 
@@ -57,7 +110,7 @@ fn target(text: &str) -> TargetId {
     TargetId::new(text).expect("a name")
 }
 
-fn sample(second: i64, target_id: &str) -> Sample {
+pub(super) fn sample(second: i64, target_id: &str) -> Sample {
     let offset = second as f64;
     Sample {
         time: at(second),
@@ -71,11 +124,11 @@ fn sample(second: i64, target_id: &str) -> Sample {
 }
 
 /// The nth run's id; ids sort by n.
-fn run_id(n: u128) -> RunId {
+pub(super) fn run_id(n: u128) -> RunId {
     RunId(Uuid::from_u128(n))
 }
 
-fn options() -> TrainingOptions {
+pub(super) fn options() -> TrainingOptions {
     TrainingOptions {
         recipe: Recipe::Hybrid,
         seed: u64::MAX - 3,
@@ -85,7 +138,7 @@ fn options() -> TrainingOptions {
     }
 }
 
-fn metadata() -> ModelMetadata {
+pub(super) fn metadata() -> ModelMetadata {
     ModelMetadata {
         format: 1,
         requested_recipe: "auto".to_owned(),
@@ -108,7 +161,7 @@ fn metadata() -> ModelMetadata {
     }
 }
 
-fn kind<T: std::fmt::Debug>(outcome: Result<T>) -> ErrorKind {
+pub(super) fn kind<T: std::fmt::Debug>(outcome: Result<T>) -> ErrorKind {
     outcome.expect_err("is refused").kind()
 }
 

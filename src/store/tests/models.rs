@@ -79,8 +79,14 @@ async fn a_changed_row_does_not_match_its_checksum() {
     assert_eq!(store.fill_in_model_checksums().await.expect("works"), 1);
     assert_eq!(store.fill_in_model_checksums().await.expect("works"), 0);
     assert_eq!(store.model_content(camera, 1).await.expect("sound").1, b"weights");
+    fixture
+        .tamper_each(
+            "UPDATE models SET weights = x'77656967687471'",
+            "UPDATE models SET weights = '\\x77656967687471'",
+        )
+        .await;
+    assert_eq!(kind(store.model_content(camera, 1).await), ErrorKind::ModelUnusable);
     for damage in [
-        "UPDATE models SET weights = x'77656967687471'",
         "UPDATE models SET metadata = replace(metadata, '120.5', '120.6')",
         "UPDATE models SET metadata = '{'",
     ] {

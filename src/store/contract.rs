@@ -1,0 +1,472 @@
+//! The methods of [`Store`] that both backends have, each with what it promises.
+//!
+//! A new method is added here and to `sqlite` and `postgres` under the same signature, with cases in `tests`.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use super::{
+    Claim, Heartbeat, IdempotencyRecord, JobCounts, JobEnd, KeysVersion, RunEnd, SampleFilter, SampleKey,
+    StorageStatus, Store, StoredAnswer, StoredHeldOutError, on_backend,
+};
+#[cfg(doc)]
+use crate::domain::ErrorKind;
+use crate::domain::{
+    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Detection, EpochReport,
+    EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey,
+    JobState, KeyId, ModelMetadata, ModelVersion, NewCamera, NewKey, NewSite, Result, Revision, RunId,
+    RunProgress, SecretDigest, Site, SiteId, SiteKey, StoredSample, TrainingOptions, TrainingRun,
+};
+use crate::geo::Position;
+
+macro_rules! contract {
+    ($($(#[$attribute:meta])* fn $name:ident(&self $(, $argument:ident: $type:ty)*) -> $output:ty;)*) => {
+        impl Store {
+            $(
+                $(#[$attribute])*
+                pub async fn $name(&self $(, $argument: $type)*) -> $output {
+                    on_backend!(self, store => store.$name($($argument),*).await)
+                }
+            )*
+        }
+    };
+}
+
+contract! {
+    /// Stores a new camera with revision 1.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraExists`]; [`ErrorKind::InvalidArgument`] naming `site` if there is no such site;
+    /// [`ErrorKind::InsufficientStorage`] beyond the limit of cameras.
+    fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera>;
+
+    /// One camera.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn camera(&self, id: &CameraId) -> Result<Camera>;
+
+    /// A page of cameras, of a site or of all, ordered by id, after an id.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn cameras(&self, site: Option<&SiteId>, after: Option<&CameraId>, limit: u32) -> Result<Vec<Camera>>;
+
+    /// Id, key, revision and active model of every camera: enough to see what has changed.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn camera_versions(&self) -> Result<Vec<(CameraId, CameraKey, Revision, Option<u32>)>>;
+
+    /// Puts a profile in the place of the stored one and counts its revision up, if the stored
+    /// revision is the expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`]; [`ErrorKind::InvalidArgument`] naming
+    /// `site` if there is no such site.
+    fn replace_camera(&self, profile: &NewCamera, expected: Option<ExpectedVersion>, now: Timestamp) -> Result<Camera>;
+
+    /// Deletes a camera with its samples, runs and models, if its revision is the expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::RunLive`] while a
+    /// training run has not ended.
+    fn delete_camera(&self, id: &CameraId, expected: Option<ExpectedVersion>, now: Timestamp) -> Result<()>;
+
+    /// A page of cameras ordered by id, after an id, each with its latest training run and that run's state.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn cameras_with_latest_run(&self, after: Option<&CameraId>, limit: u32) -> Result<Vec<(Camera, Option<(RunId, JobState)>)>>;
+
+    /// Stores a pose change, unless one was stored for that model version before; returns whether it is new.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn insert_move(&self, camera: &CameraId, moved: &CameraMoved) -> Result<bool>;
+
+    /// The pose change that was detected with a model version.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn camera_move(&self, camera: &CameraId, model_version: u32) -> Result<Option<CameraMoved>>;
+
+    /// State of the run that was started last because of the pose change found with a model version; `None` if
+    /// there was none, or it was deleted.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn retraining_state(&self, camera: &CameraId, model_version: u32) -> Result<Option<JobState>>;
+
+    /// Stores which run was started because of a pose change.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn note_retraining(&self, camera: &CameraId, model_version: u32, run: RunId) -> Result<()>;
+
+    /// Stores a new site with revision 1.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteExists`]; [`ErrorKind::InsufficientStorage`] beyond the limit of sites.
+    fn insert_site(&self, profile: &NewSite, now: Timestamp) -> Result<Site>;
+
+    /// One site.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteNotFound`].
+    fn site(&self, id: &SiteId) -> Result<Site>;
+
+    /// A page of sites ordered by id, after an id.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn sites(&self, after: Option<&SiteId>, limit: u32) -> Result<Vec<Site>>;
+
+    /// Id, key and revision of every site: enough to see what has changed.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn site_versions(&self) -> Result<Vec<(SiteId, SiteKey, Revision)>>;
+
+    /// Puts a profile in the place of the stored one and counts its revision up, if the stored revision is the
+    /// expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RevisionMismatch`].
+    fn replace_site(&self, profile: &NewSite, expected: Option<ExpectedVersion<SiteKey>>, now: Timestamp) -> Result<Site>;
+
+    /// Deletes a site that no camera belongs to, if its revision is the expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::SiteInUse`] while cameras
+    /// belong to it.
+    fn delete_site(&self, id: &SiteId, expected: Option<ExpectedVersion<SiteKey>>, now: Timestamp) -> Result<()>;
+
+    /// A page of samples ordered by time and target, after a key.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn samples(&self, id: &CameraId, filter: &SampleFilter, after: Option<SampleKey>, limit: u32) -> Result<Vec<StoredSample>>;
+
+    /// At most so many of the boxes without a fix that a filter selects, in order of time and target. Of
+    /// more, one of every few consecutive ones is taken, at a place that changes from few to few, so that
+    /// none of several simultaneous targets is preferred.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn thinned_detections(&self, id: &CameraId, filter: &SampleFilter, most: u32) -> Result<Vec<Detection>>;
+
+    /// How many samples a filter selects.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64>;
+
+    /// How many of the samples with a fix that a filter selects state the truth.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn count_truths(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64>;
+
+    /// Time of the sample with a fix that has so many before it, in order of time; `None` behind the last.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn sample_time(&self, id: &CameraId, before: u64) -> Result<Option<Timestamp>>;
+
+    /// How many samples with a fix a filter selects, and the corners of the ground they cover (south-west,
+    /// north-east in degrees; across the antimeridian, of the whole parallel).
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn sample_extent(&self, id: &CameraId, filter: &SampleFilter) -> Result<(u64, Option<[Position; 2]>)>;
+
+    /// Deletes the samples that a filter selects; returns how many.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn delete_samples(&self, id: &CameraId, filter: &SampleFilter, now: Timestamp) -> Result<u64>;
+
+    /// Queues a run.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunLive`] if the camera has a run that has not ended,
+    /// [`ErrorKind::Overloaded`] if all cameras together have `max_live` of them.
+    fn insert_run(&self, run: RunId, camera: &CameraId, options: &TrainingOptions, max_live: u32, now: Timestamp) -> Result<TrainingRun>;
+
+    /// As [`Store::insert_run`]; of several requests with the same record, the first queues a run and the
+    /// others get it.
+    ///
+    /// # Errors
+    /// As [`Store::insert_run`]; [`ErrorKind::IdempotencyKeyReused`] for a key of another request.
+    fn insert_run_once(&self, run: RunId, camera: &CameraId, options: &TrainingOptions, max_live: u32, record: Option<&IdempotencyRecord>, now: Timestamp) -> Result<TrainingRun>;
+
+    /// One run of a camera.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`].
+    fn run(&self, camera: &CameraId, run: RunId) -> Result<TrainingRun>;
+
+    /// A page of a camera's runs, newest first, before an id.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn runs(&self, camera: &CameraId, before: Option<RunId>, limit: u32) -> Result<Vec<TrainingRun>>;
+
+    /// Claims the oldest run that is queued or whose lease has expired. Its attempt and fence go up by
+    /// one; its curve and progress are reset.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn claim_run(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<TrainingRun>>>;
+
+    /// Renews the lease and stores the run's progress.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn heartbeat_run(&self, run: RunId, fence: i64, progress: &RunProgress, lease: Duration, now: Timestamp) -> Result<Heartbeat>;
+
+    /// Cancels a run: at once where no worker holds a live lease on it, otherwise at its worker's next
+    /// heartbeat. Once this has returned, the run produces no model any more.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunEnded`].
+    fn cancel_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<TrainingRun>;
+
+    /// Ends a run, or returns it to the queue, if the worker still owns its lease; `None` if it lost it,
+    /// and then nothing was changed. The model, its activation and the run's state are one transaction. A
+    /// run whose cancellation was requested is cancelled even if it succeeded or was returned.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn finish_run(&self, run: RunId, fence: i64, end: RunEnd<'_>, now: Timestamp) -> Result<Option<TrainingRun>>;
+
+    /// Adds points to the curve of a run. An epoch that is there already is replaced. Does nothing
+    /// once the lease was lost or the run has ended, which the next heartbeat reports.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()>;
+
+    /// Adds a line to the log of a run, which keeps its latest 1,000 lines of 4,000 bytes over all
+    /// attempts. Does nothing once the lease was lost.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()>;
+
+    /// The curve of a run's latest attempt, by epoch.
+    ///
+    /// # Errors
+    /// [`ErrorKind::RunNotFound`].
+    fn epochs(&self, run: RunId) -> Result<Vec<EpochReport>>;
+
+    /// The log of a run, oldest line first.
+    ///
+    /// # Errors
+    /// [`ErrorKind::RunNotFound`].
+    fn log(&self, run: RunId) -> Result<Vec<(Timestamp, String)>>;
+
+    /// Stores an imported model as the camera's next version; it does not become active.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn insert_model(&self, camera: &CameraId, metadata: &ModelMetadata, weights: &[u8], now: Timestamp) -> Result<ModelVersion>;
+
+    /// One version, without its weights.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
+    fn model(&self, camera: &CameraId, number: u32) -> Result<ModelVersion>;
+
+    /// Metadata and weights of one version, as they were stored.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`]; [`ErrorKind::ModelUnusable`] where what
+    /// is stored does not match its checksum or cannot be read.
+    fn model_content(&self, camera: &CameraId, number: u32) -> Result<(ModelMetadata, Vec<u8>)>;
+
+    /// Fills in the checksums of versions that an earlier release stored; returns how many there were.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn fill_in_model_checksums(&self) -> Result<u64>;
+
+    /// The held-out errors that were stored with a version, each with its sample as long as that is
+    /// stored; by time and target.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn held_out_errors(&self, camera: &CameraId, number: u32) -> Result<Vec<StoredHeldOutError>>;
+
+    /// A page of versions, newest first, before a number.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn models(&self, camera: &CameraId, before: Option<u32>, limit: u32) -> Result<Vec<ModelVersion>>;
+
+    /// Makes a version the active one. Naming the active one changes nothing.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
+    fn activate_model(&self, camera: &CameraId, number: u32, now: Timestamp) -> Result<Camera>;
+
+    /// Makes the version active that was before the active one. Repeated calls go further back.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::NoModel`] if none is active, [`ErrorKind::NoEarlierModel`]
+    /// if none was active before.
+    fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera>;
+
+    /// The cameras that have an active model, with its number.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn active_models(&self) -> Result<Vec<(CameraId, u32)>>;
+
+    /// Deletes a model version that is not the active one. Its number is never assigned again.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`], [`ErrorKind::ModelActive`].
+    fn delete_model(&self, camera: &CameraId, number: u32, now: Timestamp) -> Result<()>;
+
+    /// Deletes a training run that has ended, with its log and its curve. The model version that it
+    /// yielded stays.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunLive`].
+    fn delete_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<()>;
+
+    /// Queues an evaluation.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::Overloaded`] if all cameras together have
+    /// `max_live` of them that have not ended.
+    fn insert_evaluation(&self, id: EvaluationId, camera: &CameraId, plan: &EvaluationPlan, max_live: u32, now: Timestamp) -> Result<EvaluationJob>;
+
+    /// One evaluation.
+    ///
+    /// # Errors
+    /// [`ErrorKind::EvaluationNotFound`].
+    fn evaluation(&self, id: EvaluationId) -> Result<EvaluationJob>;
+
+    /// The report of an evaluation as it was stored, `None` unless it has succeeded.
+    ///
+    /// # Errors
+    /// [`ErrorKind::EvaluationNotFound`].
+    fn evaluation_report(&self, id: EvaluationId) -> Result<Option<String>>;
+
+    /// A page of evaluations, of a camera or of all, newest first, before an id.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn evaluations(&self, camera: Option<&CameraId>, before: Option<EvaluationId>, limit: u32) -> Result<Vec<EvaluationJob>>;
+
+    /// Claims the oldest evaluation that is queued or whose lease has expired. Its attempt and fence go
+    /// up by one; its progress is reset.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn claim_evaluation(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<EvaluationJob>>>;
+
+    /// Renews the lease and stores the evaluation's progress.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn heartbeat_evaluation(&self, id: EvaluationId, fence: i64, progress: &EvaluationProgress, lease: Duration, now: Timestamp) -> Result<Heartbeat>;
+
+    /// Cancels an evaluation: at once where no worker holds a live lease on it, otherwise at its worker's
+    /// next heartbeat. Once this has returned, it produces no report any more.
+    ///
+    /// # Errors
+    /// [`ErrorKind::EvaluationNotFound`], [`ErrorKind::EvaluationEnded`].
+    fn cancel_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<EvaluationJob>;
+
+    /// Ends an evaluation, or returns it to the queue, if the worker still owns its lease; `None` if it
+    /// lost it, and then nothing was changed. One whose cancellation was requested is cancelled even if it
+    /// succeeded or was returned.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn finish_evaluation(&self, id: EvaluationId, fence: i64, end: JobEnd<String>, now: Timestamp) -> Result<Option<EvaluationJob>>;
+
+    /// Deletes an evaluation, whatever its state; its worker learns of it by its next heartbeat.
+    ///
+    /// # Errors
+    /// [`ErrorKind::EvaluationNotFound`].
+    fn delete_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<()>;
+
+    /// How many jobs have not ended.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn job_counts(&self) -> Result<JobCounts>;
+
+    /// Stores a key. The oldest keys that no longer work make room for it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InsufficientStorage`] if as many keys as allowed are in use.
+    fn insert_key(&self, id: KeyId, key: &NewKey, digest: &SecretDigest, now: Timestamp) -> Result<ApiKey>;
+
+    /// One key.
+    ///
+    /// # Errors
+    /// [`ErrorKind::KeyNotFound`].
+    fn key(&self, id: KeyId) -> Result<ApiKey>;
+
+    /// A page of keys, newest first, before an id.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>>;
+
+    /// The keys that were not revoked, with their digests.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn unrevoked_keys(&self) -> Result<Vec<(ApiKey, SecretDigest)>>;
+
+    /// The key with a digest, whether it still works or not.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>>;
+
+    /// Whether the keys have changed since a version was read.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn keys_version(&self) -> Result<KeysVersion>;
+
+    /// Revokes a key. One that is revoked already stays as it is.
+    ///
+    /// # Errors
+    /// [`ErrorKind::KeyNotFound`].
+    fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey>;
+
+    /// Stores when keys were used last. A power cut may undo it.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()>;
+
+    /// A page of the audit log, of a camera or of all, newest first, before a number.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn audit_log(&self, camera: Option<&CameraId>, before: Option<AuditNumber>, limit: u32) -> Result<Vec<AuditEntry>>;
+
+    /// The answer that is stored under a key of the caller, if there is one that has not expired.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn stored_answer(&self, key: &IdempotencyKey, now: Timestamp) -> Result<Option<StoredAnswer>>;
+
+    /// Housekeeping, to be called every few seconds: sets the reserve aside again, gives freed pages
+    /// back to the disk, counts, and logs which other processes have come. Tells how much is stored.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn maintain(&self) -> Result<StorageStatus>;
+}

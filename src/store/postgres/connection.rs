@@ -1,0 +1,137 @@
+//! Connecting: the pool, the transactions, the schema.
+//!
+//! Every statement runs in a transaction and is prepared without a name, and settings are made for one transaction
+//! each. So nothing is expected of a connection between two transactions, and a pooler that gives out connections by
+//! transaction (PgBouncer and its like) may stand between.
+
+use std::sync::LazyLock;
+use std::time::Duration;
+
+use sqlx::migrate::{MigrateError, Migrator};
+use sqlx::postgres::{PgConnectOptions, PgPoolOptions};
+use sqlx::{ConnectOptions, PgPool, Postgres, Transaction};
+use tokio::time::Instant;
+
+use super::errors::failed;
+use super::locks::{Limit, try_lock_limit};
+use crate::domain::{Durability, Error, Result};
+use crate::store::folder_fault::{FolderFault, FolderFaultKind};
+use crate::store::location::DatabaseUrl;
+
+/// Connections of one process.
+const CONNECTIONS: u32 = 12;
+const CONNECTION_WAIT: Duration = Duration::from_secs(10);
+
+/// How long a start waits for another process that changes the schema.
+const SCHEMA_WAIT: Duration = Duration::from_secs(120);
+const SCHEMA_PAUSE: Duration = Duration::from_millis(100);
+
+/// A reader sees one state of the database. Whoever holds locks for longer than these times is interrupted.
+const BEGIN_READ: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; SET LOCAL statement_timeout = '60s'; \
+                          SET LOCAL idle_in_transaction_session_timeout = '60s'";
+const BEGIN_SYNCED: &str = "BEGIN; SET LOCAL statement_timeout = '60s'; SET LOCAL lock_timeout = '5s'; \
+                            SET LOCAL idle_in_transaction_session_timeout = '30s'; \
+                            SET LOCAL synchronous_commit = on";
+const BEGIN_RELAXED: &str = "BEGIN; SET LOCAL statement_timeout = '60s'; SET LOCAL lock_timeout = '5s'; \
+                             SET LOCAL idle_in_transaction_session_timeout = '30s'; \
+                             SET LOCAL synchronous_commit = off";
+const BEGIN_SCHEMA: &str = "BEGIN; SET LOCAL lock_timeout = '30s'; SET LOCAL synchronous_commit = on";
+
+/// The lock of the library lasts for a session, which a pooler does not keep.
+static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| {
+    let mut migrations = sqlx::migrate!("migrations/postgres");
+    migrations.set_locking(false);
+    migrations
+});
+
+/// Connects, and brings the schema up to date.
+///
+/// # Errors
+/// A [`FolderFault`] that names the database without its secrets.
+pub(super) async fn open(url: &DatabaseUrl) -> Result<PgPool> {
+    let pool = PgPoolOptions::new()
+        .max_connections(CONNECTIONS)
+        .acquire_timeout(CONNECTION_WAIT)
+        .connect_with(options(url)?)
+        .await
+        .map_err(|error| unreachable(url, &error))?;
+    migrate(&pool).await.map_err(|error| unusable(url, &error))?;
+    Ok(pool)
+}
+
+fn options(url: &DatabaseUrl) -> Result<PgConnectOptions> {
+    let options = url.options()?.statement_cache_capacity(0).disable_statement_logging();
+    // Floats come in binary form; some poolers refuse a connection that sets this.
+    let options = options.extra_float_digits(None::<i8>);
+    if options.get_application_name().is_some() {
+        return Ok(options);
+    }
+    Ok(options.application_name("sightfix"))
+}
+
+pub(super) async fn begin_read(pool: &PgPool) -> Result<Transaction<'static, Postgres>> {
+    pool.begin_with(BEGIN_READ).await.map_err(failed)
+}
+
+/// A transaction that is flushed to the disk when it is committed, or may be undone by a power cut.
+pub(super) async fn begin_write(
+    pool: &PgPool,
+    durability: Durability,
+) -> Result<Transaction<'static, Postgres>> {
+    let begin = match durability {
+        Durability::Synced => BEGIN_SYNCED,
+        Durability::Relaxed => BEGIN_RELAXED,
+    };
+    pool.begin_with(begin).await.map_err(failed)
+}
+
+/// All missing steps in one transaction: of several processes that start at once, one changes the schema, and a step
+/// that fails leaves it as it was.
+async fn migrate(pool: &PgPool) -> Result<(), MigrateError> {
+    let began = Instant::now();
+    loop {
+        let mut transaction = pool.begin_with(BEGIN_SCHEMA).await?;
+        if try_lock_limit(&mut transaction, Limit::Schema).await? {
+            MIGRATIONS.run_direct(None, &mut *transaction, false).await?;
+            return Ok(transaction.commit().await?);
+        }
+        transaction.rollback().await?;
+        if began.elapsed() > SCHEMA_WAIT {
+            return Err(MigrateError::Execute(sqlx::Error::PoolTimedOut));
+        }
+        tokio::time::sleep(SCHEMA_PAUSE).await;
+    }
+}
+
+/// Why there is no connection, for the person who started the program.
+fn unreachable(url: &DatabaseUrl, error: &sqlx::Error) -> Error {
+    FolderFault::error(FolderFaultKind::Unreachable, format!("cannot connect to the database {url}: {error}"))
+}
+
+fn unusable(url: &DatabaseUrl, cause: &MigrateError) -> Error {
+    let (kind, message) = match cause {
+        MigrateError::VersionMissing(step) => (
+            FolderFaultKind::OtherSchema,
+            format!(
+                "the database {url} was written by a newer version of sightfix (its schema has step {step}); start \
+                 that version, or use another database"
+            ),
+        ),
+        MigrateError::VersionMismatch(step) => (
+            FolderFaultKind::OtherSchema,
+            format!(
+                "the database {url} has another schema in step {step}; it was made by a build that was never \
+                 released"
+            ),
+        ),
+        MigrateError::Execute(sqlx::Error::PoolTimedOut) => (
+            FolderFaultKind::InUse,
+            format!("another process has been changing the schema of the database {url} for minutes"),
+        ),
+        cause => (
+            FolderFaultKind::Other,
+            format!("the schema of the database {url} cannot be brought up to date: {cause}"),
+        ),
+    };
+    FolderFault::error(kind, message)
+}

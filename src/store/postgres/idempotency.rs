@@ -1,0 +1,95 @@
+//! Answers of changes that clients may repeat, written in the transaction of the change.
+
+use jiff::Timestamp;
+use sqlx::PgConnection;
+
+use super::Store;
+use super::errors::failed;
+use crate::domain::{Actor, IdempotencyKey, Result};
+use crate::store::limits::StoreLimits;
+use crate::store::rows::idempotency::{IdempotencyRecord, StoredAnswer, expired_until_us, owner};
+
+impl Store {
+    pub(in crate::store) async fn stored_answer(
+        &self,
+        key: &IdempotencyKey,
+        now: Timestamp,
+    ) -> Result<Option<StoredAnswer>> {
+        let mut reader = self.reader().await?;
+        find_answer(&mut reader, self.limits(), (&self.actor, key), now).await
+    }
+}
+
+/// Waits until no other transaction looks for an answer under the same key, or stores one.
+pub(super) async fn lock_key(
+    connection: &mut PgConnection,
+    (actor, key): (&Actor, &IdempotencyKey),
+) -> Result<()> {
+    sqlx::query("SELECT pg_advisory_xact_lock(hashtextextended($1, 0))")
+        .bind(format!("{} {}", owner(actor), key.as_str()))
+        .execute(connection)
+        .await
+        .map_err(failed)?;
+    Ok(())
+}
+
+/// As [`Store::stored_answer`].
+pub(super) async fn find_answer(
+    connection: &mut PgConnection,
+    limits: &StoreLimits,
+    (actor, key): (&Actor, &IdempotencyKey),
+    now: Timestamp,
+) -> Result<Option<StoredAnswer>> {
+    let found: Option<(Vec<u8>, String)> = sqlx::query_as(
+        "SELECT digest, answer FROM idempotency_keys \
+         WHERE owner = $1 AND idempotency_key = $2 AND created_at_us > $3",
+    )
+    .bind(owner(actor))
+    .bind(key.as_str())
+    .bind(expired_until_us(limits, now))
+    .fetch_optional(connection)
+    .await
+    .map_err(failed)?;
+    Ok(found.map(|(digest, answer)| StoredAnswer { digest, answer }))
+}
+
+/// Stores an answer, unless one that has not expired is stored under its key. Expired ones and the oldest
+/// beyond the limit are deleted.
+pub(super) async fn insert_answer(
+    connection: &mut PgConnection,
+    limits: &StoreLimits,
+    (actor, record): (&Actor, &IdempotencyRecord),
+    answer: &str,
+    now: Timestamp,
+) -> Result<()> {
+    sqlx::query(
+        "DELETE FROM idempotency_keys WHERE number IN \
+         (SELECT number FROM idempotency_keys WHERE created_at_us <= $1 FOR UPDATE SKIP LOCKED)",
+    )
+    .bind(expired_until_us(limits, now))
+    .execute(&mut *connection)
+    .await
+    .map_err(failed)?;
+    let number: Option<i64> = sqlx::query_scalar(
+        "INSERT INTO idempotency_keys (owner, idempotency_key, digest, answer, created_at_us) \
+         VALUES ($1, $2, $3, $4, $5) ON CONFLICT DO NOTHING RETURNING number",
+    )
+    .bind(owner(actor))
+    .bind(record.key.as_str())
+    .bind(record.digest.as_slice())
+    .bind(answer)
+    .bind(now.as_microsecond())
+    .fetch_optional(&mut *connection)
+    .await
+    .map_err(failed)?;
+    let Some(number) = number else { return Ok(()) };
+    sqlx::query(
+        "DELETE FROM idempotency_keys WHERE number IN \
+         (SELECT number FROM idempotency_keys WHERE number <= $1 FOR UPDATE SKIP LOCKED)",
+    )
+    .bind(number.saturating_sub(limits.idempotency_keys.into()))
+    .execute(connection)
+    .await
+    .map_err(failed)?;
+    Ok(())
+}

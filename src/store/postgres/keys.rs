@@ -1,0 +1,146 @@
+//! Keys that clients present: digests, scopes, last use, revocation.
+
+use jiff::Timestamp;
+use sqlx::PgConnection;
+
+use super::Store;
+use super::errors::failed;
+use super::locks::{Limit, lock_limit};
+use crate::domain::{ApiKey, AuditAction, CameraId, Error, KeyId, NewKey, Result, SecretDigest};
+use crate::store::refusals::no_key;
+use crate::store::rows::audit::Change;
+use crate::store::rows::keys::{KeysVersion, check_limit, read_key, select_keys as select};
+
+impl Store {
+    pub(in crate::store) async fn insert_key(
+        &self,
+        id: KeyId,
+        key: &NewKey,
+        digest: &SecretDigest,
+        now: Timestamp,
+    ) -> Result<ApiKey> {
+        let mut transaction = self.writer().await?;
+        lock_limit(&mut transaction, Limit::Keys).await?;
+        make_room(&mut transaction, self.limits().keys, now).await?;
+        let cameras: Vec<&str> = key.scope.cameras().iter().map(CameraId::as_str).collect();
+        sqlx::query(
+            "INSERT INTO api_keys (id, name, role, cameras, sha256, created_at_us, expires_at_us) \
+             VALUES ($1, $2, $3, $4, $5, $6, $7)",
+        )
+        .bind(id.to_string())
+        .bind(&key.name)
+        .bind(key.scope.role().as_str())
+        .bind(serde_json::to_string(&cameras).map_err(Error::fault)?)
+        .bind(digest.as_bytes().as_slice())
+        .bind(now.as_microsecond())
+        .bind(key.expires_at.map(Timestamp::as_microsecond))
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        let subject = format!("{id} {} {}", key.scope.role(), key.name);
+        self.record(&mut transaction, Change::of(AuditAction::KeyCreated, subject), now).await?;
+        transaction.commit().await.map_err(failed)?;
+        self.key(id).await
+    }
+
+    pub(in crate::store) async fn key(&self, id: KeyId) -> Result<ApiKey> {
+        let mut reader = self.reader().await?;
+        let row = sqlx::query(select!("WHERE id = $1"))
+            .bind(id.to_string())
+            .fetch_optional(&mut *reader)
+            .await
+            .map_err(failed)?;
+        Ok(read_key(&row.ok_or_else(|| no_key(id))?)?.0)
+    }
+
+    pub(in crate::store) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
+        let mut reader = self.reader().await?;
+        let rows = sqlx::query(select!("WHERE id < $1 ORDER BY id DESC LIMIT $2"))
+            // "~" sorts behind all UUIDs.
+            .bind(before.map_or_else(|| "~".to_owned(), |id| id.to_string()))
+            .bind(i64::from(limit))
+            .fetch_all(&mut *reader)
+            .await
+            .map_err(failed)?;
+        rows.iter().map(|row| Ok(read_key(row)?.0)).collect()
+    }
+
+    pub(in crate::store) async fn unrevoked_keys(&self) -> Result<Vec<(ApiKey, SecretDigest)>> {
+        let mut reader = self.reader().await?;
+        let rows = sqlx::query(select!("WHERE revoked_at_us IS NULL"))
+            .fetch_all(&mut *reader)
+            .await
+            .map_err(failed)?;
+        rows.iter().map(read_key).collect()
+    }
+
+    pub(in crate::store) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
+        let mut reader = self.reader().await?;
+        let row = sqlx::query(select!("WHERE sha256 = $1"))
+            .bind(digest.as_bytes().as_slice())
+            .fetch_optional(&mut *reader)
+            .await
+            .map_err(failed)?;
+        row.map(|row| Ok(read_key(&row)?.0)).transpose()
+    }
+
+    pub(in crate::store) async fn keys_version(&self) -> Result<KeysVersion> {
+        let mut reader = self.reader().await?;
+        let (rows, revoked, latest) =
+            sqlx::query_as("SELECT count(*), count(revoked_at_us), max(id) FROM api_keys")
+                .fetch_one(&mut *reader)
+                .await
+                .map_err(failed)?;
+        Ok(KeysVersion { rows, revoked, latest })
+    }
+
+    pub(in crate::store) async fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey> {
+        let mut transaction = self.writer().await?;
+        let revoked: Option<String> = sqlx::query_scalar(
+            "UPDATE api_keys SET revoked_at_us = $1 WHERE id = $2 AND revoked_at_us IS NULL RETURNING name",
+        )
+        .bind(now.as_microsecond())
+        .bind(id.to_string())
+        .fetch_optional(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        if let Some(name) = revoked {
+            let change = Change::of(AuditAction::KeyRevoked, format!("{id} {name}"));
+            self.record(&mut transaction, change, now).await?;
+        }
+        transaction.commit().await.map_err(failed)?;
+        self.key(id).await
+    }
+
+    pub(in crate::store) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
+        let mut transaction = self.relaxed_writer().await?;
+        // In one order everywhere, or two nodes could wait for each other.
+        let mut uses = uses.to_vec();
+        uses.sort_by_key(|(id, _)| id.to_string());
+        for (id, used_at) in uses {
+            sqlx::query("UPDATE api_keys SET last_used_at_us = GREATEST(last_used_at_us, $1) WHERE id = $2")
+                .bind(used_at.as_microsecond())
+                .bind(id.to_string())
+                .execute(&mut *transaction)
+                .await
+                .map_err(failed)?;
+        }
+        transaction.commit().await.map_err(failed)
+    }
+}
+
+async fn make_room(connection: &mut PgConnection, limit: u32, now: Timestamp) -> Result<()> {
+    sqlx::query(
+        "DELETE FROM api_keys WHERE id IN (SELECT id FROM api_keys \
+         WHERE revoked_at_us IS NOT NULL OR expires_at_us <= $1 ORDER BY id \
+         LIMIT GREATEST(0, (SELECT count(*) FROM api_keys) + 1 - $2))",
+    )
+    .bind(now.as_microsecond())
+    .bind(i64::from(limit))
+    .execute(&mut *connection)
+    .await
+    .map_err(failed)?;
+    let rows: i64 =
+        sqlx::query_scalar("SELECT count(*) FROM api_keys").fetch_one(connection).await.map_err(failed)?;
+    check_limit(rows, limit)
+}

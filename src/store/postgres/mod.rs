@@ -1,0 +1,174 @@
+//! The store of a PostgreSQL database, which any number of processes share.
+//!
+//! Changes of several processes run at once. Where one is decided by rows that another may change, it locks them first:
+//! a camera's row for what belongs to the camera (`cameras::lock_camera`), an advisory lock for limits over a whole
+//! table (`locks`). Locks are taken in this order: cameras by their keys, an idempotency key, jobs, limits. Jobs are claimed with `SKIP LOCKED`.
+
+mod audit;
+mod camera_moves;
+mod cameras;
+mod connection;
+mod copy;
+mod errors;
+mod evaluations;
+mod group_commit;
+mod idempotency;
+mod jobs;
+mod keys;
+mod latest_runs;
+mod locks;
+mod models;
+mod retention;
+mod runs;
+mod sample_retention;
+mod sample_table;
+mod samples;
+mod sites;
+#[cfg(test)]
+mod tests;
+mod training;
+
+use std::sync::Arc;
+
+use sqlx::{PgPool, Postgres, Transaction};
+
+use super::StoreOptions;
+use super::group_commit::GroupCommit;
+use super::limits::{StorageStatus, StoreLimits, Usage};
+use super::location::DatabaseUrl;
+use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
+
+use errors::failed;
+use group_commit::GroupWriter;
+
+/// The store of one database.
+#[derive(Clone)]
+pub(super) struct Store {
+    inner: Arc<Inner>,
+    /// On whose behalf changes are recorded in the audit log.
+    actor: Arc<Actor>,
+}
+
+struct Inner {
+    pool: PgPool,
+    samples: GroupCommit,
+    usage: Arc<Usage>,
+}
+
+impl Store {
+    pub(super) async fn connect(url: &DatabaseUrl, options: StoreOptions) -> Result<Self> {
+        let pool = connection::open(url).await?;
+        let usage = Arc::new(Usage::new(options.limits));
+        let writer = GroupWriter { pool: pool.clone(), usage: Arc::clone(&usage) };
+        let samples = GroupCommit::start(Arc::new(writer));
+        let inner = Arc::new(Inner { pool, samples, usage });
+        let store = Self { inner, actor: Arc::new(Actor::program(&options.role)) };
+        store.count_all_samples().await?;
+        Ok(store)
+    }
+
+    pub(super) fn on_behalf_of(&self, actor: Arc<Actor>) -> Self {
+        Self { inner: Arc::clone(&self.inner), actor }
+    }
+
+    pub(super) async fn close(&self) {
+        self.inner.samples.close().await;
+        self.inner.pool.close().await;
+    }
+
+    pub(super) async fn ping(&self) -> Result<()> {
+        if self.inner.samples.has_ended() {
+            return Err(Error::refused(ErrorKind::ShuttingDown, "the store is closed"));
+        }
+        let mut reader = self.reader().await?;
+        sqlx::query_scalar::<_, i64>("SELECT count(*) FROM cameras WHERE key = 0")
+            .fetch_one(&mut *reader)
+            .await
+            .map_err(failed)?;
+        Ok(())
+    }
+
+    pub(super) fn is_full(&self) -> bool {
+        self.inner.usage.is_full()
+    }
+
+    /// Counts, and tells how much is stored.
+    pub(super) async fn maintain(&self) -> Result<StorageStatus> {
+        self.count_all_samples().await?;
+        let mut reader = self.reader().await?;
+        let bytes: i64 = sqlx::query_scalar("SELECT pg_database_size(current_database())")
+            .fetch_one(&mut *reader)
+            .await
+            .map_err(failed)?;
+        // Whether there is room again shows the next import: the disk is that of another machine.
+        self.inner.usage.has_room();
+        Ok(StorageStatus {
+            database_bytes: u64::try_from(bytes).unwrap_or_default(),
+            free_bytes: 0,
+            disk_available_bytes: None,
+            samples: self.inner.usage.samples(),
+            queued_rows: self.inner.samples.queued_rows(),
+            is_full: self.is_full(),
+        })
+    }
+
+    async fn count_all_samples(&self) -> Result<()> {
+        let mut reader = self.reader().await?;
+        let samples: i64 =
+            sqlx::query_scalar("SELECT coalesce(sum(samples + without_fix), 0)::BIGINT FROM sample_counts")
+                .fetch_one(&mut *reader)
+                .await
+                .map_err(failed)?;
+        self.inner.usage.counted(samples);
+        Ok(())
+    }
+
+    /// Keeps groups of samples from being stored until it is dropped.
+    #[cfg(test)]
+    pub(super) async fn hold(&self) -> Box<dyn Send + '_> {
+        let mut transaction = self.writer().await.expect("a transaction");
+        sqlx::raw_sql("LOCK TABLE cameras IN ACCESS EXCLUSIVE MODE")
+            .execute(&mut *transaction)
+            .await
+            .expect("locks");
+        Box::new(transaction)
+    }
+
+    /// Callers whose batches are still queued.
+    #[cfg(test)]
+    pub(super) fn waiting(&self) -> usize {
+        self.inner.samples.waiting()
+    }
+
+    /// Executes statements without the checks of the store.
+    #[cfg(test)]
+    pub(super) async fn tamper(&self, sql: &'static str) {
+        let mut transaction = self.writer().await.expect("a transaction");
+        sqlx::raw_sql(sql).execute(&mut *transaction).await.expect("runs");
+        transaction.commit().await.expect("commits");
+    }
+
+    fn limits(&self) -> &StoreLimits {
+        &self.inner.usage.limits
+    }
+
+    /// A transaction for one or several reads, which all see the same state.
+    async fn reader(&self) -> Result<Transaction<'static, Postgres>> {
+        connection::begin_read(&self.inner.pool).await
+    }
+
+    /// A transaction for a change that must be on the disk before it is acknowledged.
+    async fn writer(&self) -> Result<Transaction<'static, Postgres>> {
+        connection::begin_write(&self.inner.pool, Durability::Synced).await
+    }
+
+    /// A transaction for a change that a power cut (not a crash) may undo.
+    async fn relaxed_writer(&self) -> Result<Transaction<'static, Postgres>> {
+        connection::begin_write(&self.inner.pool, Durability::Relaxed).await
+    }
+}
+
+/// A number that is not NaN; NaN is stored as NULL in both backends.
+fn finite(number: f64) -> Option<f64> {
+    (!number.is_nan()).then_some(number)
+}

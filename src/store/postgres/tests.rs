@@ -1,0 +1,215 @@
+//! What only PostgreSQL has: several processes, connections that end, migrations at once.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+use std::time::Duration;
+
+use sqlx::Connection as _;
+use tempfile::TempDir;
+use uuid::Uuid;
+
+use crate::domain::{CameraId, Durability, ErrorKind, NewCamera, RunId};
+use crate::store::tests::copy::copy_and_compare;
+use crate::store::tests::{Fixture, Home, at, id, new_database, options, sample};
+use crate::store::{DatabaseUrl, Location, SampleFilter, Store, StoreOptions};
+
+const LEASE: Duration = Duration::from_secs(30);
+
+async fn database() -> Home {
+    let server = std::env::var("SIGHTFIX_TEST_POSTGRES").expect("the URL of a server's database");
+    Home::Database(new_database(&server).await)
+}
+
+fn url(home: &Home) -> String {
+    match home {
+        Home::Database(url) => url.revealed().to_owned(),
+        Home::Folder(_) => panic!("a database"),
+    }
+}
+
+#[test]
+fn a_url_is_shown_without_its_secrets() {
+    let url =
+        DatabaseUrl::new("postgres://someone:pass-word@db.example/fixes?sslmode=disable").expect("a URL");
+    assert_eq!(url.to_string(), "postgres://db.example:5432/fixes");
+    assert_eq!(format!("{url:?}"), "postgres://db.example:5432/fixes");
+    let refused = DatabaseUrl::new("mysql://someone:pass-word@db").expect_err("another database");
+    assert_eq!(refused.kind(), ErrorKind::InvalidArgument);
+    assert!(!refused.to_string().contains("pass-word"), "{refused}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn several_may_open_one_new_database_at_once_and_write_side_by_side() {
+    let home = Arc::new(database().await);
+    let opening: Vec<_> = (0..6)
+        .map(|_| {
+            let home = Arc::clone(&home);
+            tokio::spawn(async move { home.open().await })
+        })
+        .collect();
+    let mut stores = Vec::new();
+    for store in opening {
+        stores.push(store.await.expect("no panic"));
+    }
+    for camera in ["a", "b", "c"] {
+        stores[0].insert_camera(&NewCamera::named(id(camera)), at(0)).await.expect("new");
+    }
+    // Every store sends each sample for all cameras, in orders of its own, so groups meet in their keys.
+    let writing = stores.iter().cloned().enumerate().map(|(index, store)| {
+        tokio::spawn(async move {
+            let mut accepted = 0;
+            for n in 0..60 {
+                let camera = id(["a", "b", "c"][(n + index) % 3]);
+                let rows = (0..20).map(|second| sample(second + 20 * (n as i64 / 3), "x")).collect();
+                let inserted = store.insert_samples(&camera, rows, Durability::Synced).await.expect("stored");
+                accepted += inserted.accepted;
+            }
+            accepted
+        })
+    });
+    let mut accepted = 0;
+    for task in writing.collect::<Vec<_>>() {
+        accepted += task.await.expect("no panic");
+    }
+    assert_eq!(accepted, 3 * 400, "each key was new to one store");
+    for camera in ["a", "b", "c"] {
+        let counted = stores[5].count_samples(&id(camera), &SampleFilter::default()).await.expect("counted");
+        assert_eq!((counted, stores[5].camera(&id(camera)).await.expect("known").samples.all), (400, 400));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn workers_of_several_processes_claim_each_run_once() {
+    let home = database().await;
+    let stores = [home.open().await, home.open().await, home.open().await];
+    for n in 0..60 {
+        let camera = CameraId::new(&format!("camera-{n}")).expect("a slug");
+        stores[0].insert_camera(&NewCamera::named(camera.clone()), at(0)).await.expect("new");
+        let run = RunId(Uuid::from_u128(n));
+        stores[0].insert_run(run, &camera, &options(), 100, at(1)).await.expect("queued");
+    }
+    let workers: Vec<_> = (0..12)
+        .map(|worker| {
+            let store = stores[worker % 3].clone();
+            tokio::spawn(async move {
+                let mut claimed = Vec::new();
+                while let Some(claim) = store.claim_run(LEASE, at(2)).await.expect("works") {
+                    claimed.push(claim.job.id);
+                }
+                claimed
+            })
+        })
+        .collect();
+    let (mut claims, mut runs) = (0, HashSet::new());
+    for worker in workers {
+        let claimed = worker.await.expect("no panic");
+        claims += claimed.len();
+        runs.extend(claimed);
+    }
+    assert_eq!((claims, runs.len()), (60, 60));
+}
+
+/// Connections that the server ends, at any moment, cost an error at most; what was acknowledged stays.
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn terminated_connections_lose_and_duplicate_nothing_that_was_acknowledged() {
+    let fixture = Fixture::at(database().await).await;
+    let (store, camera) = (fixture.store.clone(), fixture.camera.clone());
+    let killing = {
+        let url = url(&fixture.folder);
+        tokio::spawn(async move {
+            let mut connection = sqlx::PgConnection::connect(&url).await.expect("a connection");
+            let mut killed = 0;
+            for _ in 0..60 {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+                let ended: Vec<bool> = sqlx::query_scalar(
+                    "SELECT pg_terminate_backend(pid) FROM pg_stat_activity \
+                     WHERE datname = current_database() AND pid <> pg_backend_pid()",
+                )
+                .fetch_all(&mut connection)
+                .await
+                .expect("works");
+                killed += ended.len();
+            }
+            killed
+        })
+    };
+    let (mut acknowledged, mut refused, mut second) = (0, 0, 0);
+    while !killing.is_finished() {
+        let rows = (0..5).map(|n| sample(second + n, "a")).collect();
+        match store.insert_samples(&camera, rows, Durability::Synced).await {
+            // A commit whose answer was lost is met again as duplicates.
+            Ok(inserted) => {
+                assert_eq!(inserted.accepted + inserted.duplicate, 5);
+                acknowledged += 5;
+                second += 5;
+            }
+            Err(error) => {
+                assert_eq!(error.kind(), ErrorKind::Overloaded, "{error}");
+                refused += 1;
+            }
+        }
+    }
+    let killed = killing.await.expect("no panic");
+    let last = (0..5).map(|n| sample(second + n, "a")).collect::<Vec<_>>();
+    while store.insert_samples(&camera, last.clone(), Durability::Synced).await.is_err() {}
+    acknowledged += 5;
+    println!("{killed} connections ended, {acknowledged} rows acknowledged, {refused} calls refused");
+    assert!(killed > 0 && acknowledged > 0);
+    assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), acknowledged);
+    assert_eq!(store.camera(&camera).await.expect("known").samples.all, acknowledged);
+}
+
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn what_cannot_be_opened_says_why() {
+    let home = database().await;
+    let store = home.open().await;
+    crate::store::on_backend!(store, store => store.tamper(
+        "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
+         VALUES (9000, 'later', TRUE, '', 0)"
+    ).await);
+    let refusal = async |location: &Location| match Store::open_at(location, StoreOptions::default()).await {
+        Ok(_) => panic!("opens"),
+        Err(error) => error.to_string(),
+    };
+    let text = refusal(&home.location()).await;
+    assert!(text.contains("newer version") && text.contains("9000"), "{text}");
+    let absent = DatabaseUrl::new("postgres://someone:pass-word@127.0.0.1:1/fixes").expect("a URL");
+    let text = refusal(&Location::Database(absent)).await;
+    assert!(text.contains("postgres://127.0.0.1:1/fixes") && !text.contains("pass-word"), "{text}");
+}
+
+/// A migration that waits for another one holds no snapshot, which would keep an index from being built.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_waiting_start_does_not_block_an_index_that_is_built_concurrently() {
+    let home = Arc::new(database().await);
+    drop(home.open().await);
+    let mut migrating = sqlx::PgConnection::connect(&url(&home)).await.expect("a connection");
+    let mut holder = migrating.begin().await.expect("begins");
+    assert!(super::locks::try_lock_limit(&mut holder, super::locks::Limit::Schema).await.expect("works"));
+    let waiting = {
+        let home = Arc::clone(&home);
+        tokio::spawn(async move { home.open().await })
+    };
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    assert!(!waiting.is_finished(), "the schema is locked");
+    let mut other = sqlx::PgConnection::connect(&url(&home)).await.expect("a connection");
+    // The holder's own transaction has no snapshot either, once its statement has ended.
+    sqlx::raw_sql("CREATE INDEX CONCURRENTLY by_class ON samples (class)")
+        .execute(&mut other)
+        .await
+        .expect("is built");
+    holder.rollback().await.expect("ends");
+    waiting.await.expect("no panic");
+}
+
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_folder_is_copied_into_a_database_and_back() {
+    let folder = Home::Folder(Arc::new(TempDir::new().expect("a folder")));
+    copy_and_compare(&Fixture::at(folder).await, &database().await).await;
+}

@@ -1,0 +1,49 @@
+//! Rows of answers that are repeated.
+
+use jiff::{SignedDuration, Timestamp};
+
+use crate::domain::{Actor, Error, ErrorKind, IdempotencyKey, RequestDigest, Result};
+use crate::store::limits::StoreLimits;
+
+/// A request that its client may repeat.
+#[derive(Debug, Clone)]
+pub struct IdempotencyRecord {
+    /// The client's key.
+    pub key: IdempotencyKey,
+    /// What the request asks for.
+    pub digest: RequestDigest,
+}
+
+/// An answer that was stored under a key.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StoredAnswer {
+    pub(in crate::store) digest: Vec<u8>,
+    pub(in crate::store) answer: String,
+}
+
+impl StoredAnswer {
+    /// The answer, if it was given to the same request.
+    ///
+    /// # Errors
+    /// [`ErrorKind::IdempotencyKeyReused`].
+    pub fn to_request(self, digest: &RequestDigest) -> Result<String> {
+        if self.digest == digest {
+            return Ok(self.answer);
+        }
+        Err(Error::field(
+            ErrorKind::IdempotencyKeyReused,
+            "idempotency-key",
+            "was used for another request; send the same request again, or this one under a new key",
+        ))
+    }
+}
+
+pub(in crate::store) fn owner(actor: &Actor) -> String {
+    actor.key_id.map(|id| id.to_string()).unwrap_or_default()
+}
+
+/// Keys of this time and before have expired.
+pub(in crate::store) fn expired_until_us(limits: &StoreLimits, now: Timestamp) -> i64 {
+    let life = SignedDuration::from_secs(limits.idempotency_key_s.into());
+    now.saturating_sub(life).map_or(i64::MIN, Timestamp::as_microsecond)
+}

@@ -1,0 +1,12 @@
+//! What is in a row, whatever the backend: the columns to select, the conversion into values of the domain, and
+//! the rules that need no statement.
+
+pub(super) mod audit;
+pub(super) mod cameras;
+pub(super) mod evaluations;
+pub(super) mod idempotency;
+pub(super) mod keys;
+pub(super) mod models;
+pub(super) mod runs;
+pub(super) mod samples;
+pub(super) mod sites;

@@ -1,0 +1,156 @@
+//! Rows of samples: the two tables, the order in them, and which of them a caller asks for.
+
+use std::collections::HashSet;
+use std::fmt;
+
+use jiff::Timestamp;
+
+use crate::domain::{
+    BoundingBox, Fix, Result, Sample, Score, SigmaM, StoredSample, TargetClass, TargetId, TimeRange,
+};
+use crate::geo::Position;
+use crate::store::row_decoder::{RowDecoder, StoredRow};
+
+/// A table of samples. A key is in one of them only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::store) enum SampleTable {
+    /// Samples with a fix.
+    WithFix,
+    /// Samples without one.
+    WithoutFix,
+}
+
+impl fmt::Display for SampleTable {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::WithFix => "samples",
+            Self::WithoutFix => "samples_without_fix",
+        })
+    }
+}
+
+/// A row with the batch it came from and the key of its camera.
+pub(in crate::store) struct Row<'a> {
+    pub(in crate::store) batch: usize,
+    pub(in crate::store) camera_key: i64,
+    pub(in crate::store) sample: &'a StoredSample,
+}
+
+/// Time and target of a sample, as they are stored.
+pub(in crate::store) fn key(sample: &StoredSample) -> (i64, &str) {
+    (sample.time.as_microsecond(), sample.target_id.as_str())
+}
+
+/// Keeps the last of samples that have the same key; returns how many others there were.
+pub(in crate::store) fn keep_last(samples: &mut Vec<StoredSample>) -> u64 {
+    let before = samples.len();
+    let mut seen = HashSet::with_capacity(before);
+    let mut is_last: Vec<bool> = samples
+        .iter()
+        .rev()
+        .map(|sample| seen.insert((sample.time.as_microsecond(), sample.target_id.clone())))
+        .collect();
+    samples.retain(|_| is_last.pop().unwrap_or(true));
+    (before - samples.len()) as u64
+}
+
+impl SampleTable {
+    /// The table of a sample.
+    pub(in crate::store) const fn of(sample: &StoredSample) -> Self {
+        if sample.fix.is_some() { Self::WithFix } else { Self::WithoutFix }
+    }
+
+    /// Columns to select, the same for both tables.
+    pub(in crate::store) const fn columns(self) -> &'static str {
+        match self {
+            Self::WithFix => {
+                "camera_key, time_us, target_id, left_px, top_px, width_px, height_px, longitude_deg, \
+                 latitude_deg, sigma_m, class, score, truth_longitude_deg, truth_latitude_deg"
+            }
+            Self::WithoutFix => {
+                "camera_key, time_us, target_id, left_px, top_px, width_px, height_px, NULL, NULL, NULL, class, \
+                 score, truth_longitude_deg, truth_latitude_deg"
+            }
+        }
+    }
+
+    /// Column of `sample_counts` that counts the rows of the table.
+    pub(in crate::store) const fn counter(self) -> &'static str {
+        match self {
+            Self::WithFix => "samples",
+            Self::WithoutFix => "without_fix",
+        }
+    }
+}
+
+/// Which samples of a camera.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct SampleFilter {
+    /// From this instant on.
+    pub from: Option<Timestamp>,
+    /// Before this instant.
+    pub until: Option<Timestamp>,
+    /// Of this target alone.
+    pub target_id: Option<TargetId>,
+    /// Only samples that have a fix, or only those that have none.
+    pub has_fix: Option<bool>,
+}
+
+impl SampleFilter {
+    /// All samples of a stretch of time.
+    #[must_use]
+    pub fn within(range: TimeRange) -> Self {
+        Self { from: range.from(), until: range.until(), ..Self::default() }
+    }
+
+    pub(in crate::store) fn tables(&self) -> &'static [SampleTable] {
+        match self.has_fix {
+            None => &[SampleTable::WithFix, SampleTable::WithoutFix],
+            Some(true) => &[SampleTable::WithFix],
+            Some(false) => &[SampleTable::WithoutFix],
+        }
+    }
+}
+
+/// The place of a sample in its camera's order: by time, then by target (bytes of its UTF-8).
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct SampleKey {
+    /// The sample's time.
+    pub time: Timestamp,
+    /// The sample's target.
+    pub target_id: TargetId,
+}
+
+impl SampleKey {
+    /// The key of a sample, to go on after it.
+    #[must_use]
+    pub fn of<F>(sample: &Sample<F>) -> Self {
+        Self { time: sample.time, target_id: sample.target_id.clone() }
+    }
+}
+
+/// A row of [`SampleTable::columns`].
+pub(in crate::store) fn read_sample<'r>(row: impl Into<StoredRow<'r>>) -> Result<StoredSample> {
+    let row = row.into();
+    let table = if row.is_null(7) { "samples_without_fix" } else { "samples" };
+    let mut fields = RowDecoder::new(table, row).skip(1);
+    let time = fields.timestamp()?;
+    let target_id = fields.parse(TargetId::new)?;
+    let (left_px, top_px) = (fields.get()?, fields.get()?);
+    let (width_px, height_px) = (fields.get()?, fields.get()?);
+    let bounding_box = fields.checked(BoundingBox::new(left_px, top_px, width_px, height_px))?;
+    let fix_position = position(&mut fields)?;
+    let sigma_m = fields.parse_optional(SigmaM::new)?;
+    let fix = fix_position.map(|position| Fix { position, sigma_m });
+    let class = fields.parse_optional(TargetClass::new)?;
+    let score = fields.parse_optional(Score::new)?;
+    let truth = position(&mut fields)?;
+    Ok(Sample { time, target_id, bounding_box, fix, class, score, truth })
+}
+
+/// The next two columns.
+fn position(fields: &mut RowDecoder<'_>) -> Result<Option<Position>> {
+    let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
+    let position = longitude_deg.zip(latitude_deg);
+    fields.checked(position.map(|(longitude, latitude)| Position::new(longitude, latitude)).transpose())
+}

@@ -1,0 +1,89 @@
+//! Detected changes of camera poses.
+
+use super::Store;
+use super::cameras::camera_key;
+use super::errors::failed;
+use crate::domain::{CameraId, CameraMoved, Error, JobState, Result, RunId};
+use crate::store::jobs::read_state;
+use crate::store::rows::models::read_move;
+
+impl Store {
+    pub(in crate::store) async fn insert_move(&self, camera: &CameraId, moved: &CameraMoved) -> Result<bool> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        let stored = sqlx::query(
+            "INSERT INTO camera_moves (camera_key, model_number, began_at_us, raised_at_us, shift_east_m, \
+             shift_north_m, statistic, targets) VALUES (?, ?, ?, ?, ?, ?, ?, ?) \
+             ON CONFLICT (camera_key, model_number) DO NOTHING",
+        )
+        .bind(key)
+        .bind(moved.model_version)
+        .bind(moved.began_at.as_microsecond())
+        .bind(moved.raised_at.as_microsecond())
+        .bind(moved.shift_east_m)
+        .bind(moved.shift_north_m)
+        .bind(moved.statistic)
+        .bind(moved.targets)
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(stored.rows_affected() > 0)
+    }
+
+    pub(in crate::store) async fn camera_move(
+        &self,
+        camera: &CameraId,
+        model_version: u32,
+    ) -> Result<Option<CameraMoved>> {
+        let row = sqlx::query(
+            "SELECT cameras.id, model_number, began_at_us, raised_at_us, shift_east_m, shift_north_m, statistic, \
+             targets FROM camera_moves JOIN cameras ON cameras.key = camera_key \
+             WHERE cameras.id = ? AND model_number = ?",
+        )
+        .bind(camera.as_str())
+        .bind(model_version)
+        .fetch_optional(self.readers())
+        .await
+        .map_err(failed)?;
+        row.as_ref().map(read_move).transpose()
+    }
+
+    pub(in crate::store) async fn retraining_state(
+        &self,
+        camera: &CameraId,
+        model_version: u32,
+    ) -> Result<Option<JobState>> {
+        let state: Option<String> = sqlx::query_scalar(
+            "SELECT state FROM camera_moves JOIN cameras ON cameras.key = camera_moves.camera_key \
+             JOIN training_runs ON training_runs.id = retraining_run \
+             WHERE cameras.id = ? AND model_number = ?",
+        )
+        .bind(camera.as_str())
+        .bind(model_version)
+        .fetch_optional(self.readers())
+        .await
+        .map_err(failed)?;
+        state.as_deref().map(read_state).transpose().map_err(Error::fault)
+    }
+
+    pub(in crate::store) async fn note_retraining(
+        &self,
+        camera: &CameraId,
+        model_version: u32,
+        run: RunId,
+    ) -> Result<()> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        sqlx::query("UPDATE camera_moves SET retraining_run = ? WHERE camera_key = ? AND model_number = ?")
+            .bind(run.to_string())
+            .bind(key)
+            .bind(model_version)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        transaction.commit().await.map_err(failed)
+    }
+}

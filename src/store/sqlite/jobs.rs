@@ -1,0 +1,213 @@
+//! The statements that the tables of background jobs have in common.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use sqlx::{AssertSqlSafe, SqliteConnection};
+use uuid::Uuid;
+
+use super::Store;
+use super::errors::failed;
+use crate::domain::{Error, JobState, Result};
+use crate::store::jobs::{
+    self, COUNT_JOBS, Claim, Finished, Heartbeat, JobCounts, JobEnd, JobTable, lease_expired, lease_us,
+};
+
+const LEASE_EXPIRED: &str = lease_expired!("?1");
+
+pub(super) const RUNS: Jobs = Jobs(&jobs::RUNS);
+pub(super) const EVALUATIONS: Jobs = Jobs(&jobs::EVALUATIONS);
+
+impl Store {
+    pub(in crate::store) async fn job_counts(&self) -> Result<JobCounts> {
+        let rows: Vec<(String, String, i64)> =
+            sqlx::query_as(COUNT_JOBS).fetch_all(self.readers()).await.map_err(failed)?;
+        Ok(JobCounts::of(&rows))
+    }
+}
+
+/// The statements of a table of jobs.
+pub(super) struct Jobs(&'static JobTable);
+
+impl Jobs {
+    /// Refuses one job more than `max_live` that have not ended.
+    pub(super) async fn check_capacity(
+        &self,
+        connection: &mut SqliteConnection,
+        max_live: u32,
+    ) -> Result<()> {
+        let table = self.0.table;
+        let sql = format!("SELECT count(*) FROM {table} WHERE state IN ('queued', 'running')");
+        let live: i64 = sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(connection).await.map_err(failed)?;
+        self.0.check_capacity(live, max_live)
+    }
+
+    /// Claims the oldest job that is queued or whose lease has expired. Attempt and fence go up by one;
+    /// the progress is reset.
+    pub(super) async fn claim(
+        &self,
+        connection: &mut SqliteConnection,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Option<Claim<Uuid>>> {
+        let JobTable { table, reset_progress, .. } = self.0;
+        let sql = format!(
+            "UPDATE {table} SET state = 'running', attempt = attempt + 1, fence = fence + 1, \
+             lease_until_us = ?1 + ?2, lease_us = ?2, started_at_us = ?1, phase = '', remaining_s = NULL, \
+             {reset_progress} \
+             WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') AND {LEASE_EXPIRED} \
+             ORDER BY id LIMIT 1) \
+             RETURNING id, fence, cancel_requested"
+        );
+        let claimed: Option<(String, i64, i64)> = sqlx::query_as(AssertSqlSafe(sql))
+            .bind(now.as_microsecond())
+            .bind(lease_us(lease))
+            .fetch_optional(connection)
+            .await
+            .map_err(failed)?;
+        let Some((id, fence, cancel_requested)) = claimed else { return Ok(None) };
+        let job = Uuid::parse_str(&id).map_err(Error::fault)?;
+        Ok(Some(Claim { job, fence, cancel_requested: cancel_requested != 0 }))
+    }
+
+    /// Renews the lease.
+    pub(super) async fn heartbeat(
+        &self,
+        connection: &mut SqliteConnection,
+        (id, fence): (Uuid, i64),
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Heartbeat> {
+        let sql = format!(
+            "UPDATE {} SET lease_until_us = ?1 + ?2, lease_us = ?2 \
+             WHERE id = ?3 AND fence = ?4 AND state = 'running' RETURNING cancel_requested",
+            self.0.table
+        );
+        let cancel_requested: Option<i64> = sqlx::query_scalar(AssertSqlSafe(sql))
+            .bind(now.as_microsecond())
+            .bind(lease_us(lease))
+            .bind(id.to_string())
+            .bind(fence)
+            .fetch_optional(connection)
+            .await
+            .map_err(failed)?;
+        Ok(match cancel_requested {
+            None => Heartbeat::Lost,
+            Some(0) => Heartbeat::Continue,
+            Some(_) => Heartbeat::CancelRequested,
+        })
+    }
+
+    /// The job's camera and whether its cancellation was requested, if the fence is still the newest and
+    /// the job runs.
+    pub(super) async fn owns_lease(
+        &self,
+        connection: &mut SqliteConnection,
+        (id, fence): (Uuid, i64),
+    ) -> Result<Option<(i64, bool)>> {
+        let sql = format!(
+            "SELECT camera_key, cancel_requested FROM {} WHERE id = ? AND fence = ? AND state = 'running'",
+            self.0.table
+        );
+        let owned: Option<(i64, i64)> = sqlx::query_as(AssertSqlSafe(sql))
+            .bind(id.to_string())
+            .bind(fence)
+            .fetch_optional(connection)
+            .await
+            .map_err(failed)?;
+        Ok(owned.map(|(camera_key, cancel_requested)| (camera_key, cancel_requested != 0)))
+    }
+
+    /// Cancels a job that has not ended: at once where no worker holds a live lease on it, otherwise at
+    /// its worker's next heartbeat.
+    pub(super) async fn cancel(
+        &self,
+        connection: &mut SqliteConnection,
+        id: Uuid,
+        now: Timestamp,
+    ) -> Result<()> {
+        let table = self.0.table;
+        let sql = format!(
+            "SELECT 1 FROM {table} WHERE id = ?2 AND (state = 'queued' OR (state = 'running' AND {LEASE_EXPIRED}))"
+        );
+        let unclaimed: Option<i64> = sqlx::query_scalar(AssertSqlSafe(sql))
+            .bind(now.as_microsecond())
+            .bind(id.to_string())
+            .fetch_optional(&mut *connection)
+            .await
+            .map_err(failed)?;
+        if unclaimed.is_some() {
+            self.end(connection, id, JobState::Cancelled, None, now).await?;
+        }
+        let sql = format!("UPDATE {table} SET cancel_requested = 1 WHERE id = ?");
+        sqlx::query(AssertSqlSafe(sql)).bind(id.to_string()).execute(connection).await.map_err(failed)?;
+        Ok(())
+    }
+
+    /// Ends a job, or returns it to the queue, if the worker still owns its lease; `None` if it lost it,
+    /// and then nothing was changed. A job whose cancellation was requested is cancelled even if it
+    /// succeeded or was returned.
+    pub(super) async fn finish<O>(
+        &self,
+        connection: &mut SqliteConnection,
+        (id, fence): (Uuid, i64),
+        end: JobEnd<O>,
+        now: Timestamp,
+    ) -> Result<Option<Finished<O>>> {
+        let Some((camera_key, cancel_requested)) = self.owns_lease(connection, (id, fence)).await? else {
+            return Ok(None);
+        };
+        let end = match end {
+            JobEnd::Succeeded { .. } | JobEnd::Requeue if cancel_requested => JobEnd::Cancelled,
+            end => end,
+        };
+        let mut stored = None;
+        match end {
+            JobEnd::Succeeded { output, outcome } => {
+                self.end(connection, id, JobState::Succeeded, outcome, now).await?;
+                stored = Some(output);
+            }
+            JobEnd::Failed { outcome } => {
+                self.end(connection, id, JobState::Failed, Some(outcome), now).await?;
+            }
+            JobEnd::Cancelled => self.end(connection, id, JobState::Cancelled, None, now).await?,
+            JobEnd::Requeue => self.requeue(connection, id).await?,
+        }
+        Ok(Some(Finished { camera_key, output: stored }))
+    }
+
+    async fn end(
+        &self,
+        connection: &mut SqliteConnection,
+        id: Uuid,
+        state: JobState,
+        outcome: Option<String>,
+        now: Timestamp,
+    ) -> Result<()> {
+        let sql = format!(
+            "UPDATE {} SET state = ?, outcome = ?, ended_at_us = ?, lease_until_us = NULL, \
+             remaining_s = NULL WHERE id = ?",
+            self.0.table
+        );
+        sqlx::query(AssertSqlSafe(sql))
+            .bind(state.as_str())
+            .bind(outcome)
+            .bind(now.as_microsecond())
+            .bind(id.to_string())
+            .execute(connection)
+            .await
+            .map_err(failed)?;
+        Ok(())
+    }
+
+    /// An orderly return is no failed attempt: otherwise a few restarts would exhaust the attempts of a
+    /// job that never failed.
+    async fn requeue(&self, connection: &mut SqliteConnection, id: Uuid) -> Result<()> {
+        let sql = format!(
+            "UPDATE {} SET state = 'queued', lease_until_us = NULL, attempt = attempt - 1 WHERE id = ?",
+            self.0.table
+        );
+        sqlx::query(AssertSqlSafe(sql)).bind(id.to_string()).execute(connection).await.map_err(failed)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,141 @@
+//! Keys that clients present: digests, scopes, last use, revocation.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+
+use super::Store;
+use super::errors::failed;
+use crate::domain::{ApiKey, AuditAction, CameraId, Error, KeyId, NewKey, Result, SecretDigest};
+use crate::store::refusals::no_key;
+use crate::store::rows::audit::Change;
+use crate::store::rows::keys::{KeysVersion, check_limit, read_key, select_keys as select};
+
+impl Store {
+    pub(in crate::store) async fn insert_key(
+        &self,
+        id: KeyId,
+        key: &NewKey,
+        digest: &SecretDigest,
+        now: Timestamp,
+    ) -> Result<ApiKey> {
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
+        make_room(&mut transaction, self.limits().keys, now).await?;
+        let cameras: Vec<&str> = key.scope.cameras().iter().map(CameraId::as_str).collect();
+        sqlx::query(
+            "INSERT INTO api_keys (id, name, role, cameras, sha256, created_at_us, expires_at_us) \
+             VALUES (?, ?, ?, ?, ?, ?, ?)",
+        )
+        .bind(id.to_string())
+        .bind(&key.name)
+        .bind(key.scope.role().as_str())
+        .bind(serde_json::to_string(&cameras).map_err(Error::fault)?)
+        .bind(digest.as_bytes().as_slice())
+        .bind(now.as_microsecond())
+        .bind(key.expires_at.map(Timestamp::as_microsecond))
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        let subject = format!("{id} {} {}", key.scope.role(), key.name);
+        self.record(&mut transaction, Change::of(AuditAction::KeyCreated, subject), now).await?;
+        transaction.commit().await.map_err(failed)?;
+        self.key(id).await
+    }
+
+    pub(in crate::store) async fn key(&self, id: KeyId) -> Result<ApiKey> {
+        let row = sqlx::query(select!("WHERE id = ?"))
+            .bind(id.to_string())
+            .fetch_optional(self.readers())
+            .await
+            .map_err(failed)?;
+        Ok(read_key(&row.ok_or_else(|| no_key(id))?)?.0)
+    }
+
+    pub(in crate::store) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
+        let rows = sqlx::query(select!("WHERE id < ? ORDER BY id DESC LIMIT ?"))
+            // "~" sorts behind all UUIDs.
+            .bind(before.map_or_else(|| "~".to_owned(), |id| id.to_string()))
+            .bind(limit)
+            .fetch_all(self.readers())
+            .await
+            .map_err(failed)?;
+        rows.iter().map(|row| Ok(read_key(row)?.0)).collect()
+    }
+
+    pub(in crate::store) async fn unrevoked_keys(&self) -> Result<Vec<(ApiKey, SecretDigest)>> {
+        let rows = sqlx::query(select!("WHERE revoked_at_us IS NULL"))
+            .fetch_all(self.readers())
+            .await
+            .map_err(failed)?;
+        rows.iter().map(read_key).collect()
+    }
+
+    pub(in crate::store) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
+        let row = sqlx::query(select!("WHERE sha256 = ?"))
+            .bind(digest.as_bytes().as_slice())
+            .fetch_optional(self.readers())
+            .await
+            .map_err(failed)?;
+        row.map(|row| Ok(read_key(&row)?.0)).transpose()
+    }
+
+    pub(in crate::store) async fn keys_version(&self) -> Result<KeysVersion> {
+        let (rows, revoked, latest) =
+            sqlx::query_as("SELECT count(*), count(revoked_at_us), max(id) FROM api_keys")
+                .fetch_one(self.readers())
+                .await
+                .map_err(failed)?;
+        Ok(KeysVersion { rows, revoked, latest })
+    }
+
+    pub(in crate::store) async fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let revoked: Option<String> = sqlx::query_scalar(
+            "UPDATE api_keys SET revoked_at_us = ? WHERE id = ? AND revoked_at_us IS NULL RETURNING name",
+        )
+        .bind(now.as_microsecond())
+        .bind(id.to_string())
+        .fetch_optional(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        if let Some(name) = revoked {
+            let change = Change::of(AuditAction::KeyRevoked, format!("{id} {name}"));
+            self.record(&mut transaction, change, now).await?;
+        }
+        transaction.commit().await.map_err(failed)?;
+        self.key(id).await
+    }
+
+    pub(in crate::store) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
+        for (id, used_at) in uses {
+            sqlx::query(
+                "UPDATE api_keys SET last_used_at_us = max(coalesce(last_used_at_us, 0), ?) WHERE id = ?",
+            )
+            .bind(used_at.as_microsecond())
+            .bind(id.to_string())
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        }
+        transaction.commit().await.map_err(failed)
+    }
+}
+
+async fn make_room(connection: &mut SqliteConnection, limit: u32, now: Timestamp) -> Result<()> {
+    sqlx::query(
+        "DELETE FROM api_keys WHERE id IN (SELECT id FROM api_keys \
+         WHERE revoked_at_us IS NOT NULL OR expires_at_us <= ?1 ORDER BY id \
+         LIMIT max(0, (SELECT count(*) FROM api_keys) + 1 - ?2))",
+    )
+    .bind(now.as_microsecond())
+    .bind(limit)
+    .execute(&mut *connection)
+    .await
+    .map_err(failed)?;
+    let rows: i64 =
+        sqlx::query_scalar("SELECT count(*) FROM api_keys").fetch_one(connection).await.map_err(failed)?;
+    check_limit(rows, limit)
+}

@@ -1,0 +1,247 @@
+//! Training runs: jobs whose output is a model version.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use sqlx::{SqliteConnection, SqliteExecutor};
+
+use super::Store;
+use super::cameras::camera_key;
+use super::errors::failed;
+use super::idempotency::{find_answer, insert_answer};
+use super::jobs::RUNS;
+use super::models::{activate, add_model};
+use super::retention::{prune_models, prune_runs};
+use crate::domain::{AuditAction, CameraId, Result, RunId, RunProgress, TrainingOptions, TrainingRun};
+use crate::store::jobs::{Claim, Heartbeat};
+use crate::store::refusals::no_run;
+use crate::store::rows::audit::{Change, version};
+use crate::store::rows::idempotency::IdempotencyRecord;
+use crate::store::rows::runs::{
+    RunEnd, RunOutput, check_no_live_run, check_not_ended, read_run, run_of, select_runs,
+};
+
+macro_rules! select {
+    ($rest:literal) => {
+        // A document that is damaged is reported where the model is read.
+        select_runs!(
+            "CASE WHEN json_valid(models.metadata) THEN json_extract(models.metadata, '$.report') END",
+            $rest
+        )
+    };
+}
+
+impl Store {
+    /// Queues a run.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunLive`] if the camera has a run that has not ended,
+    /// [`ErrorKind::Overloaded`] if all cameras together have `max_live` of them.
+    pub(in crate::store) async fn insert_run(
+        &self,
+        run: RunId,
+        camera: &CameraId,
+        options: &TrainingOptions,
+        max_live: u32,
+        now: Timestamp,
+    ) -> Result<TrainingRun> {
+        self.insert_run_once(run, camera, options, max_live, None, now).await
+    }
+
+    pub(in crate::store) async fn insert_run_once(
+        &self,
+        run: RunId,
+        camera: &CameraId,
+        options: &TrainingOptions,
+        max_live: u32,
+        record: Option<&IdempotencyRecord>,
+        now: Timestamp,
+    ) -> Result<TrainingRun> {
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
+        let key = camera_key(&mut *transaction, camera).await?;
+        if let Some(record) = record {
+            let caller = (&*self.actor, &record.key);
+            if let Some(answer) = find_answer(&mut *transaction, self.limits(), caller, now).await? {
+                let first = answer.to_request(&record.digest)?.parse()?;
+                return run_of(find_run(&mut *transaction, first).await?, camera, first);
+            }
+            insert_answer(&mut transaction, self.limits(), (&self.actor, record), &run.to_string(), now)
+                .await?;
+        }
+        prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
+        check_no_live_run(live_run(&mut transaction, key).await?)?;
+        RUNS.check_capacity(&mut transaction, max_live).await?;
+        sqlx::query(
+            "INSERT INTO training_runs (id, camera_key, recipe, seed, epochs, from_us, until_us, state, \
+             created_at_us) VALUES (?, ?, ?, ?, ?, ?, ?, 'queued', ?)",
+        )
+        .bind(run.to_string())
+        .bind(key)
+        .bind(options.recipe.as_str())
+        .bind(options.seed.cast_signed())
+        .bind(options.epochs)
+        .bind(options.from.map(Timestamp::as_microsecond))
+        .bind(options.until.map(Timestamp::as_microsecond))
+        .bind(now.as_microsecond())
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        let change = Change::of_camera(AuditAction::RunStarted, camera, Some(run.to_string()));
+        self.record(&mut transaction, change, now).await?;
+        let stored = find_run(&mut *transaction, run).await?;
+        transaction.commit().await.map_err(failed)?;
+        stored.ok_or_else(|| no_run(run))
+    }
+
+    pub(in crate::store) async fn run(&self, camera: &CameraId, run: RunId) -> Result<TrainingRun> {
+        camera_key(self.readers(), camera).await?;
+        run_of(find_run(self.readers(), run).await?, camera, run)
+    }
+
+    pub(in crate::store) async fn runs(
+        &self,
+        camera: &CameraId,
+        before: Option<RunId>,
+        limit: u32,
+    ) -> Result<Vec<TrainingRun>> {
+        let key = camera_key(self.readers(), camera).await?;
+        // "~" sorts behind all UUIDs.
+        let before = before.map_or_else(|| "~".to_owned(), |run| run.to_string());
+        let rows =
+            sqlx::query(select!("WHERE runs.camera_key = ? AND runs.id < ? ORDER BY runs.id DESC LIMIT ?"))
+                .bind(key)
+                .bind(before)
+                .bind(limit)
+                .fetch_all(self.readers())
+                .await
+                .map_err(failed)?;
+        rows.iter().map(read_run).collect()
+    }
+
+    pub(in crate::store) async fn claim_run(
+        &self,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Option<Claim<TrainingRun>>> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let Some(claim) = RUNS.claim(&mut transaction, lease, now).await? else { return Ok(None) };
+        let id = RunId(claim.job);
+        sqlx::query("DELETE FROM training_epochs WHERE run_id = ?")
+            .bind(id.to_string())
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        let job = find_run(&mut *transaction, id).await?.ok_or_else(|| no_run(id))?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
+    }
+
+    pub(in crate::store) async fn heartbeat_run(
+        &self,
+        run: RunId,
+        fence: i64,
+        progress: &RunProgress,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Heartbeat> {
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
+        let heartbeat = RUNS.heartbeat(&mut transaction, (run.0, fence), lease, now).await?;
+        if heartbeat == Heartbeat::Lost {
+            return Ok(heartbeat);
+        }
+        sqlx::query(
+            "UPDATE training_runs SET phase = ?, epoch_done = ?, epochs_planned = ?, \
+             reconstruction_error = ?, regression_error = ?, error_scale = ?, remaining_s = ? WHERE id = ?",
+        )
+        .bind(&progress.phase)
+        .bind(progress.epoch)
+        .bind(progress.epochs)
+        .bind(progress.reconstruction_error)
+        .bind(progress.regression_error)
+        .bind(progress.error_scale)
+        .bind(progress.remaining_s)
+        .bind(run.to_string())
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(heartbeat)
+    }
+
+    pub(in crate::store) async fn cancel_run(
+        &self,
+        camera: &CameraId,
+        run: RunId,
+        now: Timestamp,
+    ) -> Result<TrainingRun> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        camera_key(&mut *transaction, camera).await?;
+        let stored = run_of(find_run(&mut *transaction, run).await?, camera, run)?;
+        check_not_ended(&stored)?;
+        RUNS.cancel(&mut transaction, run.0, now).await?;
+        let change = Change::of_camera(AuditAction::RunCancelled, camera, Some(run.to_string()));
+        self.record(&mut transaction, change, now).await?;
+        let stored = find_run(&mut *transaction, run).await?;
+        transaction.commit().await.map_err(failed)?;
+        stored.ok_or_else(|| no_run(run))
+    }
+
+    pub(in crate::store) async fn finish_run(
+        &self,
+        run: RunId,
+        fence: i64,
+        end: RunEnd<'_>,
+        now: Timestamp,
+    ) -> Result<Option<TrainingRun>> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let Some(finished) = RUNS.finish(&mut transaction, (run.0, fence), end, now).await? else {
+            return Ok(None);
+        };
+        let mut activated = None;
+        if let Some(RunOutput { model, activate: wanted }) = finished.output {
+            let key = finished.camera_key;
+            let number = add_model(&mut transaction, key, Some(run), &model, now).await?;
+            if wanted {
+                activate(&mut transaction, key, number, now).await?;
+                activated = Some(number);
+            }
+            prune_models(&mut transaction, key, self.limits().models_per_camera).await?;
+            sqlx::query("UPDATE training_runs SET model_version = ? WHERE id = ?")
+                .bind(number)
+                .bind(run.to_string())
+                .execute(&mut *transaction)
+                .await
+                .map_err(failed)?;
+        }
+        let stored = find_run(&mut *transaction, run).await?;
+        if let Some((number, stored)) = activated.zip(stored.as_ref()) {
+            let change =
+                Change::of_camera(AuditAction::ModelActivated, &stored.camera_id, Some(version(number)));
+            self.record(&mut transaction, change, now).await?;
+        }
+        transaction.commit().await.map_err(failed)?;
+        Ok(stored)
+    }
+}
+
+async fn live_run(connection: &mut SqliteConnection, camera_key: i64) -> Result<Option<String>> {
+    sqlx::query_scalar("SELECT id FROM training_runs WHERE camera_key = ? AND state IN ('queued', 'running')")
+        .bind(camera_key)
+        .fetch_optional(connection)
+        .await
+        .map_err(failed)
+}
+
+async fn find_run(executor: impl SqliteExecutor<'_>, run: RunId) -> Result<Option<TrainingRun>> {
+    let row = sqlx::query(select!("WHERE runs.id = ?"))
+        .bind(run.to_string())
+        .fetch_optional(executor)
+        .await
+        .map_err(failed)?;
+    row.as_ref().map(read_run).transpose()
+}

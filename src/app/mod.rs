@@ -9,6 +9,7 @@ pub mod access;
 mod audit;
 mod camera_statuses;
 mod cameras;
+mod connections;
 mod evaluations;
 mod fusion;
 mod idempotency;
@@ -38,6 +39,10 @@ use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
+pub use connections::{
+    ConnectionBoard, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage, LiveConnection,
+    PushedMessage, connection_settings,
+};
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
@@ -69,6 +74,8 @@ pub struct Parts {
     pub registry: Registry,
     /// Sites, ready to track.
     pub site_registry: SiteRegistry,
+    /// What connections with other systems do.
+    pub connection_board: ConnectionBoard,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -131,6 +138,7 @@ impl App {
             opened_store: store,
             registry,
             site_registry,
+            connection_board: ConnectionBoard::default(),
             access,
             clock,
             randomness,
@@ -214,6 +222,9 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
     StoreLimits {
         cameras: limits.cameras,
         sites: limits.sites,
+        outside_connections: limits.outside_connections,
+        outbox_messages: limits.outbox_messages,
+        dead_letters: limits.dead_letters,
         samples_per_camera: limits.samples_per_camera,
         sample_overflow: limits.sample_overflow,
         samples: limits.samples,

@@ -17,13 +17,14 @@ use crate::app::access::Permission;
 use crate::domain::{ErrorKind, Role};
 use crate::status;
 
-const TAGS: [(&str, &str); 9] = [
+const TAGS: [(&str, &str); 10] = [
     ("cameras", "Profiles of cameras that nobody calibrated"),
     ("sites", "Cameras whose targets are tracked together"),
     ("samples", "Boxes and fixes that cameras learn from"),
     ("training", "Background fits of a camera's model"),
     ("models", "Model versions that runs yield"),
     ("fusion", "Positions of targets"),
+    ("connections", "Other systems that give detections and fixes, or take positions"),
     ("evaluations", "Methods side by side on stored samples, against the truth"),
     ("access", "Keys that clients present, and sessions of browsers"),
     ("service", "What watches the server"),
@@ -45,6 +46,8 @@ const WITH_BODY: [ErrorKind; 3] =
     [ErrorKind::MalformedBody, ErrorKind::TooLarge, ErrorKind::UnsupportedMediaType];
 /// Refusals of operations below a camera.
 const BELOW_CAMERA: [ErrorKind; 1] = [ErrorKind::CameraNotFound];
+/// Refusals of operations below a connection.
+const BELOW_CONNECTION: [ErrorKind; 1] = [ErrorKind::ConnectionNotFound];
 /// Refusals of operations below a site.
 const BELOW_SITE: [ErrorKind; 1] = [ErrorKind::SiteNotFound];
 
@@ -83,6 +86,9 @@ pub(super) fn add_problems(openapi: &mut OpenApi) {
             }
             if is_below_camera {
                 kinds.extend(BELOW_CAMERA);
+            }
+            if path.contains("{connection}") {
+                kinds.extend(BELOW_CONNECTION);
             }
             if path.contains("{site}") {
                 kinds.extend(BELOW_SITE);

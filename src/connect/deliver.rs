@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio::sync::Notify;
 
 use super::peer::PeerError;
-use super::sink::{self, Outcomes, Sink};
+use super::sink::{self, Outcomes};
 use crate::app::{App, ConnectionState, LastMessage, LiveConnection};
 use crate::domain::{ConnectionKey, OutboxMessage};
 use crate::exchange::{Secrets, SinkSettings};

@@ -30,9 +30,10 @@ pub(super) struct Routing {
 
 impl Routing {
     pub(super) fn of(settings: &SourceSettings) -> Result<Self> {
-        let cameras = settings.cameras.iter().map(|(name, mapping)| {
-            Ok((name.clone(), (mapping.camera()?, mapping.stream_size()?)))
-        });
+        let cameras = settings
+            .cameras
+            .iter()
+            .map(|(name, mapping)| Ok((name.clone(), (mapping.camera()?, mapping.stream_size()?))));
         Ok(Self {
             cameras: cameras.collect::<Result<_>>()?,
             fix_cameras: settings.fix_cameras()?,
@@ -154,9 +155,8 @@ impl Intake {
                     Ok(receiver) => receiver,
                     Err(error) => return account.skip(&description, &error),
                 };
-                let source = |camera: &CameraId| {
-                    (camera.clone(), LiveSource::Fix(fix.clone(), receiver.clone()))
-                };
+                let source =
+                    |camera: &CameraId| (camera.clone(), LiveSource::Fix(fix.clone(), receiver.clone()));
                 self.routing.fix_cameras.iter().map(source).collect()
             }
         };
@@ -176,20 +176,31 @@ impl Intake {
         Ok(())
     }
 
+    /// The stream of a camera, opened again for one that was deleted and created. The seqs go on, so that what was
+    /// pending for the camera of before counts as settled.
+    async fn stream(&mut self, camera: &CameraId) -> Result<&mut CameraStream> {
+        let last_seq = match self.streams.get(camera) {
+            Some(known) if known.stream.current_camera().is_ok() => None,
+            Some(deleted) => Some(deleted.last_seq),
+            None => Some(0),
+        };
+        if let Some(last_seq) = last_seq {
+            let name = format!("connection {} {camera}", self.id);
+            let opened =
+                self.app.open_stream(camera, &name, ClientId::UNKNOWN, last_seq, self.durability).await;
+            let stream = opened.map_err(|error| match error.kind() {
+                ErrorKind::CameraNotFound => error,
+                // No fault of the item: it must come again.
+                _ => Error::fault(error),
+            })?;
+            self.streams.insert(camera.clone(), CameraStream { stream, last_seq });
+        }
+        self.streams.get_mut(camera).ok_or_else(|| Error::fault("the stream was just opened"))
+    }
+
     /// Gives an item to the camera's stream; its seq there.
     async fn follow(&mut self, camera: &CameraId, source: LiveSource) -> Result<u64> {
-        if let Some(known) = self.streams.get(camera)
-            && known.stream.current_camera().is_err()
-        {
-            self.streams.remove(camera); // deleted, perhaps created again
-        }
-        if !self.streams.contains_key(camera) {
-            let name = format!("connection {} {camera}", self.id);
-            let stream =
-                self.app.open_stream(camera, &name, ClientId::UNKNOWN, 0, self.durability).await?;
-            self.streams.insert(camera.clone(), CameraStream { stream, last_seq: 0 });
-        }
-        let known = self.streams.get_mut(camera).ok_or_else(|| Error::fault("the stream was just opened"))?;
+        let known = self.stream(camera).await?;
         let active = known.stream.current_camera()?;
         let item = source.item(&active)?;
         let seq = known.last_seq + 1;
@@ -251,11 +262,13 @@ impl LiveSource {
             Self::Detection(detection, stream_size) => {
                 let image_size = camera.image_size;
                 let bounding_box = box_in(image_size, detection.detected_box, stream_size)?;
+                let bounding_box =
+                    image_size.map_or(Ok(bounding_box), |image_size| bounding_box.within(image_size))?;
                 LiveItem {
                     time: detection.time,
                     target_id: Some(detection.target_id),
                     receiver_id: None,
-                    bounding_box: Some(bounding_box.within(image_size)?),
+                    bounding_box: Some(bounding_box),
                     fix: None,
                     class: detection.class,
                     score: detection.score,
@@ -274,17 +287,27 @@ impl LiveSource {
     }
 }
 
-/// A detector's rectangle in pixels of the camera's image.
-fn box_in(image: ImageSize, detected: DetectedBox, stream_size: Option<ImageSize>) -> Result<BoundingBox> {
-    let (width, height) = (f64::from(image.width_px()), f64::from(image.height_px()));
-    let (edges, across, down) = match detected {
-        DetectedBox::Fractions(edges) => (edges, width, height),
-        DetectedBox::Pixels(edges) => match stream_size {
-            None => (edges, 1.0, 1.0),
-            Some(size) => {
-                (edges, width / f64::from(size.width_px()), height / f64::from(size.height_px()))
-            }
-        },
+/// A detector's rectangle in pixels of the camera's image. A camera without an image size has that of the detector.
+fn box_in(
+    image: Option<ImageSize>,
+    detected: DetectedBox,
+    stream_size: Option<ImageSize>,
+) -> Result<BoundingBox> {
+    let sides = |size: ImageSize| (f64::from(size.width_px()), f64::from(size.height_px()));
+    let (edges, (across, down)) = match detected {
+        DetectedBox::Fractions(edges) => {
+            let size = image.or(stream_size).ok_or_else(|| {
+                Error::invalid("image_size", "the camera needs an image_size for boxes without pixels")
+            })?;
+            (edges, sides(size))
+        }
+        DetectedBox::Pixels(edges) => {
+            let scales = image
+                .map(sides)
+                .zip(stream_size.map(sides))
+                .map(|(image, stream)| (image.0 / stream.0, image.1 / stream.1));
+            (edges, scales.unwrap_or((1.0, 1.0)))
+        }
     };
     let [left, top, right, bottom] = edges;
     BoundingBox::new(left * across, top * down, (right - left) * across, (bottom - top) * down)

@@ -112,7 +112,8 @@ async fn drive(mut connection: EventLoop, reports: mpsc::Sender<Report>) {
             Ok(Event::Incoming(Packet::Publish(publish))) => Report::Message(publish),
             Ok(Event::Incoming(Packet::ConnAck(_))) => Report::Connected,
             Ok(Event::Incoming(Packet::PubAck(ack))) => {
-                let is_taken = matches!(ack.reason, PubAckReason::Success | PubAckReason::NoMatchingSubscribers);
+                let is_taken =
+                    matches!(ack.reason, PubAckReason::Success | PubAckReason::NoMatchingSubscribers);
                 let refused = || format!("the broker refuses the message: {:?}", ack.reason);
                 Report::Published(ack.pkid, if is_taken { Ok(()) } else { Err(refused()) })
             }
@@ -133,8 +134,7 @@ async fn drive(mut connection: EventLoop, reports: mpsc::Sender<Report>) {
         };
         let has_failed = matches!(report, Report::Failed(_));
         // Messages of QoS 0 are not bounded by the receive maximum: those beyond the queue are lost, as QoS 0 allows.
-        let may_be_lost =
-            matches!(&report, Report::Message(publish) if publish.qos == QoS::AtMostOnce);
+        let may_be_lost = matches!(&report, Report::Message(publish) if publish.qos == QoS::AtMostOnce);
         let sent = if may_be_lost && reports.capacity() == 0 { Ok(()) } else { reports.try_send(report) };
         if has_failed || sent.is_err() {
             return;
@@ -151,10 +151,7 @@ struct Link {
 }
 
 impl Link {
-    async fn open(
-        (options, bridge): (MqttOptions, Option<Bridge>),
-        queue: usize,
-    ) -> Result<Self, PeerError> {
+    async fn open((options, bridge): (MqttOptions, Option<Bridge>), queue: usize) -> Result<Self, PeerError> {
         let (client, connection) = AsyncClient::new(options, queue);
         // Acknowledgements of subscriptions and of the connection come besides the messages.
         let (reports_in, reports) = mpsc::channel(2 * queue + 16);

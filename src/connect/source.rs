@@ -57,9 +57,9 @@ pub(super) async fn open(
     };
     let (queue, message_bytes) = (limits.connection_queue, limits.connection_message_bytes);
     Ok(match address.scheme {
-        Scheme::Mqtt | Scheme::Mqtts => {
-            Box::new(mqtt::MqttSource::open(&address, &settings.topics, &credentials, identity, limits).await?)
-        }
+        Scheme::Mqtt | Scheme::Mqtts => Box::new(
+            mqtt::MqttSource::open(&address, &settings.topics, &credentials, identity, limits).await?,
+        ),
         Scheme::Tcp | Scheme::Tls | Scheme::Gpsd => {
             Box::new(lines::LineSource::connect(&address, &credentials, message_bytes).await?)
         }

@@ -9,6 +9,7 @@ use std::time::Duration;
 use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 use tokio::sync::Notify;
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -35,6 +36,7 @@ struct RunningTask {
     key: ConnectionKey,
     revision: Revision,
     cancel: CancellationToken,
+    handle: JoinHandle<()>,
 }
 
 /// Runs all connections that are not paused, until the server shuts down.
@@ -80,31 +82,40 @@ fn adjust(
         .filter(|connection| !connection.profile.paused)
         .map(|connection| (connection.id().clone(), connection))
         .collect();
-    running.retain(|id, task| {
-        let is_current = |it: &Connection| (it.key, it.revision) == (task.key, task.revision);
-        let keeps = wanted.get(id).is_some_and(is_current) && !task.cancel.is_cancelled();
-        if !keeps {
-            task.cancel.cancel();
-        }
-        keeps
-    });
+    let is_wanted = |id: &ConnectionId, task: &RunningTask| {
+        wanted.get(id).is_some_and(|it| (it.key, it.revision) == (task.key, task.revision))
+    };
+    let mut ending: HashMap<_, _> = running.extract_if(|id, task| !is_wanted(id, task)).collect();
+    ending.values().for_each(|task| task.cancel.cancel());
     for (id, connection) in wanted {
         if running.contains_key(&id) {
             continue;
         }
+        let (key, revision) = (connection.key, connection.revision);
         let cancel = CancellationToken::new();
-        let task = RunningTask { key: connection.key, revision: connection.revision, cancel: cancel.clone() };
-        running.insert(id, task);
-        let app = app.clone();
-        tasks.spawn(async move {
-            let live = app.live_connection(&connection);
-            tokio::select! {
-                () = cancel.cancelled() => {}
-                () = keep_open(&app, &connection, &live) => {}
-            }
-            live.enter(ConnectionState::Paused, app.clock.now());
-        });
+        // A port or a session that the one before holds must be free.
+        let before = ending.remove(&id).map(|task| task.handle);
+        let handle = tasks.spawn(run_connection(app.clone(), connection, before, cancel.clone()));
+        running.insert(id, RunningTask { key, revision, cancel, handle });
     }
+}
+
+async fn run_connection(
+    app: App,
+    connection: Connection,
+    before: Option<JoinHandle<()>>,
+    cancel: CancellationToken,
+) {
+    if let Some(before) = before {
+        // A task that panicked has ended, too.
+        let _ = before.await;
+    }
+    let live = app.live_connection(&connection);
+    tokio::select! {
+        () = cancel.cancelled() => {}
+        () = keep_open(&app, &connection, &live) => {}
+    }
+    live.enter(ConnectionState::Paused, app.clock.now());
 }
 
 /// Runs a connection again and again, with growing pauses while it fails.
@@ -211,8 +222,7 @@ async fn run_sink(
     let (key, queued) = (connection.key, Notify::new());
     let client_id = client_id(connection);
     let publisher = Publisher { app, key, settings, live, queued: &queued };
-    let delivery =
-        Delivery { app, key, settings, secrets, client_id: &client_id, live, queued: &queued };
+    let delivery = Delivery { app, key, settings, secrets, client_id: &client_id, live, queued: &queued };
     tokio::select! {
         Err(error) = publisher.run() => {
             tracing::error!(connection = %connection.id(), %error, "positions cannot be queued");

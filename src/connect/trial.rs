@@ -9,9 +9,7 @@ use super::sink::{self, Outcomes};
 use super::source::{self, SourceIdentity};
 use crate::app::{App, ConnectionState, LastMessage, connection_settings};
 use crate::domain::{CameraId, Connection, OutboxMessage, Result, TargetId};
-use crate::exchange::{
-    MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, decoder,
-};
+use crate::exchange::{MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, decoder};
 use crate::geo::{PlaneCovariance, Position};
 
 /// The target of test messages.
@@ -76,8 +74,10 @@ async fn try_source(
     secrets: &Secrets,
 ) -> Result<Option<LastMessage>, PeerError> {
     let random = app.randomness.uuid_v7(app.clock.now()).simple();
-    let identity =
-        SourceIdentity { client_id: format!("sightfix-{}-test-{random}", connection.id()), is_lasting: false };
+    let identity = SourceIdentity {
+        client_id: format!("sightfix-{}-test-{random}", connection.id()),
+        is_lasting: false,
+    };
     let live = app.live_connection(connection);
     let mut source = source::open(settings, secrets, &identity, &live, &app.limits).await?;
     let message = source.next().await?;

@@ -129,7 +129,8 @@ fn signing_key(secret: &str) -> Result<Vec<u8>, PeerError> {
 }
 
 fn header(text: &str) -> Result<HeaderValue, PeerError> {
-    let mut value = HeaderValue::from_str(text).map_err(|_| PeerError::from("a header has a control character"))?;
+    let mut value =
+        HeaderValue::from_str(text).map_err(|_| PeerError::from("a header has a control character"))?;
     value.set_sensitive(true);
     Ok(value)
 }

@@ -48,7 +48,9 @@ pub use idempotency::{IdempotencyKey, IdempotentRequest, RequestDigest, RequestH
 pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
-pub use names::{CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text};
+pub use names::{
+    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
+};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use on_conflict::OnConflict;

@@ -175,11 +175,17 @@ impl Secrets {
         for (name, secret) in changes {
             if !Self::NAMES.contains(&name.as_str()) {
                 let known = Self::NAMES.join(", ");
-                return Err(Error::invalid(format!("secrets.{name}"), format!("is unknown; there are {known}")));
+                return Err(Error::invalid(
+                    format!("secrets.{name}"),
+                    format!("is unknown; there are {known}"),
+                ));
             }
             match secret {
                 Some(secret) if secret.is_empty() || secret.len() > Self::MAX_BYTES => {
-                    return Err(Error::invalid(format!("secrets.{name}"), "must be text of 1 to 32,768 bytes"));
+                    return Err(Error::invalid(
+                        format!("secrets.{name}"),
+                        "must be text of 1 to 32,768 bytes",
+                    ));
                 }
                 Some(secret) => drop(self.0.insert(name, secret)),
                 None => drop(self.0.remove(&name)),
@@ -206,16 +212,8 @@ pub enum Scheme {
 }
 
 impl Scheme {
-    const SOURCES: [Self; 8] = [
-        Self::Mqtt,
-        Self::Mqtts,
-        Self::Tcp,
-        Self::Tls,
-        Self::TcpListen,
-        Self::Udp,
-        Self::Gpsd,
-        Self::Push,
-    ];
+    const SOURCES: [Self; 8] =
+        [Self::Mqtt, Self::Mqtts, Self::Tcp, Self::Tls, Self::TcpListen, Self::Udp, Self::Gpsd, Self::Push];
     const SINKS: [Self; 7] =
         [Self::Mqtt, Self::Mqtts, Self::Tcp, Self::Tls, Self::Udp, Self::Http, Self::Https];
 
@@ -322,7 +320,10 @@ impl ConnectionSettings {
             _ => Err(Error::invalid("source", "give either source or sink")),
         }?;
         if secrets.get("client_certificate").is_some() != secrets.get("client_key").is_some() {
-            return Err(Error::invalid("secrets.client_key", "client_certificate and client_key belong together"));
+            return Err(Error::invalid(
+                "secrets.client_key",
+                "client_certificate and client_key belong together",
+            ));
         }
         Ok(())
     }

@@ -554,10 +554,7 @@ async fn list_dead_letters(
     params(("connection" = String, Path, description = "The connection's id")),
     responses((status = 200, description = "How many there were", body = DeadLetterCount))
 )]
-async fn delete_dead_letters(
-    CallerApp(app): CallerApp,
-    ConnectionPath(id): ConnectionPath,
-) -> ApiResult {
+async fn delete_dead_letters(CallerApp(app): CallerApp, ConnectionPath(id): ConnectionPath) -> ApiResult {
     Ok(json(&DeadLetterCount { dead_letters: app.delete_dead_letters(&id).await? })?)
 }
 
@@ -567,9 +564,6 @@ async fn delete_dead_letters(
     params(("connection" = String, Path, description = "The connection's id")),
     responses((status = 200, description = "How many there were", body = DeadLetterCount))
 )]
-async fn retry_dead_letters(
-    CallerApp(app): CallerApp,
-    ConnectionPath(id): ConnectionPath,
-) -> ApiResult {
+async fn retry_dead_letters(CallerApp(app): CallerApp, ConnectionPath(id): ConnectionPath) -> ApiResult {
     Ok(json(&DeadLetterCount { dead_letters: app.retry_dead_letters(&id).await? })?)
 }

@@ -14,8 +14,8 @@ use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
 use crate::admission::ClientId;
 use crate::domain::{
-    CameraId, ConnectionId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId, SiteId,
-    TargetId, parse_time,
+    CameraId, ConnectionId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId,
+    SiteId, TargetId, parse_time,
 };
 use crate::exchange::{CsvLayout, Cursor, Format, read_cursor, wire};
 

@@ -24,8 +24,8 @@ use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 use tokio_util::sync::CancellationToken;
 
-use crate::grpc::client::{ClientError, Connection};
 use crate::backoff::Backoff;
+use crate::grpc::client::{ClientError, Connection};
 use fault_injection::FaultInjector;
 use paced_feed::{PacedFeed, ReplaySchedule};
 use report::Counts;

@@ -186,11 +186,12 @@ impl App {
     /// # Errors
     /// `PermissionDenied` for a key that is restricted to other cameras than the source names;
     /// `ConnectionNotFound`; `ConnectionNotReceiving` if it is paused or has another kind of address; `Overloaded`
-    /// while its queue is full; `InvalidArgument` for a message that cannot be read.
+    /// while its queue is full; `MalformedBody` for a message that cannot be read.
     pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<()> {
         let connection = self.store.connection(id).await?;
         let not_receiving = || {
-            let message = format!("connection {id} takes no messages: it is paused, or its address is not push:");
+            let message =
+                format!("connection {id} takes no messages: it is paused, or its address is not push:");
             Error::refused(ErrorKind::ConnectionNotReceiving, message)
         };
         self.authorize_source(&connection)?;
@@ -202,14 +203,15 @@ impl App {
         })?;
         match settlement.await {
             Ok(Ok(())) => Ok(()),
-            Ok(Err(reason)) => Err(Error::invalid("", reason)),
+            Ok(Err(reason)) => Err(Error::refused(ErrorKind::MalformedBody, reason)),
             Err(_) => Err(not_receiving()),
         }
     }
 
     /// Checks that the caller may reach every camera that a source feeds.
     fn authorize_source(&self, connection: &Connection) -> Result<()> {
-        let is_restricted = self.caller().principal().scope().is_some_and(|scope| !scope.cameras().is_empty());
+        let is_restricted =
+            self.caller().principal().scope().is_some_and(|scope| !scope.cameras().is_empty());
         if !is_restricted {
             return Ok(());
         }

@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use jiff::{SignedDuration, Timestamp};
 
 use super::MessageContext;
-use crate::domain::{ReceivedFix, ReceiverId};
+use crate::domain::{ReceivedFix, ReceiverId, Result};
 use crate::exchange::wire;
 
 /// Messages of which not all sentences have come; beyond, the oldest is dropped.
@@ -62,7 +62,11 @@ impl Ais {
     }
 
     /// The whole message, once its last sentence has come.
-    fn completed(&mut self, part: &Sentence<'_>, received_at: Timestamp) -> Option<(String, usize, Timestamp)> {
+    fn completed(
+        &mut self,
+        part: &Sentence<'_>,
+        received_at: Timestamp,
+    ) -> Option<(String, usize, Timestamp)> {
         let key = (part.sequence.to_owned(), part.channel.to_owned());
         let is_same = |it: &PartialMessage| {
             it.key == key && it.parts.len() == part.count && it.parts[part.number - 1].is_none()
@@ -127,7 +131,8 @@ fn parse_sentence(line: &str) -> Result<Option<Sentence<'_>>, String> {
 fn tagged_time(tags: &str) -> Option<Timestamp> {
     let tags = tags.split('*').next()?;
     let time: i64 = tags.split(',').find_map(|tag| tag.strip_prefix("c:"))?.parse().ok()?;
-    let result = if time > 100_000_000_000 { Timestamp::from_millisecond(time) } else { Timestamp::from_second(time) };
+    let result =
+        if time > 100_000_000_000 { Timestamp::from_millisecond(time) } else { Timestamp::from_second(time) };
     result.ok()
 }
 
@@ -156,15 +161,19 @@ fn position(
     let time = match second {
         0..60 => at_second(received_at, second as i64),
         60 => received_at,
-        _ => return Err("the position is entered manually, estimated, or out of order (second 61 to 63)".to_owned()),
+        _ => {
+            return Err(
+                "the position is entered manually, estimated, or out of order (second 61 to 63)".to_owned()
+            );
+        }
     };
     let fix = wire::Fix {
         longitude_deg: longitude as f64 / DEGREE as f64,
         latitude_deg: latitude as f64 / DEGREE as f64,
         sigma_m: None,
     };
-    let checked = || {
-        crate::domain::Result::Ok(ReceivedFix {
+    let checked = || -> Result<ReceivedFix> {
+        Ok(ReceivedFix {
             time: context.time_bounds.check(time)?,
             receiver_id: Some(ReceiverId::new(&format!("{:09}", bits.unsigned(8, 30).unwrap_or_default()))?),
             fix: fix.to_domain()?,

@@ -127,7 +127,8 @@ fn minimal_object(text: &str) -> Result<Seen, String> {
 fn full_object(object: &Object) -> Seen {
     let Corners { topleftx, toplefty, bottomrightx, bottomrighty } = object.bbox;
     let attributes = object.others.iter().find(|(name, value)| {
-        value.is_object() && !matches!(name.as_str(), "location" | "coordinate" | "embedding" | "pose" | "mask")
+        value.is_object()
+            && !matches!(name.as_str(), "location" | "coordinate" | "embedding" | "pose" | "mask")
     });
     Seen {
         id: object.id.clone(),

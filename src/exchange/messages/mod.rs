@@ -9,8 +9,6 @@ mod frigate;
 mod gpsd;
 mod nmea;
 mod onvif;
-#[cfg(test)]
-mod tests;
 mod traccar;
 
 use jiff::Timestamp;

@@ -29,7 +29,12 @@ impl MessageDecoder for Nmea {
 }
 
 impl Nmea {
-    fn sentence(&mut self, line: &str, context: &MessageContext, reading: &mut Reading) -> Result<(), String> {
+    fn sentence(
+        &mut self,
+        line: &str,
+        context: &MessageContext,
+        reading: &mut Reading,
+    ) -> Result<(), String> {
         if let Some(fix) = self.ais.sentence(line, context)? {
             reading.items.push(MessageItem::Fix(fix));
             return Ok(());

@@ -133,7 +133,8 @@ impl Frames {
         }
         let time = self.time.as_deref().ok_or("the frame has no UtcTime")?;
         // The attribute is in UTC by its name; some cameras leave the letter out.
-        let zoned = if time.ends_with('Z') || time.contains('+') { time.to_owned() } else { format!("{time}Z") };
+        let zoned =
+            if time.ends_with('Z') || time.contains('+') { time.to_owned() } else { format!("{time}Z") };
         let time = parse_time(&zoned).and_then(|time| context.time_bounds.check(time));
         // From -1..1 with y up to fractions of the image with y down.
         let across = |x: f64| (scale[0] * x + translation[0] + 1.0) / 2.0;

@@ -51,13 +51,13 @@ impl MessageDecoder for Traccar {
         let named = device.and_then(|device| device.unique_id);
         let named = named.or_else(|| position.device_id.map(|id| id.to_string()));
         let time = position.fix_time.ok_or("position.fixTime is missing")?;
-        let read = || {
+        let read = || -> crate::domain::Result<ReceivedFix> {
             let fix = wire::Fix {
                 longitude_deg: position.longitude,
                 latitude_deg: position.latitude,
                 sigma_m: None,
             };
-            crate::domain::Result::Ok(ReceivedFix {
+            Ok(ReceivedFix {
                 time: context.time_bounds.check(parse_time(&time)?)?,
                 receiver_id: named.as_deref().map(ReceiverId::new).transpose()?,
                 fix: fix.to_domain()?,

@@ -47,12 +47,23 @@ impl Broker {
         assert!(process.wait().expect("it ends").success());
     }
 
-    /// The next messages of a topic by mosquitto's own client, as `topic payload`.
-    pub(super) fn subscribe(&self, topic: &str, count: u32) -> Child {
+    fn subscriber(&self, topic: &str) -> Command {
         let mut command = Command::new("mosquitto_sub");
-        let (port, count) = (self.port.to_string(), count.to_string());
-        command.args(["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1", "-t", topic, "-v", "-C", &count]);
-        command.stdout(Stdio::piped()).spawn().expect("mosquitto-clients is installed")
+        command.args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-V", "5", "-q", "1", "-t", topic]);
+        command.args(["-i", "subscriber", "-c", "-x", "600"]);
+        command
+    }
+
+    /// Has the broker keep the messages of a topic from now on, in a session of mosquitto's own client.
+    pub(super) fn subscribe(&self, topic: &str) {
+        let status = self.subscriber(topic).arg("-E").status().expect("mosquitto-clients is installed");
+        assert!(status.success());
+    }
+
+    /// The first messages of that session, as lines of topic and payload.
+    pub(super) fn received(&self, topic: &str, count: u32) -> String {
+        let output = self.subscriber(topic).args(["-v", "-C", &count.to_string()]).output();
+        String::from_utf8(output.expect("mosquitto-clients is installed").stdout).expect("text")
     }
 }
 
@@ -63,8 +74,18 @@ impl Drop for Broker {
     }
 }
 
+/// The time now.
+pub(super) fn now() -> jiff::Timestamp {
+    #[expect(clippy::disallowed_methods, reason = "the server reads the wall clock, too")]
+    jiff::Timestamp::now()
+}
+
 /// Waits until something is true of a connection, and returns it.
-pub(super) async fn connection_when(server: &TestServer, id: &str, is_wanted: impl Fn(&Value) -> bool) -> Value {
+pub(super) async fn connection_when(
+    server: &TestServer,
+    id: &str,
+    is_wanted: impl Fn(&Value) -> bool,
+) -> Value {
     loop {
         let connection = server.get(&format!("/v1/connections/{id}")).await.expect(200).json();
         if is_wanted(&connection["status"]) {
@@ -81,7 +102,13 @@ pub(super) async fn create_gate(server: &TestServer) {
 }
 
 /// Sends a fix of a target of the camera `gate`; stores samples if asked to.
-pub(super) async fn send_fix(server: &TestServer, target: &str, time: &str, longitude_deg: f64, stores: bool) {
+pub(super) async fn send_fix(
+    server: &TestServer,
+    target: &str,
+    time: &str,
+    longitude_deg: f64,
+    stores: bool,
+) {
     let fix = json!({"observations": [{
         "time": time, "target_id": target, "fix": {"longitude_deg": longitude_deg, "latitude_deg": 30.628, "sigma_m": 1.5},
     }]});

@@ -4,12 +4,12 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, UdpSocket};
 
-use super::peers::{connection_when, create_gate};
+use super::peers::{connection_when, create_gate, now};
 use crate::harness::{TestServer, data_folder, own_address};
 
 /// GGA and RMC of now, at 30.628 degrees north, 103.98678 degrees east.
 fn sentences() -> String {
-    let now = jiff::Timestamp::now();
+    let now = now();
     let time = now.strftime("%H%M%S.00");
     let date = now.strftime("%d%m%y");
     let sentence = |body: String| {
@@ -31,9 +31,14 @@ async fn start(source: Value) -> (TestServer, tempfile::TempDir) {
 
 async fn assert_tracked(server: &TestServer, target: &str) {
     let tracks = server.get("/v1/cameras/gate/tracks").await.expect(200).json();
-    let track = tracks["features"].as_array().expect("features").iter().find(|it| it["properties"]["target_id"] == target);
+    let track = tracks["features"]
+        .as_array()
+        .expect("features")
+        .iter()
+        .find(|it| it["properties"]["target_id"] == target);
     let position = &track.unwrap_or_else(|| panic!("{tracks}"))["geometry"]["coordinates"];
-    let near = |index: usize, degrees: f64| (position[index].as_f64().expect("a number") - degrees).abs() < 1e-6;
+    let near =
+        |index: usize, degrees: f64| (position[index].as_f64().expect("a number") - degrees).abs() < 1e-6;
     assert!(near(0, 103.986_78) && near(1, 30.628), "{position}");
 }
 
@@ -84,12 +89,13 @@ async fn gpsd_is_asked_for_its_reports() {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let address = listener.local_addr().expect("an address");
     let (server, _folder) =
-        start(json!({"address": format!("gpsd://{address}"), "format": "gpsd", "camera_ids": ["gate"]})).await;
+        start(json!({"address": format!("gpsd://{address}"), "format": "gpsd", "camera_ids": ["gate"]}))
+            .await;
     let (mut stream, _) = listener.accept().await.expect("the server connects");
     let mut asked = [0; 64];
     let bytes = stream.read(&mut asked).await.expect("a request");
     assert!(asked[..bytes].starts_with(b"?WATCH={\"enable\":true,\"json\":true}"));
-    let now = jiff::Timestamp::now();
+    let now = now();
     let report = format!(
         "{{\"class\":\"TPV\",\"device\":\"boat\",\"mode\":3,\"time\":\"{now:.3}\",\"lat\":30.628,\"lon\":103.98678}}\n"
     );
@@ -100,9 +106,10 @@ async fn gpsd_is_asked_for_its_reports() {
 
 #[tokio::test]
 async fn traccar_hands_in_positions_and_is_answered_when_they_are_taken() {
-    let (server, _folder) = start(json!({"address": "push:", "format": "traccar", "camera_ids": ["gate"]})).await;
+    let (server, _folder) =
+        start(json!({"address": "push:", "format": "traccar", "camera_ids": ["gate"]})).await;
     connection_when(&server, "receiver", |status| status["state"] == "running").await;
-    let now = jiff::Timestamp::now();
+    let now = now();
     let position = json!({
         "position": {"id": 7, "deviceId": 3, "fixTime": format!("{now:.3}"), "valid": true,
             "latitude": 30.628, "longitude": 103.98678, "accuracy": 4.0},
@@ -111,7 +118,7 @@ async fn traccar_hands_in_positions_and_is_answered_when_they_are_taken() {
     let path = "/v1/connections/receiver/messages";
     server.post(path, &position).await.expect(204);
     assert_tracked(&server, "boat").await;
-    let refused = server.post(path, &json!({"position": {}})).await.expect(422);
+    let refused = server.post(path, &json!({"position": {}})).await.expect(400);
     assert!(refused.text().contains("latitude"), "{}", refused.text());
     server.send("DELETE", "/v1/connections/receiver", &[], "").await.expect(204);
     server.post(path, &position).await.expect(404);

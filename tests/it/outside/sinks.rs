@@ -8,7 +8,7 @@ use sha2::Sha256;
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
 
-use super::peers::{connection_when, create_gate, patch, send_fix};
+use super::peers::{connection_when, create_gate, now, patch, send_fix};
 use crate::harness::{TestServer, data_folder, own_address};
 
 /// A request as a receiver of webhooks sees it.
@@ -61,12 +61,12 @@ async fn accept(listener: &TcpListener) -> BufReader<TcpStream> {
     BufReader::new(listener.accept().await.expect("the server connects").0)
 }
 
-/// Sends fixes of the target `van`, a second apart, the last of now.
-async fn send_fixes(server: &TestServer, count: i64) {
-    let now = jiff::Timestamp::now();
+/// Sends fixes of a target, a second apart, the last of now.
+async fn send_fixes(server: &TestServer, target: &str, count: i64) {
+    let now = now();
     for index in 1..=count {
         let time = now - jiff::SignedDuration::from_secs(count - index);
-        send_fix(server, "van", &time.to_string(), 103.98678, false).await;
+        send_fix(server, target, &time.to_string(), 103.98678, false).await;
     }
 }
 
@@ -83,7 +83,7 @@ async fn a_webhook_is_signed_and_comes_again_until_it_is_taken_also_after_a_kill
     });
     server.post("/v1/connections", &draft).await.expect(201);
     connection_when(&server, "hook", |status| status["state"] == "waiting").await;
-    send_fixes(&server, 2).await;
+    send_fixes(&server, "van", 2).await;
     connection_when(&server, "hook", |status| status["queued"] == 2).await;
     server.kill();
 
@@ -116,9 +116,10 @@ async fn what_a_receiver_refuses_for_good_is_a_dead_letter() {
     server.post("/v1/connections", &draft).await.expect(201);
     let mut stream = accept(&listener).await;
     connection_when(&server, "hook", |status| status["state"] == "running").await;
-    send_fixes(&server, 1).await;
+    send_fixes(&server, "van", 1).await;
     Hook::answered(&mut stream, 422).await;
-    let status = connection_when(&server, "hook", |status| status["dead_letters"] == 1).await["status"].clone();
+    let status =
+        connection_when(&server, "hook", |status| status["dead_letters"] == 1).await["status"].clone();
     assert_eq!((&status["queued"], &status["rejected"]), (&json!(0), &json!(1)));
     let letters = server.get("/v1/connections/hook/dead-letters").await.expect(200).json();
     let letter = &letters["items"][0];
@@ -127,15 +128,19 @@ async fn what_a_receiver_refuses_for_good_is_a_dead_letter() {
 
     let retried = server.post("/v1/connections/hook/dead-letters/retry", &json!({})).await.expect(200).json();
     assert_eq!(retried["dead_letters"], 1);
-    assert_eq!(Hook::answered(&mut stream, 200).await.header("webhook-id"), letter["id"].as_str().expect("an id"));
+    assert_eq!(
+        Hook::answered(&mut stream, 200).await.header("webhook-id"),
+        letter["id"].as_str().expect("an id")
+    );
     connection_when(&server, "hook", |status| status["dead_letters"] == 0 && status["queued"] == 0).await;
 
     // A receiver that takes nothing fills the outbox up to its limit; the oldest messages give way.
     drop((stream, listener));
-    send_fixes(&server, 8).await;
+    send_fixes(&server, "car", 8).await;
     let status = connection_when(&server, "hook", |status| status["dropped"].as_u64() >= Some(4)).await;
     assert_eq!(status["status"]["queued"], 3, "{status}");
-    let deleted = server.send("DELETE", "/v1/connections/hook/dead-letters", &[], "").await.expect(200).json();
+    let deleted =
+        server.send("DELETE", "/v1/connections/hook/dead-letters", &[], "").await.expect(200).json();
     assert_eq!(deleted["dead_letters"], 0);
 }
 
@@ -154,26 +159,32 @@ async fn cursor_on_target_events_go_over_tcp_and_over_udp() {
     create_gate(&server).await;
     let stream_address = listener.local_addr().expect("an address");
     let datagram_address = socket.local_addr().expect("an address");
-    for (id, address) in [("tak", format!("tcp://{stream_address}")), ("group", format!("udp://{datagram_address}"))] {
+    for (id, address) in
+        [("tak", format!("tcp://{stream_address}")), ("group", format!("udp://{datagram_address}"))]
+    {
         let sink = json!({"address": address, "format": "cot", "camera_ids": ["gate"], "min_interval_s": 0, "stale_s": 20});
         server.post("/v1/connections", &json!({"id": id, "sink": sink})).await.expect(201);
         connection_when(&server, id, |status| status["state"] == "running").await;
     }
     let mut stream = accept(&listener).await;
-    send_fixes(&server, 1).await;
+    send_fixes(&server, "van", 1).await;
     let mut event = String::new();
     stream.read_line(&mut event).await.expect("an event");
     let mut datagram = vec![0; 4_096];
     let bytes = socket.recv(&mut datagram).await.expect("a datagram");
     assert_eq!(event.as_bytes(), &datagram[..bytes], "the same event of the same target");
 
-    let track = server.get("/v1/cameras/gate/tracks").await.expect(200).json()["features"][0]["properties"].clone();
+    let track =
+        server.get("/v1/cameras/gate/tracks").await.expect(200).json()["features"][0]["properties"].clone();
     let variance = |axis: &str| track["covariance"][axis].as_f64().expect("m2");
     let sigma_m = ((variance("east_m2") + variance("north_m2")) / 2.0).sqrt();
     assert_eq!(attribute(&event, "ce"), format!("{sigma_m:.2}"), "one sigma, not the 95 % radius");
     assert_eq!((attribute(&event, "hae"), attribute(&event, "le")), ("9999999.0", "9999999.0"));
     assert_eq!(attribute(&event, "uid"), "sightfix.gate.van");
-    assert_eq!((attribute(&event, "version"), attribute(&event, "type"), attribute(&event, "how")), ("2.0", "a-u-G", "m-f"));
+    assert_eq!(
+        (attribute(&event, "version"), attribute(&event, "type"), attribute(&event, "how")),
+        ("2.0", "a-u-G", "m-f")
+    );
     let time = |name| attribute(&event, name).parse::<jiff::Timestamp>().expect("a time");
     assert_eq!(time("stale").duration_since(time("start")).as_secs(), 20);
     assert!((attribute(&event, "lon").parse::<f64>().expect("degrees") - 103.98678).abs() < 1e-6);
@@ -182,12 +193,15 @@ async fn cursor_on_target_events_go_over_tcp_and_over_udp() {
 
     // A server that restarts is connected to again, and the uid stays.
     drop(stream);
-    send_fixes(&server, 1).await;
+    send_fixes(&server, "van", 1).await;
     let mut stream = accept(&listener).await;
     let mut event = String::new();
     stream.read_line(&mut event).await.expect("an event");
     assert_eq!(attribute(&event, "uid"), "sightfix.gate.van");
     let tried = server.post("/v1/connections/group/test", &json!({})).await.expect(200).json();
-    assert!(tried["message"]["text"].as_str().expect("text").contains("sightfix.gate.sightfix-test"), "{tried}");
+    assert!(
+        tried["message"]["text"].as_str().expect("text").contains("sightfix.gate.sightfix-test"),
+        "{tried}"
+    );
     patch(&server, "tak", &json!({"paused": true})).await.expect(200);
 }

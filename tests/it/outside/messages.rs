@@ -1,8 +1,10 @@
 //! Messages as other systems send them; where each comes from is stated beside it.
 
 use jiff::{SignedDuration, Timestamp};
-
-use super::*;
+use sightfix::domain::{ReceivedFix, ReceiverId, Score, TargetClass, TimeBounds};
+use sightfix::exchange::{
+    DetectedBox, MessageContext, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
+};
 
 fn context() -> MessageContext {
     let received_at: Timestamp = "2026-06-01T12:00:20.5Z".parse().expect("a time");
@@ -22,12 +24,13 @@ fn only_detection(reading: &Reading) -> &NamedDetection {
 
 /// Receiver, longitude, latitude and time of each fix.
 fn fixes(reading: &Reading) -> Vec<(Option<&str>, f64, f64, String)> {
-    let fix = |item| {
+    let mut fixes = Vec::new();
+    for item in &reading.items {
         let MessageItem::Fix(ReceivedFix { time, receiver_id, fix }) = item else { panic!("{item:?}") };
-        let receiver = receiver_id.as_ref().map(crate::domain::ReceiverId::as_str);
-        (receiver, fix.position.longitude_deg(), fix.position.latitude_deg(), time.to_string())
-    };
-    reading.items.iter().map(fix).collect()
+        let receiver = receiver_id.as_ref().map(ReceiverId::as_str);
+        fixes.push((receiver, fix.position.longitude_deg(), fix.position.latitude_deg(), time.to_string()));
+    }
+    fixes
 }
 
 /// Of Frigate's documentation, docs/docs/integrations/mqtt.md.
@@ -51,7 +54,8 @@ fn frigate_states_corners_of_the_state_after_the_change() {
     assert_eq!(detection.detected_box, DetectedBox::Pixels([432.0, 496.0, 544.0, 854.0]));
     assert_eq!(detection.class.as_ref().map(TargetClass::as_str), Some("person"));
     assert_eq!(detection.score.map(Score::value), Some(0.87890625));
-    let wrong = FRIGATE.replace("\"false_positive\": false, \"start_time\"", "\"false_positive\": true, \"start_time\"");
+    let wrong = FRIGATE
+        .replace("\"false_positive\": false, \"start_time\"", "\"false_positive\": true, \"start_time\"");
     let reading = read(MessageFormat::Frigate, &wrong);
     assert!(reading.items.is_empty() && reading.skipped[0].contains("false positive"), "{reading:?}");
     let update = r#"{"type": "description", "id": "1607123955.475377-mxklsc", "description": "a person"}"#;
@@ -77,7 +81,9 @@ fn deepstreams_minimal_schema_has_many_objects_in_a_message() {
         .items
         .iter()
         .map(|item| match item {
-            MessageItem::Detection(it) => (it.target_id.as_str(), it.detected_box, it.score.map(Score::value)),
+            MessageItem::Detection(it) => {
+                (it.target_id.as_str(), it.detected_box, it.score.map(Score::value))
+            }
             MessageItem::Fix(_) => panic!("a fix"),
         })
         .collect();
@@ -158,7 +164,8 @@ fn onvif_boxes_are_transformed_whatever_the_sign_of_y() {
     }
     let empty = stream(&transformation("0", "0", "0", "0"), "");
     assert_eq!(read(MessageFormat::Onvif, &empty), Reading::default(), "an empty frame says nothing");
-    let collapsed = stream(&transformation("0", "0", "0", "0"), &object(r#"left="1" top="2" right="3" bottom="4""#));
+    let collapsed =
+        stream(&transformation("0", "0", "0", "0"), &object(r#"left="1" top="2" right="3" bottom="4""#));
     assert!(read(MessageFormat::Onvif, &collapsed).skipped[0].contains("scale of 0"));
     assert!(decoder(MessageFormat::Onvif).decode(b"<a><b></a>", &context()).is_err());
 }
@@ -171,7 +178,10 @@ fn ais_positions_are_read_also_from_two_sentences() {
     let [(Some("477553000"), longitude, latitude, time)] = &fixes(&reading)[..] else {
         panic!("{reading:?}")
     };
-    assert!((longitude + 122.345_833).abs() < 1e-5 && (latitude - 47.582_833).abs() < 1e-5, "{longitude} {latitude}");
+    assert!(
+        (longitude + 122.345_833).abs() < 1e-5 && (latitude - 47.582_833).abs() < 1e-5,
+        "{longitude} {latitude}"
+    );
     assert_eq!(time, "2026-06-01T12:00:15Z", "second 15 of the minute nearest to the server's time");
 
     let payload = "C5N3SRgPEnJGEBT>NhWAwwo862PaLELTBJ:V00000000S0D:R220";
@@ -187,7 +197,10 @@ fn ais_positions_are_read_also_from_two_sentences() {
     assert_eq!(waiting, Reading::default());
     let reading = nmea.decode(second.as_bytes(), &context()).expect("a sentence");
     let [(Some("367059850"), longitude, latitude, _)] = &fixes(&reading)[..] else { panic!("{reading:?}") };
-    assert!((longitude + 88.810_394).abs() < 1e-5 && (latitude - 29.543_695).abs() < 1e-5, "{longitude} {latitude}");
+    assert!(
+        (longitude + 88.810_394).abs() < 1e-5 && (latitude - 29.543_695).abs() < 1e-5,
+        "{longitude} {latitude}"
+    );
     // In the other order, after an incomplete message of the same id.
     nmea.decode(second.as_bytes(), &context()).expect("a sentence");
     nmea.decode(second.as_bytes(), &context()).expect("a sentence");
@@ -249,7 +262,9 @@ fn gpsd_reports_and_traccars_positions_are_fixes() {
         r#"{"class":"TPV","device":"/dev/ttyUSB0","mode":3,"time":"2026-06-01T12:00:19.000Z","lat":30.6280135,"lon":103.98678}"#
     );
     let reading = read(MessageFormat::Gpsd, reports);
-    let [(Some("/dev/ttyUSB0"), longitude, latitude, time)] = &fixes(&reading)[..] else { panic!("{reading:?}") };
+    let [(Some("/dev/ttyUSB0"), longitude, latitude, time)] = &fixes(&reading)[..] else {
+        panic!("{reading:?}")
+    };
     assert_eq!((*longitude, *latitude, time.as_str()), (103.98678, 30.6280135, "2026-06-01T12:00:19Z"));
 
     // As Traccar's PositionForwarderJson writes it.

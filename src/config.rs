@@ -48,6 +48,8 @@ pub struct Config {
     pub training: Workers,
     /// Workers of evaluations.
     pub evaluation: Workers,
+    /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
+    pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
     pub console: Console,
     /// What an outside client may make large.
@@ -122,6 +124,41 @@ impl std::fmt::Debug for Secret {
 impl Serialize for Secret {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(HIDDEN)
+    }
+}
+
+/// A connection with another system, by the JSON of its description. Its secrets are never shown.
+#[derive(Clone, PartialEq, Deserialize)]
+#[serde(transparent)]
+pub struct DeclaredConnection(serde_json::Map<String, serde_json::Value>);
+
+impl DeclaredConnection {
+    /// The description as JSON, with its secrets.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn json(&self) -> serde_json::Result<Vec<u8>> {
+        serde_json::to_vec(&self.0)
+    }
+
+    fn without_secrets(&self) -> serde_json::Map<String, serde_json::Value> {
+        let mut shown = self.0.clone();
+        if let Some(secrets) = shown.get_mut("secrets") {
+            *secrets = HIDDEN.into();
+        }
+        shown
+    }
+}
+
+impl std::fmt::Debug for DeclaredConnection {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.without_secrets().fmt(out)
+    }
+}
+
+impl Serialize for DeclaredConnection {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.without_secrets().serialize(serializer)
     }
 }
 
@@ -352,6 +389,7 @@ impl Default for Config {
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
+            connections: Vec::new(),
             console: Console::default(),
             limits: Limits::default(),
         }

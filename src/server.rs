@@ -32,6 +32,8 @@ use crate::clock::{Clock, Randomness};
 use crate::config::Config;
 use crate::connect;
 use crate::domain::{Error, KeySecret};
+use crate::exchange::ConnectionDraft;
+use crate::exchange::wire::parse_document;
 use crate::shutdown::Shutdown;
 use crate::store::{Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
@@ -103,6 +105,7 @@ impl Server {
             app.access.close();
         }
         prepare_access(&app, &config).await?;
+        declare_connections(&app, &config).await?;
         let listener = connection::listen(config.listen)
             .with_context(|| format!("cannot listen on {}", config.listen))?;
         let monitoring = config.metrics_listen.map(|address| {
@@ -185,6 +188,18 @@ impl Server {
         tracing::info!("shut down");
         Ok(())
     }
+}
+
+/// Stores the connections of the settings. Those that are not declared any more stay.
+async fn declare_connections(app: &App, config: &Config) -> anyhow::Result<()> {
+    for (index, declared) in config.connections.iter().enumerate() {
+        let declare = async {
+            let draft: ConnectionDraft = parse_document(&declared.json().map_err(Error::fault)?)?;
+            app.declare_connection(draft.try_into()?).await
+        };
+        declare.await.with_context(|| format!("the setting connections[{index}]"))?;
+    }
+    Ok(())
 }
 
 /// Stores the administrator's key of the settings, and refuses to serve everybody by an oversight.

@@ -18,6 +18,29 @@ const MAX_CAMERAS: usize = 1_024;
 /// Topics that a source may subscribe to.
 const MAX_TOPICS: usize = 64;
 
+/// A connection to be created: either a source or a sink.
+#[derive(Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ConnectionDraft {
+    /// A slug: 1 to 63 of `a-z`, `0-9` and `-`.
+    #[schema(pattern = "^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$", example = "frigate")]
+    pub id: String,
+    /// The name for people; the id if left out.
+    #[schema(max_length = 200)]
+    pub display_name: Option<String>,
+    /// Whether it stays at rest.
+    #[serde(default)]
+    pub paused: bool,
+    /// Takes detections or fixes in.
+    pub source: Option<SourceSettings>,
+    /// Gives positions out.
+    pub sink: Option<SinkSettings>,
+    /// Secrets by name, which no answer shows: `password`, `signing_key` (webhooks), `authorization` (header of webhooks),
+    /// `client_certificate` and `client_key` (PEM).
+    #[serde(default)]
+    pub secrets: BTreeMap<String, Option<String>>,
+}
+
 /// What a connection does: exactly one of both.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]

@@ -39,7 +39,8 @@ pub mod wire;
 mod write;
 
 pub use connection::{
-    Address, CameraMapping, ConnectionSettings, OutgoingFormat, Scheme, Secrets, SinkSettings, SourceSettings,
+    Address, CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, Scheme, Secrets,
+    SinkSettings, SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};

@@ -7,7 +7,7 @@ use axum::extract::{FromRequest, Request};
 use bytes::Bytes;
 use hyper::{HeaderMap, StatusCode, Uri};
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -22,9 +22,9 @@ use super::problem::{ApiError, ApiResult, Problem};
 use super::wire::{created, empty, json};
 use crate::app::{App, ConnectionRequest, ConnectionState, connection_settings};
 use crate::connect::try_connection;
-use crate::domain::{self, ConnectionId, Error, Result};
+use crate::domain::{self, Error, Result};
 use crate::exchange::wire::parse_json;
-use crate::exchange::{ConnectionSettings, SinkSettings, SourceSettings, write_cursor};
+use crate::exchange::{ConnectionDraft, SinkSettings, SourceSettings, write_cursor};
 
 /// Seconds that a trial waits for a message, and the most that a client may ask for.
 const TRIAL_S: u64 = 5;
@@ -40,41 +40,6 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(push_message))
         .routes(routes!(list_dead_letters, delete_dead_letters))
         .routes(routes!(retry_dead_letters))
-}
-
-/// A connection to be created: either a source or a sink.
-#[derive(Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-struct ConnectionDraft {
-    /// A slug: 1 to 63 of `a-z`, `0-9` and `-`.
-    #[schema(pattern = "^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$", example = "frigate")]
-    id: String,
-    /// The name for people; the id if left out.
-    #[schema(max_length = 200)]
-    display_name: Option<String>,
-    /// Whether it stays at rest.
-    #[serde(default)]
-    paused: bool,
-    /// Takes detections or fixes in.
-    source: Option<SourceSettings>,
-    /// Gives positions out.
-    sink: Option<SinkSettings>,
-    /// Secrets by name, which no answer shows: `password`, `signing_key` (webhooks), `authorization` (header of webhooks),
-    /// `client_certificate` and `client_key` (PEM).
-    #[serde(default)]
-    secrets: BTreeMap<String, Option<String>>,
-}
-
-impl ConnectionDraft {
-    fn into_request(self) -> Result<ConnectionRequest> {
-        Ok(ConnectionRequest {
-            id: ConnectionId::new(&self.id)?,
-            display_name: self.display_name,
-            paused: self.paused,
-            settings: ConnectionSettings { source: self.source, sink: self.sink },
-            secrets: self.secrets,
-        })
-    }
 }
 
 /// Changes to a connection (a merge patch, RFC 7396): what is left out stays, objects are merged.
@@ -329,7 +294,7 @@ struct DeadLetterCount {
     )
 )]
 async fn create_connection(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
-    let connection = app.create_connection(body.read::<ConnectionDraft>()?.into_request()?).await?;
+    let connection = app.create_connection(body.read::<ConnectionDraft>()?.try_into()?).await?;
     let (location, version) = (format!("/v1/connections/{}", connection.id()), connection.version());
     let shown = Connection::of(connection)?;
     Ok(with_etag(created(StatusCode::CREATED, &location, &shown)?, version).await?)
@@ -410,7 +375,7 @@ async fn change_connection(
         let connection = app.connection(&id).await?;
         let version = expected.unwrap_or(connection.version());
         let document = merge_patch::merged(&Connection::of(connection)?, &patch, &PATCHED)?;
-        let mut request = parse_json::<ConnectionDraft>(&document)?.into_request()?;
+        let mut request = ConnectionRequest::try_from(parse_json::<ConnectionDraft>(&document)?)?;
         request.secrets.clone_from(&secrets);
         app.change_connection(request, version).await
     };

@@ -15,7 +15,7 @@ use crate::domain::{
     Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
     OutboxCounts, Result, check_text,
 };
-use crate::exchange::{ConnectionSettings, Secrets};
+use crate::exchange::{ConnectionDraft, ConnectionSettings, Secrets};
 
 pub use status::{
     ConnectionBoard, ConnectionState, ConnectionStatus, LastMessage, LiveConnection, PushedMessage,
@@ -34,6 +34,20 @@ pub struct ConnectionRequest {
     pub settings: ConnectionSettings,
     /// Secrets to be set, or removed.
     pub secrets: BTreeMap<String, Option<String>>,
+}
+
+impl TryFrom<ConnectionDraft> for ConnectionRequest {
+    type Error = Error;
+
+    fn try_from(draft: ConnectionDraft) -> Result<Self> {
+        Ok(Self {
+            id: ConnectionId::new(&draft.id)?,
+            display_name: draft.display_name,
+            paused: draft.paused,
+            settings: ConnectionSettings { source: draft.source, sink: draft.sink },
+            secrets: draft.secrets,
+        })
+    }
 }
 
 impl ConnectionRequest {
@@ -71,6 +85,25 @@ impl App {
         let connection = self.store.insert_connection(&profile, self.clock.now()).await?;
         self.connection_board.notify();
         Ok(connection)
+    }
+
+    /// Stores a connection that the settings declare: a new one, or a change of the stored one where it differs.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
+    pub async fn declare_connection(&self, request: ConnectionRequest) -> Result<()> {
+        let profile = request.into_profile(Secrets::default())?;
+        let now = self.clock.now();
+        match self.store.connection(&profile.id).await {
+            Ok(stored) if stored.profile == profile => Ok(()),
+            Ok(stored) => {
+                self.store.replace_connection(&profile, Some(stored.version()), now).await.map(drop)
+            }
+            Err(error) if error.kind() == ErrorKind::ConnectionNotFound => {
+                self.store.insert_connection(&profile, now).await.map(drop)
+            }
+            Err(error) => Err(error),
+        }
     }
 
     /// One connection.

@@ -170,3 +170,30 @@ async fn a_peer_that_is_away_is_tried_again_and_a_paused_connection_rests() {
     drop(stream);
     listener.accept().await.expect("a closed connection is opened again");
 }
+
+#[tokio::test]
+async fn a_connection_of_the_settings_is_created_and_changed_at_the_start() {
+    let folder = data_folder();
+    let file = folder.path().join("settings.toml");
+    let start = |topic: &str| {
+        let text = format!(
+            "[[connections]]\nid = \"frigate\"\npaused = true\nsecrets = {{ password = \"{SECRET}\" }}\n\
+             source = {{ address = \"mqtt://broker\", topics = [\"{topic}\"], format = \"frigate\" }}\n"
+        );
+        std::fs::write(&file, text).expect("a file can be written");
+        let mut command = crate::harness::sightfix();
+        command.arg("--config").arg(&file).args(["serve", "--listen", "127.0.0.1:0", "--data"]);
+        command.arg(folder.path().join("data")).stdout(std::process::Stdio::null());
+        TestServer::run(command)
+    };
+    for (topic, revision) in [("frigate/events", 1), ("frigate/events", 1), ("other/events", 2)] {
+        let server = start(topic);
+        let shown = server.get("/v1/connections/frigate").await.expect(200).json();
+        assert_eq!((&shown["source"]["topics"], &shown["revision"]), (&json!([topic]), &json!(revision)));
+        assert_eq!(shown["secret_names"], json!(["password"]));
+    }
+    let settings =
+        crate::harness::sightfix().arg("--config").arg(&file).arg("config").output().expect("it runs");
+    let shown = String::from_utf8(settings.stdout).expect("text");
+    assert!(shown.contains("other/events") && !shown.contains(SECRET), "{shown}");
+}

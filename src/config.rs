@@ -152,7 +152,7 @@ impl DeclaredConnection {
 
 impl std::fmt::Debug for DeclaredConnection {
     fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        self.without_secrets().fmt(out)
+        std::fmt::Debug::fmt(&self.without_secrets(), out)
     }
 }
 

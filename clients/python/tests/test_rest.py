@@ -293,7 +293,9 @@ def test_columns_conflicts_and_keys_of_imports(client: Client, tmp_path: Path) -
     assert (stored[0].accepted, stored[0].rejected) == (2, 0)
     assert [it.bounding_box.width_px for it in client.samples.list("gate")] == [30.0, 30.0]
     moved = [
-        Sample(time=it.time, target_id="a", bounding_box=it.bounding_box, fix=Fix(longitude_deg=25.0, latitude_deg=59.0))
+        Sample(
+            time=it.time, target_id="a", bounding_box=it.bounding_box, fix=Fix(longitude_deg=25.0, latitude_deg=59.0)
+        )
         for it in client.samples.list("gate")
     ]
     assert client.samples.import_samples("gate", moved).duplicate == 2

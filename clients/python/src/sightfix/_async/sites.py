@@ -56,9 +56,7 @@ class Sites:
         headers = {"accept": "text/event-stream"}
         if resume_after is not None:
             headers["last-event-id"] = resume_after
-        request = Request(
-            method="GET", path=path("sites", site_id, "events"), headers=headers, is_idempotent=True
-        )
+        request = Request(method="GET", path=path("sites", site_id, "events"), headers=headers, is_idempotent=True)
         parser = ServerSentEventParser()
         async with self._transport.open(request, read_timeout_s=SILENCE_S) as response:
             async for line in response.aiter_lines():

@@ -42,6 +42,7 @@ pub fn of(kind: ErrorKind) -> Status {
     use ErrorKind as Kind;
     let (http, grpc, title) = match kind {
         Kind::InvalidArgument => (422, code::INVALID_ARGUMENT, "A field has a value that cannot be used"),
+        Kind::InvalidQuery => (400, code::INVALID_ARGUMENT, "A parameter has a value that cannot be used"),
         Kind::MalformedBody => (400, code::INVALID_ARGUMENT, "The body is not of its format"),
         Kind::UnsupportedMediaType => (415, code::INVALID_ARGUMENT, "The content type is not read here"),
         Kind::NotAcceptable => (406, code::INVALID_ARGUMENT, "None of the accepted types is written here"),

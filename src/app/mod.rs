@@ -12,6 +12,7 @@ mod cameras;
 mod evaluations;
 mod fusion;
 mod idempotency;
+mod inference;
 mod keys;
 mod live;
 mod matching;
@@ -22,6 +23,7 @@ mod registry;
 mod samples;
 mod site_registry;
 mod sites;
+mod spool;
 mod training;
 
 use std::sync::Arc;
@@ -39,6 +41,7 @@ use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
+pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind,
@@ -51,6 +54,7 @@ pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedPar
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
+pub use spool::{Content, Spool, SpoolLeases, Spooled};
 pub use training::RunRequest;
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.

@@ -54,6 +54,10 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("rustls", &["server"]),
     ("tokio_rustls", &["server"]),
     ("clap", &["cli"]),
+    ("clap_complete", &["cli"]),
+    ("clap_mangen", &["cli"]),
+    ("flate2", &["cli"]),
+    ("zstd", &["cli"]),
     ("indicatif", &["cli"]),
     ("metrics_exporter_prometheus", &["telemetry"]),
 ];

@@ -259,6 +259,16 @@ pub struct Limits {
     pub cameras: u32,
     /// Sites; more are refused.
     pub sites: u32,
+    /// Connections with other systems; more are refused.
+    pub outside_connections: u32,
+    /// Bytes of one message of a connection; a larger one is skipped.
+    pub connection_message_bytes: usize,
+    /// Messages of one source that are not settled yet; beyond, no more are read.
+    pub connection_queue: usize,
+    /// Messages of one sink that wait for their receiver; beyond, the oldest is dropped.
+    pub outbox_messages: u32,
+    /// Messages of one sink that were refused or could not be delivered; beyond, the oldest is deleted.
+    pub dead_letters: u32,
     /// Boxes and fixes of one site that wait for its tracker; beyond, they are dropped.
     pub site_queue: usize,
     /// Frames of one site that wait for earlier ones of other cameras; beyond, the oldest is tracked.
@@ -405,6 +415,11 @@ impl Default for Limits {
             truth_line_positions: 1_000,
             cameras: 10_000,
             sites: 1_000,
+            outside_connections: 256,
+            connection_message_bytes: 1 << 20,
+            connection_queue: 1_024,
+            outbox_messages: 100_000,
+            dead_letters: 1_000,
             site_queue: 16_384,
             site_frames: 1_024,
             boxes_per_frame: 256,
@@ -577,6 +592,8 @@ impl Config {
             anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
         }
         for (name, limit) in [
+            ("connection_message_bytes", limits.connection_message_bytes),
+            ("connection_queue", limits.connection_queue),
             ("site_queue", limits.site_queue),
             ("site_frames", limits.site_frames),
             ("boxes_per_frame", limits.boxes_per_frame),

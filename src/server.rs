@@ -30,6 +30,7 @@ use tokio::net::TcpListener;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
+use crate::connect;
 use crate::domain::{Error, KeySecret};
 use crate::shutdown::Shutdown;
 use crate::store::{Sharing, Store, StoreOptions};
@@ -160,6 +161,7 @@ impl Server {
         let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
+        shutdown.spawn(connect::run(app.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
         let cors = cors::layer(&config.cors_origins);

@@ -59,6 +59,11 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::SiteNotFound => (404, code::NOT_FOUND, "There is no such site"),
         Kind::SiteExists => (409, code::ALREADY_EXISTS, "A site of that id exists already"),
         Kind::SiteInUse => (409, code::FAILED_PRECONDITION, "The site has cameras"),
+        Kind::ConnectionNotFound => (404, code::NOT_FOUND, "There is no such connection"),
+        Kind::ConnectionExists => (409, code::ALREADY_EXISTS, "A connection of that id exists already"),
+        Kind::ConnectionNotReceiving => {
+            (409, code::FAILED_PRECONDITION, "The connection takes no messages now")
+        }
         Kind::RevisionMismatch => (412, code::ABORTED, "The resource was changed in the meantime"),
         Kind::RevisionRequired => {
             (428, code::FAILED_PRECONDITION, "The change needs the revision it is based on")

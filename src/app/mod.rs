@@ -9,6 +9,7 @@ pub mod access;
 mod audit;
 mod camera_statuses;
 mod cameras;
+mod connections;
 mod evaluations;
 mod fusion;
 mod idempotency;
@@ -40,6 +41,10 @@ use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
+pub use connections::{
+    ConnectionBoard, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage, LiveConnection,
+    PushedMessage, connection_settings,
+};
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use live::{
@@ -73,6 +78,8 @@ pub struct Parts {
     pub registry: Registry,
     /// Sites, ready to track.
     pub site_registry: SiteRegistry,
+    /// What connections with other systems do.
+    pub connection_board: ConnectionBoard,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -135,6 +142,7 @@ impl App {
             opened_store: store,
             registry,
             site_registry,
+            connection_board: ConnectionBoard::default(),
             access,
             clock,
             randomness,
@@ -218,6 +226,9 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
     StoreLimits {
         cameras: limits.cameras,
         sites: limits.sites,
+        outside_connections: limits.outside_connections,
+        outbox_messages: limits.outbox_messages,
+        dead_letters: limits.dead_letters,
         samples_per_camera: limits.samples_per_camera,
         sample_overflow: limits.sample_overflow,
         samples: limits.samples,

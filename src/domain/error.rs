@@ -53,6 +53,12 @@ pub enum ErrorKind {
     SiteExists,
     /// The site has cameras.
     SiteInUse,
+    /// No such connection.
+    ConnectionNotFound,
+    /// A connection of that id exists already.
+    ConnectionExists,
+    /// The connection takes no messages by HTTP, or is paused.
+    ConnectionNotReceiving,
     /// `If-Match` names another revision than the stored one.
     RevisionMismatch,
     /// The change needs an `If-Match`.

@@ -14,6 +14,7 @@ mod body_coding;
 mod body_error;
 mod camera_statuses;
 mod cameras;
+mod connections;
 mod console;
 mod description;
 mod etag;
@@ -204,6 +205,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(camera_statuses::routes())
         .merge(sites::routes())
         .merge(world_tracks::routes())
+        .merge(connections::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())

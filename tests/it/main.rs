@@ -37,6 +37,7 @@ mod model_integrity;
 mod monitoring;
 mod openapi;
 mod operator_files;
+mod outside;
 mod overload;
 mod pairing;
 mod parity;

@@ -91,7 +91,8 @@ impl CameraEvents {
 
 impl App {
     /// The bounds of times that may enter tracks and drift detection.
-    pub(super) fn live_time_bounds(&self) -> TimeBounds {
+    #[must_use]
+    pub fn live_time_bounds(&self) -> TimeBounds {
         TimeBounds::live_at(self.clock.now(), self.limits.live_ahead_s)
     }
 

@@ -1,4 +1,4 @@
-//! Exponential backoff with jitter between attempts to open a stream.
+//! Exponential backoff with jitter between attempts to reach another system.
 
 use std::time::Duration;
 
@@ -10,25 +10,27 @@ const MAX_DELAY: Duration = Duration::from_secs(5);
 
 /// The delays of one client.
 #[derive(Debug)]
-pub(super) struct Backoff {
+pub struct Backoff {
     failures: u32,
     max_attempts: u32,
     random: ChaCha8Rng,
 }
 
 impl Backoff {
-    pub(super) const fn new(max_attempts: u32, random: ChaCha8Rng) -> Self {
+    /// `max_attempts` failures in a row are followed by a delay.
+    #[must_use]
+    pub const fn new(max_attempts: u32, random: ChaCha8Rng) -> Self {
         Self { failures: 0, max_attempts, random }
     }
 
     /// Resets the delay and the attempts after a success.
-    pub(super) const fn reset(&mut self) {
+    pub const fn reset(&mut self) {
         self.failures = 0;
     }
 
     /// The delay after one more failure: 0.1 s, doubled with every failure up to 5 s, times a uniform
     /// factor from 0.5 to 1. `None` once all attempts are used.
-    pub(super) fn next_delay(&mut self) -> Option<Duration> {
+    pub fn next_delay(&mut self) -> Option<Duration> {
         if self.failures >= self.max_attempts {
             return None;
         }

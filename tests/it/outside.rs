@@ -1,0 +1,9 @@
+//! Connections with other systems: their messages, brokers, receivers, webhooks, Cursor on Target. Tests whose names contain `broker`
+//! start a real mosquitto; they are ignored by default, and `.ci/run` installs it and runs them.
+
+mod broker;
+mod messages;
+mod peers;
+mod receivers;
+mod resource;
+mod sinks;

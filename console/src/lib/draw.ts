@@ -74,6 +74,16 @@ export function drawPolygon(context: Context, corners: Pixel[], style: Style): v
   paint(context, style);
 }
 
+/** Lines, or the rings of polygons with holes, as one path. */
+export function drawPath(context: Context, parts: Pixel[][], isClosed: boolean, style: Style): void {
+  context.beginPath();
+  for (const part of parts) {
+    part.forEach(({ x, y }, at) => (at === 0 ? context.moveTo(x, y) : context.lineTo(x, y)));
+    if (isClosed) context.closePath();
+  }
+  paint(context, style);
+}
+
 export function drawLine(context: Context, from: Pixel, to: Pixel, style: Style): void {
   context.beginPath();
   context.moveTo(from.x, from.y);

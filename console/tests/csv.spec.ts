@@ -74,6 +74,7 @@ test('the lines for a shell are quoted', () => {
   expect(curlLine('http://h:8080', 'c', observation)).toBe(`curl -s http://h:8080/v1/cameras/c/fusions --json '{"time":"2026-01-01T00:00:00Z'\\''","fix":{"longitude_deg":11,"latitude_deg":48}}'`);
   expect(grpcurlLine('http://h:8080', 'c', observation)).toMatch(/^grpcurl -plaintext -d '.*' h:8080 sightfix\.v1\.FusionService\/Fuse$/);
   expect(grpcurlLine('https://h', 'c', observation)).toMatch(/^grpcurl -d .* h:443 /);
+  for (const line of [curlLine('http://h', 'c', observation, true), grpcurlLine('http://h', 'c', observation, true)]) expect(line).toContain(' -H "authorization: Bearer $SIGHTFIX_KEY" ');
 });
 
 test('a walk is saved in the columns of the importer', () => {

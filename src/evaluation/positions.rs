@@ -51,8 +51,9 @@ impl Evaluation {
     #[must_use]
     pub fn into_report_with_positions(self, test: &[TestRow]) -> ReportWithPositions {
         let step = test.len().div_ceil(SHOWN_ROWS).max(1);
-        let shown = |points: Vec<TracePoint>| {
-            points.iter().filter(|point| point.row % step == 0).map(|point| position(point, test)).collect()
+        let shown = |points: Vec<TracePoint>| -> Vec<EvaluatedPosition> {
+            let chosen = points.iter().filter(|point| point.row.is_multiple_of(step));
+            chosen.map(|point| position(point, test)).collect()
         };
         let traces = self.traces.into_iter();
         let positions = traces.map(|trace| (trace.method, shown(trace.points))).collect();

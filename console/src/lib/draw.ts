@@ -106,6 +106,19 @@ export function drawRectangle(context: Context, x: number, y: number, width: num
   paint(context, style);
 }
 
+/** A text in the colour of texts with a halo, so that it can be read on whatever is under it. */
+export function drawLabel(context: Context, text: string, at: Pixel, colors: Palette, align: CanvasTextAlign = 'left'): void {
+  context.font = '500 12px "Plex Sans", sans-serif';
+  context.textAlign = align;
+  context.lineWidth = 3.5;
+  context.lineJoin = 'round';
+  context.setLineDash([]);
+  context.strokeStyle = colors.plane;
+  context.fillStyle = colors.text;
+  context.strokeText(text, at.x, at.y);
+  context.fillText(text, at.x, at.y);
+}
+
 /** Sizes a canvas to its element in device pixels; returns the context in CSS pixels, cleared. */
 export function prepare(canvas: HTMLCanvasElement, width: number, height: number): Context {
   const ratio = window.devicePixelRatio || 1;

@@ -58,3 +58,27 @@ test('a still image that is dropped on the image plane stays in the browser', as
   await page.getByRole('button', { name: 'Remove background' }).click();
   await expect.poll(corner).not.toEqual([200, 30, 60]);
 });
+
+test('the code for a phone holds a key for this camera alone', async ({ console: page, server }) => {
+  for (const id of ['gate', 'other']) await server.request('POST', '/v1/cameras', { id });
+  const { secret } = await server.request<{ secret: string }>('POST', '/v1/keys', { name: 'first', role: 'admin', camera_ids: [] });
+  await page.goto('about:blank');
+  await page.context().request.post(`${server.url}/v1/session`, { data: { key: secret } });
+  await page.goto(`${server.url}/#/cameras/gate/data`);
+  await page.getByRole('button', { name: 'Walk with a phone' }).click();
+  const dialog = page.getByRole('dialog', { name: 'Walk with a phone' });
+  await expect(dialog.getByRole('img', { name: 'QR code of the phone page' })).toBeVisible();
+  await dialog.getByLabel('Receiver').fill('phone-3');
+  await dialog.getByRole('button', { name: 'Add a key for one day' }).click();
+  await expect(dialog.getByText('expires in a day')).toBeVisible();
+  const address = new URL((await dialog.locator('pre').textContent())!);
+  const values = new URLSearchParams(address.hash.slice(1));
+  expect([address.pathname, values.get('camera'), values.get('receiver')]).toEqual(['/walk', 'gate', 'phone-3']);
+  const send = async (camera: string): Promise<number> => {
+    const observation = { time: new Date().toISOString(), receiver_id: 'phone-3', fix: { longitude_deg: 11, latitude_deg: 48 } };
+    const headers = { authorization: `Bearer ${values.get('key')}`, 'content-type': 'application/json' };
+    return (await fetch(`${server.url}/v1/cameras/${camera}/tracks`, { method: 'POST', headers, body: JSON.stringify(observation) })).status;
+  };
+  expect(await send('gate')).toBe(200);
+  expect(await send('other')).toBe(403);
+});

@@ -31,6 +31,7 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
   ['profile', '#/cameras/north-gate/profile', (page) => expect(page.getByText('north-gate').first()).toBeVisible()],
   ['settings', '#/settings/health', (page) => expect(page.getByText('/metrics')).toBeVisible()],
   ['keys', '#/settings/keys', (page) => expect(page.locator('main .panel')).toBeVisible()],
+  ['audit', '#/settings/audit', (page) => expect(page.locator('main tbody tr').first()).toBeVisible()],
   ['limits', '#/settings/limits', (page) => expect(page.getByText('page_items')).toBeVisible()],
   ['walk', 'walk#camera=north-gate&receiver=phone-1', (page) => expect(page.locator('.record')).toBeVisible()],
 ];
@@ -46,6 +47,7 @@ async function buildTown(server: Server): Promise<Town> {
   const town = PICTURES ? TOWN : TOWN.slice(0, 1);
   const worlds = town.map(([, , , east, north], at) => simulate(at + 1, [east, north], 300));
   for (const [at, [id, name, site]] of town.entries()) await addCamera(server, id, name, worlds[at]!, { site });
+  if (PICTURES) await server.train('north-gate', { recipe: 'hybrid', epochs: 60, seed: 1 });
   await server.request('POST', '/v1/cameras', { id: 'roof-east', display_name: 'Roof east', labels: { site: 'roof' } });
   await server.request('POST', '/v1/cameras', { id: 'car-park', display_name: 'Car park', labels: { site: 'parking' } });
   await server.request('POST', '/v1/cameras/car-park/samples', worlds[0]!.csv, 'text/csv');

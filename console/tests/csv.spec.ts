@@ -66,7 +66,7 @@ test('a line that cannot be split is rejected in the preview', () => {
 
 test('a cell that is no number is rejected with its field', () => {
   const table = parseTable('time,id,left,top,width,height\n2026-01-01T00:00:00Z,a,1,2,wide,4\n');
-  expect(mapRow(table.rows[0]!, guessMapping(table), undefined)).toEqual({ line: 2, field: 'width', reason: "'wide' is not a number" });
+  expect(mapRow(table.rows[0]!, guessMapping(table), undefined)).toEqual({ line: 2, field: 'width', reason: 'must be a number, not `wide`' });
 });
 
 test('the lines for a shell are quoted', () => {

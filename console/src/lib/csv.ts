@@ -168,7 +168,7 @@ export function mapRow(row: TableRow, mapping: Mapping, image: ImageSize | undef
   if (mapping.timeForm === 'rfc3339') values.time = raw('time').replace(/^(\d{4}-\d\d-\d\d) (\d\d:)/, '$1T$2');
   else {
     const time_ms = numeric('time') * (mapping.timeForm === 'unix_s' ? 1000 : 1);
-    if (!Number.isFinite(time_ms) || Math.abs(time_ms) > 8.64e15) return reject('time', `'${raw('time')}' is not a number of seconds`);
+    if (!Number.isFinite(time_ms) || Math.abs(time_ms) > 8.64e15) return reject('time', `\`${raw('time').slice(0, 40)}\` is no Unix time`);
     values.time = new Date(time_ms).toISOString();
   }
   values.target_id = raw('target_id') || mapping.targetId;
@@ -177,7 +177,7 @@ export function mapRow(row: TableRow, mapping: Mapping, image: ImageSize | undef
     const wrong = sides.findIndex((side) => !Number.isFinite(side));
     if (wrong >= 0) {
       const field = ['left', 'top', 'width', 'height'][wrong]!;
-      return reject(field, `'${raw(field)}' is not a number`);
+      return reject(field, raw(field) === '' ? 'is empty' : `must be a number, not \`${raw(field).slice(0, 40)}\``);
     }
     let [left, top, width, height] = sides as [number, number, number, number];
     if (mapping.normalised && image) {

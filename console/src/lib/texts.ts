@@ -3,6 +3,7 @@
 const table = {
   loading: ['Loading …', 'Wird geladen …'],
   'connection.lost': ['The server cannot be reached. Trying again …', 'Der Server ist nicht erreichbar. Neuer Versuch …'],
+  'connection.unreachable': ['The server cannot be reached.', 'Der Server ist nicht erreichbar.'],
 
   'action.add': ['Add', 'Hinzufügen'],
   'action.cancel': ['Cancel', 'Abbrechen'],
@@ -209,6 +210,12 @@ const table = {
   'timeForm.rfc3339': ['RFC 3339 with offset', 'RFC 3339 mit Zeitzone'],
   'timeForm.unixMs': ['Unix milliseconds', 'Unix-Millisekunden'],
   'timeForm.unixS': ['Unix seconds', 'Unix-Sekunden'],
+  'mapping.centreX': ['centre x', 'Mitte x'],
+  'mapping.centreY': ['centre y', 'Mitte y'],
+  'mapping.x1': ['left (x1)', 'links (x1)'],
+  'mapping.x2': ['right (x2)', 'rechts (x2)'],
+  'mapping.y1': ['top (y1)', 'oben (y1)'],
+  'mapping.y2': ['bottom (y2)', 'unten (y2)'],
   'mapping.boxes': ['Boxes are', 'Boxen sind'],
   'mapping.columns': ['Columns of {file}: {n} rows, separated by “{separator}”', 'Spalten von {file}: {n} Zeilen, getrennt durch „{separator}“'],
   'mapping.decimalComma': ['Decimal comma', 'Dezimalkomma'],

@@ -46,17 +46,18 @@ test('a still image that is dropped on the image plane stays in the browser', as
   });
   await plane.dispatchEvent('drop', { dataTransfer: dropped });
   await expect(page.getByText('The image stays in this browser.')).toBeVisible();
-  const corner = (): Promise<number[]> =>
+  const redness = (): Promise<number> =>
     plane.locator('canvas').evaluate((element) => {
       const canvas = element as HTMLCanvasElement;
       // In the picture, beside the foot points.
-      return [...canvas.getContext('2d')!.getImageData(canvas.width / 2, canvas.height / 2 - canvas.width * 0.25, 1, 1).data.slice(0, 3)];
+      const [red, green] = canvas.getContext('2d')!.getImageData(canvas.width / 2, canvas.height / 2 - canvas.width * 0.25, 1, 1).data;
+      return red! - green!;
     });
-  await expect.poll(corner).toEqual([200, 30, 60]);
+  await expect.poll(redness).toBeGreaterThan(80);
   await page.reload();
-  await expect.poll(corner).toEqual([200, 30, 60]);
+  await expect.poll(redness).toBeGreaterThan(80);
   await page.getByRole('button', { name: 'Remove background' }).click();
-  await expect.poll(corner).not.toEqual([200, 30, 60]);
+  await expect.poll(redness).toBeLessThan(20);
 });
 
 test('the code for a phone holds a key for this camera alone', async ({ console: page, server }) => {

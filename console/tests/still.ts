@@ -92,8 +92,8 @@ function drawStill({ map, ground_m, image_px, width_px, height_px }: { map: numb
     x += wide + 3;
   }
   const light = context.createRadialGradient(width_px * 0.6, height_px * 0.5, height_px * 0.2, width_px * 0.5, height_px * 0.55, width_px * 0.7);
-  light.addColorStop(0, 'rgb(0 0 0 / 30%)');
-  light.addColorStop(1, 'rgb(0 0 0 / 62%)');
+  light.addColorStop(0, 'rgb(0 0 0 / 4%)');
+  light.addColorStop(1, 'rgb(0 0 0 / 34%)');
   context.fillStyle = light;
   context.fillRect(0, 0, width_px, height_px);
   return canvas.toDataURL('image/png');

@@ -82,7 +82,8 @@ test('every view is accessible, fits and can be shown', async ({ console: page, 
   for (const theme of ['dark', 'light'] as const) {
     await page.emulateMedia({ colorScheme: theme, reducedMotion: 'reduce' });
     for (const [name, path, ready] of VIEWS) {
-      await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: 900 });
+      const isLong = PICTURES && /^(evaluation|models)$/.test(name);
+      await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: isLong ? 1300 : 900 });
       await look(page, server, path, ready);
       expect.soft(await accessibilityFindings(page), `${name}, ${theme}`).toEqual([]);
       if (PICTURES) {

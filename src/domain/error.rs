@@ -29,6 +29,8 @@ pub enum ErrorKind {
     NotAcceptable,
     /// Body, batch or message beyond its limit.
     TooLarge,
+    /// `Range` asks for bytes behind the end.
+    RangeNotSatisfiable,
     /// No such path.
     RouteNotFound,
     /// The path exists, the method does not.

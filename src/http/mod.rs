@@ -40,6 +40,7 @@ mod session;
 mod sites;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod tracks;
 mod training_runs;
 mod wire;
@@ -220,6 +221,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(audit::routes())
         .merge(session::routes())
         .merge(server_info::routes())
+        .merge(tiles::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
     description::add_security(router.get_openapi_mut());

@@ -15,6 +15,7 @@ mod deliver;
 mod intake;
 mod lines;
 mod mqtt;
+mod nats;
 mod peer;
 mod publish;
 mod push;

@@ -3,7 +3,7 @@
 use futures_util::future::BoxFuture;
 
 use super::peer::{Credentials, PeerError};
-use super::{mqtt, stream, udp, webhook};
+use super::{mqtt, nats, stream, udp, webhook};
 use crate::clock::Clock;
 use crate::domain::OutboxMessage;
 use crate::exchange::{OutgoingFormat, Scheme, Secrets, SinkSettings};
@@ -45,6 +45,7 @@ pub(super) async fn open(
         Scheme::Http | Scheme::Https => {
             Box::new(webhook::Webhook::open(&address, &credentials, media_type, clock.clone()).await?)
         }
+        Scheme::Nats => Box::new(nats::NatsSink::open(&address, &credentials).await?),
         Scheme::Tcp | Scheme::Tls => Box::new(stream::StreamSink::open(&address, &credentials).await?),
         Scheme::Udp => Box::new(udp::UdpSink::open(&address, settings.multicast_ttl.unwrap_or(1)).await?),
         Scheme::TcpListen | Scheme::Gpsd | Scheme::Push => {

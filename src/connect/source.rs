@@ -66,6 +66,6 @@ pub(super) async fn open(
         Scheme::TcpListen => Box::new(lines::LineListener::bind(&address, queue, message_bytes).await?),
         Scheme::Udp => Box::new(udp::UdpSource::bind(&address).await?),
         Scheme::Push => Box::new(push::PushSource::open(live.clone(), queue)),
-        Scheme::Http | Scheme::Https => return Err("a source cannot have this address".into()),
+        Scheme::Http | Scheme::Https | Scheme::Nats => return Err("a source cannot have this address".into()),
     })
 }

@@ -104,14 +104,15 @@ pub enum OutgoingFormat {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SinkSettings {
-    /// `mqtt://HOST[:1883]` and `mqtts://HOST[:8883]` publish; `http://` and `https://` post (a webhook); `tcp://`,
+    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]` and `nats://HOST[:4222]` publish; `http://` and `https://` post (a webhook); `tcp://`,
     /// `tls://` and `udp://HOST:PORT`, also of a multicast group, send.
     #[schema(max_length = 512, example = "https://hooks.example.org/positions")]
     pub address: String,
     /// What is sent.
     #[serde(default)]
     pub format: OutgoingFormat,
-    /// Topic of MQTT; `{camera}` and `{target}` are replaced by their ids. `sightfix/{camera}/{target}` if left out.
+    /// Topic of MQTT, or subject of NATS; `{camera}` and `{target}` are replaced by their ids. `sightfix/{camera}/{target}`
+    /// if left out, with points for NATS.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub topic: Option<String>,
     /// Name of the user, where the peer asks for one; the secret `password` belongs to it.
@@ -209,13 +210,14 @@ pub enum Scheme {
     Push,
     Http,
     Https,
+    Nats,
 }
 
 impl Scheme {
     const SOURCES: [Self; 8] =
         [Self::Mqtt, Self::Mqtts, Self::Tcp, Self::Tls, Self::TcpListen, Self::Udp, Self::Gpsd, Self::Push];
-    const SINKS: [Self; 7] =
-        [Self::Mqtt, Self::Mqtts, Self::Tcp, Self::Tls, Self::Udp, Self::Http, Self::Https];
+    const SINKS: [Self; 8] =
+        [Self::Mqtt, Self::Mqtts, Self::Nats, Self::Tcp, Self::Tls, Self::Udp, Self::Http, Self::Https];
 
     const fn as_str(self) -> &'static str {
         match self {
@@ -229,6 +231,7 @@ impl Scheme {
             Self::Push => "push",
             Self::Http => "http",
             Self::Https => "https",
+            Self::Nats => "nats",
         }
     }
 
@@ -239,6 +242,7 @@ impl Scheme {
             Self::Gpsd => Some(2947),
             Self::Http => Some(80),
             Self::Https => Some(443),
+            Self::Nats => Some(4222),
             Self::Tcp | Self::Tls | Self::TcpListen | Self::Udp | Self::Push => None,
         }
     }
@@ -411,8 +415,6 @@ impl CameraMapping {
 }
 
 impl SinkSettings {
-    const DEFAULT_TOPIC: &str = "sightfix/{camera}/{target}";
-
     /// Where it is.
     ///
     /// # Errors
@@ -430,8 +432,10 @@ impl SinkSettings {
         self.cameras()?;
         if let Some(topic) = &self.topic {
             check_text("topic", topic, 1_024)?;
-            if topic.contains(['+', '#']) {
-                return Err(Error::invalid("topic", "must not contain the wildcards + and #"));
+            let wildcards: &[char] =
+                if self.address.starts_with("nats:") { &[' ', '*', '>'] } else { &['+', '#'] };
+            if topic.contains(wildcards) {
+                return Err(Error::invalid("topic", "must not contain wildcards"));
             }
         }
         for (field, value, least) in
@@ -459,11 +463,15 @@ impl SinkSettings {
         cameras(&self.camera_ids)
     }
 
-    /// The topic of a target. Characters that separate levels, or are wildcards, become `_` in its id.
+    /// The topic of a target, or its subject in NATS. Characters that separate levels there, or are wildcards, become
+    /// `_` in its id.
     #[must_use]
     pub fn topic_of(&self, camera: &CameraId, target: &TargetId) -> String {
-        let target = target.as_str().replace(['/', '+', '#'], "_");
-        let template = self.topic.as_deref().unwrap_or(Self::DEFAULT_TOPIC);
+        let is_nats = self.address.starts_with("nats:");
+        let special: &[char] = if is_nats { &[' ', '.', '*', '>'] } else { &['/', '+', '#'] };
+        let default = if is_nats { "sightfix.{camera}.{target}" } else { "sightfix/{camera}/{target}" };
+        let template = self.topic.as_deref().unwrap_or(default);
+        let target = target.as_str().replace(special, "_");
         template.replace("{camera}", camera.as_str()).replace("{target}", &target)
     }
 }

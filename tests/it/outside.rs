@@ -1,5 +1,6 @@
-//! Connections with other systems: their messages, brokers, receivers, webhooks, Cursor on Target. Tests whose names contain `broker`
-//! start a real mosquitto; they are ignored by default, and `.ci/run` installs it and runs them.
+//! Connections with other systems: their messages, brokers, receivers, webhooks, Cursor on Target. Tests whose names
+//! contain `broker` start a real mosquitto or nats-server; they are ignored by default, and `.ci/run` installs both and
+//! runs them.
 
 mod broker;
 mod messages;

@@ -1,9 +1,11 @@
 //! Sources and sinks of MQTT against a real mosquitto.
 
 use serde_json::{Value, json};
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::net::TcpStream;
 
-use super::peers::{Broker, connection_when, create_gate, now, send_fix};
-use crate::harness::{TestServer, data_folder};
+use super::peers::{Broker, connection_when, create_gate, now, patch, send_fix};
+use crate::harness::{TestServer, data_folder, own_address};
 
 const TARGET: &str = "1607123955.475377-mxklsc";
 
@@ -154,4 +156,65 @@ async fn positions_are_published_to_a_broker_also_those_of_its_absence() {
         messages.iter().map(|(_, message)| message["time"].as_str().expect("a time")).collect();
     assert!(times.is_sorted() && times.len() == 3, "{times:?}");
     connection_when(&server, "positions", |status| status["queued"] == 0).await;
+}
+
+/// Reads a message of a subscription: its subject, headers and payload.
+async fn next_message(stream: &mut BufReader<TcpStream>) -> (String, String, Value) {
+    loop {
+        let mut line = String::new();
+        assert!(stream.read_line(&mut line).await.expect("a line") > 0, "the connection is closed");
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        let ["HMSG", subject, _, header, total] = fields[..] else { continue };
+        let (header, total): (usize, usize) = (header.parse().expect("bytes"), total.parse().expect("bytes"));
+        let mut content = vec![0; total + 2];
+        stream.read_exact(&mut content).await.expect("a message");
+        let headers = String::from_utf8(content[..header].to_vec()).expect("text");
+        return (subject.to_owned(), headers, serde_json::from_slice(&content[header..total]).expect("JSON"));
+    }
+}
+
+#[tokio::test]
+#[ignore = "needs nats-server"]
+async fn positions_are_published_to_a_nats_broker_also_those_of_its_absence() {
+    let address = own_address();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let sink = json!({"address": format!("nats://{address}"), "camera_ids": ["gate"], "min_interval_s": 0});
+    server.post("/v1/connections", &json!({"id": "nats", "paused": true, "sink": sink})).await.expect(201);
+    patch(&server, "nats", &json!({"paused": false})).await.expect(200);
+    connection_when(&server, "nats", |status| status["state"] == "waiting").await;
+    send_fix(&server, "van.1", &now().to_string(), 103.98678, false).await;
+    connection_when(&server, "nats", |status| status["queued"] == 1).await;
+    patch(&server, "nats", &json!({"paused": true})).await.expect(200);
+
+    let port = address.port().to_string();
+    let mut command = std::process::Command::new("nats-server");
+    command.args(["-a", "127.0.0.1", "-p", &port]).stderr(std::process::Stdio::null());
+    let mut broker = command.spawn().expect("nats-server is installed");
+    let stream = loop {
+        match TcpStream::connect(address).await {
+            Ok(stream) => break stream,
+            Err(_) => tokio::time::sleep(std::time::Duration::from_millis(20)).await,
+        }
+    };
+    let mut stream = BufReader::new(stream);
+    let subscribe = b"CONNECT {\"verbose\":false,\"headers\":true}\r\nSUB sightfix.> 1\r\nPING\r\n";
+    stream.get_mut().write_all(subscribe).await.expect("written");
+    let mut line = String::new();
+    while line.trim_end() != "PONG" {
+        line.clear();
+        stream.read_line(&mut line).await.expect("an answer");
+    }
+    patch(&server, "nats", &json!({"paused": false})).await.expect(200);
+    let (subject, headers, message) = next_message(&mut stream).await;
+    assert_eq!(subject, "sightfix.gate.van_1");
+    assert!(
+        headers.contains(&format!("Nats-Msg-Id: {}", message["id"].as_str().expect("an id"))),
+        "{headers}"
+    );
+    assert_eq!(message["target_id"], "van.1");
+    connection_when(&server, "nats", |status| status["queued"] == 0).await;
+    broker.kill().expect("it can be killed");
+    broker.wait().expect("it is gone");
 }

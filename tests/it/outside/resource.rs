@@ -99,6 +99,7 @@ async fn settings_that_cannot_work_are_refused_with_their_field() {
         (sink(json!({"address": "http://hook", "camera_ids": []})), "sink.camera_ids"),
         (sink(json!({"address": "gpsd://hook", "camera_ids": ["gate"]})), "sink.address"),
         (sink(json!({"address": "mqtt://b", "camera_ids": ["gate"], "topic": "a/#"})), "sink.topic"),
+        (sink(json!({"address": "nats://b", "camera_ids": ["gate"], "topic": "a.>"})), "sink.topic"),
         (
             sink(json!({"address": "http://h", "camera_ids": ["gate"], "min_interval_s": -1})),
             "sink.min_interval_s",

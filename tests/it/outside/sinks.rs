@@ -1,15 +1,22 @@
 //! Sinks: webhooks, and Cursor on Target.
 
+use std::sync::Arc;
+
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use hmac::{Hmac, KeyInit as _, Mac as _};
+use rustls::pki_types::PrivateKeyDer;
+use rustls::server::WebPkiClientVerifier;
+use rustls::{RootCertStore, ServerConfig};
 use serde_json::{Value, json};
 use sha2::Sha256;
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
+use tokio_rustls::TlsAcceptor;
 
 use super::peers::{connection_when, create_gate, now, patch, send_fix};
 use crate::harness::{TestServer, data_folder, own_address};
+use crate::tls::Authority;
 
 /// A request as a receiver of webhooks sees it.
 struct Hook {
@@ -204,4 +211,60 @@ async fn cursor_on_target_events_go_over_tcp_and_over_udp() {
         "{tried}"
     );
     patch(&server, "tak", &json!({"paused": true})).await.expect(200);
+}
+
+/// A server that wants a client certificate of the authority.
+fn tls_acceptor(authority: &Authority) -> TlsAcceptor {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let mut roots = RootCertStore::empty();
+    roots.add(authority.certificate.der().clone()).expect("an authority");
+    let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider.clone()).build();
+    let (certificate, key) = authority.issue();
+    let key = PrivateKeyDer::try_from(key.serialize_der()).expect("a key");
+    let config = ServerConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .expect("versions")
+        .with_client_cert_verifier(verifier.expect("a verifier"))
+        .with_single_cert(vec![certificate.der().clone()], key);
+    TlsAcceptor::from(Arc::new(config.expect("a configuration")))
+}
+
+#[tokio::test]
+async fn a_tak_server_is_reached_over_tls_with_a_client_certificate_and_only_if_it_is_trusted() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let port = listener.local_addr().expect("an address").port();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let (authority, other) = (Authority::new(), Authority::new());
+    let acceptor = tls_acceptor(&authority);
+    let (certificate, key) = authority.issue();
+    let draft = json!({
+        "id": "tak", "secrets": {"client_certificate": certificate.pem(), "client_key": key.serialize_pem()},
+        "sink": {"address": format!("tls://localhost:{port}"), "format": "cot", "camera_ids": ["gate"],
+            "min_interval_s": 0, "ca_certificate": other.certificate.pem()},
+    });
+    server.post("/v1/connections", &draft).await.expect(201);
+    let (stream, _) = listener.accept().await.expect("the server connects");
+    acceptor.accept(stream).await.expect_err("the server does not trust this certificate");
+    let waiting = connection_when(&server, "tak", |status| status["state"] == "waiting").await;
+    let error = waiting["status"]["last_error"]["message"].as_str().expect("an error");
+    assert!(error.contains("certificate"), "{error}");
+
+    let trust = json!({"sink": {"ca_certificate": authority.certificate.pem()}});
+    patch(&server, "tak", &trust).await.expect(200);
+    // Attempts of before the change may wait in the queue of the listener.
+    let stream = loop {
+        let (stream, _) = listener.accept().await.expect("the server connects");
+        if let Ok(stream) = acceptor.accept(stream).await {
+            break stream;
+        }
+    };
+    let mut stream = BufReader::new(stream);
+    send_fixes(&server, "van", 1).await;
+    let mut event = String::new();
+    stream.read_line(&mut event).await.expect("an event");
+    assert_eq!(attribute(&event, "uid"), "sightfix.gate.van");
+    let shown = server.get("/v1/connections/tak").await.expect(200).text();
+    assert!(!shown.contains("PRIVATE KEY") && shown.contains("client_key"), "{shown}");
 }

@@ -1,5 +1,6 @@
 //! Settings and limits: defaults < file < `SIGHTFIX_*` < flags.
 
+use std::io::Read as _;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -189,6 +190,8 @@ pub struct Console {
     /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
     /// console asks no other server.
     pub tile_url: Option<String>,
+    /// A PMTiles file of map tiles that the server itself offers; instead of `tile_url`.
+    pub tile_file: Option<PathBuf>,
     /// What the provider of the tiles asks to be shown on the map.
     pub tile_attribution: Option<String>,
 }
@@ -346,7 +349,31 @@ pub struct Limits {
     pub drain_s: u64,
 }
 
+/// How a PMTiles file of version 3 begins.
+const PMTILES_MAGIC: &[u8; 8] = b"PMTiles\x03";
+
 impl Console {
+    fn check(&self) -> anyhow::Result<()> {
+        if let Some(url) = &self.tile_url {
+            anyhow::ensure!(
+                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
+                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
+            );
+        }
+        let Some(file) = &self.tile_file else { return Ok(()) };
+        anyhow::ensure!(self.tile_url.is_none(), "give console.tile_url or console.tile_file, not both");
+        let mut magic = [0; PMTILES_MAGIC.len()];
+        std::fs::File::open(file)
+            .and_then(|mut opened| opened.read_exact(&mut magic))
+            .with_context(|| format!("console.tile_file: cannot read {}", file.display()))?;
+        anyhow::ensure!(
+            magic == *PMTILES_MAGIC,
+            "console.tile_file must be a PMTiles file of version 3; {} is none",
+            file.display()
+        );
+        Ok(())
+    }
+
     /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
     /// `None` for tiles of this server.
     #[must_use]
@@ -601,12 +628,7 @@ impl Config {
             );
         }
         anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
-        if let Some(url) = &self.console.tile_url {
-            anyhow::ensure!(
-                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
-                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
-            );
-        }
+        self.console.check()?;
         anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(
             limits.reserved_requests < limits.requests,

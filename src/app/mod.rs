@@ -13,6 +13,7 @@ mod connections;
 mod evaluations;
 mod fusion;
 mod idempotency;
+mod inference;
 mod keys;
 mod live;
 mod matching;
@@ -23,6 +24,7 @@ mod registry;
 mod samples;
 mod site_registry;
 mod sites;
+mod spool;
 mod training;
 
 use std::sync::Arc;
@@ -44,6 +46,7 @@ pub use connections::{
     PushedMessage, connection_settings,
 };
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
+pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind,
@@ -56,6 +59,7 @@ pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedPar
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
+pub use spool::{Content, Spool, SpoolLeases, Spooled};
 pub use training::RunRequest;
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.

@@ -59,6 +59,10 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("rumqttc", &["connect"]),
     ("hmac", &["connect"]),
     ("clap", &["cli"]),
+    ("clap_complete", &["cli"]),
+    ("clap_mangen", &["cli"]),
+    ("flate2", &["cli"]),
+    ("zstd", &["cli"]),
     ("indicatif", &["cli"]),
     ("metrics_exporter_prometheus", &["telemetry"]),
 ];

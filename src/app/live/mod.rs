@@ -169,6 +169,17 @@ impl App {
         Ok(camera.live.tracks.latest(self.clock.monotonic()))
     }
 
+    /// Where every target of a camera was, by target, each oldest first; those that expired are left out.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn track_histories(&self, id: &CameraId) -> Result<Vec<Vec<Arc<TrackPoint>>>> {
+        let camera = self.active_camera(id).await?;
+        let now = self.clock.monotonic();
+        let latest = camera.live.tracks.latest(now);
+        Ok(latest.iter().filter_map(|point| camera.live.tracks.history(&point.target_id, now)).collect())
+    }
+
     /// Where a target was, oldest first, as far back as the history reaches.
     ///
     /// # Errors

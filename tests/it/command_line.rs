@@ -111,7 +111,10 @@ fn values_may_begin_with_a_minus() {
     let (report, _) =
         succeeded(piped(&[&evaluate[..], &["--truth-point", "-74.0,40.7", "--json", "-"]].concat(), b""));
     let report: Value = serde_json::from_str(&report).expect("the document and nothing else");
-    assert!(report["methods"]["gnss"]["mean_m"].as_f64().expect("a figure") > 1e6, "New York is far from there");
+    assert!(
+        report["methods"]["gnss"]["mean_m"].as_f64().expect("a figure") > 1e6,
+        "New York is far from there"
+    );
 }
 
 #[test]

@@ -13,9 +13,10 @@ use super::{
 #[cfg(doc)]
 use crate::domain::ErrorKind;
 use crate::domain::{
-    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Detection, EpochReport,
-    EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey,
-    JobState, KeyId, ModelMetadata, ModelVersion, NewCamera, NewKey, NewSite, Result, Revision, RunId,
+    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId,
+    ConnectionKey, DeadLetter, Detection, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
+    EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
+    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision, RunId,
     RunProgress, SecretDigest, Site, SiteId, SiteKey, StoredSample, TrainingOptions, TrainingRun,
 };
 use crate::geo::Position;
@@ -469,4 +470,78 @@ contract! {
     /// # Errors
     /// Faults only.
     fn maintain(&self) -> Result<StorageStatus>;
+
+    /// Stores a new connection with revision 1.
+    ///
+    /// # Errors
+    /// [`ErrorKind::ConnectionExists`]; [`ErrorKind::InsufficientStorage`] beyond the limit of connections.
+    fn insert_connection(&self, profile: &NewConnection, now: Timestamp) -> Result<Connection>;
+
+    /// One connection, with its secrets.
+    ///
+    /// # Errors
+    /// [`ErrorKind::ConnectionNotFound`].
+    fn connection(&self, id: &ConnectionId) -> Result<Connection>;
+
+    /// A page of connections ordered by id, after an id.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn connections(&self, after: Option<&ConnectionId>, limit: u32) -> Result<Vec<Connection>>;
+
+    /// Puts a profile in the place of the stored one and counts its revision up, if the stored revision is the
+    /// expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::ConnectionNotFound`], [`ErrorKind::RevisionMismatch`].
+    fn replace_connection(&self, profile: &NewConnection, expected: Option<ExpectedVersion<ConnectionKey>>, now: Timestamp) -> Result<Connection>;
+
+    /// Deletes a connection with its outbox, if its revision is the expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::ConnectionNotFound`], [`ErrorKind::RevisionMismatch`].
+    fn delete_connection(&self, id: &ConnectionId, expected: Option<ExpectedVersion<ConnectionKey>>, now: Timestamp) -> Result<()>;
+
+    /// Appends messages; how many of the oldest were dropped for the limit. A connection that was deleted takes none.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InsufficientStorage`]; then none is stored.
+    fn append_to_outbox(&self, key: ConnectionKey, messages: &[OutboxMessage]) -> Result<u64>;
+
+    /// The oldest waiting messages.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn outbox(&self, key: ConnectionKey, limit: u32) -> Result<Vec<OutboxMessage>>;
+
+    /// Removes what was delivered, and sets aside what was refused, with the reason. The oldest dead letters beyond
+    /// the limit are deleted. A power cut may undo it; then the messages are delivered again.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn settle_outbox(&self, key: ConnectionKey, outcomes: &[(i64, Result<(), String>)]) -> Result<()>;
+
+    /// Dead letters of a connection, oldest first, after a number.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn dead_letters(&self, key: ConnectionKey, after: i64, limit: u32) -> Result<Vec<DeadLetter>>;
+
+    /// Puts all dead letters of a connection back among the waiting messages; how many.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn retry_dead_letters(&self, key: ConnectionKey) -> Result<u64>;
+
+    /// Deletes all dead letters of a connection; how many.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn delete_dead_letters(&self, key: ConnectionKey) -> Result<u64>;
+
+    /// What is in the outbox of a connection.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn outbox_counts(&self, key: ConnectionKey) -> Result<OutboxCounts>;
 }

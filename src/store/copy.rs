@@ -36,11 +36,19 @@ pub(super) const TABLES: &[Table] = &[
     Table { name: "api_keys", key: "id" },
     Table { name: "audit_log", key: "number" },
     Table { name: "idempotency_keys", key: "number" },
+    Table { name: "connections", key: "key" },
+    Table { name: "outbox", key: "number" },
 ];
 
 /// Tables whose keys are numbered and never used twice, with the column.
-const NUMBERED: &[(&str, &str)] =
-    &[("sites", "key"), ("cameras", "key"), ("audit_log", "number"), ("idempotency_keys", "number")];
+const NUMBERED: &[(&str, &str)] = &[
+    ("sites", "key"),
+    ("cameras", "key"),
+    ("audit_log", "number"),
+    ("idempotency_keys", "number"),
+    ("connections", "key"),
+    ("outbox", "number"),
+];
 
 /// Rows that are read or written at a time.
 pub(super) const ROWS_AT_A_TIME: usize = 500;

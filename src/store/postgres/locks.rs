@@ -21,6 +21,8 @@ pub(super) enum Limit {
     Jobs = 3,
     /// Number of keys.
     Keys = 4,
+    /// Number of connections with other systems.
+    Connections = 5,
 }
 
 /// Waits until no other transaction may change how far a limit is used.

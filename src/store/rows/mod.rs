@@ -3,6 +3,7 @@
 
 pub(super) mod audit;
 pub(super) mod cameras;
+pub(super) mod connections;
 pub(super) mod evaluations;
 pub(super) mod idempotency;
 pub(super) mod keys;

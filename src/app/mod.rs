@@ -251,7 +251,7 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
 ///
 /// # Errors
 /// The setting `database` is no URL of a PostgreSQL database.
-pub fn store_location(config: &Config) -> Result<Location> {
+pub fn store_location(config: &Config) -> crate::domain::Result<Location> {
     Location::new(&config.data, config.database.as_ref().map(Secret::reveal))
 }
 

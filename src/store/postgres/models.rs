@@ -75,14 +75,14 @@ impl Store {
                 "SELECT convert_to(metadata, 'UTF8'), weights FROM models WHERE camera_key = $1 AND number = $2",
             )
             .bind(key)
-            .bind(i64::from(number))
+            .bind(number)
             .fetch_one(&mut *transaction)
             .await
             .map_err(failed)?;
             sqlx::query("UPDATE models SET sha256 = $1 WHERE camera_key = $2 AND number = $3")
                 .bind(model_sha256(&document, &weights))
                 .bind(key)
-                .bind(i64::from(number))
+                .bind(number)
                 .execute(&mut *transaction)
                 .await
                 .map_err(failed)?;

@@ -103,13 +103,15 @@ fn shared_plaza_is_tracked_over_three_cameras() {
     let cases = evaluate(&plaza, "1920x1080", &[]);
     let [together, oracle, degraded, ..] = &cases[..] else { panic!("{cases:?}") };
     // The goal is 0.97 (docs/world-tracks.md).
-    assert!(figure(together, "identity_f1_by_boxes") >= 0.94, "{together}");
+    assert!(figure(together, "identity_f1_by_boxes") >= 0.95, "{together}");
     assert!(figure(together, "handover_rate") >= 0.85, "{together}");
     assert!(figure(oracle, "mota") - figure(together, "mota") <= 0.03, "{oracle}");
     assert!(figure(oracle, "idf1") - figure(together, "idf1") <= 0.03, "{oracle}");
     assert!(figure(degraded, "identity_f1_by_boxes") >= 0.9, "{degraded}");
     let redrawn = evaluate(&plaza, "1920x1080", &["--redraws", "20"]);
     assert!((0.88..=0.99).contains(&figure(&redrawn[0], "coverage95")), "{}", redrawn[0]);
-    let alone = redrawn[5..].iter().map(|case| figure(case, "mean_error_m")).fold(f64::INFINITY, f64::min);
-    assert!(figure(&redrawn[0], "mean_error_m") < alone, "the best camera has {alone} m: {}", redrawn[0]);
+    // Cameras see other targets, near or far, so each is compared on those in its view.
+    for alone in &redrawn[5..] {
+        assert!(figure(alone, "mean_error_by_all_m") < figure(alone, "mean_error_m"), "{alone}");
+    }
 }

@@ -14,7 +14,8 @@ pub struct WorldTrackSettings {
     /// Standard deviation per axis of the velocity of a new track, m/s.
     pub birth_speed_sigma_m_s: f64,
     /// Factor on the covariance of a detection: its error is not independent from frame to frame, so a filter that
-    /// takes it for white must take it for larger.
+    /// takes it for white must take it for larger: `(1 + rho) / (1 - rho)` for a correlation rho of 0.6 between
+    /// frames.
     pub correlated_noise_inflation: f64,
     /// Largest squared Mahalanobis distance of a detection to a track.
     pub gate: f64,
@@ -25,8 +26,8 @@ pub struct WorldTrackSettings {
     /// Speed up to which a target may move between two frames if the camera's tracker follows it without a gap,
     /// whatever the motion model says, m/s.
     pub largest_speed_m_s: f64,
-    /// Density of the detections of such a target anywhere within that distance, 1/m2: a little above that of new
-    /// targets, so that it goes on rather than starts again, and never takes another track's detection.
+    /// Density of the detections of such a target anywhere within that distance, 1/m2: well above that of new
+    /// targets, so that it goes on rather than starts again, and below that of a near detection without the id.
     pub followed_density_per_m2: f64,
     /// Density of detections that belong to no track (new targets and false detections), 1/m2. A detection
     /// starts a track rather than join one where that is less likely.
@@ -66,12 +67,12 @@ impl Default for WorldTrackSettings {
             acceleration_noise_m2_s3: [0.1, 2.5],
             mode_sojourn_s: 5.0,
             birth_speed_sigma_m_s: 1.5,
-            correlated_noise_inflation: 1.8,
+            correlated_noise_inflation: 4.0,
             gate: 16.0,
             own_id_gate: 28.8,
-            own_id_bonus: 3.0,
+            own_id_bonus: 5.0,
             largest_speed_m_s: 8.0,
-            followed_density_per_m2: 0.022,
+            followed_density_per_m2: 0.3,
             birth_density_per_m2: 0.02,
             confirming_detections: 2,
             merging_frames: 4,

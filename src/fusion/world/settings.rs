@@ -14,8 +14,7 @@ pub struct WorldTrackSettings {
     /// Standard deviation per axis of the velocity of a new track, m/s.
     pub birth_speed_sigma_m_s: f64,
     /// Factor on the covariance of a detection: its error is not independent from frame to frame, so a filter that
-    /// takes it for white must take it for larger: `(1 + rho) / (1 - rho)` for a correlation rho of 0.6 between
-    /// frames.
+    /// takes it for white must take it for larger.
     pub correlated_noise_inflation: f64,
     /// Largest squared Mahalanobis distance of a detection to a track.
     pub gate: f64,
@@ -67,7 +66,7 @@ impl Default for WorldTrackSettings {
             acceleration_noise_m2_s3: [0.1, 2.5],
             mode_sojourn_s: 5.0,
             birth_speed_sigma_m_s: 1.5,
-            correlated_noise_inflation: 4.0,
+            correlated_noise_inflation: 1.8,
             gate: 16.0,
             own_id_gate: 28.8,
             own_id_bonus: 5.0,

@@ -24,7 +24,7 @@ use crate::domain::{
 };
 use crate::fusion::pairing::{PairingRule, PairingSettings, pair};
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::{Artifact, FitError, FitInput, FitOptions, GroundCamera, Regressor, fit};
+use crate::model::{Artifact, FitInput, FitOptions, GroundCamera, Regressor, fit};
 
 /// Shifts of the receivers' clocks as shares of the recording, for identities that are certainly wrong.
 const SHIFTS: [f64; 6] = [0.21, 0.33, 0.45, 0.57, 0.69, 0.81];
@@ -359,12 +359,12 @@ impl<'a> JointSearch<'a> {
             gnss_bias_sigma_m: None,
         };
         let input = FitInput { samples: &samples, unpaired: &unpaired };
-        fit(input, &options, &mut |_| ControlFlow::Continue(())).map_err(|error| match error {
-            FitError::Unusable(reason) => not_identifiable(
-                &format!("the sure boxes cannot train a model: {reason}"),
+        fit(input, &options, &mut |_| ControlFlow::Continue(())).map_err(|error| {
+            // Boxes of wrong carriers may have no fit at all, which is no fault of the program.
+            not_identifiable(
+                &format!("the matched boxes cannot train a model: {error}"),
                 "record longer, with receivers carried across the whole view",
-            ),
-            error => Error::fault(error),
+            )
         })
     }
 }

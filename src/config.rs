@@ -1,5 +1,6 @@
 //! Settings and limits: defaults < file < `SIGHTFIX_*` < flags.
 
+use std::io::Read as _;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -48,6 +49,8 @@ pub struct Config {
     pub training: Workers,
     /// Workers of evaluations.
     pub evaluation: Workers,
+    /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
+    pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
     pub console: Console,
     /// What an outside client may make large.
@@ -125,6 +128,41 @@ impl Serialize for Secret {
     }
 }
 
+/// A connection with another system, by the JSON of its description. Its secrets are never shown.
+#[derive(Clone, PartialEq, Deserialize)]
+#[serde(transparent)]
+pub struct DeclaredConnection(serde_json::Map<String, serde_json::Value>);
+
+impl DeclaredConnection {
+    /// The description as JSON, with its secrets.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn json(&self) -> serde_json::Result<Vec<u8>> {
+        serde_json::to_vec(&self.0)
+    }
+
+    fn without_secrets(&self) -> serde_json::Map<String, serde_json::Value> {
+        let mut shown = self.0.clone();
+        if let Some(secrets) = shown.get_mut("secrets") {
+            *secrets = HIDDEN.into();
+        }
+        shown
+    }
+}
+
+impl std::fmt::Debug for DeclaredConnection {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        std::fmt::Debug::fmt(&self.without_secrets(), out)
+    }
+}
+
+impl Serialize for DeclaredConnection {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.without_secrets().serialize(serializer)
+    }
+}
+
 /// Form of the log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -152,6 +190,8 @@ pub struct Console {
     /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
     /// console asks no other server.
     pub tile_url: Option<String>,
+    /// A PMTiles file of map tiles that the server itself offers; instead of `tile_url`.
+    pub tile_file: Option<PathBuf>,
     /// What the provider of the tiles asks to be shown on the map.
     pub tile_attribution: Option<String>,
 }
@@ -259,6 +299,16 @@ pub struct Limits {
     pub cameras: u32,
     /// Sites; more are refused.
     pub sites: u32,
+    /// Connections with other systems; more are refused.
+    pub outside_connections: u32,
+    /// Bytes of one message of a connection; a larger one is skipped.
+    pub connection_message_bytes: usize,
+    /// Messages of one source that are not settled yet; beyond, no more are read.
+    pub connection_queue: usize,
+    /// Messages of one sink that wait for their receiver; beyond, the oldest is dropped.
+    pub outbox_messages: u32,
+    /// Messages of one sink that were refused or could not be delivered; beyond, the oldest is deleted.
+    pub dead_letters: u32,
     /// Boxes and fixes of one site that wait for its tracker; beyond, they are dropped.
     pub site_queue: usize,
     /// Frames of one site that wait for earlier ones of other cameras; beyond, the oldest is tracked.
@@ -299,7 +349,31 @@ pub struct Limits {
     pub drain_s: u64,
 }
 
+/// How a PMTiles file of version 3 begins.
+const PMTILES_MAGIC: &[u8; 8] = b"PMTiles\x03";
+
 impl Console {
+    fn check(&self) -> anyhow::Result<()> {
+        if let Some(url) = &self.tile_url {
+            anyhow::ensure!(
+                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
+                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
+            );
+        }
+        let Some(file) = &self.tile_file else { return Ok(()) };
+        anyhow::ensure!(self.tile_url.is_none(), "give console.tile_url or console.tile_file, not both");
+        let mut magic = [0; PMTILES_MAGIC.len()];
+        std::fs::File::open(file)
+            .and_then(|mut opened| opened.read_exact(&mut magic))
+            .with_context(|| format!("console.tile_file: cannot read {}", file.display()))?;
+        anyhow::ensure!(
+            magic == *PMTILES_MAGIC,
+            "console.tile_file must be a PMTiles file of version 3; {} is none",
+            file.display()
+        );
+        Ok(())
+    }
+
     /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
     /// `None` for tiles of this server.
     #[must_use]
@@ -342,6 +416,7 @@ impl Default for Config {
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
+            connections: Vec::new(),
             console: Console::default(),
             limits: Limits::default(),
         }
@@ -405,6 +480,11 @@ impl Default for Limits {
             truth_line_positions: 1_000,
             cameras: 10_000,
             sites: 1_000,
+            outside_connections: 256,
+            connection_message_bytes: 1 << 20,
+            connection_queue: 1_024,
+            outbox_messages: 100_000,
+            dead_letters: 1_000,
             site_queue: 16_384,
             site_frames: 1_024,
             boxes_per_frame: 256,
@@ -548,12 +628,7 @@ impl Config {
             );
         }
         anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
-        if let Some(url) = &self.console.tile_url {
-            anyhow::ensure!(
-                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
-                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
-            );
-        }
+        self.console.check()?;
         anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(
             limits.reserved_requests < limits.requests,
@@ -577,6 +652,8 @@ impl Config {
             anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
         }
         for (name, limit) in [
+            ("connection_message_bytes", limits.connection_message_bytes),
+            ("connection_queue", limits.connection_queue),
             ("site_queue", limits.site_queue),
             ("site_frames", limits.site_frames),
             ("boxes_per_frame", limits.boxes_per_frame),

@@ -93,7 +93,13 @@ pub(super) async fn accept(
         };
         let server = server.clone();
         shutdown.spawn(async move {
-            let peer = Peer { client, address: address.ip().to_canonical(), certificate: None, refusal };
+            let peer = Peer {
+                client,
+                address: address.ip().to_canonical(),
+                certificate: None,
+                is_tls: false,
+                refusal,
+            };
             server.serve(stream, peer).await;
             drop(lease);
         });
@@ -142,6 +148,7 @@ impl ConnectionServer {
             Some(true) => {
                 let Some((stream, certificate)) = self.in_time(tls.accept(stream)).await else { return };
                 peer.certificate = certificate;
+                peer.is_tls = true;
                 self.serve_http(stream, peer).await;
             }
             Some(false) if is_of_this_machine(&stream, &peer) => self.serve_http(stream, peer).await,

@@ -82,7 +82,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ModelActive => (409, code::FAILED_PRECONDITION, "The model version is the active one"),
         Kind::InsufficientStorage => (507, code::RESOURCE_EXHAUSTED, "There is no space to store it"),
         Kind::NotIdentifiable => {
-            (422, code::FAILED_PRECONDITION, "Whose fixes belong to whose boxes cannot be told")
+            (422, code::FAILED_PRECONDITION, "Boxes and fixes cannot be associated with confidence")
         }
         Kind::UnusableSamples => (422, code::FAILED_PRECONDITION, "The samples cannot support a fit"),
         Kind::Cancelled => (499, code::CANCELLED, "The request was cancelled"),

@@ -83,7 +83,7 @@ pub enum ErrorKind {
     ModelActive,
     /// The disk is full, or as much is stored as the settings allow.
     InsufficientStorage,
-    /// Whose fixes belong to whose boxes cannot be told.
+    /// Boxes and fixes cannot be associated with confidence.
     NotIdentifiable,
     /// The stored samples cannot support a fit.
     UnusableSamples,

@@ -230,9 +230,9 @@ async fn one_address_gets_no_more_than_its_share_of_live_streams() {
         let kind = Some(proto::stream_request::Kind::Opening(opening));
         let first = stream::iter([proto::StreamRequest { kind }]).chain(stream::pending());
         let mut client = FusionServiceClient::new(endpoint.connect().await.expect("a connection"));
-        let mut told = client.stream(first).await.expect("errors come as the end").into_inner();
-        let opened = told.message().await.map(drop).map_err(|status| status.code());
-        held.push(told);
+        let mut reported = client.stream(first).await.expect("errors come as the end").into_inner();
+        let opened = reported.message().await.map(drop).map_err(|status| status.code());
+        held.push(reported);
         opened
     };
     assert_eq!(open([127, 0, 0, 2], "first").await, Ok(()));

@@ -54,7 +54,13 @@ pub(super) fn evaluate(
         cases: cases
             .iter()
             .zip(&outcomes)
-            .filter_map(|(case, outcomes)| SiteCase::over_draws(&case.name, outcomes))
+            .filter_map(|(case, own)| {
+                let figures = SiteCase::over_draws(&case.name, own)?;
+                Some(match (&case.cameras[..], outcomes.first()) {
+                    ([camera], Some(together)) => figures.compared_in_view(*camera, together),
+                    _ => figures,
+                })
+            })
             .collect(),
     };
     print_line(&report.table().trim_end())?;

@@ -128,14 +128,14 @@ fn evaluated(arguments: &[&str], method: &str) -> [f64; 3] {
 #[test]
 #[ignore = "needs ../shared/data; four minutes"]
 fn shared_square_is_covered_by_stretch() {
-    let rows = std::fs::read_to_string(shared("training.csv")).expect("the recording");
+    let rows = std::fs::read_to_string(shared("square/training.csv")).expect("the recording");
     let (header, rows) = rows.split_once('\n').expect("a header");
     let stretch = |row: &&str| match &row[..13] {
         time if time < "2020-12-15" => 0,
         time if time < "2020-12-15T13" => 1,
         _ => 2,
     };
-    let line = shared("truth_line.geojson");
+    let line = shared("square/truth_line.geojson");
     for (held_out, most_m) in [(0, 0.50), (1, 0.98), (2, 1.15)] {
         let folder = data_folder();
         let file = |name: &str, keep: &dyn Fn(usize) -> bool| {

@@ -310,7 +310,7 @@ pub(crate) fn data_folder() -> TempDir {
 /// Path of a file of the real square. Tests that use it are ignored by default; their names contain
 /// `shared`, so that a filter selects exactly them.
 pub(crate) fn shared(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data").join(name);
     assert!(path.exists(), "{} does not exist", path.display());
     path
 }

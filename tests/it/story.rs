@@ -137,7 +137,7 @@ async fn a_simulated_square_is_imported_trained_and_fused() {
 #[tokio::test]
 #[ignore = "needs ../shared/data"]
 async fn shared_square_is_imported_trained_and_fused() {
-    let csv = std::fs::read_to_string(shared("training.csv")).expect("the file can be read");
+    let csv = std::fs::read_to_string(shared("square/training.csv")).expect("the file can be read");
     main_use_case(None, csv, 10_078, 20).await;
 }
 

@@ -110,6 +110,8 @@ fn shared_plaza_is_tracked_over_three_cameras() {
     assert!(figure(degraded, "identity_f1_by_boxes") >= 0.9, "{degraded}");
     let redrawn = evaluate(&plaza, "1920x1080", &["--redraws", "20"]);
     assert!((0.88..=0.99).contains(&figure(&redrawn[0], "coverage95")), "{}", redrawn[0]);
-    let alone = redrawn[5..].iter().map(|case| figure(case, "mean_error_m")).fold(f64::INFINITY, f64::min);
-    assert!(figure(&redrawn[0], "mean_error_m") < alone, "the best camera has {alone} m: {}", redrawn[0]);
+    // Cameras see other targets, near or far, so each is compared on those in its view.
+    for alone in &redrawn[5..] {
+        assert!(figure(alone, "mean_error_by_all_m") < figure(alone, "mean_error_m"), "{alone}");
+    }
 }

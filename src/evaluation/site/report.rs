@@ -27,6 +27,8 @@ pub struct SiteCase {
     pub gospa_m: f64,
     /// Mean error of the positions, m.
     pub mean_error_m: Option<f64>,
+    /// Of a camera alone: mean error, over the targets in its view, of the tracks by all cameras trained together, m.
+    pub mean_error_by_all_m: Option<f64>,
     /// Share of true positions inside the stated 95 % radius.
     pub coverage95: Option<f64>,
     /// Number of draws.
@@ -34,6 +36,15 @@ pub struct SiteCase {
 }
 
 impl SiteCase {
+    /// With the mean error, over the targets in a camera's view, of tracks by all cameras.
+    #[must_use]
+    pub fn compared_in_view(self, camera: usize, by_all: &[SiteOutcome]) -> Self {
+        let errors =
+            by_all.iter().map(|outcome| Some(outcome.positions_in_view.get(camera)?.as_ref()?.mean_error_m));
+        let sum = errors.sum::<Option<f64>>();
+        Self { mean_error_by_all_m: sum.map(|sum| sum / by_all.len().max(1) as f64), ..self }
+    }
+
     /// The means over draws; `None` without any.
     #[must_use]
     pub fn over_draws(name: &str, outcomes: &[SiteOutcome]) -> Option<Self> {
@@ -54,6 +65,7 @@ impl SiteCase {
             mota: mean(&|it| it.world.mota),
             gospa_m: mean(&|it| it.world.gospa_m),
             mean_error_m: optional(&|it| it.positions.map(|positions| positions.mean_error_m)),
+            mean_error_by_all_m: None,
             coverage95: optional(&|it| it.positions.map(|positions| positions.coverage95)),
             draws: count,
         })
@@ -73,14 +85,14 @@ impl SiteReport {
     pub fn table(&self) -> String {
         let mut table = String::from(
             "| case | identity F1 by boxes | association precision | recall | hand-over | IDF1 1 m | MOTA 1 m | GOSPA \
-             m | mean error m | coverage 95 % |\n|---|---|---|---|---|---|---|---|---|---|\n",
+             m | mean error m | same targets, all cameras m | coverage 95 % |\n|---|---|---|---|---|---|---|---|---|---|---|\n",
         );
         let or_dash = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
         for case in &self.cases {
             // Writing to a string cannot fail.
             let _ = writeln!(
                 table,
-                "| {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.2} | {} | {} |",
+                "| {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.2} | {} | {} | {} |",
                 case.name,
                 case.identity_f1_by_boxes,
                 case.association_precision,
@@ -90,6 +102,7 @@ impl SiteReport {
                 case.mota,
                 case.gospa_m,
                 or_dash(case.mean_error_m),
+                or_dash(case.mean_error_by_all_m),
                 or_dash(case.coverage95),
             );
         }

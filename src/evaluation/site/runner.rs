@@ -52,6 +52,8 @@ pub struct SiteOutcome {
     pub world: WorldFigures,
     /// Errors of the positions.
     pub positions: Option<PositionFigures>,
+    /// The same of the targets that one camera of the recording sees, by camera.
+    pub positions_in_view: Vec<Option<PositionFigures>>,
 }
 
 /// Trains the maps with the known identities of the receivers' carriers.
@@ -189,6 +191,8 @@ pub fn track_site(
     }
     let in_view = visible.visible_to(cameras);
     let visits = visible.visits();
+    let views: Vec<_> = (0..visible.cameras.len()).map(|camera| visible.visible_to(&[camera])).collect();
+    let mut instants_in_view: Vec<Vec<WorldInstant>> = vec![Vec::new(); views.len()];
     let mut tracker = WorldTracker::new(recording.plane, WorldTrackSettings::default());
     let (mut records, mut instants) = (Vec::new(), Vec::new());
     for (time, by_camera) in frames {
@@ -207,18 +211,21 @@ pub fn track_site(
                 track,
             }));
         }
-        let targets = in_view.get(&time).into_iter().flatten();
         let position =
             |target: &usize| Some((visits.at(*target, time)?, *recording.truth.get(&(time, *target))?));
-        instants.push(WorldInstant {
-            targets: targets.filter_map(position).collect(),
-            tracks: reported(&tracker, time, &records[first..]),
-        });
+        let tracks = reported(&tracker, time, &records[first..]);
+        for (view, instants) in views.iter().zip(&mut instants_in_view) {
+            let targets = view.get(&time).into_iter().flatten().filter_map(position).collect();
+            instants.push(WorldInstant { targets, tracks: tracks.clone() });
+        }
+        let targets = in_view.get(&time).into_iter().flatten().filter_map(position).collect();
+        instants.push(WorldInstant { targets, tracks });
     }
     SiteOutcome {
         boxes: BoxFigures::of(&records),
         world: WorldFigures::of(&instants),
         positions: PositionFigures::of(&instants),
+        positions_in_view: instants_in_view.iter().map(|own| PositionFigures::of(own)).collect(),
     }
 }
 

@@ -1,6 +1,7 @@
 //! Chains: sets of pieces of tracklets, without overlap in time, that one receiver may own.
 
 use super::evidence::{EvidenceModel, LikelihoodRatio};
+use super::links::links;
 use super::tracklet::{Residual, SceneMotion, TimedFix, Tracklet};
 
 /// A part of a tracklet between two cuts.
@@ -33,11 +34,6 @@ pub struct ChainSettings {
     pub seen_probability: f64,
     /// Log odds per second that a carrier is seen rather than not, beside the rest.
     pub seen_per_s: f64,
-    /// Log prior odds, at most, that a tracklet that begins where and when another one ends is of the same
-    /// target rather than of another one.
-    pub max_continuation: f64,
-    /// Standard deviation per axis of a tracklet's ends, m.
-    pub end_sigma_m: f64,
     /// Probability that a tracklet goes on with another target after a cut.
     pub switch_probability: f64,
 }
@@ -53,8 +49,6 @@ impl Default for ChainSettings {
             tempering: 0.7,
             seen_probability: 0.8,
             seen_per_s: 0.2,
-            max_continuation: 0.7,
-            end_sigma_m: 0.5,
             switch_probability: 0.2,
         }
     }
@@ -77,10 +71,17 @@ pub(super) struct PieceTable {
     log_prior: Vec<f64>,
     /// In order of their first instants.
     order: Vec<usize>,
+    /// By piece, those that may continue it, with the probability that they do.
+    continuations: Vec<Vec<(usize, f64)>>,
 }
 
 impl PieceTable {
-    pub(super) fn new(tracklets: &[Tracklet], pieces: Vec<Piece>, settings: &ChainSettings) -> Self {
+    pub(super) fn new(
+        tracklets: &[Tracklet],
+        pieces: Vec<Piece>,
+        motion: SceneMotion,
+        settings: &ChainSettings,
+    ) -> Self {
         let tracks: Vec<Tracklet> = pieces
             .iter()
             .map(|piece| Tracklet {
@@ -99,7 +100,8 @@ impl PieceTable {
             .collect();
         let mut order: Vec<usize> = (0..tracks.len()).collect();
         order.sort_by(|one, other| tracks[*one].span_s()[0].total_cmp(&tracks[*other].span_s()[0]));
-        Self { pieces, tracks, log_prior, order }
+        let continuations = continuations(&pieces, &tracks, motion, settings);
+        Self { pieces, tracks, log_prior, order, continuations }
     }
 
     /// The best chains of one receiver by beam search; the first is the empty one.
@@ -110,53 +112,51 @@ impl PieceTable {
         model: &EvidenceModel,
         settings: &ChainSettings,
     ) -> Vec<Chain> {
+        let residuals: Vec<Vec<Residual>> =
+            self.tracks.iter().map(|own| own.residuals(fixes, offset_s, settings.max_gap_s)).collect();
+        let ends = self.ends(&residuals);
+        let unseen = (1.0 - settings.seen_probability).ln();
         let mut beam = vec![Partial {
             pieces: Vec::new(),
             ratio: LikelihoodRatio::new(),
-            log_prior: (1.0 - settings.seen_probability).ln(),
+            log_prior: 0.0,
             end_s: f64::NEG_INFINITY,
-            log_weight: (1.0 - settings.seen_probability).ln(),
+            log_weight: unseen,
         }];
-        for &at in &self.order {
-            let residuals = self.tracks[at].residuals(fixes, offset_s, settings.max_gap_s);
-            if residuals.len() < settings.min_fixes {
-                continue;
-            }
-            let longer: Vec<Partial> =
-                beam.iter().filter_map(|own| self.extended(own, at, &residuals, model, settings)).collect();
+        for &at in self.order.iter().filter(|at| !residuals[**at].is_empty()) {
+            let longer: Vec<Partial> = beam
+                .iter()
+                .filter_map(|own| self.extended(own, at, &residuals[at], &ends, model, settings))
+                .collect();
             beam.extend(longer);
             if beam.len() > 2 * settings.max_chains {
                 prune(&mut beam, settings.max_chains);
             }
         }
+        for own in &mut beam {
+            own.log_weight += own.pieces.last().map_or(0.0, |last| ends.last[*last].ln());
+        }
         prune(&mut beam, settings.max_chains);
         beam.into_iter().map(|own| Chain { pieces: own.pieces, log_weight: own.log_weight }).collect()
     }
 
-    /// Log density of the first position of a piece, if its target is that of an earlier piece, against that
-    /// of a target anywhere in the scene.
-    fn continuity(&self, last: usize, next: usize, motion: SceneMotion, settings: &ChainSettings) -> f64 {
-        let (Some(end), Some(start)) = (self.tracks[last].points.last(), self.tracks[next].points.first())
-        else {
-            return 0.0;
-        };
-        let gap_s = start.time_s - end.time_s;
-        let earlier = self.tracks[last].points.iter().rev().find(|own| end.time_s - own.time_s >= VELOCITY_S);
-        let velocity = earlier.map_or([0.0; 2], |earlier| {
-            let elapsed_s = end.time_s - earlier.time_s;
-            [
-                (end.position.east_m - earlier.position.east_m) / elapsed_s,
-                (end.position.north_m - earlier.position.north_m) / elapsed_s,
-            ]
-        });
-        // A target keeps its velocity for a few seconds.
-        let lever_s = VELOCITY_TIME_CONSTANT_S * (1.0 - (-gap_s.max(0.0) / VELOCITY_TIME_CONSTANT_S).exp());
-        let east_m = start.position.east_m - end.position.east_m - lever_s * velocity[0];
-        let north_m = start.position.north_m - end.position.north_m - lever_s * velocity[1];
-        let moved_m2 = (0.5 * motion.speed_m_s * gap_s).powi(2);
-        let scene_m2 = motion.spread_m * motion.spread_m;
-        let variance_m2 = settings.end_sigma_m * settings.end_sigma_m + moved_m2.min(scene_m2);
-        1.0 + (scene_m2 / variance_m2).ln() - 0.5 * (east_m * east_m + north_m * north_m) / variance_m2
+    /// Probabilities that a piece continues none, and that none continues it, among those with fixes.
+    fn ends(&self, residuals: &[Vec<Residual>]) -> Ends {
+        let mut ends = Ends { first: vec![1.0; self.tracks.len()], last: vec![1.0; self.tracks.len()] };
+        for (from, continuations) in self.continuations.iter().enumerate() {
+            for (to, probability) in continuations {
+                if !residuals[*to].is_empty() {
+                    ends.last[from] -= probability;
+                }
+                if !residuals[from].is_empty() {
+                    ends.first[*to] -= probability;
+                }
+            }
+        }
+        for own in ends.first.iter_mut().chain(&mut ends.last) {
+            *own = own.max(LEAST_END_PROBABILITY);
+        }
+        ends
     }
 
     fn extended(
@@ -164,6 +164,7 @@ impl PieceTable {
         own: &Partial,
         at: usize,
         residuals: &[Residual],
+        ends: &Ends,
         model: &EvidenceModel,
         settings: &ChainSettings,
     ) -> Option<Partial> {
@@ -171,23 +172,22 @@ impl PieceTable {
         if own.pieces.len() >= settings.max_pieces || from_s < own.end_s - settings.max_overlap_s {
             return None;
         }
-        let ratio = own.ratio.extended(residuals, model);
-        let continues = own.pieces.last().is_some_and(|last| {
-            let (last, next) = (self.pieces[*last], self.pieces[at]);
-            last.tracklet == next.tracklet && last.end == next.first
+        let last = own.pieces.last();
+        let continuation = last.and_then(|last| {
+            self.continuations[*last].iter().find(|(to, _)| *to == at).map(|(_, probability)| *probability)
         });
-        let step = if continues {
-            (1.0 - settings.switch_probability).ln()
-        } else {
-            let continuity =
-                own.pieces.last().map_or(0.0, |last| self.continuity(*last, at, model.motion, settings));
-            (self.log_prior[at] + continuity).min(settings.max_continuation)
+        let step = match continuation {
+            Some(probability) => probability.ln(),
+            // Fewer fixes tell little about a piece that nothing else links to the receiver.
+            None if residuals.len() < settings.min_fixes => return None,
+            None => self.log_prior[at] + ends.first[at].ln() + last.map_or(0.0, |last| ends.last[*last].ln()),
         };
+        let ratio = own.ratio.extended(residuals, model);
         let covered_s = residuals.last()?.fix.time_s - residuals.first()?.fix.time_s;
         let log_prior = own.log_prior + step + settings.seen_per_s * covered_s;
         let log_weight = settings.tempering * ratio.log_ratio + log_prior;
         // A piece that contradicts the others so much is no part of the chain.
-        (log_weight > own.log_weight - 6.0).then(|| {
+        (log_weight > own.log_weight - MAX_LOSS).then(|| {
             let mut pieces = own.pieces.clone();
             pieces.push(at);
             Partial { pieces, ratio, log_prior, end_s: to_s, log_weight }
@@ -195,10 +195,43 @@ impl PieceTable {
     }
 }
 
-/// Time over which the velocity at the end of a tracklet is measured, s.
-const VELOCITY_S: f64 = 1.5;
-/// Correlation time of a target's velocity, s.
-const VELOCITY_TIME_CONSTANT_S: f64 = 8.0;
+/// By piece, those that may continue it. A cut says where the tracker's id may have moved on, so it decides between
+/// the next piece of the tracklet and all others.
+fn continuations(
+    pieces: &[Piece],
+    tracks: &[Tracklet],
+    motion: SceneMotion,
+    settings: &ChainSettings,
+) -> Vec<Vec<(usize, f64)>> {
+    let is_cut = |from: usize, to: usize| {
+        pieces[from].tracklet == pieces[to].tracklet && pieces[from].end == pieces[to].first
+    };
+    let cuts: Vec<usize> = (1..pieces.len()).filter(|at| is_cut(at - 1, *at)).collect();
+    let mut continuations = vec![Vec::new(); pieces.len()];
+    for link in links(tracks, motion) {
+        if is_cut(link.from, link.to) {
+            continue;
+        }
+        let touches_cut = cuts.iter().any(|cut| *cut == link.to || *cut - 1 == link.from);
+        let share = if touches_cut { settings.switch_probability } else { 1.0 };
+        continuations[link.from].push((link.to, share * link.probability));
+    }
+    for at in cuts {
+        continuations[at - 1].push((at, 1.0 - settings.switch_probability));
+    }
+    continuations
+}
+
+/// Probabilities that a piece is the first, or the last, that is seen of its target.
+struct Ends {
+    first: Vec<f64>,
+    last: Vec<f64>,
+}
+
+/// An end is a target's last with at least this probability: a detector may lose anything.
+const LEAST_END_PROBABILITY: f64 = 0.03;
+/// Largest loss of log weight by one more piece.
+const MAX_LOSS: f64 = 6.0;
 
 /// A chain that may grow.
 #[derive(Clone)]

@@ -19,12 +19,12 @@ use super::placement::{Placement, PlacementSearch};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{
-    BoundingBox, Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, Receivers, Recipe, Result,
-    Sample, TargetClass, TargetId,
+    BoundingBox, Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, ReceiverId, Receivers,
+    Recipe, Result, Sample, TargetClass, TargetId,
 };
 use crate::fusion::pairing::{PairingRule, PairingSettings, pair};
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::{Artifact, FitError, FitInput, FitOptions, GroundCamera, Regressor, fit};
+use crate::model::{Artifact, FitInput, FitOptions, GroundCamera, Regressor, fit};
 
 /// Shifts of the receivers' clocks as shares of the recording, for identities that are certainly wrong.
 const SHIFTS: [f64; 6] = [0.21, 0.33, 0.45, 0.57, 0.69, 0.81];
@@ -45,8 +45,18 @@ const MAX_DEPARTURE: f64 = 5.0;
 const GROUND_OF_KNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06 };
 /// The same of all others, such as ships: the antenna stands somewhere on a large target.
 const GROUND_OF_UNKNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 8.0, scale_sigma: 1.5 };
-/// Rounds of training and matching.
-const ROUNDS: usize = 2;
+/// Rounds of training and matching at most.
+const ROUNDS: usize = 4;
+/// Rounds end when the model moves positions by less than this in the mean, in the standard deviation of the ground.
+const STABLE: f64 = 0.1;
+/// Posterior probability from which on boxes train the model. Where two neighbours are alike, either of them serves: they
+/// are closer to each other than fixes are to their carriers.
+const TRAINING_PROBABILITY: f64 = 0.5;
+/// Receivers from which on each half of them trains a model of its own.
+const MIN_HALVED_RECEIVERS: usize = 4;
+/// Models of both halves are at most so far from each other in the mean, in standard deviations of the ground: twice the
+/// error that is accepted.
+const MAX_HALVES_DISTANCE: f64 = 3.0;
 /// Placements kept per ground camera.
 const MODES: usize = 12;
 
@@ -166,7 +176,9 @@ impl<'a> JointSearch<'a> {
         let mut worlds = Vec::new();
         for camera in cameras {
             let search = self.search(camera, fixes);
-            worlds.extend(search.search(MODES).into_iter().map(|placement| World { camera, placement }));
+            worlds.extend(
+                search.search(MODES, SAME_WORLD_M).into_iter().map(|placement| World { camera, placement }),
+            );
         }
         worlds.sort_by(|one, other| other.placement.score.total_cmp(&one.placement.score));
         worlds
@@ -259,13 +271,28 @@ impl<'a> JointSearch<'a> {
     /// Trains on the sure pieces and matches by the model, in turn.
     fn trained(&self, world: &World, scores: WorldScores, random: &mut impl Rng) -> Result<JointMatch> {
         let mut matching = self.matched(world, random);
+        let mut model = self.fit(&matching, |_| true)?;
+        let mut regressor = model.load()?;
         for _ in 1..ROUNDS {
-            let regressor = self.fit(&matching)?.load()?;
             matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random);
+            let next = self.fit(&matching, |_| true)?;
+            let next_regressor = next.load()?;
+            let moved_m = self.distance_m(&regressor, &next_regressor);
+            (model, regressor) = (next, next_regressor);
+            if moved_m < STABLE * self.ground.map_sigma_m {
+                break;
+            }
         }
-        let model = self.fit(&matching)?;
-        let regressor = model.load()?;
         matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random);
+        let halves_m = self.halves_distance_m(&matching)?;
+        if let Some(halves_m) =
+            halves_m.filter(|halves_m| *halves_m > MAX_HALVES_DISTANCE * self.ground.map_sigma_m)
+        {
+            return Err(not_identifiable(
+                &format!("models of one half of the receivers and of the other are {halves_m:.1} m apart"),
+                "record longer, with more receivers carried across the whole view",
+            ));
+        }
         let departure_m = self.departure_m(world, &regressor);
         if departure_m > MAX_DEPARTURE * self.ground.map_sigma_m {
             return Err(not_identifiable(
@@ -292,9 +319,37 @@ impl<'a> JointSearch<'a> {
         })
     }
 
-    fn fit(&self, matching: &Matching) -> Result<Artifact> {
-        let (samples, unpaired) =
-            training_samples(self.scene.detections, self.scene, matching, self.settings);
+    /// Mean distance between the positions that two models regress, m.
+    fn distance_m(&self, one: &Regressor, other: &Regressor) -> f64 {
+        self.mean_distance_m(|own| {
+            let position = |model: &Regressor| model.plane().to_position(model.regress(own, None).regressed);
+            Some(crate::geo::distance_m(position(one), position(other)))
+        })
+    }
+
+    /// Mean distance between two models, each trained on the carriers of half of the receivers, m: about twice the
+    /// error of the model that is trained on all of them (delete-group jackknife with two groups). `None` with too few
+    /// receivers.
+    fn halves_distance_m(&self, matching: &Matching) -> Result<Option<f64>> {
+        let mut counts: BTreeMap<&ReceiverId, usize> = BTreeMap::new();
+        for piece in matching.sure(TRAINING_PROBABILITY) {
+            *counts.entry(&piece.receiver_id).or_default() += piece.detections.len();
+        }
+        if counts.len() < MIN_HALVED_RECEIVERS {
+            return Ok(None);
+        }
+        let mut by_count: Vec<(&ReceiverId, usize)> = counts.into_iter().collect();
+        by_count.sort_by(|one, other| other.1.cmp(&one.1));
+        // In turn, so that both halves have as many boxes: 0 1 1 0 0 1 1 0.
+        let half_of =
+            |id: &ReceiverId| by_count.iter().position(|own| own.0 == id).map(|at| at.div_ceil(2) % 2);
+        let [one, other] = [0, 1].map(|half| self.fit(matching, |id| half_of(id) == Some(half)));
+        Ok(Some(self.distance_m(&one?.load()?, &other?.load()?)))
+    }
+
+    /// Trains on the carriers of some of the receivers.
+    fn fit(&self, matching: &Matching, is_used: impl Fn(&ReceiverId) -> bool) -> Result<Artifact> {
+        let (samples, unpaired) = training_samples(self.scene, matching, is_used);
         let options = FitOptions {
             recipe: Recipe::GaussianProcess,
             seed: 1,
@@ -304,12 +359,12 @@ impl<'a> JointSearch<'a> {
             gnss_bias_sigma_m: None,
         };
         let input = FitInput { samples: &samples, unpaired: &unpaired };
-        fit(input, &options, &mut |_| ControlFlow::Continue(())).map_err(|error| match error {
-            FitError::Unusable(reason) => not_identifiable(
-                &format!("the sure boxes cannot train a model: {reason}"),
+        fit(input, &options, &mut |_| ControlFlow::Continue(())).map_err(|error| {
+            // Boxes of wrong carriers may have no fit at all, which is no fault of the program.
+            not_identifiable(
+                &format!("the matched boxes cannot train a model: {error}"),
                 "record longer, with receivers carried across the whole view",
-            ),
-            error => Error::fault(error),
+            )
         })
     }
 }
@@ -373,14 +428,14 @@ fn motion_of_receivers(fixes: &[Vec<TimedFix>]) -> SceneMotion {
 
 /// Samples of the sure boxes, under their receivers' ids, and all other boxes.
 fn training_samples(
-    detections: &[Detection],
     scene: &Scene<'_>,
     matching: &Matching,
-    settings: &MatchSettings,
+    is_used: impl Fn(&ReceiverId) -> bool,
 ) -> (Vec<Sample>, Vec<Detection>) {
+    let detections = scene.detections;
     let mut is_sure = vec![false; detections.len()];
     let mut sure = Vec::new();
-    for piece in matching.sure(settings.min_probability) {
+    for piece in matching.sure(TRAINING_PROBABILITY).filter(|piece| is_used(&piece.receiver_id)) {
         for at in &piece.detections {
             is_sure[*at] = true;
             let target_id = TargetId::from(piece.receiver_id.clone());

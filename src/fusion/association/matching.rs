@@ -6,6 +6,7 @@ use rand::Rng;
 
 use super::assignment::posterior;
 use super::chains::{Chain, ChainSettings, Piece, PieceTable};
+use super::companions::View;
 use super::cuts;
 use super::evidence::EvidenceModel;
 use super::recording::Scene;
@@ -199,7 +200,7 @@ pub(super) fn match_located(
     let timed: Vec<(&[TimedFix], f64)> =
         located.fixes.iter().map(Vec::as_slice).zip(offsets_s.iter().copied()).collect();
     let pieces = cuts::pieces(located.tracklets, &timed, &model, &settings.chains);
-    let table = PieceTable::new(located.tracklets, pieces, &settings.chains);
+    let table = PieceTable::new(located.tracklets, pieces, model.motion, &settings.chains);
     let chains: Vec<Vec<Chain>> = timed
         .iter()
         .map(|(fixes, offset_s)| table.chains(fixes, *offset_s, &model, &settings.chains))
@@ -215,13 +216,16 @@ pub(super) fn match_located(
         cuts: table.pieces.len() - located.tracklets.len(),
         ..Matching::default()
     };
+    let view = View::of(scene.detections);
     for (at, piece) in table.pieces.iter().enumerate() {
         let Some((receiver, probability)) = most_probable(at) else { continue };
+        let Piece { tracklet, first, end } = *piece;
+        let detections = &located.detections[tracklet][first..end];
+        let probability = probability * view.own_probability(scene.detections, detections);
         if probability >= LEAST_PROBABILITY {
-            let Piece { tracklet, first, end } = *piece;
             matching.pieces.push(MatchedPiece {
                 tracker_id: scene.tracklets[tracklet].tracker_id.clone(),
-                detections: located.detections[tracklet][first..end].to_vec(),
+                detections: detections.to_vec(),
                 receiver_id: scene.receiver_ids[receiver].clone(),
                 probability,
             });
@@ -243,7 +247,7 @@ fn clock_offsets_s(located: &Located<'_>, model: &EvidenceModel, settings: &Matc
     }
     let whole = |(tracklet, own): (usize, &Tracklet)| Piece { tracklet, first: 0, end: own.points.len() };
     let pieces = located.tracklets.iter().enumerate().map(whole).collect();
-    let table = PieceTable::new(located.tracklets, pieces, &settings.chains);
+    let table = PieceTable::new(located.tracklets, pieces, model.motion, &settings.chains);
     let evidence = |fixes: &[TimedFix], offset_s: f64| {
         let chains = table.chains(fixes, offset_s, model, &settings.chains);
         let most = chains.iter().map(|own| own.log_weight).fold(f64::NEG_INFINITY, f64::max);

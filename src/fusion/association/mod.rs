@@ -2,14 +2,16 @@
 //!
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/association.md` has the formulas and figures. The files in the order of their imports:
-//! `tracklet`, `evidence`, `chains`, `assignment`, `cuts`, `placement`, `recording`, `matching`, `joint`.
+//! `tracklet`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`.
 //! What never happens here: I/O, clocks, randomness that is not handed in.
 
 mod assignment;
 mod chains;
+mod companions;
 mod cuts;
 mod evidence;
 mod joint;
+mod links;
 mod matching;
 mod placement;
 mod recording;

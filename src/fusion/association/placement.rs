@@ -184,17 +184,22 @@ impl PlacementSearch {
         self.scores(turn, shift).iter().sum::<f64>() + self.log_prior - 0.5 * scale * scale
     }
 
-    /// The best placements that differ from each other, the best first.
-    pub(super) fn search(&self, most: usize) -> Vec<Placement> {
+    /// The best placements that differ from each other, the best first. The best starts lie mostly about the best
+    /// placement, so others are also searched for farther away than `apart_m` from it.
+    pub(super) fn search(&self, most: usize, apart_m: f64) -> Vec<Placement> {
         let mut starts = self.suggested();
         starts.extend(self.grid());
         starts.sort_by(|one, other| other.score.total_cmp(&one.score));
-        let mut modes: Vec<Placement> = Vec::new();
-        for start in distinct(starts, &self.points, REFINED, 1.0) {
-            modes.push(self.refined(start));
+        let near = distinct(&starts, &self.points, REFINED, 1.0);
+        let mut modes: Vec<Placement> = near.into_iter().map(|start| self.refined(start)).collect();
+        modes.sort_by(|one, other| other.score.total_cmp(&one.score));
+        if let Some(best) = modes.first().copied() {
+            starts.retain(|start| start.distance_m(&best, &self.points) > apart_m);
+            let far = distinct(&starts, &self.points, REFINED, 0.5 * apart_m);
+            modes.extend(far.into_iter().map(|start| self.refined(start)));
         }
         modes.sort_by(|one, other| other.score.total_cmp(&one.score));
-        distinct(modes, &self.points, most, 1.0)
+        distinct(&modes, &self.points, most, 1.0)
     }
 
     /// The placement that each pair alone suggests.
@@ -292,14 +297,14 @@ impl PlacementSearch {
 }
 
 /// Those that differ from all better ones by at least a distance, m; at most so many.
-fn distinct(sorted: Vec<Placement>, points: &[C], most: usize, apart_m: f64) -> Vec<Placement> {
+fn distinct(sorted: &[Placement], points: &[C], most: usize, apart_m: f64) -> Vec<Placement> {
     let mut kept: Vec<Placement> = Vec::new();
     for own in sorted {
         if kept.len() == most {
             break;
         }
-        if kept.iter().all(|better| better.distance_m(&own, points) > apart_m) {
-            kept.push(own);
+        if kept.iter().all(|better| better.distance_m(own, points) > apart_m) {
+            kept.push(*own);
         }
     }
     kept

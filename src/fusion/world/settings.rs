@@ -25,8 +25,8 @@ pub struct WorldTrackSettings {
     /// Speed up to which a target may move between two frames if the camera's tracker follows it without a gap,
     /// whatever the motion model says, m/s.
     pub largest_speed_m_s: f64,
-    /// Density of the detections of such a target anywhere within that distance, 1/m2: a little above that of new
-    /// targets, so that it goes on rather than starts again, and never takes another track's detection.
+    /// Density of the detections of such a target anywhere within that distance, 1/m2: well above that of new
+    /// targets, so that it goes on rather than starts again, and below that of a near detection without the id.
     pub followed_density_per_m2: f64,
     /// Density of detections that belong to no track (new targets and false detections), 1/m2. A detection
     /// starts a track rather than join one where that is less likely.
@@ -69,9 +69,9 @@ impl Default for WorldTrackSettings {
             correlated_noise_inflation: 1.8,
             gate: 16.0,
             own_id_gate: 28.8,
-            own_id_bonus: 3.0,
+            own_id_bonus: 5.0,
             largest_speed_m_s: 8.0,
-            followed_density_per_m2: 0.022,
+            followed_density_per_m2: 0.3,
             birth_density_per_m2: 0.02,
             confirming_detections: 2,
             merging_frames: 4,

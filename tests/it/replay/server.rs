@@ -134,7 +134,7 @@ async fn simulated_rows_with_faults_are_stored_once_although_the_server_is_kille
 #[tokio::test]
 #[ignore = "needs ../shared/data"]
 async fn shared_rows_with_faults_are_stored_once_although_the_server_is_killed() {
-    let path = shared("training.csv");
+    let path = shared("square/training.csv");
     let sent = samples(&std::fs::read(&path).expect("the file can be read"));
     faults_and_a_kill(&path, &sent, "4000").await;
 }
@@ -142,8 +142,8 @@ async fn shared_rows_with_faults_are_stored_once_although_the_server_is_killed()
 #[tokio::test]
 #[ignore = "needs ../shared/data"]
 async fn shared_boxes_and_fixes_are_paired_live_although_the_server_is_killed() {
-    let (boxes, fixes) = (shared("detections.csv"), shared("gnss.csv"));
-    let sent = samples(&std::fs::read(shared("training.csv")).expect("the file can be read"));
+    let (boxes, fixes) = (shared("square/detections.csv"), shared("square/gnss.csv"));
+    let sent = samples(&std::fs::read(shared("square/training.csv")).expect("the file can be read"));
     let folder = data_folder();
     let address = own_address();
     let server = TestServer::start_at(folder.path(), address);

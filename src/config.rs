@@ -1,5 +1,6 @@
 //! Settings and limits: defaults < file < `SIGHTFIX_*` < flags.
 
+mod console;
 mod load;
 mod openid;
 mod origin;
@@ -12,12 +13,12 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use self::origin::tile_origin;
 use crate::domain::SampleOverflow;
 
+pub use console::Console;
 pub use load::Overrides;
 pub use openid::OpenIdSettings;
-pub use secret::Secret;
+pub use secret::{DeclaredConnection, Secret};
 pub use tls::TlsSettings;
 
 /// Everything that can be set.
@@ -61,6 +62,8 @@ pub struct Config {
     pub training: Workers,
     /// Workers of evaluations.
     pub evaluation: Workers,
+    /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
+    pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
     pub console: Console,
     /// What an outside client may make large.
@@ -85,17 +88,6 @@ pub struct Workers {
     pub workers: usize,
     /// Seconds after which another worker claims the job of a silent one.
     pub lease_s: u32,
-}
-
-/// What the operator's console shows beside the server's own values.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Console {
-    /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
-    /// console asks no other server.
-    pub tile_url: Option<String>,
-    /// What the provider of the tiles asks to be shown on the map.
-    pub tile_attribution: Option<String>,
 }
 
 /// Everything that an outside client can make large has its limit here.
@@ -208,6 +200,16 @@ pub struct Limits {
     pub cameras: u32,
     /// Sites; more are refused.
     pub sites: u32,
+    /// Connections with other systems; more are refused.
+    pub outside_connections: u32,
+    /// Bytes of one message of a connection; a larger one is skipped.
+    pub connection_message_bytes: usize,
+    /// Messages of one source that are not settled yet; beyond, no more are read.
+    pub connection_queue: usize,
+    /// Messages of one sink that wait for their receiver; beyond, the oldest is dropped.
+    pub outbox_messages: u32,
+    /// Messages of one sink that were refused or could not be delivered; beyond, the oldest is deleted.
+    pub dead_letters: u32,
     /// Boxes and fixes of one site that wait for its tracker; beyond, they are dropped.
     pub site_queue: usize,
     /// Frames of one site that wait for earlier ones of other cameras; beyond, the oldest is tracked.
@@ -248,15 +250,6 @@ pub struct Limits {
     pub drain_s: u64,
 }
 
-impl Console {
-    /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
-    /// `None` for tiles of this server.
-    #[must_use]
-    pub fn tile_origin(&self) -> Option<&str> {
-        self.tile_url.as_deref().and_then(tile_origin).filter(|origin| !origin.is_empty())
-    }
-}
-
 impl Default for Config {
     fn default() -> Self {
         Self {
@@ -277,6 +270,7 @@ impl Default for Config {
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
+            connections: Vec::new(),
             console: Console::default(),
             limits: Limits::default(),
         }
@@ -343,6 +337,11 @@ impl Default for Limits {
             truth_line_positions: 1_000,
             cameras: 10_000,
             sites: 1_000,
+            outside_connections: 256,
+            connection_message_bytes: 1 << 20,
+            connection_queue: 1_024,
+            outbox_messages: 100_000,
+            dead_letters: 1_000,
             site_queue: 16_384,
             site_frames: 1_024,
             boxes_per_frame: 256,

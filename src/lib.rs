@@ -6,9 +6,11 @@
 
 pub mod admission;
 pub mod app;
+pub mod backoff;
 pub mod cli;
 pub mod clock;
 pub mod config;
+pub mod connect;
 pub mod doctor;
 pub mod domain;
 pub mod evaluation;

@@ -31,7 +31,10 @@ use tokio::net::TcpListener;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
+use crate::connect;
 use crate::domain::{Error, KeySecret};
+use crate::exchange::ConnectionDraft;
+use crate::exchange::wire::parse_document;
 use crate::openid;
 use crate::shutdown::Shutdown;
 use crate::store::{Sharing, Store, StoreOptions};
@@ -108,6 +111,7 @@ impl Server {
             app.access.use_openid(provider);
         }
         prepare_access(&app, &config).await?;
+        declare_connections(&app, &config).await?;
         let listener = connection::listen(config.listen)
             .with_context(|| format!("cannot listen on {}", config.listen))?;
         let monitoring = config.metrics_listen.map(|address| {
@@ -166,6 +170,7 @@ impl Server {
         let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
+        shutdown.spawn(connect::run(app.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
         let cors = cors::layer(&config.cors_origins);
@@ -192,6 +197,18 @@ impl Server {
         tracing::info!("shut down");
         Ok(())
     }
+}
+
+/// Stores the connections of the settings. Those that are not declared any more stay.
+async fn declare_connections(app: &App, config: &Config) -> anyhow::Result<()> {
+    for (index, declared) in config.connections.iter().enumerate() {
+        let declare = async {
+            let draft: ConnectionDraft = parse_document(&declared.json().map_err(Error::fault)?)?;
+            app.declare_connection(draft.try_into()?).await
+        };
+        declare.await.with_context(|| format!("the setting connections[{index}]"))?;
+    }
+    Ok(())
 }
 
 /// Stores the administrator's key of the settings, and refuses to serve everybody by an oversight.

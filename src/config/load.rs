@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 
 use super::Config;
-use super::origin::{tile_origin, url_origin};
+use super::origin::url_origin;
 use super::secret::Secret;
 
 /// Values from the command line, which win over all others.
@@ -108,12 +108,7 @@ impl Config {
             );
         }
         anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
-        if let Some(url) = &self.console.tile_url {
-            anyhow::ensure!(
-                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
-                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
-            );
-        }
+        self.console.check()?;
         anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
         anyhow::ensure!(
             limits.reserved_requests < limits.requests,
@@ -137,6 +132,8 @@ impl Config {
             anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
         }
         for (name, limit) in [
+            ("connection_message_bytes", limits.connection_message_bytes),
+            ("connection_queue", limits.connection_queue),
             ("site_queue", limits.site_queue),
             ("site_frames", limits.site_frames),
             ("boxes_per_frame", limits.boxes_per_frame),

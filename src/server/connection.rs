@@ -93,7 +93,13 @@ impl Acceptor {
             };
             let server = server.clone();
             shutdown.spawn(async move {
-                let peer = Peer { client, address: address.ip().to_canonical(), certificate: None, refusal };
+                let peer = Peer {
+                    client,
+                    address: address.ip().to_canonical(),
+                    certificate: None,
+                    is_tls: false,
+                    refusal,
+                };
                 server.serve(stream, peer).await;
                 drop(lease);
             });
@@ -160,6 +166,7 @@ impl ConnectionServer {
             Some(true) => {
                 let Some((stream, certificate)) = self.in_time(tls.accept(stream)).await else { return };
                 peer.certificate = certificate;
+                peer.is_tls = true;
                 // On the heap: plain connections need no room for what TLS holds.
                 Box::pin(self.serve_http(stream, peer)).await;
             }

@@ -11,6 +11,7 @@ use http_body_util::BodyExt as _;
 use hyper::body::{Body as _, Incoming};
 use hyper::header::{CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
 use hyper::http::HeaderValue;
+use hyper::http::uri::Scheme;
 use hyper::{Method, Request, Response, Version};
 use tokio::sync::Semaphore;
 use tower::{Layer as _, Service as _, ServiceExt as _, service_fn};
@@ -272,6 +273,7 @@ impl RequestPipeline {
                 extensions.insert(id.clone());
                 extensions.insert(*client);
                 extensions.insert(caller.clone());
+                extensions.insert(if peer.is_tls { Scheme::HTTPS } else { Scheme::HTTP });
                 if let Counted::Http(matched) = counted {
                     extensions.insert(matched.clone());
                 }

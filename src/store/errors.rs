@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use sqlx::error::DatabaseError;
 
 use super::folder_fault::{FolderFault, FolderFaultKind};
-use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, KeyId, RunId, SiteId};
+use crate::domain::{CameraId, ConnectionId, Error, ErrorKind, EvaluationId, KeyId, RunId, SiteId};
 
 /// A row that does not hold what was written: another program or the disk has changed it.
 #[derive(Debug, thiserror::Error)]
@@ -92,6 +92,10 @@ pub(super) fn no_camera(id: &CameraId) -> Error {
 
 pub(super) fn no_site(id: &SiteId) -> Error {
     Error::refused(ErrorKind::SiteNotFound, format!("no site has the id {id}"))
+}
+
+pub(super) fn no_connection(id: &ConnectionId) -> Error {
+    Error::refused(ErrorKind::ConnectionNotFound, format!("no connection has the id {id}"))
 }
 
 /// The refusal of a camera's profile that names a site.

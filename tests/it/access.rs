@@ -118,6 +118,7 @@ fn path_of(route: &str) -> (&str, String) {
     let path = template
         .replace("{camera}", "c")
         .replace("{site}", "s")
+        .replace("{connection}", "n")
         .replace("{track}", "00000000-1")
         .replace("{model}", "99")
         .replace("{target}", "nobody")

@@ -22,13 +22,13 @@ use tokio_rustls::client::TlsStream;
 use crate::harness::{TestServer, data_folder, run, sightfix};
 
 /// An authority for certificates of servers and clients.
-struct Authority {
-    certificate: Certificate,
+pub(crate) struct Authority {
+    pub(crate) certificate: Certificate,
     issuer: Issuer<'static, KeyPair>,
 }
 
 impl Authority {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let mut params = CertificateParams::new(Vec::new()).expect("no names");
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
         let key = KeyPair::generate().expect("a key");
@@ -37,7 +37,7 @@ impl Authority {
     }
 
     /// A certificate for `localhost`, and its key.
-    fn issue(&self) -> (Certificate, KeyPair) {
+    pub(crate) fn issue(&self) -> (Certificate, KeyPair) {
         let key = KeyPair::generate().expect("a key");
         let params = CertificateParams::new(vec!["localhost".to_owned()]).expect("a name");
         (params.signed_by(&key, &self.issuer).expect("a certificate"), key)

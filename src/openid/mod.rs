@@ -230,6 +230,23 @@ impl Provider {
 
     /// Exchanges the code for an ID token (RFC 6749, 4.1.3).
     async fn redeem(&self, discovery: &Discovery, code: &str, secret: &SignInSecret) -> Result<String> {
+        let (authorization, form) = self.token_request(discovery, code, secret);
+        let answer = self.fetch.post(&discovery.token_endpoint, authorization, form).await;
+        let answer = self.provided(answer)?;
+        if answer.error_name().as_deref() == Some("invalid_grant") {
+            return Err(not_signed_in("the provider does not take the code: sign in again"));
+        }
+        let tokens: TokenAnswer = self.provided(answer.content())?;
+        Ok(tokens.id_token)
+    }
+
+    /// Header and form of the request for a token, with the client's secret in either.
+    fn token_request(
+        &self,
+        discovery: &Discovery,
+        code: &str,
+        secret: &SignInSecret,
+    ) -> (Option<String>, String) {
         let mut form = Serializer::new(String::new());
         form.append_pair("grant_type", "authorization_code")
             .append_pair("code", code)
@@ -251,14 +268,7 @@ impl Provider {
                 None
             }
         };
-        let form = form.finish();
-        let answer = self.fetch.post(&discovery.token_endpoint, authorization, form).await;
-        let answer = self.provided(answer)?;
-        if answer.error_name().as_deref() == Some("invalid_grant") {
-            return Err(not_signed_in("the provider does not take the code: sign in again"));
-        }
-        let tokens: TokenAnswer = self.provided(answer.content())?;
-        Ok(tokens.id_token)
+        (authorization, form.finish())
     }
 
     /// What the provider has answered. Why it has not is for the log alone.

@@ -101,6 +101,8 @@ pub enum ErrorKind {
     Unauthenticated,
     /// The key may not do this.
     PermissionDenied,
+    /// The OpenID provider gave no usable answer.
+    SignInUnavailable,
     /// The request names a host that this server does not answer for.
     HostNotAllowed,
     /// A web page of another origin asks for a change.

@@ -79,7 +79,8 @@ fn frame(kind: u8, payload: &[u8]) -> Vec<u8> {
 #[test]
 fn floods_of_control_frames_end_the_connection() {
     let folder = data_folder();
-    let settings = [("SIGHTFIX_LIMITS__CONTROL_FRAMES_PER_S", "100")];
+    let settings =
+        [("SIGHTFIX_LIMITS__CONTROL_FRAMES_PER_S", "100"), ("SIGHTFIX_LIMITS__FLOOD_PENALTY_S", "0")];
     let server = TestServer::start_with(folder.path(), &settings);
     for flood in [
         frame(2, &[0, 0, 0, 3, 1]), // PRIORITY

@@ -151,6 +151,7 @@ async fn damaged_pages_are_told_and_fusions_go_on() {
     damage_samples(folder.path());
     let server = TestServer::start(folder.path());
     fuse(&server).await.expect(200);
+    assert_eq!(server.get("/readyz").await.expect(200).text(), "ready\n");
     let mut page = "/v1/cameras/c/samples?limit=1000".to_owned();
     let failed = loop {
         let answer = server.get(&page).await;
@@ -164,6 +165,8 @@ async fn damaged_pages_are_told_and_fusions_go_on() {
     assert!(!failed.text().contains("damaged"), "a fault is for the log: {}", failed.text());
     let is_told = |entry: &Value| entry["error"].as_str().is_some_and(|it| it.contains("sightfix restore"));
     let logged = server.logged(is_told).await;
+    let ready = server.get("/readyz").await.expect(200).text();
+    assert!(ready.starts_with("ready\ndegraded: database:"), "{ready}");
     println!("log: {}", logged["error"]);
     fuse(&server).await.expect(200);
     assert!(server.log_lines("panicked").is_empty());

@@ -175,6 +175,16 @@ impl Store {
         }
     }
 
+    /// Whether a damaged page was met since the process was started, so that a backup should be restored. Of a
+    /// PostgreSQL database its own log tells.
+    #[must_use]
+    pub fn is_damaged(&self) -> bool {
+        match &self.0 {
+            Backend::Sqlite(store) => store.is_damaged(),
+            Backend::Postgres(_) => false,
+        }
+    }
+
     /// Whether imports are refused for want of space, as far as is known without looking.
     #[must_use]
     pub fn is_full(&self) -> bool {

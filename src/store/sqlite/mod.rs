@@ -173,6 +173,10 @@ impl Store {
         Ok(())
     }
 
+    pub(super) fn is_damaged(&self) -> bool {
+        errors::has_met_damage()
+    }
+
     /// Keeps groups of samples from being stored until it is dropped.
     #[cfg(test)]
     pub(super) async fn hold(&self) -> Box<dyn Send + '_> {

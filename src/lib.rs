@@ -21,6 +21,7 @@ pub mod geo;
 pub mod grpc;
 pub mod http;
 pub mod model;
+pub mod openid;
 pub mod paper_experiments;
 pub mod replay;
 pub mod server;

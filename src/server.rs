@@ -8,6 +8,7 @@
 
 mod activity;
 mod connection;
+mod connection_gate;
 mod cors;
 mod credentials;
 mod frame_limit;
@@ -34,11 +35,13 @@ use crate::connect;
 use crate::domain::{Error, KeySecret};
 use crate::exchange::ConnectionDraft;
 use crate::exchange::wire::parse_document;
+use crate::openid;
 use crate::shutdown::Shutdown;
 use crate::store::{Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
 use crate::worker;
 
+use connection_gate::ConnectionGate;
 use host_check::HostCheck;
 use pipeline::RequestPipeline;
 use proxies::TrustedProxies;
@@ -104,6 +107,9 @@ impl Server {
         if tls.as_ref().is_some_and(|tls| tls.takes_client_certificates()) {
             app.access.close();
         }
+        if let Some(provider) = openid::Provider::new(&config.openid)? {
+            app.access.use_openid(provider);
+        }
         prepare_access(&app, &config).await?;
         declare_connections(&app, &config).await?;
         let listener = connection::listen(config.listen)
@@ -168,16 +174,19 @@ impl Server {
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
         let cors = cors::layer(&config.cors_origins);
+        let gate = ConnectionGate::new(&config.limits, proxies.clone());
         let pipeline = RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, &shutdown);
         let pipeline = Arc::new(pipeline);
         let monitored = async {
             let Some(listener) = monitoring else { return anyhow::Ok(()) };
             let hosts = HostCheck::new(&config.allowed_hosts, &[], listener.local_addr()?);
             let pipeline = Arc::new(RequestPipeline::monitoring(app.clone(), hosts, &shutdown));
-            connection::accept(listener, pipeline, None, &config.limits, &shutdown).await;
+            let monitoring = connection::Acceptor { pipeline, tls: None, gate: None };
+            monitoring.accept(listener, &config.limits, &shutdown).await;
             Ok(())
         };
-        let served = connection::accept(listener, pipeline, tls, &config.limits, &shutdown);
+        let clients = connection::Acceptor { pipeline, tls, gate: Some(gate) };
+        let served = clients.accept(listener, &config.limits, &shutdown);
         let (monitored, ()) = tokio::join!(monitored, served);
         monitored?;
         tracing::info!("shutting down");

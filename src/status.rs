@@ -82,7 +82,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ModelActive => (409, code::FAILED_PRECONDITION, "The model version is the active one"),
         Kind::InsufficientStorage => (507, code::RESOURCE_EXHAUSTED, "There is no space to store it"),
         Kind::NotIdentifiable => {
-            (422, code::FAILED_PRECONDITION, "Whose fixes belong to whose boxes cannot be told")
+            (422, code::FAILED_PRECONDITION, "Boxes and fixes cannot be associated with confidence")
         }
         Kind::UnusableSamples => (422, code::FAILED_PRECONDITION, "The samples cannot support a fit"),
         Kind::Cancelled => (499, code::CANCELLED, "The request was cancelled"),
@@ -92,6 +92,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
         Kind::Unauthenticated => (401, code::UNAUTHENTICATED, "The request needs a key that works"),
         Kind::PermissionDenied => (403, code::PERMISSION_DENIED, "The key may not do this"),
+        Kind::SignInUnavailable => (502, code::UNAVAILABLE, "The OpenID provider gave no usable answer"),
         Kind::HostNotAllowed => (421, code::PERMISSION_DENIED, "The server does not answer for this host"),
         Kind::OriginNotAllowed => {
             (403, code::PERMISSION_DENIED, "A page of another origin asked for a change")

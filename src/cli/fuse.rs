@@ -62,6 +62,7 @@ impl Fuse {
             image_size: fusion_model.image_size,
         };
         let rows = exchange::read_observations(files::open_input(&self.file)?, from, &rules)?;
+        let cannot_write = || format!("cannot write {}", self.out.display());
         let mut out = Output::create(&self.out)?;
         let mut writer = exchange::FusedWriter::new(&mut out, to);
         let (mut answered, mut rejected) = (0_u64, 0_u64);
@@ -78,11 +79,11 @@ impl Fuse {
             let fused =
                 two_step::fuse(&row.observation, model, fusion_model.image_size, fusion_model.e_gnss_m2)
                     .context("the observation cannot be fused")?;
-            writer.write(&fused)?;
+            writer.write(&fused).with_context(cannot_write)?;
             answered += 1;
         }
-        writer.finish()?;
-        out.finish().with_context(|| format!("cannot write {}", self.out.display()))?;
+        writer.finish().with_context(cannot_write)?;
+        out.finish().with_context(cannot_write)?;
         let summary = self.summary.summary(Some(&self.out));
         summary.document(&serde_json::json!({ "answered": answered, "rejected": rejected }))?;
         summary.line(&format_args!("answered {answered}, rejected {rejected}"))

@@ -49,7 +49,7 @@ pub use output::reader_is_gone;
 
 /// How settings are named in the environment.
 const ENVIRONMENT: &str = "Every setting can also be given in the environment: SIGHTFIX_ and its name in capitals, with \
-__ between a section and a name: SIGHTFIX_LISTEN, SIGHTFIX_DATA, SIGHTFIX_LOG__FORMAT, SIGHTFIX_LIMITS__BODY_BYTES. \
+__ between a section and a name: SIGHTFIX_LISTEN, SIGHTFIX_DATA, SIGHTFIX_LOG_FORMAT, SIGHTFIX_LIMITS__BODY_BYTES. \
 `sightfix config` prints all of them. Flags take precedence over the environment, and the environment over the file.";
 
 /// Positions of targets from the bounding boxes of an uncalibrated fixed camera and from GNSS fixes

@@ -83,7 +83,7 @@ pub enum ErrorKind {
     ModelActive,
     /// The disk is full, or as much is stored as the settings allow.
     InsufficientStorage,
-    /// Whose fixes belong to whose boxes cannot be told.
+    /// Boxes and fixes cannot be associated with confidence.
     NotIdentifiable,
     /// The stored samples cannot support a fit.
     UnusableSamples,
@@ -101,6 +101,8 @@ pub enum ErrorKind {
     Unauthenticated,
     /// The key may not do this.
     PermissionDenied,
+    /// The OpenID provider gave no usable answer.
+    SignInUnavailable,
     /// The request names a host that this server does not answer for.
     HostNotAllowed,
     /// A web page of another origin asks for a change.

@@ -283,7 +283,7 @@ struct DeadLetterCount {
 
 /// Connect another system
 ///
-/// It starts at once unless it is paused; whether its peer can be reached is told by its status. The server itself
+/// It starts at once unless it is paused; its status says whether its peer can be reached. The server itself
 /// opens a connection to the address, so only operators may do this.
 #[utoipa::path(
     post, path = "/v1/connections", tag = "connections", request_body = ConnectionDraft,

@@ -34,12 +34,11 @@ const TAGS: [(&str, &str); 13] = [
 ];
 
 /// Refusals that any operation may meet.
-const ANY: [ErrorKind; 6] = [
+const ANY: [ErrorKind; 5] = [
     ErrorKind::Timeout,
     ErrorKind::Internal,
     ErrorKind::Overloaded,
     ErrorKind::RateLimited,
-    ErrorKind::InvalidArgument,
     ErrorKind::HostNotAllowed,
 ];
 /// Refusals of operations that change something.
@@ -73,6 +72,8 @@ pub(super) fn head() -> OpenApi {
 pub(super) fn add_problems(openapi: &mut OpenApi) {
     for (path, item) in &mut openapi.paths.paths {
         let is_service = !["/v1/", "/v2", "/ogc"].iter().any(|prefix| path.starts_with(prefix));
+        // OGC API Features requires 400 for parameters at fault.
+        let is_features = path.starts_with("/ogc");
         let is_below_camera = path.contains("{camera}");
         let [get, changes @ ..] = operations(item);
         let changes = changes.into_iter().flatten().map(|operation| (operation, true));
@@ -80,6 +81,7 @@ pub(super) fn add_problems(openapi: &mut OpenApi) {
             let mut kinds: Vec<ErrorKind> = Vec::new();
             if !is_service {
                 kinds.extend(ANY);
+                kinds.push(if is_features { ErrorKind::InvalidQuery } else { ErrorKind::InvalidArgument });
             }
             if is_change {
                 kinds.extend(OF_CHANGES);

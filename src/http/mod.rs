@@ -29,6 +29,7 @@ mod keys;
 mod merge_patch;
 mod models;
 mod moving_features;
+mod openid;
 mod pairings;
 mod parts;
 mod problem;
@@ -99,7 +100,14 @@ impl Transport {
             .url("/openapi.json", described)
             .config(Config::default().validator_url("none").use_base_layout());
         let page = Router::from(page).layer(map_response(contain_page));
-        Self(routes.route_layer(authorize).merge(page).merge(console_routes).with_state(rest))
+        Self(
+            routes
+                .route_layer(authorize)
+                .merge(page)
+                .merge(console_routes)
+                .merge(openid::callback())
+                .with_state(rest),
+        )
     }
 
     /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
@@ -220,6 +228,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(keys::routes())
         .merge(audit::routes())
         .merge(session::routes())
+        .merge(openid::routes())
         .merge(server_info::routes())
         .merge(tiles::routes())
         .merge(service::routes());

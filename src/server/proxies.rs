@@ -16,7 +16,7 @@ const X_FORWARDED_PROTO: &str = "x-forwarded-proto";
 const X_FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
 
 /// The proxies whose statement of the client's address is used.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct TrustedProxies(Vec<Network>);
 
 impl TrustedProxies {
@@ -53,7 +53,8 @@ impl TrustedProxies {
         Cow::Owned(Peer { client: ClientId::from(address), address, is_tls, ..peer.clone() })
     }
 
-    fn trusts(&self, address: IpAddr) -> bool {
+    /// Whether an address, in its canonical form, is a trusted proxy's.
+    pub(super) fn trusts(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(address))
     }
 }
@@ -66,6 +67,7 @@ fn address_of(entry: &str) -> Option<IpAddr> {
 }
 
 /// Addresses that begin with the same bits.
+#[derive(Clone)]
 struct Network {
     first: Ipv6Addr,
     /// Of the 128 bits of an IPv6 address, to which IPv4 addresses are mapped.

@@ -232,6 +232,12 @@ impl Store {
         Ok(())
     }
 
+    /// Whether a damaged page was met since the process was started, so that a backup should be restored.
+    #[must_use]
+    pub fn is_damaged(&self) -> bool {
+        errors::has_met_damage()
+    }
+
     fn readers(&self) -> &SqlitePool {
         &self.inner.readers
     }

@@ -202,7 +202,7 @@ fn the_environment_is_named_in_the_help_and_is_read() {
         .env("SIGHTFIX_LISTEN", "127.0.0.1:9")
         .env("SIGHTFIX_DATA", "/elsewhere")
         .env("SIGHTFIX_LIMITS__BODY_BYTES", "123456")
-        .env("SIGHTFIX_LOG__FORMAT", "json")
+        .env("SIGHTFIX_LOG_FORMAT", "json")
         .output()
         .expect("ended");
     let (settings, _) = succeeded(printed);

@@ -19,13 +19,13 @@ fn the_committed_description_is_the_code_s() {
 async fn the_server_tells_the_same_description_and_shows_it_offline() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
-    let told = server.get("/openapi.json").await.expect(200).json();
+    let reported = server.get("/openapi.json").await.expect(200).json();
     let printed: serde_json::Value = serde_json::from_str(&run(&["openapi"])).expect("JSON");
-    assert_eq!(told, printed);
+    assert_eq!(reported, printed);
     assert!(
-        told["openapi"].as_str().is_some_and(|version| version.starts_with("3.1")),
+        reported["openapi"].as_str().is_some_and(|version| version.starts_with("3.1")),
         "{}",
-        told["openapi"]
+        reported["openapi"]
     );
 
     let page = server.get("/docs/").await.expect(200).text();

@@ -237,10 +237,10 @@ fn files_that_cannot_be_used_are_named() {
     let files = Files::new(&authority);
     std::fs::write(&files.key, "no key").expect("a file");
     let refused = files.serve(&data).output().expect("the binary runs");
-    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert!(!refused.status.success() && told.contains("key.pem"), "{told}");
+    let reported = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(!refused.status.success() && reported.contains("key.pem"), "{reported}");
     let mut command = files.serve(&data);
     let refused = command.env("SIGHTFIX_TLS__CLIENT_ROLE", "edge").output().expect("the binary runs");
-    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert!(told.contains("client_camera_ids"), "{told}");
+    let reported = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(reported.contains("client_camera_ids"), "{reported}");
 }

@@ -84,6 +84,8 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Authenticated, "", "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo"),
     operation(Public, "POST /v1/session", ""),
     operation(Authenticated, "GET /v1/session", ""),
+    operation(Public, "GET /v1/session/methods", ""),
+    operation(Public, "GET /v1/session/openid", ""),
     operation(Public, "DELETE /v1/session", ""),
     operation(Administer, "POST /v1/keys", "sightfix.v1.KeyService/CreateKey"),
     operation(Administer, "GET /v1/keys", "sightfix.v1.KeyService/ListKeys"),

@@ -22,7 +22,7 @@ use tonic::transport::{Channel, Endpoint};
 /// A command of the binary, without arguments.
 pub(crate) fn sightfix() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sightfix"));
-    for setting in ["SIGHTFIX_DATA", "SIGHTFIX_DATABASE", "SIGHTFIX_LISTEN"] {
+    for setting in ["SIGHTFIX_DATA", "SIGHTFIX_DATABASE", "SIGHTFIX_LISTEN", "SIGHTFIX_TEST_POSTGRES"] {
         command.env_remove(setting);
     }
     command.current_dir(std::env::temp_dir());

@@ -12,7 +12,7 @@ const RUNS: &str = "/v1/cameras/c/training-runs";
 
 /// A process of a role with the database of a folder. Leases are short.
 fn node(folder: &Path, role: &str) -> TestServer {
-    let settings = [("SIGHTFIX_ROLE", role), ("SIGHTFIX_TRAINING__LEASE_S", "2")];
+    let settings = [("SIGHTFIX_ROLE", role), ("SIGHTFIX_TRAINING__LEASE_S", "3")];
     TestServer::start_with(folder, &settings)
 }
 

@@ -1,6 +1,7 @@
 //! Connecting: the pool, the transactions, the schema.
 //!
-//! Every statement runs in a transaction and is prepared without a name, and settings are made for one transaction
+//! Every statement runs in a transaction, which begins by giving up what was prepared on its connection before (the
+//! library numbers its statements by client, and a pooler mixes clients), and settings are made for one transaction
 //! each. So nothing is expected of a connection between two transactions, and a pooler that gives out connections by
 //! transaction (PgBouncer and its like) may stand between.
 
@@ -27,15 +28,16 @@ const SCHEMA_WAIT: Duration = Duration::from_secs(120);
 const SCHEMA_PAUSE: Duration = Duration::from_millis(100);
 
 /// A reader sees one state of the database. Whoever holds locks for longer than these times is interrupted.
-const BEGIN_READ: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; SET LOCAL statement_timeout = '60s'; \
+const BEGIN_READ: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; DEALLOCATE ALL; SET LOCAL statement_timeout = '60s'; \
                           SET LOCAL idle_in_transaction_session_timeout = '60s'";
-const BEGIN_SYNCED: &str = "BEGIN; SET LOCAL statement_timeout = '60s'; SET LOCAL lock_timeout = '5s'; \
+const BEGIN_SYNCED: &str = "BEGIN; DEALLOCATE ALL; SET LOCAL statement_timeout = '60s'; SET LOCAL lock_timeout = '5s'; \
                             SET LOCAL idle_in_transaction_session_timeout = '30s'; \
                             SET LOCAL synchronous_commit = on";
-const BEGIN_RELAXED: &str = "BEGIN; SET LOCAL statement_timeout = '60s'; SET LOCAL lock_timeout = '5s'; \
+const BEGIN_RELAXED: &str = "BEGIN; DEALLOCATE ALL; SET LOCAL statement_timeout = '60s'; SET LOCAL lock_timeout = '5s'; \
                              SET LOCAL idle_in_transaction_session_timeout = '30s'; \
                              SET LOCAL synchronous_commit = off";
-const BEGIN_SCHEMA: &str = "BEGIN; SET LOCAL lock_timeout = '30s'; SET LOCAL synchronous_commit = on";
+const BEGIN_SCHEMA: &str =
+    "BEGIN; DEALLOCATE ALL; SET LOCAL lock_timeout = '30s'; SET LOCAL synchronous_commit = on";
 
 /// The lock of the library lasts for a session, which a pooler does not keep.
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| {

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tokio::sync::Notify;
 
-use super::peer::PeerError;
+use super::credentials::PeerError;
 use super::sink::{self, Outcomes};
 use crate::app::{App, ConnectionState, LastMessage, LiveConnection};
 use crate::domain::{ConnectionKey, OutboxMessage};

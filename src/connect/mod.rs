@@ -11,6 +11,7 @@
 // What other systems send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
+mod credentials;
 mod deliver;
 mod intake;
 mod lines;

@@ -24,7 +24,8 @@ use tokio::net::UnixListener;
 use tokio::sync::mpsc;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::peer::{Credentials, OPEN_TIME, PeerError, connect, within};
+use super::credentials::{Credentials, PeerError};
+use super::peer::{OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
 use super::source::{Message, Source, SourceIdentity};
 use crate::config::Limits;

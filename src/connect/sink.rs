@@ -2,7 +2,7 @@
 
 use futures_util::future::BoxFuture;
 
-use super::peer::{Credentials, PeerError};
+use super::credentials::{Credentials, PeerError};
 use super::{mqtt, nats, stream, udp, webhook};
 use crate::clock::Clock;
 use crate::domain::OutboxMessage;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 
-use super::peer::{Credentials, PeerError};
+use super::credentials::{Credentials, PeerError};
 use super::{lines, mqtt, push, udp};
 use crate::app::LiveConnection;
 use crate::config::Limits;

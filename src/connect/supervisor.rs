@@ -13,9 +13,9 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use super::credentials::PeerError;
 use super::deliver::Delivery;
 use super::intake::Intake;
-use super::peer::PeerError;
 use super::publish::Publisher;
 use super::source::{self, SourceIdentity};
 use crate::app::{App, ConnectionState, LiveConnection, connection_settings};

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
+use super::credentials::PeerError;
 use super::intake::describe;
-use super::peer::PeerError;
 use super::publish::payload;
 use super::sink::{self, Outcomes};
 use super::source::{self, SourceIdentity};

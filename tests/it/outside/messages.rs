@@ -215,7 +215,7 @@ fn ais_positions_are_read_also_from_two_sentences() {
 /// Longitude 181 degrees and latitude 91 degrees: "not available".
 #[test]
 fn ais_sentinels_are_no_positions() {
-    let mut bits = vec![0_u8; 168];
+    let mut bits = [0_u8; 168];
     let mut put = |from: usize, count: usize, value: i64| {
         for at in 0..count {
             bits[from + at] = (value >> (count - 1 - at) & 1) as u8;

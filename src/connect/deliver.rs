@@ -8,7 +8,8 @@ use std::time::Duration;
 use tokio::sync::Notify;
 
 use super::credentials::PeerError;
-use super::sink::{self, Outcomes};
+use super::open;
+use super::sink::Outcomes;
 use crate::app::{App, ConnectionState, LastMessage, LiveConnection};
 use crate::domain::{ConnectionKey, OutboxMessage};
 use crate::exchange::{Secrets, SinkSettings};
@@ -33,7 +34,7 @@ impl Delivery<'_> {
     /// Opens the sink and delivers until it fails. `progressed` is set when something was delivered.
     pub(super) async fn run(&self, progressed: &AtomicBool) -> Result<Infallible, PeerError> {
         let clock = &self.app.clock;
-        let mut sink = sink::open(self.settings, self.secrets, self.client_id, clock).await?;
+        let mut sink = open::sink(self.settings, self.secrets, self.client_id, clock).await?;
         self.live.enter(ConnectionState::Running, clock.now());
         self.live.update(|status| status.connects += 1);
         loop {

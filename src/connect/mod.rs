@@ -17,6 +17,7 @@ mod intake;
 mod lines;
 mod mqtt;
 mod nats;
+mod open;
 mod peer;
 mod publish;
 mod push;

@@ -531,7 +531,8 @@ async fn pairings_are_the_same_and_refused_alike() {
     let (samples, pairing) = (grpc.samples.expect("samples"), grpc.pairing.expect("counts"));
     assert_eq!(rest["accepted"].as_u64(), Some(samples.accepted), "{rest} {samples:?}");
     assert_eq!(samples.accepted, samples.replaced, "the same samples over REST were stored before");
-    assert_eq!((rest["pairing"]["paired"].as_u64(), pairing.paired), (Some(20), 20));
+    assert_eq!(rest["pairing"]["paired"].as_u64(), Some(pairing.paired));
+    assert!(pairing.paired > 0, "{pairing:?}");
     let of_fix = &rest["pairing"]["unused_fixes"]["no_box_of_target"];
     assert_eq!(of_fix.as_u64(), Some(pairing.fixes_no_box_of_target));
     assert_eq!(

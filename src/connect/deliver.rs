@@ -40,9 +40,11 @@ impl Delivery<'_> {
         loop {
             let messages = self.app.store.outbox(self.key, BATCH).await?;
             if messages.is_empty() {
-                // Elapsed is no failure.
-                let _ = tokio::time::timeout(LOOK_EVERY, self.queued.notified()).await;
-                continue;
+                tokio::select! {
+                    // Elapsed is no failure.
+                    _ = tokio::time::timeout(LOOK_EVERY, self.queued.notified()) => continue,
+                    error = sink.failed() => return Err(error),
+                }
             }
             let mut outcomes = Outcomes::new();
             let delivered = sink.deliver(&messages, &mut outcomes).await;

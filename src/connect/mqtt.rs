@@ -318,4 +318,14 @@ impl Sink for MqttSink {
             Ok(())
         })
     }
+
+    fn failed(&mut self) -> BoxFuture<'_, PeerError> {
+        Box::pin(async move {
+            loop {
+                if let Err(error) = self.link.report().await {
+                    return error;
+                }
+            }
+        })
+    }
 }

@@ -16,4 +16,10 @@ pub(super) trait Sink: Send {
         messages: &'a [OutboxMessage],
         outcomes: &'a mut Outcomes,
     ) -> BoxFuture<'a, Result<(), PeerError>>;
+
+    /// Completes once the connection has failed while nothing is delivered, for kinds that find out. Cancelling the wait
+    /// loses nothing.
+    fn failed(&mut self) -> BoxFuture<'_, PeerError> {
+        Box::pin(std::future::pending())
+    }
 }

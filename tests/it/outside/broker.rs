@@ -110,7 +110,7 @@ async fn a_paused_source_of_a_broker_can_be_tried() {
     };
     assert_eq!(tried["message"]["subject"], "frigate/events");
     let reading = tried["message"]["reading"][0].as_str().expect("text");
-    assert!(reading.contains(TARGET) && reading.contains("216, 248 to 272, 427 px"), "{reading}");
+    assert!(reading.contains(TARGET) && reading.contains("216, 148 to 272, 327 px"), "{reading}");
     assert_eq!(server.get("/v1/cameras/gate/tracks").await.expect(200).json()["features"], json!([]));
 }
 

@@ -105,7 +105,7 @@ def define(name: str, schema: Schema, *, is_request: bool) -> str:
 
 
 def inline_name(name: str, schema: Schema) -> str:
-    """A name for an object that is defined within the union `name`: that of the union and its tag, or its properties."""
+    """A name for an object that is defined within the union `name`: that of the union, and its tag or properties."""
     tags = schema["properties"].get("type", {}).get("enum", [])
     if len(tags) == 1:
         return f"{name}{tags[0]}"

@@ -99,7 +99,7 @@ async fn bare_rustls(config: Arc<ServerConfig>, answer: Bytes) -> SocketAddr {
                         let parsed: serde_json::Value =
                             serde_json::from_slice(&body).expect("the bench's own request");
                         assert!(parsed.is_object(), "something is asked");
-                        Ok::<_, hyper::Error>(Response::new(Full::from(answer)))
+                        Ok::<_, hyper::Error>(Response::new(Full::<Bytes>::from(answer)))
                     }
                 });
                 let connection = hyper::server::conn::http1::Builder::new();

@@ -68,10 +68,14 @@ async function setStill(page: Page, server: Server, { csv }: SimulatedCamera): P
   await expect(page.getByText('The image stays in this browser.')).toBeVisible();
 }
 
-async function look(page: Page, server: Server, path: string, ready: (page: Page) => Promise<void>): Promise<void> {
+type Theme = 'dark' | 'light';
+
+async function look(page: Page, server: Server, path: string, ready: (page: Page) => Promise<void>, theme: Theme): Promise<void> {
   await page.goto('about:blank');
   await page.goto(`${server.url}/${path}`);
   await ready(page);
+  // The emulated preference may reach a new page after its first view; colours that change meanwhile have no contrast.
+  await expect(page.locator('html')).toHaveAttribute('data-theme', theme);
 }
 
 test('every view is accessible, fits and can be shown', async ({ console: page, server }) => {
@@ -84,7 +88,7 @@ test('every view is accessible, fits and can be shown', async ({ console: page, 
     for (const [name, path, ready] of VIEWS) {
       const isLong = PICTURES && /^(evaluation|models)$/.test(name);
       await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: isLong ? 1300 : 900 });
-      await look(page, server, path, ready);
+      await look(page, server, path, ready, theme);
       expect.soft(await accessibilityFindings(page), `${name}, ${theme}`).toEqual([]);
       if (PICTURES) {
         await page.waitForTimeout(name === 'live' ? 6000 : 1200);
@@ -95,7 +99,7 @@ test('every view is accessible, fits and can be shown', async ({ console: page, 
   await page.setViewportSize({ width: 390, height: 844 });
   await page.evaluate(() => localStorage.setItem('sightfix.language', 'de'));
   for (const [name, path, ready] of VIEWS) {
-    await look(page, server, path, ready);
+    await look(page, server, path, ready, 'light');
     expect.soft(await accessibilityFindings(page), `${name}, narrow`).toEqual([]);
     const overflow = await page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
     expect.soft(overflow, `${name} scrolls sideways at 390 px`).toBeLessThanOrEqual(0);

@@ -77,7 +77,7 @@ impl OpenIdSettings {
         );
         for (name, url) in [("issuer", issuer.as_str()), ("redirect_url", redirect_url)] {
             anyhow::ensure!(
-                url_origin(url).is_some_and(|origin| is_confidential(origin)),
+                url_origin(url).is_some_and(is_confidential),
                 "openid.{name} must be an https URL (http on this machine only); `{url}` is none"
             );
         }

@@ -7,8 +7,9 @@ use std::time::Duration;
 
 use tokio::sync::Notify;
 
-use super::peer::PeerError;
-use super::sink::{self, Outcomes};
+use super::credentials::PeerError;
+use super::open;
+use super::sink::Outcomes;
 use crate::app::{App, ConnectionState, LastMessage, LiveConnection};
 use crate::domain::{ConnectionKey, OutboxMessage};
 use crate::exchange::{Secrets, SinkSettings};
@@ -33,15 +34,17 @@ impl Delivery<'_> {
     /// Opens the sink and delivers until it fails. `progressed` is set when something was delivered.
     pub(super) async fn run(&self, progressed: &AtomicBool) -> Result<Infallible, PeerError> {
         let clock = &self.app.clock;
-        let mut sink = sink::open(self.settings, self.secrets, self.client_id, clock).await?;
+        let mut sink = open::sink(self.settings, self.secrets, self.client_id, clock).await?;
         self.live.enter(ConnectionState::Running, clock.now());
         self.live.update(|status| status.connects += 1);
         loop {
             let messages = self.app.store.outbox(self.key, BATCH).await?;
             if messages.is_empty() {
-                // Elapsed is no failure.
-                let _ = tokio::time::timeout(LOOK_EVERY, self.queued.notified()).await;
-                continue;
+                tokio::select! {
+                    // Elapsed is no failure.
+                    _ = tokio::time::timeout(LOOK_EVERY, self.queued.notified()) => continue,
+                    error = sink.failed() => return Err(error),
+                }
             }
             let mut outcomes = Outcomes::new();
             let delivered = sink.deliver(&messages, &mut outcomes).await;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use jiff::Timestamp;
 
-use super::peer::PeerError;
+use super::credentials::PeerError;
 use super::source::Message;
 use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};

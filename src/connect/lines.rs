@@ -11,7 +11,8 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::peer::{ByteStream, Credentials, PeerError, connect};
+use super::credentials::{Credentials, PeerError};
+use super::peer::{ByteStream, connect};
 use super::source::{Message, Source};
 use crate::exchange::{Address, Scheme};
 

@@ -11,11 +11,13 @@
 // What other systems send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
+mod credentials;
 mod deliver;
 mod intake;
 mod lines;
 mod mqtt;
 mod nats;
+mod open;
 mod peer;
 mod publish;
 mod push;

@@ -24,7 +24,8 @@ use tokio::net::UnixListener;
 use tokio::sync::mpsc;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::peer::{Credentials, OPEN_TIME, PeerError, connect, within};
+use super::credentials::{Credentials, PeerError};
+use super::peer::{OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
 use super::source::{Message, Source, SourceIdentity};
 use crate::config::Limits;
@@ -315,6 +316,16 @@ impl Sink for MqttSink {
                 within(OPEN_TIME, settled).await?;
             }
             Ok(())
+        })
+    }
+
+    fn failed(&mut self) -> BoxFuture<'_, PeerError> {
+        Box::pin(async move {
+            loop {
+                if let Err(error) = self.link.report().await {
+                    return error;
+                }
+            }
         })
     }
 }

@@ -13,7 +13,8 @@ use tokio::io::{
 use tokio::sync::{Mutex, mpsc};
 use tokio_util::task::AbortOnDropHandle;
 
-use super::peer::{ByteStream, Credentials, OPEN_TIME, PeerError, connect, within};
+use super::credentials::{Credentials, PeerError};
+use super::peer::{ByteStream, OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
 use crate::domain::OutboxMessage;
 use crate::exchange::Address;

@@ -1,4 +1,4 @@
-//! The other end of a connection, and what may go wrong there.
+//! Streams to the other end of a connection.
 
 use std::time::Duration;
 
@@ -6,41 +6,12 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 
+use super::credentials::{Credentials, PeerError};
 use super::tls;
-use crate::exchange::{Address, Secrets};
+use crate::exchange::Address;
 
 /// Time to open a connection, its handshakes included.
 pub(super) const OPEN_TIME: Duration = Duration::from_secs(10);
-
-/// Why a connection does not work now; it is opened again.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(super) struct PeerError(pub(super) String);
-
-impl From<std::io::Error> for PeerError {
-    fn from(error: std::io::Error) -> Self {
-        Self(error.to_string())
-    }
-}
-
-impl From<crate::domain::Error> for PeerError {
-    fn from(error: crate::domain::Error) -> Self {
-        Self(error.to_string())
-    }
-}
-
-impl From<&str> for PeerError {
-    fn from(message: &str) -> Self {
-        Self(message.to_owned())
-    }
-}
-
-/// What opens connections: credentials and trust.
-pub(super) struct Credentials<'a> {
-    pub(super) username: Option<&'a str>,
-    pub(super) ca_certificate: Option<&'a str>,
-    pub(super) secrets: &'a Secrets,
-}
 
 /// A stream of bytes, plain or encrypted.
 pub(super) trait ByteStream: AsyncRead + AsyncWrite + Send + Unpin {}

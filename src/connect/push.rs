@@ -6,7 +6,7 @@ use std::sync::Arc;
 use futures_util::future::BoxFuture;
 use tokio::sync::{mpsc, oneshot};
 
-use super::peer::PeerError;
+use super::credentials::PeerError;
 use super::source::{Message, Source};
 use crate::app::{LiveConnection, PushedMessage};
 

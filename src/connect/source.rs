@@ -1,15 +1,9 @@
 //! What a source is.
 
-use std::sync::Arc;
-
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 
-use super::peer::{Credentials, PeerError};
-use super::{lines, mqtt, push, udp};
-use crate::app::LiveConnection;
-use crate::config::Limits;
-use crate::exchange::{Scheme, Secrets, SourceSettings};
+use super::credentials::PeerError;
 
 /// A message as it came.
 pub(super) struct Message {
@@ -39,33 +33,4 @@ pub(super) struct SourceIdentity {
     pub(super) client_id: String,
     /// Whether the peer keeps what is not acknowledged while the source is away.
     pub(super) is_lasting: bool,
-}
-
-/// Opens a source.
-pub(super) async fn open(
-    settings: &SourceSettings,
-    secrets: &Secrets,
-    identity: &SourceIdentity,
-    live: &Arc<LiveConnection>,
-    limits: &Limits,
-) -> Result<Box<dyn Source>, PeerError> {
-    let address = settings.address()?;
-    let credentials = Credentials {
-        username: settings.username.as_deref(),
-        ca_certificate: settings.ca_certificate.as_deref(),
-        secrets,
-    };
-    let (queue, message_bytes) = (limits.connection_queue, limits.connection_message_bytes);
-    Ok(match address.scheme {
-        Scheme::Mqtt | Scheme::Mqtts => Box::new(
-            mqtt::MqttSource::open(&address, &settings.topics, &credentials, identity, limits).await?,
-        ),
-        Scheme::Tcp | Scheme::Tls | Scheme::Gpsd => {
-            Box::new(lines::LineSource::connect(&address, &credentials, message_bytes).await?)
-        }
-        Scheme::TcpListen => Box::new(lines::LineListener::bind(&address, queue, message_bytes).await?),
-        Scheme::Udp => Box::new(udp::UdpSource::bind(&address).await?),
-        Scheme::Push => Box::new(push::PushSource::open(live.clone(), queue)),
-        Scheme::Http | Scheme::Https | Scheme::Nats => return Err("a source cannot have this address".into()),
-    })
 }

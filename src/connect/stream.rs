@@ -4,7 +4,8 @@ use futures_util::future::BoxFuture;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, ReadHalf, WriteHalf};
 use tokio_util::task::AbortOnDropHandle;
 
-use super::peer::{ByteStream, Credentials, PeerError, connect};
+use super::credentials::{Credentials, PeerError};
+use super::peer::{ByteStream, connect};
 use super::sink::{Outcomes, Sink};
 use crate::domain::OutboxMessage;
 use crate::exchange::{Address, Scheme};

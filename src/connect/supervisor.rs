@@ -13,11 +13,12 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use super::credentials::PeerError;
 use super::deliver::Delivery;
 use super::intake::Intake;
-use super::peer::PeerError;
+use super::open;
 use super::publish::Publisher;
-use super::source::{self, SourceIdentity};
+use super::source::SourceIdentity;
 use crate::app::{App, ConnectionState, LiveConnection, connection_settings};
 use crate::backoff::Backoff;
 use crate::domain::{Connection, ConnectionId, ConnectionKey, Result, Revision};
@@ -188,7 +189,7 @@ async fn run_source(
     progressed: &AtomicBool,
 ) -> Result<Infallible, PeerError> {
     let identity = SourceIdentity { client_id: client_id(connection), is_lasting: true };
-    let mut source = source::open(settings, secrets, &identity, live, &app.limits).await?;
+    let mut source = open::source(settings, secrets, &identity, live, &app.limits).await?;
     let mut intake = Intake::new(app.clone(), connection.id().clone(), live.clone(), settings)?;
     live.enter(ConnectionState::Running, app.clock.now());
     live.update(|status| status.connects += 1);

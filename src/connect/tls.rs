@@ -7,7 +7,7 @@ use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
 use rustls::{ClientConfig, RootCertStore};
 
-use super::peer::{Credentials, PeerError};
+use super::credentials::{Credentials, PeerError};
 
 /// The configuration of a client that trusts the given authority, or those of the operating system, and presents the
 /// connection's certificate if it has one.

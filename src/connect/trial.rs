@@ -2,11 +2,12 @@
 
 use std::time::Duration;
 
+use super::credentials::PeerError;
 use super::intake::describe;
-use super::peer::PeerError;
+use super::open;
 use super::publish::payload;
-use super::sink::{self, Outcomes};
-use super::source::{self, SourceIdentity};
+use super::sink::Outcomes;
+use super::source::SourceIdentity;
 use crate::app::{App, ConnectionState, LastMessage, connection_settings};
 use crate::domain::{CameraId, Connection, OutboxMessage, Result, TargetId};
 use crate::exchange::{MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, decoder};
@@ -79,7 +80,7 @@ async fn try_source(
         is_lasting: false,
     };
     let live = app.live_connection(connection);
-    let mut source = source::open(settings, secrets, &identity, &live, &app.limits).await?;
+    let mut source = open::source(settings, secrets, &identity, &live, &app.limits).await?;
     let message = source.next().await?;
     let now = app.clock.now();
     let context = MessageContext { received_at: now, time_bounds: app.live_time_bounds() };
@@ -103,7 +104,7 @@ async fn try_sink(
     let now = app.clock.now();
     let random = app.randomness.uuid_v7(now);
     let client_id = format!("sightfix-{}-test-{}", connection.id(), random.simple());
-    let mut sink = sink::open(settings, secrets, &client_id, &app.clock).await?;
+    let mut sink = open::sink(settings, secrets, &client_id, &app.clock).await?;
     let cameras = settings.cameras()?;
     let camera: &CameraId = cameras.first().ok_or_else(|| PeerError::from("the sink names no camera"))?;
     let target = TargetId::new(TEST_TARGET)?;

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use tokio::net::{UdpSocket, lookup_host};
 
-use super::peer::PeerError;
+use super::credentials::PeerError;
 use super::sink::{Outcomes, Sink};
 use super::source::{Message, Source};
 use crate::domain::OutboxMessage;

@@ -17,7 +17,8 @@ use hyper_util::rt::TokioIo;
 use sha2::Sha256;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::peer::{Credentials, OPEN_TIME, PeerError, connect, within};
+use super::credentials::{Credentials, PeerError};
+use super::peer::{OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
 use crate::clock::Clock;
 use crate::domain::OutboxMessage;

@@ -80,12 +80,12 @@ pub fn cot_event(position: &OutgoingPosition<'_>, cot_type: &str, stale_s: f64) 
     let sigma_m = position.covariance.per_axis_m2().sqrt();
     let ce = if sigma_m.is_finite() { format!("{sigma_m:.2}") } else { UNKNOWN.to_owned() };
     let mut event = String::with_capacity(512);
-    let _ = write!(
+    let _ = writeln!(
         event,
         "<event version=\"2.0\" uid=\"{uid}\" type=\"{cot_type}\" how=\"m-f\" time=\"{time:.3}\" \
          start=\"{time:.3}\" stale=\"{:.3}\"><point lat=\"{:.7}\" lon=\"{:.7}\" hae=\"{UNKNOWN}\" ce=\"{ce}\" \
          le=\"{UNKNOWN}\"/><detail><contact callsign=\"{}\"/><track course=\"{course_deg:.1}\" \
-         speed=\"{:.2}\"/></detail></event>\n",
+         speed=\"{:.2}\"/></detail></event>",
         stale.unwrap_or(time),
         position.position.latitude_deg(),
         position.position.longitude_deg(),

@@ -179,7 +179,7 @@ fn response(report: PairedReport, durability: Durability) -> proto::PairSamplesR
         accepted_without_fix: samples.without_fix,
         replaced: samples.replaced,
     };
-    let (of_detections, of_fixes): (Vec<(Part, RowError)>, Vec<(Part, RowError)>) =
+    let (of_detections, of_fixes): (Vec<_>, Vec<_>) =
         rejected.rows.into_iter().partition(|(part, _)| *part == Part::Detections);
     let rows = |rows: Vec<(Part, RowError)>| rows.into_iter().map(|(_, row)| row.into()).collect();
     proto::PairSamplesResponse {

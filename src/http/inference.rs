@@ -94,7 +94,7 @@ struct ModelReady {
 
 /// What a model takes and gives.
 #[derive(Serialize, ToSchema)]
-struct ModelMetadata {
+struct InferenceModelMetadata {
     /// The camera's id.
     name: String,
     /// Numbers of the versions that answer: the active one.
@@ -242,7 +242,7 @@ async fn server_ready(State(rest): State<Rest>) -> ApiResult {
     get, path = "/v2/models/{camera}", tag = "inference",
     params(("camera" = String, Path, description = "The camera's id")),
     responses(
-        (status = 200, description = "Its tensors", body = ModelMetadata),
+        (status = 200, description = "Its tensors", body = InferenceModelMetadata),
         (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),
     )
 )]
@@ -255,7 +255,7 @@ async fn model_metadata(CallerApp(app): CallerApp, model: ModelName) -> ApiResul
     get, path = "/v2/models/{camera}/versions/{version}", tag = "inference",
     params(("camera" = String, Path, description = "The camera's id"), ("version" = String, Path, description = "The version's number")),
     responses(
-        (status = 200, description = "Its tensors", body = ModelMetadata),
+        (status = 200, description = "Its tensors", body = InferenceModelMetadata),
         (status = 404, description = "The version does not answer", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),
     )
@@ -267,7 +267,7 @@ async fn model_version_metadata(CallerApp(app): CallerApp, model: ModelName) -> 
 async fn metadata(app: &App, model: ModelName) -> ApiResult {
     let (_, version) = app.served_model(&model.camera, model.version.as_deref()).await?;
     let tensor = |name, columns: usize| TensorMetadata { name, datatype: FP64, shape: [ANY, columns as i64] };
-    Ok(json(&ModelMetadata {
+    Ok(json(&InferenceModelMetadata {
         name: model.camera.to_string(),
         versions: vec![version.to_string()],
         platform: env!("CARGO_PKG_NAME"),

@@ -427,7 +427,7 @@ async fn follow(
 /// What the events of a camera carry, by the event's name.
 #[derive(ToSchema)]
 #[serde(untagged)]
-#[expect(dead_code, reason = "the shapes of events, for the description alone")]
+#[expect(dead_code, clippy::large_enum_variant, reason = "the shapes of events, for the description alone")]
 enum CameraEventBody<'a> {
     /// `track`.
     Track(TrackUpdate<'a>),

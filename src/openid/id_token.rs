@@ -176,15 +176,15 @@ mod tests {
     use super::*;
 
     /// An ID token that OpenSSL has signed by RS256, and the modulus of its key.
-    const TOKEN: &str = "eyJhbGciOiJSUzI1NiIsImtpZCI6IjEifQ.eyJpc3MiOiJodHRwczovL2lzc3Vlci5leGFtcGxlIiwic3ViIjoiNyIsImF1ZCI6I \
-         nNpZ2h0Zml4IiwiZXhwIjoxNzAwMDAwMzAwLCJpYXQiOjE3MDAwMDAwMDAsIm5vbmNlIjoibiJ9.Yn333sbrZtDTn55Mt3R16NeT \
-         E2cg0bIwLPh9iNpe-TLoA4IdunY7rNkg8wEYc7_Rk6TTQZT1QFAWjRQl7wlrVZdhk41y9nyF8jAJveSmourHKFuweSYTxDGxfEah \
-         EOs5JyVySJSIAw4Dc8wzNw3VFw1eFr8xOqW__VFAtWnD7IQGG9VcFRy9piIHEQncdMB0J6xLD0RFKq6-NrcXuuJa6JQCvQIM3Ro3 \
-         DDuoTJUw9hQDIqLb7JIvCoLZa6bskxoPagDHvEn7wdGrHfrJ82Y74mfAmURwC_t8CgfLoq-6wlFXZ1YqmF2USzH22ukLo-osmLgO \
+    const TOKEN: &str = "eyJhbGciOiJSUzI1NiIsImtpZCI6IjEifQ.eyJpc3MiOiJodHRwczovL2lzc3Vlci5leGFtcGxlIiwic3ViIjoiNyIsImF1ZCI6I\
+         nNpZ2h0Zml4IiwiZXhwIjoxNzAwMDAwMzAwLCJpYXQiOjE3MDAwMDAwMDAsIm5vbmNlIjoibiJ9.Yn333sbrZtDTn55Mt3R16NeT\
+         E2cg0bIwLPh9iNpe-TLoA4IdunY7rNkg8wEYc7_Rk6TTQZT1QFAWjRQl7wlrVZdhk41y9nyF8jAJveSmourHKFuweSYTxDGxfEah\
+         EOs5JyVySJSIAw4Dc8wzNw3VFw1eFr8xOqW__VFAtWnD7IQGG9VcFRy9piIHEQncdMB0J6xLD0RFKq6-NrcXuuJa6JQCvQIM3Ro3\
+         DDuoTJUw9hQDIqLb7JIvCoLZa6bskxoPagDHvEn7wdGrHfrJ82Y74mfAmURwC_t8CgfLoq-6wlFXZ1YqmF2USzH22ukLo-osmLgO\
          ySJFWw7kV9UnSbHGJw";
-    const MODULUS: &str = "qzJQ4xg6mYOrR9owjJjLPp-lGeeI-H5gLHWT7C1voEam_Wk3id5qXPbinptTGLYiNGm0GIN3rKrbpszRyZG1afE9DZs95Ju-5Mj9 \
-         N-EaMs2Iif8YVSaZJzrgEaXZHKteLTa_3fJ4szG_xAYRVoiPFmAh-VbA4v5EbVU90-sPFrQuqdpOvi2BvYEwE6r3JExdMm3_99zl \
-         cG9RIbV5j-lo4KbVM1dU5PEwYpsgNUR8x5Hog4BJXTHjVzjSIt9CxuUK_KsOmnAaz0bO1oCaUd4vqFknZsEspynraT6cMzJc3t8x \
+    const MODULUS: &str = "qzJQ4xg6mYOrR9owjJjLPp-lGeeI-H5gLHWT7C1voEam_Wk3id5qXPbinptTGLYiNGm0GIN3rKrbpszRyZG1afE9DZs95Ju-5Mj9\
+         N-EaMs2Iif8YVSaZJzrgEaXZHKteLTa_3fJ4szG_xAYRVoiPFmAh-VbA4v5EbVU90-sPFrQuqdpOvi2BvYEwE6r3JExdMm3_99zl\
+         cG9RIbV5j-lo4KbVM1dU5PEwYpsgNUR8x5Hog4BJXTHjVzjSIt9CxuUK_KsOmnAaz0bO1oCaUd4vqFknZsEspynraT6cMzJc3t8x\
          QnzxAkSfQsl7_Q_BE38pXxZJa0CETO5JXX3AAclyvQ";
     const ISSUED_AT_S: i64 = 1_700_000_000;
 

@@ -335,7 +335,7 @@ pub(crate) fn data_folder() -> TempDir {
     tempfile::tempdir().expect("a folder")
 }
 
-/// Path of a file of the real square. Tests that use it are ignored by default; their names contain
+/// Path of a file or folder of the real recordings. Tests that use it are ignored by default; their names contain
 /// `shared`, so that a filter selects exactly them.
 pub(crate) fn shared(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data").join(name);

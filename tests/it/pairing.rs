@@ -97,7 +97,8 @@ fn pair(detections: &Path, fixes: &Path, out: &Path, flags: &[&str]) -> (String,
 #[test]
 #[ignore = "needs ../shared/data"]
 fn shared_files_are_paired_to_the_paired_file() {
-    let [detections, fixes, paired] = ["detections.csv", "gnss.csv", "training.csv"].map(shared);
+    let [detections, fixes, paired] =
+        ["square/detections.csv", "square/gnss.csv", "square/training.csv"].map(shared);
     let folder = data_folder();
     let out = folder.path().join("paired.csv");
     let (printed, found) = pair(&detections, &fixes, &out, &["--estimate-offset"]);
@@ -372,7 +373,8 @@ async fn two_parts_without_receivers_are_paired_by_the_parameters() {
 #[tokio::test]
 #[ignore = "needs ../shared/data"]
 async fn shared_files_are_paired_over_rest() {
-    let [detections, fixes, paired] = ["detections.csv", "gnss.csv", "training.csv"].map(shared);
+    let [detections, fixes, paired] =
+        ["square/detections.csv", "square/gnss.csv", "square/training.csv"].map(shared);
     let read = |path: PathBuf| std::fs::read_to_string(path).expect("readable");
     let folder = data_folder();
     let server = TestServer::start(folder.path());

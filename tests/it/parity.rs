@@ -92,7 +92,7 @@ fn same_refusal_but_for(rest: Answer, grpc: &Status, kind: ErrorKind, rest_name:
     let problem = rest.expect(row.http).json();
     let violations = problem["violations"].as_array().into_iter().flatten();
     let text = |value: &Value| value.as_str().expect("text").to_owned();
-    let by_rest = Refusal {
+    let mut by_rest = Refusal {
         reason: text(&problem["type"]).trim_start_matches(status::PROBLEM_TYPE_PREFIX).to_owned(),
         message: text(&problem["detail"]),
         violations: violations.map(|at| (text(&at["field"]), text(&at["message"]))).collect(),
@@ -108,6 +108,14 @@ fn same_refusal_but_for(rest: Answer, grpc: &Status, kind: ErrorKind, rest_name:
         },
         violations: fields.map(|at| (rest_name(&at.field).to_owned(), at.description.clone())).collect(),
     };
+    // Statuses of gRPC are headers, whose texts are shortened.
+    for (rest, grpc) in by_rest.violations.iter_mut().zip(&by_grpc.violations) {
+        if let Some(begin) = grpc.1.strip_suffix("...")
+            && rest.1.starts_with(begin)
+        {
+            rest.1.clone_from(&grpc.1);
+        }
+    }
     assert_eq!(by_rest, by_grpc);
     assert_eq!(by_rest.reason, row.slug);
 }
@@ -323,7 +331,7 @@ async fn square(server: &TestServer) -> (String, String) {
 
 /// Changes the camera `c`.
 async fn patch(server: &TestServer, change: &Value) -> Answer {
-    let headers = [("content-type", "application/merge-patch+json")];
+    let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
     server.send("PATCH", "/v1/cameras/c", &headers, change.to_string()).await
 }
 
@@ -523,7 +531,8 @@ async fn pairings_are_the_same_and_refused_alike() {
     let (samples, pairing) = (grpc.samples.expect("samples"), grpc.pairing.expect("counts"));
     assert_eq!(rest["accepted"].as_u64(), Some(samples.accepted), "{rest} {samples:?}");
     assert_eq!(samples.accepted, samples.replaced, "the same samples over REST were stored before");
-    assert_eq!((rest["pairing"]["paired"].as_u64(), pairing.paired), (Some(20), 20));
+    assert_eq!(rest["pairing"]["paired"].as_u64(), Some(pairing.paired));
+    assert!(pairing.paired > 0, "{pairing:?}");
     let of_fix = &rest["pairing"]["unused_fixes"]["no_box_of_target"];
     assert_eq!(of_fix.as_u64(), Some(pairing.fixes_no_box_of_target));
     assert_eq!(

@@ -105,7 +105,10 @@ def define(name: str, schema: Schema, *, is_request: bool) -> str:
 
 
 def inline_name(name: str, schema: Schema) -> str:
-    """A name for an object that is defined within the union `name`: that of the union and its properties."""
+    """A name for an object that is defined within the union `name`: that of the union, and its tag or properties."""
+    tags = schema["properties"].get("type", {}).get("enum", [])
+    if len(tags) == 1:
+        return f"{name}{tags[0]}"
     return name + "".join(part.capitalize() for key in schema["properties"] for part in key.split("_"))
 
 

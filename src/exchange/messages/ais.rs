@@ -2,7 +2,7 @@
 //!
 //! Read are the position reports of types 1, 2, 3 (class A), 18 and 19 (class B). A message may come in several
 //! sentences. Longitude 181 degrees and latitude 91 degrees mean that there is none. A report has the second of the
-//! minute only; the minute is the one nearest to the time at which it came, or to that of its tag block (`c:`).
+//! minute only; it is the latest such instant before the message came, or before the time of its tag block (`c:`).
 
 use std::collections::VecDeque;
 
@@ -182,11 +182,16 @@ fn position(
     checked().map(Some).map_err(|error| error.to_string())
 }
 
-/// The instant with that second of the minute nearest to another.
-fn at_second(near: Timestamp, second: i64) -> Timestamp {
-    let difference_s = (second - near.as_second().rem_euclid(60) + 90).rem_euclid(60) - 30;
-    let whole = Timestamp::from_second(near.as_second()).unwrap_or(near);
-    whole.saturating_add(SignedDuration::from_secs(difference_s)).unwrap_or(near)
+/// How far a transmitter's clock may be ahead of the server's, s.
+const LEAD_S: i64 = 5;
+
+/// The latest instant with that second of the minute that is at most [`LEAD_S`] after the message was received: a
+/// position is measured before it is sent.
+fn at_second(received_at: Timestamp, second: i64) -> Timestamp {
+    let ahead_s = (second - received_at.as_second()).rem_euclid(60);
+    let difference_s = if ahead_s > LEAD_S { ahead_s - 60 } else { ahead_s };
+    let whole = Timestamp::from_second(received_at.as_second()).unwrap_or(received_at);
+    whole.saturating_add(SignedDuration::from_secs(difference_s)).unwrap_or(received_at)
 }
 
 /// The bits of a payload, six in each character.

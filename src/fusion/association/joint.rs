@@ -339,7 +339,7 @@ impl<'a> JointSearch<'a> {
             return Ok(None);
         }
         let mut by_count: Vec<(&ReceiverId, usize)> = counts.into_iter().collect();
-        by_count.sort_by(|one, other| other.1.cmp(&one.1));
+        by_count.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
         // In turn, so that both halves have as many boxes: 0 1 1 0 0 1 1 0.
         let half_of =
             |id: &ReceiverId| by_count.iter().position(|own| own.0 == id).map(|at| at.div_ceil(2) % 2);

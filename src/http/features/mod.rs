@@ -226,7 +226,7 @@ async fn get_collection(
         ("collection" = String, Path, description = "`cameras`, `{camera}.samples` or `{camera}.tracks`"),
         ("bbox" = Option<String>, Query, description = "Only features that intersect it: west,south,east,north in degrees; west may be greater than east, across the antimeridian"),
         ("datetime" = Option<String>, Query, description = "Only features of this instant or interval (RFC 3339): an instant, or begin/end, where `..` is open"),
-        ("limit" = Option<u32>, Query, description = "Features on a page, 100 if left out; more than the server's own limit counts as that"),
+        ("limit" = Option<u32>, Query, minimum = 1, description = "Features on a page, 100 if left out; more than the server's own limit counts as that"),
         ("cursor" = Option<String>, Query, description = "Where the page begins, from the link `next`"),
     ),
     responses(

@@ -11,6 +11,8 @@ use crate::http::extract::Params;
 
 /// Features on a page whose length the client leaves open.
 const PAGE_ITEMS: u32 = 100;
+/// Largest `limit` that is taken, that of the int32 which the description names.
+const MOST_ASKED: u32 = i32::MAX.unsigned_abs();
 /// Samples are stored to the microsecond, so the instant after one is this much later.
 const RESOLUTION: SignedDuration = SignedDuration::from_micros(1);
 
@@ -37,10 +39,12 @@ impl Selection {
         let area = text(params, "bbox")?.map(|text| Area::parse(&text)).transpose()?;
         let interval = text(params, "datetime")?.map(|text| Interval::parse(&text)).transpose()?;
         let limit = text(params, "limit")?.map(|text| {
-            let limit = text.parse::<u64>().ok().filter(|limit| *limit > 0);
-            limit.ok_or_else(|| Error::invalid("limit", "must be a whole number from 1 on"))
+            let limit = text.parse::<u32>().ok().filter(|limit| (1..=MOST_ASKED).contains(limit));
+            limit.ok_or_else(|| {
+                Error::invalid("limit", format!("must be a whole number from 1 to {MOST_ASKED}"))
+            })
         });
-        let limit = limit.transpose()?.map_or(PAGE_ITEMS, |limit| u32::try_from(limit).unwrap_or(u32::MAX));
+        let limit = limit.transpose()?.unwrap_or(PAGE_ITEMS);
         Ok(Self { area, interval: interval.unwrap_or_default(), limit: limit.min(most), given })
     }
 

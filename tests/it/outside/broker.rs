@@ -9,11 +9,11 @@ use crate::harness::{TestServer, data_folder, own_address};
 
 const TARGET: &str = "1607123955.475377-mxklsc";
 
-/// An update of Frigate's documentation with the time of now, or earlier.
+/// An update of Frigate's documentation with the time of now, or earlier, and 100 px higher: within a stream of 360 rows.
 fn frigate_update(time: jiff::Timestamp) -> String {
     json!({"type": "update", "before": {}, "after": {
         "id": TARGET, "camera": "front_door", "frame_time": time.as_microsecond() as f64 * 1e-6, "label": "person",
-        "false_positive": false, "score": 0.87890625, "box": [216, 248, 272, 427], "area": 40096,
+        "false_positive": false, "score": 0.87890625, "box": [216, 148, 272, 327], "area": 40096,
     }})
     .to_string()
 }
@@ -49,7 +49,7 @@ async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
     let samples = server.get("/v1/cameras/gate/samples").await.expect(200).json();
     let sample = &samples["items"][0];
     assert_eq!(sample["target_id"], TARGET);
-    let expected = json!({"left_px": 432.0, "top_px": 496.0, "width_px": 112.0, "height_px": 358.0});
+    let expected = json!({"left_px": 432.0, "top_px": 296.0, "width_px": 112.0, "height_px": 358.0});
     assert_eq!(sample["bounding_box"], expected, "in pixels of the camera, not of the detect stream");
     assert_eq!((&sample["class"], &sample["score"]), (&json!("person"), &json!(0.87890625)));
     server.kill();
@@ -110,7 +110,7 @@ async fn a_paused_source_of_a_broker_can_be_tried() {
     };
     assert_eq!(tried["message"]["subject"], "frigate/events");
     let reading = tried["message"]["reading"][0].as_str().expect("text");
-    assert!(reading.contains(TARGET) && reading.contains("216, 248 to 272, 427 px"), "{reading}");
+    assert!(reading.contains(TARGET) && reading.contains("216, 148 to 272, 327 px"), "{reading}");
     assert_eq!(server.get("/v1/cameras/gate/tracks").await.expect(200).json()["features"], json!([]));
 }
 

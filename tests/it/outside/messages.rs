@@ -182,7 +182,7 @@ fn ais_positions_are_read_also_from_two_sentences() {
         (longitude + 122.345_833).abs() < 1e-5 && (latitude - 47.582_833).abs() < 1e-5,
         "{longitude} {latitude}"
     );
-    assert_eq!(time, "2026-06-01T12:00:15Z", "second 15 of the minute nearest to the server's time");
+    assert_eq!(time, "2026-06-01T12:00:15Z", "the last second 15 before the server's time");
 
     let payload = "C5N3SRgPEnJGEBT>NhWAwwo862PaLELTBJ:V00000000S0D:R220";
     let sentence = |count, number, payload: &str| {
@@ -207,7 +207,7 @@ fn ais_positions_are_read_also_from_two_sentences() {
     assert_eq!(nmea.decode(first.as_bytes(), &context()).expect("a sentence").items.len(), 1);
 
     let tagged = format!("\\s:station,c:1748779199*00\\{one}");
-    assert_eq!(fixes(&read(MessageFormat::Nmea, &tagged))[0].3, "2025-06-01T12:00:15Z");
+    assert_eq!(fixes(&read(MessageFormat::Nmea, &tagged))[0].3, "2025-06-01T11:59:15Z");
     let reading = read(MessageFormat::Nmea, &one.replace("*5C", "*5D"));
     assert!(reading.items.is_empty() && reading.skipped[0].contains("checksum"), "{reading:?}");
 }
@@ -215,7 +215,7 @@ fn ais_positions_are_read_also_from_two_sentences() {
 /// Longitude 181 degrees and latitude 91 degrees: "not available".
 #[test]
 fn ais_sentinels_are_no_positions() {
-    let mut bits = vec![0_u8; 168];
+    let mut bits = [0_u8; 168];
     let mut put = |from: usize, count: usize, value: i64| {
         for at in 0..count {
             bits[from + at] = (value >> (count - 1 - at) & 1) as u8;

@@ -86,13 +86,15 @@ pub(super) async fn connection_when(
     id: &str,
     is_wanted: impl Fn(&Value) -> bool,
 ) -> Value {
-    loop {
-        let connection = server.get(&format!("/v1/connections/{id}")).await.expect(200).json();
+    let mut connection = Value::Null;
+    for _ in 0..3_000 {
+        connection = server.get(&format!("/v1/connections/{id}")).await.expect(200).json();
         if is_wanted(&connection["status"]) {
             return connection;
         }
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
+    panic!("the status does not come: {connection}")
 }
 
 /// A camera `gate` of 1280 x 720 px.

@@ -22,7 +22,9 @@ class CsvLayout:
 
     def query(self) -> dict[str, str | None]:
         """The parameters of a request."""
-        columns = self.columns
-        if columns is not None and not isinstance(columns, str):
-            columns = ",".join(f"{field}:{column}" for field, column in columns.items())
+        columns: str | None = None
+        if isinstance(self.columns, str):
+            columns = self.columns
+        elif self.columns is not None:
+            columns = ",".join(f"{field}:{column}" for field, column in self.columns.items())
         return {"columns": columns, "box_form": self.box_form, "box_unit": self.box_unit}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterable, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from datetime import datetime
 from pathlib import Path
@@ -282,7 +282,7 @@ class Samples:
         return (await self._transport.json(request, DeletedSamples)).deleted
 
     async def _import(
-        self, camera_id: str, rows: list[Mapping[str, Any]], durability: Durability, on_conflict: OnConflict
+        self, camera_id: str, rows: Sequence[Mapping[str, Any]], durability: Durability, on_conflict: OnConflict
     ) -> Imported:
         request = Request(
             method="POST",

@@ -1,0 +1,33 @@
+//! What opens a connection, and why it does not open.
+
+use crate::exchange::Secrets;
+
+/// Why a connection does not work now; it is opened again.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(super) struct PeerError(pub(super) String);
+
+impl From<std::io::Error> for PeerError {
+    fn from(error: std::io::Error) -> Self {
+        Self(error.to_string())
+    }
+}
+
+impl From<crate::domain::Error> for PeerError {
+    fn from(error: crate::domain::Error) -> Self {
+        Self(error.to_string())
+    }
+}
+
+impl From<&str> for PeerError {
+    fn from(message: &str) -> Self {
+        Self(message.to_owned())
+    }
+}
+
+/// What opens connections: credentials and trust.
+pub(super) struct Credentials<'a> {
+    pub(super) username: Option<&'a str>,
+    pub(super) ca_certificate: Option<&'a str>,
+    pub(super) secrets: &'a Secrets,
+}

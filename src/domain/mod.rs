@@ -21,6 +21,7 @@ mod idempotency;
 mod job;
 mod live_id;
 mod method;
+mod model_format;
 mod names;
 mod noise;
 mod observation;
@@ -48,6 +49,7 @@ pub use idempotency::{IdempotencyKey, IdempotentRequest, RequestDigest, RequestH
 pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
+pub use model_format::ModelFormat;
 pub use names::{
     CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
 };

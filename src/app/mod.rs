@@ -27,7 +27,8 @@ mod sites;
 mod spool;
 mod training;
 
-use std::sync::Arc;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore};
@@ -80,6 +81,8 @@ pub struct Parts {
     pub site_registry: SiteRegistry,
     /// What connections with other systems do.
     pub connection_board: ConnectionBoard,
+    /// Where their sinks write files, if they may: set by the server at its start.
+    pub export_folder: OnceLock<PathBuf>,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -143,6 +146,7 @@ impl App {
             registry,
             site_registry,
             connection_board: ConnectionBoard::default(),
+            export_folder: OnceLock::new(),
             access,
             clock,
             randomness,

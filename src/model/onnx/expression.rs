@@ -4,6 +4,7 @@
 //! is repeated over the columns of the other operand, as ONNX broadcasts.
 
 use std::cell::RefCell;
+use std::collections::HashSet;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 use super::messages::{AttributeProto, DOUBLE, GraphProto, INT, INT64, NodeProto, TensorProto};
@@ -128,10 +129,20 @@ impl Graph {
         }
     }
 
-    /// Nodes and constants, without name, inputs and outputs.
-    pub(super) fn finish(self) -> GraphProto {
+    /// The nodes and constants that the outputs of these names need, without name, inputs and outputs of the graph.
+    pub(super) fn finish(self, outputs: &[&str]) -> GraphProto {
         let Parts { nodes, constants } = self.0.into_inner();
-        GraphProto { node: nodes, initializer: constants, ..GraphProto::default() }
+        let mut needed: HashSet<String> = outputs.iter().map(|name| (*name).to_owned()).collect();
+        let mut kept: Vec<NodeProto> = Vec::with_capacity(nodes.len());
+        for node in nodes.into_iter().rev() {
+            if node.output.iter().any(|name| needed.contains(name)) {
+                needed.extend(node.input.iter().cloned());
+                kept.push(node);
+            }
+        }
+        kept.reverse();
+        let initializer = constants.into_iter().filter(|tensor| needed.contains(&tensor.name)).collect();
+        GraphProto { node: kept, initializer, ..GraphProto::default() }
     }
 }
 

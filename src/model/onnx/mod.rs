@@ -65,7 +65,7 @@ impl Artifact {
         let regressor = self.load()?;
         let graph = Graph::default();
         put_outputs(&regressor, &graph);
-        let mut graph = graph.finish();
+        let mut graph = graph.finish(&OUTPUTS.map(|(name, ..)| name));
         "boxes_to_positions".clone_into(&mut graph.name);
         graph.input = vec![value_info(BOXES, 4, "left, top, width and height of each box, px")];
         graph.output = OUTPUTS.iter().map(|(name, columns, text)| value_info(name, *columns, text)).collect();

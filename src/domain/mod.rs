@@ -48,7 +48,7 @@ pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
 pub use names::{CameraId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
-pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
+pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;

@@ -8,7 +8,7 @@ use std::{env, fs};
 use protox::prost::Message as _;
 
 const FOLDER: &str = "proto";
-const FILES: [&str; 9] = [
+const FILES: [&str; 12] = [
     "sightfix/v1/values.proto",
     "sightfix/v1/camera_service.proto",
     "sightfix/v1/sample_service.proto",
@@ -18,6 +18,9 @@ const FILES: [&str; 9] = [
     "sightfix/v1/key_service.proto",
     "sightfix/v1/audit_service.proto",
     "sightfix/v1/site_service.proto",
+    "sightfix/v1/track_service.proto",
+    "sightfix/v1/evaluation_service.proto",
+    "inference/open_inference_grpc.proto",
 ];
 
 /// What `npm run build` in `console/` writes.
@@ -31,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let folder = PathBuf::from(env::var("OUT_DIR")?);
     fs::write(folder.join("sightfix_descriptor.bin"), descriptors.encode_to_vec())?;
     tonic_prost_build::configure()
-        .bytes(".sightfix.v1")
+        .bytes(".")
         // Half a kilobyte that would be moved a dozen times on its way out.
         .boxed(".sightfix.v1.StreamResponse.kind.answer")
         .compile_fds(descriptors)?;

@@ -265,8 +265,69 @@ impl RateLimit {
     }
 }
 
+/// What bodies cost that are refused for what they contain: they are read and parsed in vain. Each client has some for
+/// free; beyond, it waits before its next body is read.
+pub struct RefusedBodies {
+    bytes_per_s: f64,
+    debts: Mutex<HashMap<ClientId, Debt>>,
+}
+
+/// Bytes of refused bodies, less what has been forgiven by the time.
+#[derive(Debug, Clone, Copy)]
+struct Debt {
+    bytes: f64,
+    at: Instant,
+}
+
+impl Debt {
+    fn left(self, bytes_per_s: f64, now: Instant) -> f64 {
+        (self.bytes - now.saturating_duration_since(self.at).as_secs_f64() * bytes_per_s).max(0.0)
+    }
+}
+
+/// What is free, in seconds of the rate: a wrong file or two.
+const FREE_S: f64 = 16.0;
+/// Longest wait, s.
+const MAX_WAIT_S: f64 = 10.0;
+
+impl RefusedBodies {
+    /// Forgives so many bytes per second; 0 charges nothing.
+    #[must_use]
+    pub fn new(bytes_per_s: u32) -> Self {
+        Self { bytes_per_s: f64::from(bytes_per_s), debts: Mutex::default() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<ClientId, Debt>> {
+        self.debts.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A body of a client was refused.
+    pub fn charge(&self, client: ClientId, bytes: u64, now: Instant) {
+        if self.bytes_per_s == 0.0 {
+            return;
+        }
+        let mut debts = self.lock();
+        if debts.len() >= MOST_BUCKETS && !debts.contains_key(&client) {
+            debts.retain(|_, debt| debt.left(self.bytes_per_s, now) > 0.0);
+        }
+        let left = debts.get(&client).map_or(0.0, |debt| debt.left(self.bytes_per_s, now));
+        let most = (FREE_S + MAX_WAIT_S) * self.bytes_per_s;
+        debts.insert(client, Debt { bytes: (left + bytes as f64).min(most), at: now });
+    }
+
+    /// How long a client waits until its next body is read; `None` for not at all.
+    #[must_use]
+    pub fn wait(&self, client: ClientId, now: Instant) -> Option<Duration> {
+        let debt = *self.lock().get(&client)?;
+        let beyond = debt.left(self.bytes_per_s, now) - FREE_S * self.bytes_per_s;
+        (beyond > 0.0).then(|| Duration::from_secs_f64(beyond / self.bytes_per_s))
+    }
+}
+
 /// The quotas of a server.
 pub struct Quotas {
+    /// Bodies that were refused, by client.
+    pub refused_bodies: RefusedBodies,
     /// Requests per second of one client.
     pub request_rate: RateLimit,
     /// Requests that are worked on, but for the reserved places.
@@ -292,6 +353,7 @@ impl Quotas {
     pub fn new(limits: &Limits) -> Self {
         let quota = |what, total| Quota::new(what, total, limits.client_share);
         Self {
+            refused_bodies: RefusedBodies::new(limits.refused_bytes_per_s),
             request_rate: RateLimit::new(limits.requests_per_s),
             requests: quota("requests at work", limits.requests.saturating_sub(limits.reserved_requests)),
             reserved_requests: quota("requests at work", limits.reserved_requests),
@@ -417,6 +479,23 @@ mod tests {
         assert_eq!(refused.kind(), ErrorKind::RateLimited);
         let unlimited = RateLimit::new(0);
         assert!((0..1_000).all(|_| unlimited.count(client(1), begin).is_ok()));
+    }
+
+    #[test]
+    fn refused_bodies_make_their_sender_wait() {
+        let bodies = RefusedBodies::new(1_000);
+        let begin = Instant::now();
+        bodies.charge(client(1), 16_000, begin);
+        assert_eq!(bodies.wait(client(1), begin), None, "that much is free");
+        bodies.charge(client(1), 2_000, begin);
+        assert_eq!(bodies.wait(client(1), begin), Some(Duration::from_secs(2)));
+        assert_eq!(bodies.wait(client(1), begin + Duration::from_secs(2)), None);
+        assert_eq!(bodies.wait(client(2), begin), None, "another client");
+        bodies.charge(client(1), u64::MAX, begin);
+        assert_eq!(bodies.wait(client(1), begin), Some(Duration::from_secs_f64(MAX_WAIT_S)));
+        let unlimited = RefusedBodies::new(0);
+        unlimited.charge(client(1), u64::MAX, begin);
+        assert_eq!(unlimited.wait(client(1), begin), None);
     }
 
     #[test]

@@ -1,13 +1,25 @@
 //! Settings and limits: defaults < file < `SIGHTFIX_*` < flags.
 
+mod console;
+mod load;
+mod openid;
+mod origin;
+mod secret;
+mod tls;
+
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
-use crate::domain::{CameraId, Role, SampleOverflow, Scope};
+use crate::domain::SampleOverflow;
+
+pub use console::Console;
+pub use load::Overrides;
+pub use openid::OpenIdSettings;
+pub use secret::{DeclaredConnection, Secret};
+pub use tls::TlsSettings;
 
 /// Everything that can be set.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -35,6 +47,8 @@ pub struct Config {
     pub admin_key_file: Option<PathBuf>,
     /// Encryption of the port.
     pub tls: TlsSettings,
+    /// Sign-in of people by OpenID Connect.
+    pub openid: OpenIdSettings,
     /// Secret of the key that `replay` sends to a server.
     pub api_key: Option<Secret>,
     /// `text` or `json` lines in the log.
@@ -48,81 +62,12 @@ pub struct Config {
     pub training: Workers,
     /// Workers of evaluations.
     pub evaluation: Workers,
+    /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
+    pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
     pub console: Console,
     /// What an outside client may make large.
     pub limits: Limits,
-}
-
-/// Encryption of the port.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TlsSettings {
-    /// File with the server's certificate chain (PEM); plain HTTP without.
-    pub certificate: Option<PathBuf>,
-    /// File with its private key (PEM).
-    pub key: Option<PathBuf>,
-    /// File with the authority of client certificates (PEM); none are asked for without.
-    pub client_ca: Option<PathBuf>,
-    /// What holders of client certificates may do: `viewer` if left out, `edge`, `operator`, `admin`.
-    pub client_role: Option<String>,
-    /// The cameras that the role `edge` is restricted to.
-    pub client_camera_ids: Vec<String>,
-}
-
-impl TlsSettings {
-    /// The files of the certificate and of its key; `None` for plain HTTP.
-    ///
-    /// # Errors
-    /// Names the setting that is missing.
-    pub fn certificate_and_key(&self) -> anyhow::Result<Option<(&Path, &Path)>> {
-        match (&self.certificate, &self.key) {
-            (Some(certificate), Some(key)) => Ok(Some((certificate, key))),
-            (None, None) if self.client_ca.is_none() => Ok(None),
-            _ => anyhow::bail!(
-                "tls.certificate and tls.key must be given together, tls.client_ca only with them"
-            ),
-        }
-    }
-
-    /// What holders of client certificates may do.
-    ///
-    /// # Errors
-    /// Names the setting that cannot be used.
-    pub fn client_scope(&self) -> anyhow::Result<Scope> {
-        let role = self.client_role.as_deref().map_or(Ok(Role::Viewer), str::parse);
-        let role = role.context("the setting tls.client_role")?;
-        let cameras = self.client_camera_ids.iter().map(|id| CameraId::new(id));
-        let cameras = cameras.collect::<Result<_, _>>().context("the setting tls.client_camera_ids")?;
-        Scope::new(role, cameras).context("the setting tls.client_camera_ids")
-    }
-}
-
-/// A setting that is never shown.
-#[derive(Clone, PartialEq, Eq, Deserialize)]
-#[serde(transparent)]
-pub struct Secret(String);
-
-impl Secret {
-    /// The text.
-    #[must_use]
-    pub fn reveal(&self) -> &str {
-        &self.0
-    }
-}
-
-const HIDDEN: &str = "(hidden)";
-
-impl std::fmt::Debug for Secret {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        out.write_str(HIDDEN)
-    }
-}
-
-impl Serialize for Secret {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(HIDDEN)
-    }
 }
 
 /// Form of the log lines.
@@ -143,17 +88,6 @@ pub struct Workers {
     pub workers: usize,
     /// Seconds after which another worker claims the job of a silent one.
     pub lease_s: u32,
-}
-
-/// What the operator's console shows beside the server's own values.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Console {
-    /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
-    /// console asks no other server.
-    pub tile_url: Option<String>,
-    /// What the provider of the tiles asks to be shown on the map.
-    pub tile_attribution: Option<String>,
 }
 
 /// Everything that an outside client can make large has its limit here.
@@ -203,6 +137,13 @@ pub struct Limits {
     pub body_bytes_per_s: u64,
     /// HTTP/2 frames per second and connection that carry neither headers nor data.
     pub control_frames_per_s: u32,
+    /// New connections per second of one address, TLS handshakes included; 0 is no limit.
+    pub connections_per_s: u32,
+    /// Seconds for which an address that flooded a connection is refused new ones; 0 refuses none.
+    pub flood_penalty_s: u64,
+    /// Bytes per second of bodies of one client that are refused for what they contain; beyond, the client waits
+    /// before its next body is read. 0 is no limit.
+    pub refused_bytes_per_s: u32,
     /// Seconds that a request may take, its body included, until its answer begins.
     pub request_s: u64,
     /// Open connections.
@@ -259,6 +200,16 @@ pub struct Limits {
     pub cameras: u32,
     /// Sites; more are refused.
     pub sites: u32,
+    /// Connections with other systems; more are refused.
+    pub outside_connections: u32,
+    /// Bytes of one message of a connection; a larger one is skipped.
+    pub connection_message_bytes: usize,
+    /// Messages of one source that are not settled yet; beyond, no more are read.
+    pub connection_queue: usize,
+    /// Messages of one sink that wait for their receiver; beyond, the oldest is dropped.
+    pub outbox_messages: u32,
+    /// Messages of one sink that were refused or could not be delivered; beyond, the oldest is deleted.
+    pub dead_letters: u32,
     /// Boxes and fixes of one site that wait for its tracker; beyond, they are dropped.
     pub site_queue: usize,
     /// Frames of one site that wait for earlier ones of other cameras; beyond, the oldest is tracked.
@@ -299,30 +250,6 @@ pub struct Limits {
     pub drain_s: u64,
 }
 
-impl Console {
-    /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
-    /// `None` for tiles of this server.
-    #[must_use]
-    pub fn tile_origin(&self) -> Option<&str> {
-        self.tile_url.as_deref().and_then(tile_origin).filter(|origin| !origin.is_empty())
-    }
-}
-
-/// The origin of tiles; empty for a path of this server.
-fn tile_origin(url: &str) -> Option<&str> {
-    if url.starts_with('/') && !url.starts_with("//") { Some("") } else { url_origin(url) }
-}
-
-/// Scheme and host of a URL, which end up in a header.
-fn url_origin(url: &str) -> Option<&str> {
-    let host_at = url.find("://")? + 3;
-    let host = url[host_at..].split('/').next()?;
-    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b".-:[]".contains(&byte);
-    let is_usable =
-        matches!(&url[..host_at], "http://" | "https://") && !host.is_empty() && host.bytes().all(is_plain);
-    is_usable.then(|| &url[..host_at + host.len()])
-}
-
 impl Default for Config {
     fn default() -> Self {
         Self {
@@ -336,12 +263,14 @@ impl Default for Config {
             admin_key: None,
             admin_key_file: None,
             tls: TlsSettings::default(),
+            openid: OpenIdSettings::default(),
             api_key: None,
             log_format: LogFormat::Text,
             log_filter: "info".to_owned(),
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
+            connections: Vec::new(),
             console: Console::default(),
             limits: Limits::default(),
         }
@@ -378,6 +307,9 @@ impl Default for Limits {
             body_grace_s: 20,
             body_bytes_per_s: 500,
             control_frames_per_s: 10_000,
+            connections_per_s: 1_000,
+            flood_penalty_s: 10,
+            refused_bytes_per_s: 1 << 20,
             request_s: 300,
             connections: 10_000,
             streams_per_connection: 256,
@@ -405,6 +337,11 @@ impl Default for Limits {
             truth_line_positions: 1_000,
             cameras: 10_000,
             sites: 1_000,
+            outside_connections: 256,
+            connection_message_bytes: 1 << 20,
+            connection_queue: 1_024,
+            outbox_messages: 100_000,
+            dead_letters: 1_000,
             site_queue: 16_384,
             site_frames: 1_024,
             boxes_per_frame: 256,
@@ -451,143 +388,5 @@ impl Limits {
     #[must_use]
     pub const fn drain_time(&self) -> Duration {
         Duration::from_secs(self.drain_s)
-    }
-}
-
-/// Values from the command line, which win over all others.
-#[derive(Debug, Clone, Default)]
-pub struct Overrides {
-    /// `--data`
-    pub data: Option<PathBuf>,
-    /// `--listen`
-    pub listen: Option<SocketAddr>,
-    /// `--insecure`
-    pub insecure: bool,
-    /// `--admin-key-file`
-    pub admin_key_file: Option<PathBuf>,
-    /// `--tls-cert`
-    pub tls_certificate: Option<PathBuf>,
-    /// `--tls-key`
-    pub tls_key: Option<PathBuf>,
-    /// `--tls-client-ca`
-    pub tls_client_ca: Option<PathBuf>,
-}
-
-impl Config {
-    /// Reads file and environment over the defaults, and lays the flags on top.
-    ///
-    /// Without a path, `sightfix.toml` in the working folder is read if it is there. Nested settings
-    /// are set by two underscores: `SIGHTFIX_LIMITS__BODY_BYTES=65536`.
-    ///
-    /// # Errors
-    /// Names the file or variable with a value that cannot be used, and unknown settings.
-    pub fn load(file: Option<&Path>, overrides: Overrides) -> anyhow::Result<Self> {
-        let source = match file {
-            Some(path) => config::File::from(path).required(true),
-            None => config::File::new("sightfix.toml", config::FileFormat::Toml).required(false),
-        };
-        let environment = config::Environment::with_prefix("SIGHTFIX")
-            .prefix_separator("_")
-            .separator("__")
-            .list_separator(",")
-            .with_list_parse_key("allowed_hosts")
-            .with_list_parse_key("cors_origins")
-            .with_list_parse_key("trusted_proxies")
-            .with_list_parse_key("tls.client_camera_ids")
-            .try_parsing(true);
-        let mut loaded: Self = config::Config::builder()
-            .add_source(source)
-            .add_source(environment)
-            .build()
-            .and_then(config::Config::try_deserialize)
-            .context("cannot read the settings")?;
-        if let Some(data) = overrides.data {
-            loaded.data = data;
-        }
-        if let Some(listen) = overrides.listen {
-            loaded.listen = listen;
-        }
-        for (setting, flag) in [
-            (&mut loaded.admin_key_file, overrides.admin_key_file),
-            (&mut loaded.tls.certificate, overrides.tls_certificate),
-            (&mut loaded.tls.key, overrides.tls_key),
-            (&mut loaded.tls.client_ca, overrides.tls_client_ca),
-        ] {
-            if flag.is_some() {
-                *setting = flag;
-            }
-        }
-        loaded.insecure |= overrides.insecure;
-        loaded.check()?;
-        Ok(loaded)
-    }
-
-    /// The secret of the administrator's key, from the setting itself or the file that it names.
-    ///
-    /// # Errors
-    /// Names the file that cannot be read.
-    pub fn admin_key(&self) -> anyhow::Result<Option<Secret>> {
-        let Some(path) = &self.admin_key_file else { return Ok(self.admin_key.clone()) };
-        let text = std::fs::read_to_string(path)
-            .with_context(|| format!("cannot read the admin key from {}", path.display()))?;
-        Ok(Some(Secret(text.trim().to_owned())))
-    }
-
-    fn check(&self) -> anyhow::Result<()> {
-        let limits = &self.limits;
-        anyhow::ensure!(
-            self.admin_key.is_none() || self.admin_key_file.is_none(),
-            "give admin_key or admin_key_file, not both"
-        );
-        self.tls.certificate_and_key()?;
-        self.tls.client_scope()?;
-        for origin in &self.cors_origins {
-            anyhow::ensure!(
-                url_origin(origin) == Some(origin.as_str()),
-                "cors_origins must be origins like https://maps.example.org, without a path; `{origin}` is none"
-            );
-        }
-        anyhow::ensure!(limits.keys >= 1, "limits.keys must be at least 1");
-        if let Some(url) = &self.console.tile_url {
-            anyhow::ensure!(
-                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
-                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
-            );
-        }
-        anyhow::ensure!(limits.pairings >= 1, "limits.pairings must be at least 1");
-        anyhow::ensure!(
-            limits.reserved_requests < limits.requests,
-            "limits.reserved_requests must be below limits.requests"
-        );
-        anyhow::ensure!(
-            limits.client_share > 0.0 && limits.client_share <= 1.0,
-            "limits.client_share must be above 0 and at most 1"
-        );
-        for (name, seconds) in [
-            ("header_s", limits.header_s),
-            ("idle_s", limits.idle_s),
-            ("body_grace_s", limits.body_grace_s),
-            ("drain_s", limits.drain_s),
-        ] {
-            anyhow::ensure!(seconds >= 1, "limits.{name} must be at least 1");
-        }
-        anyhow::ensure!(limits.control_frames_per_s >= 1, "limits.control_frames_per_s must be at least 1");
-        for (name, workers) in [("training", &self.training), ("evaluation", &self.evaluation)] {
-            anyhow::ensure!(workers.workers >= 1, "{name}.workers must be at least 1");
-            anyhow::ensure!(workers.lease_s >= 3, "{name}.lease_s must be at least 3");
-        }
-        for (name, limit) in [
-            ("site_queue", limits.site_queue),
-            ("site_frames", limits.site_frames),
-            ("boxes_per_frame", limits.boxes_per_frame),
-            ("tracks_per_site", limits.tracks_per_site),
-            ("site_events", limits.site_events),
-        ] {
-            anyhow::ensure!(limit >= 1, "limits.{name} must be at least 1");
-        }
-        anyhow::ensure!(self.limits.page_items >= 1, "limits.page_items must be at least 1");
-        // One active version and the one that a training run adds.
-        anyhow::ensure!(self.limits.models_per_camera >= 2, "limits.models_per_camera must be at least 2");
-        Ok(())
     }
 }

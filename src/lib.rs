@@ -6,9 +6,11 @@
 
 pub mod admission;
 pub mod app;
+pub mod backoff;
 pub mod cli;
 pub mod clock;
 pub mod config;
+pub mod connect;
 pub mod doctor;
 pub mod domain;
 pub mod evaluation;
@@ -19,6 +21,7 @@ pub mod geo;
 pub mod grpc;
 pub mod http;
 pub mod model;
+pub mod openid;
 pub mod paper_experiments;
 pub mod replay;
 pub mod server;

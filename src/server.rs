@@ -8,6 +8,7 @@
 
 mod activity;
 mod connection;
+mod connection_gate;
 mod cors;
 mod credentials;
 mod frame_limit;
@@ -30,12 +31,17 @@ use tokio::net::TcpListener;
 use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
+use crate::connect;
 use crate::domain::{Error, KeySecret};
+use crate::exchange::ConnectionDraft;
+use crate::exchange::wire::parse_document;
+use crate::openid;
 use crate::shutdown::Shutdown;
 use crate::store::{Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
 use crate::worker;
 
+use connection_gate::ConnectionGate;
 use host_check::HostCheck;
 use pipeline::RequestPipeline;
 use proxies::TrustedProxies;
@@ -101,7 +107,11 @@ impl Server {
         if tls.as_ref().is_some_and(|tls| tls.takes_client_certificates()) {
             app.access.close();
         }
+        if let Some(provider) = openid::Provider::new(&config.openid)? {
+            app.access.use_openid(provider);
+        }
         prepare_access(&app, &config).await?;
+        declare_connections(&app, &config).await?;
         let listener = connection::listen(config.listen)
             .with_context(|| format!("cannot listen on {}", config.listen))?;
         let monitoring = config.metrics_listen.map(|address| {
@@ -160,19 +170,23 @@ impl Server {
         let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
         shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
         shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
+        shutdown.spawn(connect::run(app.clone(), shutdown.clone()));
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
         let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
         let cors = cors::layer(&config.cors_origins);
+        let gate = ConnectionGate::new(&config.limits, proxies.clone());
         let pipeline = RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, &shutdown);
         let pipeline = Arc::new(pipeline);
         let monitored = async {
             let Some(listener) = monitoring else { return anyhow::Ok(()) };
             let hosts = HostCheck::new(&config.allowed_hosts, &[], listener.local_addr()?);
             let pipeline = Arc::new(RequestPipeline::monitoring(app.clone(), hosts, &shutdown));
-            connection::accept(listener, pipeline, None, &config.limits, &shutdown).await;
+            let monitoring = connection::Acceptor { pipeline, tls: None, gate: None };
+            monitoring.accept(listener, &config.limits, &shutdown).await;
             Ok(())
         };
-        let served = connection::accept(listener, pipeline, tls, &config.limits, &shutdown);
+        let clients = connection::Acceptor { pipeline, tls, gate: Some(gate) };
+        let served = clients.accept(listener, &config.limits, &shutdown);
         let (monitored, ()) = tokio::join!(monitored, served);
         monitored?;
         tracing::info!("shutting down");
@@ -183,6 +197,18 @@ impl Server {
         tracing::info!("shut down");
         Ok(())
     }
+}
+
+/// Stores the connections of the settings. Those that are not declared any more stay.
+async fn declare_connections(app: &App, config: &Config) -> anyhow::Result<()> {
+    for (index, declared) in config.connections.iter().enumerate() {
+        let declare = async {
+            let draft: ConnectionDraft = parse_document(&declared.json().map_err(Error::fault)?)?;
+            app.declare_connection(draft.try_into()?).await
+        };
+        declare.await.with_context(|| format!("the setting connections[{index}]"))?;
+    }
+    Ok(())
 }
 
 /// Stores the administrator's key of the settings, and refuses to serve everybody by an oversight.

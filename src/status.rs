@@ -30,6 +30,7 @@ mod code {
     pub(super) const RESOURCE_EXHAUSTED: i32 = 8;
     pub(super) const FAILED_PRECONDITION: i32 = 9;
     pub(super) const ABORTED: i32 = 10;
+    pub(super) const OUT_OF_RANGE: i32 = 11;
     pub(super) const UNIMPLEMENTED: i32 = 12;
     pub(super) const INTERNAL: i32 = 13;
     pub(super) const UNAVAILABLE: i32 = 14;
@@ -42,10 +43,12 @@ pub fn of(kind: ErrorKind) -> Status {
     use ErrorKind as Kind;
     let (http, grpc, title) = match kind {
         Kind::InvalidArgument => (422, code::INVALID_ARGUMENT, "A field has a value that cannot be used"),
+        Kind::InvalidQuery => (400, code::INVALID_ARGUMENT, "A parameter has a value that cannot be used"),
         Kind::MalformedBody => (400, code::INVALID_ARGUMENT, "The body is not of its format"),
         Kind::UnsupportedMediaType => (415, code::INVALID_ARGUMENT, "The content type is not read here"),
         Kind::NotAcceptable => (406, code::INVALID_ARGUMENT, "None of the accepted types is written here"),
         Kind::TooLarge => (413, code::RESOURCE_EXHAUSTED, "The request is beyond a limit"),
+        Kind::RangeNotSatisfiable => (416, code::OUT_OF_RANGE, "The range is behind the end"),
         Kind::RouteNotFound => (404, code::UNIMPLEMENTED, "There is no such path"),
         Kind::MethodNotAllowed => (405, code::UNIMPLEMENTED, "The path does not know this method"),
         Kind::CameraNotFound => (404, code::NOT_FOUND, "There is no such camera"),
@@ -58,6 +61,11 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::SiteNotFound => (404, code::NOT_FOUND, "There is no such site"),
         Kind::SiteExists => (409, code::ALREADY_EXISTS, "A site of that id exists already"),
         Kind::SiteInUse => (409, code::FAILED_PRECONDITION, "The site has cameras"),
+        Kind::ConnectionNotFound => (404, code::NOT_FOUND, "There is no such connection"),
+        Kind::ConnectionExists => (409, code::ALREADY_EXISTS, "A connection of that id exists already"),
+        Kind::ConnectionNotReceiving => {
+            (409, code::FAILED_PRECONDITION, "The connection takes no messages now")
+        }
         Kind::RevisionMismatch => (412, code::ABORTED, "The resource was changed in the meantime"),
         Kind::RevisionRequired => {
             (428, code::FAILED_PRECONDITION, "The change needs the revision it is based on")
@@ -74,7 +82,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ModelActive => (409, code::FAILED_PRECONDITION, "The model version is the active one"),
         Kind::InsufficientStorage => (507, code::RESOURCE_EXHAUSTED, "There is no space to store it"),
         Kind::NotIdentifiable => {
-            (422, code::FAILED_PRECONDITION, "Whose fixes belong to whose boxes cannot be told")
+            (422, code::FAILED_PRECONDITION, "Boxes and fixes cannot be associated with confidence")
         }
         Kind::UnusableSamples => (422, code::FAILED_PRECONDITION, "The samples cannot support a fit"),
         Kind::Cancelled => (499, code::CANCELLED, "The request was cancelled"),
@@ -84,6 +92,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
         Kind::Unauthenticated => (401, code::UNAUTHENTICATED, "The request needs a key that works"),
         Kind::PermissionDenied => (403, code::PERMISSION_DENIED, "The key may not do this"),
+        Kind::SignInUnavailable => (502, code::UNAVAILABLE, "The OpenID provider gave no usable answer"),
         Kind::HostNotAllowed => (421, code::PERMISSION_DENIED, "The server does not answer for this host"),
         Kind::OriginNotAllowed => {
             (403, code::PERMISSION_DENIED, "A page of another origin asked for a change")

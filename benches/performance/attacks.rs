@@ -32,18 +32,19 @@ pub(crate) fn run() {
     idle_connections();
 }
 
-/// A connection from an address of its own, so that limits tell attackers from the measured client.
-async fn connect(server: SocketAddr) -> Option<TcpStream> {
+/// A connection from an address of the attack's own, so that limits tell attackers from the measured client, and one
+/// attack from the next.
+async fn connect(server: SocketAddr, attack: u8) -> Option<TcpStream> {
     let socket = TcpSocket::new_v4().ok()?;
-    socket.bind(SocketAddr::from(([127, 0, 0, 2], 0))).ok()?;
+    socket.bind(SocketAddr::from(([127, 0, 0, 2 + attack], 0))).ok()?;
     socket.connect(server).await.ok()
 }
 
 /// An attacker's connection, begun again whenever the server closes it. What the server writes is read, or the
 /// connection would stall for that.
-async fn attack_forever(server: SocketAddr, begin: Vec<u8>, flood: Vec<u8>) {
+async fn attack_forever(server: SocketAddr, attack: u8, begin: Vec<u8>, flood: Vec<u8>) {
     loop {
-        let Some(stream) = connect(server).await else { continue };
+        let Some(stream) = connect(server, attack).await else { continue };
         let (mut read, mut write) = stream.into_split();
         if write.write_all(&begin).await.is_err() {
             continue;
@@ -106,12 +107,12 @@ fn beside_attacks() {
     let path = format!("/v1/cameras/{}/fusions", served.camera);
     let request = load::post(&path, "application/json", &request_body(&served.observations[..1]));
     let rate = || runtime.block_on(load::send(served.address, &request, EACH)).0;
-    for (name, connections, begin, flood) in attacks(served.camera.as_str()) {
+    for (attack, (name, connections, begin, flood)) in (0_u8..).zip(attacks(served.camera.as_str())) {
         let attacked = || {
             let mut attackers = JoinSet::new();
             for _ in 0..connections {
-                attackers
-                    .spawn_on(attack_forever(served.address, begin.clone(), flood.clone()), runtime.handle());
+                let attacker = attack_forever(served.address, attack, begin.clone(), flood.clone());
+                attackers.spawn_on(attacker, runtime.handle());
             }
             std::thread::sleep(Duration::from_millis(300));
             rate()
@@ -210,8 +211,13 @@ fn resident_bytes() -> f64 {
 /// The clients' ends are plain descriptors, whose memory is the kernel's.
 fn idle_connections() {
     let runtime = runtime();
-    let limits =
-        Limits { connections: 2 * IDLE_CONNECTIONS, client_share: 1.0, idle_s: 3_600, ..Limits::default() };
+    let limits = Limits {
+        connections: 2 * IDLE_CONNECTIONS,
+        connections_per_s: 0,
+        client_share: 1.0,
+        idle_s: 3_600,
+        ..Limits::default()
+    };
     let served = runtime.block_on(Served::start_limited(1, limits));
     println!("\n## Idle connections, each after one request\n");
     println!("| connections | bytes of resident memory each |");

@@ -6,6 +6,7 @@
 mod attacks;
 mod beside;
 mod fuse;
+mod guarded;
 mod import;
 mod load;
 mod ratio;
@@ -22,7 +23,7 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
-    let parts: [(&str, fn()); 9] = [
+    let parts: [(&str, fn()); 10] = [
         ("fuse", fuse::run),
         ("http", transports::http),
         ("grpc", transports::grpc),
@@ -32,6 +33,7 @@ fn main() {
         ("world", world::run),
         ("beside", beside::run),
         ("attacks", attacks::run),
+        ("guarded", guarded::run),
     ];
     for (name, part) in parts {
         if wanted.is_empty() || wanted.iter().any(|wish| wish == name) {

@@ -33,9 +33,15 @@ impl Served {
 
     /// Starts with these limits.
     pub(crate) async fn start_limited(workers: usize, limits: Limits) -> Self {
+        Self::start_configured(workers, |config| config.limits = limits).await
+    }
+
+    /// Starts with settings that a function changes.
+    pub(crate) async fn start_configured(workers: usize, configure: impl FnOnce(&mut Config)) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
-        let mut config = Config { data: folder.path().to_owned(), limits, ..Config::default() };
+        let mut config = Config { data: folder.path().to_owned(), ..Config::default() };
         config.listen.set_port(0);
+        configure(&mut config);
         config.training.workers = workers;
         let server = Server::bind(config, Clock::system(), Randomness::seeded(1)).await.expect("a free port");
         let (app, address, shutdown) =

@@ -4,6 +4,7 @@ import { guessMapping, isRejected, mapRow, missingFields, outputColumns, parseTa
 import { curlLine, grpcurlLine } from '../src/lib/request_lines';
 import { sigmaOf, walkCsv } from '../src/walk/queue';
 import cases from '../../tests/cases/column_mapping.json' with { type: 'json' };
+import lineCases from '../../tests/cases/csv_lines.json' with { type: 'json' };
 
 interface Case {
   name: string;
@@ -48,17 +49,24 @@ test('Unix times and a file without targets', () => {
   expect([boxes.kind, boxes.targetId]).toEqual(['detections', 'target-1']);
 });
 
-test('quotes may hold separators and line ends, and lines are counted through them', () => {
-  const table = parseTable('time,class\n"a\nb","say ""hi"", twice"\nc,d\n');
-  expect(table.rows).toEqual([
-    { line: 2, cells: ['a\nb', 'say "hi", twice'] },
-    { line: 4, cells: ['c', 'd'] },
-  ]);
+test('lines are split as the importer splits them', () => {
+  for (const { name, csv, accepted, rejected } of lineCases) {
+    const { rows } = parseTable(csv);
+    expect(rows.filter(({ problem }) => !problem).map(({ line }) => line), name).toEqual(accepted);
+    expect(rows.flatMap(({ line, problem }) => (problem ? [{ line, reason: problem }] : [])), name).toEqual(rejected);
+  }
+  const quoted = parseTable('time,class\na,"say ""hi"", twice"\n');
+  expect(quoted.rows).toEqual([{ line: 2, cells: ['a', 'say "hi", twice'] }]);
+});
+
+test('a line that cannot be split is rejected in the preview', () => {
+  const table = parseTable('time,id,left,top,width,height\n2026-01-01T00:00:00Z,"a,1,2,3,4\n');
+  expect(mapRow(table.rows[0]!, guessMapping(table), undefined)).toEqual({ line: 2, field: '', reason: 'has an unclosed quote; a field cannot continue on the next line' });
 });
 
 test('a cell that is no number is rejected with its field', () => {
   const table = parseTable('time,id,left,top,width,height\n2026-01-01T00:00:00Z,a,1,2,wide,4\n');
-  expect(mapRow(table.rows[0]!, guessMapping(table), undefined)).toEqual({ line: 2, field: 'width', reason: "'wide' is not a number" });
+  expect(mapRow(table.rows[0]!, guessMapping(table), undefined)).toEqual({ line: 2, field: 'width', reason: 'must be a number, not `wide`' });
 });
 
 test('the lines for a shell are quoted', () => {
@@ -66,6 +74,7 @@ test('the lines for a shell are quoted', () => {
   expect(curlLine('http://h:8080', 'c', observation)).toBe(`curl -s http://h:8080/v1/cameras/c/fusions --json '{"time":"2026-01-01T00:00:00Z'\\''","fix":{"longitude_deg":11,"latitude_deg":48}}'`);
   expect(grpcurlLine('http://h:8080', 'c', observation)).toMatch(/^grpcurl -plaintext -d '.*' h:8080 sightfix\.v1\.FusionService\/Fuse$/);
   expect(grpcurlLine('https://h', 'c', observation)).toMatch(/^grpcurl -d .* h:443 /);
+  for (const line of [curlLine('http://h', 'c', observation, true), grpcurlLine('http://h', 'c', observation, true)]) expect(line).toContain(' -H "authorization: Bearer $SIGHTFIX_KEY" ');
 });
 
 test('a walk is saved in the columns of the importer', () => {

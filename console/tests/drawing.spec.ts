@@ -1,26 +1,11 @@
 // What the drawing functions draw, by what they ask of a canvas.
 import { expect, test } from '@playwright/test';
-import { drawEllipse, drawPolygon, drawTrail, ellipseOf, rampColor, type Context } from '../src/lib/draw';
+import { drawEllipse, drawPolygon, drawTrail, ellipseOf, rampColor, type Palette } from '../src/lib/draw';
+import { drawScatter } from '../src/lib/scatter';
 import { roundLength, toPlane, toPosition } from '../src/lib/geo';
-import { coverageOf, footOf, imageSizeOf } from '../src/lib/image';
-
-type Call = [name: string, ...values: unknown[]];
-
-/** A canvas that writes down what it is asked for. */
-function recorder(): { context: Context; calls: Call[]; alphas: number[] } {
-  const calls: Call[] = [];
-  const alphas: number[] = [];
-  const target: Record<string, unknown> = {};
-  const context = new Proxy(target, {
-    get: (_, name: string) => (name in target ? target[name] : (...values: unknown[]) => calls.push([name, ...values])),
-    set: (_, name: string, value) => {
-      if (name === 'globalAlpha') alphas.push(value as number);
-      target[name] = value;
-      return true;
-    },
-  });
-  return { context: context as unknown as Context, calls, alphas };
-}
+import { coverageOf, emptyNinths, footOf, imageSizeOf } from '../src/lib/image';
+import { drawVectorTile } from '../src/lib/vector_tile';
+import { recorder } from './recorder';
 
 test('an ellipse has the axes and the angle of its covariance', () => {
   // Standard deviations 3 m along 30 degrees from east, 1 m across.
@@ -80,4 +65,54 @@ test('the ramp goes from cold to hot and stays inside', () => {
   expect(rampColor(-1)).toBe(rampColor(0));
   expect(rampColor(2)).toBe(rampColor(1));
   expect(rampColor(0)).not.toBe(rampColor(1));
+});
+
+test('the ninths without foot points are named', () => {
+  const size = { width_px: 300, height_px: 300 };
+  const points = [0, 1, 2].flatMap((column) => [0, 1].flatMap((row) => Array.from({ length: 6 }, () => ({ foot: { x: column * 100 + 50, y: row * 100 + 50 } }))));
+  // One foot point alone does not cover a ninth; one beyond the border belongs to the nearest.
+  expect(emptyNinths([...points, { foot: { x: 150, y: 310 } }], size)).toEqual(['lowerLeft', 'lower', 'lowerRight']);
+  expect(emptyNinths([], size)).toHaveLength(9);
+});
+
+test('a scatter plot shows every position at its place, the truth, and some radii', () => {
+  const { context, calls } = recorder();
+  const at = (north_m: number): { longitude_deg: number; latitude_deg: number } => ({ longitude_deg: 11, latitude_deg: 48 + north_m / 111_319.490793 });
+  const positions = Array.from({ length: 100 }, (_, index) => ({ ...at(10), error_m: 10, ...(index < 50 ? { r95_m: 5 } : {}) }));
+  const colors = new Proxy({}, { get: (_, name: string) => name }) as Palette;
+  const square = { reference: at(0), centre: { east_m: 0, north_m: 0 }, side_m: 40 };
+  drawScatter(context, colors, { width: 200, height: 200 }, { positions, truth: { points: [at(0)], isLine: false }, square, color: 'fused' });
+  const circles = calls.filter(([name]) => name === 'arc');
+  expect(circles).toHaveLength(101);
+  // 10 m north at 5 px/m: 50 px above the middle.
+  expect(circles[0]!.slice(1, 3).map((value) => Math.round((value as number) * 1000) / 1000)).toEqual([100, 50]);
+  expect(circles.at(-1)!.slice(1, 3)).toEqual([100, 100]);
+  const radii = calls.filter(([name]) => name === 'ellipse').map(([, , , a]) => Math.round(a as number));
+  expect(radii).toEqual(new Array(7).fill(25));
+});
+
+test('a vector tile is drawn from the ground up, ways as wide as they are', () => {
+  const { context, calls } = recorder();
+  const layer = (type: number, properties: Record<string, unknown>): { length: number; extent: number; feature: () => { type: number; properties: Record<string, unknown>; loadGeometry: () => { x: number; y: number }[][] } } => ({
+    length: 1,
+    extent: 4096,
+    feature: () => ({ type, properties, loadGeometry: () => [[{ x: 0, y: 0 }, { x: 4096, y: 0 }, { x: 4096, y: 4096 }]] }),
+  });
+  const layers = { buildings: layer(3, {}), roads: layer(2, { kind: 'major_road' }), pois: layer(1, {}), water: layer(3, {}), landuse: layer(3, { kind: 'park' }) };
+  const widths: number[] = [];
+  const fills: string[] = [];
+  const watched = new Proxy(context, {
+    set: (target, name, value) => {
+      if (name === 'lineWidth') widths.push(value as number);
+      if (name === 'fillStyle') fills.push(value as string);
+      return Reflect.set(target, name, value);
+    },
+  });
+  drawVectorTile(watched, { layers }, { water: 'water', green: 'green', building: 'building', road: 'road' }, { x: -256, y: 0, size_px: 512, px_per_m: 2 });
+  expect(fills).toEqual(['green', 'water', 'building']);
+  expect(widths).toEqual([20]);
+  expect(calls.filter(([name]) => name === 'moveTo')).toEqual(new Array(4).fill(['moveTo', -256, 0]));
+  expect(calls.filter(([name]) => name === 'lineTo').slice(0, 2)).toEqual([['lineTo', 256, 0], ['lineTo', 256, 512]]);
+  // Polygons are closed, ways are not.
+  expect(calls.filter(([name]) => name === 'closePath')).toHaveLength(3);
 });

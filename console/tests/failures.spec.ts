@@ -112,10 +112,28 @@ test('a run is cancelled, and the next may start', async ({ console: page, serve
   await expect(page.getByRole('button', { name: 'Start training' })).toBeEnabled();
 });
 
-test.describe('a database that is full', () => {
+test.describe('a disk that is full', () => {
+  test.use({ disk: '32m', settings: { SIGHTFIX_LIMITS__RESERVE_BYTES: '0' }, allowed: /507/ });
+
+  test('refuses the import, and takes it again once there is room', async ({ console: page, server }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate' });
+    await page.goto(`${server.url}/#/cameras/gate/data`);
+    await page.locator('input[type=file]').setInputFiles({ name: 'walk.csv', mimeType: 'text/csv', buffer: Buffer.from(simulate(2, [0, 0], 3000).csv) });
+    server.fillDisk();
+    await page.getByRole('button', { name: 'Import', exact: true }).click();
+    await expect(page.getByRole('alert')).toContainText(/disk|space/);
+    // What was chosen is still there.
+    server.emptyDisk();
+    await page.getByRole('button', { name: 'Import', exact: true }).click();
+    await expect(page.getByText('0 rows rejected')).toBeVisible();
+    expect((await server.request<{ count: number }>('GET', '/v1/cameras/gate/samples/count')).count).toBe(3000);
+  });
+});
+
+test.describe('a camera that holds all that it may', () => {
   test.use({ settings: { SIGHTFIX_LIMITS__SAMPLES_PER_CAMERA: '100' }, allowed: /507/ });
 
-  test('refuses the import with the remedy', async ({ console: page, server }) => {
+  test('refuses the import, and names the limit', async ({ console: page, server }) => {
     await server.request('POST', '/v1/cameras', { id: 'gate' });
     await page.goto(`${server.url}/#/cameras/gate/data`);
     await page.locator('input[type=file]').setInputFiles({ name: 'many.csv', mimeType: 'text/csv', buffer: Buffer.from(simulate(2).csv) });

@@ -7,6 +7,8 @@ import { Server } from './server';
 interface Fixtures {
   /** Settings of the test's server, from the environment. */
   settings: Record<string, string>;
+  /** Size of the disk that its data folder has for itself; none if empty. */
+  disk: string;
   server: Server;
   /** Console errors that the test provokes on purpose. */
   allowed: RegExp;
@@ -16,8 +18,9 @@ interface Fixtures {
 export const test = base.extend<Fixtures>({
   settings: [{}, { option: true }],
   allowed: [/^$/, { option: true }],
-  server: async ({ settings }, use) => {
-    const server = await Server.start(settings);
+  disk: ['', { option: true }],
+  server: async ({ settings, disk }, use) => {
+    const server = await Server.start(settings, disk);
     await use(server);
     await server.stop();
   },
@@ -27,6 +30,8 @@ export const test = base.extend<Fixtures>({
       if (!allowed.test(text)) faults.push(text);
     };
     page.on('console', (message) => {
+      // The tests' own reading of what a canvas shows.
+      if (message.text().includes('willReadFrequently')) return;
       if (message.type() === 'error' || message.type() === 'warning') report(`${message.type()}: ${message.text()}`);
     });
     page.on('pageerror', (error) => report(`uncaught: ${error.message}`));

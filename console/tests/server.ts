@@ -1,6 +1,6 @@
 // The real binary on a data folder of its own.
-import { spawn, type ChildProcess } from 'node:child_process';
-import { mkdtempSync, rmSync } from 'node:fs';
+import { execFileSync, spawn, type ChildProcess } from 'node:child_process';
+import { closeSync, mkdtempSync, openSync, rmSync, writeSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { join, resolve } from 'node:path';
 import { createInterface } from 'node:readline';
@@ -10,6 +10,8 @@ export const BINARY = resolve(process.env.SIGHTFIX ?? '../target/debug/sightfix'
 export class Server {
   readonly #folder = mkdtempSync(join(tmpdir(), 'sightfix-console-'));
   readonly #settings: Record<string, string>;
+  /** Whether the data folder is a disk of its own. */
+  #hasDisk = false;
   #process: ChildProcess | undefined;
   url = '';
 
@@ -17,8 +19,13 @@ export class Server {
     this.#settings = settings;
   }
 
-  static async start(settings: Record<string, string> = {}): Promise<Server> {
+  /** `disk` is the size of a disk of its own for the data folder, such as `24m`; mounting it needs the superuser. */
+  static async start(settings: Record<string, string> = {}, disk = ''): Promise<Server> {
     const server = new Server(settings);
+    if (disk) {
+      execFileSync('mount', ['-t', 'tmpfs', '-o', `size=${disk}`, 'tmpfs', server.#folder]);
+      server.#hasDisk = true;
+    }
     await server.run('127.0.0.1:0');
     return server;
   }
@@ -60,8 +67,23 @@ export class Server {
     await this.run(new URL(this.url).host);
   }
 
+  /** Writes a file beside the data until nothing more fits. */
+  fillDisk(): void {
+    const file = openSync(join(this.#folder, 'filler'), 'w');
+    try {
+      for (const block of [Buffer.alloc(1 << 20), Buffer.alloc(4096)]) while (fits(file, block));
+    } finally {
+      closeSync(file);
+    }
+  }
+
+  emptyDisk(): void {
+    rmSync(join(this.#folder, 'filler'));
+  }
+
   async stop(): Promise<void> {
     await this.kill();
+    if (this.#hasDisk) execFileSync('umount', [this.#folder]);
     rmSync(this.#folder, { recursive: true, force: true });
   }
 
@@ -86,5 +108,15 @@ export class Server {
       if (run.state !== 'queued' && run.state !== 'running') throw new Error(`${run.state}: ${run.outcome}`);
       await new Promise((done) => setTimeout(done, 200));
     }
+  }
+}
+
+/** Writes a block; false if the disk has no room for it. */
+function fits(file: number, block: Buffer): boolean {
+  try {
+    return writeSync(file, block) === block.length;
+  } catch (error) {
+    if ((error as NodeJS.ErrnoException).code === 'ENOSPC') return false;
+    throw error;
   }
 }

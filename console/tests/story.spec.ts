@@ -1,4 +1,5 @@
 // What an operator does with a new camera, from the drop of a file to live targets.
+import { execFileSync } from 'node:child_process';
 import { existsSync, readFileSync } from 'node:fs';
 import { resolve } from 'node:path';
 import { distance_m, toPlane } from '../src/lib/geo';
@@ -56,6 +57,10 @@ test('the real square: drop, map, train, look, try, live', async ({ console: pag
   await page.getByRole('link', { name: 'Try it' }).click();
   await expect(page.getByText('with 95 % probability')).toBeVisible();
   await expect(page.getByText('sightfix.v1.FusionService/Fuse')).toBeVisible();
+  // The line for a shell gives the answer that the page shows.
+  const command = (await page.locator('pre', { hasText: /^curl / }).textContent())!;
+  const { items } = JSON.parse(execFileSync('sh', ['-c', command], { encoding: 'utf8' })) as { items: FusedFix[] };
+  await expect(page.locator('.position')).toHaveText(`${items[0]!.fused.latitude_deg.toFixed(7)}, ${items[0]!.fused.longitude_deg.toFixed(7)}`);
 
   await page.getByRole('link', { name: 'Live', exact: true }).click();
   await expect(page.getByRole('status').getByText('Live')).toBeVisible();

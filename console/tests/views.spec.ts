@@ -3,7 +3,8 @@ import { mkdirSync } from 'node:fs';
 import { resolve } from 'node:path';
 import type { Page } from '@playwright/test';
 import { accessibilityFindings, expect, test } from './fixtures';
-import { addCamera, rowsOf, simulate, walk } from './world';
+import { stillOf } from './still';
+import { addCamera, rowsOf, simulate, walk, type SimulatedCamera } from './world';
 import type { Server } from './server';
 
 /** Pictures for the documentation are taken on request, so that a run of the tests changes no file. */
@@ -30,26 +31,41 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
   ['profile', '#/cameras/north-gate/profile', (page) => expect(page.getByText('north-gate').first()).toBeVisible()],
   ['settings', '#/settings/health', (page) => expect(page.getByText('/metrics')).toBeVisible()],
   ['keys', '#/settings/keys', (page) => expect(page.locator('main .panel')).toBeVisible()],
+  ['audit', '#/settings/audit', (page) => expect(page.locator('main tbody tr').first()).toBeVisible()],
   ['limits', '#/settings/limits', (page) => expect(page.getByText('page_items')).toBeVisible()],
   ['walk', 'walk#camera=north-gate&receiver=phone-1', (page) => expect(page.locator('.record')).toBeVisible()],
 ];
 
+interface Town {
+  /** The world of the camera that is looked at. */
+  world: SimulatedCamera;
+  stop: () => void;
+}
+
 /** A town with trained cameras, one without samples, one ready to train, and an evaluation. */
-async function buildTown(server: Server): Promise<() => void> {
+async function buildTown(server: Server): Promise<Town> {
   const town = PICTURES ? TOWN : TOWN.slice(0, 1);
   const worlds = town.map(([, , , east, north], at) => simulate(at + 1, [east, north], 300));
   for (const [at, [id, name, site]] of town.entries()) await addCamera(server, id, name, worlds[at]!, { site });
+  if (PICTURES) await server.train('north-gate', { recipe: 'hybrid', epochs: 60, seed: 1 });
   await server.request('POST', '/v1/cameras', { id: 'roof-east', display_name: 'Roof east', labels: { site: 'roof' } });
   await server.request('POST', '/v1/cameras', { id: 'car-park', display_name: 'Car park', labels: { site: 'parking' } });
   await server.request('POST', '/v1/cameras/car-park/samples', worlds[0]!.csv, 'text/csv');
   const { id } = await server.request<{ id: string }>('POST', '/v1/evaluations', {
     camera_id: 'north-gate',
     methods: ['gnss', 'imm_ukf', 'homography.denied', ...(PICTURES ? ['projective.two_step'] : [])],
-    ...(worlds[0]!.csv.includes('truth') ? {} : { truth_point: rowsOf(worlds[0]!.csv)[0]!.fix }),
   });
   await expect.poll(async () => (await server.request<{ state: string }>('GET', `/v1/evaluations/${id}`)).state, { timeout: 600_000 }).toBe('succeeded');
   const stops = town.slice(0, 3).map(([camera], at) => walk(server, camera, worlds[at]!.live));
-  return () => stops.forEach((stop) => stop());
+  return { world: worlds[0]!, stop: () => stops.forEach((stop) => stop()) };
+}
+
+/** A still image behind the foot points of the camera that is looked at. */
+async function setStill(page: Page, server: Server, { csv }: SimulatedCamera): Promise<void> {
+  const buffer = await stillOf(page, rowsOf(csv), { width_px: 1280, height_px: 720 });
+  await page.goto(`${server.url}/#/cameras/north-gate/scene`);
+  await page.locator('.still input').setInputFiles({ name: 'still.png', mimeType: 'image/png', buffer });
+  await expect(page.getByText('The image stays in this browser.')).toBeVisible();
 }
 
 async function look(page: Page, server: Server, path: string, ready: (page: Page) => Promise<void>): Promise<void> {
@@ -60,12 +76,14 @@ async function look(page: Page, server: Server, path: string, ready: (page: Page
 
 test('every view is accessible, fits and can be shown', async ({ console: page, server }) => {
   test.setTimeout(1_200_000);
-  const stop = await buildTown(server);
+  const { world, stop } = await buildTown(server);
+  if (PICTURES) await setStill(page, server, world);
   // Trails grow while other views are looked at.
   for (const theme of ['dark', 'light'] as const) {
     await page.emulateMedia({ colorScheme: theme, reducedMotion: 'reduce' });
     for (const [name, path, ready] of VIEWS) {
-      await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: 900 });
+      const isLong = PICTURES && /^(evaluation|models)$/.test(name);
+      await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: isLong ? 1300 : 900 });
       await look(page, server, path, ready);
       expect.soft(await accessibilityFindings(page), `${name}, ${theme}`).toEqual([]);
       if (PICTURES) {

@@ -10,6 +10,7 @@ export interface Row {
   target_id: string;
   box: { left_px: number; top_px: number; width_px: number; height_px: number };
   fix?: { longitude_deg: number; latitude_deg: number };
+  truth?: { longitude_deg: number; latitude_deg: number };
 }
 
 export interface SimulatedCamera {
@@ -29,6 +30,7 @@ export function rowsOf(csv: string): Row[] {
       time: cell('time'),
       target_id: cell('target_id'),
       box: { left_px: number('left'), top_px: number('top'), width_px: number('width'), height_px: number('height') },
+      ...(cell('truth_longitude') ? { truth: { longitude_deg: number('truth_longitude'), latitude_deg: number('truth_latitude') } } : {}),
       ...(cell('longitude') ? { fix: { longitude_deg: number('longitude'), latitude_deg: number('latitude') } } : {}),
     };
   });

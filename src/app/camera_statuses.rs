@@ -20,6 +20,14 @@ pub struct CameraStatus {
 }
 
 impl App {
+    /// What happens in the view of a stored camera, and its model; without its latest run.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn camera_status(&self, id: &CameraId) -> Result<CameraStatus> {
+        Ok(self.status_of(self.store.camera(id).await?, None))
+    }
+
     /// Statuses of cameras by id, from behind a cursor on.
     ///
     /// # Errors
@@ -30,15 +38,17 @@ impl App {
         limit: u32,
     ) -> Result<Page<CameraStatus, CameraId>> {
         let cameras = self.store.cameras_with_latest_run(after, limit + 1).await?;
-        let statuses = cameras.into_iter().map(|(camera, latest_run)| {
-            let active = self.registry.get(camera.id());
-            CameraStatus {
-                model_summary: active.as_ref().and_then(|active| active.model_summary.clone()),
-                activity: active.map_or_else(CameraActivity::default, |active| self.activity(&active)),
-                camera,
-                latest_run,
-            }
-        });
+        let statuses = cameras.into_iter().map(|(camera, latest_run)| self.status_of(camera, latest_run));
         Ok(page_of(statuses.collect(), limit, |status| status.camera.id().clone()))
+    }
+
+    fn status_of(&self, camera: Camera, latest_run: Option<(RunId, JobState)>) -> CameraStatus {
+        let active = self.registry.get(camera.id());
+        CameraStatus {
+            model_summary: active.as_ref().and_then(|active| active.model_summary.clone()),
+            activity: active.map_or_else(CameraActivity::default, |active| self.activity(&active)),
+            camera,
+            latest_run,
+        }
     }
 }

@@ -3,6 +3,7 @@
 use super::access::{Access, Principal, SessionToken};
 use super::{App, Page, page_of};
 use crate::domain::{ApiKey, Error, ErrorKind, KeyId, KeySecret, NewKey, Result, Role, Scope};
+use crate::openid::{Provider, SignInSecret};
 
 /// Name of the key that the settings give.
 const ADMIN_KEY_NAME: &str = "admin key of the settings";
@@ -90,6 +91,39 @@ impl App {
         let token = SessionToken::generate(|bytes| self.randomness.fill(bytes));
         let principal = self.access.start_session(secret, &token, self.clock.now())?;
         Ok((token, principal))
+    }
+
+    /// Begins the sign-in of a person: a secret for their browser, and where it is sent.
+    ///
+    /// # Errors
+    /// `RouteNotFound` where the settings name no provider; what
+    /// [`Provider::authorization_url`] refuses.
+    pub async fn begin_sign_in(&self) -> Result<(SignInSecret, String)> {
+        let secret = SignInSecret::generate(|bytes| self.randomness.fill(bytes));
+        let url = self.openid()?.authorization_url(&secret, self.clock.now()).await?;
+        Ok((secret, url))
+    }
+
+    /// Starts a session for a person who comes back from the provider with a code.
+    ///
+    /// # Errors
+    /// As [`App::begin_sign_in`]; what [`Provider::identity`] refuses.
+    pub async fn finish_sign_in(
+        &self,
+        secret: &SignInSecret,
+        state: &str,
+        code: &str,
+    ) -> Result<SessionToken> {
+        let identity = self.openid()?.identity(secret, state, code, self.clock.now()).await?;
+        tracing::info!(user = identity.name, role = %identity.scope.role(), "a person has signed in");
+        let token = SessionToken::generate(|bytes| self.randomness.fill(bytes));
+        self.access.start_user_session(identity, &token, self.clock.now());
+        Ok(token)
+    }
+
+    fn openid(&self) -> Result<&Provider> {
+        let missing = || Error::refused(ErrorKind::RouteNotFound, "sign-in by OpenID Connect is not set up");
+        self.access.openid().ok_or_else(missing)
     }
 }
 

@@ -9,9 +9,11 @@ pub mod access;
 mod audit;
 mod camera_statuses;
 mod cameras;
+mod connections;
 mod evaluations;
 mod fusion;
 mod idempotency;
+mod inference;
 mod keys;
 mod live;
 mod matching;
@@ -22,6 +24,7 @@ mod registry;
 mod samples;
 mod site_registry;
 mod sites;
+mod spool;
 mod training;
 
 use std::sync::Arc;
@@ -38,7 +41,12 @@ use crate::store::{Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
+pub use connections::{
+    ConnectionBoard, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage, LiveConnection,
+    PushedMessage, connection_settings,
+};
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
+pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind,
@@ -51,6 +59,7 @@ pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedPar
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
+pub use spool::{Content, Spool, SpoolLeases, Spooled};
 pub use training::RunRequest;
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.
@@ -69,6 +78,8 @@ pub struct Parts {
     pub registry: Registry,
     /// Sites, ready to track.
     pub site_registry: SiteRegistry,
+    /// What connections with other systems do.
+    pub connection_board: ConnectionBoard,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -131,6 +142,7 @@ impl App {
             opened_store: store,
             registry,
             site_registry,
+            connection_board: ConnectionBoard::default(),
             access,
             clock,
             randomness,
@@ -214,6 +226,9 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
     StoreLimits {
         cameras: limits.cameras,
         sites: limits.sites,
+        outside_connections: limits.outside_connections,
+        outbox_messages: limits.outbox_messages,
+        dead_letters: limits.dead_letters,
         samples_per_camera: limits.samples_per_camera,
         sample_overflow: limits.sample_overflow,
         samples: limits.samples,

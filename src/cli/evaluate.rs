@@ -7,11 +7,11 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::evaluate_site::{self, Draws};
+use super::files::{self, write_text};
 use super::import::{gnss_bias_sigma, image_size};
 use super::output::{print_line, print_note};
 use super::progress::Progress;
 use super::recordings;
-use super::{format_of, open_file};
 use crate::clock::{Clock, process_cpu_s};
 use crate::domain::{
     Detection, GnssBiasSigma, ImageSize, Recipe, Sample, SigmaM, StoredSample, TargetId, TimeBounds,
@@ -30,14 +30,14 @@ const MAX_SEEDS: u64 = 100;
 /// Compare methods on a test file, without a server
 #[derive(Args)]
 pub(super) struct Evaluate {
-    /// Training rows, as CSV, NDJSON or JSON; boxes without a fix serve the geometry of the camera
+    /// Training rows, as CSV, NDJSON or JSON, by file extension, which may be followed by .gz or .zst; - is standard input; boxes without a fix serve the geometry of the camera
     #[arg(long, value_name = "FILE", required_unless_present_any = ["paper", "site"])]
     train: Option<PathBuf>,
     /// Test rows; boxes and fixes may be empty
     #[arg(long, value_name = "FILE", required_unless_present_any = ["paper", "site"])]
     test: Option<PathBuf>,
     /// The true position of all rows [default: the columns truth_longitude and truth_latitude]
-    #[arg(long, value_name = "LON,LAT", value_parser = point, allow_negative_numbers = true)]
+    #[arg(long, value_name = "LON,LAT", value_parser = point, allow_hyphen_values = true)]
     truth_point: Option<Position>,
     /// The true positions are on the lines of this GeoJSON file
     #[arg(long, value_name = "FILE", conflicts_with = "truth_point")]
@@ -61,7 +61,7 @@ pub(super) struct Evaluate {
     /// Enlarge the test boxes to the upper left by this, px
     #[arg(long, value_name = "N", default_value_t = 0.0)]
     box_shift_px: f64,
-    /// Write the results as JSON
+    /// Write the results as JSON; - prints them instead of the table
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     /// Write plots to this folder, as SVG
@@ -105,7 +105,7 @@ impl Evaluate {
         if let Some(folder) = &self.site {
             let draws = Draws { count: self.redraws, first_seed: self.first_redraw };
             let report = evaluate_site::evaluate(folder, self.image_size, &draws)?;
-            return self.json.as_ref().map_or(Ok(()), |path| write(path, &report.to_json()?));
+            return self.json.as_ref().map_or(Ok(()), |path| write_text(path, &report.to_json()?));
         }
         let (Some(train), Some(test)) = (&self.train, &self.test) else {
             anyhow::bail!("give --train and --test")
@@ -131,13 +131,15 @@ impl Evaluate {
         };
         let input = FitInput { samples: &train.samples, unpaired: &train.unpaired };
         let evaluation = evaluate_with_progress(input, &test, &truth, &options)?;
-        print_line(&format_args!("{}", evaluation.report.table().trim_end()))?;
+        if !self.json.as_deref().is_some_and(files::is_standard) {
+            print_line(&format_args!("{}", evaluation.report.table().trim_end()))?;
+        }
         if let Some(path) = &self.json {
-            write(path, &evaluation.report.to_json()?)?;
+            write_text(path, &evaluation.report.to_json()?)?;
         }
         if let Some(folder) = &self.plots {
             for (name, picture) in plots(&evaluation, &test, &truth) {
-                write(&folder.join(name), &picture)?;
+                write_text(&folder.join(name), &picture)?;
             }
         }
         anyhow::ensure!(!evaluation.report.methods.is_empty(), "no method could run");
@@ -161,7 +163,7 @@ impl Evaluate {
         let worlds = Worlds { first: self.first_world, count: self.seeds };
         let documents = paper_experiments::run(worlds, &recordings, stem, &mut PaperRunner)?;
         for document in &documents {
-            write(&folder.join(&document.path), &document.text)?;
+            write_text(&folder.join(&document.path), &document.text)?;
         }
         print_line(&format_args!("{}", documents.first().map_or("", |page| page.text.trim_end())))?;
         Ok(())
@@ -180,14 +182,6 @@ impl Evaluate {
         );
         Ok(Truth::Columns)
     }
-}
-
-/// Writes a file, and the folder that it is in.
-fn write(path: &Path, text: &str) -> anyhow::Result<()> {
-    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
-    }
-    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Evaluates the experiments of the paper, with progress on standard error.
@@ -282,7 +276,7 @@ fn read(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<Observ
     let rules = RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size };
     let mut rows = Vec::new();
     let mut invalid = 0_u64;
-    for row in exchange::read_observations(open_file(path)?, format_of(path)?, &rules)? {
+    for row in exchange::read_observations(files::open_input(path)?, files::format_of(path, None)?, &rules)? {
         match row.with_context(|| format!("cannot read {}", path.display()))? {
             Ok(row) => rows.push(row),
             Err(error) => {

@@ -1,29 +1,39 @@
 //! `sightfix fuse`
 
-use std::fs::File;
-use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use clap::Args;
 
-use super::output::{print_line, print_note};
-use super::{DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime};
+use super::files::{self, Output};
+use super::output::print_note;
+use super::summary::SummaryFlags;
+use super::{DataFolder, MissingData, camera_id, open_app, runtime};
 use crate::clock::Clock;
 use crate::domain::{CameraId, ImageSize, TimeBounds};
-use crate::exchange::{self, RowRules};
+use crate::exchange::{self, Format, RowRules};
 use crate::fusion::two_step;
 use crate::model::{Artifact, Regressor};
 
 /// Fuse observations from a file, without a server
 #[derive(Args)]
 pub(super) struct Fuse {
-    /// Observations as CSV, NDJSON or JSON, by file extension; boxes and fixes may be empty
+    /// Observations as CSV, NDJSON or JSON, by file extension, which may be followed by .gz or .zst; boxes and fixes may
+    /// be empty; - is standard input
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Output file: CSV, NDJSON, JSON or GeoJSON, by file extension
+    /// Format of the observations if the ending does not name it [default: csv for -]
+    #[arg(long, value_name = "FORMAT", value_parser = files::format)]
+    format: Option<Format>,
+    /// Output file: CSV, NDJSON, JSON or GeoJSON, by file extension, which may be followed by .gz or .zst; - is standard
+    /// output
     #[arg(long, short, value_name = "FILE")]
     out: PathBuf,
+    /// Format of the output if the ending does not name it [default: csv for -]
+    #[arg(long, value_name = "FORMAT", value_parser = files::format)]
+    out_format: Option<Format>,
+    #[command(flatten)]
+    summary: SummaryFlags,
     /// The camera whose active model is used
     #[arg(long, value_name = "ID", value_parser = camera_id, required_unless_present = "model")]
     camera: Option<CameraId>,
@@ -44,15 +54,16 @@ struct FusionModel {
 
 impl Fuse {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
-        let (from, to) = (format_of(&self.file)?, format_of(&self.out)?);
+        let from = files::format_of(&self.file, self.format)?;
+        let to = files::format_of(&self.out, self.out_format)?;
         let fusion_model = self.model(file)?;
         let rules = RowRules {
             time_bounds: TimeBounds::at(Clock::system().now()),
             image_size: fusion_model.image_size,
         };
-        let rows = exchange::read_observations(open_file(&self.file)?, from, &rules)?;
-        let out = File::create(&self.out).with_context(|| format!("cannot write {}", self.out.display()))?;
-        let mut out = BufWriter::new(out);
+        let rows = exchange::read_observations(files::open_input(&self.file)?, from, &rules)?;
+        let cannot_write = || format!("cannot write {}", self.out.display());
+        let mut out = Output::create(&self.out)?;
         let mut writer = exchange::FusedWriter::new(&mut out, to);
         let (mut answered, mut rejected) = (0_u64, 0_u64);
         for row in rows {
@@ -68,13 +79,14 @@ impl Fuse {
             let fused =
                 two_step::fuse(&row.observation, model, fusion_model.image_size, fusion_model.e_gnss_m2)
                     .context("the observation cannot be fused")?;
-            writer.write(&fused)?;
+            writer.write(&fused).with_context(cannot_write)?;
             answered += 1;
         }
-        writer.finish()?;
-        out.flush()?;
-        print_line(&format_args!("answered {answered}, rejected {rejected}"))?;
-        Ok(())
+        writer.finish().with_context(cannot_write)?;
+        out.finish().with_context(cannot_write)?;
+        let summary = self.summary.summary(Some(&self.out));
+        summary.document(&serde_json::json!({ "answered": answered, "rejected": rejected }))?;
+        summary.line(&format_args!("answered {answered}, rejected {rejected}"))
     }
 
     fn model(&self, file: Option<&Path>) -> anyhow::Result<FusionModel> {

@@ -6,21 +6,20 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::layout::LayoutFlags;
-use super::output::print_line;
 use super::progress::Progress;
-use super::{
-    DataFolder, MissingData, camera_id, format_of, open_app, open_file, runtime, site_id, target_id,
-};
+use super::summary::{Summary, SummaryFlags};
+use super::{DataFolder, MissingData, camera_id, files, open_app, runtime, site_id, target_id};
 use crate::app::{App, ImportOptions, ImportReport};
 use crate::domain::{
     CameraId, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera, NewSite, OnConflict, SiteId, TargetId,
 };
-use crate::exchange::CsvLayout;
+use crate::exchange::{CsvLayout, Format};
 
 /// Import samples from a file into a camera
 #[derive(Args)]
 pub(super) struct Import {
-    /// Samples as CSV, NDJSON or JSON, by file extension; longitude and latitude may be empty together: a box
+    /// Samples as CSV, NDJSON or JSON, by file extension, which may be followed by .gz or .zst; - is standard input;
+    /// longitude and latitude may be empty together: a box
     /// without a fix
     #[arg(value_name = "FILE")]
     file: PathBuf,
@@ -46,6 +45,11 @@ pub(super) struct Import {
     /// The target of rows that name none
     #[arg(long, value_name = "ID", value_parser = target_id)]
     target_id: Option<TargetId>,
+    /// Format of the file if its ending does not name it: csv, ndjson or json [default: csv for -]
+    #[arg(long, value_name = "FORMAT", value_parser = files::format)]
+    format: Option<Format>,
+    #[command(flatten)]
+    summary: SummaryFlags,
     #[command(flatten)]
     layout: LayoutFlags,
     #[command(flatten)]
@@ -55,15 +59,11 @@ pub(super) struct Import {
 impl Import {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let settings = self.folder.settings(file)?;
-        let format = format_of(&self.file)?;
-        let source = open_file(&self.file)?;
-        let bytes = source.metadata()?.len();
-        let source = ProgressReader {
-            source,
-            read: 0,
-            bytes,
-            progress: Progress::new("{bar:40} {bytes}/{total_bytes}"),
-        };
+        let format = files::format_of(&self.file, self.format)?;
+        let (stored, bytes) = files::open_stored(&self.file)?;
+        let progress = Progress::new("{bar:40} {bytes}/{total_bytes}");
+        let stored = ProgressReader { source: stored, read: 0, bytes: bytes.unwrap_or(0), progress };
+        let source = files::decoded(&self.file, stored)?;
         let missing = if self.create { MissingData::Create } else { MissingData::Refuse };
         let report = runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix import", missing).await?;
@@ -77,7 +77,7 @@ impl Import {
             app.store.close().await;
             anyhow::Ok(report?)
         })?;
-        print(&report)?;
+        print(&report, &self.summary.summary(None))?;
         anyhow::ensure!(
             report.accepted + report.duplicate > 0 || report.rejected == 0,
             "every row was rejected"
@@ -131,19 +131,20 @@ impl Import {
     }
 }
 
-fn print(report: &ImportReport) -> anyhow::Result<()> {
+fn print(report: &ImportReport, summary: &Summary) -> anyhow::Result<()> {
     let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows } = report;
-    print_line(&format_args!(
+    summary.document(&serde_json::to_value(report)?)?;
+    summary.line(&format_args!(
         "accepted {accepted} (without a fix {without_fix}), duplicate {duplicate}, rejected {rejected}"
     ))?;
     if *replaced > 0 {
-        print_line(&format_args!("replaced {replaced}"))?;
+        summary.line(&format_args!("replaced {replaced}"))?;
     }
     for row in rejected_rows {
-        print_line(&format_args!("line {}: {}: {}", row.line, row.field, row.reason))?;
+        summary.line(&format_args!("line {}: {}: {}", row.line, row.field, row.reason))?;
     }
     if *rejected > rejected_rows.len() as u64 {
-        print_line(&format_args!("... and {} more", rejected - rejected_rows.len() as u64))?;
+        summary.line(&format_args!("... and {} more", rejected - rejected_rows.len() as u64))?;
     }
     Ok(())
 }

@@ -9,6 +9,7 @@ mod doctor;
 mod evaluate;
 mod evaluate_site;
 mod exit_code;
+mod files;
 mod fuse;
 mod gnss_error;
 mod health;
@@ -23,12 +24,13 @@ mod recordings;
 mod replay;
 mod restore;
 mod serve;
+mod shell;
 mod simulate;
 mod simulate_site;
 mod site_recording;
+mod summary;
 mod train;
 
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
@@ -39,19 +41,27 @@ use crate::app::{App, store_limits};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, Overrides};
 use crate::domain::{CameraId, ReceiverId, SiteId, TargetId};
-use crate::exchange::Format;
 use crate::store::{Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
 
 pub use exit_code::exit_code;
+pub use output::reader_is_gone;
+
+/// How settings are named in the environment.
+const ENVIRONMENT: &str = "Every setting can also be given in the environment: SIGHTFIX_ and its name in capitals, with \
+__ between a section and a name: SIGHTFIX_LISTEN, SIGHTFIX_DATA, SIGHTFIX_LOG_FORMAT, SIGHTFIX_LIMITS__BODY_BYTES. \
+`sightfix config` prints all of them. Flags take precedence over the environment, and the environment over the file.";
 
 /// Positions of targets from the bounding boxes of an uncalibrated fixed camera and from GNSS fixes
 #[derive(Parser)]
-#[command(name = "sightfix", version, arg_required_else_help = true)]
+#[command(name = "sightfix", version, arg_required_else_help = true, after_help = ENVIRONMENT)]
 pub struct Cli {
     /// Settings file [default: sightfix.toml in the working folder, if it exists]
     #[arg(long, global = true, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Print no progress and no notes, only results and errors
+    #[arg(long, short, global = true)]
+    quiet: bool,
     #[command(subcommand)]
     command: Command,
 }
@@ -90,6 +100,10 @@ enum Command {
     Config(config::PrintConfig),
     /// Print the OpenAPI description of the REST interface
     Openapi(openapi::Openapi),
+    /// Print completions for a shell
+    Completions(shell::Completions),
+    /// Print the manual page, or write those of all subcommands to a folder
+    Man(shell::Man),
 }
 
 impl Cli {
@@ -105,6 +119,9 @@ impl Cli {
     /// A human-readable error.
     pub fn run(self) -> anyhow::Result<()> {
         let file = self.config.as_deref();
+        if self.quiet {
+            output::be_quiet();
+        }
         match self.command {
             Command::Serve(command) => command.run(file),
             Command::Import(command) => command.run(file),
@@ -122,6 +139,8 @@ impl Cli {
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),
             Command::Openapi(command) => command.run(),
+            Command::Completions(command) => command.run(),
+            Command::Man(command) => command.run(),
         }
     }
 }
@@ -129,7 +148,7 @@ impl Cli {
 /// The data folder of a command.
 #[derive(Args)]
 struct DataFolder {
-    /// Folder of the database
+    /// Folder of the database [env: SIGHTFIX_DATA]
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
 }
@@ -190,16 +209,4 @@ fn receiver_id(text: &str) -> Result<ReceiverId, String> {
 
 fn target_id(text: &str) -> Result<TargetId, String> {
     TargetId::new(text).map_err(|error| error.to_string())
-}
-
-/// Opens a file for reading; an error contains its name.
-fn open_file(path: &Path) -> anyhow::Result<File> {
-    File::open(path).with_context(|| format!("cannot open {}", path.display()))
-}
-
-/// The format by file extension.
-fn format_of(path: &Path) -> anyhow::Result<Format> {
-    Format::from_path(path).with_context(|| {
-        format!("{}: the extension must be .csv, .ndjson, .jsonl, .json or .geojson", path.display())
-    })
 }

@@ -1,19 +1,17 @@
 //! `sightfix pair`
 
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
 use clap::Args;
 
+use super::files::{self, Output};
 use super::import::image_size;
 use super::layout::LayoutFlags;
-use super::output::{print_line, print_note};
-use super::{
-    DataFolder, MissingData, camera_id, format_of, open_app, open_file, receiver_id, runtime, target_id,
-};
+use super::output::print_note;
+use super::summary::{Summary, SummaryFlags};
+use super::{DataFolder, MissingData, camera_id, open_app, receiver_id, runtime, target_id};
 use crate::app::{
     MatchReport, MatchRequest, PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part,
 };
@@ -31,16 +29,19 @@ use crate::model::{Artifact, Regressor};
 /// Pair detections and fixes that were recorded separately into samples
 #[derive(Args)]
 pub(super) struct Pair {
-    /// Boxes as CSV (time, target_id, left, top, width, height), NDJSON or JSON, by file extension
+    /// Boxes as CSV (time, target_id, left, top, width, height), NDJSON or JSON, by file extension, which may be followed by
+    /// .gz or .zst; - is standard input
     #[arg(long, value_name = "FILE")]
     detections: PathBuf,
-    /// Fixes as CSV, NMEA, GPX or gpsd reports (.json), by file extension
+    /// Fixes as CSV, NMEA, GPX or gpsd reports (.json), by file extension, which may be followed by .gz or .zst; - is standard
+    /// input
     #[arg(long, value_name = "FILE")]
     fixes: PathBuf,
     /// Format of the fixes if the extension does not determine it: csv, nmea, gpx or gpsd
     #[arg(long, value_name = "FORMAT")]
     fixes_format: Option<FixFormat>,
-    /// Output file for `sightfix import`: CSV, NDJSON or JSON, by file extension
+    /// Output file for `sightfix import`: CSV, NDJSON or JSON, by file extension, which may be followed by .gz or
+    /// .zst; - is standard output
     #[arg(long, value_name = "FILE", required_unless_present = "estimate_offset")]
     out: Option<PathBuf>,
     /// Pairing method: nearest (each is the other's nearest within the window) or interpolate (between
@@ -74,6 +75,8 @@ pub(super) struct Pair {
     /// Write the boxes that find no fix, too, with empty longitude and latitude
     #[arg(long)]
     keep_unpaired: bool,
+    #[command(flatten)]
+    summary: SummaryFlags,
     #[command(flatten)]
     layout: LayoutFlags,
     #[command(flatten)]
@@ -138,38 +141,38 @@ impl MatchFlags {
 impl Pair {
     pub(super) fn run(self, config: Option<&Path>) -> anyhow::Result<()> {
         let settings = PairingSettings::new(self.method, self.window_s, self.longest_gap_s)?;
+        let summary = self.summary.summary(self.out.as_deref());
         let (mut recording, format) = self.read()?;
-        print_rejected(&recording.rejected)?;
+        print_rejected(&summary, &recording.rejected)?;
         let mut receivers = self.receivers()?;
         if let Some(receiver) = recording.name_fixes(format, &receivers, self.receiver_id.clone())? {
-            print_line(&format_args!("fixes that name no receiver are those of {}", carried(&receiver)))?;
+            summary.line(&format_args!("fixes that name no receiver are those of {}", carried(&receiver)))?;
         }
         if self.estimate_offset {
             let estimates = recording.clock_offsets(&receivers);
             for (receiver, estimate) in &estimates {
-                print_offset(receiver, estimate.as_ref())?;
+                print_offset(&summary, receiver, estimate.as_ref())?;
             }
             if self.apply_offset {
                 receivers = applied(&receivers, &estimates)?;
             }
         }
-        let Some(out) = &self.out else { return Ok(()) };
+        let Some(out) = &self.out else {
+            return summary.document(&serde_json::json!({ "rejected": recording.rejected.count }));
+        };
         if self.matching.matches {
-            return self.write_matched(recording, &receivers, &settings, out, config);
+            return self.write_matched(recording, &receivers, &settings, out, config, &summary);
         }
-        let (paired, counts, _) = recording.paired(&receivers, &settings);
-        print_counts(&counts)?;
+        let (paired, counts, rejected) = recording.paired(&receivers, &settings);
+        print_counts(&summary, &counts, &rejected)?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
-        let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
+        let mut file = Output::create(out)?;
         if self.keep_unpaired {
-            print_line(&format_args!("boxes kept without a fix {}", paired.unpaired_detections.len()))?;
+            summary.line(&format_args!("boxes kept without a fix {}", paired.unpaired_detections.len()))?;
         }
-        exchange::write_samples(
-            BufWriter::new(file),
-            format_of(out)?,
-            &paired.into_samples(self.keep_unpaired),
-        )?;
-        Ok(())
+        let samples = paired.into_samples(self.keep_unpaired);
+        exchange::write_samples(&mut file, files::format_of(out, None)?, &samples)?;
+        file.finish().with_context(|| format!("cannot write {}", out.display()))
     }
 
     /// Matches, pairs and writes the samples of sure matches.
@@ -180,6 +183,7 @@ impl Pair {
         settings: &PairingSettings,
         out: &Path,
         config: Option<&Path>,
+        summary: &Summary,
     ) -> anyhow::Result<()> {
         let regressor = self.matching.regressor(config)?;
         let request = MatchRequest {
@@ -189,37 +193,39 @@ impl Pair {
             seed: self.matching.match_seed,
         };
         let matched = recording.matched(receivers, &request)?;
-        print_match(&matched.report)?;
-        let (paired, counts, _) = matched.recording.paired(&matched.receivers, settings);
-        print_counts(&counts)?;
+        print_match(summary, &matched.report)?;
+        let (paired, counts, rejected) = matched.recording.paired(&matched.receivers, settings);
+        print_counts(summary, &counts, &rejected)?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
-        let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
-        let mut writer = MatchedSampleWriter::new(BufWriter::new(file), format_of(out)?);
+        let mut file = Output::create(out)?;
+        let mut writer = MatchedSampleWriter::new(&mut file, files::format_of(out, None)?);
         for sample in paired.into_samples(self.keep_unpaired) {
             let key = (sample.time, sample.target_id.clone());
             writer.write(&sample, matched.associations.get(&key))?;
         }
         writer.finish()?;
-        Ok(())
+        file.finish().with_context(|| format!("cannot write {}", out.display()))
     }
 
     fn read(&self) -> anyhow::Result<(Recording, FixFormat)> {
-        let format = self.fixes_format.or_else(|| FixFormat::from_path(&self.fixes)).with_context(|| {
+        let both = files::is_standard(&self.detections) && files::is_standard(&self.fixes);
+        anyhow::ensure!(!both, "only one of --detections and --fixes can be standard input");
+        let format = files::fix_format_of(&self.fixes, self.fixes_format).with_context(|| {
             let name = self.fixes.display();
             format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx or gpsd")
         })?;
         if let Some(out) = &self.out {
-            format_of(out)?; // fail early
+            files::format_of(out, None)?; // fail early
         }
         let rules = RowRules {
             time_bounds: TimeBounds::at(Clock::system().now()),
             image_size: self.matching.image_size,
         };
         let layout = self.layout.to_layout();
-        let (detections, fixes) = (open_file(&self.detections)?, open_file(&self.fixes)?);
+        let (detections, fixes) = (files::open_input(&self.detections)?, files::open_input(&self.fixes)?);
         let boxes = exchange::read_detections(
             detections,
-            (format_of(&self.detections)?, &layout),
+            (files::format_of(&self.detections, None)?, &layout),
             &rules,
             self.target_id.clone(),
         )
@@ -265,7 +271,7 @@ fn carried(receiver: &Receiver) -> String {
     format!("{}, carried by {}", receiver.receiver_id, receiver.target_id)
 }
 
-fn print_rejected(rejected: &RejectedParts) -> anyhow::Result<()> {
+fn print_rejected(summary: &Summary, rejected: &RejectedParts) -> anyhow::Result<()> {
     for (part, row) in &rejected.rows {
         print_note(format_args!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason));
     }
@@ -274,20 +280,24 @@ fn print_rejected(rejected: &RejectedParts) -> anyhow::Result<()> {
         print_note(format_args!("... and {} more", rejected.count - printed));
     }
     if rejected.count > 0 {
-        print_line(&format_args!("rejected rows {}", rejected.count))?;
+        summary.line(&format_args!("rejected rows {}", rejected.count))?;
     }
     Ok(())
 }
 
-fn print_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) -> anyhow::Result<()> {
+fn print_offset(
+    summary: &Summary,
+    receiver: &Receiver,
+    estimate: Option<&OffsetEstimate>,
+) -> anyhow::Result<()> {
     let receiver_and_target = carried(receiver);
     let given_s = receiver.clock_offset.seconds();
     match estimate {
-        None => print_line(&format_args!(
+        None => summary.line(&format_args!(
             "clock offset of {receiver_and_target}: cannot be estimated (too little movement, too little overlap, or \
              more than 10 s); {given_s:+.3} s is given"
         )),
-        Some(found) => print_line(&format_args!(
+        Some(found) => summary.line(&format_args!(
             "clock offset of {receiver_and_target}: {:+.3} s, standard deviation {:.3} s, explains {:.1} % of the movement \
              ({:.1} % without an offset); {given_s:+.3} s is given",
             found.clock_offset.as_secs_f64(),
@@ -298,14 +308,14 @@ fn print_offset(receiver: &Receiver, estimate: Option<&OffsetEstimate>) -> anyho
     }
 }
 
-fn print_match(report: &MatchReport) -> anyhow::Result<()> {
+fn print_match(summary: &Summary, report: &MatchReport) -> anyhow::Result<()> {
     if let Some(world) = &report.world {
-        print_line(&format_args!(
+        summary.line(&format_args!(
             "found the camera with score {:.1}; with shifted clocks at most {:.1}, another place at most {:.1}",
             world.best, world.best_shifted, world.second
         ))?;
     }
-    print_line(&format_args!(
+    summary.line(&format_args!(
         "matched {} tracklets (cut {} times) with {} receivers: {} boxes of probability {} or more, {} of less left out",
         report.tracklets,
         report.cuts,
@@ -315,10 +325,10 @@ fn print_match(report: &MatchReport) -> anyhow::Result<()> {
         report.unsure_detections,
     ))?;
     for (receiver_id, offset) in &report.clock_offsets {
-        print_line(&format_args!("clock offset of {receiver_id}: {:+.1} s found", offset.seconds()))?;
+        summary.line(&format_args!("clock offset of {receiver_id}: {:+.1} s found", offset.seconds()))?;
     }
     for pair in &report.pairs {
-        print_line(&format_args!(
+        summary.line(&format_args!(
             "{} is {} from {} to {}, {} boxes, probability {:.3}",
             pair.tracker_id, pair.receiver_id, pair.from, pair.to, pair.detections, pair.probability
         ))?;
@@ -326,10 +336,28 @@ fn print_match(report: &MatchReport) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn print_counts(counts: &PairingCounts) -> anyhow::Result<()> {
+fn print_counts(summary: &Summary, counts: &PairingCounts, rejected: &RejectedParts) -> anyhow::Result<()> {
     let PairingCounts { detections, fixes, paired, .. } = counts;
-    print_line(&format_args!("paired {paired} of {detections} detections and {fixes} fixes"))?;
-    print_line(&format_args!(
+    summary.document(&serde_json::json!({
+        "detections": detections,
+        "fixes": fixes,
+        "paired": paired,
+        "rejected": rejected.count,
+        "unpaired_detections": {
+            "no_fix_of_target": counts.detections_without_fixes,
+            "no_fix_near": counts.detections_far_from_fixes,
+            "fix_nearer_to_another": counts.detections_with_fix_claimed,
+            "duplicate": counts.detections_duplicate,
+        },
+        "unused_fixes": {
+            "no_receiver": counts.fixes_without_receiver,
+            "no_box_of_target": counts.fixes_without_detections,
+            "no_box_near": counts.fixes_unused,
+            "duplicate": counts.fixes_duplicate,
+        },
+    }))?;
+    summary.line(&format_args!("paired {paired} of {detections} detections and {fixes} fixes"))?;
+    summary.line(&format_args!(
         "unpaired detections: no fix of the target {}, no fix near in time {}, nearest fix is nearer to \
          another box {}, duplicate {}",
         counts.detections_without_fixes,
@@ -337,7 +365,7 @@ fn print_counts(counts: &PairingCounts) -> anyhow::Result<()> {
         counts.detections_with_fix_claimed,
         counts.detections_duplicate,
     ))?;
-    print_line(&format_args!(
+    summary.line(&format_args!(
         "unused fixes: no receiver named {}, no box of the target {}, no box to take it {}, duplicate {}",
         counts.fixes_without_receiver,
         counts.fixes_without_detections,

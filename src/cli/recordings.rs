@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use jiff::Timestamp;
 
-use super::{format_of, open_file};
+use super::files::{format_of, open_input};
 use crate::clock::Clock;
 use crate::domain::{
     Detection, ImageSize, Observation, Receiver, ReceiverId, Receivers, TargetClass, TargetId, TimeBounds,
@@ -83,14 +83,14 @@ fn rules() -> RowRules {
 }
 
 pub(super) fn read_boxes(path: &Path) -> anyhow::Result<Vec<Detection>> {
-    let rows = exchange::read_detections(open_file(path)?, format_of(path)?, &rules(), None)?;
+    let rows = exchange::read_detections(open_input(path)?, format_of(path, None)?, &rules(), None)?;
     rows.map(|row| row?.map_err(|error| anyhow::anyhow!("line {}: {}", error.line, error.reason)))
         .collect::<anyhow::Result<_>>()
         .with_context(|| format!("cannot read {}", path.display()))
 }
 
 pub(super) fn read_fixes(path: &Path) -> anyhow::Result<Vec<ReceivedFix>> {
-    let rows = exchange::read_received_fixes(open_file(path)?, FixFormat::Csv, rules().time_bounds)?;
+    let rows = exchange::read_received_fixes(open_input(path)?, FixFormat::Csv, rules().time_bounds)?;
     rows.map(|row| row?.map_err(|error| anyhow::anyhow!("line {}: {}", error.line, error.reason)))
         .collect::<anyhow::Result<_>>()
         .with_context(|| format!("cannot read {}", path.display()))

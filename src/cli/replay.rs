@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::output::{print_line, print_note};
 use super::progress::Progress;
-use super::{camera_id, format_of, open_file, receiver_id, runtime, target_id};
+use super::{camera_id, files, receiver_id, runtime, target_id};
 use crate::clock::Clock;
 use crate::config::{Config, Overrides};
 use crate::domain::{CameraId, KeySecret, ReceiverId, TargetId, TimeBounds};
@@ -218,7 +218,7 @@ impl Delivery {
 /// The valid rows of a file; the others are reported on standard error and skipped.
 fn rows(path: &Path, rules: &RowRules) -> anyhow::Result<Vec<ObservedRow>> {
     let mut valid = Vec::new();
-    for row in exchange::read_observations(open_file(path)?, format_of(path)?, rules)? {
+    for row in exchange::read_observations(files::open_input(path)?, files::format_of(path, None)?, rules)? {
         match row? {
             Ok(row) => valid.push(row),
             Err(row) => print_note(format_args!(

@@ -18,13 +18,13 @@ use crate::telemetry::{self, LogControl};
 /// Serve REST and gRPC on one port
 #[derive(Args)]
 pub(super) struct Serve {
-    /// Address and port [default: 127.0.0.1:8080]
+    /// Address and port [env: SIGHTFIX_LISTEN] [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDR")]
     listen: Option<SocketAddr>,
     /// Fill an empty data folder with a small simulated camera, train it, and print requests to try
     #[arg(long)]
     demo: bool,
-    /// Serve everybody on an address that other machines reach, while no key exists
+    /// Serve everybody on an address that other machines reach, while no key exists [env: SIGHTFIX_INSECURE]
     #[arg(long)]
     insecure: bool,
     /// File with the secret of an administrator's key; or set SIGHTFIX_ADMIN_KEY

@@ -1,17 +1,17 @@
 //! `sightfix simulate`
 
-use std::fs::File;
-use std::io::{self, BufWriter};
-use std::path::{Path, PathBuf};
+use std::io::{self, Write};
+use std::path::PathBuf;
 
 use anyhow::Context as _;
 use clap::{Args, Subcommand};
 
+use super::files::{self, Output};
 use super::simulate_site::SimulateSite;
 use crate::exchange::{self, Format};
 use crate::simulation::{Options, Route, Scene, TargetShape, World, simulate};
 
-/// Write a simulated world with its truth, as CSV
+/// Write a simulated world with its truth
 #[derive(Args)]
 #[command(subcommand_negates_reqs = true, args_conflicts_with_subcommands = true)]
 pub(super) struct Simulate {
@@ -20,13 +20,14 @@ pub(super) struct Simulate {
     /// The scene: airport or square
     #[arg(value_name = "SCENE", required = true)]
     scene: Option<Scene>,
-    /// Output file of the training rows
+    /// Output file of the training rows: CSV, NDJSON, JSON or GeoJSON, by file extension, which may be followed by .gz or
+    /// .zst; - is standard output
     #[arg(long, value_name = "FILE", required = true)]
     out: Option<PathBuf>,
     /// Number of training rows
     #[arg(long, value_name = "N", default_value_t = 10_000)]
     samples: usize,
-    /// Output file of the test rows: the same camera, other traverses
+    /// Output file of the test rows, as CSV: the same camera, other traverses
     #[arg(long, value_name = "FILE")]
     test_out: Option<PathBuf>,
     /// Number of test rows
@@ -138,12 +139,25 @@ impl Simulate {
             ..base
         };
         check(&options)?;
-        let out = create(out)?;
-        exchange::write_samples(out, Format::Csv, &simulate(&options).training_samples())?;
+        let format = files::format_of(out, None)?;
+        if let Some(path) = &self.test_out {
+            let is_csv = files::format_of(path, None)? == Format::Csv;
+            anyhow::ensure!(
+                is_csv,
+                "{}: the test rows are written as CSV: the extension must be .csv",
+                path.display()
+            );
+        }
+        let mut file = Output::create(out)?;
+        exchange::write_samples(&mut file, format, &simulate(&options).training_samples())?;
+        file.finish().with_context(|| format!("cannot write {}", out.display()))?;
         if let Some(path) = &self.test_out {
             let test =
                 Options { route: self.test_route.unwrap_or(self.route), ..options.test(self.test_samples) };
-            write_test(&simulate(&test), create(path)?)?;
+            let mut file = Output::create(path)?;
+            write_test(&simulate(&test), &mut file)
+                .and_then(|()| file.finish())
+                .with_context(|| format!("cannot write {}", path.display()))?;
         }
         Ok(())
     }
@@ -161,13 +175,8 @@ impl Simulate {
     }
 }
 
-fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {
-    let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
-    Ok(BufWriter::new(file))
-}
-
 /// Writes the columns of a sample file; missing boxes and fixes are empty.
-fn write_test(world: &World, mut out: impl io::Write) -> io::Result<()> {
+fn write_test(world: &World, out: &mut impl Write) -> io::Result<()> {
     let columns =
         "time,target_id,left,top,width,height,longitude,latitude,class,truth_longitude,truth_latitude";
     writeln!(out, "{columns}")?;
@@ -185,7 +194,7 @@ fn write_test(world: &World, mut out: impl io::Write) -> io::Result<()> {
         }
         writeln!(out, ",{},{:.8},{:.8}", row.class, row.truth.longitude_deg(), row.truth.latitude_deg())?;
     }
-    out.flush()
+    Ok(())
 }
 
 /// Checks the ranges of the options.

@@ -5,8 +5,8 @@ use std::path::Path;
 use clap::Args;
 use futures_util::StreamExt as _;
 
-use super::output::print_line;
 use super::progress::Progress;
+use super::summary::SummaryFlags;
 use super::{DataFolder, MissingData, camera_id, open_app, runtime};
 use crate::app::{App, RunRequest};
 use crate::config::Config;
@@ -30,6 +30,8 @@ pub(super) struct Train {
     #[arg(long, value_name = "N")]
     epochs: Option<u32>,
     #[command(flatten)]
+    summary: SummaryFlags,
+    #[command(flatten)]
     folder: DataFolder,
 }
 
@@ -49,11 +51,15 @@ impl Train {
             let ended = ended?;
             let outcome = ended.outcome.as_deref().unwrap_or("no outcome was recorded");
             anyhow::ensure!(ended.state == JobState::Succeeded, "{}: {outcome}", ended.state.as_str());
-            print_line(&format_args!("version {} {outcome}", ended.model_version.unwrap_or_default()))?;
-            if let Some(report) = &ended.report {
-                print_line(report)?;
-            }
-            Ok(())
+            let summary = self.summary.summary(None);
+            summary.document(&serde_json::json!({
+                "run": ended.id.to_string(),
+                "model_version": ended.model_version,
+                "outcome": outcome,
+                "report": ended.report,
+            }))?;
+            summary.line(&format_args!("version {} {outcome}", ended.model_version.unwrap_or_default()))?;
+            ended.report.as_ref().map_or(Ok(()), |report| summary.line(report))
         })
     }
 }
@@ -76,7 +82,13 @@ pub(super) async fn train(
         latest = run?;
         let RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. } = &latest.progress;
         let remaining = remaining_s.map(|seconds| format!(", {seconds:.0} s left")).unwrap_or_default();
-        progress.set((*epoch).into(), (*epochs).into(), &format!("{phase}, Es {error_scale:.3}{remaining}"));
+        // Before the first epoch there is nothing to count and no error scale.
+        let message = match (phase.as_str(), *epoch) {
+            ("", _) => latest.state.as_str().to_owned(),
+            (phase, 0) => format!("{phase}{remaining}"),
+            (phase, _) => format!("{phase}, Es {error_scale:.3}{remaining}"),
+        };
+        progress.set((*epoch).into(), (*epochs).into(), &message);
     }
     progress.finish();
     shutdown.drain_with_timeout(settings.limits.drain_time()).await;

@@ -47,6 +47,12 @@ pub enum AuditAction {
     SiteChanged,
     /// A site was deleted.
     SiteDeleted,
+    /// A connection with another system was created.
+    ConnectionCreated,
+    /// A connection was changed, paused or resumed.
+    ConnectionChanged,
+    /// A connection was deleted with its outbox.
+    ConnectionDeleted,
     /// Samples were deleted.
     SamplesDeleted,
     /// Stored samples were replaced by those of an import.

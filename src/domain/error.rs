@@ -18,6 +18,9 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 pub enum ErrorKind {
     /// A field has a value that cannot be used.
     InvalidArgument,
+    /// A parameter of a query has a value that cannot be used, on interfaces whose standard gives that a kind of
+    /// its own.
+    InvalidQuery,
     /// The body is not in the declared format.
     MalformedBody,
     /// The operation does not read this content type.
@@ -26,6 +29,8 @@ pub enum ErrorKind {
     NotAcceptable,
     /// Body, batch or message beyond its limit.
     TooLarge,
+    /// `Range` asks for bytes behind the end.
+    RangeNotSatisfiable,
     /// No such path.
     RouteNotFound,
     /// The path exists, the method does not.
@@ -50,6 +55,12 @@ pub enum ErrorKind {
     SiteExists,
     /// The site has cameras.
     SiteInUse,
+    /// No such connection.
+    ConnectionNotFound,
+    /// A connection of that id exists already.
+    ConnectionExists,
+    /// The connection takes no messages by HTTP, or is paused.
+    ConnectionNotReceiving,
     /// `If-Match` names another revision than the stored one.
     RevisionMismatch,
     /// The change needs an `If-Match`.
@@ -72,7 +83,7 @@ pub enum ErrorKind {
     ModelActive,
     /// The disk is full, or as much is stored as the settings allow.
     InsufficientStorage,
-    /// Whose fixes belong to whose boxes cannot be told.
+    /// Boxes and fixes cannot be associated with confidence.
     NotIdentifiable,
     /// The stored samples cannot support a fit.
     UnusableSamples,
@@ -90,6 +101,8 @@ pub enum ErrorKind {
     Unauthenticated,
     /// The key may not do this.
     PermissionDenied,
+    /// The OpenID provider gave no usable answer.
+    SignInUnavailable,
     /// The request names a host that this server does not answer for.
     HostNotAllowed,
     /// A web page of another origin asks for a change.

@@ -12,6 +12,7 @@ mod audit;
 mod bounding_box;
 mod camera;
 mod checksum;
+mod connection;
 mod durability;
 mod error;
 mod evaluation;
@@ -38,6 +39,7 @@ pub use audit::{Actor, AuditAction, AuditEntry, AuditNumber};
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, ExpectedVersion, NewCamera, Revision};
 pub use checksum::model_sha256;
+pub use connection::{Connection, ConnectionKey, DeadLetter, NewConnection, OutboxCounts, OutboxMessage};
 pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
@@ -46,7 +48,9 @@ pub use idempotency::{IdempotencyKey, IdempotentRequest, RequestDigest, RequestH
 pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
-pub use names::{CameraId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text};
+pub use names::{
+    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
+};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;

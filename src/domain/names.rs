@@ -55,6 +55,10 @@ slug!(
     /// Id of a site: a slug like that of a camera.
     SiteId
 );
+slug!(
+    /// Id of a connection with another system: a slug like that of a camera.
+    ConnectionId
+);
 
 fn check_slug(id: &str) -> Result<()> {
     let inner = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';

@@ -3,7 +3,9 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
-use crate::domain::{AuditNumber, CameraId, Error, EvaluationId, KeyId, Result, RunId, SiteId};
+use crate::domain::{
+    AuditNumber, CameraId, ConnectionId, Error, EvaluationId, KeyId, Result, RunId, SiteId, TargetId,
+};
 
 /// Largest accepted cursor, bytes.
 const MAX_BYTES: usize = 512;
@@ -51,8 +53,33 @@ impl Cursor for CameraId {
     }
 }
 
+/// Target of a track.
+impl Cursor for TargetId {
+    const LIST: &'static str = "tracks";
+
+    fn to_key(&self) -> String {
+        self.as_str().to_owned()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        Self::new(key).ok()
+    }
+}
+
 impl Cursor for SiteId {
     const LIST: &'static str = "sites";
+
+    fn to_key(&self) -> String {
+        self.as_str().to_owned()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        Self::new(key).ok()
+    }
+}
+
+impl Cursor for ConnectionId {
+    const LIST: &'static str = "connections";
 
     fn to_key(&self) -> String {
         self.as_str().to_owned()

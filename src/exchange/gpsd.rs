@@ -65,7 +65,11 @@ impl<R: Read> GpsdFixes<R> {
 }
 
 /// The fix of a report; `None` for a report of another class.
-fn report(line: u64, text: &str, time_bounds: &TimeBounds) -> Result<Option<Result<FixRow, RowError>>> {
+pub(super) fn report(
+    line: u64,
+    text: &str,
+    time_bounds: &TimeBounds,
+) -> Result<Option<Result<FixRow, RowError>>> {
     let report: GpsdReport<'_> = wire::parse_json(text.as_bytes())?;
     if report.class.as_str() != "TPV" {
         return Ok(None);

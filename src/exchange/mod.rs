@@ -11,6 +11,7 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod columns;
+mod connection;
 mod csv_header;
 mod csv_layout;
 mod csv_rows;
@@ -27,19 +28,29 @@ mod gpx;
 mod json_errors;
 mod json_violations;
 mod lines;
+mod messages;
 mod nmea_fixes;
 mod objects_only;
+mod outgoing;
 mod rows;
 #[cfg(test)]
 mod tests;
 pub mod wire;
 mod write;
 
+pub use connection::{
+    Address, CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, Scheme, Secrets,
+    SinkSettings, SourceSettings,
+};
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
+pub use messages::{
+    DetectedBox, MessageContext, MessageDecoder, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
+};
+pub use outgoing::{OutgoingPosition, cot_event, position_json};
 pub use rows::{
     ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
 };

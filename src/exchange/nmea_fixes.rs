@@ -39,7 +39,7 @@ enum PendingRow {
 }
 
 /// Content of a line.
-enum SentenceContent {
+pub(super) enum SentenceContent {
     Fix(Option<Time>, Fix),
     Date(Timestamp),
     None,
@@ -101,7 +101,7 @@ impl<R: Read> NmeaFixes<R> {
 
 /// The instant with that time of day that is nearest to a dated instant: at midnight a fix may precede
 /// the sentence with the new date.
-fn nearest_instant(time_of_day: Time, dated: Timestamp) -> Option<Timestamp> {
+pub(super) fn nearest_instant(time_of_day: Time, dated: Timestamp) -> Option<Timestamp> {
     let date = TimeZone::UTC.to_datetime(dated).date();
     let same_day = instant(date, time_of_day)?;
     let day = SignedDuration::from_hours(24);
@@ -114,7 +114,7 @@ fn instant(date: Date, time: Time) -> Option<Timestamp> {
 }
 
 /// Parses a line; blank lines and other sentences have no content.
-fn content_of(text: &str) -> Result<SentenceContent, String> {
+pub(super) fn content_of(text: &str) -> Result<SentenceContent, String> {
     let Some(sentence) = sentence_of(text) else { return Ok(SentenceContent::None) };
     match nmea::parse_str(text) {
         Ok(ParseResult::GGA(gga)) => Ok(SentenceContent::Fix(time_of(gga.fix_time), fix_of(&gga)?)),

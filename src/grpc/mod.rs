@@ -11,17 +11,21 @@ mod cameras;
 mod cancel_on_shutdown;
 pub mod client;
 mod convert;
+mod evaluations;
 mod fusion;
 mod idempotency;
+mod inference;
 mod keys;
 mod mask;
 mod models;
 mod outbox;
 mod pages;
+mod pairings;
 mod samples;
 mod sites;
 mod statuses;
 mod stream;
+mod tracks;
 mod training;
 mod world_tracks;
 
@@ -38,13 +42,16 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 use cancel_on_shutdown::CancelOnShutdown;
+use inference_proto::grpc_inference_service_server::GrpcInferenceServiceServer;
 use proto::audit_service_server::AuditServiceServer;
 use proto::camera_service_server::CameraServiceServer;
+use proto::evaluation_service_server::EvaluationServiceServer;
 use proto::fusion_service_server::FusionServiceServer;
 use proto::key_service_server::KeyServiceServer;
 use proto::model_service_server::ModelServiceServer;
 use proto::sample_service_server::SampleServiceServer;
 use proto::site_service_server::SiteServiceServer;
+use proto::track_service_server::TrackServiceServer;
 use proto::training_service_server::TrainingServiceServer;
 
 pub use statuses::{explain, trailers};
@@ -57,6 +64,12 @@ pub mod proto {
 
     /// The descriptors of all files of `proto/`, for server reflection.
     pub const FILE_DESCRIPTOR_SET: &[u8] = tonic::include_file_descriptor_set!("sightfix_descriptor");
+}
+
+/// Messages and service of the Open Inference Protocol, generated from `proto/inference`.
+#[expect(clippy::allow_attributes, reason = "generated code")]
+pub mod inference_proto {
+    tonic::include_proto!("inference");
 }
 
 /// All services, health and reflection. Requests carry their [`RequestId`] as an extension; pass
@@ -74,6 +87,11 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
     let keys = KeyServiceServer::new(keys::Keys::new(app)).max_decoding_message_size(most);
     let audit = AuditServiceServer::new(audit::Audit::new(app)).max_decoding_message_size(most);
     let sites = SiteServiceServer::new(sites::Sites::new(app, shutdown)).max_decoding_message_size(most);
+    let tracks = TrackServiceServer::new(tracks::Tracks::new(app, shutdown)).max_decoding_message_size(most);
+    let evaluations =
+        EvaluationServiceServer::new(evaluations::Evaluations::new(app)).max_decoding_message_size(most);
+    let inference = GrpcInferenceServiceServer::new(inference::Inference::new(app, shutdown))
+        .max_decoding_message_size(most);
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(proto::FILE_DESCRIPTOR_SET)
@@ -96,6 +114,9 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .add_service(keys)
         .add_service(audit)
         .add_service(sites)
+        .add_service(tracks)
+        .add_service(evaluations)
+        .add_service(inference)
         .prepare()
 }
 
@@ -104,8 +125,15 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
 pub fn class(path: &str) -> RequestClass {
     match path {
         "/grpc.health.v1.Health/Check" => RequestClass::Probe,
-        "/sightfix.v1.FusionService/Fuse" => RequestClass::Fusion,
-        "/sightfix.v1.SampleService/ImportSamples" => RequestClass::ImportStream,
+        "/inference.GRPCInferenceService/ServerLive" | "/inference.GRPCInferenceService/ServerReady" => {
+            RequestClass::Probe
+        }
+        "/sightfix.v1.FusionService/Fuse" | "/inference.GRPCInferenceService/ModelInfer" => {
+            RequestClass::Fusion
+        }
+        "/sightfix.v1.SampleService/ImportSamples" | "/sightfix.v1.SampleService/PairSamples" => {
+            RequestClass::ImportStream
+        }
         "/sightfix.v1.FusionService/Stream" => RequestClass::LiveStream,
         _ => RequestClass::Other,
     }
@@ -118,7 +146,7 @@ pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
 }
 
 /// The services whose health is reported; the empty name is the server as a whole.
-const HEALTHY: [&str; 9] = [
+const HEALTHY: [&str; 12] = [
     "",
     CameraServiceServer::<()>::NAME,
     SampleServiceServer::<()>::NAME,
@@ -128,6 +156,9 @@ const HEALTHY: [&str; 9] = [
     KeyServiceServer::<()>::NAME,
     AuditServiceServer::<()>::NAME,
     SiteServiceServer::<()>::NAME,
+    TrackServiceServer::<()>::NAME,
+    EvaluationServiceServer::<()>::NAME,
+    GrpcInferenceServiceServer::<()>::NAME,
 ];
 
 /// Serving until the end begins; then watchers get a last status, and their streams end.
@@ -169,6 +200,9 @@ mod tests {
             "KeyService",
             "AuditService",
             "SiteService",
+            "TrackService",
+            "EvaluationService",
+            "GRPCInferenceService",
         ];
         assert_eq!(names, own);
     }

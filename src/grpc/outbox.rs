@@ -152,3 +152,24 @@ impl Stream for Responses {
         Poll::Ready(Some(Ok(StreamResponse { kind: Some(kind) })))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use futures_util::StreamExt as _;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn one_answer_more_than_the_limit_loses_the_oldest() {
+        let (outbox, mut responses) = outbox(2);
+        let answer = |seq| Box::new(StreamAnswer { seq, ..StreamAnswer::default() });
+        assert!(!outbox.answer(answer(1)) && !outbox.answer(answer(2)), "just allowed");
+        assert!(outbox.answer(answer(3)), "the first is lost");
+        outbox.end(None);
+        let mut read = Vec::new();
+        while let Some(Ok(StreamResponse { kind: Some(Kind::Answer(answer)) })) = responses.next().await {
+            read.push((answer.seq, answer.lost_answers));
+        }
+        assert_eq!(read, [(2, 0), (3, 1)]);
+    }
+}

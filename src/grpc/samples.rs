@@ -7,9 +7,10 @@ use tonic::Streaming;
 use super::convert::{camera_id, durability, on_conflict, sample, sample_filter};
 use super::idempotency::idempotent;
 use super::pages;
+use super::pairings::{Pieces, pair};
 use super::proto;
 use super::proto::sample_service_server::SampleService;
-use super::statuses::{Reply, answer, broken};
+use super::statuses::{Reply, answer, broken, client_id};
 use crate::admission::BodyRefusal;
 use crate::app::{App, ImportOptions, ImportReport, RejectedRow};
 use crate::domain::{Durability, Error, ErrorKind, RequestHasher, Result, SampleCount, StoredSample};
@@ -58,6 +59,20 @@ impl SampleService for Samples {
             let options = ImportOptions { durability, on_conflict, idempotent };
             let report = app.import_rows(&camera, rows, options).await?;
             Ok(imported(report, durability))
+        })
+        .await
+    }
+
+    async fn pair_samples(
+        &self,
+        request: tonic::Request<Streaming<proto::PairSamplesRequest>>,
+    ) -> Reply<proto::PairSamplesResponse> {
+        let refusal = request.extensions().get().cloned().unwrap_or_default();
+        let client = client_id(request.extensions());
+        let idempotent = idempotent(&request, "PairSamples");
+        answer(&self.app, request, |app, messages| async move {
+            let pieces = Pieces { messages, refusal, shutdown: self.shutdown.clone() };
+            pair(&app, pieces, client, idempotent?).await
         })
         .await
     }

@@ -17,25 +17,28 @@ use crate::app::access::Permission;
 use crate::domain::{ErrorKind, Role};
 use crate::status;
 
-const TAGS: [(&str, &str); 9] = [
+const TAGS: [(&str, &str); 13] = [
     ("cameras", "Profiles of cameras that nobody calibrated"),
     ("sites", "Cameras whose targets are tracked together"),
     ("samples", "Boxes and fixes that cameras learn from"),
     ("training", "Background fits of a camera's model"),
     ("models", "Model versions that runs yield"),
     ("fusion", "Positions of targets"),
+    ("tracks", "Targets as they move: tracks, histories and live events"),
+    ("inference", "The Open Inference Protocol (KServe's V2): positions of boxes as tensors"),
+    ("features", "OGC API Features: cameras, samples and tracks for GIS"),
+    ("connections", "Other systems that give detections and fixes, or take positions"),
     ("evaluations", "Methods side by side on stored samples, against the truth"),
     ("access", "Keys that clients present, and sessions of browsers"),
     ("service", "What watches the server"),
 ];
 
 /// Refusals that any operation may meet.
-const ANY: [ErrorKind; 6] = [
+const ANY: [ErrorKind; 5] = [
     ErrorKind::Timeout,
     ErrorKind::Internal,
     ErrorKind::Overloaded,
     ErrorKind::RateLimited,
-    ErrorKind::InvalidArgument,
     ErrorKind::HostNotAllowed,
 ];
 /// Refusals of operations that change something.
@@ -45,6 +48,8 @@ const WITH_BODY: [ErrorKind; 3] =
     [ErrorKind::MalformedBody, ErrorKind::TooLarge, ErrorKind::UnsupportedMediaType];
 /// Refusals of operations below a camera.
 const BELOW_CAMERA: [ErrorKind; 1] = [ErrorKind::CameraNotFound];
+/// Refusals of operations below a connection.
+const BELOW_CONNECTION: [ErrorKind; 1] = [ErrorKind::ConnectionNotFound];
 /// Refusals of operations below a site.
 const BELOW_SITE: [ErrorKind; 1] = [ErrorKind::SiteNotFound];
 
@@ -66,7 +71,9 @@ pub(super) fn head() -> OpenApi {
 /// Gives each operation the problems that it has in common with others.
 pub(super) fn add_problems(openapi: &mut OpenApi) {
     for (path, item) in &mut openapi.paths.paths {
-        let is_service = !path.starts_with("/v1/");
+        let is_service = !["/v1/", "/v2", "/ogc"].iter().any(|prefix| path.starts_with(prefix));
+        // OGC API Features requires 400 for parameters at fault.
+        let is_features = path.starts_with("/ogc");
         let is_below_camera = path.contains("{camera}");
         let [get, changes @ ..] = operations(item);
         let changes = changes.into_iter().flatten().map(|operation| (operation, true));
@@ -74,6 +81,7 @@ pub(super) fn add_problems(openapi: &mut OpenApi) {
             let mut kinds: Vec<ErrorKind> = Vec::new();
             if !is_service {
                 kinds.extend(ANY);
+                kinds.push(if is_features { ErrorKind::InvalidQuery } else { ErrorKind::InvalidArgument });
             }
             if is_change {
                 kinds.extend(OF_CHANGES);
@@ -83,6 +91,9 @@ pub(super) fn add_problems(openapi: &mut OpenApi) {
             }
             if is_below_camera {
                 kinds.extend(BELOW_CAMERA);
+            }
+            if path.contains("{connection}") {
+                kinds.extend(BELOW_CONNECTION);
             }
             if path.contains("{site}") {
                 kinds.extend(BELOW_SITE);

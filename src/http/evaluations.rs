@@ -15,7 +15,7 @@ use super::problem::{ApiResult, Problem};
 use super::wire::{JobState, Recipe, created, empty, instant, json};
 use crate::app::EvaluationRequest;
 use crate::domain::{self, Error, EvaluationProgress, Method, Result, SigmaM, Truth};
-use crate::evaluation::Report;
+use crate::evaluation::ReportWithPositions;
 use crate::exchange::wire::Position;
 use crate::exchange::write_cursor;
 use crate::geo;
@@ -193,10 +193,10 @@ struct Evaluation {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     ended_at: Option<Timestamp>,
-    /// The figures, once it has succeeded; the same document as that of `sightfix evaluate --json`.
-    /// Lists leave it out.
+    /// Once it has succeeded: the figures, as in the document of `sightfix evaluate --json`, and the positions
+    /// behind them. Lists leave it out.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Option<Report>)]
+    #[schema(value_type = Option<ReportWithPositions>)]
     report: Option<Box<RawValue>>,
 }
 

@@ -14,8 +14,8 @@ use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
 use crate::admission::ClientId;
 use crate::domain::{
-    CameraId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId, SiteId,
-    TargetId, parse_time,
+    CameraId, ConnectionId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId,
+    SiteId, TargetId, parse_time,
 };
 use crate::exchange::{CsvLayout, Cursor, Format, read_cursor, wire};
 
@@ -68,6 +68,22 @@ impl<S: Send + Sync> FromRequestParts<S> for SitePath {
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         Ok(Self(site_of(&path::<SiteSegment, S>(parts, state).await?.site)?))
+    }
+}
+
+/// A connection of the path. What is no slug names none.
+pub(super) struct ConnectionPath(pub(super) ConnectionId);
+
+impl<S: Send + Sync> FromRequestParts<S> for ConnectionPath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        let id = path::<ConnectionSegment, S>(parts, state).await?.connection;
+        let id = ConnectionId::new(&id).map_err(|_| {
+            let message = "that is not the id of a connection";
+            Error::refused(ErrorKind::ConnectionNotFound, message)
+        })?;
+        Ok(Self(id))
     }
 }
 
@@ -141,6 +157,11 @@ impl<S: Send + Sync> FromRequestParts<S> for ModelPath {
 #[derive(Deserialize)]
 struct CameraSegment {
     camera: String,
+}
+
+#[derive(Deserialize)]
+struct ConnectionSegment {
+    connection: String,
 }
 
 #[derive(Deserialize)]

@@ -13,7 +13,7 @@ use super::problem::ApiResult;
 use super::samples::RejectedRow;
 use super::wire::json;
 use super::{Rest, body};
-use crate::app::GnssErrorEstimate;
+use crate::app::{GnssErrorEstimate, Spooled};
 use crate::domain::{Error, Result};
 use crate::exchange::{FixFormat, RowError, TimedFix, read_fixes, wire};
 
@@ -95,7 +95,7 @@ async fn estimate_gnss_error(
 
 enum FixSource {
     Given(Vec<wire::Fix>),
-    File(body::Spooled, FixFormat),
+    File(Spooled, FixFormat),
 }
 
 fn from_given(fixes: &[wire::Fix], tell_at_most: usize) -> Result<GnssErrorEstimate> {

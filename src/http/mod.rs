@@ -14,17 +14,22 @@ mod body_coding;
 mod body_error;
 mod camera_statuses;
 mod cameras;
+mod connections;
 mod console;
 mod description;
 mod etag;
 mod evaluations;
 mod extract;
+mod features;
 mod fusions;
 mod gnss_error;
 mod idempotency;
+mod inference;
 mod keys;
 mod merge_patch;
 mod models;
+mod moving_features;
+mod openid;
 mod pairings;
 mod parts;
 mod problem;
@@ -36,6 +41,7 @@ mod session;
 mod sites;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod tracks;
 mod training_runs;
 mod wire;
@@ -49,7 +55,10 @@ use axum::body::Body;
 use axum::middleware::map_response;
 use axum::response::Response;
 use futures_util::FutureExt as _;
-use hyper::header::{CONTENT_SECURITY_POLICY, REFERRER_POLICY, X_FRAME_OPTIONS};
+use http_body_util::BodyExt as _;
+use hyper::header::{
+    CONTENT_LENGTH, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, X_FRAME_OPTIONS,
+};
 use hyper::http::HeaderValue;
 use hyper::{Method, Request};
 use tower::Service as _;
@@ -91,7 +100,14 @@ impl Transport {
             .url("/openapi.json", described)
             .config(Config::default().validator_url("none").use_base_layout());
         let page = Router::from(page).layer(map_response(contain_page));
-        Self(routes.route_layer(authorize).merge(page).merge(console_routes).with_state(rest))
+        Self(
+            routes
+                .route_layer(authorize)
+                .merge(page)
+                .merge(console_routes)
+                .merge(openid::callback())
+                .with_state(rest),
+        )
     }
 
     /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
@@ -124,7 +140,9 @@ const DESCRIPTION_POLICY: &str = "default-src 'none'; script-src 'self'; style-s
      img-src 'self' data:; font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
 
-async fn contain_page(mut response: Response) -> Response {
+/// Names the page, and contains what it may do.
+async fn contain_page(response: Response) -> Response {
+    let mut response = named(response).await;
     for (name, value) in [
         (CONTENT_SECURITY_POLICY, DESCRIPTION_POLICY),
         (X_FRAME_OPTIONS, "DENY"),
@@ -135,12 +153,40 @@ async fn contain_page(mut response: Response) -> Response {
     response
 }
 
+/// The page under its own title instead of the library's.
+async fn named(response: Response) -> Response {
+    let is_page =
+        response.headers().get(CONTENT_TYPE).is_some_and(|it| it.as_bytes().starts_with(b"text/html"));
+    if !is_page {
+        return response;
+    }
+    let (mut head, body) = response.into_parts();
+    // The library holds the page in memory.
+    let Ok(page) = body.collect().await else { return problem::panicked(Box::new("the page has no body")) };
+    let page = String::from_utf8_lossy(&page.to_bytes()).replacen(LIBRARY_TITLE, TITLE, 1);
+    head.headers.remove(CONTENT_LENGTH);
+    Response::from_parts(head, Body::from(page))
+}
+
+/// The title of the page, as the library writes it.
+const LIBRARY_TITLE: &str = "<title>Swagger UI</title>";
+const TITLE: &str = "<title>sightfix: REST interface</title>";
+
 /// What a request is for, by its method and path.
 #[must_use]
 pub fn class(method: &Method, path: &str) -> RequestClass {
     let last = path.rsplit('/').next().unwrap_or_default();
+    if path.starts_with("/v2/models/") && method == Method::POST && last == "infer" {
+        return RequestClass::Fusion;
+    }
     match path.strip_prefix("/v1/") {
-        None if matches!(path, "/livez" | "/readyz" | "/metrics") => RequestClass::Probe,
+        None if matches!(
+            path,
+            "/livez" | "/readyz" | "/metrics" | "/v2/health/live" | "/v2/health/ready"
+        ) =>
+        {
+            RequestClass::Probe
+        }
         Some(_) if method == Method::POST => match last {
             "fusions" | "tracks" => RequestClass::Fusion,
             "samples" | "pairings" | "gnss-error" => RequestClass::Import,
@@ -168,6 +214,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(camera_statuses::routes())
         .merge(sites::routes())
         .merge(world_tracks::routes())
+        .merge(connections::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
         .merge(training_runs::routes())
@@ -176,10 +223,14 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(tracks::routes())
         .merge(gnss_error::routes())
         .merge(evaluations::routes())
+        .merge(inference::routes())
+        .merge(features::routes())
         .merge(keys::routes())
         .merge(audit::routes())
         .merge(session::routes())
+        .merge(openid::routes())
         .merge(server_info::routes())
+        .merge(tiles::routes())
         .merge(service::routes());
     description::add_problems(router.get_openapi_mut());
     description::add_security(router.get_openapi_mut());

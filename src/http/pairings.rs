@@ -13,7 +13,7 @@ use super::idempotency::idempotent;
 use super::parts::parts;
 use super::problem::{ApiResult, Problem};
 use super::receivers::Receiver;
-use super::wire::{Durability, json};
+use super::wire::{BoxForm, BoxUnit, Durability, OnConflict, json};
 use crate::app::{self, App, ImportOptions, MatchReport, PairedImport, PairedReport, PairingCounts, Part};
 use crate::domain::{self, Error, ReceiverId, Result, TargetId};
 use crate::exchange::{FixFormat, Format, RowError};
@@ -23,6 +23,17 @@ use crate::fusion::pairing::{PairingRule, PairingSettings};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(pair_samples))
+}
+
+/// How a box finds its fix.
+#[derive(ToSchema)]
+#[schema(rename_all = "snake_case")]
+#[expect(dead_code, reason = "the values of a parameter, for the description alone")]
+enum PairingMethod {
+    /// Box and fix that are each other's nearest within the window.
+    Nearest,
+    /// Every box between two fixes gets a fix of its own time.
+    Interpolate,
 }
 
 /// Two files to be paired by time.
@@ -206,7 +217,7 @@ struct ClockOffsetEstimate {
     post, path = "/v1/cameras/{camera}/samples/pairings", tag = "samples",
     params(
         ("camera" = String, Path, description = "The camera's id"),
-        ("method" = Option<String>, Query, description = "`nearest` (if left out) or `interpolate`"),
+        ("method" = inline(Option<PairingMethod>), Query, description = "`nearest` (if left out) or `interpolate`"),
         ("window_s" = Option<f64>, Query, description = "Box and fix are at most this far apart (nearest), 0.5 if left out"),
         ("longest_gap_s" = Option<f64>, Query, description = "Fixes are joined over at most this long a gap (interpolate), 2.5 if left out"),
         ("target_id" = Option<String>, Query, description = "The target of boxes that name none"),
@@ -215,11 +226,11 @@ struct ClockOffsetEstimate {
         ("match" = Option<bool>, Query, description = "Find out whose boxes show whose receivers"),
         ("min_probability" = Option<f64>, Query, description = "With `match`, leave out samples whose match is less probable, 0.9 if left out; 0.5 to 1"),
         ("clock_window_s" = Option<f64>, Query, description = "With `match`, the receivers' clocks are off by at most this, 0 if left out; 0 to 30"),
-        ("durability" = Option<String>, Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
-        ("on_conflict" = Option<String>, Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
+        ("durability" = inline(Option<Durability>), Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
+        ("on_conflict" = inline(Option<OnConflict>), Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
         ("columns" = Option<String>, Query, description = "The columns of CSV parts: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` (such as `time:Timestamp,left:x1`) names them; other columns are ignored"),
-        ("box_form" = Option<String>, Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV part hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
-        ("box_unit" = Option<String>, Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
+        ("box_form" = inline(Option<BoxForm>), Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV part hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
+        ("box_unit" = inline(Option<BoxUnit>), Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
         ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters: an import that is sent again under the same key gets the answer of the first; for a day"),
         ("estimate_offset" = Option<bool>, Query, description = "Tell the receivers' clock offsets as the files show them; they are not applied"),
     ),

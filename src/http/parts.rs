@@ -20,9 +20,9 @@ use hyper::header::CONTENT_TYPE;
 use hyper::http::request::Parts;
 use tokio::io::AsyncReadExt as _;
 
-use super::body::{self, Content, Spool, SpoolLeases, Spooled, client_id};
+use super::body::{self, client_id};
 use super::extract::{media_type, not_read};
-use crate::app::App;
+use crate::app::{App, Content, Spool, SpoolLeases, Spooled};
 use crate::domain::{Error, ErrorKind, Result};
 
 /// Read at once while the body is split into its parts.

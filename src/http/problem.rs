@@ -15,12 +15,17 @@ use hyper::{Method, StatusCode, Uri};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use crate::domain::{Error, ErrorKind};
+use crate::domain::{Error, ErrorKind, Refusal};
 use crate::status;
 use crate::telemetry::RequestId;
 
 /// Media type of a problem.
 pub(super) const PROBLEM_JSON: &str = "application/problem+json";
+
+/// Below it, problems also have the member of the Open Inference Protocol.
+const INFERENCE: &str = "/v2";
+/// Below it, what is wrong with a query is a 400, as OGC API Features demands.
+const FEATURES: &str = "/ogc";
 
 /// An error on its way to where its problem is written.
 #[derive(Clone)]
@@ -71,6 +76,10 @@ pub(super) struct Problem<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     conflicting_id: Option<&'a str>,
+    /// The same as `detail`, where the Open Inference Protocol wants it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    error: Option<String>,
 }
 
 /// One field at fault.
@@ -102,7 +111,9 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
             ("the server failed; its log has more under this trace_id".to_owned(), Vec::new(), None)
         }
     };
+    let is_inference = instance.is_some_and(|path| path.starts_with(INFERENCE));
     let problem = Problem {
+        error: is_inference.then(|| detail.clone()),
         r#type: format!("{}{}", status::PROBLEM_TYPE_PREFIX, row.slug),
         title: row.title,
         status: row.http,
@@ -151,6 +162,7 @@ impl Refused {
                 None => return answer,
             },
         };
+        let error = if self.uri.path().starts_with(FEATURES) { as_query_error(&error) } else { error };
         let id = self.id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
         let mut problem = response(&error, &id, Some(self.uri.path()));
         for (name, value) in answer.headers() {
@@ -162,6 +174,16 @@ impl Refused {
             *problem.body_mut() = Body::empty();
         }
         problem
+    }
+}
+
+/// A value at fault as OGC API Features answers it; other errors as they are.
+fn as_query_error(error: &Arc<Error>) -> Arc<Error> {
+    match error.as_ref() {
+        Error::Refused(refusal) if refusal.kind == ErrorKind::InvalidArgument => {
+            Arc::new(Error::Refused(Refusal { kind: ErrorKind::InvalidQuery, ..refusal.clone() }))
+        }
+        Error::Refused(_) | Error::Fault(_) => error.clone(),
     }
 }
 

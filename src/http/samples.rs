@@ -17,7 +17,7 @@ use super::access::CallerApp;
 use super::extract::{CameraPath, Params, layout_of, media_type, negotiate, not_read};
 use super::idempotency::idempotent;
 use super::problem::{ApiResult, Problem};
-use super::wire::{Durability, json};
+use super::wire::{BoxForm, BoxUnit, Durability, OnConflict, json};
 use super::{Rest, body};
 use crate::app::{App, ImportOptions, ImportReport};
 use crate::domain::{self, CameraId, Error, Result, StoredSample, TargetId, TimeRange};
@@ -134,17 +134,17 @@ struct DeletedSamples {
     post, path = "/v1/cameras/{camera}/samples", tag = "samples",
     params(
         ("camera" = String, Path, description = "The camera's id"),
-        ("durability" = Option<String>, Query, description = "When the rows are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
-        ("on_conflict" = Option<String>, Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
+        ("durability" = inline(Option<Durability>), Query, description = "When the rows are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
+        ("on_conflict" = inline(Option<OnConflict>), Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
         ("columns" = Option<String>, Query, description = "The columns of a CSV file: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` (such as `time:Timestamp,left:x1`) names them; other columns are ignored"),
-        ("box_form" = Option<String>, Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV file hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
-        ("box_unit" = Option<String>, Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
+        ("box_form" = inline(Option<BoxForm>), Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV file hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
+        ("box_unit" = inline(Option<BoxUnit>), Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
         ("target_id" = Option<String>, Query, description = "The target of rows of a CSV file that name none"),
         ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters: an import that is sent again under the same key gets the answer of the first; for a day"),
     ),
     request_body(content(
         (String = "text/csv", example = "time,target_id,left,top,width,height,longitude,latitude\n2020-12-14T14:41:48+08:00,person-1,475,11,28,77,103.98678,30.6280135\n"),
-        (wire::Sample<'static> = "application/x-ndjson"),
+        (String = "application/x-ndjson", example = "{\"time\":\"2020-12-14T14:41:48+08:00\",\"target_id\":\"person-1\",\"bounding_box\":{\"left_px\":475,\"top_px\":11,\"width_px\":28,\"height_px\":77},\"fix\":{\"longitude_deg\":103.98678,\"latitude_deg\":30.628}}\n"),
         (Vec<wire::Sample<'static>> = "application/json"),
     )),
     responses(

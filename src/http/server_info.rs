@@ -11,7 +11,9 @@ use utoipa_axum::routes;
 
 use super::Rest;
 use super::problem::ApiResult;
+use super::tiles::TILES_PATH;
 use super::wire::json;
+use crate::config::Console;
 use crate::domain::Error;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -32,11 +34,23 @@ struct Server {
     tiles: Option<Tiles>,
 }
 
+/// How map tiles are stored.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum TileFormat {
+    /// An image per tile, each under a URL of its own.
+    Images,
+    /// One file that is read by ranges of bytes (PMTiles, version 3).
+    Pmtiles,
+}
+
 /// Map tiles.
 #[derive(Serialize, ToSchema)]
 struct Tiles {
-    /// Where they are, with `{z}`, `{x}` and `{y}`.
+    /// Where they are: with `{z}`, `{x}` and `{y}` for images, without for a PMTiles file.
     url: String,
+    /// How they are stored there.
+    format: TileFormat,
     /// What their provider asks to be shown.
     attribution: String,
 }
@@ -51,10 +65,14 @@ async fn get_server(State(rest): State<Rest>) -> ApiResult {
     let mut limits: BTreeMap<String, Value> = limits.map_err(Error::fault)?;
     // The others are policies, such as `sample_overflow`.
     limits.retain(|_, value| value.is_number());
-    let tiles = rest
-        .console
-        .tile_url
-        .clone()
-        .map(|url| Tiles { url, attribution: rest.console.tile_attribution.clone().unwrap_or_default() });
-    Ok(json(&Server { version: env!("CARGO_PKG_VERSION"), limits, tiles })?)
+    Ok(json(&Server { version: env!("CARGO_PKG_VERSION"), limits, tiles: tiles_of(&rest.console) })?)
+}
+
+fn tiles_of(settings: &Console) -> Option<Tiles> {
+    let (url, format) = match (&settings.tile_url, &settings.tile_file) {
+        (Some(url), _) => (url.clone(), TileFormat::Images),
+        (None, Some(_)) => (TILES_PATH.to_owned(), TileFormat::Pmtiles),
+        (None, None) => return None,
+    };
+    Some(Tiles { url, format, attribution: settings.tile_attribution.clone().unwrap_or_default() })
 }

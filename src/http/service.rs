@@ -37,7 +37,7 @@ const NAMED_CAMERAS: usize = 100;
 ///
 /// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
 /// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
-/// a line `degraded: insufficient-storage: ...`. Callers that may not read get the first line only.
+/// a line `degraded: insufficient-storage: ...`, nor damaged pages, of which a line `degraded: database: ...` tells. Callers that may not read get the first line only.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -60,6 +60,11 @@ async fn readyz(State(rest): State<Rest>, CallerApp(app): CallerApp) -> ApiResul
     let faults = app.registry.model_faults();
     if app.store.is_full() {
         text.push_str("degraded: insufficient-storage: imports are refused until space is freed\n");
+    }
+    if app.store.is_damaged() {
+        text.push_str(
+            "degraded: database: a damaged page was met; restore a backup: sightfix restore FILE\n",
+        );
     }
     for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {
         text.push_str(&format!("degraded: camera {camera}: {}\n", fault.reason));

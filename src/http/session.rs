@@ -39,7 +39,7 @@ struct SessionDraft {
 struct Session {
     /// What the caller may do.
     role: Role,
-    /// Name of the caller's key.
+    /// Name of the caller's key, or of the person who has signed in.
     #[serde(skip_serializing_if = "Option::is_none")]
     name: Option<String>,
     /// Id of the caller's key.
@@ -57,10 +57,14 @@ impl Session {
             Principal::Key(key) => Some(key.key()),
             _ => None,
         };
+        let user = match principal {
+            Principal::User(user) => Some(user.name().to_string()),
+            _ => None,
+        };
         let scope = principal.scope();
         Self {
             role: scope.map_or(Role::Admin, |scope| scope.role().into()),
-            name: key.map(|key| key.name.clone()),
+            name: key.map(|key| key.name.clone()).or(user),
             key_id: key.map(|key| key.id.to_string()),
             camera_ids: scope.map(camera_ids).unwrap_or_default(),
             open_access: matches!(principal, Principal::Everyone),
@@ -84,7 +88,7 @@ async fn start_session(CallerApp(app): CallerApp, headers: HeaderMap, body: Json
     let SessionDraft { key } = body.read()?;
     let (token, principal) = app.start_session(&key)?;
     let response = json(&Session::of(&principal))?;
-    Ok(with_cookie(response, &headers, token.reveal(), SESSION_TIME.as_secs())?)
+    Ok(with_cookie(response, is_https(&headers), token.reveal(), SESSION_TIME.as_secs())?)
 }
 
 /// Who asks, and what they may do
@@ -105,25 +109,39 @@ async fn end_session(CallerApp(app): CallerApp, headers: HeaderMap) -> ApiResult
     if let Some(token) = session_token(&headers) {
         app.access.end_session(token);
     }
-    Ok(with_cookie(empty(), &headers, "", 0)?)
+    Ok(with_cookie(empty(), is_https(&headers), "", 0)?)
 }
 
 /// The token of the session's cookie.
 #[must_use]
 pub fn session_token(headers: &HeaderMap) -> Option<&str> {
+    cookie(headers, SESSION_COOKIE)
+}
+
+/// The value of a cookie.
+pub(super) fn cookie<'h>(headers: &'h HeaderMap, wanted: &str) -> Option<&'h str> {
     let cookies = headers.get_all(COOKIE).iter().filter_map(|header| header.to_str().ok());
     cookies.flat_map(|cookies| cookies.split(';')).find_map(|cookie| {
         let (name, value) = cookie.trim().split_once('=')?;
-        (name == SESSION_COOKIE).then_some(value)
+        (name == wanted).then_some(value)
     })
 }
 
-fn with_cookie(mut response: Response, headers: &HeaderMap, token: &str, age_s: i64) -> Result<Response> {
-    // The browser names the scheme that it sees, whether TLS ends here or at a proxy.
-    let is_https = headers.get(ORIGIN).is_some_and(|origin| origin.as_bytes().starts_with(b"https://"));
+/// The browser names the scheme that it sees, whether TLS ends here or at a proxy.
+fn is_https(headers: &HeaderMap) -> bool {
+    headers.get(ORIGIN).is_some_and(|origin| origin.as_bytes().starts_with(b"https://"))
+}
+
+/// The response with the session's cookie; an empty token of age 0 removes it.
+pub(super) fn with_cookie(
+    mut response: Response,
+    is_https: bool,
+    token: &str,
+    age_s: i64,
+) -> Result<Response> {
     let secure = if is_https { "; Secure" } else { "" };
     let cookie =
         format!("{SESSION_COOKIE}={token}; Path=/; Max-Age={age_s}; HttpOnly; SameSite=Strict{secure}");
-    response.headers_mut().insert(SET_COOKIE, HeaderValue::from_str(&cookie).map_err(Error::fault)?);
+    response.headers_mut().append(SET_COOKIE, HeaderValue::from_str(&cookie).map_err(Error::fault)?);
     Ok(response)
 }

@@ -22,12 +22,13 @@ use super::access::CallerApp;
 use super::cameras::CameraMoved;
 use super::extract::{CameraPath, Client, JsonBody, LastEventId, Params, TargetPath};
 use super::fusions::{FusionRequest, observations};
+use super::moving_features::MovingFeatures;
 use super::problem::{ApiResult, Problem};
-use super::wire::{json, json_of_about};
+use super::wire::{Durability, json, json_of_about};
 use crate::app::{
     Acknowledgement, CameraEvent, EventId, ItemResult, LostEvents, NotStoredReason, TargetUpdate, TrackPoint,
 };
-use crate::domain::Result;
+use crate::domain::{Error, Result};
 use crate::exchange::wire;
 use crate::fusion::track;
 use crate::geo::Position;
@@ -196,6 +197,15 @@ struct TrackFeatures {
     features: Vec<TrackFeature>,
 }
 
+/// Positions as features, or as moving features.
+#[derive(ToSchema)]
+#[serde(untagged)]
+#[expect(dead_code, reason = "the shapes of an answer, for the description alone")]
+enum TracksOrHistories {
+    Positions(TrackFeatures),
+    Histories(MovingFeatures),
+}
+
 fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     let features = points.iter().map(|point| point.as_ref().into()).collect();
     let mut response = json(&TrackFeatures { r#type: "FeatureCollection", features })?;
@@ -203,28 +213,79 @@ fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     Ok(response)
 }
 
+/// What histories are written as.
+#[derive(Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum HistoryForm {
+    /// A GeoJSON feature per position.
+    #[serde(rename = "geojson")]
+    GeoJson,
+    /// A moving feature per target.
+    MovingFeatures,
+}
+
+impl HistoryForm {
+    fn of(uri: &Uri) -> Result<Self> {
+        let mut params = Params::of(uri)?;
+        let form = params.take("form", |text| match text {
+            "geojson" => Ok(Self::GeoJson),
+            "moving_features" => Ok(Self::MovingFeatures),
+            _ => Err(Error::invalid("form", "must be geojson or moving_features")),
+        })?;
+        params.end()?;
+        Ok(form.unwrap_or(Self::GeoJson))
+    }
+}
+
+fn moving_features<'a>(
+    histories: impl Iterator<Item = &'a [Arc<TrackPoint>]>,
+) -> Result<axum::response::Response> {
+    let mut response = json(&MovingFeatures::of(histories))?;
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/geo+json"));
+    Ok(response)
+}
+
+/// All that a track states, as the properties of a GeoJSON feature.
+pub(super) fn track_properties(point: &TrackPoint) -> impl Serialize + use<> {
+    TrackState::from(point)
+}
+
 /// List the targets that are followed, with their latest positions
 ///
-/// A target that was not measured for a minute is left out.
+/// A target that was not measured for a minute is left out. With `form=moving_features` each target comes with its
+/// history, as OGC Moving Features JSON (19-045r3).
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/tracks", tag = "tracks",
-    params(("camera" = String, Path, description = "The camera's id")),
-    responses((status = 200, description = "Positions, by target", body = TrackFeatures, content_type = "application/geo+json"))
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("form" = inline(Option<HistoryForm>), Query, description = "`geojson` (if left out) or `moving_features`"),
+    ),
+    responses((status = 200, description = "Positions, by target", body = TracksOrHistories, content_type = "application/geo+json"))
 )]
-async fn list_tracks(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    Ok(geojson(&app.tracks(&id).await?)?)
+async fn list_tracks(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
+    if HistoryForm::of(&uri)? == HistoryForm::GeoJson {
+        return Ok(geojson(&app.tracks(&id).await?)?);
+    }
+    let histories = app.track_histories(&id).await?;
+    Ok(moving_features(histories.iter().map(Vec::as_slice))?)
 }
 
 /// Read where a target was
 ///
-/// Oldest first, as far back as the history reaches.
+/// Oldest first, as far back as the history reaches. With `form=moving_features` as one feature of OGC Moving
+/// Features JSON (19-045r3).
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/tracks/{target}", tag = "tracks",
-    params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id")),
-    responses((status = 200, description = "Positions, oldest first", body = TrackFeatures, content_type = "application/geo+json"))
+    params(("camera" = String, Path, description = "The camera's id"), ("target" = String, Path, description = "The target's id"), ("form" = inline(Option<HistoryForm>), Query, description = "`geojson` (if left out) or `moving_features`")),
+    responses((status = 200, description = "Positions, oldest first", body = TracksOrHistories, content_type = "application/geo+json"))
 )]
-async fn get_track(CallerApp(app): CallerApp, TargetPath(id, target): TargetPath) -> ApiResult {
-    Ok(geojson(&app.track_history(&id, &target).await?)?)
+async fn get_track(CallerApp(app): CallerApp, TargetPath(id, target): TargetPath, uri: Uri) -> ApiResult {
+    let form = HistoryForm::of(&uri)?;
+    let history = app.track_history(&id, &target).await?;
+    Ok(match form {
+        HistoryForm::GeoJson => geojson(&history)?,
+        HistoryForm::MovingFeatures => moving_features(std::iter::once(&history[..]))?,
+    })
 }
 
 /// One observation's own position, and its target's track with it.
@@ -347,7 +408,7 @@ impl From<Acknowledgement> for StoredObservations {
     params(
         ("camera" = String, Path, description = "The camera's id"),
         ("store_samples" = Option<bool>, Query, description = "Pair boxes and fixes by target and time, and store the samples"),
-        ("durability" = Option<String>, Query, description = "When samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
+        ("durability" = inline(Option<Durability>), Query, description = "When samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
     ),
     request_body = FusionRequest,
     responses(
@@ -382,6 +443,19 @@ async fn follow(
     Ok(json_of_about(&FollowedObservations { items, stored }, 64 + ITEM_BYTES * followed.len())?)
 }
 
+/// What the events of a camera carry, by the event's name.
+#[derive(ToSchema)]
+#[serde(untagged)]
+#[expect(dead_code, reason = "the shapes of events, for the description alone")]
+enum CameraEventBody<'a> {
+    /// `track`.
+    Track(TrackUpdate<'a>),
+    /// `camera_moved`.
+    Moved(CameraMoved),
+    /// `lost`: the number of lost events, null where it is not known.
+    Lost(Option<u64>),
+}
+
 /// Watch a camera
 ///
 /// Server-sent events from now on: `track` with a position as GeoJSON whenever a target was
@@ -398,7 +472,7 @@ async fn follow(
         ("last-event-id" = Option<String>, Header, description = "The id of the last event that the client has seen"),
         ("last_event_id" = Option<String>, Query, description = "The same, for a page that cannot send the header"),
     ),
-    responses((status = 200, description = "Events", body = TrackUpdate<'static>, content_type = "text/event-stream"))
+    responses((status = 200, description = "Events", body = CameraEventBody<'static>, content_type = "text/event-stream"))
 )]
 async fn watch_camera(
     State(rest): State<Rest>,

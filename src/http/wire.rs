@@ -51,6 +51,41 @@ impl From<crate::domain::Recipe> for Recipe {
     }
 }
 
+/// What becomes of a sample that is stored already.
+#[derive(ToSchema)]
+#[schema(rename_all = "snake_case")]
+#[expect(dead_code, reason = "the values of a parameter, for the description alone")]
+pub(super) enum OnConflict {
+    /// It is counted as a duplicate; but a sample with a fix takes the place of one without.
+    Keep,
+    /// The new one takes its place.
+    Replace,
+}
+
+/// What the columns of a box hold in a CSV file.
+#[derive(ToSchema)]
+#[schema(rename_all = "snake_case")]
+#[expect(dead_code, reason = "the values of a parameter, for the description alone")]
+pub(super) enum BoxForm {
+    /// Left, top, width, height.
+    LeftTop,
+    /// Centre x, centre y, width, height.
+    Centre,
+    /// Left, top, right, bottom.
+    Corners,
+}
+
+/// Unit of the sides of boxes in a CSV file.
+#[derive(ToSchema)]
+#[schema(rename_all = "snake_case")]
+#[expect(dead_code, reason = "the values of a parameter, for the description alone")]
+pub(super) enum BoxUnit {
+    /// Pixels.
+    Px,
+    /// Shares of the image's width and height.
+    Share,
+}
+
 /// When stored samples are acknowledged.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]

@@ -6,7 +6,6 @@
 //! ([`Backoff`]), opens another stream and resumes after the last acknowledgement. What never happens
 //! here: files, flags, unbounded memory, randomness without a seed.
 
-mod backoff;
 mod fault_injection;
 mod latency_histogram;
 mod options;
@@ -25,8 +24,8 @@ use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 use tokio_util::sync::CancellationToken;
 
+use crate::backoff::Backoff;
 use crate::grpc::client::{ClientError, Connection};
-use backoff::Backoff;
 use fault_injection::FaultInjector;
 use paced_feed::{PacedFeed, ReplaySchedule};
 use report::Counts;

@@ -7,12 +7,12 @@ use std::time::{Duration, Instant};
 use tokio::time::{sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::backoff::Backoff;
 use super::options::ReplayOptions;
 use super::paced_feed::PacedFeed;
 use super::progress::Counters;
 use super::report::Counts;
 use super::resend_buffer::{Answered, ResendBuffer};
+use crate::backoff::Backoff;
 use crate::domain::{LiveItem, ReceiverId, TargetId};
 use crate::grpc::client::{ClientError, Connection, Event, Events, ItemSender, Opening, SendPermit};
 use crate::grpc::proto::StreamAnswer;

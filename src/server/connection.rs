@@ -3,6 +3,7 @@
 //!
 //! `axum::serve` sets no deadlines: a half-sent header would stay open without end.
 
+use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,6 +16,7 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::{Instant, MissedTickBehavior};
 
 use super::activity::Activity;
+use super::connection_gate::ConnectionGate;
 use super::guarded_stream::GuardedStream;
 use super::peer::Peer;
 use super::pipeline::RequestPipeline;
@@ -52,51 +54,74 @@ pub(super) fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
     socket.listen(BACKLOG)
 }
 
-/// Accepts connections until the shutdown begins.
-pub(super) async fn accept(
-    listener: TcpListener,
-    pipeline: Arc<RequestPipeline>,
-    tls: Option<Arc<Tls>>,
-    limits: &Limits,
-    shutdown: &Shutdown,
-) {
-    let server = Arc::new(ConnectionServer {
-        builder: builder(limits),
-        pipeline,
-        tls,
-        limits: limits.clone(),
-        shutdown: shutdown.clone(),
-    });
-    let connections = Quota::new("connections", limits.connections, limits.client_share);
-    let excess = Quota::new("connections", EXCESS_CONNECTIONS, limits.client_share);
-    loop {
-        let (stream, address) = tokio::select! {
-            () = shutdown.draining() => return,
-            accepted = listener.accept() => match accepted {
-                Ok(accepted) => accepted,
-                Err(error) => {
-                    // Out of file descriptors, mostly: wait until some are given back.
-                    tracing::warn!(%error, "cannot accept a connection");
-                    tokio::time::sleep(Duration::from_millis(100)).await;
-                    continue;
-                }
-            },
-        };
-        let client = ClientId::from(address.ip());
-        let (lease, refusal) = match connections.try_acquire(client, 1) {
-            Ok(lease) => (lease, None),
-            Err(error) => {
-                server.pipeline.metrics().connection_refused();
-                let Ok(lease) = excess.try_acquire(client, 1) else { continue };
-                (lease, Some(Arc::new(error)))
-            }
-        };
-        let server = server.clone();
-        shutdown.spawn(async move {
-            let peer = Peer { client, address: address.ip().to_canonical(), certificate: None, refusal };
-            server.serve(stream, peer).await;
-            drop(lease);
+/// What becomes of the connections of one listener.
+pub(super) struct Acceptor {
+    pub(super) pipeline: Arc<RequestPipeline>,
+    pub(super) tls: Option<Arc<Tls>>,
+    /// Bounds how often an address connects, where clients do.
+    pub(super) gate: Option<Arc<ConnectionGate>>,
+}
+
+impl Acceptor {
+    /// Accepts connections until the shutdown begins.
+    pub(super) async fn accept(self, listener: TcpListener, limits: &Limits, shutdown: &Shutdown) {
+        let server = Arc::new(ConnectionServer {
+            builder: builder(limits),
+            acceptor: self,
+            limits: limits.clone(),
+            shutdown: shutdown.clone(),
         });
+        let connections = Quota::new("connections", limits.connections, limits.client_share);
+        let excess = Quota::new("connections", EXCESS_CONNECTIONS, limits.client_share);
+        while let Some((stream, address)) = next_connection(&listener, shutdown).await {
+            let client = ClientId::from(address.ip());
+            let metrics = server.acceptor.pipeline.metrics();
+            if let Some(gate) = &server.acceptor.gate
+                && let Some(until) = gate.refused_until(address.ip(), Instant::now())
+            {
+                metrics.connection_refused();
+                gate.hold(stream, client, until, shutdown);
+                continue;
+            }
+            let (lease, refusal) = match connections.try_acquire(client, 1) {
+                Ok(lease) => (lease, None),
+                Err(error) => {
+                    metrics.connection_refused();
+                    let Ok(lease) = excess.try_acquire(client, 1) else { continue };
+                    (lease, Some(Arc::new(error)))
+                }
+            };
+            let server = server.clone();
+            shutdown.spawn(async move {
+                let peer = Peer {
+                    client,
+                    address: address.ip().to_canonical(),
+                    certificate: None,
+                    is_tls: false,
+                    refusal,
+                };
+                server.serve(stream, peer).await;
+                drop(lease);
+            });
+        }
+    }
+}
+
+/// The next connection; `None` once the shutdown begins.
+async fn next_connection(listener: &TcpListener, shutdown: &Shutdown) -> Option<(TcpStream, SocketAddr)> {
+    loop {
+        let accepted = tokio::select! {
+            () = shutdown.draining() => return None,
+            accepted = listener.accept() => accepted,
+        };
+        match accepted {
+            Ok(accepted) => return Some(accepted),
+            Err(error) => {
+                // Out of file descriptors, mostly: wait until some are given back.
+                tracing::warn!(%error, "cannot accept a connection");
+                tokio::time::sleep(Duration::from_millis(100)).await;
+            }
+        }
     }
 }
 
@@ -121,8 +146,7 @@ fn builder(limits: &Limits) -> Builder<TokioExecutor> {
 /// What all connections share.
 struct ConnectionServer {
     builder: Builder<TokioExecutor>,
-    pipeline: Arc<RequestPipeline>,
-    tls: Option<Arc<Tls>>,
+    acceptor: Acceptor,
     limits: Limits,
     shutdown: Shutdown,
 }
@@ -132,8 +156,8 @@ impl ConnectionServer {
     async fn serve(&self, stream: TcpStream, mut peer: Peer) {
         // Answers are written whole; waiting to fill a packet only delays them.
         let _ = stream.set_nodelay(true);
-        let _open = self.pipeline.metrics().connection();
-        let Some(tls) = &self.tls else { return self.serve_http(stream, peer).await };
+        let _open = self.acceptor.pipeline.metrics().connection();
+        let Some(tls) = &self.acceptor.tls else { return self.serve_http(stream, peer).await };
         let is_tls = async {
             let mut first = [0];
             Ok::<_, std::io::Error>(stream.peek(&mut first).await? > 0 && first[0] == HANDSHAKE_RECORD)
@@ -142,7 +166,9 @@ impl ConnectionServer {
             Some(true) => {
                 let Some((stream, certificate)) = self.in_time(tls.accept(stream)).await else { return };
                 peer.certificate = certificate;
-                self.serve_http(stream, peer).await;
+                peer.is_tls = true;
+                // On the heap: plain connections need no room for what TLS holds.
+                Box::pin(self.serve_http(stream, peer)).await;
             }
             Some(false) if is_of_this_machine(&stream, &peer) => self.serve_http(stream, peer).await,
             Some(false) => {
@@ -172,14 +198,16 @@ impl ConnectionServer {
     where
         S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
     {
-        let metrics = self.pipeline.metrics();
+        let metrics = self.acceptor.pipeline.metrics();
         let activity = Activity::new();
         let mut closing = Closing::new(&self.limits, peer.refusal.is_some());
         let stream = TokioIo::new(GuardedStream::new(stream, &self.limits, activity.clone()));
-        let (pipeline, requests) = (self.pipeline.clone(), activity.clone());
+        let (pipeline, requests) = (self.acceptor.pipeline.clone(), activity.clone());
+        let address = peer.address;
         let service = service_fn(move |request| {
             let (pipeline, peer, open) = (pipeline.clone(), peer.clone(), requests.request());
-            async move { Ok::<_, std::convert::Infallible>(pipeline.answer(request, &peer, open).await) }
+            // hyper holds a place as large as this future as long as an HTTP/1 connection is open.
+            Box::pin(async move { Ok::<_, Infallible>(pipeline.answer(request, &peer, open).await) })
         });
         let mut connection = std::pin::pin!(self.builder.serve_connection(stream, service));
         let mut looks = tokio::time::interval(self.limits.idle_time() / LOOKS_PER_IDLE_TIME);
@@ -187,8 +215,11 @@ impl ConnectionServer {
         let mut is_draining = false;
         let reason = loop {
             tokio::select! {
-                // A connection that breaks is the client's affair.
-                _ = connection.as_mut() => break closing.reason,
+                ended = connection.as_mut() => break match ended {
+                    Err(error) if is_flood(&*error) => Some(CloseReason::Flooded),
+                    // A connection that breaks is the client's affair.
+                    _ => closing.reason,
+                },
                 () = self.shutdown.draining(), if !is_draining => {
                     connection.as_mut().graceful_shutdown();
                     is_draining = true;
@@ -207,8 +238,19 @@ impl ConnectionServer {
         if let Some(reason) = activity.given_up().or(reason) {
             tracing::debug!(?reason, "closed a connection");
             metrics.connection_closed(reason);
+            if let (CloseReason::Flooded, Some(gate)) = (reason, &self.acceptor.gate) {
+                gate.flooded(address, Instant::now());
+            }
         }
     }
+}
+
+/// Whether the library ended a connection for a flood, such as of streams that are reset at once.
+fn is_flood(error: &(dyn std::error::Error + 'static)) -> bool {
+    let causes = std::iter::successors(Some(error), |error| error.source());
+    causes
+        .filter_map(|error| error.downcast_ref::<h2::Error>())
+        .any(|error| error.is_library() && error.reason() == Some(h2::Reason::ENHANCE_YOUR_CALM))
 }
 
 /// Whether the client is on this machine, by either of its addresses.

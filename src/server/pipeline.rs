@@ -11,6 +11,7 @@ use http_body_util::BodyExt as _;
 use hyper::body::{Body as _, Incoming};
 use hyper::header::{CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
 use hyper::http::HeaderValue;
+use hyper::http::uri::Scheme;
 use hyper::{Method, Request, Response, Version};
 use tokio::sync::Semaphore;
 use tower::{Layer as _, Service as _, ServiceExt as _, service_fn};
@@ -32,12 +33,14 @@ use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
 use crate::telemetry::{MatchedRoute, Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
-use crate::{grpc, http};
+use crate::{grpc, http, status};
 
 /// Longest request id that is taken from a client, in bytes.
 const LONGEST_REQUEST_ID: usize = 128;
 /// Bodies of refused requests that are read to their end at a time; more clients are answered at once.
 const DISCARDED_BODIES: usize = 256;
+/// Longest time for which the refusal of a client waits whose bodies were refused before.
+const REFUSED_WAIT: Duration = Duration::from_secs(1);
 /// How long the body of a refused request is read.
 const DISCARD_TIME: Duration = Duration::from_secs(10);
 
@@ -223,9 +226,12 @@ impl RequestPipeline {
         id: &RequestId,
     ) -> (Response<Body>, Option<Ticket>) {
         let is_grpc = counted.is_grpc();
+        let is_encoded = request.headers().contains_key(CONTENT_ENCODING);
         match self.admit(request, counted, peer, id).await {
             Ok((request, granted)) => {
-                (self.route(is_grpc, request, &granted, id).await, Some(granted.ticket))
+                let response = self.route(is_grpc, request, &granted, id).await;
+                self.charge_refused(&response, &granted, is_encoded);
+                (response, Some(granted.ticket))
             }
             Err(error) => {
                 if error.kind() == ErrorKind::Overloaded {
@@ -248,7 +254,13 @@ impl RequestPipeline {
         let path = request.uri().path();
         let is_grpc = counted.is_grpc();
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
-        match self.grant(&request, class, is_grpc, peer, id) {
+        let has_body = !request.body().is_end_stream();
+        let granted = match self.grant(&request, class, is_grpc, peer, id) {
+            Ok(granted) if has_body => self.wait_for_refused(class, granted).await,
+            Ok(granted) => Ok(granted),
+            Err(error) => Err(error),
+        };
+        match granted {
             Ok(granted) => {
                 let Granted { ticket, caller, client } = &granted;
                 let limits = &self.app.limits;
@@ -261,6 +273,7 @@ impl RequestPipeline {
                 extensions.insert(id.clone());
                 extensions.insert(*client);
                 extensions.insert(caller.clone());
+                extensions.insert(if peer.is_tls { Scheme::HTTPS } else { Scheme::HTTP });
                 if let Counted::Http(matched) = counted {
                     extensions.insert(matched.clone());
                 }
@@ -273,6 +286,49 @@ impl RequestPipeline {
                 self.discard(request).await;
                 Err(error)
             }
+        }
+    }
+
+    /// A client whose bodies were refused is served again after a while; until then it waits for the refusal, or it
+    /// would send the next at once.
+    async fn wait_for_refused(&self, class: RequestClass, granted: Granted) -> Result<Granted> {
+        if matches!(class, RequestClass::Probe | RequestClass::LiveStream) {
+            return Ok(granted);
+        }
+        let bodies = &self.app.quotas.refused_bodies;
+        let Some(wait) = bodies.wait(granted.client, tokio::time::Instant::now()) else { return Ok(granted) };
+        drop(granted);
+        tokio::select! {
+            () = tokio::time::sleep(wait.min(REFUSED_WAIT)) => {}
+            () = self.shutdown.forced() => return Err(shutting_down()),
+        }
+        let message = format!(
+            "bodies of this client were refused faster than the limit refused_bytes_per_s allows; try again in {} s",
+            wait.as_secs() + 1
+        );
+        Err(Error::refused(ErrorKind::RateLimited, message))
+    }
+
+    /// Charges a client for a body that was read in vain.
+    fn charge_refused(&self, response: &Response<Body>, granted: &Granted, is_encoded: bool) {
+        let is = |kind| response.status().as_u16() == status::of(kind).http;
+        let received = granted.ticket.received_bytes();
+        let body_bytes = self.app.limits.body_bytes as u64;
+        let bytes = match response.headers().get(GRPC_STATUS).map(HeaderValue::to_str) {
+            // Of the codes of gRPC only this one is always about the content.
+            Some(Ok(code)) if code.parse::<i32>() == Ok(status::of(ErrorKind::InvalidArgument).grpc) => {
+                received
+            }
+            Some(_) => return,
+            // What is beyond a limit is not looked at.
+            None if is(ErrorKind::TooLarge) => received.min(body_bytes),
+            None if is(ErrorKind::InvalidArgument) || is(ErrorKind::MalformedBody) => received,
+            None => return,
+        };
+        // What was decoded is not known here; what a body may be at most is.
+        let bytes = if is_encoded && bytes > 0 { bytes.max(body_bytes) } else { bytes };
+        if bytes > 0 {
+            self.app.quotas.refused_bodies.charge(granted.client, bytes, tokio::time::Instant::now());
         }
     }
 

@@ -12,10 +12,11 @@ use super::peer::Peer;
 use crate::admission::ClientId;
 
 /// Addresses of the client and of the proxies that passed its request on, in this order.
+const X_FORWARDED_PROTO: &str = "x-forwarded-proto";
 const X_FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
 
 /// The proxies whose statement of the client's address is used.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct TrustedProxies(Vec<Network>);
 
 impl TrustedProxies {
@@ -32,7 +33,7 @@ impl TrustedProxies {
         networks.iter().map(parse).collect::<anyhow::Result<_>>().map(Self)
     }
 
-    /// The sender of a request: of the addresses that `X-Forwarded-For` names, the last that is not a trusted
+    /// The sender of a request, and whether the proxy got it over TLS: of the addresses that `X-Forwarded-For` names, the last that is not a trusted
     /// proxy's. Anybody can write the entries before it.
     pub(super) fn original<'p>(&self, peer: &'p Peer, headers: &HeaderMap) -> Cow<'p, Peer> {
         if !self.trusts(peer.address) {
@@ -48,10 +49,12 @@ impl TrustedProxies {
                 break;
             }
         }
-        Cow::Owned(Peer { client: ClientId::from(address), address, ..peer.clone() })
+        let is_tls = headers.get(X_FORWARDED_PROTO).map_or(peer.is_tls, |scheme| scheme == "https");
+        Cow::Owned(Peer { client: ClientId::from(address), address, is_tls, ..peer.clone() })
     }
 
-    fn trusts(&self, address: IpAddr) -> bool {
+    /// Whether an address, in its canonical form, is a trusted proxy's.
+    pub(super) fn trusts(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(address))
     }
 }
@@ -64,6 +67,7 @@ fn address_of(entry: &str) -> Option<IpAddr> {
 }
 
 /// Addresses that begin with the same bits.
+#[derive(Clone)]
 struct Network {
     first: Ipv6Addr,
     /// Of the 128 bits of an IPv6 address, to which IPv4 addresses are mapped.
@@ -109,7 +113,7 @@ mod tests {
         let proxies = ["10.0.0.0/8".to_owned(), "fd00::1".to_owned()];
         let proxies = TrustedProxies::new(&proxies).expect("networks");
         let address: IpAddr = from.parse().expect("an address");
-        let peer = Peer { client: address.into(), address, certificate: None, refusal: None };
+        let peer = Peer { client: address.into(), address, certificate: None, is_tls: false, refusal: None };
         let mut headers = HeaderMap::new();
         for value in forwarded {
             headers.append(X_FORWARDED_FOR, HeaderValue::from_str(value).expect("a header"));

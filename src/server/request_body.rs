@@ -33,6 +33,7 @@ struct Grant {
     client: ClientId,
     /// Most bytes of the body that are held in memory and charged for.
     charged_bytes: u64,
+    received_bytes: u64,
     memory: Option<Lease>,
     place: Option<Lease>,
     refusal: BodyRefusal,
@@ -58,6 +59,7 @@ impl Ticket {
             class,
             client,
             charged_bytes: charged_bytes as u64,
+            received_bytes: 0,
             memory,
             place: None,
             refusal: BodyRefusal::default(),
@@ -84,6 +86,16 @@ impl Ticket {
     /// The work is done and the answer begins.
     pub(super) fn end_work(&self) {
         self.lock().place = None;
+    }
+
+    /// Bytes of the body that were passed on.
+    pub(super) fn received_bytes(&self) -> u64 {
+        self.lock().received_bytes
+    }
+
+    fn receive(&self, bytes: u64) -> Result<()> {
+        self.lock().received_bytes += bytes;
+        self.charge(bytes)
     }
 
     /// Why the body was refused, if it was or will be.
@@ -145,7 +157,7 @@ impl AdmittedBody {
             *left = left.saturating_sub(bytes);
             return None;
         }
-        let charged = self.ticket.charge(bytes).and_then(|()| {
+        let charged = self.ticket.receive(bytes).and_then(|()| {
             // Readers that know the length do not ask for the end.
             if self.body.is_end_stream() { self.ticket.begin_work() } else { Ok(()) }
         });

@@ -1,9 +1,11 @@
 //! Conversion of database errors into errors of the domain.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use sqlx::error::DatabaseError;
 
 use super::folder_fault::{FolderFault, FolderFaultKind};
-use crate::domain::{CameraId, Error, ErrorKind, EvaluationId, KeyId, RunId, SiteId};
+use crate::domain::{CameraId, ConnectionId, Error, ErrorKind, EvaluationId, KeyId, RunId, SiteId};
 
 /// A row that does not hold what was written: another program or the disk has changed it.
 #[derive(Debug, thiserror::Error)]
@@ -48,12 +50,23 @@ pub(super) fn failed(error: sqlx::Error) -> Error {
             "the disk is full, or the database has reached limits.database_bytes; delete samples, models or \
              training runs, or give it more space",
         ),
-        damaged if is_damaged(&damaged) => FolderFault::error(
-            FolderFaultKind::Damaged,
-            format!("the database is damaged ({damaged}); restore a backup: sightfix restore FILE"),
-        ),
+        damaged if is_damaged(&damaged) => {
+            DAMAGE_MET.store(true, Ordering::Relaxed);
+            FolderFault::error(
+                FolderFaultKind::Damaged,
+                format!("the database is damaged ({damaged}); restore a backup: sightfix restore FILE"),
+            )
+        }
         other => Error::fault(other),
     }
+}
+
+/// Of the process, as the log is: a server has one store, and an error does not know which statement it is of.
+static DAMAGE_MET: AtomicBool = AtomicBool::new(false);
+
+/// Whether a statement has met a damaged page since the process was started.
+pub(super) fn has_met_damage() -> bool {
+    DAMAGE_MET.load(Ordering::Relaxed)
 }
 
 /// SQLITE_CORRUPT and SQLITE_NOTADB.
@@ -79,6 +92,10 @@ pub(super) fn no_camera(id: &CameraId) -> Error {
 
 pub(super) fn no_site(id: &SiteId) -> Error {
     Error::refused(ErrorKind::SiteNotFound, format!("no site has the id {id}"))
+}
+
+pub(super) fn no_connection(id: &ConnectionId) -> Error {
+    Error::refused(ErrorKind::ConnectionNotFound, format!("no connection has the id {id}"))
 }
 
 /// The refusal of a camera's profile that names a site.

@@ -17,6 +17,7 @@ mod backup;
 mod camera_moves;
 mod cameras;
 mod connection;
+mod connections;
 mod errors;
 mod evaluations;
 mod file_check;
@@ -29,6 +30,7 @@ mod keys;
 mod latest_runs;
 mod models;
 mod occupants;
+mod outbox;
 mod reserve;
 mod restore;
 mod retention;
@@ -228,6 +230,12 @@ impl Store {
             .await
             .map_err(failed)?;
         Ok(())
+    }
+
+    /// Whether a damaged page was met since the process was started, so that a backup should be restored.
+    #[must_use]
+    pub fn is_damaged(&self) -> bool {
+        errors::has_met_damage()
     }
 
     fn readers(&self) -> &SqlitePool {

@@ -28,6 +28,12 @@ pub struct StoreLimits {
     pub cameras: u32,
     /// Sites; more are refused.
     pub sites: u32,
+    /// Connections with other systems; more are refused.
+    pub outside_connections: u32,
+    /// Waiting messages of one connection; beyond, the oldest is dropped.
+    pub outbox_messages: u32,
+    /// Dead letters of one connection; beyond, the oldest is deleted.
+    pub dead_letters: u32,
     /// Samples of one camera.
     pub samples_per_camera: u64,
     /// What happens beyond that.
@@ -59,6 +65,9 @@ impl Default for StoreLimits {
         Self {
             cameras: u32::MAX,
             sites: u32::MAX,
+            outside_connections: u32::MAX,
+            outbox_messages: u32::MAX,
+            dead_letters: u32::MAX,
             samples_per_camera: u64::MAX,
             sample_overflow: SampleOverflow::Refuse,
             samples: u64::MAX,

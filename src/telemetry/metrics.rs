@@ -1,18 +1,33 @@
 //! Metrics, as one typed struct: no name is spelled at a call site.
 
+mod answers;
+mod connections;
+mod jobs;
+mod live;
+mod storage;
+
 use std::sync::Arc;
 use std::time::Duration;
 
-use metrics::{Counter, Gauge, Histogram};
+use metrics::{Counter, Gauge};
 use metrics_exporter_prometheus::PrometheusHandle;
 
+use self::answers::{FusionMetrics, ImportMetrics};
+use self::connections::ConnectionMetrics;
+use self::jobs::QueueMetrics;
+use self::live::{LiveMetrics, SiteMetrics};
+use self::storage::{QuotaMetrics, StorageMetrics};
 use super::process;
 use super::registry::Registry;
 use super::request_metrics::{RequestMetrics, Route, RpcCall};
 use crate::admission::{QuotaUsage, Quotas};
-use crate::domain::{Flag, FusedFix, JobState};
-use crate::fusion::track::{Rejection, RejectionReason};
+use crate::domain::{Flag, FusedFix};
+use crate::fusion::track::Rejection;
 use crate::store::{JobCounts, StorageStatus};
+
+pub use self::connections::{CloseReason, OpenConnection};
+pub use self::jobs::JobMetrics;
+pub use self::live::SiteItemOutcome;
 
 /// Everything that is counted and timed.
 #[derive(Clone)]
@@ -34,153 +49,6 @@ pub struct Metrics {
     queues: QueueMetrics,
     models_unusable: Gauge,
     maintenance_errors: Counter,
-}
-
-#[derive(Clone)]
-struct FusionMetrics {
-    answered: Counter,
-    denied: Counter,
-    outside_training: Counter,
-}
-
-#[derive(Clone)]
-struct ImportMetrics {
-    accepted: Counter,
-    duplicate: Counter,
-    rejected: Counter,
-}
-
-#[derive(Clone)]
-struct ConnectionMetrics {
-    open: Gauge,
-    refused: Counter,
-    closed: [(CloseReason, Counter); CloseReason::ALL.len()],
-}
-
-#[derive(Clone)]
-struct LiveMetrics {
-    track_nis: Histogram,
-    track_rejections: [(RejectionReason, Counter); RejectionReason::ALL.len()],
-    streams: Gauge,
-    items: Counter,
-    item_errors: Counter,
-    answers_lost: Counter,
-    cameras_moved: Counter,
-}
-
-#[derive(Clone)]
-struct SiteMetrics {
-    items: [(SiteItemOutcome, Counter); SiteItemOutcome::ALL.len()],
-    tracks: Gauge,
-    tracks_started: Counter,
-    handovers: Counter,
-    events_lost: Counter,
-}
-
-/// What became of a box or fix that was handed to the tracker of a site.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SiteItemOutcome {
-    /// It went into the tracker.
-    Tracked,
-    /// A later frame had been tracked before.
-    Late,
-    /// The queue, or its frame, was full.
-    Overflow,
-    /// It is beyond the range of the site's plane.
-    OutOfRange,
-    /// Its position is too uncertain to tell targets apart.
-    Uncertain,
-}
-
-impl SiteItemOutcome {
-    /// All of them.
-    pub const ALL: [Self; 5] = [Self::Tracked, Self::Late, Self::Overflow, Self::OutOfRange, Self::Uncertain];
-
-    /// The label in the metrics.
-    #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Tracked => "tracked",
-            Self::Late => "late",
-            Self::Overflow => "overflow",
-            Self::OutOfRange => "out_of_range",
-            Self::Uncertain => "uncertain",
-        }
-    }
-}
-
-#[derive(Clone)]
-struct StorageMetrics {
-    is_full: Gauge,
-    database_bytes: Gauge,
-    database_free_bytes: Gauge,
-    disk_available_bytes: Gauge,
-    samples: Gauge,
-    queued_rows: Gauge,
-}
-
-#[derive(Clone)]
-struct QuotaMetrics {
-    held: Gauge,
-    limit: Gauge,
-}
-
-/// Jobs that have not ended.
-#[derive(Clone)]
-struct QueueMetrics {
-    training: [Gauge; 2],
-    evaluation: [Gauge; 2],
-}
-
-/// Why the server closes a connection by itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum CloseReason {
-    /// No request for the idle time.
-    Idle,
-    /// The client took a response too slowly.
-    Stalled,
-    /// Too many HTTP/2 control frames per second.
-    Flooded,
-    /// It was still open when the time to shut down was over.
-    Shutdown,
-}
-
-impl CloseReason {
-    /// All of them.
-    pub const ALL: [Self; 4] = [Self::Idle, Self::Stalled, Self::Flooded, Self::Shutdown];
-
-    /// The label in the metrics.
-    #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Idle => "idle",
-            Self::Stalled => "stalled",
-            Self::Flooded => "flooded",
-            Self::Shutdown => "shutdown",
-        }
-    }
-}
-
-/// What is counted and timed of one kind of background job.
-#[derive(Clone)]
-pub struct JobMetrics {
-    succeeded: Counter,
-    failed: Counter,
-    cancelled: Counter,
-    duration_s: Histogram,
-}
-
-impl JobMetrics {
-    /// A job has ended.
-    pub fn ended(&self, state: JobState, time: Duration) {
-        match state {
-            JobState::Succeeded => self.succeeded.increment(1),
-            JobState::Failed => self.failed.increment(1),
-            JobState::Cancelled => self.cancelled.increment(1),
-            JobState::Queued | JobState::Running | JobState::Cancelling => return,
-        }
-        self.duration_s.record(time.as_secs_f64());
-    }
 }
 
 impl Default for Metrics {
@@ -399,87 +267,6 @@ impl Metrics {
     }
 }
 
-impl FusionMetrics {
-    fn register(registry: &Registry) -> Self {
-        Self {
-            answered: registry.counter("sightfix_fusions_total", "Observations answered", &[]),
-            denied: registry.counter(
-                "sightfix_fusions_denied_total",
-                "Observations answered without a fix",
-                &[],
-            ),
-            outside_training: registry.counter(
-                "sightfix_fusions_outside_training_total",
-                "Observations whose box was unlike those trained on",
-                &[],
-            ),
-        }
-    }
-}
-
-impl ImportMetrics {
-    fn register(registry: &Registry) -> Self {
-        let rows = |outcome| {
-            registry.counter("sightfix_samples_total", "Rows of imports, by outcome", &[("outcome", outcome)])
-        };
-        Self { accepted: rows("accepted"), duplicate: rows("duplicate"), rejected: rows("rejected") }
-    }
-}
-
-impl JobMetrics {
-    /// Each pair is a metric's name and its description.
-    fn register(registry: &Registry, total: [&'static str; 2], duration: [&'static str; 2]) -> Self {
-        let ended = |state: JobState| registry.counter(total[0], total[1], &[("state", state.as_str())]);
-        Self {
-            succeeded: ended(JobState::Succeeded),
-            failed: ended(JobState::Failed),
-            cancelled: ended(JobState::Cancelled),
-            duration_s: registry.histogram(duration[0], duration[1], &[]),
-        }
-    }
-}
-
-impl ConnectionMetrics {
-    fn register(registry: &Registry) -> Self {
-        let closed = |reason: CloseReason| {
-            let help = "Connections that the server closed by itself, by reason";
-            let name = "sightfix_connections_closed_total";
-            (reason, registry.counter(name, help, &[("reason", reason.as_str())]))
-        };
-        Self {
-            open: registry.gauge("sightfix_connections", "Open connections", &[]),
-            refused: registry.counter(
-                "sightfix_connections_refused_total",
-                "Connections beyond the limit, in all or of one client address",
-                &[],
-            ),
-            closed: CloseReason::ALL.map(closed),
-        }
-    }
-}
-
-impl QuotaMetrics {
-    fn register(registry: &Registry, resource: &'static str) -> Self {
-        let labels = [("resource", resource)];
-        Self {
-            held: registry.gauge("sightfix_quota_held", "Held of a bounded resource by all clients", &labels),
-            limit: registry.gauge("sightfix_quota_limit", "Limit of a bounded resource", &labels),
-        }
-    }
-}
-
-impl QueueMetrics {
-    fn register(registry: &Registry) -> Self {
-        let jobs = |kind| {
-            ["queued", "running"].map(|state| {
-                let labels = [("kind", kind), ("state", state)];
-                registry.gauge("sightfix_jobs", "Background jobs that have not ended", &labels)
-            })
-        };
-        Self { training: jobs("training"), evaluation: jobs("evaluation") }
-    }
-}
-
 fn register_build_info(registry: &Registry) {
     let profile = if cfg!(debug_assertions) { "debug" } else { "release" };
     let labels = [
@@ -489,109 +276,4 @@ fn register_build_info(registry: &Registry) {
         ("profile", profile),
     ];
     registry.gauge("sightfix_build_info", "1; the labels tell what runs", &labels).set(1.0);
-}
-
-impl LiveMetrics {
-    fn register(registry: &Registry) -> Self {
-        let rejections = |reason: RejectionReason| {
-            let help = "Measured positions that tracks rejected, by reason";
-            let name = "sightfix_track_rejections_total";
-            (reason, registry.counter(name, help, &[("reason", reason.as_str())]))
-        };
-        Self {
-            track_nis: registry.histogram(
-                "sightfix_track_nis",
-                "Normalised innovation squared of tracks, 2 degrees of freedom each; mean 2 if consistent",
-                &[],
-            ),
-            track_rejections: RejectionReason::ALL.map(rejections),
-            streams: registry.gauge("sightfix_live_streams", "Open live streams", &[]),
-            items: registry.counter(
-                "sightfix_live_items_total",
-                "Items of live streams that were accepted",
-                &[],
-            ),
-            item_errors: registry.counter(
-                "sightfix_live_item_errors_total",
-                "Items of live streams that were refused",
-                &[],
-            ),
-            answers_lost: registry.counter(
-                "sightfix_live_answers_lost_total",
-                "Answers of live streams that slow readers lost",
-                &[],
-            ),
-            cameras_moved: registry.counter(
-                "sightfix_cameras_moved_total",
-                "Alarms that a camera was moved",
-                &[],
-            ),
-        }
-    }
-}
-
-impl SiteMetrics {
-    fn register(registry: &Registry) -> Self {
-        let items = |outcome: SiteItemOutcome| {
-            let help = "Boxes and fixes handed to the trackers of sites, by outcome";
-            (outcome, registry.counter("sightfix_site_items_total", help, &[("outcome", outcome.as_str())]))
-        };
-        Self {
-            items: SiteItemOutcome::ALL.map(items),
-            tracks: registry.gauge("sightfix_world_tracks", "Confirmed world tracks of all sites", &[]),
-            tracks_started: registry.counter(
-                "sightfix_world_tracks_started_total",
-                "World tracks that were confirmed",
-                &[],
-            ),
-            handovers: registry.counter(
-                "sightfix_world_track_handovers_total",
-                "Targets handed over from camera to camera",
-                &[],
-            ),
-            events_lost: registry.counter(
-                "sightfix_site_events_lost_total",
-                "Events of sites that slow readers lost",
-                &[],
-            ),
-        }
-    }
-}
-
-impl StorageMetrics {
-    fn register(registry: &Registry) -> Self {
-        Self {
-            is_full: registry.gauge(
-                "sightfix_storage_full",
-                "1 while imports are refused for want of space",
-                &[],
-            ),
-            database_bytes: registry.gauge("sightfix_database_bytes", "Size of the database file", &[]),
-            database_free_bytes: registry.gauge(
-                "sightfix_database_free_bytes",
-                "Of these, free for new rows",
-                &[],
-            ),
-            disk_available_bytes: registry.gauge(
-                "sightfix_disk_available_bytes",
-                "Available on the disk of the data folder",
-                &[],
-            ),
-            samples: registry.gauge("sightfix_samples_stored", "Samples of all cameras", &[]),
-            queued_rows: registry.gauge(
-                "sightfix_sample_rows_queued",
-                "Samples that wait to be stored, or are being stored",
-                &[],
-            ),
-        }
-    }
-}
-
-/// Counts an open connection while it lives.
-pub struct OpenConnection(Gauge);
-
-impl Drop for OpenConnection {
-    fn drop(&mut self) {
-        self.0.decrement(1.0);
-    }
 }

@@ -7,7 +7,7 @@ use super::{Ended, Job, JobIdentity, Work, load_samples, load_unpaired};
 use crate::app::{App, JobQueue};
 use crate::clock::thread_cpu_s;
 use crate::domain::{Error, EvaluationJob, EvaluationProgress, JobState, Observation, Result, Sample};
-use crate::evaluation::{self, EvaluateOptions, Report, TestRow, evaluate};
+use crate::evaluation::{self, EvaluateOptions, ReportWithPositions, TestRow, evaluate};
 use crate::model::FitInput;
 use crate::store::{Claim, Heartbeat, JobEnd, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
@@ -20,7 +20,7 @@ impl JobProgress for EvaluationProgress {
 
 /// How an evaluation ended.
 pub(super) enum Evaluated {
-    Completed(Result<Report>),
+    Completed(Result<ReportWithPositions>),
     Cancelled,
 }
 
@@ -86,7 +86,10 @@ impl Job for EvaluationJob {
                     flow
                 },
             );
-            if cancelled { Evaluated::Cancelled } else { Evaluated::Completed(evaluated.map(|it| it.report)) }
+            if cancelled {
+                return Evaluated::Cancelled;
+            }
+            Evaluated::Completed(evaluated.map(|evaluation| evaluation.into_report_with_positions(&test)))
         }))
     }
 
@@ -110,7 +113,7 @@ impl Job for EvaluationJob {
         let end = match output {
             Evaluated::Cancelled if shutting_down => JobEnd::Requeue,
             Evaluated::Cancelled => JobEnd::Cancelled,
-            Evaluated::Completed(Ok(report)) if report.methods.is_empty() => {
+            Evaluated::Completed(Ok(ReportWithPositions { report, .. })) if report.methods.is_empty() => {
                 let reasons: Vec<String> =
                     report.failed.iter().map(|(method, reason)| format!("{method}: {reason}")).collect();
                 JobEnd::Failed { outcome: format!("no method could run: {}", reasons.join("; ")) }

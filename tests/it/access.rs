@@ -118,6 +118,7 @@ fn path_of(route: &str) -> (&str, String) {
     let path = template
         .replace("{camera}", "c")
         .replace("{site}", "s")
+        .replace("{connection}", "n")
         .replace("{track}", "00000000-1")
         .replace("{model}", "99")
         .replace("{target}", "nobody")
@@ -413,10 +414,10 @@ async fn an_address_that_others_reach_needs_a_key() {
         command
     };
     let refused = serve().output().expect("the binary runs");
-    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
+    let reported = String::from_utf8_lossy(&refused.stderr).into_owned();
     assert!(
-        !refused.status.success() && told.contains("--insecure") && told.contains("keys create"),
-        "{told}"
+        !refused.status.success() && reported.contains("--insecure") && reported.contains("keys create"),
+        "{reported}"
     );
 
     let mut insecure = serve();

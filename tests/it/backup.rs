@@ -43,7 +43,7 @@ fn count(database: &Path) -> u64 {
     u64::try_from(count).expect("not negative")
 }
 
-/// Imports until it is told to stop, and counts what was acknowledged.
+/// Imports until the flag says stop, and counts what was acknowledged.
 async fn import_until(server: &TestServer, stop: &AtomicBool, acknowledged: &AtomicU64) {
     for import in 0.. {
         if stop.load(Ordering::Relaxed) {

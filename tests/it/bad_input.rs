@@ -108,7 +108,7 @@ async fn one_bad_row_never_loses_the_others() {
     assert_eq!(report["accepted"], 2, "{report}");
     assert_eq!(report["duplicate"], 1, "{report}");
     assert_eq!(report["rejected"], 3, "{report}");
-    let told: Vec<_> = report["rejected_rows"]
+    let reported: Vec<_> = report["rejected_rows"]
         .as_array()
         .expect("rows")
         .iter()
@@ -116,9 +116,9 @@ async fn one_bad_row_never_loses_the_others() {
             (row["line"].as_u64().expect("a line"), row["field"].as_str().expect("a field").to_owned())
         })
         .collect();
-    assert_eq!(told.len(), 3, "{report}");
+    assert_eq!(reported.len(), 3, "{report}");
     for ((line, field), (expected_line, part)) in
-        told.iter().zip([(3, "latitude"), (4, "time"), (5, "width")])
+        reported.iter().zip([(3, "latitude"), (4, "time"), (5, "width")])
     {
         assert_eq!(*line, expected_line, "{report}");
         assert!(field.contains(part), "{report}");

@@ -167,3 +167,39 @@ async fn files_that_come_apart_are_mapped_too() {
     let written = std::fs::read_to_string(path("samples.csv")).expect("written");
     assert!(written.contains("2020-12-14T06:41:48Z,a,10,20,30,40,103.00000000,30.00000000"), "{written}");
 }
+
+/// A file whose lines are split into fields, or cannot be.
+#[derive(Deserialize)]
+struct LineCase {
+    name: String,
+    csv: String,
+    /// Numbers of the lines that are read.
+    accepted: Vec<u64>,
+    rejected: Vec<RejectedLine>,
+}
+
+#[derive(Deserialize)]
+struct RejectedLine {
+    line: u64,
+    reason: String,
+}
+
+#[tokio::test]
+async fn a_server_splits_the_lines_of_each_case() {
+    let (_folder, server) = with_camera().await;
+    let cases: Vec<LineCase> =
+        serde_json::from_str(include_str!("../cases/csv_lines.json")).expect("the cases");
+    for case in cases {
+        let path = format!("{SAMPLES}?on_conflict=replace");
+        let report = server.send("POST", &path, &CSV, case.csv).await.expect(200).json();
+        assert_eq!(report["accepted"], case.accepted.len(), "{}: {report}", case.name);
+        let rejected = report["rejected_rows"].as_array().expect("rows").iter();
+        let rejected: Vec<(u64, &str)> = rejected
+            .map(|row| (row["line"].as_u64().expect("a number"), row["reason"].as_str().expect("text")))
+            .collect();
+        let expected: Vec<(u64, &str)> =
+            case.rejected.iter().map(|row| (row.line, row.reason.as_str())).collect();
+        assert_eq!(rejected, expected, "{}", case.name);
+        server.send("DELETE", &format!("{SAMPLES}?target_id=a"), &[], "").await.expect(200);
+    }
+}

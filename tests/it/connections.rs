@@ -79,7 +79,8 @@ fn frame(kind: u8, payload: &[u8]) -> Vec<u8> {
 #[test]
 fn floods_of_control_frames_end_the_connection() {
     let folder = data_folder();
-    let settings = [("SIGHTFIX_LIMITS__CONTROL_FRAMES_PER_S", "100")];
+    let settings =
+        [("SIGHTFIX_LIMITS__CONTROL_FRAMES_PER_S", "100"), ("SIGHTFIX_LIMITS__FLOOD_PENALTY_S", "0")];
     let server = TestServer::start_with(folder.path(), &settings);
     for flood in [
         frame(2, &[0, 0, 0, 3, 1]), // PRIORITY
@@ -230,9 +231,9 @@ async fn one_address_gets_no_more_than_its_share_of_live_streams() {
         let kind = Some(proto::stream_request::Kind::Opening(opening));
         let first = stream::iter([proto::StreamRequest { kind }]).chain(stream::pending());
         let mut client = FusionServiceClient::new(endpoint.connect().await.expect("a connection"));
-        let mut told = client.stream(first).await.expect("errors come as the end").into_inner();
-        let opened = told.message().await.map(drop).map_err(|status| status.code());
-        held.push(told);
+        let mut reported = client.stream(first).await.expect("errors come as the end").into_inner();
+        let opened = reported.message().await.map(drop).map_err(|status| status.code());
+        held.push(reported);
         opened
     };
     assert_eq!(open([127, 0, 0, 2], "first").await, Ok(()));

@@ -128,3 +128,53 @@ async fn tiles_are_shown_only_from_the_set_server() {
         assert!(String::from_utf8_lossy(&output.stderr).contains("console.tile_url"));
     }
 }
+
+#[tokio::test]
+async fn a_file_of_tiles_is_served_by_ranges_and_the_policy_stays() {
+    let folder = data_folder();
+    let file = folder.path().join("area.pmtiles");
+    let content: Vec<u8> =
+        b"PMTiles\x03".iter().copied().chain((0..2_000).map(|at| (at % 251) as u8)).collect();
+    std::fs::write(&file, &content).expect("written");
+    let setting = file.to_string_lossy().into_owned();
+    let settings = [("SIGHTFIX_CONSOLE__TILE_FILE", setting.as_str())];
+    let server = TestServer::start_with(&folder.path().join("data"), &settings);
+    let policy = asset(&server, "/", &[]).await.expect(200).header("content-security-policy").to_owned();
+    assert!(policy.contains("connect-src 'self'; img-src 'self' data: blob:;"), "{policy}");
+    let info = server.get("/v1/server").await.expect(200).json();
+    assert_eq!(info["tiles"], json!({"url": "/v1/tiles", "format": "pmtiles", "attribution": ""}));
+
+    let whole = asset(&server, "/v1/tiles", &[("accept-encoding", "gzip")]).await.expect(200);
+    assert_eq!((whole.body.to_vec(), whole.header("accept-ranges")), (content.clone(), "bytes"));
+    let tag = whole.header("etag").to_owned();
+    let part =
+        asset(&server, "/v1/tiles", &[("range", "bytes=1000-1099"), ("if-range", &tag)]).await.expect(206);
+    assert_eq!(
+        (part.body.as_ref(), part.header("content-range")),
+        (&content[1_000..1_100], "bytes 1000-1099/2008")
+    );
+    assert_eq!((part.header("etag"), part.header("content-length")), (tag.as_str(), "100"));
+    let end = asset(&server, "/v1/tiles", &[("range", "bytes=2000-16383")]).await.expect(206);
+    assert_eq!((end.body.as_ref(), end.header("content-range")), (&content[2_000..], "bytes 2000-2007/2008"));
+    let other = [("range", "bytes=0-9"), ("if-range", "\"other\"")];
+    asset(&server, "/v1/tiles", &other).await.expect(200);
+    let behind = asset(&server, "/v1/tiles", &[("range", "bytes=2008-")]).await.expect(416).json();
+    assert_eq!(behind["violations"][0]["field"], "range", "{behind}");
+}
+
+#[tokio::test]
+async fn without_a_file_of_tiles_there_is_none_and_a_wrong_one_is_refused_at_the_start() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    server.get("/v1/tiles").await.expect(404);
+    assert!(server.get("/v1/server").await.expect(200).json().get("tiles").is_none());
+
+    let file = folder.path().join("note.txt");
+    std::fs::write(&file, "not tiles").expect("written");
+    for path in [file, folder.path().join("missing.pmtiles")] {
+        let output = sightfix().arg("config").env("SIGHTFIX_CONSOLE__TILE_FILE", &path).output();
+        let output = output.expect("the binary runs");
+        assert!(!output.status.success(), "{} was taken", path.display());
+        assert!(String::from_utf8_lossy(&output.stderr).contains("console.tile_file"));
+    }
+}

@@ -7,6 +7,7 @@ mod checks;
 mod client;
 mod kills;
 mod load;
+mod offline;
 mod soak;
 
 /// A number of the environment, for longer runs than the usual ones.

@@ -62,11 +62,11 @@ async fn fuse(server: &TestServer) -> Answer {
 async fn a_second_server_on_a_folder_is_refused_until_the_first_has_ended() {
     let folder = data_folder();
     let first = TestServer::start(folder.path());
-    let (code, told) = refused_start(folder.path());
-    println!("second server: {code:?} {told}");
-    assert_eq!(code, IN_USE, "{told}");
+    let (code, reported) = refused_start(folder.path());
+    println!("second server: {code:?} {reported}");
+    assert_eq!(code, IN_USE, "{reported}");
     let holder = format!("is in use by server with process id {}", first.pid());
-    assert!(told.contains(&holder), "{told}");
+    assert!(reported.contains(&holder), "{reported}");
     first.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
     // A lock ends with its process, however it ends.
     first.kill();
@@ -78,8 +78,8 @@ async fn a_second_server_on_a_folder_is_refused_until_the_first_has_ended() {
 fn what_cannot_be_opened_ends_with_a_message_and_a_code() {
     let folder = data_folder();
     std::fs::write(folder.path().join("sightfix.db"), vec![b'x'; 5_000]).expect("written");
-    let (code, told) = refused_start(folder.path());
-    assert!(code == UNUSABLE && told.contains("is not a database"), "{code:?} {told}");
+    let (code, reported) = refused_start(folder.path());
+    assert!(code == UNUSABLE && reported.contains("is not a database"), "{code:?} {reported}");
 
     let folder = data_folder();
     drop(TestServer::start(folder.path()));
@@ -87,8 +87,11 @@ fn what_cannot_be_opened_ends_with_a_message_and_a_code() {
     let later = "INSERT INTO _sqlx_migrations VALUES (9000, 'later', '', 1, x'00', 0)";
     database.execute_batch(later).expect("the row can be written");
     drop(database);
-    let (code, told) = refused_start(folder.path());
-    assert!(code == UNUSABLE && told.contains("newer version") && told.contains("9000"), "{code:?} {told}");
+    let (code, reported) = refused_start(folder.path());
+    assert!(
+        code == UNUSABLE && reported.contains("newer version") && reported.contains("9000"),
+        "{code:?} {reported}"
+    );
 }
 
 /// Runs as another user where the test has the rights of the superuser, whom no permission stops.
@@ -108,9 +111,9 @@ fn a_folder_that_cannot_be_written_ends_with_a_message_and_a_code() {
     if std::fs::write(folder.join("probe"), "").is_ok() {
         command.uid(NOBODY).gid(NOBODY);
     }
-    let (code, told) = ended(command);
-    println!("read-only folder: {code:?} {told}");
-    assert!(code == UNUSABLE && told.contains("cannot be opened for writing"), "{code:?} {told}");
+    let (code, reported) = ended(command);
+    println!("read-only folder: {code:?} {reported}");
+    assert!(code == UNUSABLE && reported.contains("cannot be opened for writing"), "{code:?} {reported}");
 }
 
 #[tokio::test]
@@ -130,8 +133,8 @@ async fn a_database_that_another_process_holds_delays_writes_and_no_answer() {
     server.kill();
 
     holder.execute_batch("BEGIN IMMEDIATE").expect("the lock");
-    let (code, told) = refused_start(folder.path());
-    assert!(code == IN_USE && told.contains("is held by another process"), "{code:?} {told}");
+    let (code, reported) = refused_start(folder.path());
+    assert!(code == IN_USE && reported.contains("is held by another process"), "{code:?} {reported}");
 }
 
 /// Overwrites pages near the end of the database, where its latest samples are.
@@ -148,6 +151,7 @@ async fn damaged_pages_are_told_and_fusions_go_on() {
     damage_samples(folder.path());
     let server = TestServer::start(folder.path());
     fuse(&server).await.expect(200);
+    assert_eq!(server.get("/readyz").await.expect(200).text(), "ready\n");
     let mut page = "/v1/cameras/c/samples?limit=1000".to_owned();
     let failed = loop {
         let answer = server.get(&page).await;
@@ -161,6 +165,8 @@ async fn damaged_pages_are_told_and_fusions_go_on() {
     assert!(!failed.text().contains("damaged"), "a fault is for the log: {}", failed.text());
     let is_told = |entry: &Value| entry["error"].as_str().is_some_and(|it| it.contains("sightfix restore"));
     let logged = server.logged(is_told).await;
+    let ready = server.get("/readyz").await.expect(200).text();
+    assert!(ready.starts_with("ready\ndegraded: database:"), "{ready}");
     println!("log: {}", logged["error"]);
     fuse(&server).await.expect(200);
     assert!(server.log_lines("panicked").is_empty());
@@ -174,6 +180,6 @@ async fn damaged_pages_are_told_and_fusions_go_on() {
     let backup = folder.path().join("backup.db");
     let mut command = sightfix();
     command.arg("backup").arg(&backup).arg("--data").arg(folder.path());
-    let (code, told) = ended(command);
-    assert!(code == UNUSABLE && told.contains("damaged") && !backup.exists(), "{code:?} {told}");
+    let (code, reported) = ended(command);
+    assert!(code == UNUSABLE && reported.contains("damaged") && !backup.exists(), "{code:?} {reported}");
 }

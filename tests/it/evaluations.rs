@@ -111,6 +111,18 @@ async fn rest_and_command_line_give_the_same_figures() {
     }
     let mean_m = |name: &str| reported[name]["mean_m"].as_f64().expect("a number");
     assert!(mean_m("hybrid.two_step") < mean_m("gnss"), "{ended}");
+    let positions = &ended["report"]["positions"];
+    assert!(printed_report.get("positions").is_none(), "the command line prints figures alone");
+    for (name, method) in reported {
+        let shown = positions[name].as_array().expect("positions");
+        assert_eq!(shown.len(), test.training_samples().len(), "{name}: fewer rows than the limit");
+        let sum_m: f64 = shown.iter().map(|it| it["error_m"].as_f64().expect("a number")).sum();
+        // Those of the first seed.
+        let seed_mean_m = method["seed_means_m"][0].as_f64().expect("a number");
+        let mean_m = sum_m / shown.len() as f64;
+        assert!((mean_m - seed_mean_m).abs() < 1e-4, "{name}: {mean_m} and {seed_mean_m}");
+        assert!(shown[0]["truth_latitude_deg"].is_number(), "{name}: {}", shown[0]);
+    }
 
     let listed = server.get("/v1/evaluations?camera=square").await.expect(200).json();
     assert_eq!(listed["items"][0]["id"], ended["id"]);

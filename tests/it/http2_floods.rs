@@ -92,7 +92,8 @@ fn ends(server: &TestServer, begin: &[u8], mut flood: impl FnMut(u32) -> Vec<u8>
 }
 
 fn server(folder: &std::path::Path, settings: &[(&str, &str)]) -> TestServer {
-    let unlimited = [("SIGHTFIX_LIMITS__CONTROL_FRAMES_PER_S", "4000000000")];
+    let unlimited =
+        [("SIGHTFIX_LIMITS__CONTROL_FRAMES_PER_S", "4000000000"), ("SIGHTFIX_LIMITS__FLOOD_PENALTY_S", "0")];
     TestServer::start_with(folder, &[&unlimited[..], settings].concat())
 }
 

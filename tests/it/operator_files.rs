@@ -77,11 +77,11 @@ fn every_alert_has_its_section() {
 fn systemd_takes_the_unit() {
     let folder = data_folder();
     let path = folder.path().join("sightfix.service");
-    let unit = UNIT.replace("/usr/local/bin/sightfix", env!("CARGO_BIN_EXE_sightfix"));
+    let unit = UNIT.replace("ExecStart=sightfix", concat!("ExecStart=", env!("CARGO_BIN_EXE_sightfix")));
     std::fs::write(&path, unit).expect("written");
     let verified = Command::new("systemd-analyze").arg("verify").arg(&path).output().expect("it runs");
-    let told = String::from_utf8_lossy(&verified.stderr).into_owned();
-    assert!(verified.status.success() && told.trim().is_empty(), "{told}");
+    let reported = String::from_utf8_lossy(&verified.stderr).into_owned();
+    assert!(verified.status.success() && reported.trim().is_empty(), "{reported}");
     for setting in ["ExecReload=/bin/kill -HUP", "NoNewPrivileges=yes", "RestartPreventExitStatus=2 4"] {
         assert!(UNIT.contains(setting), "{setting}");
     }

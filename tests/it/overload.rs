@@ -1,4 +1,4 @@
-//! More is asked of the server than it takes: who is still answered, and what the others are told.
+//! More is asked of the server than it takes: who is still answered, and what the others are answered.
 
 use std::convert::Infallible;
 use std::net::SocketAddr;

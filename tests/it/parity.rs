@@ -3,12 +3,16 @@
 
 use serde_json::{Value, json};
 use sightfix::domain::ErrorKind;
+use sightfix::exchange::{Format, write_samples};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
+use sightfix::grpc::proto::evaluation_service_client::EvaluationServiceClient;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::model_service_client::ModelServiceClient;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
+use sightfix::grpc::proto::track_service_client::TrackServiceClient;
 use sightfix::grpc::proto::training_service_client::TrainingServiceClient;
+use sightfix::simulation::{Options, Scene, simulate};
 use sightfix::status;
 use tonic::Status;
 use tonic::transport::Channel;
@@ -293,4 +297,280 @@ async fn runs_and_models_are_refused_alike() {
     let request = proto::GetModelRequest { camera_id: "c".to_owned(), number: 7 };
     let grpc = ModelServiceClient::new(both.channel.clone()).get_model(request).await;
     same_refusal(rest, &grpc.expect_err("unknown"), ErrorKind::ModelNotFound);
+}
+
+/// A world of one camera, `square`, with its samples in the server.
+async fn square(server: &TestServer) -> (String, String) {
+    let options = Options { samples: 300, ..Options::new(Scene::Square) };
+    let world = simulate(&options);
+    let size = json!({"width_px": world.image_size.width_px(), "height_px": world.image_size.height_px()});
+    server.post("/v1/cameras", &json!({"id": "square", "image_size": size})).await.expect(201);
+    let mut csv = Vec::new();
+    write_samples(&mut csv, Format::Csv, &world.training_samples()).expect("memory can be written");
+    let csv = String::from_utf8(csv).expect("UTF-8");
+    let headers = [("content-type", "text/csv")];
+    server.send("POST", "/v1/cameras/square/samples", &headers, csv).await.expect(200);
+    let (mut detections, mut fixes) =
+        ("time,target_id,left,top,width,height\n".to_owned(), "time,longitude,latitude\n".to_owned());
+    for sample in world.training_samples().iter().take(20) {
+        let [left, top, width, height] = sample.bounding_box.sides_px();
+        let at = sample.fix.position;
+        detections += &format!("{},{},{left},{top},{width},{height}\n", sample.time, sample.target_id);
+        fixes += &format!("{},{},{}\n", sample.time, at.longitude_deg(), at.latitude_deg());
+    }
+    (detections, fixes)
+}
+
+/// Changes the camera `c`.
+async fn patch(server: &TestServer, change: &Value) -> Answer {
+    let headers = [("content-type", "application/merge-patch+json")];
+    server.send("PATCH", "/v1/cameras/c", &headers, change.to_string()).await
+}
+
+#[tokio::test]
+async fn evaluations_are_the_same_and_refused_alike() {
+    let both = Both::start(&[]).await;
+    square(&both.server).await;
+    let client = || EvaluationServiceClient::new(both.channel.clone());
+    let start = |request: proto::StartEvaluationRequest| {
+        let request = proto::StartEvaluationRequest { camera_id: "square".to_owned(), ..request };
+        async move { client().start_evaluation(request).await.map(tonic::Response::into_inner) }
+    };
+    let truth_point = proto::Position { longitude_deg: Some(103.98678), latitude_deg: Some(30.628) };
+    let truth = Some(proto::start_evaluation_request::Truth::TruthPoint(truth_point));
+    let methods = vec!["gnss".to_owned()];
+
+    let good = proto::StartEvaluationRequest { truth, methods: methods.clone(), ..Default::default() };
+    let started = start(good.clone()).await.expect("good").evaluation.expect("an evaluation");
+    let path = format!("/v1/evaluations/{}", started.id);
+    let get = || {
+        let request = proto::GetEvaluationRequest { evaluation_id: started.id.clone() };
+        async move { client().get_evaluation(request).await.map(tonic::Response::into_inner) }
+    };
+    let ended = loop {
+        let now = get().await.expect("there").evaluation.expect("an evaluation");
+        if now.ended_at.is_some() {
+            break now;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    };
+    let rest = both.server.get(&path).await.expect(200).json();
+    let report: Value = serde_json::from_str(ended.report_json.as_deref().expect("a report")).expect("JSON");
+    assert_eq!(rest["report"], report);
+    assert_eq!(rest["methods"], json!(ended.methods));
+    assert_eq!(rest["seeds"].as_u64(), Some(ended.seeds.into()));
+
+    let draft = |more: Value| {
+        let mut draft = json!({"camera_id": "square", "methods": ["gnss"], "truth_point": {"longitude_deg": 103.98678, "latitude_deg": 30.628}});
+        draft.as_object_mut().expect("an object").extend(more.as_object().expect("an object").clone());
+        draft
+    };
+    let range = |from, until| {
+        let at = |seconds| Some(prost_types::Timestamp { seconds, nanos: 0 });
+        Some(proto::TimeRange { from: at(from), until: at(until) })
+    };
+    let cases = [
+        (json!({"seeds": 0}), proto::StartEvaluationRequest { seeds: Some(0), ..good.clone() }),
+        (json!({"test_share": 2.0}), proto::StartEvaluationRequest { test_share: Some(2.0), ..good.clone() }),
+        (
+            json!({"gnss_sigma_m": -1.0}),
+            proto::StartEvaluationRequest { gnss_sigma_m: Some(-1.0), ..good.clone() },
+        ),
+        (
+            json!({"methods": ["gnss", "none"]}),
+            proto::StartEvaluationRequest { methods: vec!["gnss".into(), "none".into()], ..good.clone() },
+        ),
+        (
+            json!({"train": {"from": "2026-01-02T00:00:00Z", "until": "2026-01-01T00:00:00Z"}}),
+            proto::StartEvaluationRequest { train: range(1_767_312_000, 1_767_225_600), ..good },
+        ),
+    ];
+    for (more, request) in cases {
+        let rest = both.server.post("/v1/evaluations", &draft(more)).await;
+        same_refusal(rest, &start(request).await.expect_err("bad"), ErrorKind::InvalidArgument);
+    }
+
+    let cancelled = proto::CancelEvaluationRequest { evaluation_id: started.id.clone() };
+    let grpc = client().cancel_evaluation(cancelled).await.expect_err("it has ended");
+    same_refusal(
+        both.server.post(&format!("{path}/cancel"), &json!({})).await,
+        &grpc,
+        ErrorKind::EvaluationEnded,
+    );
+    let listed = client().list_evaluations(proto::ListEvaluationsRequest::default()).await.expect("a list");
+    assert_eq!(listed.into_inner().evaluations[0].id, started.id);
+    let deleted = proto::DeleteEvaluationRequest { evaluation_id: started.id.clone() };
+    client().delete_evaluation(deleted).await.expect("deleted");
+    same_refusal(
+        both.server.get(&path).await,
+        &get().await.expect_err("gone"),
+        ErrorKind::EvaluationNotFound,
+    );
+}
+
+#[tokio::test]
+async fn tracks_and_events_are_the_same() {
+    let both = Both::start(&[]).await;
+    let client = || TrackServiceClient::new(both.channel.clone());
+    let watched = proto::WatchCameraRequest { camera_id: "c".to_owned(), resume_after: String::new() };
+    let mut events = client().watch_camera(watched).await.expect("watched").into_inner();
+    for second in 0..3 {
+        let fix = json!({"longitude_deg": 103.9, "latitude_deg": 30.6 + f64::from(second) * 1e-5});
+        let time = format!("2026-01-01T00:00:0{second}Z");
+        let observations = json!({"observations": [{"time": time, "target_id": "a", "fix": fix}]});
+        both.server.post("/v1/cameras/c/tracks", &observations).await.expect(200);
+    }
+    let compare = |rest: &Value, grpc: &proto::TrackPoint| {
+        let at = |axis: usize| rest["geometry"]["coordinates"][axis].as_f64().expect("degrees");
+        let position = grpc.position.as_ref().expect("a position");
+        assert!((at(0) - position.longitude_deg.expect("set")).abs() < 1e-7);
+        assert!((at(1) - position.latitude_deg.expect("set")).abs() < 1e-7);
+        let number = |name: &str| rest["properties"][name].as_f64();
+        assert_eq!(number("r95_m"), Some(grpc.r95_m));
+        assert_eq!(number("velocity_north_m_s"), Some(grpc.velocity_north_m_s));
+        assert_eq!(rest["properties"]["target_id"], grpc.target_id);
+    };
+    let rest = both.server.get("/v1/cameras/c/tracks").await.expect(200).json();
+    let request = proto::ListTracksRequest { camera_id: "c".to_owned() };
+    let latest = client().list_tracks(request).await.expect("tracks").into_inner().tracks;
+    assert_eq!(latest.len(), 1);
+    compare(&rest["features"][0], &latest[0]);
+    let get = |target: &str| {
+        let request = proto::GetTrackRequest { camera_id: "c".to_owned(), target_id: target.to_owned() };
+        async move { client().get_track(request).await.map(tonic::Response::into_inner) }
+    };
+    let rest = both.server.get("/v1/cameras/c/tracks/a").await.expect(200).json();
+    let history = get("a").await.expect("a history").points;
+    assert_eq!(rest["features"].as_array().map(Vec::len), Some(history.len()));
+    for (rest, grpc) in rest["features"].as_array().expect("features").iter().zip(&history) {
+        compare(rest, grpc);
+    }
+    let rest = both.server.get("/v1/cameras/c/tracks/none").await;
+    same_refusal(rest, &get("none").await.expect_err("not followed"), ErrorKind::TrackNotFound);
+
+    let first = events.message().await.expect("an event").expect("an event");
+    let Some(proto::watch_camera_response::Event::Track(update)) = first.event else { panic!("a track") };
+    assert_eq!(update.track.expect("a track").target_id, "a");
+    drop(events);
+    let again = proto::WatchCameraRequest { camera_id: "c".to_owned(), resume_after: first.event_id };
+    let mut events = client().watch_camera(again).await.expect("watched").into_inner();
+    let second = events.message().await.expect("an event").expect("an event");
+    let Some(proto::watch_camera_response::Event::Track(update)) = second.event else { panic!("a track") };
+    let time = update.track.expect("a track").time.expect("a time");
+    assert_eq!(time.seconds, 1_767_225_601, "the reader goes on behind the event that it has seen");
+    both.server.send("DELETE", "/v1/cameras/c", &[], "").await.expect(204);
+    let ended = loop {
+        match events.message().await {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("the end is an error"),
+            Err(status) => break status,
+        }
+    };
+    let rest = both.server.get("/v1/cameras/c/events").await.expect(404).json();
+    let reason = ended.get_error_details().error_info().expect("ErrorInfo").reason.clone();
+    assert!(rest["type"].as_str().expect("a type").ends_with(&reason), "{rest} {reason}");
+}
+
+#[tokio::test]
+async fn pairings_are_the_same_and_refused_alike() {
+    let both = Both::start(&[]).await;
+    let (detections, fixes) = square(&both.server).await;
+    let walker = detections.lines().nth(1).and_then(|row| row.split(',').nth(1)).expect("a row");
+    let profile = json!({"receivers": [{"receiver_id": "phone", "target_id": walker}]});
+    patch(&both.server, &profile).await.expect(200);
+    let body = {
+        let part = |name: &str, text: &str| {
+            format!(
+                "--x\r\ncontent-disposition: form-data; name=\"{name}\"\r\ncontent-type: text/csv\r\n\r\n{text}\r\n"
+            )
+        };
+        part("detections", &detections) + &part("fixes", &fixes) + "--x--\r\n"
+    };
+    let rest_pair = |query: &str| {
+        let path = format!("/v1/cameras/c/samples/pairings?keep_unpaired=true{query}");
+        let body = body.clone();
+        let both = &both;
+        async move {
+            let headers = [("content-type", "multipart/form-data; boundary=x")];
+            both.server.send("POST", &path, &headers, body).await
+        }
+    };
+    let opening = proto::PairingOpening {
+        camera_id: "c".to_owned(),
+        keep_unpaired: true,
+        on_conflict: proto::OnConflict::Replace.into(),
+        ..Default::default()
+    };
+    let grpc_pair = |opening: proto::PairingOpening| {
+        use proto::pair_samples_request::Kind;
+        // Pieces of a file need not end with its lines.
+        let pieces = |text: &str, kind: fn(bytes::Bytes) -> Kind| {
+            text.as_bytes().chunks(100).map(|piece| kind(piece.to_vec().into())).collect::<Vec<_>>()
+        };
+        let mut kinds = vec![Kind::Opening(opening)];
+        kinds.extend(pieces(&detections, Kind::Detections));
+        kinds.extend(pieces(&fixes, Kind::Fixes));
+        let messages = kinds.into_iter().map(|kind| proto::PairSamplesRequest { kind: Some(kind) });
+        let messages: Vec<_> = messages.collect();
+        let mut client = SampleServiceClient::new(both.channel.clone());
+        async move {
+            let answer = client.pair_samples(futures_util::stream::iter(messages)).await;
+            answer.map(tonic::Response::into_inner)
+        }
+    };
+    let rest = rest_pair("").await.expect(200).json();
+    let grpc = grpc_pair(opening.clone()).await.expect("good");
+    let (samples, pairing) = (grpc.samples.expect("samples"), grpc.pairing.expect("counts"));
+    assert_eq!(rest["accepted"].as_u64(), Some(samples.accepted), "{rest} {samples:?}");
+    assert_eq!(samples.accepted, samples.replaced, "the same samples over REST were stored before");
+    assert_eq!((rest["pairing"]["paired"].as_u64(), pairing.paired), (Some(20), 20));
+    let of_fix = &rest["pairing"]["unused_fixes"]["no_box_of_target"];
+    assert_eq!(of_fix.as_u64(), Some(pairing.fixes_no_box_of_target));
+    assert_eq!(
+        rest["unnamed_fixes_of"]["receiver_id"],
+        grpc.unnamed_fixes_of.expect("a receiver").receiver_id
+    );
+
+    let bad = proto::PairingOpening { window_s: Some(-1.0), ..opening.clone() };
+    let grpc = grpc_pair(bad).await.expect_err("bad");
+    same_refusal(rest_pair("&window_s=-1").await, &grpc, ErrorKind::InvalidArgument);
+    let bad = proto::PairingOpening { target_id: Some(String::new()), ..opening.clone() };
+    let grpc = grpc_pair(bad).await.expect_err("bad");
+    same_refusal(rest_pair("&target_id=").await, &grpc, ErrorKind::InvalidArgument);
+    let unknown = proto::PairingOpening { camera_id: "none".to_owned(), ..opening };
+    let grpc = grpc_pair(unknown).await.expect_err("unknown");
+    same_refusal(both.server.get("/v1/cameras/none").await, &grpc, ErrorKind::CameraNotFound);
+}
+
+#[tokio::test]
+async fn receivers_are_the_same_and_refused_alike() {
+    let both = Both::start(&[]).await;
+    let client = || CameraServiceClient::new(both.channel.clone());
+    let update = |receivers: Vec<proto::Receiver>| {
+        let request = proto::UpdateCameraRequest {
+            camera_id: "c".to_owned(),
+            profile: Some(proto::CameraProfile { receivers, ..Default::default() }),
+            ..Default::default()
+        };
+        async move { client().update_camera(request).await.map(tonic::Response::into_inner) }
+    };
+    let receiver = |id: &str, clock_offset_s: f64| proto::Receiver {
+        receiver_id: id.to_owned(),
+        target_id: "walker".to_owned(),
+        clock_offset_s,
+    };
+    let stored = update(vec![receiver("phone", -0.35)]).await.expect("good").camera.expect("a camera");
+    let rest = both.server.get("/v1/cameras/c").await.expect(200).json();
+    let profile = stored.profile.expect("a profile");
+    assert_eq!(rest["receivers"][0]["receiver_id"], profile.receivers[0].receiver_id);
+    assert_eq!(rest["receivers"][0]["target_id"], "walker");
+    assert_eq!(rest["receivers"][0]["clock_offset_s"], -0.35);
+    for (id, offset_s) in [("phone", 1e9), ("", 0.0)] {
+        let given = json!({"receiver_id": id, "target_id": "walker", "clock_offset_s": offset_s});
+        let rest = patch(&both.server, &json!({"receivers": [given]})).await;
+        let grpc = update(vec![receiver(id, offset_s)]).await.expect_err("bad");
+        same_refusal_but_for(rest, &grpc, ErrorKind::InvalidArgument, |field| {
+            field.strip_prefix("profile.").unwrap_or(field)
+        });
+    }
 }

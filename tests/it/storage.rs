@@ -90,7 +90,7 @@ async fn imports_say_how_durable_they_are() {
     assert_eq!(problem(&refused, 422, "invalid-argument")["violations"][0]["field"], "durability");
 
     let mut samples = SampleServiceClient::new(server.channel().await);
-    for (asked, told) in [
+    for (asked, reported) in [
         (proto::Durability::Unspecified, proto::Durability::Synced),
         (proto::Durability::Synced, proto::Durability::Synced),
         (proto::Durability::Relaxed, proto::Durability::Relaxed),
@@ -101,11 +101,12 @@ async fn imports_say_how_durable_they_are() {
             ..Default::default()
         };
         let report = samples.import_samples(stream::iter([message])).await.expect("taken").into_inner();
-        assert_eq!(report.durability(), told);
+        assert_eq!(report.durability(), reported);
     }
 
     let mut fusion = FusionServiceClient::new(server.channel().await);
-    for (store_samples, told) in [(true, proto::Durability::Relaxed), (false, proto::Durability::Unspecified)]
+    for (store_samples, reported) in
+        [(true, proto::Durability::Relaxed), (false, proto::Durability::Unspecified)]
     {
         let opening = proto::StreamOpening {
             camera_id: "c".to_owned(),
@@ -118,7 +119,7 @@ async fn imports_say_how_durable_they_are() {
         let mut answers = fusion.stream(stream::iter([first])).await.expect("taken").into_inner();
         let answer = answers.message().await.expect("no error").expect("an answer");
         let Some(proto::stream_response::Kind::Opened(opened)) = answer.kind else { panic!("{answer:?}") };
-        assert_eq!(opened.durability(), told);
+        assert_eq!(opened.durability(), reported);
     }
 }
 

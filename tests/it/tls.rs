@@ -22,13 +22,13 @@ use tokio_rustls::client::TlsStream;
 use crate::harness::{TestServer, data_folder, run, sightfix};
 
 /// An authority for certificates of servers and clients.
-struct Authority {
-    certificate: Certificate,
+pub(crate) struct Authority {
+    pub(crate) certificate: Certificate,
     issuer: Issuer<'static, KeyPair>,
 }
 
 impl Authority {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let mut params = CertificateParams::new(Vec::new()).expect("no names");
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
         let key = KeyPair::generate().expect("a key");
@@ -37,7 +37,7 @@ impl Authority {
     }
 
     /// A certificate for `localhost`, and its key.
-    fn issue(&self) -> (Certificate, KeyPair) {
+    pub(crate) fn issue(&self) -> (Certificate, KeyPair) {
         let key = KeyPair::generate().expect("a key");
         let params = CertificateParams::new(vec!["localhost".to_owned()]).expect("a name");
         (params.signed_by(&key, &self.issuer).expect("a certificate"), key)
@@ -237,10 +237,10 @@ fn files_that_cannot_be_used_are_named() {
     let files = Files::new(&authority);
     std::fs::write(&files.key, "no key").expect("a file");
     let refused = files.serve(&data).output().expect("the binary runs");
-    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert!(!refused.status.success() && told.contains("key.pem"), "{told}");
+    let reported = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(!refused.status.success() && reported.contains("key.pem"), "{reported}");
     let mut command = files.serve(&data);
     let refused = command.env("SIGHTFIX_TLS__CLIENT_ROLE", "edge").output().expect("the binary runs");
-    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert!(told.contains("client_camera_ids"), "{told}");
+    let reported = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(reported.contains("client_camera_ids"), "{reported}");
 }

@@ -1,4 +1,4 @@
-//! Mistakes that people make with the interfaces, and what they are told.
+//! Mistakes that people make with the interfaces, and the refusals that they get.
 
 use std::fs::File;
 use std::io::{Read as _, Write as _};
@@ -21,7 +21,7 @@ async fn an_array_is_no_object_and_types_are_named_as_in_json() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
     server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
-    for (path, body, field, told) in [
+    for (path, body, field, reported) in [
         (
             "/v1/cameras",
             r#"["arr", "n", null, null, null, [], {}, [], false]"#,
@@ -42,7 +42,7 @@ async fn an_array_is_no_object_and_types_are_named_as_in_json() {
         let violation = &problem["violations"][0];
         assert_eq!(violation["field"], field, "{body}: {problem}");
         let message = violation["message"].as_str().expect("text");
-        assert!(message.contains(told), "{body}: {message}");
+        assert!(message.contains(reported), "{body}: {message}");
         for word in ["struct", "sequence", "f64", "u32", "i64", "enum", "expected"] {
             assert!(!message.contains(word), "{body}: {message}");
         }
@@ -138,9 +138,9 @@ fn a_closed_or_full_output_is_no_panic() {
     for arguments in [&["openapi"][..], &["config"], &["keys", "generate"]] {
         let full = File::options().write(true).open("/dev/full").expect("Linux has it");
         let ended = sightfix().args(arguments).stdout(full).output().expect("runs");
-        let told = String::from_utf8_lossy(&ended.stderr).into_owned();
-        assert_eq!(ended.status.code(), Some(1), "{arguments:?}: {told}");
-        assert!(told.contains("standard output cannot be written"), "{arguments:?}: {told}");
+        let reported = String::from_utf8_lossy(&ended.stderr).into_owned();
+        assert_eq!(ended.status.code(), Some(1), "{arguments:?}: {reported}");
+        assert!(reported.contains("standard output cannot be written"), "{arguments:?}: {reported}");
     }
 }
 
@@ -204,7 +204,7 @@ fn commands_make_no_folder_of_a_typo_and_compare_the_image_size() {
     std::fs::write(&file, simulated_csv()).expect("a file");
     let (path, data) = (file.to_str().expect("UTF-8"), folder.path().join("data"));
     let data = data.to_str().expect("UTF-8");
-    let told = |arguments: &[&str]| {
+    let reported = |arguments: &[&str]| {
         let ended = sightfix().args(arguments).output().expect("runs");
         assert_eq!(ended.status.code(), Some(1), "{arguments:?}");
         String::from_utf8_lossy(&ended.stderr).into_owned()
@@ -215,13 +215,13 @@ fn commands_make_no_folder_of_a_typo_and_compare_the_image_size() {
         &["import", path, "--camera", "c", "--data", typo_text],
         &["keys", "list", "--data", typo_text],
     ] {
-        assert!(told(arguments).contains("there is no data folder"), "{arguments:?}");
+        assert!(reported(arguments).contains("there is no data folder"), "{arguments:?}");
         assert!(!typo.exists(), "{arguments:?}");
     }
     let import = ["import", path, "--camera", "c", "--data", data, "--create", "--image-size"];
     run(&[&import[..], &["640x480"]].concat());
     run(&[&import[..], &["640x480"]].concat());
-    let refused = told(&[&import[..], &["1280x720"]].concat());
+    let refused = reported(&[&import[..], &["1280x720"]].concat());
     assert!(refused.contains("640x480") && refused.contains("1280x720"), "{refused}");
 }
 

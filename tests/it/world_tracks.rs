@@ -80,7 +80,7 @@ fn the_files_of_a_site_are_those_that_pairing_reads() {
 fn folders_and_flags_that_cannot_be_used_are_refused() {
     let folder = data_folder();
     let path = folder.path().to_str().expect("UTF-8");
-    for (arguments, told) in [
+    for (arguments, reported) in [
         (vec!["evaluate", "--site", path], "fixes.csv"),
         (vec!["evaluate", "--site", path, "--paper"], "cannot be used"),
         (vec!["evaluate", "--redraws", "3"], "required"),
@@ -91,7 +91,7 @@ fn folders_and_flags_that_cannot_be_used_are_refused() {
     ] {
         let output = sightfix().args(&arguments).output().expect("runs");
         let error = String::from_utf8_lossy(&output.stderr);
-        assert!(!output.status.success() && error.contains(told), "{arguments:?}: {error}");
+        assert!(!output.status.success() && error.contains(reported), "{arguments:?}: {error}");
     }
 }
 

@@ -25,9 +25,9 @@ def write_stubs(proto: Path, package: Path) -> None:
 
 
 def run_protoc(proto: Path, *options: str) -> None:
-    """Compiles all files under `proto`."""
+    """Compiles the files of `sightfix.v1` under `proto`."""
     google = importlib.resources.files("grpc_tools") / "_proto"
-    files = sorted(str(path.relative_to(proto)) for path in proto.rglob("*.proto"))
+    files = sorted(str(path.relative_to(proto)) for path in (proto / "sightfix").rglob("*.proto"))
     command = [sys.executable, "-m", "grpc_tools.protoc", f"-I{proto}", f"-I{google}", *options, *files]
     subprocess.run(command, check=True)  # noqa: S603, fixed arguments
 

@@ -14,6 +14,7 @@ from sightfix import (
     Client,
     ConflictError,
     ConnectionFailedError,
+    CsvLayout,
     Fix,
     ImageSize,
     InvalidRequestError,
@@ -242,6 +243,84 @@ def test_a_site_tracks_targets_over_its_cameras(trained: ServerProcess) -> None:
         client.sites.delete("harbour")
         with pytest.raises(NotFoundError):
             client.sites.get("harbour")
+
+
+def test_events_of_a_site_are_watched(server: ServerProcess) -> None:
+    with Client(server.url) as client:
+        client.sites.create(id="mall")
+        client.cameras.create(id="gate", site="mall")
+
+        def follow() -> None:
+            for second in range(6):
+                fix = Fix(longitude_deg=24.7, latitude_deg=59.4 + second * 1e-5, sigma_m=2.0)
+                moment = NOON + timedelta(seconds=second)
+                client.tracks.follow("gate", [Observation(time=moment, target_id="a", fix=fix)])
+
+        timer = threading.Timer(0.5, follow)
+        timer.start()
+        names = []
+        for event in client.sites.watch("mall"):
+            names.append(event.name)
+            assert event.id
+            if "track" in names:
+                break
+        timer.join()
+        assert names[0] in ("track_started", "track")
+
+
+def test_columns_conflicts_and_keys_of_imports(client: Client, tmp_path: Path) -> None:
+    client.cameras.create(id="gate")
+    detections = tmp_path / "export.csv"
+    detections.write_text(
+        "Timestamp,x1,y1,x2,y2,lon,lat\n2026-01-01T00:00:00Z,10,20,40,90,24.7,59.4\n"
+        "2026-01-01T00:00:01Z,11,20,41,90,24.7,59.4\n"
+    )
+    columns = {
+        "time": "Timestamp",
+        "left": "x1",
+        "top": "y1",
+        "width": "x2",
+        "height": "y2",
+        "longitude": "lon",
+        "latitude": "lat",
+    }
+    layout = CsvLayout(columns=columns, box_form="corners")
+    stored = [
+        client.samples.import_file("gate", detections, layout=layout, target_id="a", idempotency_key="first")
+        for _ in range(2)
+    ]
+    assert stored[0] == stored[1], "the second answer is that of the first"
+    assert (stored[0].accepted, stored[0].rejected) == (2, 0)
+    assert [it.bounding_box.width_px for it in client.samples.list("gate")] == [30.0, 30.0]
+    moved = [
+        Sample(
+            time=it.time, target_id="a", bounding_box=it.bounding_box, fix=Fix(longitude_deg=25.0, latitude_deg=59.0)
+        )
+        for it in client.samples.list("gate")
+    ]
+    assert client.samples.import_samples("gate", moved).duplicate == 2
+    assert client.samples.import_samples("gate", moved, on_conflict="replace").replaced == 2
+    longitudes = [it.fix.longitude_deg for it in client.samples.list("gate") if it.fix is not None]
+    assert longitudes == [25.0, 25.0]
+
+
+def test_runs_have_idempotency_keys_and_followed_observations_are_stored(
+    client: Client, recording: tuple[Path, Path]
+) -> None:
+    client.cameras.create(id="square", image_size=ImageSize(width_px=1280, height_px=720))
+    client.samples.import_file("square", recording[0])
+    runs = [
+        client.training_runs.start("square", recipe="projective", epochs=20, idempotency_key="night") for _ in range(2)
+    ]
+    assert runs[0].id == runs[1].id
+    before = client.samples.count("square").count
+    box = BoundingBox(left_px=240.0, top_px=100.0, width_px=30.0, height_px=80.0)
+    fix = Fix(longitude_deg=24.7, latitude_deg=59.4)
+    observation = Observation(time=NOON, target_id="walker", bounding_box=box, fix=fix)
+    followed = client.tracks.follow_and_store("square", [observation], durability="relaxed")
+    assert followed.stored is not None
+    assert followed.stored.in_samples == 1
+    assert client.samples.count("square").count == before + 1
 
 
 def test_keys_have_roles_and_can_be_revoked(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 // The client of the public REST interface. Every refusal is a problem by RFC 9457.
 import { connection, session } from './connection.svelte';
+import { t } from './i18n.svelte';
 import type { Page, RejectedRow } from './types';
 
 export class ApiProblem extends Error {
@@ -52,7 +53,7 @@ async function send(method: string, path: string, options: Options): Promise<Res
   } catch (error) {
     if (options.signal?.aborted) throw error;
     connection.lose();
-    throw new ServerUnreachable('The server cannot be reached.');
+    throw new ServerUnreachable(t('connection.unreachable'));
   }
   connection.regain();
   if (response.ok) return response;

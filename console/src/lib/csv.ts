@@ -7,11 +7,18 @@ export type FileKind = 'samples' | 'detections' | 'fixes';
 export type BoxForm = 'left_top' | 'centre' | 'corners';
 export type TimeForm = 'rfc3339' | 'unix_s' | 'unix_ms';
 
+export interface TableRow {
+  /** Number of its line in the file, from 1. */
+  line: number;
+  cells: string[];
+  /** Why the line cannot be split into the header's columns; it has no cells then. */
+  problem?: string;
+}
+
 export interface Table {
   header: string[];
   separator: string;
-  /** Raw rows with their line numbers in the file, from 1. */
-  rows: { line: number; cells: string[] }[];
+  rows: TableRow[];
 }
 
 export interface Mapping {
@@ -26,42 +33,61 @@ export interface Mapping {
   targetId: string;
 }
 
-/** Reads all rows; a quoted cell may hold separators, quotes and line ends. */
+const MOST_ROW_BYTES = 64 * 1024;
+
+/** Splits a text into rows as the importer does: line by line, so that an open quote spoils no more than its own line. */
 export function parseTable(text: string): Table {
-  const content = text.charCodeAt(0) === 0xfeff ? text.slice(1) : text;
-  const firstLine = content.slice(0, Math.max(content.search(/\r?\n/), 0) || content.length);
-  const separator = [';', '\t', ',', '|'].map((it) => [it, firstLine.split(it).length] as const).sort((a, b) => b[1] - a[1])[0]![0];
-  const rows: Table['rows'] = [];
-  let cells: string[] = [];
-  let cell = '';
-  let [line, rowLine, quoted] = [1, 1, false];
-  const endRow = (): void => {
-    cells.push(cell.trim());
-    cell = '';
-    if (cells.length > 1 || cells[0] !== '') rows.push({ line: rowLine, cells });
-    cells = [];
-  };
-  for (let at = 0; at < content.length; at++) {
-    const char = content[at]!;
-    if (char === '\n') line += 1;
-    if (quoted) {
-      if (char !== '"') cell += char;
-      else if (content[at + 1] === '"') cell += content[++at];
-      else quoted = false;
-    } else if (char === '"' && cell.trim() === '') {
-      quoted = true;
-      cell = '';
-    } else if (char === separator) {
-      cells.push(cell.trim());
-      cell = '';
-    } else if (char === '\n') {
-      endRow();
-      rowLine = line;
-    } else if (char !== '\r') cell += char;
-  }
-  if (cell !== '' || cells.length > 0) endRow();
-  const header = rows.shift()?.cells ?? [];
+  const lines = text.replace(/^\uFEFF/, '').split('\n').map((line) => line.replace(/\r$/, ''));
+  const first = lines.findIndex((line) => line.trim() !== '');
+  const headerLine = lines[first] ?? '';
+  const separator = [';', '\t', ',', '|'].map((it) => [it, headerLine.split(it).length] as const).sort((a, b) => b[1] - a[1])[0]![0];
+  const split = splitLine(headerLine, separator);
+  const header = typeof split === 'string' ? [] : split;
+  const rows = lines.flatMap((line, at): TableRow[] => {
+    if (at <= first || line.trim() === '') return [];
+    const cells = rowOf(line, separator, header.length);
+    return [typeof cells === 'string' ? { line: at + 1, cells: [], problem: cells } : { line: at + 1, cells }];
+  });
   return { header, separator, rows };
+}
+
+/** The cells of a line, or why it has not those that the header names. */
+function rowOf(line: string, separator: string, width: number): string[] | string {
+  // A character is at most four bytes.
+  if (line.length * 4 > MOST_ROW_BYTES && new TextEncoder().encode(line).length > MOST_ROW_BYTES) return 'is longer than 64 KiB';
+  const cells = splitLine(line, separator);
+  if (typeof cells === 'string' || cells.length === width) return cells;
+  return `has ${cells.length} fields where the header names ${width}`;
+}
+
+/** The trimmed fields of a line as in RFC 4180, but without line ends within quotes; or what is wrong with it. */
+function splitLine(line: string, separator: string): string[] | string {
+  const cells: string[] = [];
+  let at = 0;
+  for (;;) {
+    let cell = '';
+    if (line[at] === '"') {
+      at += 1;
+      for (;;) {
+        const end = line.indexOf('"', at);
+        if (end < 0) return 'has an unclosed quote; a field cannot continue on the next line';
+        cell += line.slice(at, end);
+        at = end + 1;
+        if (line[at] !== '"') break;
+        cell += '"';
+        at += 1;
+      }
+      if (at < line.length && line[at] !== separator) return 'has text after a closing quote';
+    } else {
+      const end = line.indexOf(separator, at);
+      const next = end < 0 ? line.length : end;
+      cell = line.slice(at, next);
+      at = next;
+    }
+    cells.push(cell.trim());
+    if (at >= line.length) return cells;
+    at += 1;
+  }
 }
 
 /** Names that columns of each field have in the wild, lower case without units and signs; the importer has the same. */
@@ -130,9 +156,10 @@ export function missingFields(mapping: Mapping): string[] {
 }
 
 /** One row in the importer's columns, or why it cannot be. */
-export function mapRow(row: Table['rows'][number], mapping: Mapping, image: ImageSize | undefined): MappedRow | RejectedRow {
+export function mapRow(row: TableRow, mapping: Mapping, image: ImageSize | undefined): MappedRow | RejectedRow {
   const raw = (field: string): string => row.cells[mapping.columns[field] ?? -1] ?? '';
   const reject = (field: string, reason: string): RejectedRow => ({ line: row.line, field, reason });
+  if (row.problem) return reject('', row.problem);
   const numeric = (field: string): number => {
     const text = mapping.decimalComma ? raw(field).replace(',', '.') : raw(field);
     return text === '' ? NaN : Number(text);
@@ -141,7 +168,7 @@ export function mapRow(row: Table['rows'][number], mapping: Mapping, image: Imag
   if (mapping.timeForm === 'rfc3339') values.time = raw('time').replace(/^(\d{4}-\d\d-\d\d) (\d\d:)/, '$1T$2');
   else {
     const time_ms = numeric('time') * (mapping.timeForm === 'unix_s' ? 1000 : 1);
-    if (!Number.isFinite(time_ms) || Math.abs(time_ms) > 8.64e15) return reject('time', `'${raw('time')}' is not a number of seconds`);
+    if (!Number.isFinite(time_ms) || Math.abs(time_ms) > 8.64e15) return reject('time', `\`${raw('time').slice(0, 40)}\` is no Unix time`);
     values.time = new Date(time_ms).toISOString();
   }
   values.target_id = raw('target_id') || mapping.targetId;
@@ -150,7 +177,7 @@ export function mapRow(row: Table['rows'][number], mapping: Mapping, image: Imag
     const wrong = sides.findIndex((side) => !Number.isFinite(side));
     if (wrong >= 0) {
       const field = ['left', 'top', 'width', 'height'][wrong]!;
-      return reject(field, `'${raw(field)}' is not a number`);
+      return reject(field, raw(field) === '' ? 'is empty' : `must be a number, not \`${raw(field).slice(0, 40)}\``);
     }
     let [left, top, width, height] = sides as [number, number, number, number];
     if (mapping.normalised && image) {

@@ -74,6 +74,16 @@ export function drawPolygon(context: Context, corners: Pixel[], style: Style): v
   paint(context, style);
 }
 
+/** Lines, or the rings of polygons with holes, as one path. */
+export function drawPath(context: Context, parts: Pixel[][], isClosed: boolean, style: Style): void {
+  context.beginPath();
+  for (const part of parts) {
+    part.forEach(({ x, y }, at) => (at === 0 ? context.moveTo(x, y) : context.lineTo(x, y)));
+    if (isClosed) context.closePath();
+  }
+  paint(context, style);
+}
+
 export function drawLine(context: Context, from: Pixel, to: Pixel, style: Style): void {
   context.beginPath();
   context.moveTo(from.x, from.y);
@@ -94,6 +104,19 @@ export function drawRectangle(context: Context, x: number, y: number, width: num
   context.beginPath();
   context.rect(x, y, width, height);
   paint(context, style);
+}
+
+/** A text in the colour of texts with a halo, so that it can be read on whatever is under it. */
+export function drawLabel(context: Context, text: string, at: Pixel, colors: Palette, align: CanvasTextAlign = 'left'): void {
+  context.font = '500 12px "Plex Sans", sans-serif';
+  context.textAlign = align;
+  context.lineWidth = 3.5;
+  context.lineJoin = 'round';
+  context.setLineDash([]);
+  context.strokeStyle = colors.plane;
+  context.fillStyle = colors.text;
+  context.strokeText(text, at.x, at.y);
+  context.fillText(text, at.x, at.y);
 }
 
 /** Sizes a canvas to its element in device pixels; returns the context in CSS pixels, cleared. */

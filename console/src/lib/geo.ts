@@ -26,6 +26,11 @@ export function toPosition(reference: Position, point: EastNorth): Position {
   };
 }
 
+/** Metres in a CSS pixel of the web's Mercator projection with tiles of 256 px. */
+export function metresPerPixel(latitude_rad: number, zoom: number): number {
+  return (METRES_PER_DEGREE * 360 * Math.cos(latitude_rad)) / (256 * 2 ** zoom);
+}
+
 export function distance_m(a: Position, b: Position): number {
   const { east_m, north_m } = toPlane(a, b);
   return Math.hypot(east_m, north_m);

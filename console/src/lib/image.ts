@@ -18,6 +18,18 @@ export function imageSizeOf(camera: Camera | undefined, boxes: BoundingBox[]): I
   return boxes.length > 0 ? { width_px: round(width_px, 10), height_px: round(height_px, 10) } : { width_px: 1280, height_px: 720 };
 }
 
+/** Parts of the image, a third of its width and height each, row by row. */
+export const NINTHS = ['upperLeft', 'upper', 'upperRight', 'left', 'middle', 'right', 'lowerLeft', 'lower', 'lowerRight'] as const;
+export type Ninth = (typeof NINTHS)[number];
+
+/** The ninths of the image with hardly any foot point: what to walk next. */
+export function emptyNinths(points: { foot: { x: number; y: number } }[], size: ImageSize): Ninth[] {
+  const counts = new Array<number>(NINTHS.length).fill(0);
+  const third = (value: number, extent: number): number => Math.min(2, Math.max(0, Math.floor((value / extent) * 3)));
+  for (const { foot } of points) counts[third(foot.y, size.height_px) * 3 + third(foot.x, size.width_px)]! += 1;
+  return NINTHS.filter((_, at) => counts[at]! < Math.max(5, points.length * 0.005));
+}
+
 export interface Coverage {
   columns: number;
   rows: number;

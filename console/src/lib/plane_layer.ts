@@ -1,7 +1,7 @@
 // A canvas over a Leaflet map: the metric grid, and whatever a view draws.
 import type * as L from 'leaflet';
 import { drawLine, palette, prepare, type Context, type Palette, type Pixel } from './draw';
-import { roundLength } from './geo';
+import { metresPerPixel, roundLength } from './geo';
 import type { Position } from './types';
 
 /** What a view gets to draw on. */
@@ -43,8 +43,7 @@ export class PlaneLayer {
 
   /** Metres in a CSS pixel at the middle of the view. */
   metresPerPixel(): number {
-    const latitude = (this.#map.getCenter().lat * Math.PI) / 180;
-    return (40_075_016.686 * Math.cos(latitude)) / (256 * 2 ** this.#map.getZoom());
+    return metresPerPixel((this.#map.getCenter().lat * Math.PI) / 180, this.#map.getZoom());
   }
 
   redraw(): void {

@@ -11,13 +11,16 @@ function quoted(value: unknown): string {
   return `'${JSON.stringify(value).replaceAll("'", "'\\''")}'`;
 }
 
-export function curlLine(origin: string, camera: string, observation: TriedObservation): string {
-  return `curl -s ${origin}/v1/cameras/${camera}/fusions --json ${quoted(observation)}`;
+/** The header that a server with keys asks for; the key itself stays in the shell's environment. */
+const KEY = '-H "authorization: Bearer $SIGHTFIX_KEY" ';
+
+export function curlLine(origin: string, camera: string, observation: TriedObservation, needsKey = false): string {
+  return `curl -s ${needsKey ? KEY : ''}${origin}/v1/cameras/${camera}/fusions --json ${quoted(observation)}`;
 }
 
-export function grpcurlLine(origin: string, camera: string, observation: TriedObservation): string {
+export function grpcurlLine(origin: string, camera: string, observation: TriedObservation, needsKey = false): string {
   const url = new URL(origin);
   const plain = url.protocol === 'http:' ? '-plaintext ' : '';
   const host = url.port ? url.host : `${url.host}:${url.protocol === 'http:' ? 80 : 443}`;
-  return `grpcurl ${plain}-d ${quoted({ camera_id: camera, observations: [observation] })} ${host} sightfix.v1.FusionService/Fuse`;
+  return `grpcurl ${plain}${needsKey ? KEY : ''}-d ${quoted({ camera_id: camera, observations: [observation] })} ${host} sightfix.v1.FusionService/Fuse`;
 }

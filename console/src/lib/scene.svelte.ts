@@ -51,6 +51,21 @@ export class Scene {
     }
   }
 
+  /** Adds samples that were stored since, those of the last minute included: pairs are complete some seconds late. */
+  async loadNewer(): Promise<void> {
+    const newest = this.points.at(-1)?.sample.time;
+    const query = newest ? `?from=${encodeURIComponent(new Date(Date.parse(newest) - 60_000).toISOString())}` : '';
+    const path = cameraPath(this.#camera, 'samples') + query;
+    const known = new Set(this.points.map(({ sample }) => keyOf(sample)));
+    try {
+      const samples = await getAll<Sample>(path, MOST_SAMPLES, this.#abort.signal);
+      const added = samples.filter((sample) => !known.has(keyOf(sample)));
+      if (added.length > 0) this.points = [...this.points, ...added.map((sample) => ({ sample, foot: footOf(sample.bounding_box) }))];
+    } catch (error) {
+      if (!this.#abort.signal.aborted) this.error = messageOf(error);
+    }
+  }
+
   /** Asks the active model for evenly chosen samples, with the fixes that they have. */
   async #answer(signal: AbortSignal): Promise<void> {
     const step = Math.max(1, Math.ceil(this.points.length / MOST_ANSWERS));
@@ -72,4 +87,8 @@ export class Scene {
       this.points = [...this.points];
     }
   }
+}
+
+function keyOf({ time, target_id }: Sample): string {
+  return `${time} ${target_id}`;
 }

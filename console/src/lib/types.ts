@@ -125,6 +125,8 @@ export interface TrainingRun {
   attempt: number;
   model_version?: number;
   outcome?: string;
+  /** Of models that came with a report. */
+  report?: { advice: string[] };
   created_at: string;
   started_at?: string;
   ended_at?: string;
@@ -228,12 +230,26 @@ export interface Evaluation {
   outcome?: string;
   created_at: string;
   ended_at?: string;
-  report?: { methods: Record<string, Record<string, unknown>>; failed?: Record<string, string> } | null;
+  truth_point?: Position;
+  truth_line?: [number, number][];
+  report?: EvaluationReport | null;
+}
+export interface EvaluatedPosition extends Position {
+  error_m?: number;
+  r95_m?: number;
+  truth_longitude_deg?: number;
+  truth_latitude_deg?: number;
+}
+export interface EvaluationReport {
+  methods: Record<string, ErrorFigures>;
+  failed?: Record<string, string>;
+  /** Missing in evaluations of earlier releases. */
+  positions?: Record<string, EvaluatedPosition[]>;
 }
 export interface ServerInfo {
   version: string;
   limits: Record<string, number>;
-  tiles?: { url: string; attribution: string };
+  tiles?: { url: string; format: 'images' | 'pmtiles'; attribution: string };
 }
 export type Role = 'viewer' | 'edge' | 'operator' | 'admin';
 export interface Session {

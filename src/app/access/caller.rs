@@ -5,6 +5,7 @@ use std::sync::{Arc, LazyLock};
 
 use super::key_table::ActiveKey;
 use super::permission::Permission;
+use super::signed_in_user::SignedInUser;
 use crate::domain::{Actor, CameraId, Error, ErrorKind, Result, Scope};
 
 /// The holder of a client certificate that the server's client authority has signed.
@@ -27,6 +28,8 @@ pub enum Principal {
     Program,
     /// The holder of a key.
     Key(Arc<ActiveKey>),
+    /// A person who has signed in by OpenID Connect.
+    User(Arc<SignedInUser>),
     /// The holder of a client certificate.
     Certificate(CertificateHolder),
 }
@@ -39,6 +42,7 @@ impl Principal {
         match self {
             Self::Anonymous | Self::Everyone | Self::Program => None,
             Self::Key(key) => Some(&key.key().scope),
+            Self::User(user) => Some(user.scope()),
             Self::Certificate(holder) => Some(&holder.scope),
         }
     }
@@ -52,6 +56,7 @@ impl Principal {
             Self::Everyone => EVERYONE.clone(),
             Self::Program => "program".into(),
             Self::Key(key) => key.name(),
+            Self::User(user) => user.name(),
             Self::Certificate(holder) => format!("certificate {}", holder.fingerprint).into(),
         }
     }
@@ -128,13 +133,15 @@ impl Caller {
         }
     }
 
-    /// Checks that the caller's key has not been revoked, nor expired, since the request began.
+    /// Checks that the caller's key has not been revoked, nor expired, since the request began, and their session
+    /// has not ended.
     ///
     /// # Errors
     /// `Unauthenticated`.
     pub fn check_active(&self) -> Result<()> {
         match self.principal() {
             Principal::Key(key) => key.check_active(),
+            Principal::User(user) => user.check_active(),
             _ => Ok(()),
         }
     }
@@ -142,13 +149,14 @@ impl Caller {
     /// Whether the caller may lose its access while a request is open.
     #[must_use]
     pub fn is_revocable(&self) -> bool {
-        matches!(self.principal(), Principal::Key(_))
+        matches!(self.principal(), Principal::Key(_) | Principal::User(_))
     }
 
-    /// Waits until the caller's key is revoked or expires; the error says so.
+    /// Waits until the caller's key is revoked or expires, or their session ends; the error says so.
     pub async fn ended(&self) -> Error {
         match self.principal() {
             Principal::Key(key) => key.ended().await,
+            Principal::User(user) => user.ended().await,
             _ => std::future::pending().await,
         }
     }

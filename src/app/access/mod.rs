@@ -8,7 +8,9 @@ mod caller;
 mod key_table;
 mod permission;
 mod sessions;
+mod signed_in_user;
 
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use jiff::Timestamp;
@@ -16,12 +18,14 @@ use jiff::Timestamp;
 use self::key_table::KeyTable;
 use self::sessions::Sessions;
 use crate::domain::{Error, ErrorKind, KeyId, KeySecret, Result};
+use crate::openid::{Identity, Provider};
 use crate::store::Store;
 
 pub use caller::{Caller, CertificateHolder, Principal};
 pub use key_table::ActiveKey;
 pub use permission::{OPERATIONS, Operation, Permission, RoutePermission};
 pub use sessions::{SESSION_TIME, SessionToken};
+pub use signed_in_user::SignedInUser;
 
 /// What a client presents.
 #[derive(Debug, Clone, Copy)]
@@ -45,12 +49,27 @@ pub struct Access {
     sessions: Sessions,
     /// Credentials are needed although no key exists, because there are client certificates.
     is_closed: AtomicBool,
+    /// Where people sign in, if the settings say.
+    openid: OnceLock<Provider>,
 }
 
 impl Access {
     /// Asks every client for a credential, even while no key exists.
     pub fn close(&self) {
         self.is_closed.store(true, Ordering::Relaxed);
+    }
+
+    /// Lets people sign in at a provider, and asks every client for a credential.
+    pub fn use_openid(&self, provider: Provider) {
+        if self.openid.set(provider).is_ok() {
+            self.close();
+        }
+    }
+
+    /// Where people sign in, if the settings say.
+    #[must_use]
+    pub fn openid(&self) -> Option<&Provider> {
+        self.openid.get()
     }
 
     /// Whether everybody may do everything, because no key was ever created.
@@ -75,10 +94,9 @@ impl Access {
                 self.keys.use_key(&digest, now).map(Principal::Key)
             }
             // A page whose session has ended must be able to sign in again.
-            Credential::Session(token) => Ok(match self.sessions.key_of(token, now) {
-                Some(key) if key.use_at(now) => Principal::Key(key),
-                _ => Principal::Anonymous,
-            }),
+            Credential::Session(token) => {
+                Ok(self.sessions.principal_of(token, now).unwrap_or(Principal::Anonymous))
+            }
             Credential::Unreadable => Err(Error::refused(
                 ErrorKind::Unauthenticated,
                 "the header authorization must be `Bearer sf_...`, once",
@@ -97,8 +115,13 @@ impl Access {
         now: Timestamp,
     ) -> Result<Principal> {
         let key = self.keys.use_key(&KeySecret::parse(secret)?.digest(), now)?;
-        self.sessions.start(token, key.clone(), now);
+        self.sessions.start_for_key(token, key.clone(), now);
         Ok(Principal::Key(key))
+    }
+
+    /// Starts a session for a person who has signed in.
+    pub(super) fn start_user_session(&self, identity: Identity, token: &SessionToken, now: Timestamp) {
+        self.sessions.start_for_user(token, identity, now);
     }
 
     /// Ends a session; nothing happens if there is none.
@@ -112,6 +135,7 @@ impl Access {
     /// # Errors
     /// A fault if the store cannot be read.
     pub async fn refresh(&self, store: &Store, now: Timestamp) -> Result<()> {
+        self.sessions.end_expired(now);
         self.keys.refresh(store, now).await
     }
 

@@ -1,4 +1,5 @@
-//! Sessions of browsers: a token in a cookie stands for a key, so that no page holds the key itself.
+//! Sessions of browsers: a token in a cookie stands for a key, so that no page holds the key itself, or for a person who
+//! has signed in by OpenID Connect.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -7,8 +8,11 @@ use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use jiff::{SignedDuration, Timestamp};
 
+use super::caller::Principal;
 use super::key_table::ActiveKey;
+use super::signed_in_user::SignedInUser;
 use crate::domain::SecretDigest;
+use crate::openid::Identity;
 
 /// How long a session lasts.
 pub const SESSION_TIME: SignedDuration = SignedDuration::from_hours(12);
@@ -33,10 +37,32 @@ impl SessionToken {
     }
 }
 
+/// Whom a session stands for.
+enum Holder {
+    Key(Arc<ActiveKey>),
+    User(Arc<SignedInUser>),
+}
+
 struct Session {
     digest: SecretDigest,
-    key: Arc<ActiveKey>,
+    holder: Holder,
     expires_at: Timestamp,
+}
+
+impl Session {
+    fn is_valid_at(&self, now: Timestamp) -> bool {
+        let is_over = matches!(&self.holder, Holder::Key(key) if key.has_ended());
+        now < self.expires_at && !is_over
+    }
+}
+
+/// What is open for a user ends with the session; a key's end with the key.
+impl Drop for Session {
+    fn drop(&mut self) {
+        if let Holder::User(user) = &self.holder {
+            user.end();
+        }
+    }
 }
 
 /// The sessions of this process; a restart ends them.
@@ -48,23 +74,45 @@ impl Sessions {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn start(&self, token: &SessionToken, key: Arc<ActiveKey>, now: Timestamp) {
+    /// A session of the holder of a key.
+    pub(super) fn start_for_key(&self, token: &SessionToken, key: Arc<ActiveKey>, now: Timestamp) {
+        self.start(token, Holder::Key(key), now);
+    }
+
+    /// A session of a person; who they are to all requests that come with its token.
+    pub(super) fn start_for_user(&self, token: &SessionToken, identity: Identity, now: Timestamp) {
+        self.start(token, Holder::User(Arc::new(SignedInUser::new(identity))), now);
+    }
+
+    fn start(&self, token: &SessionToken, holder: Holder, now: Timestamp) {
+        self.end_expired(now);
         let mut sessions = self.lock();
-        sessions.retain(|_, session| session.expires_at > now && !session.key.has_ended());
         if sessions.len() >= MAX_SESSIONS {
             let oldest = sessions.iter().min_by_key(|(_, session)| session.expires_at).map(|it| *it.0);
             oldest.and_then(|oldest| sessions.remove(&oldest));
         }
         let digest = SecretDigest::of(token.0.as_bytes());
         let expires_at = now.saturating_add(SESSION_TIME).unwrap_or(Timestamp::MAX);
-        sessions.insert(digest.bucket(), Session { digest, key, expires_at });
+        sessions.insert(digest.bucket(), Session { digest, holder, expires_at });
     }
 
-    pub(super) fn key_of(&self, token: &str, now: Timestamp) -> Option<Arc<ActiveKey>> {
+    /// Whom a token stands for, who makes a request now.
+    pub(super) fn principal_of(&self, token: &str, now: Timestamp) -> Option<Principal> {
         let digest = SecretDigest::of(token.as_bytes());
         let sessions = self.lock();
         let session = sessions.get(&digest.bucket())?;
-        (session.digest == digest && now < session.expires_at).then(|| session.key.clone())
+        if session.digest != digest || !session.is_valid_at(now) {
+            return None;
+        }
+        match &session.holder {
+            Holder::Key(key) => key.use_at(now).then(|| Principal::Key(key.clone())),
+            Holder::User(user) => Some(Principal::User(user.clone())),
+        }
+    }
+
+    /// Ends the sessions whose time is over.
+    pub(super) fn end_expired(&self, now: Timestamp) {
+        self.lock().retain(|_, session| session.is_valid_at(now));
     }
 
     pub(super) fn end(&self, token: &str) {

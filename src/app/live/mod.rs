@@ -96,7 +96,8 @@ impl CameraEvents {
 
 impl App {
     /// The bounds of times that may enter tracks and drift detection.
-    pub(super) fn live_time_bounds(&self) -> TimeBounds {
+    #[must_use]
+    pub fn live_time_bounds(&self) -> TimeBounds {
         TimeBounds::live_at(self.clock.now(), self.limits.live_ahead_s)
     }
 
@@ -178,6 +179,17 @@ impl App {
     pub async fn tracks(&self, id: &CameraId) -> Result<Vec<Arc<TrackPoint>>> {
         let camera = self.active_camera(id).await?;
         Ok(camera.live.tracks.latest(self.clock.monotonic()))
+    }
+
+    /// Where every target of a camera was, by target, each oldest first; those that expired are left out.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn track_histories(&self, id: &CameraId) -> Result<Vec<Vec<Arc<TrackPoint>>>> {
+        let camera = self.active_camera(id).await?;
+        let now = self.clock.monotonic();
+        let latest = camera.live.tracks.latest(now);
+        Ok(latest.iter().filter_map(|point| camera.live.tracks.history(&point.target_id, now)).collect())
     }
 
     /// Where a target was, oldest first, as far back as the history reaches.

@@ -209,12 +209,12 @@ fn continuations(
     let cuts: Vec<usize> = (1..pieces.len()).filter(|at| is_cut(at - 1, *at)).collect();
     let mut continuations = vec![Vec::new(); pieces.len()];
     for link in links(tracks, motion) {
-        let touches_cut = |cut: &&usize| **cut == link.to || **cut - 1 == link.from;
-        match cuts.iter().filter(touches_cut).count() {
-            _ if is_cut(link.from, link.to) => {}
-            0 => continuations[link.from].push((link.to, link.probability)),
-            _ => continuations[link.from].push((link.to, settings.switch_probability * link.probability)),
+        if is_cut(link.from, link.to) {
+            continue;
         }
+        let touches_cut = cuts.iter().any(|cut| *cut == link.to || *cut - 1 == link.from);
+        let share = if touches_cut { settings.switch_probability } else { 1.0 };
+        continuations[link.from].push((link.to, share * link.probability));
     }
     for at in cuts {
         continuations[at - 1].push((at, 1.0 - settings.switch_probability));

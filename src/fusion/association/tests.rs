@@ -147,7 +147,7 @@ fn place_and_direction_are_found_by_fixes_of_unknown_carriers() {
     let ground: Vec<Tracklet> = tracks.iter().map(seen).collect();
     let receivers: Vec<Vec<TimedFix>> = (0..3).map(|at| carried(&tracks[at], 20 + at as u64)).collect();
     let search = PlacementSearch::new(&ground, &receivers, &MODEL, 1.0, (0.06, 0.0));
-    let best = search.search(1)[0];
+    let best = search.search(1, 50.0)[0];
     for (track, ground) in tracks.iter().zip(&ground) {
         let (truth, point) = (track.points[60].position, ground.points[60].position);
         let [east_m, north_m] = best.apply(point.east_m, point.north_m);

@@ -21,7 +21,9 @@ fn every_operation_tells_its_problems() {
                 assert_eq!(is_problem, status.as_str() >= "400", "{method} {path} {status}");
             }
             let has = |status: &str| responses.contains_key(status);
-            assert_eq!(has("422"), path.starts_with("/v1/"), "{method} {path}");
+            let refuses_arguments = ["/v1/", "/v2"].iter().any(|prefix| path.starts_with(prefix));
+            assert_eq!(has("422"), refuses_arguments, "{method} {path}");
+            assert!(has("400") || !path.starts_with("/ogc"), "{method} {path}");
             assert!(has("404") || !path.contains("{camera}"), "{method} {path}");
             assert!(has("413") || operation.get("requestBody").is_none(), "{method} {path}");
         }

@@ -19,8 +19,8 @@ use super::setting;
 use crate::harness::{TestServer, data_folder, run, sightfix};
 
 /// The calls by which SQLite writes, and flushes.
-const WRITE: &str = "pwrite64";
-const FLUSH: &str = "fsync,fdatasync";
+pub(super) const WRITE: &str = "pwrite64";
+pub(super) const FLUSH: &str = "fsync,fdatasync";
 /// A server that reached no such call is killed after this time.
 const LONGEST_LIFE: Duration = Duration::from_secs(3);
 /// Every so many moments are those of a database that is being created.
@@ -28,7 +28,7 @@ const CREATION_EVERY: u64 = 6;
 
 /// How a server ends.
 #[derive(Debug, Clone)]
-enum Kill {
+pub(super) enum Kill {
     After(Duration),
     /// At the n-th call of that name of the writing thread.
     AtCall(&'static str, u32),
@@ -62,7 +62,7 @@ impl Kill {
     }
 
     /// The server, traced if a call is to be hit.
-    fn command(&self) -> Command {
+    pub(super) fn command(&self) -> Command {
         let injection = match self {
             Self::After(_) => return sightfix(),
             Self::AtCall(call, number) => format!("inject={call}:signal=KILL:when={number}"),

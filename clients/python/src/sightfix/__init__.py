@@ -24,8 +24,9 @@ from sightfix._errors import (
     UnavailableError,
     WaitTimeoutError,
 )
-from sightfix._events import CameraEvent, LostEvents
+from sightfix._events import CameraEvent, LostEvents, SiteEvent
 from sightfix._items import LiveItem
+from sightfix._layout import CsvLayout
 from sightfix._request import RetryPolicy
 from sightfix._sync.client import Client
 from sightfix._tables import live_items
@@ -40,6 +41,7 @@ __all__ = [
     "Client",
     "ConflictError",
     "ConnectionFailedError",
+    "CsvLayout",
     "Fix",
     "ImageSize",
     "InsufficientStorageError",
@@ -59,6 +61,7 @@ __all__ = [
     "Sample",
     "ServerFaultError",
     "SightfixError",
+    "SiteEvent",
     "StreamClosedError",
     "TimeRange",
     "TooLargeError",

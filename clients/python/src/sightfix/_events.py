@@ -1,10 +1,10 @@
-"""Server-sent events of a camera."""
+"""Server-sent events of cameras and sites."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from sightfix._json import from_json
-from sightfix.models import CameraMoved, TrackUpdate
+from sightfix.models import CameraMoved, LostSiteEventCount, TrackChange, TrackUpdate, WorldTrackFeature
 
 
 @dataclass(frozen=True)
@@ -15,11 +15,26 @@ class LostEvents:
     """How many; None if the server does not know."""
 
 
+@dataclass(frozen=True)
+class SiteEvent:
+    """What happened at a site."""
+
+    id: str
+    """Its id; a watch can resume after it."""
+    name: str
+    """`track`, `track_started`, `handed_over`, `identified`, `merged`, `track_ended` or `lost`."""
+    body: WorldTrackFeature | TrackChange | LostSiteEventCount
+    """A position (`track`), lost events (`lost`), or a change of tracks."""
+
+
 CameraEvent = TrackUpdate | CameraMoved | LostEvents
 
 
 class ServerSentEventParser:
     """Builds events from lines (HTML standard, section 9.2.6)."""
+
+    last_event_id = ""
+    """Id of the latest event that had one."""
 
     def __init__(self) -> None:
         self._name = ""
@@ -34,10 +49,25 @@ class ServerSentEventParser:
                 self._name = value
             elif field == "data":
                 self._lines.append(value)
+            elif field == "id":
+                self.last_event_id = value
             return None
         event = (self._name, "\n".join(self._lines)) if self._lines else None
         self._name, self._lines = "", []
         return event
+
+
+def site_event(id_: str, name: str, value: Any) -> SiteEvent | None:
+    """An event of a site from its name and JSON values; None for a name that this version does not know."""
+    match name:
+        case "track":
+            return SiteEvent(id_, name, from_json(WorldTrackFeature, value))
+        case "lost":
+            return SiteEvent(id_, name, from_json(LostSiteEventCount, value))
+        case "track_started" | "handed_over" | "identified" | "merged" | "track_ended":
+            return SiteEvent(id_, name, from_json(TrackChange, value))
+        case _:
+            return None
 
 
 def camera_event(name: str, value: Any) -> CameraEvent | None:

@@ -38,6 +38,11 @@ def path(*segments: str | int) -> str:
     return "/".join(["/v1", *(quote(str(segment), safe="") for segment in segments)])
 
 
+def idempotency(key: str | None) -> dict[str, str]:
+    """The header of a request that may be sent again, if it has a key."""
+    return {} if key is None else {"idempotency-key": key}
+
+
 def get(path: str, **query: Parameter) -> Request:
     """Reads a resource."""
     return Request(method="GET", path=path, query=query, is_idempotent=True)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from sightfix._async.transport import Transport
 from sightfix._json import dump, to_json
-from sightfix._request import Request, delete, get, in_chunks, path
+from sightfix._layout import CsvLayout, OnConflict
+from sightfix._request import Request, delete, get, idempotency, in_chunks, path
 from sightfix._tables import Table, sample_columns, sample_rows, to_arrays, to_frame
 from sightfix.models import (
     DeletedSamples,
@@ -44,24 +45,69 @@ class Samples:
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    async def import_file(self, camera_id: str, file: str | Path, *, durability: Durability = "synced") -> Imported:
+    async def import_file(
+        self,
+        camera_id: str,
+        file: str | Path,
+        *,
+        durability: Durability = "synced",
+        on_conflict: OnConflict = "keep",
+        layout: CsvLayout | None = None,
+        target_id: str | None = None,
+        idempotency_key: str | None = None,
+    ) -> Imported:
         """Imports a file of CSV, NDJSON or JSON, by its name's ending.
 
         `line` of a rejected row is the line of the file.
+
+        Args:
+            camera_id: The camera.
+            file: The file.
+            durability: When the samples are acknowledged.
+            on_conflict: Whether a sample takes the place of a stored one of the same target and time.
+            layout: Columns of a CSV file; the documented ones by default.
+            target_id: The target of a CSV file that names none.
+            idempotency_key: The same import under the same key gets the answer of the first, for a day.
 
         Raises:
             ValueError: The name has another ending.
         """
         file = Path(file)
-        return await self._import(camera_id, file, media_type(file), durability)
+        request = Request(
+            method="POST",
+            path=path("cameras", camera_id, "samples"),
+            query={
+                "durability": durability,
+                "on_conflict": on_conflict,
+                "target_id": target_id,
+                **(layout or CsvLayout()).query(),
+            },
+            headers={"content-type": media_type(file), **idempotency(idempotency_key)},
+            body=file,
+            is_idempotent=True,
+        )
+        return await self._transport.json(request, Imported)
 
     async def import_samples(
-        self, camera_id: str, samples: Iterable[Sample], *, durability: Durability = "synced"
+        self,
+        camera_id: str,
+        samples: Iterable[Sample],
+        *,
+        durability: Durability = "synced",
+        on_conflict: OnConflict = "keep",
     ) -> Imported:
         """Imports samples in requests of 20,000. `line` of a rejected row counts the samples from 1."""
-        return await self._import_rows(camera_id, (to_json(sample) for sample in samples), durability)
+        rows = (to_json(sample) for sample in samples)
+        return await self._import_rows(camera_id, rows, durability, on_conflict)
 
-    async def import_table(self, camera_id: str, table: Table, *, durability: Durability = "synced") -> Imported:
+    async def import_table(
+        self,
+        camera_id: str,
+        table: Table,
+        *,
+        durability: Durability = "synced",
+        on_conflict: OnConflict = "keep",
+    ) -> Imported:
         """Imports the columns of a pandas DataFrame, or a mapping of names to arrays.
 
         The columns are those of a CSV file, with or without their units: `time`, `target_id`, `left_px`, `top_px`,
@@ -72,7 +118,7 @@ class Samples:
         Raises:
             ValueError: A column is unknown, or a time has no UTC offset.
         """
-        return await self._import_rows(camera_id, sample_rows(table), durability)
+        return await self._import_rows(camera_id, sample_rows(table), durability, on_conflict)
 
     async def pair_files(
         self,
@@ -87,7 +133,13 @@ class Samples:
         receiver_id: str | None = None,
         keep_unpaired: bool | None = None,
         estimate_offset: bool | None = None,
+        match: bool | None = None,
+        min_probability: float | None = None,
+        clock_window_s: float | None = None,
         durability: Durability | None = None,
+        on_conflict: OnConflict | None = None,
+        layout: CsvLayout | None = None,
+        idempotency_key: str | None = None,
     ) -> PairedSamples:
         """Pairs boxes and fixes that were recorded apart by time, and stores the pairs.
 
@@ -102,7 +154,13 @@ class Samples:
             receiver_id: The receiver of fixes that name none.
             keep_unpaired: Store boxes without a fix as samples without one.
             estimate_offset: Estimate the clock offsets of the receivers; they are not applied.
+            match: Find out whose boxes show whose receivers; boxes then need only a tracker's ids.
+            min_probability: Leave out samples whose match is less probable.
+            clock_window_s: The receivers' clocks are off by at most this, for `match`.
             durability: When the samples are acknowledged.
+            on_conflict: Whether a sample takes the place of a stored one of the same target and time.
+            layout: Columns of CSV files; the documented ones by default.
+            idempotency_key: The same import under the same key gets the answer of the first, for a day.
         """
         request = Request(
             method="POST",
@@ -115,8 +173,14 @@ class Samples:
                 "receiver_id": receiver_id,
                 "keep_unpaired": keep_unpaired,
                 "estimate_offset": estimate_offset,
+                "match": match,
+                "min_probability": min_probability,
+                "clock_window_s": clock_window_s,
                 "durability": durability,
+                "on_conflict": on_conflict,
+                **(layout or CsvLayout()).query(),
             },
+            headers=idempotency(idempotency_key),
             files={"detections": Path(detections), "fixes": Path(fixes)},
             is_idempotent=True,
         )
@@ -217,27 +281,30 @@ class Samples:
         )
         return (await self._transport.json(request, DeletedSamples)).deleted
 
-    async def _import(self, camera_id: str, body: bytes | Path, media_type: str, durability: Durability) -> Imported:
+    async def _import(
+        self, camera_id: str, rows: list[Mapping[str, Any]], durability: Durability, on_conflict: OnConflict
+    ) -> Imported:
         request = Request(
             method="POST",
             path=path("cameras", camera_id, "samples"),
-            query={"durability": durability},
-            headers={"content-type": media_type},
-            body=body,
+            query={"durability": durability, "on_conflict": on_conflict},
+            headers={"content-type": MEDIA_TYPES[".ndjson"]},
+            body=b"\n".join(dump(row) for row in rows),
             is_idempotent=True,
         )
         return await self._transport.json(request, Imported)
 
-    async def _import_rows(self, camera_id: str, rows: Iterable[Mapping[str, Any]], durability: Durability) -> Imported:
+    async def _import_rows(
+        self, camera_id: str, rows: Iterable[Mapping[str, Any]], durability: Durability, on_conflict: OnConflict
+    ) -> Imported:
         imported: Imported | None = None
         rows_before = 0
         for chunk in in_chunks(rows, ROWS_PER_REQUEST):
-            body = b"\n".join(dump(row) for row in chunk)
-            part = await self._import(camera_id, body, MEDIA_TYPES[".ndjson"], durability)
+            part = await self._import(camera_id, chunk, durability, on_conflict)
             imported = part if imported is None else added(imported, part, rows_before)
             rows_before += len(chunk)
         # Without rows the server says what no rows become.
-        return imported or await self._import(camera_id, b"", MEDIA_TYPES[".ndjson"], durability)
+        return imported or await self._import(camera_id, [], durability, on_conflict)
 
 
 def added(imported: Imported, part: Imported, rows_before: int) -> Imported:

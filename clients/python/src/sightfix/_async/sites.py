@@ -1,11 +1,14 @@
 """Sites: several cameras with one set of tracks."""
 
-from collections.abc import AsyncIterator, Sequence
+import json
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from typing import Unpack
 
+from sightfix._async.tracks import SILENCE_S
 from sightfix._async.transport import Transport
+from sightfix._events import ServerSentEventParser, SiteEvent, site_event
 from sightfix._json import request_json
-from sightfix._request import delete, get, path, with_json
+from sightfix._request import Request, delete, get, path, with_json
 from sightfix.models import Site, SiteChange, SiteDraft, WorldTrack, WorldTracks
 
 
@@ -44,6 +47,23 @@ class Sites:
     async def tracks(self, site_id: str) -> Sequence[WorldTrack]:
         """The latest positions of all targets that are tracked over the cameras of a site."""
         return (await self._transport.json(get(path("sites", site_id, "tracks")), WorldTracks)).items
+
+    async def watch(self, site_id: str, *, resume_after: str | None = None) -> AsyncGenerator[SiteEvent, None]:
+        """What happens at a site from now on, or after the event of an id that was read before.
+
+        Ends when the site is deleted or the server shuts down.
+        """
+        headers = {"accept": "text/event-stream"}
+        if resume_after is not None:
+            headers["last-event-id"] = resume_after
+        request = Request(method="GET", path=path("sites", site_id, "events"), headers=headers, is_idempotent=True)
+        parser = ServerSentEventParser()
+        async with self._transport.open(request, read_timeout_s=SILENCE_S) as response:
+            async for line in response.aiter_lines():
+                message = parser.push(line)
+                event = site_event(parser.last_event_id, message[0], json.loads(message[1])) if message else None
+                if event is not None:
+                    yield event
 
     async def history(self, site_id: str, track_id: str) -> Sequence[WorldTrack]:
         """The positions of one target, oldest first."""

@@ -2,12 +2,14 @@
 
 import json
 from collections.abc import AsyncGenerator, Iterable, Sequence
+from dataclasses import replace
 
 from sightfix._async.transport import Transport
 from sightfix._events import CameraEvent, ServerSentEventParser, camera_event
 from sightfix._json import to_json
 from sightfix._request import Request, get, path, with_json
 from sightfix.models import (
+    Durability,
     FollowedObservation,
     FollowedObservations,
     Observation,
@@ -38,6 +40,20 @@ class Tracks:
         body = {"observations": [to_json(observation) for observation in observations]}
         request = with_json("POST", path("cameras", camera_id, "tracks"), body)
         return (await self._transport.json(request, FollowedObservations)).items
+
+    async def follow_and_store(
+        self, camera_id: str, observations: Iterable[Observation], *, durability: Durability = "synced"
+    ) -> FollowedObservations:
+        """Tracks the targets of observations, pairs boxes with fixes and stores the pairs as samples.
+
+        Returns when it is decided what becomes of each observation, some seconds later.
+        """
+        body = {"observations": [to_json(observation) for observation in observations]}
+        request = replace(
+            with_json("POST", path("cameras", camera_id, "tracks"), body),
+            query={"store_samples": True, "durability": durability},
+        )
+        return await self._transport.json(request, FollowedObservations)
 
     async def watch(self, camera_id: str) -> AsyncGenerator[CameraEvent, None]:
         """What happens on a camera from now on: measured targets, a moved camera, lost events.

@@ -6,7 +6,7 @@ from typing import Unpack
 from sightfix._async.jobs import wait_for_job
 from sightfix._async.transport import Transport
 from sightfix._json import request_json
-from sightfix._request import Request, delete, get, path, with_json
+from sightfix._request import Request, delete, get, idempotency, path, with_json
 from sightfix.models import EpochReport, LogLine, RunDraft, TrainingCurve, TrainingLog, TrainingRun
 
 
@@ -16,9 +16,21 @@ class TrainingRuns:
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    async def start(self, camera_id: str, **draft: Unpack[RunDraft]) -> TrainingRun:
-        """Starts a run; it is queued when this returns."""
-        request = with_json("POST", path("cameras", camera_id, "training-runs"), request_json(draft))
+    async def start(
+        self, camera_id: str, *, idempotency_key: str | None = None, **draft: Unpack[RunDraft]
+    ) -> TrainingRun:
+        """Starts a run; it is queued when this returns.
+
+        With an `idempotency_key` the same request again returns the run of the first, for a day; it is then also
+        sent again by itself after a broken connection.
+        """
+        request = with_json(
+            "POST",
+            path("cameras", camera_id, "training-runs"),
+            request_json(draft),
+            headers=idempotency(idempotency_key),
+            is_idempotent=idempotency_key is not None,
+        )
         return await self._transport.json(request, TrainingRun)
 
     async def wait(

@@ -1,0 +1,57 @@
+// Map tiles from a local file.
+import { mkdtempSync, writeFileSync } from 'node:fs';
+import { tmpdir } from 'node:os';
+import { join } from 'node:path';
+import { expect, test } from './fixtures';
+import { pmtilesFile } from './pmtiles';
+import { addCamera, simulate } from './world';
+
+const FILE = join(mkdtempSync(join(tmpdir(), 'sightfix-tiles-')), 'area.pmtiles');
+writeFileSync(FILE, pmtilesFile());
+
+test.describe('a server with a file of tiles', () => {
+  test.use({ settings: { SIGHTFIX_CONSOLE__TILE_FILE: FILE, SIGHTFIX_CONSOLE__TILE_ATTRIBUTION: 'the survey of the town' } });
+
+  test('the map shows them in the colours of the theme, closer than they were made', async ({ console: page, server }) => {
+    await addCamera(server, 'gate', 'Gate', simulate(1));
+    const [ranges, scripts]: [string[], string[]] = [[], []];
+    page.on('response', (response) => {
+      const { pathname } = new URL(response.url());
+      if (pathname === '/v1/tiles') ranges.push(`${response.status()} ${response.headers()['content-range'] ?? ''}`);
+      if (pathname.endsWith('.js')) scripts.push(pathname);
+    });
+    await page.reload();
+    await expect(page.getByText('the survey of the town')).toBeVisible();
+    // The colour in the middle of the tiles, and that of water in the theme.
+    const colors = (): Promise<string[]> =>
+      page.evaluate(() => {
+        const hex = getComputedStyle(document.documentElement).getPropertyValue('--map-water').trim();
+        const water = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16)).join(' ');
+        const canvases = [...document.querySelectorAll<HTMLCanvasElement>('.leaflet-tile-pane canvas')];
+        return [water, ...canvases.map((canvas) => [...canvas.getContext('2d')!.getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data.slice(0, 3)].join(' '))];
+      });
+    const areWater = async (): Promise<boolean> => {
+      const [water, ...tiles] = await colors();
+      return tiles.length > 0 && tiles.every((color) => color === water);
+    };
+    await expect.poll(areWater).toBe(true);
+    const [before] = await colors();
+    await page.getByRole('button', { name: 'Switch between light and dark' }).click();
+    await expect.poll(areWater).toBe(true);
+    expect((await colors())[0]).not.toBe(before);
+    expect(ranges.length).toBeGreaterThan(0);
+    expect(ranges.every((range) => /^206 bytes \d+-\d+\/\d+$/.test(range)), ranges.join(', ')).toBe(true);
+    expect(scripts.some((path) => path.includes('tile_layer'))).toBe(true);
+  });
+});
+
+test('without a file nothing of it is loaded, and the map is a plain plane', async ({ console: page, server }) => {
+  const paths: string[] = [];
+  page.on('request', (request) => paths.push(new URL(request.url()).pathname));
+  await page.goto('about:blank');
+  await page.goto(server.url);
+  await expect(page.getByRole('application')).toBeVisible();
+  await expect.poll(() => paths.some((path) => path.includes('leaflet-src'))).toBe(true);
+  await expect(page.locator('.plane-canvas')).toBeAttached();
+  expect(paths.filter((path) => /tile_layer|\/v1\/tiles/.test(path))).toEqual([]);
+});

@@ -1,0 +1,263 @@
+//! Connections with other systems.
+//!
+//! Here they are created, changed and watched; `connect` runs them.
+
+mod status;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use tokio::sync::oneshot;
+
+use super::{App, Page, page_of};
+use crate::domain::{
+    Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
+    OutboxCounts, Result, check_text,
+};
+use crate::exchange::{ConnectionDraft, ConnectionSettings, Secrets};
+
+pub use status::{
+    ConnectionBoard, ConnectionState, ConnectionStatus, LastMessage, LiveConnection, PushedMessage,
+};
+
+/// A connection as a caller describes it.
+#[derive(Debug, Clone)]
+pub struct ConnectionRequest {
+    /// Its id.
+    pub id: ConnectionId,
+    /// The name for people; the id if left out.
+    pub display_name: Option<String>,
+    /// Whether it is at rest.
+    pub paused: bool,
+    /// What it does.
+    pub settings: ConnectionSettings,
+    /// Secrets to be set, or removed.
+    pub secrets: BTreeMap<String, Option<String>>,
+}
+
+impl TryFrom<ConnectionDraft> for ConnectionRequest {
+    type Error = Error;
+
+    fn try_from(draft: ConnectionDraft) -> Result<Self> {
+        Ok(Self {
+            id: ConnectionId::new(&draft.id)?,
+            display_name: draft.display_name,
+            paused: draft.paused,
+            settings: ConnectionSettings { source: draft.source, sink: draft.sink },
+            secrets: draft.secrets,
+        })
+    }
+}
+
+impl ConnectionRequest {
+    fn into_profile(self, known: Secrets) -> Result<NewConnection> {
+        let display_name = self.display_name.unwrap_or_else(|| self.id.as_str().to_owned());
+        check_text("display_name", &display_name, 200)?;
+        let secrets = known.changed(self.secrets)?;
+        self.settings.check(&secrets)?;
+        Ok(NewConnection {
+            id: self.id,
+            display_name,
+            paused: self.paused,
+            settings: serde_json::to_string(&self.settings).map_err(Error::fault)?,
+            secrets: serde_json::to_string(&secrets).map_err(Error::fault)?,
+        })
+    }
+}
+
+/// The stored settings of a connection.
+///
+/// # Errors
+/// A fault if they cannot be read, which an earlier release may have written otherwise.
+pub fn connection_settings(connection: &Connection) -> Result<(ConnectionSettings, Secrets)> {
+    let settings = serde_json::from_str(&connection.profile.settings).map_err(Error::fault)?;
+    Ok((settings, serde_json::from_str(&connection.profile.secrets).map_err(Error::fault)?))
+}
+
+impl App {
+    /// Stores a new connection, which starts at once unless it is paused.
+    ///
+    /// # Errors
+    /// `ConnectionExists`; `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
+    pub async fn create_connection(&self, request: ConnectionRequest) -> Result<Connection> {
+        let profile = request.into_profile(Secrets::default())?;
+        let connection = self.store.insert_connection(&profile, self.clock.now()).await?;
+        self.connection_board.notify();
+        Ok(connection)
+    }
+
+    /// Stores a connection that the settings declare: a new one, or a change of the stored one where it differs.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
+    pub async fn declare_connection(&self, request: ConnectionRequest) -> Result<()> {
+        let profile = request.into_profile(Secrets::default())?;
+        let now = self.clock.now();
+        match self.store.connection(&profile.id).await {
+            Ok(stored) if stored.profile == profile => Ok(()),
+            Ok(stored) => {
+                self.store.replace_connection(&profile, Some(stored.version()), now).await.map(drop)
+            }
+            Err(error) if error.kind() == ErrorKind::ConnectionNotFound => {
+                self.store.insert_connection(&profile, now).await.map(drop)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// One connection.
+    ///
+    /// # Errors
+    /// `ConnectionNotFound`.
+    pub async fn connection(&self, id: &ConnectionId) -> Result<Connection> {
+        self.store.connection(id).await
+    }
+
+    /// Connections by id, from behind a cursor on.
+    ///
+    /// # Errors
+    /// A fault of the store.
+    pub async fn connections(
+        &self,
+        after: Option<&ConnectionId>,
+        limit: u32,
+    ) -> Result<Page<Connection, ConnectionId>> {
+        let connections = self.store.connections(after, limit + 1).await?;
+        Ok(page_of(connections, limit, |connection| connection.id().clone()))
+    }
+
+    /// Puts a description in the place of the stored one; secrets that it does not name stay. It starts again.
+    ///
+    /// # Errors
+    /// `ConnectionNotFound`, `RevisionMismatch`, `InvalidArgument` naming the field.
+    pub async fn change_connection(
+        &self,
+        request: ConnectionRequest,
+        expected: ExpectedVersion<ConnectionKey>,
+    ) -> Result<Connection> {
+        let stored = self.store.connection(&request.id).await?;
+        let (_, secrets) = connection_settings(&stored)?;
+        let profile = request.into_profile(secrets)?;
+        let connection = self.store.replace_connection(&profile, Some(expected), self.clock.now()).await?;
+        self.connection_board.notify();
+        Ok(connection)
+    }
+
+    /// Deletes a connection with its outbox.
+    ///
+    /// # Errors
+    /// `ConnectionNotFound`, `RevisionMismatch`.
+    pub async fn delete_connection(
+        &self,
+        id: &ConnectionId,
+        expected: Option<ExpectedVersion<ConnectionKey>>,
+    ) -> Result<()> {
+        self.store.delete_connection(id, expected, self.clock.now()).await?;
+        self.connection_board.forget(id);
+        self.connection_board.notify();
+        Ok(())
+    }
+
+    /// What a connection does, and what is in its outbox.
+    ///
+    /// # Errors
+    /// A fault of the store.
+    pub async fn connection_status(
+        &self,
+        connection: &Connection,
+    ) -> Result<(ConnectionStatus, OutboxCounts)> {
+        let mut status = self.live_connection(connection).status();
+        let outbox = self.store.outbox_counts(connection.key).await?;
+        if let Some(oldest_at) = outbox.oldest_at {
+            status.lag_s = Some(self.clock.now().duration_since(oldest_at).as_secs_f64().max(0.0));
+        }
+        Ok((status, outbox))
+    }
+
+    /// The live part of a connection.
+    #[must_use]
+    pub fn live_connection(&self, connection: &Connection) -> Arc<LiveConnection> {
+        self.connection_board.live(connection.id(), connection.key)
+    }
+
+    /// Dead letters of a connection, oldest first, after the number of one.
+    ///
+    /// # Errors
+    /// `ConnectionNotFound`.
+    pub async fn dead_letters(
+        &self,
+        id: &ConnectionId,
+        after: i64,
+        limit: u32,
+    ) -> Result<Page<DeadLetter, i64>> {
+        let connection = self.store.connection(id).await?;
+        let letters = self.store.dead_letters(connection.key, after, limit + 1).await?;
+        Ok(page_of(letters, limit, |letter| letter.message.number))
+    }
+
+    /// Tries all dead letters of a connection again; how many.
+    ///
+    /// # Errors
+    /// `ConnectionNotFound`.
+    pub async fn retry_dead_letters(&self, id: &ConnectionId) -> Result<u64> {
+        let connection = self.store.connection(id).await?;
+        self.store.retry_dead_letters(connection.key).await
+    }
+
+    /// Deletes all dead letters of a connection; how many.
+    ///
+    /// # Errors
+    /// `ConnectionNotFound`.
+    pub async fn delete_dead_letters(&self, id: &ConnectionId) -> Result<u64> {
+        let connection = self.store.connection(id).await?;
+        self.store.delete_dead_letters(connection.key).await
+    }
+
+    /// Hands a message to a source that takes them by HTTP; returns when what was to be stored is stored.
+    ///
+    /// # Errors
+    /// `PermissionDenied` for a key that is restricted to other cameras than the source names;
+    /// `ConnectionNotFound`; `ConnectionNotReceiving` if it is paused or has another kind of address; `Overloaded`
+    /// while its queue is full; `MalformedBody` for a message that cannot be read.
+    pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<()> {
+        let connection = self.store.connection(id).await?;
+        let not_receiving = || {
+            let message =
+                format!("connection {id} takes no messages: it is paused, or its address is not push:");
+            Error::refused(ErrorKind::ConnectionNotReceiving, message)
+        };
+        self.authorize_source(&connection)?;
+        let inlet = self.live_connection(&connection).inlet().ok_or_else(not_receiving)?;
+        let (settled, settlement) = oneshot::channel();
+        let sender = self.caller().actor().name.to_string();
+        inlet.try_send(PushedMessage { sender, payload, settled }).map_err(|_| {
+            Error::refused(ErrorKind::Overloaded, format!("connection {id} has too many messages to do"))
+        })?;
+        match settlement.await {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(reason)) => Err(Error::refused(ErrorKind::MalformedBody, reason)),
+            Err(_) => Err(not_receiving()),
+        }
+    }
+
+    /// Checks that the caller may reach every camera that a source feeds.
+    fn authorize_source(&self, connection: &Connection) -> Result<()> {
+        let is_restricted =
+            self.caller().principal().scope().is_some_and(|scope| !scope.cameras().is_empty());
+        if !is_restricted {
+            return Ok(());
+        }
+        let (settings, _) = connection_settings(connection)?;
+        let Some(source) = settings.source else { return Ok(()) };
+        if source.names_any_camera() {
+            let message = "the key is restricted to cameras, and the connection's messages may name any";
+            return Err(Error::refused(ErrorKind::PermissionDenied, message));
+        }
+        let mapped = source.cameras.values().map(|mapping| mapping.camera());
+        for camera in mapped.chain(source.fix_cameras()?.into_iter().map(Ok)) {
+            self.caller().authorize_camera(&camera?)?;
+        }
+        Ok(())
+    }
+}

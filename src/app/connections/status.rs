@@ -1,0 +1,185 @@
+//! What connections do now: state, counts, the last message. In memory, since the server was started.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use bytes::Bytes;
+use jiff::Timestamp;
+use strum::IntoStaticStr;
+use tokio::sync::{Notify, mpsc, oneshot};
+
+use crate::domain::{ConnectionId, ConnectionKey};
+
+/// Bytes of a message that are shown.
+const SHOWN_BYTES: usize = 4_096;
+
+/// State of a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
+pub enum ConnectionState {
+    /// At rest, as the operator wants it.
+    #[default]
+    Paused,
+    /// Tries to reach its peer.
+    Connecting,
+    /// Takes or gives messages.
+    Running,
+    /// Failed; tries again after a pause.
+    Waiting,
+}
+
+/// A message as it came or went, with what was read from it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LastMessage {
+    /// When.
+    pub time: Timestamp,
+    /// Its topic, or the address of its sender.
+    pub subject: String,
+    /// Its beginning.
+    pub text: String,
+    /// What it says: its items, what was skipped, or why it cannot be read.
+    pub reading: Vec<String>,
+}
+
+impl LastMessage {
+    /// Of a payload, of which the first 4 KiB are kept.
+    #[must_use]
+    pub fn new(time: Timestamp, subject: String, payload: &[u8], reading: Vec<String>) -> Self {
+        let shown = &payload[..payload.len().min(SHOWN_BYTES)];
+        Self { time, subject, text: String::from_utf8_lossy(shown).into_owned(), reading }
+    }
+}
+
+/// What a connection does.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ConnectionStatus {
+    /// State.
+    pub state: ConnectionState,
+    /// Since when.
+    pub since: Option<Timestamp>,
+    /// What failed last, and when.
+    pub last_error: Option<(Timestamp, String)>,
+    /// The last message.
+    pub last_message: Option<LastMessage>,
+    /// Messages that came, or were delivered.
+    pub messages: u64,
+    /// Detections and fixes that were taken, or positions that were queued.
+    pub items: u64,
+    /// Detections and fixes that could not be taken, and parts of messages without any.
+    pub skipped: u64,
+    /// Messages that could not be read, or that the receiver refused.
+    pub rejected: u64,
+    /// Positions that were dropped since the outbox was full.
+    pub dropped: u64,
+    /// Messages that were acknowledged to the peer.
+    pub acknowledged: u64,
+    /// Connections to the peer that were opened.
+    pub connects: u64,
+    /// Age of the last item when it came, s; of the oldest waiting message of a sink.
+    pub lag_s: Option<f64>,
+}
+
+/// A message that a client hands to a connection, with the way back.
+pub struct PushedMessage {
+    /// Who sends it.
+    pub sender: String,
+    /// Content.
+    pub payload: Bytes,
+    /// Answered when what was to be stored is stored: the error of a message that cannot be read.
+    pub settled: oneshot::Sender<Result<(), String>>,
+}
+
+/// One connection in memory.
+#[derive(Default)]
+pub struct LiveConnection {
+    status: Mutex<ConnectionStatus>,
+    /// The way to the running source, where it takes pushed messages.
+    inlet: Mutex<Option<mpsc::Sender<PushedMessage>>>,
+    changed: Notify,
+}
+
+impl LiveConnection {
+    /// What it does now.
+    #[must_use]
+    pub fn status(&self) -> ConnectionStatus {
+        lock(&self.status).clone()
+    }
+
+    /// Changes what is known of it.
+    pub fn update(&self, change: impl FnOnce(&mut ConnectionStatus)) {
+        change(&mut lock(&self.status));
+        self.changed.notify_waiters();
+    }
+
+    /// Enters a state.
+    pub fn enter(&self, state: ConnectionState, now: Timestamp) {
+        self.update(|status| {
+            if status.state != state {
+                (status.state, status.since) = (state, Some(now));
+            }
+        });
+    }
+
+    /// Opens or closes the way for pushed messages.
+    pub fn set_inlet(&self, inlet: Option<mpsc::Sender<PushedMessage>>) {
+        *lock(&self.inlet) = inlet;
+    }
+
+    pub(in crate::app) fn inlet(&self) -> Option<mpsc::Sender<PushedMessage>> {
+        lock(&self.inlet).clone()
+    }
+
+    /// Waits until something is true of its status.
+    pub async fn reached(&self, is_reached: impl Fn(&ConnectionStatus) -> bool) {
+        loop {
+            let changed = self.changed.notified();
+            tokio::pin!(changed);
+            changed.as_mut().enable();
+            if is_reached(&lock(&self.status)) {
+                return;
+            }
+            changed.await;
+        }
+    }
+}
+
+/// All connections in memory.
+#[derive(Default)]
+pub struct ConnectionBoard {
+    live: Mutex<HashMap<ConnectionId, (ConnectionKey, Arc<LiveConnection>)>>,
+    changed: Notify,
+}
+
+impl ConnectionBoard {
+    /// The live part of a connection.
+    pub fn live(&self, id: &ConnectionId, key: ConnectionKey) -> Arc<LiveConnection> {
+        let mut live = lock(&self.live);
+        let known = live.get(id).filter(|(known, _)| *known == key);
+        match known {
+            Some((_, connection)) => connection.clone(),
+            None => {
+                let connection = Arc::new(LiveConnection::default());
+                live.insert(id.clone(), (key, connection.clone()));
+                connection
+            }
+        }
+    }
+
+    pub(super) fn forget(&self, id: &ConnectionId) {
+        lock(&self.live).remove(id);
+    }
+
+    /// Tells that connections were created, changed or deleted.
+    pub(super) fn notify(&self) {
+        self.changed.notify_one();
+    }
+
+    /// Waits for such a change.
+    pub async fn changed(&self) {
+        self.changed.notified().await;
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,55 @@
+//! Settings of the operator's console.
+
+use std::io::Read as _;
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use serde::{Deserialize, Serialize};
+
+use super::origin::tile_origin;
+
+/// How a PMTiles file of version 3 begins.
+const PMTILES_MAGIC: &[u8; 8] = b"PMTiles\x03";
+
+/// What the operator's console shows beside the server's own values.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Console {
+    /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
+    /// console asks no other server.
+    pub tile_url: Option<String>,
+    /// A PMTiles file of map tiles that the server itself offers; instead of `tile_url`.
+    pub tile_file: Option<PathBuf>,
+    /// What the provider of the tiles asks to be shown on the map.
+    pub tile_attribution: Option<String>,
+}
+
+impl Console {
+    pub(super) fn check(&self) -> anyhow::Result<()> {
+        if let Some(url) = &self.tile_url {
+            anyhow::ensure!(
+                tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),
+                "console.tile_url must be a URL like https://tiles.example.org/{{z}}/{{x}}/{{y}}.png"
+            );
+        }
+        let Some(file) = &self.tile_file else { return Ok(()) };
+        anyhow::ensure!(self.tile_url.is_none(), "give console.tile_url or console.tile_file, not both");
+        let mut magic = [0; PMTILES_MAGIC.len()];
+        std::fs::File::open(file)
+            .and_then(|mut opened| opened.read_exact(&mut magic))
+            .with_context(|| format!("console.tile_file: cannot read {}", file.display()))?;
+        anyhow::ensure!(
+            magic == *PMTILES_MAGIC,
+            "console.tile_file must be a PMTiles file of version 3; {} is none",
+            file.display()
+        );
+        Ok(())
+    }
+
+    /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
+    /// `None` for tiles of this server.
+    #[must_use]
+    pub fn tile_origin(&self) -> Option<&str> {
+        self.tile_url.as_deref().and_then(tile_origin).filter(|origin| !origin.is_empty())
+    }
+}

@@ -1,0 +1,75 @@
+//! From the outbox to the receiver.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use tokio::sync::Notify;
+
+use super::peer::PeerError;
+use super::sink::{self, Outcomes};
+use crate::app::{App, ConnectionState, LastMessage, LiveConnection};
+use crate::domain::{ConnectionKey, OutboxMessage};
+use crate::exchange::{Secrets, SinkSettings};
+
+/// Messages that are read from the outbox at a time.
+const BATCH: u32 = 256;
+/// The outbox is looked at this often without a notice: dead letters may have been put back.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
+
+/// Delivers the outbox of one sink.
+pub(super) struct Delivery<'a> {
+    pub(super) app: &'a App,
+    pub(super) key: ConnectionKey,
+    pub(super) settings: &'a SinkSettings,
+    pub(super) secrets: &'a Secrets,
+    pub(super) client_id: &'a str,
+    pub(super) live: &'a Arc<LiveConnection>,
+    pub(super) queued: &'a Notify,
+}
+
+impl Delivery<'_> {
+    /// Opens the sink and delivers until it fails. `progressed` is set when something was delivered.
+    pub(super) async fn run(&self, progressed: &AtomicBool) -> Result<Infallible, PeerError> {
+        let clock = &self.app.clock;
+        let mut sink = sink::open(self.settings, self.secrets, self.client_id, clock).await?;
+        self.live.enter(ConnectionState::Running, clock.now());
+        self.live.update(|status| status.connects += 1);
+        loop {
+            let messages = self.app.store.outbox(self.key, BATCH).await?;
+            if messages.is_empty() {
+                // Elapsed is no failure.
+                let _ = tokio::time::timeout(LOOK_EVERY, self.queued.notified()).await;
+                continue;
+            }
+            let mut outcomes = Outcomes::new();
+            let delivered = sink.deliver(&messages, &mut outcomes).await;
+            if !outcomes.is_empty() {
+                self.app.store.settle_outbox(self.key, &outcomes).await?;
+                self.report(&messages, &outcomes);
+                progressed.store(true, Ordering::Relaxed);
+            }
+            delivered?;
+        }
+    }
+
+    fn report(&self, messages: &[OutboxMessage], outcomes: &Outcomes) {
+        let now = self.app.clock.now();
+        let refused = outcomes.iter().filter_map(|(_, outcome)| outcome.as_ref().err());
+        let last = outcomes.last().and_then(|(number, outcome)| {
+            let message = messages.iter().find(|message| message.number == *number)?;
+            let reading = outcome.as_ref().map_or_else(Clone::clone, |()| "delivered".to_owned());
+            Some(LastMessage::new(now, message.subject.clone(), &message.payload, vec![reading]))
+        });
+        self.live.update(|status| {
+            let refusals = refused.clone().count() as u64;
+            status.messages += outcomes.len() as u64 - refusals;
+            status.rejected += refusals;
+            if let Some(reason) = refused.clone().next_back() {
+                status.last_error = Some((now, reason.clone()));
+            }
+            status.last_message = last;
+        });
+    }
+}

@@ -1,0 +1,397 @@
+//! From messages to the live tracks and samples of cameras, as the items of a live stream.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+
+use jiff::Timestamp;
+
+use super::peer::PeerError;
+use super::source::Message;
+use crate::admission::ClientId;
+use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
+use crate::domain::{
+    BoundingBox, CameraId, ConnectionId, Durability, Error, ErrorKind, ImageSize, LiveItem, ReceivedFix,
+    ReceiverId, Result,
+};
+use crate::exchange::{
+    DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, SourceSettings,
+    decoder,
+};
+
+/// The name that stands for any camera of a sender.
+const ANY_CAMERA: &str = "*";
+
+/// Which camera an item is for.
+pub(super) struct Routing {
+    cameras: HashMap<String, (CameraId, Option<ImageSize>)>,
+    fix_cameras: Vec<CameraId>,
+    receiver: Option<ReceiverId>,
+}
+
+impl Routing {
+    pub(super) fn of(settings: &SourceSettings) -> Result<Self> {
+        let cameras = settings
+            .cameras
+            .iter()
+            .map(|(name, mapping)| Ok((name.clone(), (mapping.camera()?, mapping.stream_size()?))));
+        Ok(Self {
+            cameras: cameras.collect::<Result<_>>()?,
+            fix_cameras: settings.fix_cameras()?,
+            receiver: settings.receiver()?,
+        })
+    }
+
+    /// The camera of a sender's name, and the size of the sender's stream if it is another.
+    fn camera(&self, name: &str) -> Result<(CameraId, Option<ImageSize>)> {
+        match self.cameras.get(name).or_else(|| self.cameras.get(ANY_CAMERA)) {
+            Some(known) => Ok(known.clone()),
+            None => CameraId::new(name).map(|id| (id, None)).map_err(|_| {
+                Error::invalid("cameras", format!("names no camera for the sender's camera `{name}`"))
+            }),
+        }
+    }
+
+    /// The receiver of a fix.
+    fn receiver(&self, fix: &ReceivedFix) -> Result<ReceiverId> {
+        fix.receiver_id.clone().or_else(|| self.receiver.clone()).ok_or_else(|| {
+            Error::invalid("receiver_id", "the message names no receiver; set receiver_id of the connection")
+        })
+    }
+}
+
+/// One camera's stream of a connection.
+struct CameraStream {
+    stream: LiveStream,
+    last_seq: u64,
+}
+
+/// A message of which something is not stored yet.
+struct PendingMessage {
+    receipt: u64,
+    /// Items that are to be settled: camera and seq.
+    items: Vec<(CameraId, u64)>,
+    outcome: Result<(), String>,
+}
+
+/// Takes the messages of one source.
+pub(super) struct Intake {
+    app: App,
+    id: ConnectionId,
+    live: Arc<LiveConnection>,
+    routing: Routing,
+    durability: Option<Durability>,
+    decoder: Box<dyn MessageDecoder>,
+    streams: HashMap<CameraId, CameraStream>,
+    pending: VecDeque<PendingMessage>,
+}
+
+impl Intake {
+    pub(super) fn new(
+        app: App,
+        id: ConnectionId,
+        live: Arc<LiveConnection>,
+        settings: &SourceSettings,
+    ) -> Result<Self> {
+        Ok(Self {
+            app,
+            id,
+            live,
+            routing: Routing::of(settings)?,
+            durability: settings.store_samples.then_some(Durability::Synced),
+            decoder: decoder(settings.format),
+            streams: HashMap::new(),
+            pending: VecDeque::new(),
+        })
+    }
+
+    /// Messages that are not settled.
+    pub(super) fn pending(&self) -> usize {
+        self.pending.len()
+    }
+
+    /// Takes a message. What is wrong with it, or with one of its items, is counted and shown in the status.
+    ///
+    /// # Errors
+    /// What failed is not the message's fault, so it must come again.
+    pub(super) async fn take(&mut self, message: Message) -> Result<(), PeerError> {
+        let now = self.app.clock.now();
+        let context = MessageContext { received_at: now, time_bounds: self.app.live_time_bounds() };
+        let read = if message.payload.len() > self.app.limits.connection_message_bytes {
+            Err(format!("is larger than {} bytes", self.app.limits.connection_message_bytes))
+        } else {
+            self.decoder.decode(&message.payload, &context)
+        };
+        let mut account = Account { now, ..Account::default() };
+        let mut items = Vec::new();
+        let outcome = match read {
+            Ok(Reading { items: read, skipped }) => {
+                account.skip_all(skipped);
+                for item in read {
+                    self.take_item(item, &mut items, &mut account).await?;
+                }
+                Ok(())
+            }
+            Err(reason) => Err(reason),
+        };
+        account.report(&self.live, &message, &outcome);
+        self.pending.push_back(PendingMessage { receipt: message.receipt, items, outcome });
+        Ok(())
+    }
+
+    async fn take_item(
+        &mut self,
+        item: MessageItem,
+        items: &mut Vec<(CameraId, u64)>,
+        account: &mut Account,
+    ) -> Result<(), PeerError> {
+        let description = describe(&item);
+        let targets = match item {
+            MessageItem::Detection(detection) => match self.routing.camera(&detection.camera) {
+                Ok((camera, size)) => vec![(camera, LiveSource::Detection(detection, size))],
+                Err(error) => return account.skip(&description, &error),
+            },
+            MessageItem::Fix(fix) => {
+                let receiver = match self.routing.receiver(&fix) {
+                    Ok(receiver) => receiver,
+                    Err(error) => return account.skip(&description, &error),
+                };
+                let source =
+                    |camera: &CameraId| (camera.clone(), LiveSource::Fix(fix.clone(), receiver.clone()));
+                self.routing.fix_cameras.iter().map(source).collect()
+            }
+        };
+        for (camera, source) in targets {
+            let time = source.time();
+            match self.follow(&camera, source).await {
+                Ok(seq) => {
+                    account.took(&camera, &description, time);
+                    if self.durability.is_some() {
+                        items.push((camera, seq));
+                    }
+                }
+                Err(error) if is_of_item(error.kind()) => account.skip(&description, &error)?,
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(())
+    }
+
+    /// The stream of a camera, opened again for one that was deleted and created. The seqs go on, so that what was
+    /// pending for the camera of before counts as settled.
+    async fn stream(&mut self, camera: &CameraId) -> Result<&mut CameraStream> {
+        let last_seq = match self.streams.get(camera) {
+            Some(known) if known.stream.current_camera().is_ok() => None,
+            Some(deleted) => Some(deleted.last_seq),
+            None => Some(0),
+        };
+        if let Some(last_seq) = last_seq {
+            let name = format!("connection {} {camera}", self.id);
+            let opened =
+                self.app.open_stream(camera, &name, ClientId::UNKNOWN, last_seq, self.durability).await;
+            let stream = opened.map_err(|error| match error.kind() {
+                ErrorKind::CameraNotFound => error,
+                // No fault of the item: it must come again.
+                _ => Error::fault(error),
+            })?;
+            self.streams.insert(camera.clone(), CameraStream { stream, last_seq });
+        }
+        self.streams.get_mut(camera).ok_or_else(|| Error::fault("the stream was just opened"))
+    }
+
+    /// Gives an item to the camera's stream; its seq there.
+    async fn follow(&mut self, camera: &CameraId, source: LiveSource) -> Result<u64> {
+        let known = self.stream(camera).await?;
+        let active = known.stream.current_camera()?;
+        let item = source.item(&active)?;
+        let seq = known.last_seq + 1;
+        known.stream.check_seq(seq)?;
+        known.last_seq = seq;
+        match known.stream.take(&active, seq, item).await {
+            Ok(_) => Ok(seq),
+            Err(error) => {
+                // One that was recorded before it was refused is settled by its recording.
+                known.stream.ack_refused(seq);
+                Err(error)
+            }
+        }
+    }
+
+    /// The oldest messages of which all is stored that was to be, in their order.
+    ///
+    /// # Errors
+    /// Samples could not be stored: nothing behind is acknowledged.
+    pub(super) fn settled(&mut self) -> Result<Vec<(u64, Result<(), String>)>> {
+        let mut settled = Vec::new();
+        while let Some(message) = self.pending.front() {
+            for (camera, seq) in &message.items {
+                if let Some(known) = self.streams.get(camera)
+                    && known.stream.acknowledgement()?.is_some_and(|it| it.seq < *seq)
+                {
+                    return Ok(settled);
+                }
+            }
+            if let Some(message) = self.pending.pop_front() {
+                settled.push((message.receipt, message.outcome));
+            }
+        }
+        Ok(settled)
+    }
+}
+
+/// Whether an error concerns one item, so that the rest goes on.
+const fn is_of_item(kind: ErrorKind) -> bool {
+    matches!(kind, ErrorKind::InvalidArgument | ErrorKind::CameraNotFound | ErrorKind::Overloaded)
+}
+
+/// An item with what turns it into that of a camera.
+enum LiveSource {
+    Detection(NamedDetection, Option<ImageSize>),
+    Fix(ReceivedFix, ReceiverId),
+}
+
+impl LiveSource {
+    const fn time(&self) -> Timestamp {
+        match self {
+            Self::Detection(detection, _) => detection.time,
+            Self::Fix(fix, _) => fix.time,
+        }
+    }
+
+    fn item(self, camera: &ActiveCamera) -> Result<LiveItem> {
+        Ok(match self {
+            Self::Detection(detection, stream_size) => {
+                let image_size = camera.image_size;
+                let bounding_box = box_in(image_size, detection.detected_box, stream_size)?;
+                let bounding_box =
+                    image_size.map_or(Ok(bounding_box), |image_size| bounding_box.within(image_size))?;
+                LiveItem {
+                    time: detection.time,
+                    target_id: Some(detection.target_id),
+                    receiver_id: None,
+                    bounding_box: Some(bounding_box),
+                    fix: None,
+                    class: detection.class,
+                    score: detection.score,
+                }
+            }
+            Self::Fix(fix, receiver_id) => LiveItem {
+                time: fix.time,
+                target_id: None,
+                receiver_id: Some(receiver_id),
+                bounding_box: None,
+                fix: Some(fix.fix),
+                class: None,
+                score: None,
+            },
+        })
+    }
+}
+
+/// A detector's rectangle in pixels of the camera's image. A camera without an image size has that of the detector.
+fn box_in(
+    image: Option<ImageSize>,
+    detected: DetectedBox,
+    stream_size: Option<ImageSize>,
+) -> Result<BoundingBox> {
+    let sides = |size: ImageSize| (f64::from(size.width_px()), f64::from(size.height_px()));
+    let (edges, (across, down)) = match detected {
+        DetectedBox::Fractions(edges) => {
+            let size = image.or(stream_size).ok_or_else(|| {
+                Error::invalid("image_size", "the camera needs an image_size for boxes without pixels")
+            })?;
+            (edges, sides(size))
+        }
+        DetectedBox::Pixels(edges) => {
+            let scales = image
+                .map(sides)
+                .zip(stream_size.map(sides))
+                .map(|(image, stream)| (image.0 / stream.0, image.1 / stream.1));
+            (edges, scales.unwrap_or((1.0, 1.0)))
+        }
+    };
+    let [left, top, right, bottom] = edges;
+    BoundingBox::new(left * across, top * down, (right - left) * across, (bottom - top) * down)
+}
+
+/// What became of the items of one message.
+#[derive(Default)]
+struct Account {
+    now: Timestamp,
+    lines: Vec<String>,
+    taken: u64,
+    skipped: u64,
+    latest: Option<Timestamp>,
+}
+
+impl Account {
+    /// Lines of a message that are shown.
+    const MAX_LINES: usize = 32;
+
+    fn line(&mut self, line: String) {
+        if self.lines.len() < Self::MAX_LINES {
+            self.lines.push(line);
+        }
+    }
+
+    fn took(&mut self, camera: &CameraId, description: &str, time: Timestamp) {
+        self.taken += 1;
+        self.latest = Some(self.latest.map_or(time, |latest| latest.max(time)));
+        self.line(format!("camera {camera}: {description}"));
+    }
+
+    fn skip(&mut self, description: &str, error: &Error) -> Result<(), PeerError> {
+        self.skipped += 1;
+        self.line(format!("skipped: {description}: {error}"));
+        Ok(())
+    }
+
+    fn skip_all(&mut self, reasons: Vec<String>) {
+        self.skipped += reasons.len() as u64;
+        reasons.into_iter().for_each(|reason| self.line(format!("skipped: {reason}")));
+    }
+
+    fn report(mut self, live: &LiveConnection, message: &Message, outcome: &Result<(), String>) {
+        if let Err(reason) = outcome {
+            self.line(format!("rejected: {reason}"));
+        }
+        let lag = self.latest.map(|latest| self.now.duration_since(latest).as_secs_f64());
+        let Self { now, lines, taken, skipped, .. } = self;
+        let last = LastMessage::new(now, message.subject.clone(), &message.payload, lines);
+        live.update(|status| {
+            status.messages += 1;
+            status.items += taken;
+            status.skipped += skipped;
+            status.rejected += u64::from(outcome.is_err());
+            status.last_message = Some(last);
+            if lag.is_some() {
+                status.lag_s = lag;
+            }
+        });
+    }
+}
+
+/// An item in words.
+pub(super) fn describe(item: &MessageItem) -> String {
+    match item {
+        MessageItem::Detection(detection) => {
+            let (name, [left, top, right, bottom]) = match detection.detected_box {
+                DetectedBox::Pixels(edges) => ("px", edges),
+                DetectedBox::Fractions(edges) => ("of the image", edges),
+            };
+            format!(
+                "target {} of `{}` at {}: box {left}, {top} to {right}, {bottom} {name}",
+                detection.target_id, detection.camera, detection.time
+            )
+        }
+        MessageItem::Fix(fix) => {
+            let position = fix.fix.position;
+            let receiver = fix.receiver_id.as_ref().map_or("the connection", ReceiverId::as_str);
+            format!(
+                "fix of {receiver} at {}: longitude {}, latitude {} degrees",
+                fix.time,
+                position.longitude_deg(),
+                position.latitude_deg()
+            )
+        }
+    }
+}

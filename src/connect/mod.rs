@@ -1,0 +1,32 @@
+//! Sources and sinks: other systems that give detections and fixes, or take positions.
+//!
+//! A source is a [`source::Source`] and a decoder of [`crate::exchange`]; a sink is a [`sink::Sink`]. A task per
+//! connection of `/v1/connections` runs it, opens it again with growing pauses when it fails, and keeps its status.
+//! What a source took is acknowledged to its peer when what was to be stored is stored; what a sink is to deliver is
+//! stored first and deleted when its receiver has it.
+//!
+//! What never happens here: formats of messages (they are in `exchange`), rules of tracks (they are in `app`), a
+//! queue without a limit.
+
+// What other systems send reaches this module: nothing in it may end the process.
+#![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
+
+mod deliver;
+mod intake;
+mod lines;
+mod mqtt;
+mod nats;
+mod peer;
+mod publish;
+mod push;
+mod sink;
+mod source;
+mod stream;
+mod supervisor;
+mod tls;
+mod trial;
+mod udp;
+mod webhook;
+
+pub use supervisor::run;
+pub use trial::{Trial, try_connection};

@@ -1,0 +1,77 @@
+//! The other end of a connection, and what may go wrong there.
+
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
+
+use super::tls;
+use crate::exchange::{Address, Secrets};
+
+/// Time to open a connection, its handshakes included.
+pub(super) const OPEN_TIME: Duration = Duration::from_secs(10);
+
+/// Why a connection does not work now; it is opened again.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(super) struct PeerError(pub(super) String);
+
+impl From<std::io::Error> for PeerError {
+    fn from(error: std::io::Error) -> Self {
+        Self(error.to_string())
+    }
+}
+
+impl From<crate::domain::Error> for PeerError {
+    fn from(error: crate::domain::Error) -> Self {
+        Self(error.to_string())
+    }
+}
+
+impl From<&str> for PeerError {
+    fn from(message: &str) -> Self {
+        Self(message.to_owned())
+    }
+}
+
+/// What opens connections: credentials and trust.
+pub(super) struct Credentials<'a> {
+    pub(super) username: Option<&'a str>,
+    pub(super) ca_certificate: Option<&'a str>,
+    pub(super) secrets: &'a Secrets,
+}
+
+/// A stream of bytes, plain or encrypted.
+pub(super) trait ByteStream: AsyncRead + AsyncWrite + Send + Unpin {}
+impl<S: AsyncRead + AsyncWrite + Send + Unpin> ByteStream for S {}
+
+/// Opens a TCP connection, encrypted if asked for.
+pub(super) async fn connect(
+    address: &Address,
+    is_encrypted: bool,
+    credentials: &Credentials<'_>,
+) -> Result<Box<dyn ByteStream>, PeerError> {
+    let open = async {
+        let stream = TcpStream::connect((address.host.as_str(), address.port)).await?;
+        stream.set_nodelay(true)?;
+        if !is_encrypted {
+            return Ok(Box::new(stream) as Box<dyn ByteStream>);
+        }
+        let connector = TlsConnector::from(tls::client_config(credentials)?);
+        let name = tls::server_name(&address.host)?;
+        Ok(Box::new(connector.connect(name, stream).await?) as Box<dyn ByteStream>)
+    };
+    within(OPEN_TIME, open).await
+}
+
+/// The work, or an error when it takes longer.
+pub(super) async fn within<T>(
+    time: Duration,
+    work: impl Future<Output = Result<T, PeerError>>,
+) -> Result<T, PeerError> {
+    match tokio::time::timeout(time, work).await {
+        Ok(done) => done,
+        Err(_) => Err(PeerError(format!("the peer did not answer within {} s", time.as_secs()))),
+    }
+}

@@ -1,0 +1,53 @@
+//! Messages that clients hand in by HTTP.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use futures_util::future::BoxFuture;
+use tokio::sync::{mpsc, oneshot};
+
+use super::peer::PeerError;
+use super::source::{Message, Source};
+use crate::app::{LiveConnection, PushedMessage};
+
+/// Takes what `App::push_message` hands in, while it exists.
+pub(super) struct PushSource {
+    live: Arc<LiveConnection>,
+    messages: mpsc::Receiver<PushedMessage>,
+    unsettled: HashMap<u64, oneshot::Sender<Result<(), String>>>,
+    last_receipt: u64,
+}
+
+impl PushSource {
+    pub(super) fn open(live: Arc<LiveConnection>, queue: usize) -> Self {
+        let (inlet, messages) = mpsc::channel(queue);
+        live.set_inlet(Some(inlet));
+        Self { live, messages, unsettled: HashMap::new(), last_receipt: 0 }
+    }
+}
+
+impl Drop for PushSource {
+    fn drop(&mut self) {
+        self.live.set_inlet(None);
+    }
+}
+
+impl Source for PushSource {
+    fn next(&mut self) -> BoxFuture<'_, Result<Message, PeerError>> {
+        Box::pin(async {
+            let PushedMessage { sender, payload, settled } =
+                self.messages.recv().await.ok_or_else(|| PeerError::from("the connection is closed"))?;
+            self.last_receipt += 1;
+            self.unsettled.insert(self.last_receipt, settled);
+            Ok(Message { receipt: self.last_receipt, subject: sender, payload })
+        })
+    }
+
+    fn settle(&mut self, receipt: u64, outcome: Result<(), String>) -> BoxFuture<'_, Result<(), PeerError>> {
+        if let Some(settled) = self.unsettled.remove(&receipt) {
+            // The client may have gone.
+            let _ = settled.send(outcome);
+        }
+        Box::pin(async { Ok(()) })
+    }
+}

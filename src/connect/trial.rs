@@ -1,0 +1,133 @@
+//! Trying a connection: the next message of a source and what it says, or a test message of a sink.
+
+use std::time::Duration;
+
+use super::intake::describe;
+use super::peer::PeerError;
+use super::publish::payload;
+use super::sink::{self, Outcomes};
+use super::source::{self, SourceIdentity};
+use crate::app::{App, ConnectionState, LastMessage, connection_settings};
+use crate::domain::{CameraId, Connection, OutboxMessage, Result, TargetId};
+use crate::exchange::{MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, decoder};
+use crate::geo::{PlaneCovariance, Position};
+
+/// The target of test messages.
+const TEST_TARGET: &str = "sightfix-test";
+
+/// What came of trying a connection.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Trial {
+    /// The message, with what was read from it; `None` if none came in time.
+    pub message: Option<LastMessage>,
+    /// What failed.
+    pub error: Option<String>,
+}
+
+/// Tries a connection for at most `wait`. A source that runs shows its last message, or the next if none has come; a
+/// paused one is opened for a moment, and nothing of its message is used or acknowledged. A sink sends a position of
+/// the target `sightfix-test` at longitude 0, latitude 0.
+///
+/// # Errors
+/// The stored settings cannot be read.
+pub async fn try_connection(app: &App, connection: &Connection, wait: Duration) -> Result<Trial> {
+    let (settings, secrets) = connection_settings(connection)?;
+    let tried = match (&settings.source, &settings.sink) {
+        (Some(source), _) if connection.profile.paused => {
+            tokio::time::timeout(wait, try_source(app, connection, source, &secrets)).await
+        }
+        (Some(_), _) => Ok(watch(app, connection, wait).await),
+        (None, Some(sink)) => tokio::time::timeout(wait, try_sink(app, connection, sink, &secrets)).await,
+        (None, None) => return Err(crate::domain::Error::fault("a connection without source and sink")),
+    };
+    Ok(match tried {
+        Ok(Ok(message)) => Trial { message, error: None },
+        Ok(Err(error)) => Trial { message: None, error: Some(error.to_string()) },
+        Err(_) => {
+            let error = format!("nothing came within {} s", wait.as_secs());
+            Trial { message: None, error: Some(error) }
+        }
+    })
+}
+
+/// The last message of a source that runs.
+async fn watch(app: &App, connection: &Connection, wait: Duration) -> Result<Option<LastMessage>, PeerError> {
+    let live = app.live_connection(connection);
+    let shown = live.reached(|status| {
+        status.last_message.is_some()
+            || (status.state == ConnectionState::Waiting && status.last_error.is_some())
+    });
+    let has_come = tokio::time::timeout(wait, shown).await.is_ok();
+    let status = live.status();
+    match (status.last_message, status.last_error) {
+        (Some(message), _) => Ok(Some(message)),
+        (None, Some((_, error))) => Err(PeerError(error)),
+        (None, None) if has_come => Ok(None),
+        (None, None) => Err(PeerError(format!("nothing came within {} s", wait.as_secs()))),
+    }
+}
+
+async fn try_source(
+    app: &App,
+    connection: &Connection,
+    settings: &SourceSettings,
+    secrets: &Secrets,
+) -> Result<Option<LastMessage>, PeerError> {
+    let random = app.randomness.uuid_v7(app.clock.now()).simple();
+    let identity = SourceIdentity {
+        client_id: format!("sightfix-{}-test-{random}", connection.id()),
+        is_lasting: false,
+    };
+    let live = app.live_connection(connection);
+    let mut source = source::open(settings, secrets, &identity, &live, &app.limits).await?;
+    let message = source.next().await?;
+    let now = app.clock.now();
+    let context = MessageContext { received_at: now, time_bounds: app.live_time_bounds() };
+    let reading = match decoder(settings.format).decode(&message.payload, &context) {
+        Ok(read) => {
+            let skipped = read.skipped.iter().map(|reason| format!("skipped: {reason}"));
+            read.items.iter().map(describe).chain(skipped).take(32).collect()
+        }
+        Err(reason) => vec![format!("rejected: {reason}")],
+    };
+    source.settle(message.receipt, Err("the connection is only tried".to_owned())).await?;
+    Ok(Some(LastMessage::new(now, message.subject, &message.payload, reading)))
+}
+
+async fn try_sink(
+    app: &App,
+    connection: &Connection,
+    settings: &SinkSettings,
+    secrets: &Secrets,
+) -> Result<Option<LastMessage>, PeerError> {
+    let now = app.clock.now();
+    let random = app.randomness.uuid_v7(now);
+    let client_id = format!("sightfix-{}-test-{}", connection.id(), random.simple());
+    let mut sink = sink::open(settings, secrets, &client_id, &app.clock).await?;
+    let cameras = settings.cameras()?;
+    let camera: &CameraId = cameras.first().ok_or_else(|| PeerError::from("the sink names no camera"))?;
+    let target = TargetId::new(TEST_TARGET)?;
+    let message_id = random.to_string();
+    let position = OutgoingPosition {
+        message_id: &message_id,
+        camera_id: camera,
+        target_id: &target,
+        time: now,
+        position: Position::new(0.0, 0.0).map_err(|error| PeerError(error.to_string()))?,
+        covariance: PlaneCovariance::isotropic(1.0),
+        r95_m: PlaneCovariance::isotropic(1.0).r95_m(),
+        velocity_m_s: [0.0; 2],
+    };
+    let message = OutboxMessage {
+        number: 0,
+        subject: settings.topic_of(camera, &target),
+        payload: payload(settings, &position),
+        created_at: now,
+        message_id,
+    };
+    let mut outcomes = Outcomes::new();
+    sink.deliver(std::slice::from_ref(&message), &mut outcomes).await?;
+    let outcome = outcomes.pop().map_or(Ok(()), |(_, outcome)| outcome);
+    let reading = outcome.map_or_else(|reason| reason, |()| "delivered".to_owned());
+    Ok(Some(LastMessage::new(now, message.subject, &message.payload, vec![reading])))
+}

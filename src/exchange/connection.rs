@@ -1,0 +1,512 @@
+//! The JSON of a connection's settings: where a source or a sink is, what it speaks, and what goes where.
+//!
+//! Secrets are an object of their own, so that settings can be shown as they are.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::messages::MessageFormat;
+use crate::domain::{CameraId, Error, ImageSize, ReceiverId, Result, TargetId, check_text};
+
+/// Longest address, bytes.
+const MAX_ADDRESS_BYTES: usize = 512;
+/// Cameras that a connection may name.
+const MAX_CAMERAS: usize = 1_024;
+/// Topics that a source may subscribe to.
+const MAX_TOPICS: usize = 64;
+
+/// A connection to be created: either a source or a sink.
+#[derive(Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ConnectionDraft {
+    /// A slug: 1 to 63 of `a-z`, `0-9` and `-`.
+    #[schema(pattern = "^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$", example = "frigate")]
+    pub id: String,
+    /// The name for people; the id if left out.
+    #[schema(max_length = 200)]
+    pub display_name: Option<String>,
+    /// Whether it stays at rest.
+    #[serde(default)]
+    pub paused: bool,
+    /// Takes detections or fixes in.
+    pub source: Option<SourceSettings>,
+    /// Gives positions out.
+    pub sink: Option<SinkSettings>,
+    /// Secrets by name, which no answer shows: `password`, `signing_key` (webhooks), `authorization` (header of webhooks),
+    /// `client_certificate` and `client_key` (PEM).
+    #[serde(default)]
+    pub secrets: BTreeMap<String, Option<String>>,
+}
+
+/// What a connection does: exactly one of both.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ConnectionSettings {
+    /// Takes detections or fixes in.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub source: Option<SourceSettings>,
+    /// Gives positions out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sink: Option<SinkSettings>,
+}
+
+/// A camera of this server, by the sender's name of it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CameraMapping {
+    /// The camera here.
+    #[schema(example = "gate")]
+    pub camera_id: String,
+    /// Size of the stream that the sender's boxes are in, if it is not the camera's `image_size`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image_size: Option<StreamSize>,
+}
+
+/// Size of a stream, px.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct StreamSize {
+    /// Width, px.
+    pub width_px: u32,
+    /// Height, px.
+    pub height_px: u32,
+}
+
+/// Where detections or fixes come from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct SourceSettings {
+    /// `mqtt://HOST[:1883]` and `mqtts://HOST[:8883]` subscribe; `tcp://`, `tls://` and `gpsd://HOST[:2947]` connect and
+    /// read lines; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
+    /// `POST /v1/connections/{connection}/messages`.
+    #[schema(max_length = 512, example = "mqtt://broker.example.org:1883")]
+    pub address: String,
+    /// What the messages are.
+    pub format: MessageFormat,
+    /// Topics of MQTT, with its wildcards.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schema(max_items = 64, example = json!(["frigate/events"]))]
+    pub topics: Vec<String>,
+    /// Name of the user, where the peer asks for one; the secret `password` belongs to it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub username: Option<String>,
+    /// Authority of the peer's certificate (PEM); those of the operating system if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ca_certificate: Option<String>,
+    /// Cameras by the sender's names of them; a name that is missing here is taken as the id of a camera. The name `*`
+    /// stands for any.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub cameras: BTreeMap<String, CameraMapping>,
+    /// Cameras that fixes are for; each pairs them with its boxes.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schema(max_items = 1024, example = json!(["gate"]))]
+    pub camera_ids: Vec<String>,
+    /// The receiver of fixes whose messages name none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub receiver_id: Option<String>,
+    /// Whether boxes and fixes are paired and stored as samples. The peer's messages are acknowledged when that is done.
+    #[serde(default)]
+    pub store_samples: bool,
+}
+
+/// Format of a sink's messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OutgoingFormat {
+    /// A JSON object per position.
+    #[default]
+    Json,
+    /// A Cursor on Target event (XML, version 2.0) per position.
+    Cot,
+}
+
+/// Where positions go to.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct SinkSettings {
+    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]` and `nats://HOST[:4222]` publish; `http://` and `https://` post (a webhook); `tcp://`,
+    /// `tls://` and `udp://HOST:PORT`, also of a multicast group, send.
+    #[schema(max_length = 512, example = "https://hooks.example.org/positions")]
+    pub address: String,
+    /// What is sent.
+    #[serde(default)]
+    pub format: OutgoingFormat,
+    /// Topic of MQTT, or subject of NATS; `{camera}` and `{target}` are replaced by their ids. `sightfix/{camera}/{target}`
+    /// if left out, with points for NATS.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub topic: Option<String>,
+    /// Name of the user, where the peer asks for one; the secret `password` belongs to it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub username: Option<String>,
+    /// Authority of the peer's certificate (PEM); those of the operating system if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ca_certificate: Option<String>,
+    /// Cameras whose tracks are sent.
+    #[schema(min_items = 1, max_items = 1024, example = json!(["gate"]))]
+    pub camera_ids: Vec<String>,
+    /// Least time between two positions of a target, s; 1 if left out, 0 for every one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.0, maximum = 86400.0)]
+    pub min_interval_s: Option<f64>,
+    /// Time after which a Cursor on Target event is stale, s; 30 if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1.0, maximum = 86400.0)]
+    pub stale_s: Option<f64>,
+    /// Type of Cursor on Target events; `a-u-G` (unknown, on the ground) if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cot_type: Option<String>,
+    /// Routers that a multicast datagram may pass; 1 if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub multicast_ttl: Option<u8>,
+}
+
+/// The secrets of a connection, by name; they are never shown.
+#[derive(Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Secrets(BTreeMap<String, String>);
+
+impl fmt::Debug for Secrets {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.debug_set().entries(self.names()).finish()
+    }
+}
+
+impl Secrets {
+    /// Names of the secrets that connections may have.
+    pub const NAMES: [&str; 5] =
+        ["password", "signing_key", "authorization", "client_certificate", "client_key"];
+    const MAX_BYTES: usize = 32 << 10;
+
+    /// A secret that is set.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&str> {
+        self.0.get(name).map(String::as_str)
+    }
+
+    /// Names of the secrets that are set.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.0.keys().map(String::as_str)
+    }
+
+    /// These secrets with changes: a text sets one, `None` removes it.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming a secret that connections do not have, or that is too long.
+    pub fn changed(mut self, changes: BTreeMap<String, Option<String>>) -> Result<Self> {
+        for (name, secret) in changes {
+            if !Self::NAMES.contains(&name.as_str()) {
+                let known = Self::NAMES.join(", ");
+                return Err(Error::invalid(
+                    format!("secrets.{name}"),
+                    format!("is unknown; there are {known}"),
+                ));
+            }
+            match secret {
+                Some(secret) if secret.is_empty() || secret.len() > Self::MAX_BYTES => {
+                    return Err(Error::invalid(
+                        format!("secrets.{name}"),
+                        "must be text of 1 to 32,768 bytes",
+                    ));
+                }
+                Some(secret) => drop(self.0.insert(name, secret)),
+                None => drop(self.0.remove(&name)),
+            }
+        }
+        Ok(self)
+    }
+}
+
+/// The part of an address before the host.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(missing_docs, reason = "each is the scheme of its name")]
+pub enum Scheme {
+    Mqtt,
+    Mqtts,
+    Tcp,
+    Tls,
+    TcpListen,
+    Udp,
+    Gpsd,
+    Push,
+    Http,
+    Https,
+    Nats,
+}
+
+impl Scheme {
+    const SOURCES: [Self; 8] =
+        [Self::Mqtt, Self::Mqtts, Self::Tcp, Self::Tls, Self::TcpListen, Self::Udp, Self::Gpsd, Self::Push];
+    const SINKS: [Self; 8] =
+        [Self::Mqtt, Self::Mqtts, Self::Nats, Self::Tcp, Self::Tls, Self::Udp, Self::Http, Self::Https];
+
+    const fn as_str(self) -> &'static str {
+        match self {
+            Self::Mqtt => "mqtt",
+            Self::Mqtts => "mqtts",
+            Self::Tcp => "tcp",
+            Self::Tls => "tls",
+            Self::TcpListen => "tcp-listen",
+            Self::Udp => "udp",
+            Self::Gpsd => "gpsd",
+            Self::Push => "push",
+            Self::Http => "http",
+            Self::Https => "https",
+            Self::Nats => "nats",
+        }
+    }
+
+    const fn default_port(self) -> Option<u16> {
+        match self {
+            Self::Mqtt => Some(1883),
+            Self::Mqtts => Some(8883),
+            Self::Gpsd => Some(2947),
+            Self::Http => Some(80),
+            Self::Https => Some(443),
+            Self::Nats => Some(4222),
+            Self::Tcp | Self::Tls | Self::TcpListen | Self::Udp | Self::Push => None,
+        }
+    }
+}
+
+/// Where a peer is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Address {
+    /// How it is reached.
+    pub scheme: Scheme,
+    /// Name or address of its machine; without the brackets of IPv6.
+    pub host: String,
+    /// Its port.
+    pub port: u16,
+    /// Path and query of a webhook, from `/` on.
+    pub path: String,
+}
+
+impl Address {
+    /// Reads an address of one of these schemes.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `address`.
+    fn parse(text: &str, schemes: &[Scheme]) -> Result<Self> {
+        let invalid = |message: String| Error::invalid("address", message);
+        check_text("address", text, MAX_ADDRESS_BYTES)?;
+        if text == "push:" && schemes.contains(&Scheme::Push) {
+            return Ok(Self { scheme: Scheme::Push, host: String::new(), port: 0, path: String::new() });
+        }
+        let named = text.split_once("://").and_then(|(name, rest)| {
+            Some((schemes.iter().copied().find(|it| it.as_str() == name && *it != Scheme::Push)?, rest))
+        });
+        let Some((scheme, rest)) = named else {
+            let known: Vec<String> = schemes.iter().map(|it| format!("{}:", it.as_str())).collect();
+            return Err(invalid(format!("must begin with one of {}", known.join(", "))));
+        };
+        let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+        if authority.contains('@') {
+            return Err(invalid("must not contain a user; give username and the secret password".to_owned()));
+        }
+        let has_path = matches!(scheme, Scheme::Http | Scheme::Https);
+        if !has_path && !matches!(path, "" | "/") {
+            return Err(invalid("must end behind the port".to_owned()));
+        }
+        if path.contains(|it: char| it.is_whitespace() || !it.is_ascii()) {
+            return Err(invalid("must be ASCII without spaces".to_owned()));
+        }
+        let (host, port) = match authority.rsplit_once(':') {
+            Some((host, port)) if !port.ends_with(']') => {
+                let port = port.parse().ok().filter(|port| *port > 0);
+                (host, Some(port.ok_or_else(|| invalid("has no port from 1 to 65535".to_owned()))?))
+            }
+            _ => (authority, None),
+        };
+        let host = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
+        let is_host = |byte: u8| byte.is_ascii_alphanumeric() || b".-_:".contains(&byte);
+        if host.is_empty() || !host.bytes().all(is_host) {
+            return Err(invalid("has no host".to_owned()));
+        }
+        let port = port.or(scheme.default_port());
+        Ok(Self {
+            scheme,
+            host: host.to_owned(),
+            port: port.ok_or_else(|| invalid("must name a port, as in HOST:PORT".to_owned()))?,
+            path: if path.is_empty() { "/".to_owned() } else { path.to_owned() },
+        })
+    }
+}
+
+impl ConnectionSettings {
+    /// Checks the settings as a whole.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field.
+    pub fn check(&self, secrets: &Secrets) -> Result<()> {
+        match (&self.source, &self.sink) {
+            (Some(source), None) => source.check().map_err(|error| error.under("source")),
+            (None, Some(sink)) => sink.check().map_err(|error| error.under("sink")),
+            _ => Err(Error::invalid("source", "give either source or sink")),
+        }?;
+        if secrets.get("client_certificate").is_some() != secrets.get("client_key").is_some() {
+            return Err(Error::invalid(
+                "secrets.client_key",
+                "client_certificate and client_key belong together",
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl SourceSettings {
+    /// Where it is.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `address`.
+    pub fn address(&self) -> Result<Address> {
+        Address::parse(&self.address, &Scheme::SOURCES)
+    }
+
+    fn check(&self) -> Result<()> {
+        let address = self.address()?;
+        let subscribes = matches!(address.scheme, Scheme::Mqtt | Scheme::Mqtts);
+        if subscribes == self.topics.is_empty() || self.topics.len() > MAX_TOPICS {
+            return Err(Error::invalid("topics", "must be 1 to 64 for MQTT, and none for other addresses"));
+        }
+        for topic in &self.topics {
+            check_text("topics", topic, 1_024)?;
+        }
+        check_username(self.username.as_deref())?;
+        if self.format.brings_fixes() && self.camera_ids.is_empty() {
+            return Err(Error::invalid("camera_ids", "must name the cameras that the fixes are for"));
+        }
+        if address.scheme == Scheme::Gpsd && self.format != MessageFormat::Gpsd {
+            return Err(Error::invalid("format", "must be gpsd for an address of gpsd:"));
+        }
+        self.fix_cameras()?;
+        self.receiver()?;
+        if self.cameras.len() > MAX_CAMERAS {
+            return Err(Error::invalid("cameras", "must be at most 1,024"));
+        }
+        for (name, mapping) in &self.cameras {
+            let checked = || {
+                mapping.camera()?;
+                mapping.stream_size().map(drop)
+            };
+            checked().map_err(|error: Error| error.under(&format!("cameras.{name}")))?;
+        }
+        Ok(())
+    }
+
+    /// Whether a message may name a camera that the settings do not: then the name is the id of a camera.
+    #[must_use]
+    pub fn names_any_camera(&self) -> bool {
+        !self.format.brings_fixes() && !self.cameras.contains_key("*")
+    }
+
+    /// The cameras that fixes are for.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `camera_ids`.
+    pub fn fix_cameras(&self) -> Result<Vec<CameraId>> {
+        cameras(&self.camera_ids)
+    }
+
+    /// The receiver of fixes whose messages name none.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `receiver_id`.
+    pub fn receiver(&self) -> Result<Option<ReceiverId>> {
+        self.receiver_id.as_deref().map(ReceiverId::new).transpose()
+    }
+}
+
+impl CameraMapping {
+    /// The camera.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `camera_id`.
+    pub fn camera(&self) -> Result<CameraId> {
+        CameraId::new(&self.camera_id).map_err(|error| error.at("camera_id"))
+    }
+
+    /// Size of the sender's stream, if it is not that of the camera.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming a side.
+    pub fn stream_size(&self) -> Result<Option<ImageSize>> {
+        self.image_size.map(|size| ImageSize::new(size.width_px, size.height_px)).transpose()
+    }
+}
+
+impl SinkSettings {
+    /// Where it is.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `address`.
+    pub fn address(&self) -> Result<Address> {
+        Address::parse(&self.address, &Scheme::SINKS)
+    }
+
+    fn check(&self) -> Result<()> {
+        self.address()?;
+        check_username(self.username.as_deref())?;
+        if self.camera_ids.is_empty() {
+            return Err(Error::invalid("camera_ids", "must name the cameras whose tracks are sent"));
+        }
+        self.cameras()?;
+        if let Some(topic) = &self.topic {
+            check_text("topic", topic, 1_024)?;
+            let wildcards: &[char] =
+                if self.address.starts_with("nats:") { &[' ', '*', '>'] } else { &['+', '#'] };
+            if topic.contains(wildcards) {
+                return Err(Error::invalid("topic", "must not contain wildcards"));
+            }
+        }
+        for (field, value, least) in
+            [("min_interval_s", self.min_interval_s, 0.0), ("stale_s", self.stale_s, 1.0)]
+        {
+            if value.is_some_and(|value| !(least..=86_400.0).contains(&value)) {
+                return Err(Error::invalid(field, format!("must be from {least} to 86400")));
+            }
+        }
+        let is_type = |text: &str| {
+            (1..=64).contains(&text.len())
+                && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"-.".contains(&byte))
+        };
+        if self.cot_type.as_deref().is_some_and(|text| !is_type(text)) {
+            return Err(Error::invalid("cot_type", "must be letters, digits and -, such as a-f-G-U-C"));
+        }
+        Ok(())
+    }
+
+    /// The cameras whose tracks are sent.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `camera_ids`.
+    pub fn cameras(&self) -> Result<Vec<CameraId>> {
+        cameras(&self.camera_ids)
+    }
+
+    /// The topic of a target, or its subject in NATS. Characters that separate levels there, or are wildcards, become
+    /// `_` in its id.
+    #[must_use]
+    pub fn topic_of(&self, camera: &CameraId, target: &TargetId) -> String {
+        let is_nats = self.address.starts_with("nats:");
+        let special: &[char] = if is_nats { &[' ', '.', '*', '>'] } else { &['/', '+', '#'] };
+        let default = if is_nats { "sightfix.{camera}.{target}" } else { "sightfix/{camera}/{target}" };
+        let template = self.topic.as_deref().unwrap_or(default);
+        let target = target.as_str().replace(special, "_");
+        template.replace("{camera}", camera.as_str()).replace("{target}", &target)
+    }
+}
+
+fn cameras(ids: &[String]) -> Result<Vec<CameraId>> {
+    if ids.len() > MAX_CAMERAS {
+        return Err(Error::invalid("camera_ids", "must be at most 1,024"));
+    }
+    let camera = |id: &String| CameraId::new(id).map_err(|error| error.at("camera_ids"));
+    ids.iter().map(camera).collect()
+}
+
+fn check_username(username: Option<&str>) -> Result<()> {
+    username.map_or(Ok(()), |name| check_text("username", name, 256))
+}

@@ -1,0 +1,69 @@
+//! Positions as Traccar forwards them (`forward.type = json`): `{"position": {...}, "device": {...}}`.
+//!
+//! The field `accuracy` is not used: its confidence level is not defined.
+
+use serde::Deserialize;
+
+use super::{MessageContext, MessageDecoder, MessageItem, Reading, parse};
+use crate::domain::{ReceivedFix, ReceiverId, parse_time};
+use crate::exchange::wire;
+
+pub(super) struct Traccar;
+
+#[derive(Deserialize)]
+struct Forwarded {
+    position: Position,
+    device: Option<Device>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Position {
+    device_id: Option<i64>,
+    fix_time: Option<String>,
+    #[serde(default = "yes")]
+    valid: bool,
+    /// Whether the receiver had no new fix and this is its last one.
+    #[serde(default)]
+    outdated: bool,
+    latitude: f64,
+    longitude: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Device {
+    unique_id: Option<String>,
+}
+
+const fn yes() -> bool {
+    true
+}
+
+impl MessageDecoder for Traccar {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+        let Forwarded { position, device } = parse(payload)?;
+        let mut reading = Reading::default();
+        if !position.valid || position.outdated {
+            reading.skip("the position is not valid, or an old one");
+            return Ok(reading);
+        }
+        let named = device.and_then(|device| device.unique_id);
+        let named = named.or_else(|| position.device_id.map(|id| id.to_string()));
+        let time = position.fix_time.ok_or("position.fixTime is missing")?;
+        let read = || -> crate::domain::Result<ReceivedFix> {
+            let fix = wire::Fix {
+                longitude_deg: position.longitude,
+                latitude_deg: position.latitude,
+                sigma_m: None,
+            };
+            Ok(ReceivedFix {
+                time: context.time_bounds.check(parse_time(&time)?)?,
+                receiver_id: named.as_deref().map(ReceiverId::new).transpose()?,
+                fix: fix.to_domain()?,
+            })
+        };
+        reading.items.push(MessageItem::Fix(read().map_err(|error| error.to_string())?));
+        Ok(reading)
+    }
+}

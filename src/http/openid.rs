@@ -1,0 +1,112 @@
+//! `/v1/session/openid`: sign-in of people at the provider of the settings.
+
+use axum::Router;
+use axum::response::Response;
+use axum::routing::get;
+use hyper::header::{CACHE_CONTROL, LOCATION, SET_COOKIE};
+use hyper::http::HeaderValue;
+use hyper::{HeaderMap, StatusCode, Uri};
+use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Rest;
+use super::access::CallerApp;
+use super::problem::{ApiResult, Problem};
+use super::session::{cookie, with_cookie};
+use super::wire::{empty, json};
+use crate::app::access::SESSION_TIME;
+use crate::domain::{Error, ErrorKind, Result};
+use crate::openid::{Provider, SignInSecret};
+
+/// Cookie that binds a sign-in to the browser that began it.
+const SIGN_IN_COOKIE: &str = "sightfix_sign_in";
+/// Time for a person to sign in at the provider, s.
+const SIGN_IN_TIME_S: u32 = 600;
+
+pub(super) fn routes() -> OpenApiRouter<Rest> {
+    OpenApiRouter::new().routes(routes!(get_sign_in_methods)).routes(routes!(begin_sign_in))
+}
+
+/// Where the provider sends the browser back to. It is no part of the description: which parameters come is the
+/// provider's choice, and clients ignore those that they do not know (RFC 6749, 4.1.2).
+pub(super) fn callback() -> Router<Rest> {
+    Router::new().route("/v1/session/openid/callback", get(finish_sign_in))
+}
+
+/// How browsers sign in here.
+#[derive(Serialize, ToSchema)]
+struct SignInMethods {
+    /// Whether `/v1/session/openid` leads to a provider where people sign in.
+    openid: bool,
+}
+
+/// How browsers sign in here
+///
+/// For the sign-in page. Keys are always taken (`POST /v1/session`).
+#[utoipa::path(
+    get, path = "/v1/session/methods", tag = "access",
+    responses((status = 200, description = "The methods", body = SignInMethods))
+)]
+async fn get_sign_in_methods(CallerApp(app): CallerApp) -> ApiResult {
+    Ok(json(&SignInMethods { openid: app.access.openid().is_some() })?)
+}
+
+/// Sign in by OpenID Connect
+///
+/// A page of this server links here. Leads the browser to the provider of the settings, which leads it back; then it
+/// has a session like that of a key, with the role that the provider's claim gives, and is led to `/`.
+#[utoipa::path(
+    get, path = "/v1/session/openid", tag = "access",
+    responses(
+        (status = 303, description = "To the provider", headers(("location" = String, description = "Its authorization endpoint"))),
+        (status = 404, description = "No provider is set up", body = Problem, content_type = "application/problem+json"),
+        (status = 502, description = "The provider gives no usable answer", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn begin_sign_in(CallerApp(app): CallerApp) -> ApiResult {
+    let (secret, url) = app.begin_sign_in().await?;
+    let response = see_other(&url)?;
+    let is_https = app.access.openid().is_some_and(Provider::is_https);
+    Ok(with_sign_in_cookie(response, is_https, secret.reveal(), SIGN_IN_TIME_S)?)
+}
+
+async fn finish_sign_in(CallerApp(app): CallerApp, uri: Uri, headers: HeaderMap) -> ApiResult {
+    let parameter = |wanted: &str| {
+        let query = uri.query().unwrap_or_default().as_bytes();
+        form_urlencoded::parse(query).find(|(name, _)| name == wanted).map(|(_, value)| value.into_owned())
+    };
+    if let Some(error) = parameter("error") {
+        let shown: String = error.chars().filter(|it| it.is_ascii_graphic()).take(64).collect();
+        let message = format!("the provider did not sign the person in: {shown}");
+        return Err(Error::refused(ErrorKind::Unauthenticated, message).into());
+    }
+    let missing = || Error::refused(ErrorKind::Unauthenticated, "the sign-in was not begun in this browser");
+    let secret = SignInSecret::of_cookie(cookie(&headers, SIGN_IN_COOKIE).ok_or_else(missing)?);
+    let (state, code) = parameter("state").zip(parameter("code")).ok_or_else(missing)?;
+    let token = app.finish_sign_in(&secret, &state, &code).await?;
+    let is_https = app.access.openid().is_some_and(Provider::is_https);
+    // The address has the code, which no page is to learn.
+    let response = with_cookie(see_other("/")?, is_https, token.reveal(), SESSION_TIME.as_secs())?;
+    Ok(with_sign_in_cookie(response, is_https, "", 0)?)
+}
+
+fn see_other(url: &str) -> Result<Response> {
+    let mut response = empty();
+    *response.status_mut() = StatusCode::SEE_OTHER;
+    let headers = response.headers_mut();
+    headers.insert(LOCATION, HeaderValue::from_str(url).map_err(Error::fault)?);
+    headers.insert(CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    Ok(response)
+}
+
+/// `Lax`, since the browser comes back from a page of the provider.
+fn with_sign_in_cookie(mut response: Response, is_https: bool, secret: &str, age_s: u32) -> Result<Response> {
+    let secure = if is_https { "; Secure" } else { "" };
+    let cookie = format!(
+        "{SIGN_IN_COOKIE}={secret}; Path=/v1/session/openid; Max-Age={age_s}; HttpOnly; SameSite=Lax{secure}"
+    );
+    response.headers_mut().append(SET_COOKIE, HeaderValue::from_str(&cookie).map_err(Error::fault)?);
+    Ok(response)
+}

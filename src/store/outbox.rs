@@ -1,0 +1,189 @@
+//! Messages that wait for their receivers.
+//!
+//! A message is deleted when its receiver has acknowledged it, so a crash in between delivers it again, under the
+//! same id. Beyond the limit the oldest waiting message of the connection is dropped, and counted by the caller.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use sqlx::sqlite::SqliteRow;
+
+use super::Store;
+use super::errors::failed;
+use super::row_decoder::RowDecoder;
+use crate::domain::{ConnectionKey, DeadLetter, OutboxCounts, OutboxMessage, Result};
+
+impl Store {
+    /// Appends messages; how many of the oldest were dropped for the limit. A connection that was deleted takes none.
+    ///
+    /// # Errors
+    /// [`crate::domain::ErrorKind::InsufficientStorage`]; then none is stored.
+    pub async fn append_to_outbox(&self, key: ConnectionKey, messages: &[OutboxMessage]) -> Result<u64> {
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
+        for message in messages {
+            sqlx::query(
+                "INSERT INTO outbox (connection_key, message_id, subject, payload, created_at_us) \
+                 SELECT key, ?, ?, ?, ? FROM connections WHERE key = ?",
+            )
+            .bind(&message.message_id)
+            .bind(&message.subject)
+            .bind(&message.payload)
+            .bind(message.created_at.as_microsecond())
+            .bind(key.0)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        }
+        let dropped = trim(&mut transaction, key, "IS NULL", self.limits().outbox_messages).await?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(dropped)
+    }
+
+    /// The oldest waiting messages.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn outbox(&self, key: ConnectionKey, limit: u32) -> Result<Vec<OutboxMessage>> {
+        let rows = sqlx::query(
+            "SELECT number, message_id, subject, payload, created_at_us FROM outbox \
+             WHERE connection_key = ? AND dead_reason IS NULL ORDER BY number LIMIT ?",
+        )
+        .bind(key.0)
+        .bind(limit)
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        rows.iter().map(|row| read_message(&mut RowDecoder::new("outbox", row))).collect()
+    }
+
+    /// Removes what was delivered, and sets aside what was refused, with the reason. The oldest dead letters beyond
+    /// the limit are deleted. A power cut may undo it; then the messages are delivered again.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn settle_outbox(
+        &self,
+        key: ConnectionKey,
+        outcomes: &[(i64, Result<(), String>)],
+    ) -> Result<()> {
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
+        for (number, outcome) in outcomes {
+            let sql = match outcome {
+                Ok(()) => "DELETE FROM outbox WHERE connection_key = ? AND number = ?",
+                Err(_) => "UPDATE outbox SET dead_reason = ?3 WHERE connection_key = ?1 AND number = ?2",
+            };
+            let query = sqlx::query(sql).bind(key.0).bind(number);
+            let query = match outcome {
+                Ok(()) => query,
+                Err(reason) => query.bind(reason),
+            };
+            query.execute(&mut *transaction).await.map_err(failed)?;
+        }
+        trim(&mut transaction, key, "IS NOT NULL", self.limits().dead_letters).await?;
+        transaction.commit().await.map_err(failed)
+    }
+
+    /// Dead letters of a connection, oldest first, after a number.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn dead_letters(&self, key: ConnectionKey, after: i64, limit: u32) -> Result<Vec<DeadLetter>> {
+        let rows = sqlx::query(
+            "SELECT number, message_id, subject, payload, created_at_us, dead_reason FROM outbox \
+             WHERE connection_key = ? AND dead_reason IS NOT NULL AND number > ? ORDER BY number LIMIT ?",
+        )
+        .bind(key.0)
+        .bind(after)
+        .bind(limit)
+        .fetch_all(self.readers())
+        .await
+        .map_err(failed)?;
+        let read = |row: &SqliteRow| {
+            let mut fields = RowDecoder::new("outbox", row);
+            Ok(DeadLetter { message: read_message(&mut fields)?, reason: fields.get()? })
+        };
+        rows.iter().map(read).collect()
+    }
+
+    /// Puts all dead letters of a connection back among the waiting messages; how many.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn retry_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
+        self.change_dead_letters(key, "UPDATE outbox SET dead_reason = NULL").await
+    }
+
+    /// Deletes all dead letters of a connection; how many.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn delete_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
+        self.change_dead_letters(key, "DELETE FROM outbox").await
+    }
+
+    async fn change_dead_letters(&self, key: ConnectionKey, change: &str) -> Result<u64> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let sql = format!("{change} WHERE connection_key = ? AND dead_reason IS NOT NULL");
+        let changed = sqlx::query(sqlx::AssertSqlSafe(sql))
+            .bind(key.0)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?
+            .rows_affected();
+        transaction.commit().await.map_err(failed)?;
+        Ok(changed)
+    }
+
+    /// What is in the outbox of a connection.
+    ///
+    /// # Errors
+    /// Faults only.
+    pub async fn outbox_counts(&self, key: ConnectionKey) -> Result<OutboxCounts> {
+        let (queued, dead, oldest_us): (i64, i64, Option<i64>) = sqlx::query_as(
+            "SELECT count(*) FILTER (WHERE dead_reason IS NULL), count(dead_reason), \
+             min(created_at_us) FILTER (WHERE dead_reason IS NULL) FROM outbox WHERE connection_key = ?",
+        )
+        .bind(key.0)
+        .fetch_one(self.readers())
+        .await
+        .map_err(failed)?;
+        Ok(OutboxCounts {
+            queued: queued.try_into().unwrap_or_default(),
+            dead: dead.try_into().unwrap_or_default(),
+            oldest_at: oldest_us.and_then(|us| Timestamp::from_microsecond(us).ok()),
+        })
+    }
+}
+
+/// Deletes the oldest messages beyond a limit; how many.
+async fn trim(
+    connection: &mut SqliteConnection,
+    key: ConnectionKey,
+    dead_reason: &str,
+    limit: u32,
+) -> Result<u64> {
+    let sql = format!(
+        "DELETE FROM outbox WHERE number IN (SELECT number FROM outbox WHERE connection_key = ?1 \
+         AND dead_reason {dead_reason} ORDER BY number DESC LIMIT -1 OFFSET ?2)"
+    );
+    let trimmed = sqlx::query(sqlx::AssertSqlSafe(sql))
+        .bind(key.0)
+        .bind(limit)
+        .execute(connection)
+        .await
+        .map_err(failed)?
+        .rows_affected();
+    Ok(trimmed)
+}
+
+fn read_message(fields: &mut RowDecoder<'_>) -> Result<OutboxMessage> {
+    Ok(OutboxMessage {
+        number: fields.get()?,
+        message_id: fields.get()?,
+        subject: fields.get()?,
+        payload: fields.get()?,
+        created_at: fields.timestamp()?,
+    })
+}

@@ -1,0 +1,220 @@
+//! Sources and sinks of MQTT against a real mosquitto.
+
+use serde_json::{Value, json};
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::net::TcpStream;
+
+use super::peers::{Broker, connection_when, create_gate, now, patch, send_fix};
+use crate::harness::{TestServer, data_folder, own_address};
+
+const TARGET: &str = "1607123955.475377-mxklsc";
+
+/// An update of Frigate's documentation with the time of now, or earlier.
+fn frigate_update(time: jiff::Timestamp) -> String {
+    json!({"type": "update", "before": {}, "after": {
+        "id": TARGET, "camera": "front_door", "frame_time": time.as_microsecond() as f64 * 1e-6, "label": "person",
+        "false_positive": false, "score": 0.87890625, "box": [216, 248, 272, 427], "area": 40096,
+    }})
+    .to_string()
+}
+
+/// Frigate's events for the camera `gate`, detected on a stream of half its size.
+fn frigate(broker: &Broker) -> Value {
+    json!({"id": "frigate", "source": {
+        "address": format!("mqtt://127.0.0.1:{}", broker.port), "format": "frigate", "topics": ["frigate/events"],
+        "cameras": {"front_door": {"camera_id": "gate", "image_size": {"width_px": 640, "height_px": 360}}},
+        "store_samples": true,
+    }})
+}
+
+#[tokio::test]
+#[ignore = "needs mosquitto"]
+async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
+    let broker = Broker::start();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    server.post("/v1/connections", &frigate(&broker)).await.expect(201);
+    connection_when(&server, "frigate", |status| status["state"] == "running").await;
+    let time = now();
+    broker.publish("frigate/events", &frigate_update(time));
+    let taken = connection_when(&server, "frigate", |status| status["items"] == 1).await;
+    assert_eq!(taken["status"]["acknowledged"], 0, "the box may still become part of a sample");
+    server.kill();
+
+    let server = TestServer::start(folder.path());
+    connection_when(&server, "frigate", |status| status["items"] == 1).await;
+    send_fix(&server, TARGET, &time.to_string(), 103.98678, true).await;
+    connection_when(&server, "frigate", |status| status["acknowledged"] == 1).await;
+    let samples = server.get("/v1/cameras/gate/samples").await.expect(200).json();
+    let sample = &samples["items"][0];
+    assert_eq!(sample["target_id"], TARGET);
+    let expected = json!({"left_px": 432.0, "top_px": 496.0, "width_px": 112.0, "height_px": 358.0});
+    assert_eq!(sample["bounding_box"], expected, "in pixels of the camera, not of the detect stream");
+    assert_eq!((&sample["class"], &sample["score"]), (&json!("person"), &json!(0.87890625)));
+    server.kill();
+
+    // What was acknowledged does not come again.
+    let server = TestServer::start(folder.path());
+    connection_when(&server, "frigate", |status| status["state"] == "running").await;
+    broker.publish("frigate/events", "not JSON");
+    let status =
+        connection_when(&server, "frigate", |status| status["messages"] == 1).await["status"].clone();
+    assert_eq!((&status["items"], &status["rejected"]), (&json!(0), &json!(1)), "{status}");
+    connection_when(&server, "frigate", |status| status["acknowledged"] == 1).await;
+    assert_eq!(server.get("/v1/cameras/gate/samples/count").await.expect(200).json()["count"], 1);
+}
+
+#[tokio::test]
+#[ignore = "needs mosquitto"]
+async fn a_broker_may_go_and_come_back() {
+    let broker = Broker::start();
+    let port = broker.port;
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    server.post("/v1/connections", &frigate(&broker)).await.expect(201);
+    connection_when(&server, "frigate", |status| status["state"] == "running").await;
+    drop(broker);
+    connection_when(&server, "frigate", |status| status["state"] == "waiting").await;
+    let broker = Broker::start_at(port);
+    connection_when(&server, "frigate", |status| status["connects"] == 2).await;
+    broker.publish("frigate/events", &frigate_update(now()));
+    connection_when(&server, "frigate", |status| status["acknowledged"] == 1).await;
+}
+
+#[tokio::test]
+#[ignore = "needs mosquitto"]
+async fn a_paused_source_of_a_broker_can_be_tried() {
+    let broker = Broker::start();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let mut draft = frigate(&broker);
+    draft["paused"] = json!(true);
+    server.post("/v1/connections", &draft).await.expect(201);
+    let silent = server.post("/v1/connections/frigate/test?wait_s=1", &json!({})).await.expect(200).json();
+    assert_eq!(silent["error"], "nothing came within 1 s");
+    let empty = json!({});
+    let trial = server.post("/v1/connections/frigate/test?wait_s=30", &empty);
+    let publishing = async {
+        // Until the trial has subscribed nobody gets it.
+        loop {
+            broker.publish("frigate/events", &frigate_update(now()));
+            tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+        }
+    };
+    let tried = tokio::select! {
+        tried = trial => tried.expect(200).json(),
+        _ = publishing => panic!("it never ends"),
+    };
+    assert_eq!(tried["message"]["subject"], "frigate/events");
+    let reading = tried["message"]["reading"][0].as_str().expect("text");
+    assert!(reading.contains(TARGET) && reading.contains("216, 248 to 272, 427 px"), "{reading}");
+    assert_eq!(server.get("/v1/cameras/gate/tracks").await.expect(200).json()["features"], json!([]));
+}
+
+#[tokio::test]
+#[ignore = "needs mosquitto"]
+async fn positions_are_published_to_a_broker_also_those_of_its_absence() {
+    let broker = Broker::start();
+    let port = broker.port;
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let sink = json!({"id": "positions", "sink": {
+        "address": format!("mqtt://127.0.0.1:{port}"), "camera_ids": ["gate"], "min_interval_s": 0,
+    }});
+    server.post("/v1/connections", &sink).await.expect(201);
+    connection_when(&server, "positions", |status| status["state"] == "running").await;
+    drop(broker);
+    connection_when(&server, "positions", |status| status["state"] == "waiting").await;
+    let now = now();
+    for second in 0..3 {
+        let time = now - jiff::SignedDuration::from_secs(3 - second);
+        send_fix(&server, "van/1", &time.to_string(), 103.98678, false).await;
+    }
+    connection_when(&server, "positions", |status| status["queued"] == 3).await;
+    server.kill();
+
+    let broker = Broker::start_at(port);
+    broker.subscribe("sightfix/#");
+    let server = TestServer::start(folder.path());
+    let output = broker.received("sightfix/#", 3);
+    let messages: Vec<(&str, Value)> = output
+        .lines()
+        .map(|line| line.split_once(' ').expect("topic and payload"))
+        .map(|(topic, payload)| (topic, serde_json::from_str(payload).expect("JSON")))
+        .collect();
+    for (topic, message) in &messages {
+        assert_eq!(*topic, "sightfix/gate/van_1");
+        assert_eq!((&message["camera_id"], &message["target_id"]), (&json!("gate"), &json!("van/1")));
+        assert!((message["position"]["longitude_deg"].as_f64().expect("degrees") - 103.98678).abs() < 1e-4);
+        assert!(message["r95_m"].as_f64().expect("m") > 0.0);
+    }
+    let times: Vec<&str> =
+        messages.iter().map(|(_, message)| message["time"].as_str().expect("a time")).collect();
+    assert!(times.is_sorted() && times.len() == 3, "{times:?}");
+    connection_when(&server, "positions", |status| status["queued"] == 0).await;
+}
+
+/// Reads a message of a subscription: its subject, headers and payload.
+async fn next_message(stream: &mut BufReader<TcpStream>) -> (String, String, Value) {
+    loop {
+        let mut line = String::new();
+        assert!(stream.read_line(&mut line).await.expect("a line") > 0, "the connection is closed");
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        let ["HMSG", subject, _, header, total] = fields[..] else { continue };
+        let (header, total): (usize, usize) = (header.parse().expect("bytes"), total.parse().expect("bytes"));
+        let mut content = vec![0; total + 2];
+        stream.read_exact(&mut content).await.expect("a message");
+        let headers = String::from_utf8(content[..header].to_vec()).expect("text");
+        return (subject.to_owned(), headers, serde_json::from_slice(&content[header..total]).expect("JSON"));
+    }
+}
+
+#[tokio::test]
+#[ignore = "needs nats-server"]
+async fn positions_are_published_to_a_nats_broker_also_those_of_its_absence() {
+    let address = own_address();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let sink = json!({"address": format!("nats://{address}"), "camera_ids": ["gate"], "min_interval_s": 0});
+    server.post("/v1/connections", &json!({"id": "nats", "paused": true, "sink": sink})).await.expect(201);
+    patch(&server, "nats", &json!({"paused": false})).await.expect(200);
+    connection_when(&server, "nats", |status| status["state"] == "waiting").await;
+    send_fix(&server, "van.1", &now().to_string(), 103.98678, false).await;
+    connection_when(&server, "nats", |status| status["queued"] == 1).await;
+    patch(&server, "nats", &json!({"paused": true})).await.expect(200);
+
+    let port = address.port().to_string();
+    let mut command = std::process::Command::new("nats-server");
+    command.args(["-a", "127.0.0.1", "-p", &port]).stderr(std::process::Stdio::null());
+    let mut broker = command.spawn().expect("nats-server is installed");
+    let stream = loop {
+        match TcpStream::connect(address).await {
+            Ok(stream) => break stream,
+            Err(_) => tokio::time::sleep(std::time::Duration::from_millis(20)).await,
+        }
+    };
+    let mut stream = BufReader::new(stream);
+    let subscribe = b"CONNECT {\"verbose\":false,\"headers\":true}\r\nSUB sightfix.> 1\r\nPING\r\n";
+    stream.get_mut().write_all(subscribe).await.expect("written");
+    let mut line = String::new();
+    while line.trim_end() != "PONG" {
+        line.clear();
+        stream.read_line(&mut line).await.expect("an answer");
+    }
+    patch(&server, "nats", &json!({"paused": false})).await.expect(200);
+    let (subject, headers, message) = next_message(&mut stream).await;
+    assert_eq!(subject, "sightfix.gate.van_1");
+    assert!(
+        headers.contains(&format!("Nats-Msg-Id: {}", message["id"].as_str().expect("an id"))),
+        "{headers}"
+    );
+    assert_eq!(message["target_id"], "van.1");
+    connection_when(&server, "nats", |status| status["queued"] == 0).await;
+    broker.kill().expect("it can be killed");
+    broker.wait().expect("it is gone");
+}

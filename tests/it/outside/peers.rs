@@ -1,0 +1,123 @@
+//! The other ends of connections.
+
+use std::io::Write as _;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use hyper::body::Bytes;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::harness::{TestServer, own_address};
+
+/// A mosquitto of its own, which keeps sessions in memory; killed when dropped.
+pub(super) struct Broker {
+    process: Child,
+    pub(super) port: u16,
+    _folder: TempDir,
+}
+
+impl Broker {
+    pub(super) fn start() -> Self {
+        Self::start_at(own_address().port())
+    }
+
+    pub(super) fn start_at(port: u16) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("mosquitto.conf");
+        let text = format!("listener {port} 127.0.0.1\nallow_anonymous true\n");
+        std::fs::write(&path, text).expect("a file can be written");
+        let mut command = Command::new("mosquitto");
+        command.arg("-c").arg(&path).stdout(Stdio::null()).stderr(Stdio::null());
+        let process = command.spawn().expect("mosquitto is installed");
+        while std::net::TcpStream::connect(("127.0.0.1", port)).is_err() {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        Self { process, port, _folder: folder }
+    }
+
+    /// Publishes with QoS 1 by mosquitto's own client.
+    pub(super) fn publish(&self, topic: &str, message: &str) {
+        let mut command = Command::new("mosquitto_pub");
+        command.args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-q", "1", "-t", topic, "-s"]);
+        let mut process = command.stdin(Stdio::piped()).spawn().expect("mosquitto-clients is installed");
+        let mut input = process.stdin.take().expect("piped");
+        input.write_all(message.as_bytes()).expect("it reads");
+        drop(input);
+        assert!(process.wait().expect("it ends").success());
+    }
+
+    fn subscriber(&self, topic: &str) -> Command {
+        let mut command = Command::new("mosquitto_sub");
+        command.args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-V", "5", "-q", "1", "-t", topic]);
+        command.args(["-i", "subscriber", "-c", "-x", "600"]);
+        command
+    }
+
+    /// Has the broker keep the messages of a topic from now on, in a session of mosquitto's own client.
+    pub(super) fn subscribe(&self, topic: &str) {
+        let status = self.subscriber(topic).arg("-E").status().expect("mosquitto-clients is installed");
+        assert!(status.success());
+    }
+
+    /// The first messages of that session, as lines of topic and payload.
+    pub(super) fn received(&self, topic: &str, count: u32) -> String {
+        let output = self.subscriber(topic).args(["-v", "-C", &count.to_string()]).output();
+        String::from_utf8(output.expect("mosquitto-clients is installed").stdout).expect("text")
+    }
+}
+
+impl Drop for Broker {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+/// The time now.
+pub(super) fn now() -> jiff::Timestamp {
+    #[expect(clippy::disallowed_methods, reason = "the server reads the wall clock, too")]
+    jiff::Timestamp::now()
+}
+
+/// Waits until something is true of a connection, and returns it.
+pub(super) async fn connection_when(
+    server: &TestServer,
+    id: &str,
+    is_wanted: impl Fn(&Value) -> bool,
+) -> Value {
+    loop {
+        let connection = server.get(&format!("/v1/connections/{id}")).await.expect(200).json();
+        if is_wanted(&connection["status"]) {
+            return connection;
+        }
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+/// A camera `gate` of 1280 x 720 px.
+pub(super) async fn create_gate(server: &TestServer) {
+    let camera = json!({"id": "gate", "image_size": {"width_px": 1280, "height_px": 720}});
+    server.post("/v1/cameras", &camera).await.expect(201);
+}
+
+/// Sends a fix of a target of the camera `gate`; stores samples if asked to.
+pub(super) async fn send_fix(
+    server: &TestServer,
+    target: &str,
+    time: &str,
+    longitude_deg: f64,
+    stores: bool,
+) {
+    let fix = json!({"observations": [{
+        "time": time, "target_id": target, "fix": {"longitude_deg": longitude_deg, "latitude_deg": 30.628, "sigma_m": 1.5},
+    }]});
+    let path = format!("/v1/cameras/gate/tracks?store_samples={stores}");
+    server.post(&path, &fix).await.expect(200);
+}
+
+/// Changes a connection, whatever its revision.
+pub(super) async fn patch(server: &TestServer, id: &str, change: &Value) -> crate::harness::Answer {
+    let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
+    server.send("PATCH", &format!("/v1/connections/{id}"), &headers, Bytes::from(change.to_string())).await
+}

@@ -1,0 +1,125 @@
+//! Receivers whose fixes come live.
+
+use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, UdpSocket};
+
+use super::peers::{connection_when, create_gate, now};
+use crate::harness::{TestServer, data_folder, own_address};
+
+/// GGA and RMC of now, at 30.628 degrees north, 103.98678 degrees east.
+fn sentences() -> String {
+    let now = now();
+    let time = now.strftime("%H%M%S.00");
+    let date = now.strftime("%d%m%y");
+    let sentence = |body: String| {
+        let checksum = body.bytes().fold(0, |sum, byte| sum ^ byte);
+        format!("${body}*{checksum:02X}\r\n")
+    };
+    let rmc = sentence(format!("GPRMC,{time},A,3037.6800,N,10359.2068,E,0.5,054.7,{date},020.3,E"));
+    let gga = sentence(format!("GPGGA,{time},3037.6800,N,10359.2068,E,1,08,0.9,545.4,M,46.9,M,,"));
+    rmc + &gga
+}
+
+async fn start(source: Value) -> (TestServer, tempfile::TempDir) {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    server.post("/v1/connections", &json!({"id": "receiver", "source": source})).await.expect(201);
+    (server, folder)
+}
+
+async fn assert_tracked(server: &TestServer, target: &str) {
+    let tracks = server.get("/v1/cameras/gate/tracks").await.expect(200).json();
+    let track = tracks["features"]
+        .as_array()
+        .expect("features")
+        .iter()
+        .find(|it| it["properties"]["target_id"] == target);
+    let position = &track.unwrap_or_else(|| panic!("{tracks}"))["geometry"]["coordinates"];
+    let near =
+        |index: usize, degrees: f64| (position[index].as_f64().expect("a number") - degrees).abs() < 1e-6;
+    assert!(near(0, 103.986_78) && near(1, 30.628), "{position}");
+}
+
+#[tokio::test]
+async fn nmea_over_tcp_feeds_the_track_of_the_connections_receiver() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let (server, _folder) = start(json!({
+        "address": format!("tcp://{address}"), "format": "nmea", "camera_ids": ["gate"], "receiver_id": "boat",
+    }))
+    .await;
+    let (mut stream, _) = listener.accept().await.expect("the server connects");
+    // A line in pieces, one that is no sentence, one that is too long.
+    let sentences = sentences();
+    let (first, rest) = sentences.split_at(20);
+    stream.write_all(first.as_bytes()).await.expect("written");
+    tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    stream.write_all(rest.as_bytes()).await.expect("written");
+    stream.write_all(b"noise\r\n").await.expect("written");
+    stream.write_all(&vec![b'x'; 3 << 20]).await.expect("written");
+    stream.write_all(b"\r\n").await.expect("written");
+    stream.write_all(sentences.as_bytes()).await.expect("written");
+    let connection = connection_when(&server, "receiver", |status| status["messages"] == 5).await;
+    let status = &connection["status"];
+    assert_eq!((&status["items"], &status["skipped"]), (&json!(2), &json!(1)), "{status}");
+    assert_tracked(&server, "boat").await;
+    let tried = server.post("/v1/connections/receiver/test", &json!({})).await.expect(200).json();
+    assert!(tried["message"]["text"].as_str().expect("text").starts_with("$GPGGA"), "{tried}");
+    assert!(tried["message"]["reading"][0].as_str().expect("text").contains("latitude 30.628"), "{tried}");
+}
+
+#[tokio::test]
+async fn a_datagram_may_have_several_sentences() {
+    let address = own_address();
+    let (server, _folder) = start(json!({
+        "address": format!("udp://{address}"), "format": "nmea", "camera_ids": ["gate"], "receiver_id": "boat",
+    }))
+    .await;
+    connection_when(&server, "receiver", |status| status["state"] == "running").await;
+    let socket = UdpSocket::bind("127.0.0.1:0").await.expect("a port");
+    socket.send_to(sentences().as_bytes(), address).await.expect("sent");
+    connection_when(&server, "receiver", |status| status["items"] == 1).await;
+    assert_tracked(&server, "boat").await;
+}
+
+#[tokio::test]
+async fn gpsd_is_asked_for_its_reports() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let (server, _folder) =
+        start(json!({"address": format!("gpsd://{address}"), "format": "gpsd", "camera_ids": ["gate"]}))
+            .await;
+    let (mut stream, _) = listener.accept().await.expect("the server connects");
+    let mut asked = [0; 64];
+    let bytes = stream.read(&mut asked).await.expect("a request");
+    assert!(asked[..bytes].starts_with(b"?WATCH={\"enable\":true,\"json\":true}"));
+    let now = now();
+    let report = format!(
+        "{{\"class\":\"TPV\",\"device\":\"boat\",\"mode\":3,\"time\":\"{now:.3}\",\"lat\":30.628,\"lon\":103.98678}}\n"
+    );
+    stream.write_all(report.as_bytes()).await.expect("written");
+    connection_when(&server, "receiver", |status| status["items"] == 1).await;
+    assert_tracked(&server, "boat").await;
+}
+
+#[tokio::test]
+async fn traccar_hands_in_positions_and_is_answered_when_they_are_taken() {
+    let (server, _folder) =
+        start(json!({"address": "push:", "format": "traccar", "camera_ids": ["gate"]})).await;
+    connection_when(&server, "receiver", |status| status["state"] == "running").await;
+    let now = now();
+    let position = json!({
+        "position": {"id": 7, "deviceId": 3, "fixTime": format!("{now:.3}"), "valid": true,
+            "latitude": 30.628, "longitude": 103.98678, "accuracy": 4.0},
+        "device": {"id": 3, "uniqueId": "boat"},
+    });
+    let path = "/v1/connections/receiver/messages";
+    server.post(path, &position).await.expect(204);
+    assert_tracked(&server, "boat").await;
+    let refused = server.post(path, &json!({"position": {}})).await.expect(400);
+    assert!(refused.text().contains("latitude"), "{}", refused.text());
+    server.send("DELETE", "/v1/connections/receiver", &[], "").await.expect(204);
+    server.post(path, &position).await.expect(404);
+}

@@ -1,0 +1,270 @@
+//! Sinks: webhooks, and Cursor on Target.
+
+use std::sync::Arc;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use hmac::{Hmac, KeyInit as _, Mac as _};
+use rustls::pki_types::PrivateKeyDer;
+use rustls::server::WebPkiClientVerifier;
+use rustls::{RootCertStore, ServerConfig};
+use serde_json::{Value, json};
+use sha2::Sha256;
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
+use tokio_rustls::TlsAcceptor;
+
+use super::peers::{connection_when, create_gate, now, patch, send_fix};
+use crate::harness::{TestServer, data_folder, own_address};
+use crate::tls::Authority;
+
+/// A request as a receiver of webhooks sees it.
+struct Hook {
+    headers: Vec<(String, String)>,
+    body: Vec<u8>,
+}
+
+impl Hook {
+    /// Reads a request and answers with a status.
+    async fn answered(stream: &mut BufReader<TcpStream>, status: u16) -> Self {
+        let mut headers = Vec::new();
+        loop {
+            let mut line = String::new();
+            assert!(stream.read_line(&mut line).await.expect("a line") > 0, "the connection is closed");
+            match line.trim_end().split_once(": ") {
+                Some((name, value)) => headers.push((name.to_lowercase(), value.to_owned())),
+                None if line.trim_end().is_empty() => break,
+                None => assert!(line.starts_with("POST /hook?site=1 HTTP/1.1"), "{line}"),
+            }
+        }
+        let mut hook = Self { headers, body: Vec::new() };
+        hook.body = vec![0; hook.header("content-length").parse().expect("a number")];
+        stream.read_exact(&mut hook.body).await.expect("a body");
+        let answer = format!("HTTP/1.1 {status} Status\r\ncontent-length: 0\r\n\r\n");
+        stream.get_mut().write_all(answer.as_bytes()).await.expect("an answer");
+        hook
+    }
+
+    fn header(&self, name: &str) -> &str {
+        let found = self.headers.iter().find(|(given, _)| given == name);
+        &found.unwrap_or_else(|| panic!("no header {name}")).1
+    }
+
+    /// The message, whose signature and id are checked.
+    fn verified(&self, key: &[u8]) -> Value {
+        let (id, timestamp) = (self.header("webhook-id"), self.header("webhook-timestamp"));
+        let mut mac = Hmac::<Sha256>::new_from_slice(key).expect("a key");
+        mac.update(format!("{id}.{timestamp}.").as_bytes());
+        mac.update(&self.body);
+        let expected = format!("v1,{}", STANDARD.encode(mac.finalize().into_bytes()));
+        assert_eq!(self.header("webhook-signature"), expected);
+        let message: Value = serde_json::from_slice(&self.body).expect("JSON");
+        assert_eq!(message["id"], id);
+        message
+    }
+}
+
+async fn accept(listener: &TcpListener) -> BufReader<TcpStream> {
+    BufReader::new(listener.accept().await.expect("the server connects").0)
+}
+
+/// Sends fixes of a target, a second apart, the last of now.
+async fn send_fixes(server: &TestServer, target: &str, count: i64) {
+    let now = now();
+    for index in 1..=count {
+        let time = now - jiff::SignedDuration::from_secs(count - index);
+        send_fix(server, target, &time.to_string(), 103.98678, false).await;
+    }
+}
+
+#[tokio::test]
+async fn a_webhook_is_signed_and_comes_again_until_it_is_taken_also_after_a_kill() {
+    let address = own_address();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let key = STANDARD.encode(b"a key of the test");
+    let draft = json!({
+        "id": "hook", "secrets": {"signing_key": format!("whsec_{key}"), "authorization": "Bearer abc"},
+        "sink": {"address": format!("http://{address}/hook?site=1"), "camera_ids": ["gate"], "min_interval_s": 0},
+    });
+    server.post("/v1/connections", &draft).await.expect(201);
+    connection_when(&server, "hook", |status| status["state"] == "waiting").await;
+    send_fixes(&server, "van", 2).await;
+    connection_when(&server, "hook", |status| status["queued"] == 2).await;
+    server.kill();
+
+    let listener = TcpListener::bind(address).await.expect("the address is free");
+    let server = TestServer::start(folder.path());
+    let mut stream = accept(&listener).await;
+    let refused = Hook::answered(&mut stream, 503).await;
+    let first = refused.verified(b"a key of the test");
+    assert_eq!(refused.header("authorization"), "Bearer abc");
+    assert_eq!(refused.header("content-type"), "application/json");
+    let mut stream = accept(&listener).await;
+    let again = Hook::answered(&mut stream, 200).await.verified(b"a key of the test");
+    assert_eq!(again, first, "the same id and content");
+    let second = Hook::answered(&mut stream, 200).await.verified(b"a key of the test");
+    assert!(second["time"].as_str() > first["time"].as_str() && second["id"] != first["id"]);
+    connection_when(&server, "hook", |status| status["queued"] == 0).await;
+    assert!(server.log_lines(&key).is_empty());
+}
+
+#[tokio::test]
+async fn what_a_receiver_refuses_for_good_is_a_dead_letter() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let folder = data_folder();
+    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__OUTBOX_MESSAGES", "3")]);
+    create_gate(&server).await;
+    let draft = json!({"id": "hook", "sink": {
+        "address": format!("http://{address}/hook?site=1"), "camera_ids": ["gate"], "min_interval_s": 0,
+    }});
+    server.post("/v1/connections", &draft).await.expect(201);
+    let mut stream = accept(&listener).await;
+    connection_when(&server, "hook", |status| status["state"] == "running").await;
+    send_fixes(&server, "van", 1).await;
+    Hook::answered(&mut stream, 422).await;
+    let status =
+        connection_when(&server, "hook", |status| status["dead_letters"] == 1).await["status"].clone();
+    assert_eq!((&status["queued"], &status["rejected"]), (&json!(0), &json!(1)));
+    let letters = server.get("/v1/connections/hook/dead-letters").await.expect(200).json();
+    let letter = &letters["items"][0];
+    assert_eq!(letter["reason"], "the receiver answered 422 Unprocessable Entity");
+    assert!(letter["text"].as_str().expect("text").contains("\"target_id\":\"van\""), "{letter}");
+
+    let retried = server.post("/v1/connections/hook/dead-letters/retry", &json!({})).await.expect(200).json();
+    assert_eq!(retried["dead_letters"], 1);
+    assert_eq!(
+        Hook::answered(&mut stream, 200).await.header("webhook-id"),
+        letter["id"].as_str().expect("an id")
+    );
+    connection_when(&server, "hook", |status| status["dead_letters"] == 0 && status["queued"] == 0).await;
+
+    // A receiver that takes nothing fills the outbox up to its limit; the oldest messages give way.
+    drop((stream, listener));
+    send_fixes(&server, "car", 8).await;
+    let status = connection_when(&server, "hook", |status| status["dropped"].as_u64() >= Some(4)).await;
+    assert_eq!(status["status"]["queued"], 3, "{status}");
+    let deleted =
+        server.send("DELETE", "/v1/connections/hook/dead-letters", &[], "").await.expect(200).json();
+    assert_eq!(deleted["dead_letters"], 0);
+}
+
+/// The value of an attribute of an event.
+fn attribute<'a>(event: &'a str, name: &str) -> &'a str {
+    let rest = event.split_once(&format!(" {name}=\"")).unwrap_or_else(|| panic!("no {name}: {event}")).1;
+    rest.split_once('"').expect("a value").0
+}
+
+#[tokio::test]
+async fn cursor_on_target_events_go_over_tcp_and_over_udp() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let socket = UdpSocket::bind("127.0.0.1:0").await.expect("a port");
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let stream_address = listener.local_addr().expect("an address");
+    let datagram_address = socket.local_addr().expect("an address");
+    for (id, address) in
+        [("tak", format!("tcp://{stream_address}")), ("group", format!("udp://{datagram_address}"))]
+    {
+        let sink = json!({"address": address, "format": "cot", "camera_ids": ["gate"], "min_interval_s": 0, "stale_s": 20});
+        server.post("/v1/connections", &json!({"id": id, "sink": sink})).await.expect(201);
+        connection_when(&server, id, |status| status["state"] == "running").await;
+    }
+    let mut stream = accept(&listener).await;
+    send_fixes(&server, "van", 1).await;
+    let mut event = String::new();
+    stream.read_line(&mut event).await.expect("an event");
+    let mut datagram = vec![0; 4_096];
+    let bytes = socket.recv(&mut datagram).await.expect("a datagram");
+    assert_eq!(event.as_bytes(), &datagram[..bytes], "the same event of the same target");
+
+    let track =
+        server.get("/v1/cameras/gate/tracks").await.expect(200).json()["features"][0]["properties"].clone();
+    let variance = |axis: &str| track["covariance"][axis].as_f64().expect("m2");
+    let sigma_m = ((variance("east_m2") + variance("north_m2")) / 2.0).sqrt();
+    assert_eq!(attribute(&event, "ce"), format!("{sigma_m:.2}"), "one sigma, not the 95 % radius");
+    assert_eq!((attribute(&event, "hae"), attribute(&event, "le")), ("9999999.0", "9999999.0"));
+    assert_eq!(attribute(&event, "uid"), "sightfix.gate.van");
+    assert_eq!(
+        (attribute(&event, "version"), attribute(&event, "type"), attribute(&event, "how")),
+        ("2.0", "a-u-G", "m-f")
+    );
+    let time = |name| attribute(&event, name).parse::<jiff::Timestamp>().expect("a time");
+    assert_eq!(time("stale").duration_since(time("start")).as_secs(), 20);
+    assert!((attribute(&event, "lon").parse::<f64>().expect("degrees") - 103.98678).abs() < 1e-6);
+    let mut reader = quick_xml::Reader::from_str(&event);
+    while !matches!(reader.read_event().expect("XML"), quick_xml::events::Event::Eof) {}
+
+    // A server that restarts is connected to again, and the uid stays.
+    drop(stream);
+    send_fixes(&server, "van", 1).await;
+    let mut stream = accept(&listener).await;
+    let mut event = String::new();
+    stream.read_line(&mut event).await.expect("an event");
+    assert_eq!(attribute(&event, "uid"), "sightfix.gate.van");
+    let tried = server.post("/v1/connections/group/test", &json!({})).await.expect(200).json();
+    assert!(
+        tried["message"]["text"].as_str().expect("text").contains("sightfix.gate.sightfix-test"),
+        "{tried}"
+    );
+    patch(&server, "tak", &json!({"paused": true})).await.expect(200);
+}
+
+/// A server that wants a client certificate of the authority.
+fn tls_acceptor(authority: &Authority) -> TlsAcceptor {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let mut roots = RootCertStore::empty();
+    roots.add(authority.certificate.der().clone()).expect("an authority");
+    let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider.clone()).build();
+    let (certificate, key) = authority.issue();
+    let key = PrivateKeyDer::try_from(key.serialize_der()).expect("a key");
+    let config = ServerConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .expect("versions")
+        .with_client_cert_verifier(verifier.expect("a verifier"))
+        .with_single_cert(vec![certificate.der().clone()], key);
+    TlsAcceptor::from(Arc::new(config.expect("a configuration")))
+}
+
+#[tokio::test]
+async fn a_tak_server_is_reached_over_tls_with_a_client_certificate_and_only_if_it_is_trusted() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let port = listener.local_addr().expect("an address").port();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let (authority, other) = (Authority::new(), Authority::new());
+    let acceptor = tls_acceptor(&authority);
+    let (certificate, key) = authority.issue();
+    let draft = json!({
+        "id": "tak", "secrets": {"client_certificate": certificate.pem(), "client_key": key.serialize_pem()},
+        "sink": {"address": format!("tls://localhost:{port}"), "format": "cot", "camera_ids": ["gate"],
+            "min_interval_s": 0, "ca_certificate": other.certificate.pem()},
+    });
+    server.post("/v1/connections", &draft).await.expect(201);
+    let (stream, _) = listener.accept().await.expect("the server connects");
+    acceptor.accept(stream).await.expect_err("the server does not trust this certificate");
+    let waiting = connection_when(&server, "tak", |status| status["state"] == "waiting").await;
+    let error = waiting["status"]["last_error"]["message"].as_str().expect("an error");
+    assert!(error.contains("certificate"), "{error}");
+
+    let trust = json!({"sink": {"ca_certificate": authority.certificate.pem()}});
+    patch(&server, "tak", &trust).await.expect(200);
+    // Attempts of before the change may wait in the queue of the listener.
+    let stream = loop {
+        let (stream, _) = listener.accept().await.expect("the server connects");
+        if let Ok(stream) = acceptor.accept(stream).await {
+            break stream;
+        }
+    };
+    let mut stream = BufReader::new(stream);
+    send_fixes(&server, "van", 1).await;
+    let mut event = String::new();
+    stream.read_line(&mut event).await.expect("an event");
+    assert_eq!(attribute(&event, "uid"), "sightfix.gate.van");
+    let shown = server.get("/v1/connections/tak").await.expect(200).text();
+    assert!(!shown.contains("PRIVATE KEY") && shown.contains("client_key"), "{shown}");
+}

@@ -52,7 +52,7 @@ pub use names::{
     CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
 };
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
-pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
+pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;

@@ -124,6 +124,17 @@ impl From<ReceiverId> for TargetId {
     }
 }
 
+impl TargetId {
+    /// The number that a camera's tracker gave a box.
+    ///
+    /// # Errors
+    /// As [`Self::new`]; the field is `tracker_id`.
+    pub fn of_tracker(text: &str) -> Result<Self> {
+        check_text("tracker_id", text, MAX_NAME_BYTES)?;
+        Ok(Self(text.into()))
+    }
+}
+
 /// Where all receivers of a target count as one, the target's id names it.
 impl From<TargetId> for ReceiverId {
     fn from(target_id: TargetId) -> Self {

@@ -228,6 +228,11 @@ pub struct Observation<'a> {
     #[serde(borrow, default)]
     #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "phone-1")]
     pub receiver_id: Option<Text<'a>>,
+    /// Number that the camera's tracker gave a box whose target is not known: where targets are followed, it is
+    /// matched with the receivers whose fixes come at the same time.
+    #[serde(borrow, default)]
+    #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "17")]
+    pub tracker_id: Option<Text<'a>>,
     /// The detection.
     #[serde(default)]
     pub bounding_box: Option<BoundingBox>,
@@ -261,6 +266,9 @@ impl Observation<'_> {
             target_id,
             self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
             self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
+        )?
+        .with_tracker_id(
+            self.tracker_id.as_ref().map(|id| domain::TargetId::of_tracker(id.as_str())).transpose()?,
         )
     }
 }

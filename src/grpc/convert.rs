@@ -193,6 +193,7 @@ pub(super) fn live_item(item: proto::StreamItem, rules: &RowRules) -> Result<Liv
     Ok(LiveItem {
         time: checked_time(item.time, rules)?,
         target_id: target_id(item.target_id.as_deref())?,
+        tracker_id: item.tracker_id.as_deref().map(TargetId::of_tracker).transpose()?,
         receiver_id: item.receiver_id.as_deref().map(ReceiverId::new).transpose()?,
         bounding_box: item.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,
         fix: item.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,

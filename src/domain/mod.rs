@@ -49,7 +49,7 @@ pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
 pub use names::{
-    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
+    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels, check_text,
 };
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};

@@ -6,7 +6,7 @@ use strum::IntoStaticStr;
 use super::bounding_box::BoundingBox;
 use super::error::{Error, Result};
 use super::gnss_error::SigmaM;
-use super::names::{ReceiverId, TargetClass, TargetId};
+use super::names::{ReceiverId, TargetClass, TargetId, TrackerId};
 use super::score::Score;
 use crate::geo::{PlaneCovariance, Position};
 
@@ -42,7 +42,7 @@ pub struct LiveItem {
     /// The target, if known.
     pub target_id: Option<TargetId>,
     /// Number that the camera's tracker gave a box whose target is not known.
-    pub tracker_id: Option<TargetId>,
+    pub tracker_id: Option<TrackerId>,
     /// The receiver of a fix that does not name its target.
     pub receiver_id: Option<ReceiverId>,
     /// The detection.
@@ -60,7 +60,7 @@ pub struct LiveItem {
 pub struct Observation {
     time: Timestamp,
     target_id: Option<TargetId>,
-    tracker_id: Option<TargetId>,
+    tracker_id: Option<TrackerId>,
     bounding_box: Option<BoundingBox>,
     fix: Option<Fix>,
 }
@@ -93,7 +93,7 @@ impl Observation {
     ///
     /// # Errors
     /// Names `tracker_id` beside a target or a fix, whose target would be known.
-    pub fn with_tracker_id(self, tracker_id: Option<TargetId>) -> Result<Self> {
+    pub fn with_tracker_id(self, tracker_id: Option<TrackerId>) -> Result<Self> {
         if tracker_id.is_some() && (self.target_id.is_some() || self.fix.is_some()) {
             return Err(Error::invalid(
                 "tracker_id",
@@ -134,7 +134,7 @@ impl Observation {
 
     /// Number that the camera's tracker gave a box whose target was not known.
     #[must_use]
-    pub const fn tracker_id(&self) -> Option<&TargetId> {
+    pub const fn tracker_id(&self) -> Option<&TrackerId> {
         self.tracker_id.as_ref()
     }
 

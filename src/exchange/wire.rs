@@ -228,10 +228,11 @@ pub struct Observation<'a> {
     #[serde(borrow, default)]
     #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "phone-1")]
     pub receiver_id: Option<Text<'a>>,
-    /// Number that the camera's tracker gave a box whose target is not known: where targets are followed, it is
-    /// matched with the receivers whose fixes come at the same time.
+    /// Number that the camera's tracker gave a box whose target is not known; instead of `target_id` and `receiver_id`.
+    /// Where targets are followed, the box is matched with the receivers whose fixes come at the same time; until that
+    /// is sure, its target is `tracker:` and this number.
     #[serde(borrow, default)]
-    #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "17")]
+    #[schema(value_type = Option<String>, min_length = 1, max_length = 120, example = "17")]
     pub tracker_id: Option<Text<'a>>,
     /// The detection.
     #[serde(default)]
@@ -267,9 +268,7 @@ impl Observation<'_> {
             self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
             self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
         )?
-        .with_tracker_id(
-            self.tracker_id.as_ref().map(|id| domain::TargetId::of_tracker(id.as_str())).transpose()?,
-        )
+        .with_tracker_id(self.tracker_id.as_ref().map(|id| domain::TrackerId::new(id.as_str())).transpose()?)
     }
 }
 

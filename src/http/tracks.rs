@@ -300,7 +300,7 @@ struct FollowedObservation<'a> {
     /// The target's world track in the camera's site, as of the latest frame that was tracked there.
     #[serde(skip_serializing_if = "Option::is_none")]
     world_track_id: Option<String>,
-    /// The receiver that the target of the box carries, where the observation has a `tracker_id` and the match is sure.
+    /// The receiver that the target of the box carries, where the observation has a `tracker_id` and was matched.
     #[serde(skip_serializing_if = "Option::is_none")]
     receiver_match: Option<ReceiverMatch>,
 }
@@ -374,7 +374,7 @@ struct StoredObservations {
     too_late: u64,
     /// Those of which the same target and instant was there before.
     duplicate: u64,
-    /// Boxes that have only a tracker's id, of which it is not sure whose they are.
+    /// Boxes with only a tracker's id whose receiver is not sure enough.
     unmatched: u64,
 }
 

@@ -22,7 +22,7 @@ pub enum NotStoredReason {
     TooLate,
     /// A box or fix of the same target and instant was there before.
     Duplicate,
-    /// It has only a tracker's id, and whose box it is is not sure.
+    /// It is a box with only a tracker's id, and its receiver is not sure enough.
     Unmatched,
 }
 

@@ -44,6 +44,7 @@ pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub use camera_events::{EventId, LostEvents};
+pub(super) use matching::MatchingSlot;
 pub(super) use retraining::RetrainSchedule;
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
@@ -62,7 +63,7 @@ pub struct ItemResult {
     pub track: Option<Arc<TrackPoint>>,
     /// The target's world track in the camera's site, as of the latest frame that was tracked there.
     pub world_track: Option<LiveId>,
-    /// The receiver that the target of a box carries which came with a tracker's id alone, if that is sure.
+    /// The receiver that the target of a box carries which came with a tracker's id alone, if it was matched.
     pub receiver_match: Option<ReceiverMatch>,
 }
 
@@ -120,7 +121,7 @@ impl App {
     }
 
     fn follow_identified(&self, camera: &Arc<ActiveCamera>, identified: Identified) -> Result<ItemResult> {
-        let Identified { observation, receiver_match } = identified;
+        let Identified { observation, receiver_match, .. } = identified;
         let observation = &observation;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);

@@ -249,10 +249,10 @@ impl LiveStream {
         // A time that no track takes must not move the pairing either.
         self.app.live_time_bounds().check(time)?;
         let identified = self.app.identify(camera, observation);
-        if identified.is_unmatched() {
-            self.ack_without_storing(seq, NotStoredReason::Unmatched);
-        } else {
+        if identified.is_sure {
             self.record(seq, &identified.observation, item.class, item.score).await?;
+        } else {
+            self.ack_without_storing(seq, NotStoredReason::Unmatched);
         }
         self.app.follow_identified(camera, identified)
     }

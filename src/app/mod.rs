@@ -103,6 +103,8 @@ pub struct Parts {
     pub evaluation_queue: JobQueue,
     /// Open live streams.
     stream_slots: live::StreamSlots,
+    /// Rounds of live matching.
+    matching_slot: live::MatchingSlot,
     /// The way to the drift detectors.
     residuals: live::ResidualQueue,
     /// When moved cameras are trained again.
@@ -157,6 +159,7 @@ impl App {
             training_queue: JobQueue::default(),
             evaluation_queue: JobQueue::default(),
             stream_slots: live::StreamSlots::default(),
+            matching_slot: live::MatchingSlot::default(),
             residuals,
             retraining: live::RetrainSchedule::default(),
             tasks: TaskTracker::new(),

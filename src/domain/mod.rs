@@ -51,10 +51,10 @@ pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
 pub use model_format::ModelFormat;
 pub use names::{
-    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
+    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels, check_text,
 };
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
-pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
+pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;

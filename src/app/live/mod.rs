@@ -12,6 +12,7 @@ mod camera_events;
 mod drift;
 mod event_log;
 mod history;
+mod matching;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
@@ -26,13 +27,15 @@ use jiff::Timestamp;
 
 use self::camera::CameraLive;
 use self::camera_events::CameraEventReader;
+use self::matching::Identified;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
 use super::fusion::fuse_observed;
 use super::registry::ActiveCamera;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, Result, TargetId, TimeBounds,
+    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, ReceiverMatch, Result, TargetId,
+    TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
@@ -41,6 +44,7 @@ pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub use camera_events::{EventId, LostEvents};
+pub(super) use matching::MatchingSlot;
 pub(super) use retraining::RetrainSchedule;
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
@@ -59,6 +63,8 @@ pub struct ItemResult {
     pub track: Option<Arc<TrackPoint>>,
     /// The target's world track in the camera's site, as of the latest frame that was tracked there.
     pub world_track: Option<LiveId>,
+    /// The receiver that the target of a box carries which came with a tracker's id alone, if it was matched.
+    pub receiver_match: Option<ReceiverMatch>,
 }
 
 /// What happens in a camera's view, since the server was started.
@@ -110,6 +116,13 @@ impl App {
     /// tracks as many targets as it may.
     pub fn follow(&self, camera: &Arc<ActiveCamera>, observation: &Observation) -> Result<ItemResult> {
         self.live_time_bounds().check(observation.time())?;
+        let identified = self.identify(camera, observation.clone());
+        self.follow_identified(camera, identified)
+    }
+
+    fn follow_identified(&self, camera: &Arc<ActiveCamera>, identified: Identified) -> Result<ItemResult> {
+        let Identified { observation, receiver_match, .. } = identified;
+        let observation = &observation;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);
         let now = self.clock.monotonic();
@@ -148,7 +161,7 @@ impl App {
         if let Some(residual) = residual {
             self.hand_over(camera, residual);
         }
-        Ok(ItemResult { fused, track, world_track })
+        Ok(ItemResult { fused, track, world_track, receiver_match })
     }
 
     /// What happens in a camera's view.

@@ -22,6 +22,7 @@ mod job;
 mod live_id;
 mod method;
 mod names;
+mod node;
 mod noise;
 mod observation;
 mod on_conflict;
@@ -51,6 +52,7 @@ pub use method::{InferenceMode, Method};
 pub use names::{
     CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
 };
+pub use node::{Node, NodeId, NodeProfile};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
 pub use on_conflict::OnConflict;

@@ -105,9 +105,7 @@ pub fn of(kind: ErrorKind) -> Status {
         }
         Kind::Internal => (500, code::INTERNAL, "The server failed"),
     };
-    let is_temporary = matches!(
-        kind,
-        Kind::Overloaded | Kind::RateLimited | Kind::ShuttingDown | Kind::CameraBetweenNodes
-    );
+    let is_temporary =
+        matches!(kind, Kind::Overloaded | Kind::RateLimited | Kind::ShuttingDown | Kind::CameraBetweenNodes);
     Status { http, grpc, slug: kind.as_str(), title, retry_after_s: is_temporary.then_some(1) }
 }

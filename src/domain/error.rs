@@ -258,7 +258,13 @@ impl Error {
 
     /// A refusal without a field.
     pub fn refused(kind: ErrorKind, message: impl Into<String>) -> Self {
-        Self::Refused(Refusal { kind, message: message.into(), violations: Vec::new(), conflicting_id: None, other_node: None })
+        Self::Refused(Refusal {
+            kind,
+            message: message.into(),
+            violations: Vec::new(),
+            conflicting_id: None,
+            other_node: None,
+        })
     }
 
     /// An invalid field.

@@ -275,10 +275,7 @@ impl StreamSession {
 
 /// Whether a refusal is of the whole stream, not of an item.
 const fn ends_stream(kind: ErrorKind) -> bool {
-    matches!(
-        kind,
-        ErrorKind::CameraNotFound | ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes
-    )
+    matches!(kind, ErrorKind::CameraNotFound | ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }
 
 fn ending() -> Error {

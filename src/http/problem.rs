@@ -165,7 +165,7 @@ impl Refused {
         let error = if self.uri.path().starts_with(FEATURES) { as_query_error(&error) } else { error };
         let id = self.id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
         let mut problem = response(&error, &id, Some(self.uri.path()));
-        if let Some(location) = self.location(&error) {
+        if let Some(location) = location(&error, &self.uri) {
             problem.headers_mut().insert(LOCATION, location);
         }
         for (name, value) in answer.headers() {
@@ -180,13 +180,11 @@ impl Refused {
     }
 }
 
-impl Refused {
-    /// The same request at the node that answers it.
-    fn location(&self, error: &Error) -> Option<HeaderValue> {
-        let Error::Refused(Refusal { other_node: Some(url), .. }) = error else { return None };
-        let path = self.uri.path_and_query().map_or("/", |path| path.as_str());
-        HeaderValue::try_from(format!("{url}{path}")).ok()
-    }
+/// The same request at the node that answers it.
+fn location(error: &Error, uri: &Uri) -> Option<HeaderValue> {
+    let Error::Refused(Refusal { other_node: Some(url), .. }) = error else { return None };
+    let path = uri.path_and_query().map_or("/", |path| path.as_str());
+    HeaderValue::try_from(format!("{url}{path}")).ok()
 }
 
 /// A value at fault as OGC API Features answers it; other errors as they are.

@@ -36,7 +36,8 @@ fn sql(folder: &Path, statement: &str) -> String {
 
 /// The fence of a camera's owner.
 fn fence(folder: &Path, camera: &str) -> i64 {
-    let of = format!("SELECT fence FROM camera_owners JOIN cameras ON key = camera_key WHERE id = '{camera}'");
+    let of =
+        format!("SELECT fence FROM camera_owners JOIN cameras ON key = camera_key WHERE id = '{camera}'");
     sql(folder, &of).parse().expect("a number")
 }
 

@@ -61,7 +61,12 @@ impl CameraLease {
 }
 
 impl HeldLease {
-    pub(super) fn new(camera: &ActiveCamera, fence: i64, registration: Arc<Registration>, now: Duration) -> Self {
+    pub(super) fn new(
+        camera: &ActiveCamera,
+        fence: i64,
+        registration: Arc<Registration>,
+        now: Duration,
+    ) -> Self {
         Self {
             camera: camera.id.clone(),
             key: camera.key,

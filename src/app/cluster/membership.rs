@@ -81,7 +81,8 @@ impl Membership {
         if let Some(lease) = self.held(camera.key, app.clock.monotonic()) {
             return Ok(lease);
         }
-        let _acquiring = self.acquiring[camera.key.0.cast_unsigned() as usize % ACQUISITION_LOCKS].lock().await;
+        let _acquiring =
+            self.acquiring[camera.key.0.cast_unsigned() as usize % ACQUISITION_LOCKS].lock().await;
         let now = app.clock.monotonic();
         if let Some(lease) = self.held(camera.key, now) {
             return Ok(lease);
@@ -137,8 +138,10 @@ impl Membership {
     /// Gives up the leases of which this is true, given whether anything but this node itself holds them.
     pub(super) fn give_up(&self, is_over: impl Fn(&HeldLease, bool) -> bool) {
         let mut held = lock(&self.held);
-        let over: Vec<_> =
-            held.extract_if(|_, lease| is_over(lease, Arc::strong_count(lease) > 1)).map(|(_, lease)| lease).collect();
+        let over: Vec<_> = held
+            .extract_if(|_, lease| is_over(lease, Arc::strong_count(lease) > 1))
+            .map(|(_, lease)| lease)
+            .collect();
         drop(held);
         over.iter().for_each(|lease| lease.ended.cancel());
         let id = self.registration.load().id;
@@ -165,7 +168,9 @@ impl Membership {
 
     /// Ends everything that this node owned: another one may own it from now on.
     pub(super) fn lose(&self, app: &App) {
-        self.registration.load().invalidate();
+        if !self.registration.load().invalidate() {
+            return;
+        }
         let lost = std::mem::take(&mut *lock(&self.held));
         lock(&self.unreleased).clear();
         lost.values().for_each(|lease| lease.ended.cancel());
@@ -199,9 +204,9 @@ impl Membership {
     /// What a client hears whose camera or site another node owns: its address, unless that node seems to be gone or is going.
     pub(super) fn elsewhere(&self, owned: &str, owner: NodeId, now: Duration) -> Error {
         let others = lock(&self.others);
-        let reachable = others
-            .get(&owner)
-            .filter(|other| !other.node.is_draining && !other.is_silent_for(other.node.profile.lease / 2, now));
+        let reachable = others.get(&owner).filter(|other| {
+            !other.node.is_draining && !other.is_silent_for(other.node.profile.lease / 2, now)
+        });
         match reachable.and_then(|other| other.node.profile.url.as_ref()) {
             Some(url) => Error::on_other_node(format!("{owned} is live on the node at {url}"), url.as_str()),
             None => between_nodes(owned),

@@ -106,7 +106,10 @@ impl App {
             started_at: self.clock.now(),
         };
         let joined = match self.store.node_leases() {
-            None => Joined::Alone(id, profile),
+            None => {
+                self.metrics.nodes(1);
+                Joined::Alone(id, profile)
+            }
             Some(leases) => {
                 let sent_at = self.clock.monotonic();
                 leases.register(id, &profile, heartbeat::random(self)).await?;
@@ -198,7 +201,8 @@ impl App {
             Some(Joined::Shared(membership)) => {
                 let own = membership.registration.load().id;
                 let nodes = membership.leases.nodes().await?.into_iter();
-                let status = |(node, cameras): (Node, u64)| NodeStatus { is_this: node.id == own, node, cameras };
+                let status =
+                    |(node, cameras): (Node, u64)| NodeStatus { is_this: node.id == own, node, cameras };
                 Ok(nodes.map(status).collect())
             }
         }

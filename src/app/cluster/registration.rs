@@ -26,8 +26,9 @@ impl Registration {
         self.valid_until_ns.store(as_ns(valid_until), Ordering::Release);
     }
 
-    pub(super) fn invalidate(&self) {
-        self.valid_until_ns.store(0, Ordering::Release);
+    /// Ends it for good; whether it had not been ended before.
+    pub(super) fn invalidate(&self) -> bool {
+        self.valid_until_ns.swap(0, Ordering::AcqRel) != 0
     }
 }
 

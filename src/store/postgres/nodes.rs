@@ -14,9 +14,7 @@ use uuid::Uuid;
 
 use super::connection::{begin_read, begin_write};
 use super::errors::failed;
-use crate::domain::{
-    CameraKey, Durability, Error, ErrorKind, Node, NodeId, NodeProfile, Result, SiteKey,
-};
+use crate::domain::{CameraKey, Durability, Error, ErrorKind, Node, NodeId, NodeProfile, Result, SiteKey};
 
 /// The registrations and ownerships of the nodes of one database.
 #[derive(Clone)]
@@ -43,8 +41,7 @@ pub enum Acquired {
 }
 
 /// The columns of a node, read by [`read_node`].
-const COLUMNS: &str =
-    "id, url, role, version, lease_ms, renewal, is_draining, started_at_us, renewed_at_us";
+const COLUMNS: &str = "id, url, role, version, lease_ms, renewal, is_draining, started_at_us, renewed_at_us";
 type NodeRow = (String, Option<String>, String, String, i64, i64, bool, i64, i64);
 
 /// The time of the database, in microseconds.
@@ -301,11 +298,12 @@ async fn lock_ownership(
     connection: &mut PgConnection,
     camera: CameraKey,
 ) -> Result<(Option<String>, i64, Option<i64>)> {
-    let site: Option<Option<i64>> = sqlx::query_scalar("SELECT site_key FROM cameras WHERE key = $1 FOR KEY SHARE")
-        .bind(camera.0)
-        .fetch_optional(&mut *connection)
-        .await
-        .map_err(failed)?;
+    let site: Option<Option<i64>> =
+        sqlx::query_scalar("SELECT site_key FROM cameras WHERE key = $1 FOR KEY SHARE")
+            .bind(camera.0)
+            .fetch_optional(&mut *connection)
+            .await
+            .map_err(failed)?;
     let Some(site) = site else {
         return Err(Error::refused(ErrorKind::CameraNotFound, "the camera was deleted"));
     };

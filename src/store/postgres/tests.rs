@@ -244,7 +244,8 @@ async fn of_nodes_that_acquire_at_once_one_owns_a_camera_and_its_whole_site() {
     let site = SiteId::new("port").expect("a slug");
     store.insert_site(&NewSite::named(site.clone()), at(0)).await.expect("new");
     for number in 0..12 {
-        let camera = NewCamera { site: Some(site.clone()), ..NewCamera::named(id(&format!("of-site-{number}"))) };
+        let camera =
+            NewCamera { site: Some(site.clone()), ..NewCamera::named(id(&format!("of-site-{number}"))) };
         store.insert_camera(&camera, at(0)).await.expect("new");
         store.insert_camera(&NewCamera::named(id(&format!("alone-{number}"))), at(0)).await.expect("new");
     }
@@ -262,8 +263,8 @@ async fn of_nodes_that_acquire_at_once_one_owns_a_camera_and_its_whole_site() {
     }
     assert!(owners.values().all(|owners| owners.len() == 1), "{owners:?}");
     assert_eq!(owners.len(), 24, "every camera has an owner");
-    let of_site: HashSet<_> = owners.iter().filter(|(camera, _)| camera.starts_with("of-site")).collect();
-    let of_site: HashSet<NodeId> = of_site.into_iter().flat_map(|(_, owners)| owners.clone()).collect();
+    let of_site = owners.iter().filter(|(camera, _)| camera.starts_with("of-site"));
+    let of_site: HashSet<NodeId> = of_site.flat_map(|(_, owners)| owners.clone()).collect();
     assert_eq!(of_site.len(), 1, "a site has one owner");
 }
 

@@ -24,13 +24,15 @@ struct Balancer {
 impl Balancer {
     async fn start(folder: &Path, nodes: &[&TestServer]) -> Self {
         let (rest, grpc) = (own_address(), own_address());
-        let mut text = CONFIGURATION.replace("8080;\n    listen 8081", &format!("{rest};\n    listen {grpc}"));
+        let mut text =
+            CONFIGURATION.replace("8080;\n    listen 8081", &format!("{rest};\n    listen {grpc}"));
         for (number, server) in (1..).zip(nodes) {
             text = text.replace(&format!("sightfix-{number}:8080"), &server.address.to_string());
         }
         let file = folder.join("nginx.conf");
         std::fs::write(&file, text).expect("written");
-        let global = format!("daemon off; pid {}; error_log stderr warn;", folder.join("nginx.pid").display());
+        let global =
+            format!("daemon off; pid {}; error_log stderr warn;", folder.join("nginx.pid").display());
         let mut command = Command::new("nginx");
         command.args(["-p", folder.to_str().expect("UTF-8"), "-e", "stderr", "-c"]).arg(&file);
         let process = command.args(["-g", &global]).stdout(Stdio::null()).spawn().expect("nginx runs");

@@ -203,10 +203,7 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
         known.rotate_left(begin_at);
         let feeding = streaming(all[300 * round..300 * (round + 1)].to_vec(), &known);
         until_stored(folder.path(), before + random.random_range(5..120)).await;
-        let owner = sql(
-            folder.path(),
-            "SELECT url FROM nodes JOIN camera_owners ON node_id = id",
-        );
+        let owner = sql(folder.path(), "SELECT url FROM nodes JOIN camera_owners ON node_id = id");
         let owner = nodes.iter().position(|server| url(server) == owner).expect("a node");
         let fence_before = fence(folder.path(), "yard");
         let began = Instant::now();

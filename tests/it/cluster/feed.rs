@@ -57,7 +57,8 @@ impl Feed {
         let opened = FusionServiceClient::new(channel).stream(messages(queue));
         let opened = tokio::time::timeout(SILENCE, opened).await.map_err(|_| silent())?;
         let mut responses = opened?.into_inner();
-        let rest: Vec<_> = (1..).zip(self.items[..self.upto].to_vec()).skip(self.acknowledged as usize).collect();
+        let rest: Vec<_> =
+            (1..).zip(self.items[..self.upto].to_vec()).skip(self.acknowledged as usize).collect();
         let mut sending = Some(tokio::spawn(async move {
             for (seq, item) in rest {
                 if sent.send(request(Sent::Item(proto::StreamItem { seq, ..item }))).await.is_err() {

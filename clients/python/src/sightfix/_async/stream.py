@@ -79,7 +79,8 @@ class Stream:
     After a broken connection or a restart of the server it reconnects with exponential back-off and sends again
     whatever was not acknowledged (not answered, if samples are not stored); sending an item twice is harmless.
     Where the server has several nodes, it goes on at the one that has the camera, and returns to the given address when
-    that one cannot be reached. Leaving the `with` block waits until everything is acknowledged. Answers are messages of `sightfix.v1`.
+    that one cannot be reached. Leaving the `with` block waits until everything is acknowledged. Answers are messages of
+    `sightfix.v1`.
     """
 
     def __init__(self, settings: Settings, options: StreamOptions) -> None:

@@ -1,6 +1,7 @@
 """Requests and streams that meet a node of the server which does not have the camera's live state."""
 
 from datetime import UTC, datetime
+from typing import Any
 
 import grpc
 import httpx
@@ -73,7 +74,7 @@ class OwnerNamed(grpc.RpcError):
     def details(self) -> str:  # noqa: D102
         return "camera yard is live on the node at http://node-2:8080"
 
-    def trailing_metadata(self) -> tuple[tuple[str, bytes], ...]:  # noqa: D102
+    def trailing_metadata(self) -> Any:  # noqa: D102
         status = status_pb2.Status(code=14)
         info = error_details_pb2.ErrorInfo(reason="camera-on-other-node", metadata={"owner": "http://node-2:8080"})
         status.details.add().Pack(info)

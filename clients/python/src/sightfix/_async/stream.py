@@ -249,9 +249,9 @@ class Stream:
             while not self._is_finished:
                 if server not in channels:
                     channels[server] = open_channel(self._settings, server)
-                failure = await self._run_stream(FusionServiceStub(channels[server]))
-                await self._continue_after(failure)
-                server = self._settings.node_of(failure)
+                ended = await self._run_stream(FusionServiceStub(channels[server]))
+                await self._continue_after(ended)
+                server = self._settings.node_of(ended)
         except Exception as error:
             async with self._changed:
                 failure = SightfixError(f"the stream failed: {error!r}")

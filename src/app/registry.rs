@@ -20,6 +20,7 @@ use crate::model::{Artifact, Regressor, ViewArea};
 use crate::store::Store;
 
 /// Everything that answers for one camera.
+#[derive(Clone)]
 pub struct ActiveCamera {
     /// The camera's id.
     pub id: CameraId,
@@ -179,6 +180,23 @@ impl Registry {
         let mut faults: Vec<_> = faults.collect();
         faults.sort_by(|one, other| one.0.as_str().cmp(other.0.as_str()));
         faults
+    }
+
+    /// Prepares a camera's live state for changes under a fence; whether it begins anew, since another node may have had
+    /// it in between.
+    pub(super) async fn begin_tenure(&self, id: &CameraId, key: CameraKey, fence: i64) -> bool {
+        let _change = self.change.lock().await;
+        let Some(known) = self.get(id).filter(|known| known.key == key) else { return false };
+        if known.live.continue_under(fence) {
+            return false;
+        }
+        known.live.replace();
+        let tenure = fence.cast_unsigned().rotate_right(16);
+        let live = CameraLive::new(self.event_log(key).wrapping_add(tenure));
+        live.continue_under(fence);
+        let anew = Arc::new(ActiveCamera { live, ..ActiveCamera::clone(&known) });
+        self.replace(|cameras| cameras.insert(id.clone(), anew.clone()));
+        true
     }
 
     /// Removes a deleted camera and ends what listens to it. Waits for a refresh under way, which may

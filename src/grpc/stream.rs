@@ -96,7 +96,7 @@ impl StreamSession {
         }
         let settled = tokio::select! {
             settled = stream.settle() => settled,
-            error = stream.deleted() => Err(error),
+            error = stream.ended() => Err(error),
             () = self.shutdown.forced() => Err(ending()),
         };
         // What is settled is acknowledged even where the rest could not be.
@@ -149,7 +149,7 @@ impl StreamSession {
         loop {
             tokio::select! {
                 biased;
-                error = stream.deleted() => return Err(error),
+                error = stream.ended() => return Err(error),
                 () = self.shutdown.draining(), if clock.reconnect_sent_at.is_none() => {
                     self.outbox.reconnect("the server is ending; reconnect to continue the stream");
                     clock.reconnect_sent_at = Some(Instant::now());
@@ -262,7 +262,7 @@ impl StreamSession {
         };
         match answered {
             Ok(item) => Ok(answer_of(seq, item)),
-            Err(Error::Refused(refusal)) if refusal.kind != ErrorKind::CameraNotFound => {
+            Err(Error::Refused(refusal)) if !ends_stream(refusal.kind) => {
                 // What was recorded before the refusal is acknowledged with its commit.
                 stream.acknowledgement()?;
                 stream.ack_refused(seq);
@@ -271,6 +271,11 @@ impl StreamSession {
             Err(error) => Err(error),
         }
     }
+}
+
+/// Whether a refusal is of the whole stream, not of an item.
+const fn ends_stream(kind: ErrorKind) -> bool {
+    matches!(kind, ErrorKind::CameraNotFound | ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }
 
 fn ending() -> Error {

@@ -413,6 +413,7 @@ impl From<Acknowledgement> for StoredObservations {
     request_body = FusionRequest,
     responses(
         (status = 200, description = "Positions and tracks", body = FollowedObservations<'static>),
+        (status = 307, description = "Another node has the camera's live state; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
     )
 )]
@@ -427,7 +428,7 @@ async fn follow(
     let stores_samples = params.flag("store_samples")?.unwrap_or(false);
     let durability = params.durability()?;
     params.end()?;
-    let camera = app.active_camera(&id).await?;
+    let (camera, lease) = app.own_camera(&id).await?;
     // Times ahead of the clock are refused before any track has changed.
     let observations = observations(&app, &body.read()?, &app.live_rules(&camera), &camera.receivers)?;
     app.check_batch(observations.len())?;
@@ -436,7 +437,7 @@ async fn follow(
             app.follow_and_store(&camera, observations, client, durability).await?;
         (followed, Some(StoredObservations::from(acknowledgement)))
     } else {
-        let follow = |observation| app.follow(&camera, observation);
+        let follow = |observation| app.follow((&camera, &lease), observation);
         (observations.iter().map(follow).collect::<Result<Vec<_>>>()?, None)
     };
     let items = followed.iter().map(Into::into).collect();

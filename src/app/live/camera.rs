@@ -1,6 +1,6 @@
 //! The state in memory of one camera that exists, from its creation to its deletion.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
@@ -47,6 +47,9 @@ pub(in crate::app) struct CameraLive {
     last_observed_at: Mutex<Option<Timestamp>>,
     open_streams: AtomicUsize,
     deleted: CancellationToken,
+    replaced: CancellationToken,
+    /// The fence under which it was changed last; 0 before the first.
+    tenure: AtomicI64,
 }
 
 impl CameraLive {
@@ -62,12 +65,33 @@ impl CameraLive {
             last_observed_at: Mutex::new(None),
             open_streams: AtomicUsize::new(0),
             deleted: CancellationToken::new(),
+            replaced: CancellationToken::new(),
+            tenure: AtomicI64::new(0),
         })
     }
 
     /// Ends the streams and listeners of a camera that was deleted.
     pub(in crate::app) fn end(&self) {
         self.deleted.cancel();
+    }
+
+    /// Takes the fence of a new tenure; false if another node may have had the camera since the one before.
+    pub(in crate::app) fn continue_under(&self, fence: i64) -> bool {
+        let before = self.tenure.swap(fence, Ordering::AcqRel);
+        before == 0 || before + 1 == fence
+    }
+
+    /// Ends the readers of a state that another one takes the place of.
+    pub(in crate::app) fn replace(&self) {
+        self.replaced.cancel();
+    }
+
+    pub(super) fn is_replaced(&self) -> bool {
+        self.replaced.is_cancelled()
+    }
+
+    pub(super) async fn replaced(&self) {
+        self.replaced.cancelled().await;
     }
 
     /// Whether the camera is deleted.

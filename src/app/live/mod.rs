@@ -18,7 +18,7 @@ mod sample_committer;
 mod sample_recorder;
 pub(super) mod site;
 mod stream;
-mod sync;
+pub(super) mod sync;
 mod tracks;
 
 use std::sync::Arc;
@@ -31,6 +31,7 @@ use self::matching::Identified;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
+use super::cluster::{CameraLease, Watch};
 use super::fusion::fuse_observed;
 use super::registry::ActiveCamera;
 use crate::domain::{
@@ -78,18 +79,27 @@ pub struct CameraActivity {
     pub last_observed_at: Option<Timestamp>,
 }
 
-/// The events of one camera from some instant on; they end when it is deleted.
+/// The events of one camera from some instant on; they end when it is deleted, or another node has become its owner.
 pub struct CameraEvents {
     reader: CameraEventReader<CameraEvent>,
     live: Arc<CameraLive>,
+    watch: Watch,
 }
 
 impl CameraEvents {
-    /// The next event; `None` once the camera is deleted.
+    /// Whether they have ended since they continue elsewhere: the reader should ask again.
+    #[must_use]
+    pub fn continue_elsewhere(&self) -> bool {
+        self.watch.has_ended() || self.live.is_replaced()
+    }
+
+    /// The next event; `None` once the camera is deleted or goes on elsewhere.
     pub async fn next(&mut self) -> Option<Result<(EventId, Arc<CameraEvent>), LostEvents>> {
         tokio::select! {
             biased;
             () = self.live.deleted() => None,
+            () = self.live.replaced() => None,
+            () = self.watch.ended() => None,
             event = self.reader.next() => Some(event),
         }
     }
@@ -112,20 +122,30 @@ impl App {
     /// and fix.
     ///
     /// # Errors
-    /// `InvalidArgument` naming `time` for a time ahead of the server's clock; `Overloaded` if the camera
-    /// tracks as many targets as it may.
-    pub fn follow(&self, camera: &Arc<ActiveCamera>, observation: &Observation) -> Result<ItemResult> {
+    /// `CameraBetweenNodes` if the lease has ended; `InvalidArgument` naming `time` for a time ahead of the
+    /// server's clock; `Overloaded` if the camera tracks as many targets as it may.
+    pub fn follow(
+        &self,
+        (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
+        observation: &Observation,
+    ) -> Result<ItemResult> {
+        // A time that no track takes must not move the matching either.
         self.live_time_bounds().check(observation.time())?;
         let identified = self.identify(camera, observation.clone());
-        self.follow_identified(camera, identified)
+        self.follow_identified((camera, lease), identified)
     }
 
-    fn follow_identified(&self, camera: &Arc<ActiveCamera>, identified: Identified) -> Result<ItemResult> {
+    fn follow_identified(
+        &self,
+        (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
+        identified: Identified,
+    ) -> Result<ItemResult> {
+        let now = self.clock.monotonic();
+        lease.check(now)?;
         let Identified { observation, receiver_match, .. } = identified;
         let observation = &observation;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);
-        let now = self.clock.monotonic();
         let ActiveCamera { image_size, e_gnss_m2, .. } = **camera;
         // A box without a model measures nothing, so it makes no target.
         let measures = regressor.is_some() || observation.fix().is_some();
@@ -176,18 +196,18 @@ impl App {
     /// Where every target of a camera is now, by target; those that expired are left out.
     ///
     /// # Errors
-    /// `CameraNotFound`.
+    /// `CameraNotFound`, `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub async fn tracks(&self, id: &CameraId) -> Result<Vec<Arc<TrackPoint>>> {
-        let camera = self.active_camera(id).await?;
+        let camera = self.readable_camera(id).await?;
         Ok(camera.live.tracks.latest(self.clock.monotonic()))
     }
 
     /// Where every target of a camera was, by target, each oldest first; those that expired are left out.
     ///
     /// # Errors
-    /// `CameraNotFound`.
+    /// As [`App::tracks`].
     pub async fn track_histories(&self, id: &CameraId) -> Result<Vec<Vec<Arc<TrackPoint>>>> {
-        let camera = self.active_camera(id).await?;
+        let camera = self.readable_camera(id).await?;
         let now = self.clock.monotonic();
         let latest = camera.live.tracks.latest(now);
         Ok(latest.iter().filter_map(|point| camera.live.tracks.history(&point.target_id, now)).collect())
@@ -196,9 +216,9 @@ impl App {
     /// Where a target was, oldest first, as far back as the history reaches.
     ///
     /// # Errors
-    /// `CameraNotFound`, `TrackNotFound`.
+    /// As [`App::tracks`]; `TrackNotFound`.
     pub async fn track_history(&self, id: &CameraId, target_id: &TargetId) -> Result<Vec<Arc<TrackPoint>>> {
-        let camera = self.active_camera(id).await?;
+        let camera = self.readable_camera(id).await?;
         let history = camera.live.tracks.history(target_id, self.clock.monotonic());
         history.ok_or_else(|| {
             let message = format!("camera {id} does not follow a target {target_id} now");
@@ -206,14 +226,31 @@ impl App {
         })
     }
 
+    /// A camera whose live state is read.
+    async fn readable_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
+        let camera = self.active_camera(id).await?;
+        self.check_readable(&camera).await?;
+        Ok(camera)
+    }
+
     /// Everything that happens in a camera's view from now on, or after the last event that the reader has
     /// seen. A reader that is too slow, or was away for too long, misses the oldest of what it has not read.
     ///
     /// # Errors
-    /// `CameraNotFound`.
+    /// As [`App::tracks`].
     pub async fn camera_events(&self, id: &CameraId, last_seen: Option<EventId>) -> Result<CameraEvents> {
+        let camera = self.readable_camera(id).await?;
+        let watch = self.watch_camera_owner(&camera);
+        Ok(CameraEvents { reader: camera.live.events.reader(last_seen), live: camera.live.clone(), watch })
+    }
+
+    /// What happens in a camera's view on this node alone, from now on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn own_camera_events(&self, id: &CameraId) -> Result<CameraEvents> {
         let live = self.active_camera(id).await?.live.clone();
-        Ok(CameraEvents { reader: live.events.reader(last_seen), live })
+        Ok(CameraEvents { reader: live.events.reader(None), live, watch: Watch::default() })
     }
 
     /// Whether a camera's active model no longer fits what the camera sees.

@@ -14,6 +14,7 @@ use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
 use crate::admission::{ClientId, Lease};
 use crate::app::App;
+use crate::app::cluster::CameraLease;
 use crate::app::registry::ActiveCamera;
 use crate::domain::{
     CameraId, CameraMoved, Detection, Durability, Error, ErrorKind, LiveItem, Observation, Result, Sample,
@@ -73,6 +74,8 @@ pub struct LiveStream {
     app: App,
     /// As it was when the stream was opened; its key and its live state do not change.
     camera: Arc<ActiveCamera>,
+    /// `None` only while it is dropped.
+    lease: Option<CameraLease>,
     recording: Option<StreamRecording>,
     last_seq: u64,
     _slot: SlotGuard,
@@ -91,7 +94,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`; `InvalidArgument` naming `client_name`; `Overloaded` beyond the limits of
-    /// streams.
+    /// streams; `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub async fn open_stream(
         &self,
         id: &CameraId,
@@ -101,12 +104,13 @@ impl App {
         store_samples: Option<Durability>,
     ) -> Result<LiveStream> {
         check_text("client_name", client_name, LONGEST_CLIENT_NAME)?;
-        let camera = self.active_camera(id).await?;
+        self.active_camera(id).await?;
         let limits = &self.limits;
         // Names are the client's choice; its address is not.
         let client_lease = self.quotas.live_streams.try_acquire(client_id, 1)?;
         let slot =
             self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
+        let (camera, lease) = self.own_camera(id).await?;
         let recording = store_samples.map(|durability| StreamRecording {
             recorder: self.recorder_of(&camera),
             tracker: AckTracker::beginning_after(resume_after_seq, durability),
@@ -116,6 +120,7 @@ impl App {
             app: self.clone(),
             _count: camera.live.count_stream(),
             camera,
+            lease: Some(lease),
             recording,
             last_seq: resume_after_seq,
             _slot: slot,
@@ -188,10 +193,22 @@ impl LiveStream {
         current.filter(|camera| camera.key == self.camera.key).ok_or_else(|| self.camera_deleted())
     }
 
-    /// Waits until the camera is deleted.
-    pub async fn deleted(&self) -> Error {
-        self.camera.live.deleted().await;
-        self.camera_deleted()
+    /// Waits until the camera is deleted, or this node is no longer surely its owner.
+    pub async fn ended(&self) -> Error {
+        let lost = async {
+            match &self.lease {
+                Some(lease) => lease.ended().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            () = self.camera.live.deleted() => self.camera_deleted(),
+            error = lost => error,
+        }
+    }
+
+    fn lease(&self) -> Result<&CameraLease> {
+        self.lease.as_ref().ok_or_else(|| self.camera_deleted())
     }
 
     fn camera_deleted(&self) -> Error {
@@ -233,9 +250,11 @@ impl LiveStream {
     /// Takes an item: its own position, its target's track with it, and its part in a sample.
     ///
     /// # Errors
-    /// `InvalidArgument` for neither box nor fix, or for a time ahead of the server's clock, naming the
+    /// `CameraBetweenNodes`, which ends the stream; `InvalidArgument` for neither box nor fix, or for a time ahead of the server's clock, naming the
     /// field; as [`App::follow`].
     pub async fn take(&self, camera: &Arc<ActiveCamera>, seq: u64, item: LiveItem) -> Result<ItemResult> {
+        let lease = self.lease()?;
+        lease.check(self.app.clock.monotonic())?;
         let (target_id, time) = match (item.target_id, &item.receiver_id) {
             (Some(target_id), _) => (Some(target_id), item.time),
             (None, Some(receiver_id)) => {
@@ -254,7 +273,7 @@ impl LiveStream {
         } else {
             self.ack_without_storing(seq, NotStoredReason::Unmatched);
         }
-        self.app.follow_identified(camera, identified)
+        self.app.follow_identified((camera, lease), identified)
     }
 
     async fn record(
@@ -352,6 +371,8 @@ impl ChangeNotices {
 
 impl Drop for LiveStream {
     fn drop(&mut self) {
+        self.lease = None;
+        self.app.cluster.let_go();
         self.app.metrics.stream_closed();
     }
 }

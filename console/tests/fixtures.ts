@@ -9,6 +9,8 @@ interface Fixtures {
   settings: Record<string, string>;
   /** Size of the disk that its data folder has for itself; none if empty. */
   disk: string;
+  /** Where the server listens; a free port if it is not named. */
+  listen: string;
   server: Server;
   /** Console errors that the test provokes on purpose. */
   allowed: RegExp;
@@ -19,8 +21,9 @@ export const test = base.extend<Fixtures>({
   settings: [{}, { option: true }],
   allowed: [/^$/, { option: true }],
   disk: ['', { option: true }],
-  server: async ({ settings, disk }, use) => {
-    const server = await Server.start(settings, disk);
+  listen: ['127.0.0.1:0', { option: true }],
+  server: async ({ settings, disk, listen }, use) => {
+    const server = await Server.start(settings, disk, listen);
     await use(server);
     await server.stop();
   },

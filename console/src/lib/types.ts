@@ -267,3 +267,58 @@ export interface ApiKey {
   last_used_at?: string;
   revoked_at?: string;
 }
+export type ConnectionState = 'paused' | 'connecting' | 'running' | 'waiting';
+export interface LastMessage {
+  time: string;
+  subject: string;
+  text: string;
+  reading: string[];
+}
+export interface ConnectionStatus {
+  state: ConnectionState;
+  since?: string;
+  last_error?: { time: string; message: string };
+  last_message?: LastMessage;
+  messages: number;
+  items: number;
+  skipped: number;
+  rejected: number;
+  dropped: number;
+  acknowledged: number;
+  connects: number;
+  queued: number;
+  dead_letters: number;
+  lag_s?: number;
+}
+/** Where messages come from, or go to. */
+export interface ConnectionSettings {
+  address: string;
+  format: string;
+  topics?: string[];
+  topic?: string;
+  username?: string;
+  cameras?: Record<string, { camera_id: string }>;
+  camera_ids?: string[];
+  receiver_id?: string;
+  store_samples?: boolean;
+  min_interval_s?: number;
+}
+export interface Connection {
+  id: string;
+  display_name: string;
+  paused: boolean;
+  source?: ConnectionSettings;
+  sink?: ConnectionSettings;
+  secret_names: string[];
+  revision: number;
+  created_at: string;
+  status: ConnectionStatus;
+}
+export interface DeadLetter {
+  number: number;
+  id: string;
+  subject: string;
+  text: string;
+  created_at: string;
+  reason: string;
+}

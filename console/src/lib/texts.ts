@@ -462,6 +462,7 @@ const table = {
   'connections.deadLetters.delete': ['Delete all', 'Alle löschen'],
   'connections.deadLetters.more': ['and {n} more', 'und {n} weitere'],
   'connections.deadLetters.open': ['{n} dead letters: refused for good by the receiver', '{n} unzustellbare Nachrichten: vom Empfänger endgültig abgelehnt'],
+  'connections.deadLetters.openOne': ['1 dead letter: refused for good by the receiver', '1 unzustellbare Nachricht: vom Empfänger endgültig abgelehnt'],
   'connections.delete.confirm': ['Delete the connection “{name}” with what waits in it?', 'Die Verbindung „{name}“ mit allem, was darin wartet, löschen?'],
   'connections.deleted': ['“{name}” was deleted', '„{name}“ wurde gelöscht'],
   'connections.dropped': ['Dropped', 'Verworfen'],

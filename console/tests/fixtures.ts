@@ -61,6 +61,14 @@ async function serveFrom(page: Page, url: string, folder: string): Promise<void>
       return route.fulfill({ path: `${folder}${pathname === '/' ? '/index.html' : pathname === '/walk' ? '/walk.html' : pathname}` });
     },
   );
+  // Where a redirect leads is asked of the server itself; a page that goes on is routed.
+  await page.route('**/v1/session/openid**', async (route) => {
+    const response = await route.fetch({ maxRedirects: 0 });
+    const { location } = response.headers();
+    if (!location?.startsWith('/')) return route.fulfill({ response });
+    const { location: _, ...headers } = response.headers();
+    return route.fulfill({ status: 200, headers: { ...headers, 'content-type': 'text/html' }, body: `<script>location.replace('${location}')</script>` });
+  });
 }
 
 const axe = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8');

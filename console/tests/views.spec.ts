@@ -65,7 +65,7 @@ async function buildTown(server: Server): Promise<Town> {
 /** A source that has taken a message, one whose peer is away, and a sink. */
 async function connect(server: Server): Promise<void> {
   const create = (id: string, display_name: string, settings: object): Promise<unknown> => server.request('POST', '/v1/connections', { id, display_name, ...settings });
-  await create('entrance', 'Frigate at the entrance', { source: { address: 'push:', format: 'frigate', cameras: { front_door: { camera_id: 'north-gate' } } } });
+  await create('entrance', 'Frigate at the entrance', { source: { address: 'push:', format: 'frigate', cameras: { front_door: { camera_id: 'car-park' } } } });
   const after = { id: '1607123955.475377-mxklsc', camera: 'front_door', frame_time: Date.now() / 1000, label: 'person', false_positive: false, score: 0.88, box: [432, 296, 544, 500] };
   await server.request('POST', '/v1/connections/entrance/messages', { type: 'new', after });
   await create('patrol-boat', 'Patrol boat', { source: { address: 'tcp://127.0.0.1:9', format: 'nmea', camera_ids: ['north-gate'], receiver_id: 'boat' } });

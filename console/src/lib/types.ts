@@ -257,6 +257,17 @@ export interface Session {
   name?: string;
   open_access: boolean;
 }
+export interface AuditEntry {
+  number: number;
+  time: string;
+  actor: string;
+  address?: string;
+  request_id?: string;
+  /** What happened, such as `camera-created`. */
+  action: string;
+  subject?: string;
+  camera_id?: string;
+}
 export interface ApiKey {
   id: string;
   name: string;

@@ -29,6 +29,7 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
   ['evaluation', '#/cameras/north-gate/evaluation', (page) => expect(page.locator('table').first()).toBeVisible()],
   ['try-it', '#/cameras/north-gate/try', (page) => expect(page.locator('.weights')).toBeVisible()],
   ['profile', '#/cameras/north-gate/profile', (page) => expect(page.getByText('north-gate').first()).toBeVisible()],
+  ['site', '#/sites/old-town', (page) => expect(page.locator('.targets tbody tr').first()).toBeVisible({ timeout: 60_000 })],
   ['settings', '#/settings/health', (page) => expect(page.getByText('/metrics')).toBeVisible()],
   ['connections', '#/settings/connections', (page) => expect(page.getByRole('article')).toHaveCount(3)],
   ['keys', '#/settings/keys', (page) => expect(page.locator('main .panel')).toBeVisible()],
@@ -58,6 +59,8 @@ async function buildTown(server: Server): Promise<Town> {
   });
   await expect.poll(async () => (await server.request<{ state: string }>('GET', `/v1/evaluations/${id}`)).state, { timeout: 600_000 }).toBe('succeeded');
   await connect(server);
+  await server.request('POST', '/v1/sites', { id: 'old-town', display_name: 'Old town' });
+  for (const [camera] of town.slice(0, 3)) await server.request('PATCH', `/v1/cameras/${camera}`, { site: 'old-town' }, 'application/merge-patch+json', { 'if-match': '*' });
   const stops = town.slice(0, 3).map(([camera], at) => walk(server, camera, worlds[at]!.live));
   return { world: worlds[0]!, stop: () => stops.forEach((stop) => stop()) };
 }

@@ -49,6 +49,8 @@ export interface Camera {
   target_classes: string[];
   labels: Record<string, string>;
   receivers: Receiver[];
+  /** Whose world tracks the camera contributes to. */
+  site?: string;
   retrain_when_moved: boolean;
   revision: number;
   created_at: string;
@@ -332,4 +334,26 @@ export interface DeadLetter {
   text: string;
   created_at: string;
   reason: string;
+}
+export interface Site {
+  id: string;
+  display_name: string;
+  cameras: number;
+}
+/** A target of a site, over all of its cameras. */
+export interface WorldTrack {
+  id: string;
+  /** Once a receiver is known. */
+  target_id?: string;
+  time: string;
+  velocity_east_m_s: number;
+  velocity_north_m_s: number;
+  covariance: Covariance;
+  r95_m: number;
+  sightings: { camera_id: string; tracker_id?: string; last_seen_at: string }[];
+  position: Position;
+}
+export interface WorldTrackFeature {
+  geometry: { coordinates: [number, number] };
+  properties: Omit<WorldTrack, 'position'>;
 }

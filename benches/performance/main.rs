@@ -5,6 +5,7 @@
 
 mod attacks;
 mod beside;
+mod database;
 mod fuse;
 mod guarded;
 mod import;
@@ -23,7 +24,7 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
-    let parts: [(&str, fn()); 10] = [
+    let parts: [(&str, fn()); 11] = [
         ("fuse", fuse::run),
         ("http", transports::http),
         ("grpc", transports::grpc),
@@ -34,6 +35,7 @@ fn main() {
         ("beside", beside::run),
         ("attacks", attacks::run),
         ("guarded", guarded::run),
+        ("database", database::run),
     ];
     for (name, part) in parts {
         if wanted.is_empty() || wanted.iter().any(|wish| wish == name) {

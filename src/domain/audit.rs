@@ -29,6 +29,12 @@ impl Actor {
     pub fn program(name: &str) -> Self {
         Self { name: name.into(), key_id: None, address: None, request_id: None }
     }
+
+    /// Whether a client asked, rather than the program by itself.
+    #[must_use]
+    pub const fn is_client(&self) -> bool {
+        self.key_id.is_some() || self.address.is_some()
+    }
 }
 
 /// What was changed.

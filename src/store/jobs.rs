@@ -11,7 +11,7 @@
 
 use std::time::Duration;
 
-use crate::domain::{Error, ErrorKind, JobState, Result};
+use crate::domain::{Actor, Error, ErrorKind, JobState, Result};
 
 /// A claimed job.
 #[derive(Debug, Clone, PartialEq)]
@@ -131,18 +131,28 @@ pub(super) struct JobTable {
     pub(super) plural: &'static str,
     /// Assignments that reset the table's own columns of progress.
     pub(super) reset_progress: &'static str,
+    /// Columns by which waiting jobs are claimed. Ids rise with time, and a camera has one live run at most, so
+    /// no camera is served twice before all that wait with it were served once.
+    pub(super) order: &'static str,
+}
+
+/// Priority of a run: what a client asked for comes before what the server starts by itself.
+pub(super) fn run_priority(actor: &Actor) -> i64 {
+    i64::from(actor.is_client())
 }
 
 pub(super) const RUNS: JobTable = JobTable {
     table: "training_runs",
     plural: "training runs",
     reset_progress: "epoch_done = 0, epochs_planned = 0, reconstruction_error = 0, regression_error = 0, error_scale = 0",
+    order: "priority DESC, id",
 };
 
 pub(super) const EVALUATIONS: JobTable = JobTable {
     table: "evaluations",
     plural: "evaluations",
     reset_progress: "steps_done = 0, steps_planned = 0",
+    order: "id",
 };
 
 impl JobTable {

@@ -80,11 +80,15 @@ pub(super) async fn begin_write(
     pool: &PgPool,
     durability: Durability,
 ) -> Result<Transaction<'static, Postgres>> {
-    let begin = match durability {
+    pool.begin_with(begin_write_statement(durability)).await.map_err(failed)
+}
+
+/// As [`begin_write`], for a connection that is at hand.
+pub(super) const fn begin_write_statement(durability: Durability) -> &'static str {
+    match durability {
         Durability::Synced => BEGIN_SYNCED,
         Durability::Relaxed => BEGIN_RELAXED,
-    };
-    pool.begin_with(begin).await.map_err(failed)
+    }
 }
 
 /// All missing steps in one transaction: of several processes that start at once, one changes the schema, and a step

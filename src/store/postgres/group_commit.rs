@@ -5,10 +5,11 @@ use std::sync::Arc;
 
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
-use sqlx::{PgConnection, PgPool};
+use sqlx::pool::PoolConnection;
+use sqlx::{Connection as _, PgConnection, PgPool, Postgres};
 
 use super::audit::record;
-use super::connection::begin_write;
+use super::connection::begin_write_statement;
 use super::errors::failed;
 use super::idempotency::insert_answer;
 use super::sample_retention::delete_oldest;
@@ -30,17 +31,24 @@ pub(super) struct GroupWriter {
 
 impl SampleWriter for GroupWriter {
     fn session(&self) -> BoxFuture<'_, Result<Box<dyn WriteSession + '_>>> {
-        async move { Ok(Box::new(Session(self)) as Box<dyn WriteSession + '_>) }.boxed()
+        async move {
+            let connection = self.pool.acquire().await.map_err(failed)?;
+            Ok(Box::new(Session { connection, usage: &self.usage }) as Box<dyn WriteSession + '_>)
+        }
+        .boxed()
     }
 }
 
-struct Session<'w>(&'w GroupWriter);
+struct Session<'w> {
+    connection: PoolConnection<Postgres>,
+    usage: &'w Usage,
+}
 
 impl WriteSession for Session<'_> {
     fn commit<'a>(&'a mut self, durability: Durability, group: &'a [SampleBatch]) -> Committing<'a> {
         async move {
-            let committed = try_commit(self.0, durability, group).await;
-            note(&self.0.usage, &committed);
+            let committed = try_commit(&mut self.connection, self.usage, durability, group).await;
+            note(self.usage, &committed);
             committed
         }
         .boxed()
@@ -48,12 +56,16 @@ impl WriteSession for Session<'_> {
 }
 
 async fn try_commit(
-    GroupWriter { pool, usage }: &GroupWriter,
+    connection: &mut PgConnection,
+    usage: &Usage,
     durability: Durability,
     group: &[SampleBatch],
 ) -> Result<Vec<Result<Inserted>>, Failure> {
     for counting in [Counting::Together, Counting::Apart] {
-        let mut transaction = begin_write(pool, durability).await.map_err(Failure::Transaction)?;
+        let mut transaction = connection
+            .begin_with(begin_write_statement(durability))
+            .await
+            .map_err(|error| Failure::Transaction(failed(error)))?;
         let outcomes = store(&mut transaction, usage, group, counting).await.map_err(Failure::Statement)?;
         if let Some(outcomes) = outcomes {
             if must_roll_back(group, &outcomes) {

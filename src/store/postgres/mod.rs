@@ -128,12 +128,12 @@ impl Store {
     /// Keeps groups of samples from being stored until it is dropped.
     #[cfg(test)]
     pub(super) async fn hold(&self) -> Box<dyn Send + '_> {
-        let mut transaction = self.writer().await.expect("a transaction");
-        sqlx::raw_sql("LOCK TABLE cameras IN ACCESS EXCLUSIVE MODE")
-            .execute(&mut *transaction)
-            .await
-            .expect("locks");
-        Box::new(transaction)
+        let pool = &self.inner.pool;
+        let mut connections = Vec::new();
+        for _ in 0..pool.options().get_max_connections() {
+            connections.push(pool.acquire().await.expect("a connection"));
+        }
+        Box::new(connections)
     }
 
     /// Callers whose batches are still queued.

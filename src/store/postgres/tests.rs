@@ -10,7 +10,7 @@ use uuid::Uuid;
 
 use crate::domain::{CameraId, Durability, ErrorKind, NewCamera, RunId};
 use crate::store::tests::copy::copy_and_compare;
-use crate::store::tests::{Fixture, Home, at, id, new_database, options, sample};
+use crate::store::tests::{Fixture, Home, at, connect, id, new_database, options, sample};
 use crate::store::{DatabaseUrl, Location, SampleFilter, Store, StoreOptions};
 
 const LEASE: Duration = Duration::from_secs(30);
@@ -120,11 +120,11 @@ async fn terminated_connections_lose_and_duplicate_nothing_that_was_acknowledged
     let killing = {
         let url = url(&fixture.folder);
         tokio::spawn(async move {
-            let mut connection = sqlx::PgConnection::connect(&url).await.expect("a connection");
+            let mut connection = connect(&url).await;
             let mut killed = 0;
             for _ in 0..60 {
                 tokio::time::sleep(Duration::from_millis(20)).await;
-                let ended: Vec<bool> = sqlx::query_scalar(
+                let ended = sqlx::raw_sql(
                     "SELECT pg_terminate_backend(pid) FROM pg_stat_activity \
                      WHERE datname = current_database() AND pid <> pg_backend_pid()",
                 )
@@ -188,8 +188,8 @@ async fn what_cannot_be_opened_says_why() {
 async fn a_waiting_start_does_not_block_an_index_that_is_built_concurrently() {
     let home = Arc::new(database().await);
     drop(home.open().await);
-    let mut migrating = sqlx::PgConnection::connect(&url(&home)).await.expect("a connection");
-    let mut holder = migrating.begin().await.expect("begins");
+    let mut migrating = connect(&url(&home)).await;
+    let mut holder = migrating.begin_with("BEGIN; DEALLOCATE ALL").await.expect("begins");
     assert!(super::locks::try_lock_limit(&mut holder, super::locks::Limit::Schema).await.expect("works"));
     let waiting = {
         let home = Arc::clone(&home);
@@ -197,7 +197,7 @@ async fn a_waiting_start_does_not_block_an_index_that_is_built_concurrently() {
     };
     tokio::time::sleep(Duration::from_millis(300)).await;
     assert!(!waiting.is_finished(), "the schema is locked");
-    let mut other = sqlx::PgConnection::connect(&url(&home)).await.expect("a connection");
+    let mut other = connect(&url(&home)).await;
     // The holder's own transaction has no snapshot either, once its statement has ended.
     sqlx::raw_sql("CREATE INDEX CONCURRENTLY by_class ON samples (class)")
         .execute(&mut other)

@@ -42,7 +42,7 @@ impl Jobs {
         self.0.check_capacity(live, max_live)
     }
 
-    /// Claims the oldest job that is queued or whose lease has expired. Attempt and fence go up by one;
+    /// Claims the job that comes first of those that are queued or whose lease has expired. Attempt and fence go up by one;
     /// the progress is reset.
     pub(super) async fn claim(
         &self,
@@ -50,13 +50,13 @@ impl Jobs {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Option<Claim<Uuid>>> {
-        let JobTable { table, reset_progress, .. } = self.0;
+        let JobTable { table, reset_progress, order, .. } = self.0;
         let sql = format!(
             "UPDATE {table} SET state = 'running', attempt = attempt + 1, fence = fence + 1, \
              lease_until_us = ?1 + ?2, lease_us = ?2, started_at_us = ?1, phase = '', remaining_s = NULL, \
              {reset_progress} \
              WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') AND {LEASE_EXPIRED} \
-             ORDER BY id LIMIT 1) \
+             ORDER BY {order} LIMIT 1) \
              RETURNING id, fence, cancel_requested"
         );
         let claimed: Option<(String, i64, i64)> = sqlx::query_as(AssertSqlSafe(sql))

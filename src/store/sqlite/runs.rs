@@ -13,7 +13,7 @@ use super::jobs::RUNS;
 use super::models::{activate, add_model};
 use super::retention::{prune_models, prune_runs};
 use crate::domain::{AuditAction, CameraId, Result, RunId, RunProgress, TrainingOptions, TrainingRun};
-use crate::store::jobs::{Claim, Heartbeat};
+use crate::store::jobs::{Claim, Heartbeat, run_priority};
 use crate::store::refusals::no_run;
 use crate::store::rows::audit::{Change, version};
 use crate::store::rows::idempotency::IdempotencyRecord;
@@ -74,7 +74,7 @@ impl Store {
         RUNS.check_capacity(&mut transaction, max_live).await?;
         sqlx::query(
             "INSERT INTO training_runs (id, camera_key, recipe, seed, epochs, from_us, until_us, state, \
-             created_at_us) VALUES (?, ?, ?, ?, ?, ?, ?, 'queued', ?)",
+             created_at_us, priority) VALUES (?, ?, ?, ?, ?, ?, ?, 'queued', ?, ?)",
         )
         .bind(run.to_string())
         .bind(key)
@@ -84,6 +84,7 @@ impl Store {
         .bind(options.from.map(Timestamp::as_microsecond))
         .bind(options.until.map(Timestamp::as_microsecond))
         .bind(now.as_microsecond())
+        .bind(run_priority(&self.actor))
         .execute(&mut *transaction)
         .await
         .map_err(failed)?;

@@ -18,7 +18,7 @@ pub(in crate::store) async fn hold(store: &Store) -> Box<dyn Send + '_> {
     on_backend!(store, store => store.hold().await)
 }
 
-/// Waits until all but the first of so many calls are queued: they share the next transaction, on one backend with it.
+/// Waits until all but the first of so many calls are queued: they share its transaction.
 async fn queued(store: &Store, calls: usize) {
     while on_backend!(store, store => store.waiting()) + 1 < calls {
         tokio::task::yield_now().await;

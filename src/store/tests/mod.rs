@@ -48,6 +48,15 @@ impl Home {
     }
 }
 
+/// A connection of a case's own, which a pooler takes too.
+pub(super) async fn connect(url: &str) -> sqlx::PgConnection {
+    use sqlx::Connection as _;
+
+    let options: sqlx::postgres::PgConnectOptions = url.parse().expect("a URL");
+    let options = options.extra_float_digits(None::<i8>);
+    sqlx::PgConnection::connect_with(&options).await.expect("the server of SIGHTFIX_TEST_POSTGRES")
+}
+
 /// A database that nobody else uses.
 pub(super) async fn new_database(server: &str) -> DatabaseUrl {
     use sqlx::Connection as _;
@@ -55,8 +64,7 @@ pub(super) async fn new_database(server: &str) -> DatabaseUrl {
     static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
     let number = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
     let name = format!("case_{}_{number}", std::process::id());
-    let mut connection =
-        sqlx::PgConnection::connect(server).await.expect("the server of SIGHTFIX_TEST_POSTGRES");
+    let mut connection = connect(server).await;
     let create = sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"));
     sqlx::raw_sql(create).execute(&mut connection).await.expect("a database");
     connection.close().await.expect("closes");

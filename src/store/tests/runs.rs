@@ -1,7 +1,7 @@
 use std::time::Duration;
 
 use super::*;
-use crate::domain::{EpochReport, JobState, RunProgress, TrainingRun};
+use crate::domain::{Actor, EpochReport, JobState, RunProgress, TrainingRun};
 use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput};
 
 const LEASE: Duration = Duration::from_secs(30);
@@ -133,6 +133,24 @@ async fn of_claims_at_once_one_gets_the_run() {
         taken += usize::from(claim.await.expect("no panic").is_some());
     }
     assert_eq!(taken, 1);
+}
+
+#[tokio::test]
+async fn runs_of_clients_are_claimed_before_those_of_the_server_and_each_in_their_order() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    let client =
+        Actor { address: Some("192.0.2.7".parse().expect("an address")), ..Actor::program("client") };
+    let client = store.on_behalf_of(Arc::new(client));
+    store.insert_run(run_id(1), &camera, &options(), 9, at(1)).await.expect("queued");
+    for (n, name) in [(2, "b"), (3, "a")] {
+        store.insert_camera(&NewCamera::named(id(name)), at(0)).await.expect("new");
+        client.insert_run(run_id(n), &id(name), &options(), 9, at(1)).await.expect("queued");
+    }
+    let mut claimed = Vec::new();
+    while let Some(claim) = store.claim_run(LEASE, at(2)).await.expect("works") {
+        claimed.push(claim.job.id);
+    }
+    assert_eq!(claimed, [run_id(2), run_id(3), run_id(1)]);
 }
 
 #[tokio::test]

@@ -42,8 +42,8 @@ impl Feed {
     pub(super) async fn stream(&mut self, node: &str, pace: Duration) -> Result<(), Status> {
         self.attempts += 1;
         let endpoint = Endpoint::from_shared(node.to_owned()).expect("an address");
-        let connecting = endpoint.connect_timeout(Duration::from_secs(1)).connect();
-        let channel = connecting.await.map_err(|error| Status::unavailable(error.to_string()))?;
+        let endpoint = endpoint.connect_timeout(Duration::from_secs(1));
+        let channel = endpoint.connect().await.map_err(|error| Status::unavailable(error.to_string()))?;
         let (sent, queue) = mpsc::channel(64);
         let request = |kind| proto::StreamRequest { kind: Some(kind) };
         let opening = proto::StreamOpening {
@@ -54,7 +54,8 @@ impl Feed {
             ..Default::default()
         };
         sent.send(request(Sent::Opening(opening))).await.expect("room");
-        let opened = FusionServiceClient::new(channel).stream(messages(queue));
+        let mut service = FusionServiceClient::new(channel);
+        let opened = service.stream(messages(queue));
         let opened = tokio::time::timeout(SILENCE, opened).await.map_err(|_| silent())?;
         let mut responses = opened?.into_inner();
         let rest: Vec<_> =

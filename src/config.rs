@@ -72,6 +72,9 @@ pub struct Config {
     pub training: Workers,
     /// Workers of evaluations.
     pub evaluation: Workers,
+    /// Folder below which sinks of connections write files (`file:`), each in a folder of its own; without it there are
+    /// no such sinks.
+    pub export_folder: Option<PathBuf>,
     /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
     pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
@@ -254,6 +257,8 @@ pub struct Limits {
     pub connection_queue: usize,
     /// Messages of one sink that wait for their receiver; beyond, the oldest is dropped.
     pub outbox_messages: u32,
+    /// Files of one sink; beyond, the oldest is deleted.
+    pub export_files: usize,
     /// Messages of one sink that were refused or could not be delivered; beyond, the oldest is deleted.
     pub dead_letters: u32,
     /// Boxes and fixes of one site that wait for its tracker; beyond, they are dropped.
@@ -320,6 +325,7 @@ impl Default for Config {
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
+            export_folder: None,
             connections: Vec::new(),
             console: Console::default(),
             limits: Limits::default(),
@@ -391,6 +397,7 @@ impl Default for Limits {
             connection_message_bytes: 1 << 20,
             connection_queue: 1_024,
             outbox_messages: 100_000,
+            export_files: 256,
             dead_letters: 1_000,
             site_queue: 16_384,
             site_frames: 1_024,

@@ -31,4 +31,5 @@ pub mod statistics;
 pub mod status;
 pub mod store;
 pub mod telemetry;
+pub mod tls_client;
 pub mod worker;

@@ -103,6 +103,9 @@ impl Server {
             Store::open_at(&location, options).await.with_context(|| format!("cannot open {location}"))?;
         store.log_newcomers();
         let app = App::new(store, clock, randomness, config.limits.clone(), Metrics::new()).await?;
+        if let Some(folder) = &config.export_folder {
+            app.export_folder.get_or_init(|| folder.clone());
+        }
         let tls = Tls::load(&config.tls)?;
         if tls.as_ref().is_some_and(|tls| tls.takes_client_certificates()) {
             app.access.close();

@@ -28,7 +28,8 @@ mod sites;
 mod spool;
 mod training;
 
-use std::sync::Arc;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore};
@@ -82,6 +83,8 @@ pub struct Parts {
     pub site_registry: SiteRegistry,
     /// What connections with other systems do.
     pub connection_board: ConnectionBoard,
+    /// Where their sinks write files, if they may: set by the server at its start.
+    pub export_folder: OnceLock<PathBuf>,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -104,6 +107,8 @@ pub struct Parts {
     cluster: Cluster,
     /// Open live streams.
     stream_slots: live::StreamSlots,
+    /// Rounds of live matching.
+    matching_slot: live::MatchingSlot,
     /// The way to the drift detectors.
     residuals: live::ResidualQueue,
     /// When moved cameras are trained again.
@@ -147,6 +152,7 @@ impl App {
             registry,
             site_registry,
             connection_board: ConnectionBoard::default(),
+            export_folder: OnceLock::new(),
             access,
             clock,
             randomness,
@@ -158,6 +164,7 @@ impl App {
             evaluation_queue: JobQueue::default(),
             cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),
+            matching_slot: live::MatchingSlot::default(),
             residuals,
             retraining: live::RetrainSchedule::default(),
             tasks: TaskTracker::new(),

@@ -2,9 +2,9 @@
 
 use bytes::Bytes;
 
-use super::registry::{ModelFault, load_model};
+use super::registry::{ModelFault, load_model, unusable};
 use super::{App, Page, page_of};
-use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelVersion, Result};
+use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelFormat, ModelVersion, Result};
 use crate::exchange::{RowError, TimedFix};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::Artifact;
@@ -144,13 +144,17 @@ impl App {
         Ok(page_of(models, limit, |model| model.number))
     }
 
-    /// One version as a file: safetensors with the metadata in its header.
+    /// One version as a file of that format.
     ///
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`, `ModelUnusable`.
-    pub async fn download_model(&self, id: &CameraId, number: u32) -> Result<Bytes> {
+    pub async fn download_model(&self, id: &CameraId, number: u32, format: ModelFormat) -> Result<Bytes> {
         let (metadata, weights) = self.store.model_content(id, number).await?;
-        Artifact { metadata, weights: weights.into() }.to_file().map_err(Error::fault)
+        let artifact = Artifact { metadata, weights: weights.into() };
+        match format {
+            ModelFormat::Safetensors => artifact.to_file().map_err(Error::fault),
+            ModelFormat::Onnx => artifact.to_onnx().map_err(|error| unusable(id, number, error)),
+        }
     }
 
     /// Stores a version from a file that [`App::download_model`] gave, here or on another server.

@@ -315,13 +315,18 @@ pub(super) async fn load_model(
         let view_area = artifact.view_area(&regressor)?;
         Ok((regressor, ModelSummary { view_area, held_out: artifact.metadata.held_out.clone() }))
     });
-    loaded.map_err(|error| match error {
+    loaded.map_err(|error| unusable(id, number, error))
+}
+
+/// The error of a stored version that does not pass the checks of a model.
+pub(super) fn unusable(id: &CameraId, number: u32, error: Error) -> Error {
+    match error {
         Error::Refused(refusal) => Error::refused(
             ErrorKind::ModelUnusable,
             format!("version {number} of camera {id} cannot be used: {}", Error::Refused(refusal)),
         ),
         fault @ Error::Fault(_) => fault,
-    })
+    }
 }
 
 #[cfg(test)]

@@ -18,6 +18,7 @@ mod import;
 mod keys;
 mod layout;
 mod migrate;
+mod models;
 mod openapi;
 mod output;
 mod pair;
@@ -78,6 +79,8 @@ enum Command {
     Pair(pair::Pair),
     /// Train a camera's model from its samples
     Train(train::Train),
+    /// Write a camera's model versions to files, for sightfix or for other runtimes
+    Models(models::Models),
     /// Fuse observations from a file, without a server
     Fuse(fuse::Fuse),
     /// Estimate a receiver's error from many fixes at one fixed point
@@ -133,6 +136,7 @@ impl Cli {
             Command::Import(command) => command.run(file),
             Command::Pair(command) => command.run(file),
             Command::Train(command) => command.run(file),
+            Command::Models(command) => command.run(file),
             Command::Fuse(command) => command.run(file),
             Command::GnssError(command) => command.run(),
             Command::Evaluate(command) => command.run(),

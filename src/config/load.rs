@@ -156,6 +156,7 @@ impl Config {
         for (name, limit) in [
             ("connection_message_bytes", limits.connection_message_bytes),
             ("connection_queue", limits.connection_queue),
+            ("export_files", limits.export_files),
             ("site_queue", limits.site_queue),
             ("site_frames", limits.site_frames),
             ("boxes_per_frame", limits.boxes_per_frame),

@@ -11,7 +11,7 @@ use super::credentials::PeerError;
 use super::open;
 use super::sink::Outcomes;
 use crate::app::{App, ConnectionState, LastMessage, LiveConnection};
-use crate::domain::{ConnectionKey, OutboxMessage};
+use crate::domain::{ConnectionId, ConnectionKey, OutboxMessage};
 use crate::exchange::{Secrets, SinkSettings};
 
 /// Messages that are read from the outbox at a time.
@@ -22,6 +22,7 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// Delivers the outbox of one sink.
 pub(super) struct Delivery<'a> {
     pub(super) app: &'a App,
+    pub(super) id: &'a ConnectionId,
     pub(super) key: ConnectionKey,
     pub(super) settings: &'a SinkSettings,
     pub(super) secrets: &'a Secrets,
@@ -34,7 +35,7 @@ impl Delivery<'_> {
     /// Opens the sink and delivers until it fails. `progressed` is set when something was delivered.
     pub(super) async fn run(&self, progressed: &AtomicBool) -> Result<Infallible, PeerError> {
         let clock = &self.app.clock;
-        let mut sink = open::sink(self.settings, self.secrets, self.client_id, clock).await?;
+        let mut sink = open::sink(self.app, self.id, self.settings, self.secrets, self.client_id).await?;
         self.live.enter(ConnectionState::Running, clock.now());
         self.live.update(|status| status.connects += 1);
         loop {

@@ -13,6 +13,7 @@
 
 mod credentials;
 mod deliver;
+mod file;
 mod intake;
 mod lines;
 mod mqtt;

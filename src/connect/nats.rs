@@ -131,4 +131,17 @@ impl Sink for NatsSink {
             Ok(())
         })
     }
+
+    fn failed(&mut self) -> BoxFuture<'_, PeerError> {
+        Box::pin(async {
+            loop {
+                match self.answers.recv().await {
+                    // No `PING` of ours is under way.
+                    Some(Ok(())) => {}
+                    Some(Err(refusal)) => return PeerError(refusal),
+                    None => return "the server has closed the connection".into(),
+                }
+            }
+        })
+    }
 }

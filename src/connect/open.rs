@@ -3,13 +3,17 @@
 use std::sync::Arc;
 
 use super::credentials::{Credentials, PeerError};
+use super::file::{FileSettings, FileSink};
 use super::sink::Sink;
 use super::source::{Source, SourceIdentity};
 use super::{lines, mqtt, nats, push, stream, udp, webhook};
-use crate::app::LiveConnection;
-use crate::clock::Clock;
+use crate::app::{App, LiveConnection};
 use crate::config::Limits;
+use crate::domain::ConnectionId;
 use crate::exchange::{OutgoingFormat, Scheme, Secrets, SinkSettings, SourceSettings};
+
+/// Time after which a new file begins, s.
+const DEFAULT_ROTATE_S: f64 = 3_600.0;
 
 /// Opens a source.
 pub(super) async fn source(
@@ -36,16 +40,19 @@ pub(super) async fn source(
         Scheme::TcpListen => Box::new(lines::LineListener::bind(&address, queue, message_bytes).await?),
         Scheme::Udp => Box::new(udp::UdpSource::bind(&address).await?),
         Scheme::Push => Box::new(push::PushSource::open(live.clone(), queue)),
-        Scheme::Http | Scheme::Https | Scheme::Nats => return Err("a source cannot have this address".into()),
+        Scheme::Http | Scheme::Https | Scheme::Nats | Scheme::File => {
+            return Err("a source cannot have this address".into());
+        }
     })
 }
 
-/// Opens a sink.
+/// Opens a sink of a connection.
 pub(super) async fn sink(
+    app: &App,
+    connection: &ConnectionId,
     settings: &SinkSettings,
     secrets: &Secrets,
     client_id: &str,
-    clock: &Clock,
 ) -> Result<Box<dyn Sink>, PeerError> {
     let address = settings.address()?;
     let credentials = Credentials {
@@ -54,21 +61,38 @@ pub(super) async fn sink(
         secrets,
     };
     let media_type = match settings.format {
-        OutgoingFormat::Json => "application/json",
         OutgoingFormat::Cot => "application/xml",
+        OutgoingFormat::Json | OutgoingFormat::Gpx | OutgoingFormat::Kml => "application/json",
     };
     Ok(match address.scheme {
         Scheme::Mqtt | Scheme::Mqtts => {
             Box::new(mqtt::MqttSink::open(&address, &credentials, client_id, media_type).await?)
         }
         Scheme::Http | Scheme::Https => {
-            Box::new(webhook::Webhook::open(&address, &credentials, media_type, clock.clone()).await?)
+            Box::new(webhook::Webhook::open(&address, &credentials, media_type, app.clock.clone()).await?)
         }
         Scheme::Nats => Box::new(nats::NatsSink::open(&address, &credentials).await?),
         Scheme::Tcp | Scheme::Tls => Box::new(stream::StreamSink::open(&address, &credentials).await?),
         Scheme::Udp => Box::new(udp::UdpSink::open(&address, settings.multicast_ttl.unwrap_or(1)).await?),
+        Scheme::File => Box::new(file_sink(app, connection, settings).await?),
         Scheme::TcpListen | Scheme::Gpsd | Scheme::Push => {
             return Err("a sink cannot have this address".into());
         }
     })
+}
+
+async fn file_sink(
+    app: &App,
+    connection: &ConnectionId,
+    settings: &SinkSettings,
+) -> Result<FileSink, PeerError> {
+    let folder = app.export_folder.get().ok_or_else(|| {
+        PeerError::from(
+            "sinks may not write files here; name the folder for them in the setting export_folder",
+        )
+    })?;
+    let format = settings.format.track_file().ok_or_else(|| PeerError::from("format must be gpx or kml"))?;
+    let rotate_s = settings.rotate_s.unwrap_or(DEFAULT_ROTATE_S);
+    let settings = FileSettings { format, rotate_s, max_files: app.limits.export_files };
+    FileSink::open(folder, connection, settings).await
 }

@@ -29,7 +29,7 @@ pub(super) async fn connect(
         if !is_encrypted {
             return Ok(Box::new(stream) as Box<dyn ByteStream>);
         }
-        let connector = TlsConnector::from(tls::client_config(credentials)?);
+        let connector = TlsConnector::from(tls::peer_config(credentials)?);
         let name = tls::server_name(&address.host)?;
         Ok(Box::new(connector.connect(name, stream).await?) as Box<dyn ByteStream>)
     };

@@ -143,7 +143,8 @@ impl Publisher<'_> {
 /// A position in the format of a sink.
 pub(super) fn payload(settings: &SinkSettings, position: &OutgoingPosition<'_>) -> Vec<u8> {
     match settings.format {
-        OutgoingFormat::Json => position_json(position),
+        // Files are written from the same objects.
+        OutgoingFormat::Json | OutgoingFormat::Gpx | OutgoingFormat::Kml => position_json(position),
         OutgoingFormat::Cot => {
             let cot_type = settings.cot_type.as_deref().unwrap_or(DEFAULT_COT_TYPE);
             cot_event(position, cot_type, settings.stale_s.unwrap_or(DEFAULT_STALE_S))

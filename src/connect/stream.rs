@@ -10,6 +10,8 @@ use super::sink::{Outcomes, Sink};
 use crate::domain::OutboxMessage;
 use crate::exchange::{Address, Scheme};
 
+const CLOSED: &str = "the peer has closed the connection";
+
 /// Writes messages. What the system has taken counts as delivered: the protocol has no acknowledgement.
 pub(super) struct StreamSink {
     out: WriteHalf<Box<dyn ByteStream>>,
@@ -40,13 +42,24 @@ impl Sink for StreamSink {
             for message in messages {
                 // A write into a connection that the peer has closed would seem to succeed once.
                 if self.reading.is_finished() {
-                    return Err("the peer has closed the connection".into());
+                    return Err(CLOSED.into());
                 }
                 self.out.write_all(&message.payload).await?;
                 self.out.flush().await?;
                 outcomes.push((message.number, Ok(())));
             }
             Ok(())
+        })
+    }
+
+    fn failed(&mut self) -> BoxFuture<'_, PeerError> {
+        Box::pin(async {
+            // A handle must not be awaited again once it has yielded.
+            if !self.reading.is_finished() {
+                // Nothing but the end of the stream ends it.
+                let _ = (&mut self.reading).await;
+            }
+            CLOSED.into()
         })
     }
 }

@@ -223,7 +223,16 @@ async fn run_sink(
     let (key, queued) = (connection.key, Notify::new());
     let client_id = client_id(connection);
     let publisher = Publisher { app, key, settings, live, queued: &queued };
-    let delivery = Delivery { app, key, settings, secrets, client_id: &client_id, live, queued: &queued };
+    let delivery = Delivery {
+        app,
+        id: connection.id(),
+        key,
+        settings,
+        secrets,
+        client_id: &client_id,
+        live,
+        queued: &queued,
+    };
     tokio::select! {
         Err(error) = publisher.run() => {
             tracing::error!(connection = %connection.id(), %error, "positions cannot be queued");

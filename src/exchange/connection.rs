@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::messages::MessageFormat;
+use super::track_files::TrackFileFormat;
 use crate::domain::{CameraId, Error, ImageSize, ReceiverId, Result, TargetId, check_text};
 
 /// Longest address, bytes.
@@ -121,6 +122,22 @@ pub enum OutgoingFormat {
     Json,
     /// A Cursor on Target event (XML, version 2.0) per position.
     Cot,
+    /// Tracks in files of GPX 1.1, for the address `file:`.
+    Gpx,
+    /// Tracks in files of KML 2.2, for the address `file:`.
+    Kml,
+}
+
+impl OutgoingFormat {
+    /// The format of files of tracks, if it is one.
+    #[must_use]
+    pub const fn track_file(self) -> Option<TrackFileFormat> {
+        match self {
+            Self::Json | Self::Cot => None,
+            Self::Gpx => Some(TrackFileFormat::Gpx),
+            Self::Kml => Some(TrackFileFormat::Kml),
+        }
+    }
 }
 
 /// Where positions go to.
@@ -128,7 +145,8 @@ pub enum OutgoingFormat {
 #[serde(deny_unknown_fields)]
 pub struct SinkSettings {
     /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]` and `nats://HOST[:4222]` publish; `http://` and `https://` post (a webhook); `tcp://`,
-    /// `tls://` and `udp://HOST:PORT`, also of a multicast group, send.
+    /// `tls://` and `udp://HOST:PORT`, also of a multicast group, send; `file:` writes files to the folder of the setting
+    /// `export_folder`.
     #[schema(max_length = 512, example = "https://hooks.example.org/positions")]
     pub address: String,
     /// What is sent.
@@ -161,6 +179,10 @@ pub struct SinkSettings {
     /// Routers that a multicast datagram may pass; 1 if left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub multicast_ttl: Option<u8>,
+    /// Time after which a new file begins, s; 3600 if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1.0, maximum = 86400.0)]
+    pub rotate_s: Option<f64>,
 }
 
 /// The secrets of a connection, by name; they are never shown.
@@ -234,13 +256,25 @@ pub enum Scheme {
     Http,
     Https,
     Nats,
+    File,
 }
 
 impl Scheme {
     const SOURCES: [Self; 8] =
         [Self::Mqtt, Self::Mqtts, Self::Tcp, Self::Tls, Self::TcpListen, Self::Udp, Self::Gpsd, Self::Push];
-    const SINKS: [Self; 8] =
-        [Self::Mqtt, Self::Mqtts, Self::Nats, Self::Tcp, Self::Tls, Self::Udp, Self::Http, Self::Https];
+    const SINKS: [Self; 9] = [
+        Self::Mqtt,
+        Self::Mqtts,
+        Self::Nats,
+        Self::Tcp,
+        Self::Tls,
+        Self::Udp,
+        Self::Http,
+        Self::Https,
+        Self::File,
+    ];
+    /// What is no address of another machine.
+    const LOCAL: [Self; 2] = [Self::Push, Self::File];
 
     const fn as_str(self) -> &'static str {
         match self {
@@ -255,6 +289,7 @@ impl Scheme {
             Self::Http => "http",
             Self::Https => "https",
             Self::Nats => "nats",
+            Self::File => "file",
         }
     }
 
@@ -266,7 +301,7 @@ impl Scheme {
             Self::Http => Some(80),
             Self::Https => Some(443),
             Self::Nats => Some(4222),
-            Self::Tcp | Self::Tls | Self::TcpListen | Self::Udp | Self::Push => None,
+            Self::Tcp | Self::Tls | Self::TcpListen | Self::Udp | Self::Push | Self::File => None,
         }
     }
 }
@@ -292,11 +327,15 @@ impl Address {
     fn parse(text: &str, schemes: &[Scheme]) -> Result<Self> {
         let invalid = |message: String| Error::invalid("address", message);
         check_text("address", text, MAX_ADDRESS_BYTES)?;
-        if text == "push:" && schemes.contains(&Scheme::Push) {
-            return Ok(Self { scheme: Scheme::Push, host: String::new(), port: 0, path: String::new() });
+        let local = Scheme::LOCAL.into_iter().filter(|scheme| schemes.contains(scheme));
+        if let Some(scheme) = local.into_iter().find(|scheme| text == format!("{}:", scheme.as_str())) {
+            return Ok(Self { scheme, host: String::new(), port: 0, path: String::new() });
         }
         let named = text.split_once("://").and_then(|(name, rest)| {
-            Some((schemes.iter().copied().find(|it| it.as_str() == name && *it != Scheme::Push)?, rest))
+            Some((
+                schemes.iter().copied().find(|it| it.as_str() == name && !Scheme::LOCAL.contains(it))?,
+                rest,
+            ))
         });
         let Some((scheme, rest)) = named else {
             let known: Vec<String> = schemes.iter().map(|it| format!("{}:", it.as_str())).collect();
@@ -447,7 +486,13 @@ impl SinkSettings {
     }
 
     fn check(&self) -> Result<()> {
-        self.address()?;
+        let writes_files = self.address()?.scheme == Scheme::File;
+        if writes_files != self.format.track_file().is_some() {
+            return Err(Error::invalid(
+                "format",
+                "must be gpx or kml for the address file:, and for no other",
+            ));
+        }
         check_username(self.username.as_deref())?;
         if self.camera_ids.is_empty() {
             return Err(Error::invalid("camera_ids", "must name the cameras whose tracks are sent"));
@@ -461,9 +506,11 @@ impl SinkSettings {
                 return Err(Error::invalid("topic", "must not contain wildcards"));
             }
         }
-        for (field, value, least) in
-            [("min_interval_s", self.min_interval_s, 0.0), ("stale_s", self.stale_s, 1.0)]
-        {
+        for (field, value, least) in [
+            ("min_interval_s", self.min_interval_s, 0.0),
+            ("stale_s", self.stale_s, 1.0),
+            ("rotate_s", self.rotate_s, 1.0),
+        ] {
             if value.is_some_and(|value| !(least..=86_400.0).contains(&value)) {
                 return Err(Error::invalid(field, format!("must be from {least} to 86400")));
             }

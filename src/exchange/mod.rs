@@ -35,6 +35,7 @@ mod outgoing;
 mod rows;
 #[cfg(test)]
 mod tests;
+mod track_files;
 pub mod wire;
 mod write;
 
@@ -54,6 +55,7 @@ pub use outgoing::{OutgoingPosition, cot_event, position_json};
 pub use rows::{
     ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
 };
+pub use track_files::{TrackFile, TrackFileFormat};
 pub use write::{FusedWriter, MatchedSampleWriter, SampleWriter, write_fused, write_samples};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.

@@ -95,8 +95,8 @@ pub fn cot_event(position: &OutgoingPosition<'_>, cot_type: &str, stale_s: f64) 
     event.into_bytes()
 }
 
-/// Text of an XML attribute.
-fn escaped(text: &str) -> String {
+/// Text of an XML attribute or element.
+pub(super) fn escaped(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for character in text.chars() {
         match character {

@@ -10,6 +10,8 @@ mod plane;
 mod plane_covariance;
 mod position;
 
+pub(crate) use plane::{ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS_M};
 pub use plane::{EastNorth, LocalPlane, PLANE_RANGE_M};
 pub use plane_covariance::PlaneCovariance;
+pub(crate) use plane_covariance::R95_BY_RATIO;
 pub use position::{Position, PositionError, distance_m};

@@ -3,9 +3,9 @@
 use super::position::{Position, wrap_degrees};
 
 /// Semi-major axis of WGS 84 in metres.
-const EQUATORIAL_RADIUS_M: f64 = 6_378_137.0;
+pub(crate) const EQUATORIAL_RADIUS_M: f64 = 6_378_137.0;
 /// First eccentricity of WGS 84, squared.
-const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_141_316e-3;
+pub(crate) const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_141_316e-3;
 
 /// Largest distance from the origin, m, at which a [`LocalPlane`] is used. Up to here the plane is exact
 /// to 1 mm in both directions; beyond it nothing that a ground camera sees is measured.
@@ -50,14 +50,14 @@ impl EastNorth {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalPlane {
     origin: Position,
-    sin_latitude: f64,
-    cos_latitude: f64,
+    pub(crate) sin_latitude: f64,
+    pub(crate) cos_latitude: f64,
     /// Distance of the origin from the polar axis and from the equatorial plane, m.
-    axis_m: f64,
-    equator_m: f64,
+    pub(crate) axis_m: f64,
+    pub(crate) equator_m: f64,
     /// Radii of curvature at the origin, in the prime vertical and in the meridian, m.
-    prime_vertical_m: f64,
-    meridian_m: f64,
+    pub(crate) prime_vertical_m: f64,
+    pub(crate) meridian_m: f64,
 }
 
 impl LocalPlane {

@@ -7,7 +7,7 @@ use super::EastNorth;
 /// 95 % radius of a bivariate normal distribution divided by its larger principal standard deviation,
 /// tabulated by the ratio of the smaller to the larger in steps of 0.1. Solved numerically from the
 /// integral over the disc. The function is convex, so linear interpolation never underestimates it.
-const R95_BY_RATIO: [f64; 11] = [
+pub(crate) const R95_BY_RATIO: [f64; 11] = [
     1.959_964, 1.962_530, 1.970_409, 1.984_197, 2.005_138, 2.035_859, 2.081_305, 2.145_982, 2.230_288,
     2.331_799, 2.447_747,
 ];

@@ -6,7 +6,7 @@ use super::proto;
 use super::proto::model_service_server::ModelService;
 use super::statuses::{Reply, answer};
 use crate::app::{App, GnssErrorEstimate};
-use crate::domain::{Error, HeldOutError, ModelVersion, Result, RunId};
+use crate::domain::{Error, HeldOutError, ModelFormat, ModelVersion, Result, RunId};
 use crate::exchange::{RowError, TimedFix};
 
 pub(super) struct Models {
@@ -79,8 +79,14 @@ impl ModelService for Models {
         request: tonic::Request<proto::DownloadModelRequest>,
     ) -> Reply<proto::DownloadModelResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let safetensors = app.download_model(&camera_id(&asked.camera_id)?, asked.number).await?;
-            Ok(proto::DownloadModelResponse { safetensors })
+            let format = model_format(asked.format)?;
+            let file = app.download_model(&camera_id(&asked.camera_id)?, asked.number, format).await?;
+            Ok(match format {
+                ModelFormat::Safetensors => {
+                    proto::DownloadModelResponse { safetensors: file, ..Default::default() }
+                }
+                ModelFormat::Onnx => proto::DownloadModelResponse { onnx: file, ..Default::default() },
+            })
         })
         .await
     }
@@ -170,5 +176,15 @@ impl From<GnssErrorEstimate> for proto::EstimateGnssErrorResponse {
             rejected: estimate.rejected,
             rejected_rows: estimate.rejected_rows.into_iter().map(Into::into).collect(),
         }
+    }
+}
+
+/// # Errors
+/// Names `format`.
+fn model_format(format: i32) -> Result<ModelFormat> {
+    match proto::ModelFormat::try_from(format) {
+        Ok(proto::ModelFormat::Unspecified | proto::ModelFormat::Safetensors) => Ok(ModelFormat::Safetensors),
+        Ok(proto::ModelFormat::Onnx) => Ok(ModelFormat::Onnx),
+        Err(_) => Err(Error::invalid("format", "must be MODEL_FORMAT_SAFETENSORS or MODEL_FORMAT_ONNX")),
     }
 }

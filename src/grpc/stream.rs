@@ -297,6 +297,10 @@ fn answer_of(seq: u64, item: ItemResult) -> proto::StreamAnswer {
         flags,
         lost_answers: 0,
         world_track_id: item.world_track.map(|id| id.to_string()),
+        receiver_match: item.receiver_match.map(|own| proto::ReceiverMatch {
+            receiver_id: own.receiver_id.as_str().to_owned(),
+            probability: own.probability,
+        }),
     }
 }
 
@@ -329,6 +333,7 @@ impl From<NotStored> for proto::NotStored {
             NotStoredReason::Unpaired => Reason::Unpaired,
             NotStoredReason::TooLate => Reason::TooLate,
             NotStoredReason::Duplicate => Reason::Duplicate,
+            NotStoredReason::Unmatched => Reason::Unmatched,
         };
         Self { reason: reason.into(), count: not_stored.count, last_seq: not_stored.last_seq }
     }

@@ -17,11 +17,12 @@ use super::extract::{CameraPath, JsonBody, ModelPath, Params, media_type, not_re
 use super::problem::{ApiResult, Problem};
 use super::wire::{created, empty, json};
 use super::{Rest, body};
-use crate::domain::{self, Error, ModelMetadata};
+use crate::domain::{self, Error, ModelFormat, ModelMetadata};
 use crate::exchange::write_cursor;
 
 /// Weights with the metadata in their header.
 const SAFETENSORS: &str = "application/vnd.safetensors";
+const OCTET_STREAM: &str = "application/octet-stream";
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new()
@@ -141,17 +142,34 @@ struct ModelFile(Vec<u8>);
 /// Download a model version
 ///
 /// A safetensors file: the weights, and the metadata in its header. It can be imported on another
-/// server.
+/// server. With `format=onnx` an ONNX graph (operators of version 18, float64) for other runtimes: the input `boxes`
+/// has a row of left, top, width and height in pixels per box; the outputs are `position_m` (east, north of the origin
+/// in the metadata), `position_deg`, `covariance_m2`, `r95_m` and `outside_training`, as the service answers a box
+/// alone. It cannot be imported.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/models/{model}/file", tag = "models",
-    params(("camera" = String, Path, description = "The camera's id"), ("model" = u32, Path, description = "The version's number")),
-    responses((status = 200, description = "The file", body = ModelFile, content_type = "application/vnd.safetensors"))
+    params(
+        ("camera" = String, Path, description = "The camera's id"),
+        ("model" = u32, Path, description = "The version's number"),
+        ("format" = Option<String>, Query, description = "`safetensors` (the default) or `onnx`"),
+    ),
+    responses((status = 200, description = "The file", content(
+        (ModelFile = "application/vnd.safetensors"), (ModelFile = "application/octet-stream"),
+    )))
 )]
-async fn download_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) -> ApiResult {
-    let mut response = Response::new(Body::from(app.download_model(&id, number).await?));
-    let name = format!("attachment; filename=\"{id}-{number}.safetensors\"");
+async fn download_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath, uri: Uri) -> ApiResult {
+    let mut params = Params::of(&uri)?;
+    let format = params.take("format", str::parse)?.unwrap_or_default();
+    params.end()?;
+    let mut response = Response::new(Body::from(app.download_model(&id, number, format).await?));
+    let name = format!("attachment; filename=\"{id}-{number}.{format}\"");
+    let content_type = match format {
+        ModelFormat::Safetensors => SAFETENSORS,
+        // ONNX has no registered media type.
+        ModelFormat::Onnx => OCTET_STREAM,
+    };
     let headers = response.headers_mut();
-    headers.insert(CONTENT_TYPE, HeaderValue::from_static(SAFETENSORS));
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(content_type));
     headers.insert(CONTENT_DISPOSITION, HeaderValue::from_str(&name).map_err(Error::fault)?);
     Ok(response)
 }
@@ -167,7 +185,7 @@ async fn download_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelP
 )]
 async fn import_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, request: Request) -> ApiResult {
     let (parts, content) = request.into_parts();
-    let readable = [SAFETENSORS, "application/octet-stream"];
+    let readable = [SAFETENSORS, OCTET_STREAM];
     if !media_type(&parts.headers).is_some_and(|given| readable.contains(&given)) {
         return Err(not_read(&readable).into());
     }

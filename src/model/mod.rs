@@ -2,13 +2,14 @@
 //!
 //! [`fit`] turns samples into an [`Artifact`]; [`Artifact::load`] turns that into a [`Regressor`], which
 //! regresses box by box from flat weights. The folders in the order of their layers: `artifact`, `network`,
-//! `samples`, `progress`, `encoder`, `uncertainty`, `regressor`, `probe`, `view_area`, `fitting`. This is the only module that
+//! `samples`, `progress`, `encoder`, `uncertainty`, `regressor`, `probe`, `onnx`, `view_area`, `fitting`. This is the only module that
 //! uses candle; it has no I/O, clocks or threads.
 
 mod artifact;
 mod encoder;
 mod fitting;
 pub mod network;
+mod onnx;
 mod probe;
 mod progress;
 mod regressor;

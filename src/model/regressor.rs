@@ -13,7 +13,7 @@ use crate::statistics::R95_PER_SIGMA;
 /// White share of a regression's error variance where the model does not state it.
 const DEFAULT_WHITE_SHARE: f64 = 0.3;
 /// Range of the error variance, m2: weights and radii are finite for every box.
-const VARIANCE_RANGE_M2: [f64; 2] = [1e-6, 1e12];
+pub(super) const VARIANCE_RANGE_M2: [f64; 2] = [1e-6, 1e12];
 
 /// The one-step answer for one box.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -68,13 +68,13 @@ impl Regression {
 pub struct Regressor {
     plane: LocalPlane,
     e_gnss_m2: f64,
-    r95_scale: f64,
+    pub(super) r95_scale: f64,
     white_share: f64,
     track_noise: Option<TrackNoiseModel>,
     /// Added to every error variance, m2 per axis.
     added_m2: f64,
-    error_model: ErrorModel,
-    encoder: Encoder,
+    pub(super) error_model: ErrorModel,
+    pub(super) encoder: Encoder,
 }
 
 impl Regressor {

@@ -2,7 +2,6 @@
 //! deadline and a limit on its answer.
 
 use std::path::Path;
-use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -11,14 +10,13 @@ use http_body_util::{BodyExt as _, Full, Limited};
 use hyper::header::{ACCEPT, AUTHORIZATION, CONNECTION, CONTENT_TYPE, HOST};
 use hyper::{Method, Request, StatusCode, Uri};
 use hyper_util::rt::TokioIo;
-use rustls::crypto::ring::default_provider;
-use rustls::pki_types::pem::PemObject as _;
-use rustls::pki_types::{CertificateDer, ServerName};
-use rustls::{ClientConfig, RootCertStore};
+use rustls::pki_types::ServerName;
 use serde::de::DeserializeOwned;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
+
+use crate::tls_client::{authorities, client_config};
 
 /// Time for a request, from the connection to the last byte of its answer.
 const TIME: Duration = Duration::from_secs(10);
@@ -64,26 +62,10 @@ impl Fetch {
     /// # Errors
     /// Names the file that cannot be used.
     pub(super) fn new(ca: Option<&Path>) -> anyhow::Result<Self> {
-        let mut roots = RootCertStore::empty();
-        match ca {
-            Some(path) => {
-                let unusable = || format!("openid.ca: {} contains no certificates (PEM)", path.display());
-                let certificates = CertificateDer::pem_file_iter(path).with_context(unusable)?;
-                for certificate in certificates {
-                    roots.add(certificate.with_context(unusable)?).with_context(unusable)?;
-                }
-                anyhow::ensure!(!roots.is_empty(), unusable());
-            }
-            None => {
-                roots.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
-            }
-        }
-        let config = ClientConfig::builder_with_provider(Arc::new(default_provider()))
-            .with_safe_default_protocol_versions()
-            .context("the cryptography has no protocol version")?
-            .with_root_certificates(roots)
-            .with_no_client_auth();
-        Ok(Self { tls: Arc::new(config).into() })
+        let unusable = || format!("openid.ca: {} cannot be used", ca.unwrap_or(Path::new("")).display());
+        let pem = ca.map(std::fs::read).transpose().with_context(unusable)?;
+        let trusted = authorities(pem.as_deref()).with_context(unusable)?;
+        Ok(Self { tls: client_config(trusted, None)?.into() })
     }
 
     pub(super) async fn get<T: DeserializeOwned>(&self, url: &str) -> anyhow::Result<T> {

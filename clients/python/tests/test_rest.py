@@ -188,6 +188,7 @@ def test_changes_are_based_on_a_revision(client: Client) -> None:
 def test_models_are_copied_activated_and_rolled_back(trained: ServerProcess, client: Client) -> None:
     with Client(trained.url) as source:
         file = source.models.download("square", 1)
+        assert b"boxes_to_positions" in source.models.download("square", 1, file_format="onnx")
     client.cameras.create(id="copy")
     for number in (1, 2):
         assert client.models.import_file("copy", file).number == number

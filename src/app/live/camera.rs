@@ -10,6 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::camera_events::CameraEventLog;
 use super::drift::DriftMonitor;
+use super::matching::LiveMatching;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
@@ -39,6 +40,7 @@ pub struct TargetUpdate {
 pub(in crate::app) struct CameraLive {
     pub(super) tracks: Tracks,
     pub(super) drift: DriftMonitor,
+    pub(super) matching: LiveMatching,
     pub(super) events: CameraEventLog<CameraEvent>,
     pub(super) moved: watch::Sender<Option<Arc<CameraMoved>>>,
     pub(super) recorder: Mutex<Weak<SampleRecorder>>,
@@ -56,6 +58,7 @@ impl CameraLive {
         Arc::new(Self {
             tracks: Tracks::default(),
             drift: DriftMonitor::default(),
+            matching: LiveMatching::default(),
             events: CameraEventLog::new(event_log),
             moved: watch::channel(None).0,
             recorder: Mutex::new(Weak::new()),

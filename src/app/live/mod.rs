@@ -12,6 +12,7 @@ mod camera_events;
 mod drift;
 mod event_log;
 mod history;
+mod matching;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
@@ -26,6 +27,7 @@ use jiff::Timestamp;
 
 use self::camera::CameraLive;
 use self::camera_events::CameraEventReader;
+use self::matching::Identified;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
@@ -33,7 +35,8 @@ use super::cluster::{CameraLease, Watch};
 use super::fusion::fuse_observed;
 use super::registry::ActiveCamera;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, Result, TargetId, TimeBounds,
+    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, ReceiverMatch, Result, TargetId,
+    TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
@@ -42,6 +45,7 @@ pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub use camera_events::{EventId, LostEvents};
+pub(super) use matching::MatchingSlot;
 pub(super) use retraining::RetrainSchedule;
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
@@ -60,6 +64,8 @@ pub struct ItemResult {
     pub track: Option<Arc<TrackPoint>>,
     /// The target's world track in the camera's site, as of the latest frame that was tracked there.
     pub world_track: Option<LiveId>,
+    /// The receiver that the target of a box carries which came with a tracker's id alone, if it was matched.
+    pub receiver_match: Option<ReceiverMatch>,
 }
 
 /// What happens in a camera's view, since the server was started.
@@ -123,9 +129,21 @@ impl App {
         (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
         observation: &Observation,
     ) -> Result<ItemResult> {
+        // A time that no track takes must not move the matching either.
+        self.live_time_bounds().check(observation.time())?;
+        let identified = self.identify(camera, observation.clone());
+        self.follow_identified((camera, lease), identified)
+    }
+
+    fn follow_identified(
+        &self,
+        (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
+        identified: Identified,
+    ) -> Result<ItemResult> {
         let now = self.clock.monotonic();
         lease.check(now)?;
-        self.live_time_bounds().check(observation.time())?;
+        let Identified { observation, receiver_match, .. } = identified;
+        let observation = &observation;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);
         let ActiveCamera { image_size, e_gnss_m2, .. } = **camera;
@@ -163,7 +181,7 @@ impl App {
         if let Some(residual) = residual {
             self.hand_over(camera, residual);
         }
-        Ok(ItemResult { fused, track, world_track })
+        Ok(ItemResult { fused, track, world_track, receiver_match })
     }
 
     /// What happens in a camera's view.

@@ -144,9 +144,10 @@ impl App {
         let mut stream = self.open_stream(&camera.id, &name, client, 0, Some(durability)).await?;
         let mut followed = Vec::with_capacity(observations.len());
         for (seq, observation) in (1..).zip(observations) {
+            let tracker_id = observation.tracker_id().cloned();
             let (time, target_id, bounding_box, fix) = observation.into_parts();
-            let item =
-                LiveItem { time, target_id, receiver_id: None, bounding_box, fix, class: None, score: None };
+            let (receiver_id, class, score) = (None, None, None);
+            let item = LiveItem { time, target_id, tracker_id, receiver_id, bounding_box, fix, class, score };
             stream.check_seq(seq)?;
             followed.push(stream.take(camera, seq, item).await?);
         }
@@ -262,11 +263,17 @@ impl LiveStream {
             }
             (None, None) => (None, item.time),
         };
-        let observation = Observation::new(time, target_id, item.bounding_box, item.fix)?;
+        let observation = Observation::new(time, target_id, item.bounding_box, item.fix)?
+            .with_tracker_id(item.tracker_id)?;
         // A time that no track takes must not move the pairing either.
         self.app.live_time_bounds().check(time)?;
-        self.record(seq, &observation, item.class, item.score).await?;
-        self.app.follow((camera, lease), &observation)
+        let identified = self.app.identify(camera, observation);
+        if identified.is_sure {
+            self.record(seq, &identified.observation, item.class, item.score).await?;
+        } else {
+            self.ack_without_storing(seq, NotStoredReason::Unmatched);
+        }
+        self.app.follow_identified((camera, lease), identified)
     }
 
     async fn record(

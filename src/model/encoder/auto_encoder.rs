@@ -17,9 +17,9 @@ const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.5, regression: 1.0 
 
 /// The standardisation of the labels: position = centre + unit * output.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct OutputScale {
-    pub(super) centre: EastNorth,
-    pub(super) unit_m: f64,
+pub(crate) struct OutputScale {
+    pub(crate) centre: EastNorth,
+    pub(crate) unit_m: f64,
 }
 
 impl OutputScale {
@@ -104,9 +104,9 @@ fn training_set(
 /// The network for inference.
 #[derive(Debug, Clone)]
 pub(crate) struct AutoEncoder {
-    pub(super) net: Net,
-    pub(super) scales: [Scale; FEATURE_COUNT],
-    pub(super) output: OutputScale,
+    pub(crate) net: Net,
+    pub(crate) scales: [Scale; FEATURE_COUNT],
+    pub(crate) output: OutputScale,
 }
 
 impl AutoEncoder {

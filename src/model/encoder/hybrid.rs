@@ -35,7 +35,7 @@ pub(crate) fn fit(
 
 /// The network for inference.
 #[derive(Debug, Clone)]
-pub(crate) struct HybridEncoder(AutoEncoder);
+pub(crate) struct HybridEncoder(pub(crate) AutoEncoder);
 
 impl HybridEncoder {
     pub(super) fn build(parts: &mut ModelParts) -> Result<Self> {

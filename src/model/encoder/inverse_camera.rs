@@ -11,9 +11,9 @@ use crate::domain::Result;
 use crate::model::artifact::tensors::Tensors;
 
 /// Three coefficients per feature and two of the common denominator.
-const COEFFICIENTS: usize = 3 * FEATURE_COUNT + 2;
+pub(crate) const COEFFICIENTS: usize = 3 * FEATURE_COUNT + 2;
 /// Lower bound of the denominator.
-const LEAST_DENOMINATOR: f64 = 0.02;
+pub(crate) const LEAST_DENOMINATOR: f64 = 0.02;
 /// Rounds of reweighting.
 const ROUNDS: usize = 6;
 /// Residual, in standard deviations of a feature, at which a box has half the weight (Cauchy weights).
@@ -21,7 +21,7 @@ const RESIDUAL_SCALE: f64 = 0.3;
 
 /// Coefficients in the order `d`, `g`.
 #[derive(Debug, Clone)]
-pub(crate) struct InverseCamera([f64; COEFFICIENTS]);
+pub(crate) struct InverseCamera(pub(crate) [f64; COEFFICIENTS]);
 
 impl InverseCamera {
     /// Fits pairs of position (units) and standardised features by iteratively reweighted linear least

@@ -1,11 +1,11 @@
 //! The encoders of the recipes: from a box to a position, and back to the box that belongs to it.
 
-mod auto_encoder;
+pub(crate) mod auto_encoder;
 pub(crate) mod features;
 pub(crate) mod gaussian_process;
 pub(crate) mod hybrid;
 mod initial_projection;
-mod inverse_camera;
+pub(crate) mod inverse_camera;
 pub(crate) mod paper;
 pub(crate) mod projection;
 pub(crate) mod projection_fit;

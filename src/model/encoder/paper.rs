@@ -18,7 +18,7 @@ use crate::model::samples::rows::TrainingRows;
 use crate::statistics::R95_PER_SIGMA;
 
 /// Units per degree.
-const UNITS_PER_DEGREE: f64 = 1e4;
+pub(crate) const UNITS_PER_DEGREE: f64 = 1e4;
 /// Metres per degree at the equator, for positions outside the range of coordinates.
 const METRES_PER_DEGREE: f64 = 111_320.0;
 /// Hidden units; not specified in the paper.
@@ -133,11 +133,11 @@ pub(crate) struct PaperEstimate {
 #[derive(Debug, Clone)]
 pub(crate) struct PaperEncoder {
     joint: Net,
-    denied: Net,
+    pub(crate) denied: Net,
     /// Es of (4) of the joint and of the denied network, units2 per unit of eX.
-    error_scales: [f64; 2],
+    pub(crate) error_scales: [f64; 2],
     /// m2 per unit2, mean of both axes.
-    unit_m2: f64,
+    pub(crate) unit_m2: f64,
 }
 
 impl PaperEncoder {

@@ -24,9 +24,9 @@ pub(crate) const TERMS: usize = 1 + FEATURE_COUNT;
 /// Coefficients of both numerators and of the denominator, whose constant term is 1.
 pub(crate) const COEFFICIENTS: usize = 2 * TERMS + FEATURE_COUNT;
 /// Lower bound of the denominator, so that the map is finite near the horizon.
-const LEAST_DENOMINATOR: f64 = 0.02;
+pub(crate) const LEAST_DENOMINATOR: f64 = 0.02;
 /// Bound of the standardised width and height, so that the position of an outlying box is bounded.
-const LARGEST_SIZE: f64 = 3.5;
+pub(crate) const LARGEST_SIZE: f64 = 3.5;
 
 /// The map with its scaling.
 #[derive(Debug, Clone, PartialEq)]

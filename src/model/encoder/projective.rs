@@ -182,9 +182,9 @@ fn hidden_columns(net: &Net, inputs: &[[f32; FEATURE_COUNT]]) -> Vec<Vec<f64>> {
 
 /// Weights of the hidden units for east and north, in units of position.
 #[derive(Debug, Clone)]
-struct ResidualNetwork {
-    net: Net,
-    weights: [Vec<f64>; 2],
+pub(crate) struct ResidualNetwork {
+    pub(crate) net: Net,
+    pub(crate) weights: [Vec<f64>; 2],
 }
 
 fn put_residual(tensors: &mut Tensors, parameters: &[f32], weights: &[Vec<f64>; 2]) {
@@ -213,11 +213,11 @@ fn take_residual(tensors: &mut Tensors) -> Result<Option<ResidualNetwork>> {
 
 /// The map from a box to a position.
 #[derive(Debug, Clone)]
-struct ProjectiveMap {
-    projection: Projection,
+pub(crate) struct ProjectiveMap {
+    pub(crate) projection: Projection,
     /// Least and greatest position per axis, in units.
-    bounds: [[f64; 2]; 2],
-    residual: Option<ResidualNetwork>,
+    pub(crate) bounds: [[f64; 2]; 2],
+    pub(crate) residual: Option<ResidualNetwork>,
 }
 
 impl ProjectiveMap {
@@ -238,8 +238,8 @@ impl ProjectiveMap {
 /// Map and inverse camera for inference.
 #[derive(Debug, Clone)]
 pub(crate) struct ProjectiveEncoder {
-    map: ProjectiveMap,
-    decoder: InverseCamera,
+    pub(crate) map: ProjectiveMap,
+    pub(crate) decoder: InverseCamera,
 }
 
 impl ProjectiveEncoder {

@@ -69,6 +69,13 @@ impl Net {
         &self.shape
     }
 
+    /// Weights of a layer as rows of one input each, and its biases.
+    #[must_use]
+    pub(crate) fn matrix(&self, layer: &Layer) -> (&[f32], &[f32]) {
+        let biases = &self.transposed[layer.biases..layer.biases + layer.outputs];
+        (&self.transposed[layer.weights..layer.biases], biases)
+    }
+
     /// The regressed position (the bottleneck) of one scaled input.
     #[inline]
     #[must_use]

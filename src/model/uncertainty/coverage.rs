@@ -196,7 +196,7 @@ const LANES: usize = 8;
 const FAR: f32 = 1e12;
 /// Squared distance that is added to every other, in squared radii, so that the weight at a centre is
 /// finite.
-const SOFTENING: f32 = 1e-3;
+pub(crate) const SOFTENING: f32 = 1e-3;
 
 #[derive(Debug, Clone, PartialEq)]
 struct Group {
@@ -218,10 +218,10 @@ pub(crate) struct CoverageLookup {
 /// A [`Coverage`] with the centres in lanes, so that a look-up takes some tens of nanoseconds.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct CoverageTable {
-    units: Point,
-    radius: f32,
+    pub(crate) units: Point,
+    pub(crate) radius: f32,
     groups: Vec<Group>,
-    largest_m2: f32,
+    pub(crate) largest_m2: f32,
 }
 
 impl CoverageTable {
@@ -262,6 +262,14 @@ impl CoverageTable {
             nominal_m2: f64::from(nominal_m2),
             nearest: nearest[lane] as usize * LANES + lane,
         }
+    }
+
+    /// Centres, in units, with their error variances, m2: in the order of [`CoverageLookup::nearest`].
+    pub(crate) fn centres(&self) -> impl Iterator<Item = (Point, f32)> + '_ {
+        let lanes = self.groups.iter().flat_map(|group| (0..LANES).map(move |lane| (group, lane)));
+        lanes
+            .map(|(group, lane)| (group.axes.map(|axis| axis[lane]), group.errors_m2[lane]))
+            .filter(|(centre, _)| centre[0] < FAR)
     }
 
     /// Displacement of the foot point that makes one covering radius, px.

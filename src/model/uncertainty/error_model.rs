@@ -19,7 +19,7 @@ use crate::statistics::R95_PER_SIGMA;
 
 /// Distance to the nearest centre, in covering radii, up to which the nominal error holds; a box beyond it
 /// is outside of the training.
-const NOMINAL_RATIO: f64 = 1.5;
+pub(crate) const NOMINAL_RATIO: f64 = 1.5;
 
 /// A box in full view (0) or cut by the image's border (1): the excess variance of the two is calibrated
 /// separately.
@@ -31,27 +31,27 @@ pub(crate) const EXCESS_PARAMETERS: [[&str; 2]; 2] =
 
 /// The ratio of the actual to the computed excess variance of the atypical training boxes.
 #[derive(Debug, Clone, Copy)]
-struct ExcessCalibration {
+pub(crate) struct ExcessCalibration {
     /// The computed excess variance that 95 % of these boxes do not exceed, m2; beyond it the computed
     /// value counts in full.
-    limit_m2: f64,
-    factor: f64,
+    pub(crate) limit_m2: f64,
+    pub(crate) factor: f64,
 }
 
 /// The error model of one recipe's encoder.
 #[derive(Debug, Clone)]
 pub(crate) struct ErrorModel {
-    coverage: CoverageTable,
-    local_boxes: LocalBoxModel,
-    image_size: Option<ImageSize>,
+    pub(crate) coverage: CoverageTable,
+    pub(crate) local_boxes: LocalBoxModel,
+    pub(crate) image_size: Option<ImageSize>,
     /// Es: m2 per axis per unit of reconstruction error.
-    error_scale: f64,
+    pub(crate) error_scale: f64,
     /// Reconstruction error up to which there is no excess.
-    nominal_reconstruction_error: f64,
+    pub(crate) nominal_reconstruction_error: f64,
     /// Factor on the nominal variance of a box at the image's border.
-    border_factor: f64,
+    pub(crate) border_factor: f64,
     /// By truncation class.
-    excess: [ExcessCalibration; 2],
+    pub(crate) excess: [ExcessCalibration; 2],
 }
 
 /// The error of one box.

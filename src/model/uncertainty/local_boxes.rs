@@ -40,7 +40,7 @@ const ITERATIONS: usize = 12;
 /// factor.
 const NOMINAL_QUANTILES: [(f64, f64); 2] = [(0.7, 4.0), (0.99, 1.5)];
 /// Share of `d^2` that counts in the mean direction instead of the exact one.
-const ISOTROPIC_SHARE: f64 = 0.25;
+pub(crate) const ISOTROPIC_SHARE: f64 = 0.25;
 /// Standard deviation of the displacement along the reconstructed box, px: positions where no training box
 /// was are consistent too.
 const DISPLACEMENT_PX: f64 = 40.0;
@@ -48,26 +48,26 @@ const DISPLACEMENT_PX: f64 = 40.0;
 const NUMBERS: usize = 30;
 
 /// One region of the image.
-#[derive(Debug, Clone, PartialEq)]
-struct Region {
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct Region {
     /// `m`, px.
-    mean: [f32; 4],
+    pub(crate) mean: [f32; 4],
     /// `C^-1`, 1/px2.
-    precision: [[f32; 4]; 4],
+    pub(crate) precision: [[f32; 4]; 4],
     /// `J N`, m/px.
-    noise_gain: [[f32; 4]; 2],
+    pub(crate) noise_gain: [[f32; 4]; 2],
     /// `l2 * trace(J J^T) / 8`, m2 per axis.
-    isotropic_m2: f32,
+    pub(crate) isotropic_m2: f32,
     /// `D`.
-    nominal_limit: f32,
+    pub(crate) nominal_limit: f32,
 }
 
 /// All regions; the nearest centre of the coverage determines the region of a box.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct LocalBoxModel {
-    regions: Vec<Region>,
+    pub(crate) regions: Vec<Region>,
     /// Region of each centre.
-    of_centre: Vec<u8>,
+    pub(crate) of_centre: Vec<u8>,
 }
 
 impl LocalBoxModel {

@@ -59,9 +59,13 @@ async fn versions_come_and_go_and_answer_as_the_application_does() {
     let active = models.roll_back_model(back).await.expect("one before").into_inner().model;
     assert_eq!(active, Some(first));
 
-    let get = proto::DownloadModelRequest { camera_id: "yard".to_owned(), number: 2 };
-    let downloaded = models.download_model(get).await.expect("there").into_inner().safetensors;
-    assert_eq!(downloaded, file(2));
+    let get = |format| proto::DownloadModelRequest { camera_id: "yard".to_owned(), number: 2, format };
+    let downloaded = models.download_model(get(0)).await.expect("there").into_inner();
+    assert_eq!((&downloaded.safetensors, downloaded.onnx.is_empty()), (&file(2), true));
+    let onnx = models.download_model(get(proto::ModelFormat::Onnx as i32)).await.expect("there").into_inner();
+    assert!(onnx.safetensors.is_empty() && !onnx.onnx.is_empty(), "the graph alone");
+    let status = models.download_model(get(9)).await.expect_err("no such format");
+    refusal_of(&status, Code::InvalidArgument, "invalid-argument");
     fuses_as_the_application_does(&server).await;
 }
 

@@ -268,3 +268,35 @@ async fn a_tak_server_is_reached_over_tls_with_a_client_certificate_and_only_if_
     let shown = server.get("/v1/connections/tak").await.expect(200).text();
     assert!(!shown.contains("PRIVATE KEY") && shown.contains("client_key"), "{shown}");
 }
+
+/// Accepts a sink's connection; a NATS server also answers its greeting.
+async fn accept_sink(listener: &TcpListener, is_nats: bool) -> BufReader<TcpStream> {
+    let mut stream = accept(listener).await;
+    if is_nats {
+        let mut line = String::new();
+        while line.trim_end() != "PING" {
+            line.clear();
+            assert!(stream.read_line(&mut line).await.expect("a line") > 0, "the connection is closed");
+        }
+        stream.get_mut().write_all(b"PONG\r\n").await.expect("an answer");
+    }
+    stream
+}
+
+#[tokio::test]
+async fn a_sink_with_nothing_to_deliver_notices_that_its_peer_has_gone() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    for scheme in ["tcp", "nats"] {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = format!("{scheme}://{}", listener.local_addr().expect("an address"));
+        let sink = json!({"address": address, "camera_ids": ["gate"]});
+        server.post("/v1/connections", &json!({"id": scheme, "sink": sink})).await.expect(201);
+        let stream = accept_sink(&listener, scheme == "nats").await;
+        connection_when(&server, scheme, |status| status["state"] == "running").await;
+        drop((stream, listener));
+        let status = connection_when(&server, scheme, |status| status["state"] == "waiting").await;
+        assert_eq!(status["status"]["connects"], 1, "{status}");
+    }
+}

@@ -41,7 +41,8 @@ def to_message(item: LiveItem | Observation | Sample) -> messages.StreamItem:
             values.Fix(longitude_deg=fix.longitude_deg, latitude_deg=fix.latitude_deg, sigma_m=fix.sigma_m)
         )
     # Not every kind of item has these.
-    for name, attribute in (("receiver_id", "receiver_id"), ("class", "class_"), ("score", "score")):
+    optional = (("receiver_id", "receiver_id"), ("tracker_id", "tracker_id"), ("class", "class_"), ("score", "score"))
+    for name, attribute in optional:
         value = getattr(item, attribute, None)
         if value is not None:
             setattr(message, name, value)

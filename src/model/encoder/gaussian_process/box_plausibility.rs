@@ -23,7 +23,7 @@ const ROUNDS: usize = 3;
 /// Smallest standard deviation of a logarithmic side.
 const MIN_LOG_SIDE: f64 = 0.01;
 /// Largest logarithm of a side in px: no image is larger.
-const MAX_LOG_SIDE: f64 = 11.8;
+pub(crate) const MAX_LOG_SIDE: f64 = 11.8;
 /// A deviation is normal up to the 99 % point, or to this factor on training's own.
 const NORMAL_QUANTILE: f64 = 0.99;
 const NORMAL_FACTOR: f64 = 1.5;

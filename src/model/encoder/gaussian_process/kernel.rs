@@ -12,7 +12,7 @@ use super::projective_mean::{Box4, moments};
 /// A kernel's jitter, as a share of its variance.
 const JITTER: f64 = 1e-6;
 const LLOYD_ROUNDS: usize = 12;
-const SQRT_5: f64 = 2.236_067_977_499_79;
+pub(crate) const SQRT_5: f64 = 2.236_067_977_499_79;
 
 /// Standardisation of (foot u, foot v, log width, log height).
 #[derive(Debug, Clone, PartialEq)]

@@ -6,7 +6,7 @@
 //! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`;
 //! `recipe` and `stored` connect both to the rest of the module. Random starts have a seed of their own.
 
-mod box_plausibility;
+pub(crate) mod box_plausibility;
 mod candidate;
 mod companion;
 mod edge_noise;
@@ -15,12 +15,12 @@ mod fit;
 mod ground_camera;
 mod groups;
 mod hyperparameters;
-mod kernel;
+pub(crate) mod kernel;
 mod leave_out;
 mod map_rows;
 mod noise;
 mod posterior;
-mod predictor;
+pub(crate) mod predictor;
 pub(crate) mod projective_mean;
 mod recipe;
 mod sessions;

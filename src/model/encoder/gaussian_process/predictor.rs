@@ -20,9 +20,9 @@ const MIN_DETERMINED: f64 = 0.02;
 /// Points of the radius' table, between one and two degrees of freedom.
 pub(crate) const QUANTILES: usize = 5;
 /// Of an implausible box: the answer moves by this share of its weight toward that of the plausible box.
-const SHRINKAGE: f64 = 0.5;
+pub(crate) const SHRINKAGE: f64 = 0.5;
 /// Share of the squared distance between its edges and the plausible ones that each edge may be wrong by.
-const UNEXPLAINED_SHARE: f64 = 0.2;
+pub(crate) const UNEXPLAINED_SHARE: f64 = 0.2;
 
 /// What is stated beside the maps.
 pub(crate) struct Stated {
@@ -63,7 +63,7 @@ pub(crate) struct PositionMap {
     /// Scaled so that the sum of squares is the variance to add.
     pub(crate) deviations: Vec<CoefficientDeviation>,
     /// Kernel weights per inducing point and axis, for derivatives; from `basis` and `weights`.
-    point_weights: [Vec<f64>; 2],
+    pub(crate) point_weights: [Vec<f64>; 2],
 }
 
 /// A fitted model, ready to answer.

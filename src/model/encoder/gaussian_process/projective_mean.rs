@@ -16,9 +16,9 @@ pub(crate) const COEFFICIENTS: usize = 14;
 /// Those of the foot.
 pub(crate) const FOOT_COEFFICIENTS: usize = 8;
 /// The denominator is kept above it, so that a box at the horizon stays finite.
-const MIN_DENOMINATOR: f64 = 0.02;
+pub(crate) const MIN_DENOMINATOR: f64 = 0.02;
 /// Standardised sides are bounded, so that one abnormal box cannot land far away.
-const MAX_SIDE: f64 = 3.5;
+pub(crate) const MAX_SIDE: f64 = 3.5;
 /// Prior standard deviation of the foot's numerators, in standard deviations of the positions, and of
 /// the denominator's coefficients per standardised pixel.
 const NUMERATOR_PRIOR: f64 = 30.0;

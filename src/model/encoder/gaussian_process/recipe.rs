@@ -192,9 +192,9 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
 /// The encoder of a loaded model.
 #[derive(Debug, Clone)]
 pub(crate) struct GaussianProcessEncoder {
-    predictor: Predictor,
+    pub(crate) predictor: Predictor,
     /// Models of earlier releases have none.
-    auto_encoder: Option<AutoEncoder>,
+    pub(crate) auto_encoder: Option<AutoEncoder>,
 }
 
 /// Position, error and reconstruction of a box.

@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Literal
 
 from sightfix._async.transport import Transport
 from sightfix._request import Request, delete, get, path, with_json
@@ -40,9 +41,12 @@ class Models:
         request = Request(method="POST", path=path("cameras", camera_id, "active-model", "roll-back"))
         return await self._transport.json(request, ModelVersion)
 
-    async def download(self, camera_id: str, number: int) -> bytes:
-        """The file of a version, for `import_file` here or on another server."""
-        return (await self._transport.send(get(path("cameras", camera_id, "models", number, "file")))).content
+    async def download(
+        self, camera_id: str, number: int, *, file_format: Literal["safetensors", "onnx"] = "safetensors"
+    ) -> bytes:
+        """The file of a version: safetensors for `import_file` here or on another server, ONNX for other runtimes."""
+        request = get(path("cameras", camera_id, "models", number, "file"), format=file_format)
+        return (await self._transport.send(request)).content
 
     async def import_file(self, camera_id: str, model: bytes | Path) -> ModelVersion:
         """Stores a downloaded file as a new version, which does not become active by itself."""

@@ -43,7 +43,7 @@ fn fence(folder: &Path, camera: &str) -> i64 {
 
 /// Samples of a camera as items with both halves, one a second, of one target.
 fn items(count: usize) -> Vec<sightfix::grpc::proto::StreamItem> {
-    let options = Options { seed: 5, samples: 2 * count as u32, targets: 1, ..Options::demo() };
+    let options = Options { seed: 5, samples: 2 * count, targets: 1, ..Options::demo() };
     let rows = rows(&options);
     let whole_rows = rows.iter().filter(|row| row.bounding_box.is_some() && row.fix.is_some());
     let items: Vec<_> = whole_rows.take(count).map(whole).collect();

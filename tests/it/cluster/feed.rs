@@ -55,8 +55,8 @@ impl Feed {
         };
         sent.send(request(Sent::Opening(opening))).await.expect("room");
         let mut service = FusionServiceClient::new(channel);
-        let opened =
-            tokio::time::timeout(SILENCE, service.stream(messages(queue))).await.map_err(|_| silent())?;
+        let opened = service.stream(messages(queue));
+        let opened = tokio::time::timeout(SILENCE, opened).await.map_err(|_| silent())?;
         let mut responses = opened?.into_inner();
         let rest: Vec<_> =
             (1..).zip(self.items[..self.upto].to_vec()).skip(self.acknowledged as usize).collect();

@@ -12,6 +12,7 @@ mod camera_events;
 mod drift;
 mod event_log;
 mod history;
+mod identification;
 mod matching;
 mod retraining;
 mod sample_committer;
@@ -27,7 +28,7 @@ use jiff::Timestamp;
 
 use self::camera::CameraLive;
 use self::camera_events::CameraEventReader;
-use self::matching::Identified;
+use self::identification::Identified;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
@@ -45,7 +46,7 @@ pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub use camera_events::{EventId, LostEvents};
-pub(super) use matching::MatchingSlot;
+pub(super) use identification::MatchingSlot;
 pub(super) use retraining::RetrainSchedule;
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,

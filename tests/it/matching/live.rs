@@ -83,7 +83,12 @@ fn item(row: &Row, shift: SignedDuration) -> proto::StreamItem {
         (Some(_), &[left_px, top_px, width_px, height_px]) => proto::StreamItem {
             time,
             tracker_id: Some(row.id.clone()),
-            bounding_box: Some(proto::BoundingBox { left_px, top_px, width_px, height_px }),
+            bounding_box: Some(proto::BoundingBox {
+                left_px: Some(left_px),
+                top_px: Some(top_px),
+                width_px: Some(width_px),
+                height_px: Some(height_px),
+            }),
             ..Default::default()
         },
         (None, &[longitude_deg, latitude_deg]) => proto::StreamItem {
@@ -134,7 +139,7 @@ impl Answered {
         let target = answer.track.as_ref().map(|track| track.target_id.as_str());
         match (&answer.receiver_match, row.walker) {
             (Some(found), Some(walker)) => {
-                assert!(found.probability >= 0.6 && target == Some(&found.receiver_id), "{answer:?}");
+                assert!(found.probability >= 0.6 && target == Some(found.receiver_id.as_str()), "{answer:?}");
                 let is_right = found.receiver_id == format!("phone-{walker}");
                 *if is_right { &mut self.right } else { &mut self.wrong } += 1;
             }
@@ -186,7 +191,7 @@ async fn boxes_of_a_stream_are_matched_with_the_receivers_beside_them() {
 
 /// All samples of the camera.
 async fn exported_csv(server: &TestServer) -> String {
-    const ALL: &str = "/v1/cameras/yard/samples?limit=10000";
+    const ALL: &str = "/v1/cameras/yard/samples";
     server.send("GET", ALL, &[("accept", "text/csv")], "").await.expect(200).text()
 }
 

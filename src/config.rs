@@ -32,6 +32,11 @@ pub struct Config {
     pub database: Option<Secret>,
     /// What this process does of the work that all processes with one database share.
     pub role: NodeRole,
+    /// Address of this process for clients that others with the same database redirect here, such as
+    /// `https://node-1.example.org:8443`; by default that of `listen`, if it names one machine.
+    pub advertised_url: Option<String>,
+    /// Seconds after which the live streams of a silent process go to another one with the same database.
+    pub node_lease_s: u32,
     /// Address of the one port for REST and gRPC.
     pub listen: SocketAddr,
     /// Address of a second port, for probes and metrics alone, without keys and without TLS; none if left out.
@@ -95,6 +100,16 @@ impl NodeRole {
     #[must_use]
     pub const fn works_on_jobs(self) -> bool {
         matches!(self, Self::Both | Self::Train)
+    }
+
+    /// Its name in settings.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Both => "both",
+            Self::Serve => "serve",
+            Self::Train => "train",
+        }
     }
 
     /// Whether it answers clients.
@@ -292,6 +307,8 @@ impl Default for Config {
             data: PathBuf::from("data"),
             database: None,
             role: NodeRole::Both,
+            advertised_url: None,
+            node_lease_s: 4,
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             metrics_listen: None,
             allowed_hosts: Vec::new(),

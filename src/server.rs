@@ -28,7 +28,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tokio::net::TcpListener;
 
-use crate::app::{App, store_limits, store_location};
+use crate::app::{App, NodeSettings, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
 use crate::connect;
@@ -122,6 +122,7 @@ impl Server {
                 .with_context(|| format!("cannot listen on {address}, the setting metrics_listen"))
         });
         let monitoring = monitoring.transpose()?;
+        app.join(NodeSettings::of(&config, reachable_url(&listener, tls.is_some())?)).await?;
         Ok(Self { config, app, listener, monitoring, tls, proxies, shutdown: Shutdown::new() })
     }
 
@@ -179,7 +180,12 @@ impl Server {
             shutdown.spawn(connect::run(app.clone(), shutdown.clone()));
         }
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
-        let hosts = HostCheck::new(&config.allowed_hosts, &config.cors_origins, listener.local_addr()?);
+        shutdown.spawn(app.clone().keep_registered(shutdown.clone()));
+        let mut allowed_hosts = config.allowed_hosts.clone();
+        // Clients are redirected to this name.
+        let advertised = config.advertised_url.as_deref().and_then(|url| url.split_once("://"));
+        allowed_hosts.extend(advertised.map(|(_, host)| host.to_owned()));
+        let hosts = HostCheck::new(&allowed_hosts, &config.cors_origins, listener.local_addr()?);
         let cors = cors::layer(&config.cors_origins);
         let gate = ConnectionGate::new(&config.limits, proxies.clone());
         let pipeline = Arc::new(if config.role.answers_clients() {
@@ -207,6 +213,13 @@ impl Server {
         tracing::info!("shut down");
         Ok(())
     }
+}
+
+/// The address of a listener for clients; `None` where it is that of any machine.
+fn reachable_url(listener: &TcpListener, has_tls: bool) -> std::io::Result<Option<String>> {
+    let address = listener.local_addr()?;
+    let scheme = if has_tls { "https" } else { "http" };
+    Ok((!address.ip().is_unspecified()).then(|| format!("{scheme}://{address}")))
 }
 
 /// Stores the connections of the settings. Those that are not declared any more stay.

@@ -89,6 +89,12 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::Overloaded => (503, code::UNAVAILABLE, "The server has too much to do"),
         Kind::RateLimited => (429, code::RESOURCE_EXHAUSTED, "The client sends too many requests"),
         Kind::Timeout => (408, code::DEADLINE_EXCEEDED, "The request took too long"),
+        // UNAVAILABLE, which every client tries again: one that does not read the owner's address reaches the owner
+        // through a balancer in the end.
+        Kind::CameraOnOtherNode => (307, code::UNAVAILABLE, "Another node has the camera's live state"),
+        Kind::CameraBetweenNodes => {
+            (503, code::UNAVAILABLE, "The camera's live state is going from one node to another")
+        }
         Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
         Kind::Unauthenticated => (401, code::UNAUTHENTICATED, "The request needs a key that works"),
         Kind::PermissionDenied => (403, code::PERMISSION_DENIED, "The key may not do this"),
@@ -99,6 +105,7 @@ pub fn of(kind: ErrorKind) -> Status {
         }
         Kind::Internal => (500, code::INTERNAL, "The server failed"),
     };
-    let is_temporary = matches!(kind, Kind::Overloaded | Kind::RateLimited | Kind::ShuttingDown);
+    let is_temporary =
+        matches!(kind, Kind::Overloaded | Kind::RateLimited | Kind::ShuttingDown | Kind::CameraBetweenNodes);
     Status { http, grpc, slug: kind.as_str(), title, retry_after_s: is_temporary.then_some(1) }
 }

@@ -69,7 +69,4 @@ test('an evaluation that the page starts is stored, and shown again after a relo
   await expect(report.getByRole('img', { name: 'Cumulative share of errors by method' })).toBeVisible();
   await expect(report.getByRole('img', { name: /^Calibration/ })).toBeVisible();
   expect(await accessibilityFindings(page)).toEqual([]);
-
-  await page.getByRole('link', { name: 'Models', exact: true }).click();
-  await expect(page.getByRole('img', { name: /positions of homography\.denied around the truth/ })).toBeVisible();
 });

@@ -100,6 +100,28 @@ test('a run that fails says why', async ({ console: page, server }) => {
   await expect(run.locator('.notice.error')).toContainText(/repeat|same/);
 });
 
+test.describe('in German', () => {
+  test.use({ allowed: /status of 4(04|22)/ });
+
+  test('a refusal names its kind in German, and what the server words is marked as English', async ({ console: page, server }) => {
+    await page.evaluate(() => localStorage.setItem('sightfix.language', 'de'));
+    await page.goto(`${server.url}/#/cameras/nobody/scene`);
+    await page.reload();
+    const alert = page.getByRole('alert');
+    await expect(alert).toContainText('Diese Kamera gibt es nicht:');
+    await expect(alert.locator('[lang=en]')).toContainText('nobody');
+
+    await server.request('POST', '/v1/cameras', { id: 'gate' });
+    await server.request('POST', '/v1/cameras/gate/samples', simulate(2).csv, 'text/csv');
+    await server.train('gate', { recipe: 'projective', epochs: 10 });
+    await page.goto(`${server.url}/#/cameras/gate/training`);
+    const advice = page.getByRole('listitem').filter({ hasText: 'on another day' });
+    await expect(advice).toBeVisible();
+    expect(await advice.evaluate((item) => item.closest('[lang]')!.getAttribute('lang'))).toBe('en');
+    expect(await page.evaluate(() => document.documentElement.lang)).toBe('de');
+  });
+});
+
 test('a run is cancelled, and the next may start', async ({ console: page, server }) => {
   await server.request('POST', '/v1/cameras', { id: 'gate' });
   await server.request('POST', '/v1/cameras/gate/samples', simulate(2, [0, 0], 2000).csv, 'text/csv');

@@ -9,6 +9,8 @@ interface Fixtures {
   settings: Record<string, string>;
   /** Size of the disk that its data folder has for itself; none if empty. */
   disk: string;
+  /** Where the server listens; a free port if it is not named. */
+  listen: string;
   server: Server;
   /** Console errors that the test provokes on purpose. */
   allowed: RegExp;
@@ -19,8 +21,9 @@ export const test = base.extend<Fixtures>({
   settings: [{}, { option: true }],
   allowed: [/^$/, { option: true }],
   disk: ['', { option: true }],
-  server: async ({ settings, disk }, use) => {
-    const server = await Server.start(settings, disk);
+  listen: ['127.0.0.1:0', { option: true }],
+  server: async ({ settings, disk, listen }, use) => {
+    const server = await Server.start(settings, disk, listen);
     await use(server);
     await server.stop();
   },
@@ -58,6 +61,14 @@ async function serveFrom(page: Page, url: string, folder: string): Promise<void>
       return route.fulfill({ path: `${folder}${pathname === '/' ? '/index.html' : pathname === '/walk' ? '/walk.html' : pathname}` });
     },
   );
+  // Where a redirect leads is asked of the server itself; a page that goes on is routed.
+  await page.route('**/v1/session/openid**', async (route) => {
+    const response = await route.fetch({ maxRedirects: 0 });
+    const { location } = response.headers();
+    if (!location?.startsWith('/')) return route.fulfill({ response });
+    const { location: _, ...headers } = response.headers();
+    return route.fulfill({ status: 200, headers: { ...headers, 'content-type': 'text/html' }, body: `<script>location.replace('${location}')</script>` });
+  });
 }
 
 const axe = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8');

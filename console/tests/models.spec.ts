@@ -35,6 +35,33 @@ test('versions are activated, rolled back, downloaded, uploaded and deleted, and
   await expect(log.getByRole('row').nth(1)).toContainText('gate');
 });
 
+test('each version is shown beside GNSS, IMM-UKF and homography, from an evaluation that the page starts', async ({ console: page, server }) => {
+  await addCamera(server, 'gate', 'Gate', simulate(11, [0, 0], 300));
+  await server.train('gate', { recipe: 'hybrid', epochs: 20, seed: 1 });
+  await page.goto(`${server.url}/#/cameras/gate/models`);
+  const compared = page.locator('section', { has: page.getByRole('heading', { name: /against GNSS, IMM-UKF and homography$/ }) });
+  const report = async (recipe: string): Promise<void> => {
+    await compared.getByRole('button', { name: `Evaluate ${recipe}` }).click();
+    await expect(compared.getByRole('row')).toHaveCount(5, { timeout: 300_000 });
+    for (const method of ['gnss', 'imm_ukf', 'homography.denied', `${recipe}.two_step`]) await expect(compared.getByRole('img', { name: new RegExp(`positions of ${method.replace('.', '\\.')} around the truth$`) })).toBeVisible();
+    await expect(compared.getByRole('img', { name: 'Cumulative share of errors by method' })).toBeVisible();
+    await expect(compared.getByRole('img', { name: /^Calibration/ })).toBeVisible();
+  };
+  await page.getByRole('button', { name: 'v1', exact: true }).click();
+  await expect(compared.getByRole('heading', { name: 'Version 1 against' })).toBeVisible();
+  await expect(compared).toContainText('cannot be judged on the samples that it has learnt from');
+  await report('projective');
+  await expect(compared).toContainText('the recipe of version 1 (projective), fitted to the earlier samples alone');
+
+  // The other version has its own.
+  await page.getByRole('button', { name: 'v2', exact: true }).click();
+  await expect(compared.getByRole('heading', { name: 'Version 2 against' })).toBeVisible();
+  await expect(compared.getByRole('row')).toHaveCount(0);
+  await report('hybrid');
+  await page.getByRole('button', { name: 'v1', exact: true }).click();
+  await expect(compared.getByRole('img', { name: /positions of projective\.two_step/ })).toBeVisible();
+});
+
 test('two runs are compared, and their reports are in words', async ({ console: page, server }) => {
   await addCamera(server, 'gate', 'Gate', simulate(10, [0, 0], 300));
   await page.goto(`${server.url}/#/cameras/gate/training`);

@@ -20,13 +20,13 @@ export class Server {
   }
 
   /** `disk` is the size of a disk of its own for the data folder, such as `24m`; mounting it needs the superuser. */
-  static async start(settings: Record<string, string> = {}, disk = ''): Promise<Server> {
+  static async start(settings: Record<string, string> = {}, disk = '', listen = '127.0.0.1:0'): Promise<Server> {
     const server = new Server(settings);
     if (disk) {
       execFileSync('mount', ['-t', 'tmpfs', '-o', `size=${disk}`, 'tmpfs', server.#folder]);
       server.#hasDisk = true;
     }
-    await server.run('127.0.0.1:0');
+    await server.run(listen);
     return server;
   }
 

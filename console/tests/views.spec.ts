@@ -29,7 +29,9 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
   ['evaluation', '#/cameras/north-gate/evaluation', (page) => expect(page.locator('table').first()).toBeVisible()],
   ['try-it', '#/cameras/north-gate/try', (page) => expect(page.locator('.weights')).toBeVisible()],
   ['profile', '#/cameras/north-gate/profile', (page) => expect(page.getByText('north-gate').first()).toBeVisible()],
+  ['site', '#/sites/old-town', (page) => expect(page.locator('.targets tbody tr').first()).toBeVisible({ timeout: 60_000 })],
   ['settings', '#/settings/health', (page) => expect(page.getByText('/metrics')).toBeVisible()],
+  ['connections', '#/settings/connections', (page) => expect(page.getByRole('article')).toHaveCount(3)],
   ['keys', '#/settings/keys', (page) => expect(page.locator('main .panel')).toBeVisible()],
   ['audit', '#/settings/audit', (page) => expect(page.locator('main tbody tr').first()).toBeVisible()],
   ['limits', '#/settings/limits', (page) => expect(page.getByText('page_items')).toBeVisible()],
@@ -56,8 +58,21 @@ async function buildTown(server: Server): Promise<Town> {
     methods: ['gnss', 'imm_ukf', 'homography.denied', ...(PICTURES ? ['projective.two_step'] : [])],
   });
   await expect.poll(async () => (await server.request<{ state: string }>('GET', `/v1/evaluations/${id}`)).state, { timeout: 600_000 }).toBe('succeeded');
+  await connect(server);
+  await server.request('POST', '/v1/sites', { id: 'old-town', display_name: 'Old town' });
+  for (const [camera] of town.slice(0, 3)) await server.request('PATCH', `/v1/cameras/${camera}`, { site: 'old-town' }, 'application/merge-patch+json', { 'if-match': '*' });
   const stops = town.slice(0, 3).map(([camera], at) => walk(server, camera, worlds[at]!.live));
   return { world: worlds[0]!, stop: () => stops.forEach((stop) => stop()) };
+}
+
+/** A source that has taken a message, one whose peer is away, and a sink. */
+async function connect(server: Server): Promise<void> {
+  const create = (id: string, display_name: string, settings: object): Promise<unknown> => server.request('POST', '/v1/connections', { id, display_name, ...settings });
+  await create('entrance', 'Frigate at the entrance', { source: { address: 'push:', format: 'frigate', cameras: { front_door: { camera_id: 'car-park' } } } });
+  const after = { id: '1607123955.475377-mxklsc', camera: 'front_door', frame_time: Date.now() / 1000, label: 'person', false_positive: false, score: 0.88, box: [432, 296, 544, 500] };
+  await server.request('POST', '/v1/connections/entrance/messages', { type: 'new', after });
+  await create('patrol-boat', 'Patrol boat', { source: { address: 'tcp://127.0.0.1:9', format: 'nmea', camera_ids: ['north-gate'], receiver_id: 'boat' } });
+  await create('dispatch', 'Positions for dispatch', { sink: { address: 'udp://127.0.0.1:6969', format: 'cot', camera_ids: ['north-gate'] } });
 }
 
 /** A still image behind the foot points of the camera that is looked at. */
@@ -86,7 +101,7 @@ test('every view is accessible, fits and can be shown', async ({ console: page, 
   for (const theme of ['dark', 'light'] as const) {
     await page.emulateMedia({ colorScheme: theme, reducedMotion: 'reduce' });
     for (const [name, path, ready] of VIEWS) {
-      const isLong = PICTURES && /^(evaluation|models)$/.test(name);
+      const isLong = PICTURES && /^(evaluation|models|connections)$/.test(name);
       await page.setViewportSize(name === 'walk' ? { width: 390, height: 844 } : { width: 1440, height: isLong ? 1300 : 900 });
       await look(page, server, path, ready, theme);
       expect.soft(await accessibilityFindings(page), `${name}, ${theme}`).toEqual([]);

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::recording::Recording;
 use crate::domain::{
-    Association, ClockOffset, Error, ErrorKind, ImageSize, ReceiverId, Receivers, Result, TargetId,
+    Association, ClockOffset, Error, ErrorKind, ImageSize, ReceiverId, Receivers, Result, TargetId, TrackerId,
 };
 use crate::fusion::association::{
     MatchSettings, Matching, WorldScores, match_with_model, match_without_model,
@@ -193,7 +193,7 @@ impl Recording {
             self.fixes.iter().filter_map(|fix| fix.receiver_id.clone()).map(TargetId::from).collect();
         for (own, is_sure) in self.detections.iter_mut().zip(is_sure) {
             if !is_sure && receivers.contains(&own.target_id) {
-                own.target_id = TargetId::new(&format!("tracker {}", own.target_id))?;
+                own.target_id = TargetId::from(&TrackerId::new(own.target_id.as_str())?);
             }
         }
         Ok(associations)

@@ -9,6 +9,7 @@ pub mod access;
 mod audit;
 mod camera_statuses;
 mod cameras;
+mod cluster;
 mod connections;
 mod evaluations;
 mod fusion;
@@ -42,6 +43,7 @@ use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
+pub use cluster::{CameraLease, Cluster, NodeSettings, NodeStatus, Watch};
 pub use connections::{
     ConnectionBoard, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage, LiveConnection,
     PushedMessage, connection_settings,
@@ -101,8 +103,12 @@ pub struct Parts {
     pub training_queue: JobQueue,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
+    /// Which nodes there are, and what this one owns.
+    cluster: Cluster,
     /// Open live streams.
     stream_slots: live::StreamSlots,
+    /// Rounds of live matching.
+    matching_slot: live::MatchingSlot,
     /// The way to the drift detectors.
     residuals: live::ResidualQueue,
     /// When moved cameras are trained again.
@@ -156,7 +162,9 @@ impl App {
             pairings,
             training_queue: JobQueue::default(),
             evaluation_queue: JobQueue::default(),
+            cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),
+            matching_slot: live::MatchingSlot::default(),
             residuals,
             retraining: live::RetrainSchedule::default(),
             tasks: TaskTracker::new(),

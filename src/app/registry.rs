@@ -19,7 +19,12 @@ use crate::exchange::RowRules;
 use crate::model::{Artifact, Regressor, ViewArea};
 use crate::store::Store;
 
+/// Cameras that a refresh loads before it shows them: every change copies the map, so that one at a time would cost the
+/// square of their number at the start of a server.
+const LOADED_BEFORE_SHOWN: usize = 512;
+
 /// Everything that answers for one camera.
+#[derive(Clone)]
 pub struct ActiveCamera {
     /// The camera's id.
     pub id: CameraId,
@@ -146,28 +151,46 @@ impl Registry {
         for deleted in known.values().filter(|camera| keys.get(&camera.id) != Some(&camera.key)) {
             self.remove(&deleted.id);
         }
-        for (id, key, revision, active) in &versions {
-            let is_current = known.get(id).is_some_and(|camera| {
+        let is_current = |(id, key, revision, active): &&(CameraId, CameraKey, Revision, Option<u32>)| {
+            known.get(id).is_some_and(|camera| {
                 let version = camera.model.as_ref().map(|(_, version)| *version);
                 (camera.key, camera.revision, version) == (*key, *revision, *active)
-            });
-            if is_current {
-                continue;
+            })
+        };
+        let changed: Vec<_> = versions.iter().filter(|version| !is_current(version)).collect();
+        for group in changed.chunks(LOADED_BEFORE_SHOWN) {
+            let mut loaded = Vec::with_capacity(group.len());
+            for (id, ..) in group {
+                loaded.push((id, self.read(store, id).await));
             }
-            let loaded = match store.camera(id).await {
-                Ok(camera) => self.load(store, camera).await,
-                Err(error) => Err(error),
-            };
-            match loaded {
-                Ok(camera) => self.replace(|cameras| cameras.insert(id.clone(), camera.clone())),
-                Err(error) if error.kind() == ErrorKind::CameraNotFound => self.remove(id),
-                Err(error) => {
-                    tracing::error!(camera.id = %id, %error, "cannot read the camera");
-                    self.replace(|cameras| cameras.remove(id));
+            self.replace(|cameras| {
+                for (id, camera) in &loaded {
+                    match camera {
+                        Some(camera) => cameras.insert((*id).clone(), camera.clone()),
+                        None => cameras.remove(*id),
+                    };
                 }
-            }
+            });
         }
         Ok(())
+    }
+
+    /// A camera as it is stored; `None` if it has been deleted, which ends what listens to it, or cannot be read.
+    async fn read(&self, store: &Store, id: &CameraId) -> Option<Arc<ActiveCamera>> {
+        let loaded = match store.camera(id).await {
+            Ok(camera) => self.load(store, camera).await,
+            Err(error) => Err(error),
+        };
+        match loaded {
+            Ok(camera) => return Some(camera),
+            Err(error) if error.kind() == ErrorKind::CameraNotFound => {
+                if let Some(deleted) = self.get(id) {
+                    deleted.live.end();
+                }
+            }
+            Err(error) => tracing::error!(camera.id = %id, %error, "cannot read the camera"),
+        }
+        None
     }
 
     /// The cameras whose active model cannot be used, by id.
@@ -179,6 +202,23 @@ impl Registry {
         let mut faults: Vec<_> = faults.collect();
         faults.sort_by(|one, other| one.0.as_str().cmp(other.0.as_str()));
         faults
+    }
+
+    /// Prepares a camera's live state for changes under a fence; whether it begins anew, since another node may have had
+    /// it in between.
+    pub(super) async fn begin_tenure(&self, id: &CameraId, key: CameraKey, fence: i64) -> bool {
+        let _change = self.change.lock().await;
+        let Some(known) = self.get(id).filter(|known| known.key == key) else { return false };
+        if known.live.continue_under(fence) {
+            return false;
+        }
+        known.live.replace();
+        let tenure = fence.cast_unsigned().rotate_right(16);
+        let live = CameraLive::new(self.event_log(key).wrapping_add(tenure));
+        live.continue_under(fence);
+        let anew = Arc::new(ActiveCamera { live, ..ActiveCamera::clone(&known) });
+        self.replace(|cameras| cameras.insert(id.clone(), anew.clone()));
+        true
     }
 
     /// Removes a deleted camera and ends what listens to it. Waits for a refresh under way, which may

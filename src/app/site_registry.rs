@@ -14,7 +14,7 @@ use crate::store::Store;
 /// A site that exists.
 pub struct ActiveSite {
     /// Which one of those that had this id.
-    key: SiteKey,
+    pub(super) key: SiteKey,
     /// Revision of the profile that this was made from.
     revision: Revision,
     /// Its tracks and events; the same as long as the site exists.
@@ -82,6 +82,15 @@ impl SiteRegistry {
             }
         }
         Ok(())
+    }
+
+    /// Begins a site's tracks and events anew, since another node had its cameras in between.
+    ///
+    /// # Errors
+    /// As [`SiteRegistry::refresh_site`].
+    pub(super) async fn begin_anew(&self, store: &Store, id: &SiteId) -> Result<()> {
+        self.forget_site(id).await;
+        self.refresh_site(store, id).await.map(drop)
     }
 
     /// Removes a deleted site and ends what listens to it.

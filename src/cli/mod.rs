@@ -17,6 +17,7 @@ mod health;
 mod import;
 mod keys;
 mod layout;
+mod migrate;
 mod models;
 mod openapi;
 mod output;
@@ -98,6 +99,8 @@ enum Command {
     Restore(restore::Restore),
     /// Copy everything from a data folder or database into another one, and compare
     Copy(copy::Copy),
+    /// Bring the schema of the database up to date, before servers of a new version start
+    Migrate(migrate::Migrate),
     /// Check folder, database, models, clock, port and system, and say what to do
     Doctor(doctor::Doctor),
     /// Check whether a server is alive
@@ -143,6 +146,7 @@ impl Cli {
             Command::Backup(command) => command.run(file),
             Command::Restore(command) => command.run(file),
             Command::Copy(command) => command.run(),
+            Command::Migrate(command) => command.run(file),
             Command::Doctor(command) => command.run(file),
             Command::Health(command) => command.run(file),
             Command::Config(command) => command.run(file),

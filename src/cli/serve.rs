@@ -22,6 +22,10 @@ pub(super) struct Serve {
     /// Address and port [env: SIGHTFIX_LISTEN] [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDR")]
     listen: Option<SocketAddr>,
+    /// Address of this process for clients that others with the same database redirect here
+    /// [env: SIGHTFIX_ADVERTISED_URL]
+    #[arg(long, value_name = "URL")]
+    advertise: Option<String>,
     /// Fill an empty data folder with a small simulated camera, train it, and print requests to try
     #[arg(long)]
     demo: bool,
@@ -48,6 +52,7 @@ impl Serve {
     pub(super) fn run(self, file: Option<&Path>) -> anyhow::Result<()> {
         let overrides = Overrides {
             listen: self.listen,
+            advertised_url: self.advertise,
             insecure: self.insecure,
             admin_key_file: self.admin_key_file,
             tls_certificate: self.tls_cert,

@@ -18,6 +18,8 @@ pub struct Overrides {
     pub database: Option<Secret>,
     /// `--listen`
     pub listen: Option<SocketAddr>,
+    /// `--advertise`
+    pub advertised_url: Option<String>,
     /// `--insecure`
     pub insecure: bool,
     /// `--admin-key-file`
@@ -72,6 +74,9 @@ impl Config {
         if let Some(listen) = overrides.listen {
             loaded.listen = listen;
         }
+        if overrides.advertised_url.is_some() {
+            loaded.advertised_url = overrides.advertised_url;
+        }
         for (setting, flag) in [
             (&mut loaded.admin_key_file, overrides.admin_key_file),
             (&mut loaded.tls.certificate, overrides.tls_certificate),
@@ -108,6 +113,13 @@ impl Config {
             self.role == NodeRole::Both || self.database.is_some(),
             "role = \"serve\" and role = \"train\" need the setting database: a data folder has one server"
         );
+        anyhow::ensure!(self.node_lease_s >= 2, "node_lease_s must be at least 2");
+        if let Some(url) = &self.advertised_url {
+            anyhow::ensure!(
+                url_origin(url) == Some(url.as_str()),
+                "advertised_url must be like https://node-1.example.org:8443, without a path; `{url}` is not"
+            );
+        }
         self.tls.certificate_and_key()?;
         self.tls.client_scope()?;
         self.openid.check()?;

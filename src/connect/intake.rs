@@ -268,6 +268,7 @@ impl LiveSource {
                     time: detection.time,
                     target_id: Some(detection.target_id),
                     receiver_id: None,
+                    tracker_id: None,
                     bounding_box: Some(bounding_box),
                     fix: None,
                     class: detection.class,
@@ -277,6 +278,7 @@ impl LiveSource {
             Self::Fix(fix, receiver_id) => LiveItem {
                 time: fix.time,
                 target_id: None,
+                tracker_id: None,
                 receiver_id: Some(receiver_id),
                 bounding_box: None,
                 fix: Some(fix.fix),

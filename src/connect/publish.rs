@@ -160,7 +160,7 @@ async fn read_camera(
     live: Arc<LiveConnection>,
 ) {
     loop {
-        if let Ok(mut events) = app.camera_events(&camera, None).await {
+        if let Ok(mut events) = app.own_camera_events(&camera).await {
             while let Some(event) = events.next().await {
                 match event {
                     Ok((_, event)) => {

@@ -95,6 +95,10 @@ pub enum ErrorKind {
     RateLimited,
     /// The request took longer than it may.
     Timeout,
+    /// Another node has the camera's live state.
+    CameraOnOtherNode,
+    /// No node that can be named has the camera's live state for sure.
+    CameraBetweenNodes,
     /// The server is ending.
     ShuttingDown,
     /// No key was presented, or one that does not work.
@@ -156,7 +160,7 @@ pub fn convert_all<T, R>(
     }
     let message = format!("nothing was done, for the {list} at fault");
     let kind = ErrorKind::InvalidArgument;
-    Err(Error::Refused(Refusal { kind, message, violations, conflicting_id: None }))
+    Err(Error::Refused(Refusal { kind, message, violations, conflicting_id: None, other_node: None }))
 }
 
 /// One invalid field.
@@ -189,6 +193,8 @@ pub struct Refusal {
     pub violations: Vec<Violation>,
     /// Id of what stands in the way, for a conflict with something that the caller can look at.
     pub conflicting_id: Option<String>,
+    /// Address of the node that would answer, such as `https://node-1.example.org:8443`.
+    pub other_node: Option<String>,
 }
 
 impl fmt::Display for Refusal {
@@ -239,9 +245,26 @@ pub enum Error {
 }
 
 impl Error {
+    /// A refusal of a request that another node answers.
+    pub fn on_other_node(message: impl Into<String>, url: impl Into<String>) -> Self {
+        Self::Refused(Refusal {
+            kind: ErrorKind::CameraOnOtherNode,
+            message: message.into(),
+            violations: Vec::new(),
+            conflicting_id: None,
+            other_node: Some(url.into()),
+        })
+    }
+
     /// A refusal without a field.
     pub fn refused(kind: ErrorKind, message: impl Into<String>) -> Self {
-        Self::Refused(Refusal { kind, message: message.into(), violations: Vec::new(), conflicting_id: None })
+        Self::Refused(Refusal {
+            kind,
+            message: message.into(),
+            violations: Vec::new(),
+            conflicting_id: None,
+            other_node: None,
+        })
     }
 
     /// An invalid field.
@@ -257,6 +280,7 @@ impl Error {
             message: violation.message.clone(),
             violations: vec![violation],
             conflicting_id: None,
+            other_node: None,
         })
     }
 
@@ -267,6 +291,7 @@ impl Error {
             message: message.into(),
             violations: Vec::new(),
             conflicting_id: Some(id.into()),
+            other_node: None,
         })
     }
 
@@ -286,7 +311,7 @@ impl Error {
             return Ok(());
         }
         let (kind, message) = (ErrorKind::InvalidArgument, message.to_owned());
-        Err(Self::Refused(Refusal { kind, message, violations, conflicting_id: None }))
+        Err(Self::Refused(Refusal { kind, message, violations, conflicting_id: None, other_node: None }))
     }
 
     /// The kind that `status.rs` maps.

@@ -23,6 +23,7 @@ mod live_id;
 mod method;
 mod model_format;
 mod names;
+mod node;
 mod noise;
 mod observation;
 mod on_conflict;
@@ -51,10 +52,11 @@ pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
 pub use model_format::ModelFormat;
 pub use names::{
-    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, check_labels, check_text,
+    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels, check_text,
 };
+pub use node::{Node, NodeId, NodeProfile};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation};
-pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation};
+pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;

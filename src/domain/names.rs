@@ -71,18 +71,21 @@ fn check_slug(id: &str) -> Result<()> {
     }
 }
 
-/// A newtype for printable, trimmed text of 1 to 128 bytes.
+/// Before the id of a tracker in that of its target.
+const TRACKER_PREFIX: &str = "tracker:";
+
+/// A newtype for printable, trimmed text of limited length.
 macro_rules! name {
-    ($(#[$doc:meta])* $name:ident, $field:literal) => {
+    ($(#[$doc:meta])* $name:ident, $field:literal, $max_bytes:expr) => {
         $(#[$doc])*
         #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
         pub struct $name(Arc<str>);
 
         impl $name {
             /// # Errors
-            /// Refuses text that is empty, longer than 128 bytes, padded, or contains control characters.
+            /// Refuses text that is empty, too long, padded, or contains control characters.
             pub fn new(text: &str) -> Result<Self> {
-                check_text($field, text, MAX_NAME_BYTES)?;
+                check_text($field, text, $max_bytes)?;
                 Ok(Self(text.into()))
             }
 
@@ -102,25 +105,41 @@ macro_rules! name {
 }
 
 name!(
-    /// Id of a target, chosen by the detector or the receiver.
+    /// Id of a target, chosen by the detector or the receiver. 1 to 128 bytes.
     TargetId,
-    "target_id"
+    "target_id",
+    MAX_NAME_BYTES
 );
 name!(
-    /// Id of a GNSS receiver, chosen by the operator or the receiver.
+    /// Id of a GNSS receiver, chosen by the operator or the receiver. 1 to 128 bytes.
     ReceiverId,
-    "receiver_id"
+    "receiver_id",
+    MAX_NAME_BYTES
 );
 name!(
-    /// Class of a target: `person`, `car`, `aircraft`.
+    /// Number that a camera's tracker gave the boxes of one target. 1 to 120 bytes.
+    TrackerId,
+    "tracker_id",
+    MAX_NAME_BYTES - TRACKER_PREFIX.len()
+);
+name!(
+    /// Class of a target: `person`, `car`, `aircraft`. 1 to 128 bytes.
     TargetClass,
-    "class"
+    "class",
+    MAX_NAME_BYTES
 );
 
 /// A receiver that is not mapped to a target has its own id as target id.
 impl From<ReceiverId> for TargetId {
     fn from(receiver_id: ReceiverId) -> Self {
         Self(receiver_id.0)
+    }
+}
+
+/// A box whose target is not known has a target of its own, which no receiver's fixes are taken for.
+impl From<&TrackerId> for TargetId {
+    fn from(tracker_id: &TrackerId) -> Self {
+        Self(format!("{TRACKER_PREFIX}{tracker_id}").into())
     }
 }
 

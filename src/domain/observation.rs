@@ -6,7 +6,7 @@ use strum::IntoStaticStr;
 use super::bounding_box::BoundingBox;
 use super::error::{Error, Result};
 use super::gnss_error::SigmaM;
-use super::names::{ReceiverId, TargetClass, TargetId};
+use super::names::{ReceiverId, TargetClass, TargetId, TrackerId};
 use super::score::Score;
 use crate::geo::{PlaneCovariance, Position};
 
@@ -41,6 +41,8 @@ pub struct LiveItem {
     pub time: Timestamp,
     /// The target, if known.
     pub target_id: Option<TargetId>,
+    /// Number that the camera's tracker gave a box whose target is not known.
+    pub tracker_id: Option<TrackerId>,
     /// The receiver of a fix that does not name its target.
     pub receiver_id: Option<ReceiverId>,
     /// The detection.
@@ -58,8 +60,18 @@ pub struct LiveItem {
 pub struct Observation {
     time: Timestamp,
     target_id: Option<TargetId>,
+    tracker_id: Option<TrackerId>,
     bounding_box: Option<BoundingBox>,
     fix: Option<Fix>,
+}
+
+/// The receiver that the target of a box carries, by association.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReceiverMatch {
+    /// The receiver.
+    pub receiver_id: ReceiverId,
+    /// Posterior probability.
+    pub probability: f64,
 }
 
 impl Observation {
@@ -74,7 +86,27 @@ impl Observation {
         if bounding_box.is_none() && fix.is_none() {
             return Err(Error::invalid("bounding_box", "give a bounding_box, a fix, or both"));
         }
-        Ok(Self { time, target_id, bounding_box, fix })
+        Ok(Self { time, target_id, tracker_id: None, bounding_box, fix })
+    }
+
+    /// Of a box that has only the number of its camera's tracker.
+    ///
+    /// # Errors
+    /// Names `tracker_id` beside a target or a fix, whose target would be known.
+    pub fn with_tracker_id(self, tracker_id: Option<TrackerId>) -> Result<Self> {
+        if tracker_id.is_some() && (self.target_id.is_some() || self.fix.is_some()) {
+            return Err(Error::invalid(
+                "tracker_id",
+                "belongs to a box without a target, a receiver and a fix",
+            ));
+        }
+        Ok(Self { tracker_id, ..self })
+    }
+
+    /// The same of a known target.
+    #[must_use]
+    pub fn with_target(self, target_id: TargetId) -> Self {
+        Self { target_id: Some(target_id), ..self }
     }
 
     /// Of a fix, with or without a box.
@@ -85,7 +117,7 @@ impl Observation {
         bounding_box: Option<BoundingBox>,
         fix: Fix,
     ) -> Self {
-        Self { time, target_id, bounding_box, fix: Some(fix) }
+        Self { time, target_id, tracker_id: None, bounding_box, fix: Some(fix) }
     }
 
     /// Time of the measurement.
@@ -98,6 +130,12 @@ impl Observation {
     #[must_use]
     pub const fn target_id(&self) -> Option<&TargetId> {
         self.target_id.as_ref()
+    }
+
+    /// Number that the camera's tracker gave a box whose target was not known.
+    #[must_use]
+    pub const fn tracker_id(&self) -> Option<&TrackerId> {
+        self.tracker_id.as_ref()
     }
 
     /// The detection.

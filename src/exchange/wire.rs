@@ -228,6 +228,12 @@ pub struct Observation<'a> {
     #[serde(borrow, default)]
     #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "phone-1")]
     pub receiver_id: Option<Text<'a>>,
+    /// Number that the camera's tracker gave a box whose target is not known; instead of `target_id` and `receiver_id`.
+    /// Where targets are followed, the box is matched with the receivers whose fixes come at the same time; until that
+    /// is sure, its target is `tracker:` and this number.
+    #[serde(borrow, default)]
+    #[schema(value_type = Option<String>, min_length = 1, max_length = 120, example = "17")]
+    pub tracker_id: Option<Text<'a>>,
     /// The detection.
     #[serde(default)]
     pub bounding_box: Option<BoundingBox>,
@@ -261,7 +267,8 @@ impl Observation<'_> {
             target_id,
             self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
             self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
-        )
+        )?
+        .with_tracker_id(self.tracker_id.as_ref().map(|id| domain::TrackerId::new(id.as_str())).transpose()?)
     }
 }
 

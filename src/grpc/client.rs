@@ -195,6 +195,7 @@ impl SendPermit<'_> {
             time: Some(timestamp(item.time)),
             target_id: item.target_id.map(|id| id.as_str().to_owned()),
             receiver_id: item.receiver_id.map(|id| id.as_str().to_owned()),
+            tracker_id: item.tracker_id.map(|id| id.as_str().to_owned()),
             bounding_box: item.bounding_box.map(Into::into),
             fix: item.fix.map(Into::into),
             class: item.class.map(|class| class.as_str().to_owned()),

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use super::proto;
 use crate::domain::{
     self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Score,
-    SiteId, StoredSample, TargetClass, TargetId, TimeRange,
+    SiteId, StoredSample, TargetClass, TargetId, TimeRange, TrackerId,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -193,6 +193,7 @@ pub(super) fn live_item(item: proto::StreamItem, rules: &RowRules) -> Result<Liv
     Ok(LiveItem {
         time: checked_time(item.time, rules)?,
         target_id: target_id(item.target_id.as_deref())?,
+        tracker_id: item.tracker_id.as_deref().map(TrackerId::new).transpose()?,
         receiver_id: item.receiver_id.as_deref().map(ReceiverId::new).transpose()?,
         bounding_box: item.bounding_box.map(|sides| bounding_box(sides, rules)).transpose()?,
         fix: item.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,

@@ -76,13 +76,17 @@ pub(super) fn client_id(extensions: &Extensions) -> ClientId {
     extensions.get().copied().unwrap_or(ClientId::UNKNOWN)
 }
 
-/// An error with its code and details: `ErrorInfo` with the problem's slug as reason, `RequestInfo`,
+/// An error with its code and details: `ErrorInfo` with the problem's slug as reason (and as `owner` in its metadata the
+/// address of the node to ask instead), `RequestInfo`,
 /// `RetryInfo` where a later try may succeed, and `BadRequest` where fields are at fault. A fault is logged here and nothing of it is shown.
 pub(super) fn to_status(error: &Error, id: &RequestId) -> Status {
     let row = status::of(error.kind());
     let mut metadata = HashMap::new();
     if let Error::Refused(Refusal { conflicting_id: Some(id), .. }) = error {
         metadata.insert("conflicting_id".to_owned(), id.clone());
+    }
+    if let Error::Refused(Refusal { other_node: Some(url), .. }) = error {
+        metadata.insert("owner".to_owned(), url.clone());
     }
     let mut details = ErrorDetails::with_error_info(row.slug, DOMAIN, metadata);
     details.set_request_info(id.as_str(), "");

@@ -96,7 +96,7 @@ impl StreamSession {
         }
         let settled = tokio::select! {
             settled = stream.settle() => settled,
-            error = stream.deleted() => Err(error),
+            error = stream.ended() => Err(error),
             () = self.shutdown.forced() => Err(ending()),
         };
         // What is settled is acknowledged even where the rest could not be.
@@ -149,7 +149,7 @@ impl StreamSession {
         loop {
             tokio::select! {
                 biased;
-                error = stream.deleted() => return Err(error),
+                error = stream.ended() => return Err(error),
                 () = self.shutdown.draining(), if clock.reconnect_sent_at.is_none() => {
                     self.outbox.reconnect("the server is ending; reconnect to continue the stream");
                     clock.reconnect_sent_at = Some(Instant::now());
@@ -262,7 +262,7 @@ impl StreamSession {
         };
         match answered {
             Ok(item) => Ok(answer_of(seq, item)),
-            Err(Error::Refused(refusal)) if refusal.kind != ErrorKind::CameraNotFound => {
+            Err(Error::Refused(refusal)) if !ends_stream(refusal.kind) => {
                 // What was recorded before the refusal is acknowledged with its commit.
                 stream.acknowledgement()?;
                 stream.ack_refused(seq);
@@ -271,6 +271,11 @@ impl StreamSession {
             Err(error) => Err(error),
         }
     }
+}
+
+/// Whether a refusal is of the whole stream, not of an item.
+const fn ends_stream(kind: ErrorKind) -> bool {
+    matches!(kind, ErrorKind::CameraNotFound | ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }
 
 fn ending() -> Error {
@@ -292,6 +297,10 @@ fn answer_of(seq: u64, item: ItemResult) -> proto::StreamAnswer {
         flags,
         lost_answers: 0,
         world_track_id: item.world_track.map(|id| id.to_string()),
+        receiver_match: item.receiver_match.map(|own| proto::ReceiverMatch {
+            receiver_id: own.receiver_id.as_str().to_owned(),
+            probability: own.probability,
+        }),
     }
 }
 
@@ -324,6 +333,7 @@ impl From<NotStored> for proto::NotStored {
             NotStoredReason::Unpaired => Reason::Unpaired,
             NotStoredReason::TooLate => Reason::TooLate,
             NotStoredReason::Duplicate => Reason::Duplicate,
+            NotStoredReason::Unmatched => Reason::Unmatched,
         };
         Self { reason: reason.into(), count: not_stored.count, last_seq: not_stored.last_seq }
     }

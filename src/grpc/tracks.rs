@@ -88,7 +88,7 @@ fn events(source: CameraEvents, camera: CameraId, lease: Lease, shutdown: Shutdo
             let next = tokio::select! {
                 biased;
                 () = shutdown.draining() => Err(ending()),
-                next = source.next() => next.ok_or_else(|| deleted(&camera)),
+                next = source.next() => next.ok_or_else(|| ended(&source, &camera)),
             };
             Some(match next {
                 Ok(Ok((id, event))) => (Ok(response(id, (&*event).into())), Some((source, lease))),
@@ -107,7 +107,11 @@ fn response(id: EventId, event: Event) -> proto::WatchCameraResponse {
     proto::WatchCameraResponse { event_id: id.to_string(), event: Some(event) }
 }
 
-fn deleted(camera: &CameraId) -> Error {
+fn ended(source: &CameraEvents, camera: &CameraId) -> Error {
+    if source.continue_elsewhere() {
+        let message = format!("camera {camera} has gone to another node; watch it again");
+        return Error::refused(ErrorKind::CameraBetweenNodes, message);
+    }
     Error::refused(ErrorKind::CameraNotFound, format!("camera {camera} was deleted"))
 }
 

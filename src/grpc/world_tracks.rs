@@ -54,7 +54,7 @@ pub(super) fn events(
             let next = tokio::select! {
                 biased;
                 () = shutdown.draining() => Err(ending()),
-                next = source.next() => next.ok_or_else(|| deleted(&site)),
+                next = source.next() => next.ok_or_else(|| ended(&source, &site)),
             };
             Some(match next {
                 Ok(Ok(event)) => (Ok(event.into()), Some((source, lease))),
@@ -66,7 +66,11 @@ pub(super) fn events(
     .boxed()
 }
 
-fn deleted(site: &SiteId) -> Error {
+fn ended(source: &SiteEvents, site: &SiteId) -> Error {
+    if source.continue_elsewhere() {
+        let message = format!("site {site} has gone to another node; watch it again");
+        return Error::refused(ErrorKind::CameraBetweenNodes, message);
+    }
     Error::refused(ErrorKind::SiteNotFound, format!("site {site} was deleted"))
 }
 

@@ -40,6 +40,8 @@ pub(super) struct Request<'a> {
     target_id: Option<wire::Text<'a>>,
     #[serde(borrow)]
     receiver_id: Option<wire::Text<'a>>,
+    #[serde(borrow)]
+    tracker_id: Option<wire::Text<'a>>,
     bounding_box: Option<wire::BoundingBox>,
     fix: Option<wire::Fix>,
 }
@@ -154,6 +156,7 @@ pub(super) fn observations(
             time: request.time.clone().ok_or_else(|| Error::invalid("time", "is required"))?,
             target_id: request.target_id.clone(),
             receiver_id: request.receiver_id.clone(),
+            tracker_id: request.tracker_id.clone(),
             bounding_box: request.bounding_box,
             fix: request.fix,
         };
@@ -163,6 +166,7 @@ pub(super) fn observations(
         ("time", request.time.is_some()),
         ("target_id", request.target_id.is_some()),
         ("receiver_id", request.receiver_id.is_some()),
+        ("tracker_id", request.tracker_id.is_some()),
         ("bounding_box", request.bounding_box.is_some()),
         ("fix", request.fix.is_some()),
     ];

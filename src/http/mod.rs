@@ -29,6 +29,7 @@ mod keys;
 mod merge_patch;
 mod models;
 mod moving_features;
+mod nodes;
 mod openid;
 mod pairings;
 mod parts;
@@ -229,6 +230,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(audit::routes())
         .merge(session::routes())
         .merge(openid::routes())
+        .merge(nodes::routes())
         .merge(server_info::routes())
         .merge(tiles::routes())
         .merge(service::routes());

@@ -3,7 +3,7 @@
 use axum::Router;
 use axum::response::Response;
 use axum::routing::get;
-use hyper::header::{CACHE_CONTROL, LOCATION, SET_COOKIE};
+use hyper::header::{ACCEPT, CACHE_CONTROL, LOCATION, SET_COOKIE};
 use hyper::http::HeaderValue;
 use hyper::{HeaderMap, StatusCode, Uri};
 use serde::Serialize;
@@ -16,6 +16,7 @@ use super::access::CallerApp;
 use super::problem::{ApiResult, Problem};
 use super::session::{cookie, with_cookie};
 use super::wire::{empty, json};
+use crate::app::App;
 use crate::app::access::SESSION_TIME;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::openid::{Provider, SignInSecret};
@@ -56,7 +57,8 @@ async fn get_sign_in_methods(CallerApp(app): CallerApp) -> ApiResult {
 /// Sign in by OpenID Connect
 ///
 /// A page of this server links here. Leads the browser to the provider of the settings, which leads it back; then it
-/// has a session like that of a key, with the role that the provider's claim gives, and is led to `/`.
+/// has a session like that of a key, with the role that the provider's claim gives, and is led to `/`. A browser that asks
+/// for HTML is led to the console where this fails; it says what failed.
 #[utoipa::path(
     get, path = "/v1/session/openid", tag = "access",
     responses(
@@ -65,14 +67,34 @@ async fn get_sign_in_methods(CallerApp(app): CallerApp) -> ApiResult {
         (status = 502, description = "The provider gives no usable answer", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn begin_sign_in(CallerApp(app): CallerApp) -> ApiResult {
-    let (secret, url) = app.begin_sign_in().await?;
-    let response = see_other(&url)?;
-    let is_https = app.access.openid().is_some_and(Provider::is_https);
-    Ok(with_sign_in_cookie(response, is_https, secret.reveal(), SIGN_IN_TIME_S)?)
+async fn begin_sign_in(CallerApp(app): CallerApp, headers: HeaderMap) -> ApiResult {
+    Ok(answer_person(begin(&app).await, &headers)?)
 }
 
 async fn finish_sign_in(CallerApp(app): CallerApp, uri: Uri, headers: HeaderMap) -> ApiResult {
+    Ok(answer_person(finish(&app, &uri, &headers).await, &headers)?)
+}
+
+/// The answer for whoever asks. A person sees the console, which names the kind of refusal in their language; a program
+/// gets the problem. Faults stay as they are, so that they are logged.
+fn answer_person(answer: Result<Response>, headers: &HeaderMap) -> Result<Response> {
+    let reads_html = |accepted: &HeaderValue| accepted.to_str().is_ok_and(|it| it.contains("text/html"));
+    match answer {
+        Err(Error::Refused(refusal)) if headers.get_all(ACCEPT).iter().any(reads_html) => {
+            see_other(&format!("/#/sign-in/{}", refusal.kind.as_str()))
+        }
+        answer => answer,
+    }
+}
+
+async fn begin(app: &App) -> Result<Response> {
+    let (secret, url) = app.begin_sign_in().await?;
+    let response = see_other(&url)?;
+    let is_https = app.access.openid().is_some_and(Provider::is_https);
+    with_sign_in_cookie(response, is_https, secret.reveal(), SIGN_IN_TIME_S)
+}
+
+async fn finish(app: &App, uri: &Uri, headers: &HeaderMap) -> Result<Response> {
     let parameter = |wanted: &str| {
         let query = uri.query().unwrap_or_default().as_bytes();
         form_urlencoded::parse(query).find(|(name, _)| name == wanted).map(|(_, value)| value.into_owned())
@@ -80,16 +102,16 @@ async fn finish_sign_in(CallerApp(app): CallerApp, uri: Uri, headers: HeaderMap)
     if let Some(error) = parameter("error") {
         let shown: String = error.chars().filter(|it| it.is_ascii_graphic()).take(64).collect();
         let message = format!("the provider did not sign the person in: {shown}");
-        return Err(Error::refused(ErrorKind::Unauthenticated, message).into());
+        return Err(Error::refused(ErrorKind::Unauthenticated, message));
     }
     let missing = || Error::refused(ErrorKind::Unauthenticated, "the sign-in was not begun in this browser");
-    let secret = SignInSecret::of_cookie(cookie(&headers, SIGN_IN_COOKIE).ok_or_else(missing)?);
+    let secret = SignInSecret::of_cookie(cookie(headers, SIGN_IN_COOKIE).ok_or_else(missing)?);
     let (state, code) = parameter("state").zip(parameter("code")).ok_or_else(missing)?;
     let token = app.finish_sign_in(&secret, &state, &code).await?;
     let is_https = app.access.openid().is_some_and(Provider::is_https);
     // The address has the code, which no page is to learn.
     let response = with_cookie(see_other("/")?, is_https, token.reveal(), SESSION_TIME.as_secs())?;
-    Ok(with_sign_in_cookie(response, is_https, "", 0)?)
+    with_sign_in_cookie(response, is_https, "", 0)
 }
 
 fn see_other(url: &str) -> Result<Response> {

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use axum::body::Body;
 use axum::extract::Request;
 use axum::response::{IntoResponse, Response};
-use hyper::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER, WWW_AUTHENTICATE};
+use hyper::header::{CONTENT_LENGTH, CONTENT_TYPE, LOCATION, RETRY_AFTER, WWW_AUTHENTICATE};
 use hyper::http::HeaderValue;
 use hyper::{Method, StatusCode, Uri};
 use serde::Serialize;
@@ -165,6 +165,9 @@ impl Refused {
         let error = if self.uri.path().starts_with(FEATURES) { as_query_error(&error) } else { error };
         let id = self.id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
         let mut problem = response(&error, &id, Some(self.uri.path()));
+        if let Some(location) = location(&error, &self.uri) {
+            problem.headers_mut().insert(LOCATION, location);
+        }
         for (name, value) in answer.headers() {
             if name != CONTENT_TYPE && name != CONTENT_LENGTH {
                 problem.headers_mut().insert(name, value.clone());
@@ -175,6 +178,13 @@ impl Refused {
         }
         problem
     }
+}
+
+/// The same request at the node that answers it.
+fn location(error: &Error, uri: &Uri) -> Option<HeaderValue> {
+    let Error::Refused(Refusal { other_node: Some(url), .. }) = error else { return None };
+    let path = uri.path_and_query().map_or("/", |path| path.as_str());
+    HeaderValue::try_from(format!("{url}{path}")).ok()
 }
 
 /// A value at fault as OGC API Features answers it; other errors as they are.

@@ -300,6 +300,18 @@ struct FollowedObservation<'a> {
     /// The target's world track in the camera's site, as of the latest frame that was tracked there.
     #[serde(skip_serializing_if = "Option::is_none")]
     world_track_id: Option<String>,
+    /// The receiver that the target of the box carries, where the observation has a `tracker_id` and was matched.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    receiver_match: Option<ReceiverMatch>,
+}
+
+/// The receiver that the target of a box carries.
+#[derive(Serialize, ToSchema)]
+struct ReceiverMatch {
+    /// The receiver: the target of its fixes.
+    receiver_id: String,
+    /// Posterior probability, 0 to 1.
+    probability: f64,
 }
 
 impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
@@ -308,6 +320,10 @@ impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
             fused: followed.fused.as_ref().map(Into::into),
             track: followed.track.as_ref().map(|point| point.as_ref().into()),
             world_track_id: followed.world_track.map(|id| id.to_string()),
+            receiver_match: followed.receiver_match.as_ref().map(|own| ReceiverMatch {
+                receiver_id: own.receiver_id.as_str().to_owned(),
+                probability: own.probability,
+            }),
         }
     }
 }
@@ -358,6 +374,8 @@ struct StoredObservations {
     too_late: u64,
     /// Those of which the same target and instant was there before.
     duplicate: u64,
+    /// Boxes with only a tracker's id whose receiver is not sure enough.
+    unmatched: u64,
 }
 
 impl From<Acknowledgement> for StoredObservations {
@@ -372,6 +390,7 @@ impl From<Acknowledgement> for StoredObservations {
             unpaired: count(NotStoredReason::Unpaired),
             too_late: count(NotStoredReason::TooLate),
             duplicate: count(NotStoredReason::Duplicate),
+            unmatched: count(NotStoredReason::Unmatched),
         }
     }
 }
@@ -394,6 +413,7 @@ impl From<Acknowledgement> for StoredObservations {
     request_body = FusionRequest,
     responses(
         (status = 200, description = "Positions and tracks", body = FollowedObservations<'static>),
+        (status = 307, description = "Another node has the camera's live state; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "The camera follows as many targets as it may", body = Problem, content_type = "application/problem+json"),
     )
 )]
@@ -408,7 +428,7 @@ async fn follow(
     let stores_samples = params.flag("store_samples")?.unwrap_or(false);
     let durability = params.durability()?;
     params.end()?;
-    let camera = app.active_camera(&id).await?;
+    let (camera, lease) = app.own_camera(&id).await?;
     // Times ahead of the clock are refused before any track has changed.
     let observations = observations(&app, &body.read()?, &app.live_rules(&camera), &camera.receivers)?;
     app.check_batch(observations.len())?;
@@ -417,7 +437,7 @@ async fn follow(
             app.follow_and_store(&camera, observations, client, durability).await?;
         (followed, Some(StoredObservations::from(acknowledgement)))
     } else {
-        let follow = |observation| app.follow(&camera, observation);
+        let follow = |observation| app.follow((&camera, &lease), observation);
         (observations.iter().map(follow).collect::<Result<Vec<_>>>()?, None)
     };
     let items = followed.iter().map(Into::into).collect();

@@ -131,7 +131,7 @@ impl RecordedStream {
 fn item(row: ObservedRow) -> LiveItem {
     let ObservedRow { observation, class, score, truth: _ } = row;
     let (time, target_id, bounding_box, fix) = observation.into_parts();
-    LiveItem { time, target_id, receiver_id: None, bounding_box, fix, class, score }
+    LiveItem { time, target_id, tracker_id: None, receiver_id: None, bounding_box, fix, class, score }
 }
 
 #[cfg(test)]

@@ -38,6 +38,7 @@ pub use group_commit::{Completion, InsertOptions, Inserted};
 pub use jobs::{Claim, Heartbeat, JobCounts, JobEnd, LiveJobs};
 pub use limits::{StorageStatus, StoreLimits};
 pub use location::{DatabaseUrl, Location};
+pub use postgres::{Acquired, NodeLeases};
 pub use rows::idempotency::{IdempotencyRecord, StoredAnswer};
 pub use rows::keys::KeysVersion;
 pub use rows::models::{NewModel, StoredHeldOutError};
@@ -156,6 +157,16 @@ impl Store {
     /// A fault if it does not.
     pub async fn ping(&self) -> Result<()> {
         on_backend!(self, store => store.ping().await)
+    }
+
+    /// Who has the live state of each camera, where several processes share the database; `None` for a data folder,
+    /// whose one server has that of all.
+    #[must_use]
+    pub fn node_leases(&self) -> Option<&NodeLeases> {
+        match &self.0 {
+            Backend::Sqlite(_) => None,
+            Backend::Postgres(store) => Some(store.node_leases()),
+        }
     }
 
     /// Other processes that have begun to use the data folder since the last call; at the first, all

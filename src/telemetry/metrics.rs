@@ -1,6 +1,7 @@
 //! Metrics, as one typed struct: no name is spelled at a call site.
 
 mod answers;
+mod cluster;
 mod connections;
 mod jobs;
 mod live;
@@ -13,6 +14,7 @@ use metrics::{Counter, Gauge};
 use metrics_exporter_prometheus::PrometheusHandle;
 
 use self::answers::{FusionMetrics, ImportMetrics};
+use self::cluster::ClusterMetrics;
 use self::connections::ConnectionMetrics;
 use self::jobs::QueueMetrics;
 use self::live::{LiveMetrics, SiteMetrics};
@@ -43,6 +45,7 @@ pub struct Metrics {
     requests: RequestMetrics,
     requests_refused: Counter,
     live: LiveMetrics,
+    cluster: ClusterMetrics,
     sites: SiteMetrics,
     storage: StorageMetrics,
     quotas: [QuotaMetrics; Quotas::COUNT],
@@ -84,6 +87,7 @@ impl Metrics {
                 &[],
             ),
             live: LiveMetrics::register(&registry),
+            cluster: ClusterMetrics::register(&registry),
             sites: SiteMetrics::register(&registry),
             storage: StorageMetrics::register(&registry),
             quotas: Quotas::NAMES.map(|name| QuotaMetrics::register(&registry, name)),
@@ -162,6 +166,26 @@ impl Metrics {
     /// A camera was found to have moved.
     pub fn camera_moved(&self) {
         self.live.cameras_moved.increment(1);
+    }
+
+    /// How many processes share the database.
+    pub fn nodes(&self, nodes: usize) {
+        self.cluster.nodes.set(nodes as f64);
+    }
+
+    /// How many cameras this process owns.
+    pub fn owned_cameras(&self, cameras: usize) {
+        self.cluster.owned_cameras.set(cameras as f64);
+    }
+
+    /// A camera was acquired whose owner has ended without releasing it.
+    pub fn camera_taken_over(&self) {
+        self.cluster.takeovers.increment(1);
+    }
+
+    /// This process could not renew its registration in time.
+    pub fn node_registration_lost(&self) {
+        self.cluster.registrations_lost.increment(1);
     }
 
     /// A box or fix was handed to the tracker of a site.

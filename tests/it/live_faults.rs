@@ -319,12 +319,12 @@ async fn a_wall_clock_that_jumps_back_keeps_no_target_out() {
     let app = server.app();
     let id = CameraId::new("yard").expect("a slug");
     app.create_camera(NewCamera::named(id.clone())).await.expect("a new camera");
-    let camera = app.active_camera(&id).await.expect("known");
+    let (camera, lease) = app.own_camera(&id).await.expect("known");
     let follow = |name: &str| {
         let time = Timestamp::from_second(wall_s.load(Ordering::SeqCst)).expect("in range");
         let target_id = Some(TargetId::new(name).expect("a name"));
         let fix = Fix { position: at(8.0, 47.0), sigma_m: None };
-        app.follow(&camera, &Observation::with_fix(time, target_id, None, fix))
+        app.follow((&camera, &lease), &Observation::with_fix(time, target_id, None, fix))
     };
     for name in ["a", "b", "c", "d"] {
         follow(name).expect("followed");

@@ -5,6 +5,7 @@ mod audit;
 mod backup;
 mod bad_input;
 mod boxes_without_fix;
+mod cluster;
 mod column_mapping;
 mod command_line;
 mod connections;

@@ -233,6 +233,27 @@ async fn what_does_not_hold_signs_nobody_in() {
 }
 
 #[tokio::test]
+async fn a_person_who_is_refused_is_led_to_the_console() {
+    let (_folder, server, provider) = start().await;
+    let accept = ("accept", "text/html,application/xhtml+xml;q=0.9,*/*;q=0.8");
+    let begun = begin(&server, &provider).await;
+    let mut sign_in =
+        SignIn { challenge: begun.challenge, claims: provider.claims(&begun.nonce), is_forged: false };
+    sign_in.claims["groups"] = json!(["staff"]);
+    *provider.sign_in.lock().expect("no panic") = sign_in;
+    let cookie = ("cookie", &*begun.cookie);
+    for (query, problem) in [
+        (format!("code={CODE}&state={}", begun.state), "permission-denied"),
+        ("error=access_denied".to_owned(), "unauthenticated"),
+    ] {
+        let path = format!("/v1/session/openid/callback?{query}");
+        let answer = server.send("GET", &path, &[cookie, accept], "").await.expect(303);
+        assert_eq!(answer.header("location"), format!("/#/sign-in/{problem}"));
+        assert!(!answer.headers.contains_key("set-cookie"));
+    }
+}
+
+#[tokio::test]
 async fn a_provider_that_does_not_answer_is_named_in_the_log_alone() {
     let folder = data_folder();
     let server = TestServer::start_with(
@@ -247,6 +268,8 @@ async fn a_provider_that_does_not_answer_is_named_in_the_log_alone() {
     );
     let refused = server.get("/v1/session/openid").await.expect(502);
     assert!(!refused.text().contains("127.0.0.1:9"), "{}", refused.text());
+    let led = server.send("GET", "/v1/session/openid", &[("accept", "text/html")], "").await.expect(303);
+    assert_eq!(led.header("location"), "/#/sign-in/sign-in-unavailable");
     server.logged(|entry| entry["issuer"] == "http://127.0.0.1:9").await;
     assert!(server.log_lines("s3cret").is_empty());
 }

@@ -43,6 +43,14 @@ def test_items_are_answered_in_their_order(trained: ServerProcess, items: list[L
     assert all(answer.HasField("fused") and answer.HasField("track") for answer in answers)
 
 
+def test_a_box_with_only_a_tracker_number_has_a_track_of_its_own(trained: ServerProcess, items: list[LiveItem]) -> None:
+    anonymous = replace(items[0], target_id=None, tracker_id="17", fix=None)
+    with Client(trained.url) as client:
+        (answer,) = client.stream_items("square", [anonymous])
+    assert answer.track.target_id == "tracker:17"
+    assert not answer.HasField("receiver_match")
+
+
 def test_everything_acknowledged_is_stored_once_though_the_server_is_killed(
     server: ServerProcess, square: Client, items: list[LiveItem]
 ) -> None:

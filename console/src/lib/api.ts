@@ -26,11 +26,6 @@ export class ApiProblem extends Error {
 
 export class ServerUnreachable extends Error {}
 
-export function messageOf(error: unknown): string {
-  if (error instanceof ApiProblem) return error.text;
-  return error instanceof Error ? error.message : String(error);
-}
-
 interface Options {
   body?: unknown;
   headers?: Record<string, string>;

@@ -1,5 +1,6 @@
 // The statuses of all cameras, read again while somebody looks.
-import { getAll, messageOf } from './api';
+import { getAll } from './api';
+import { failureOf, type Failure } from './failure';
 import type { CameraStatus } from './types';
 
 const MOST_CAMERAS = 10_000;
@@ -7,7 +8,7 @@ const MOST_CAMERAS = 10_000;
 class Cameras {
   statuses = $state.raw<CameraStatus[]>([]);
   loaded = $state(false);
-  error = $state('');
+  error = $state.raw<Failure>();
   #watchers = 0;
   #timer: ReturnType<typeof setTimeout> | undefined;
 
@@ -19,9 +20,9 @@ class Cameras {
     try {
       this.statuses = await getAll<CameraStatus>('/v1/camera-statuses', MOST_CAMERAS);
       this.loaded = true;
-      this.error = '';
+      this.error = undefined;
     } catch (error) {
-      this.error = messageOf(error);
+      this.error = failureOf(error);
     }
   }
 

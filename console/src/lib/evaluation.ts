@@ -1,7 +1,12 @@
 // Curves and extents of an evaluation's positions.
 import type { Palette } from './draw';
 import { toPlane, type EastNorth } from './geo';
-import type { EvaluatedPosition, Evaluation, Position } from './types';
+import type { EvaluatedPosition, Evaluation, Position, Recipe } from './types';
+
+/** What a recipe is compared with: the receiver, a filter, and a plain homography. */
+export function comparedMethods(recipe: Recipe): string[] {
+  return ['gnss', 'imm_ukf', 'homography.denied', `${recipe}.two_step`];
+}
 
 /** A method keeps its colour from report to report; those of one source share its colour and differ by dashes. */
 export function lineOf(method: string): { color: keyof Palette; dash?: number[] } {

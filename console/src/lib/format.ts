@@ -56,3 +56,13 @@ export function age(text: string | undefined, now_ms: number): string {
 export function degrees(value: number): string {
   return value.toFixed(7);
 }
+
+/** An id of lower-case letters, digits and hyphens, from a name for people. */
+export function slugOf(name: string): string {
+  return name
+    .toLowerCase()
+    .normalize('NFKD')
+    .replace(/[^a-z0-9]+/g, '-')
+    .slice(0, 63)
+    .replace(/^-+|-+$/g, '');
+}

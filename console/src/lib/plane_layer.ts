@@ -22,16 +22,17 @@ export class PlaneLayer {
   readonly canvas = document.createElement('canvas');
   readonly #leaflet: typeof L;
   readonly #map: L.Map;
-  readonly #hasTiles: boolean;
+  readonly #hasGrid: boolean;
   #draw: Draw = () => {};
   #frame = 0;
   #isClosed = false;
 
-  constructor(leaflet: typeof L, map: L.Map, hasTiles: boolean) {
+  /** The class names its canvas in style sheets. */
+  constructor(leaflet: typeof L, map: L.Map, className: string, hasGrid: boolean) {
     this.#leaflet = leaflet;
     this.#map = map;
-    this.#hasTiles = hasTiles;
-    this.canvas.className = 'plane-canvas';
+    this.#hasGrid = hasGrid;
+    this.canvas.className = className;
     map.getPanes().overlayPane.append(this.canvas);
     map.on('move zoom viewreset resize', () => this.redraw());
   }
@@ -70,7 +71,7 @@ export class PlaneLayer {
     const at = ({ longitude_deg, latitude_deg }: Position): Pixel =>
       this.#map.latLngToContainerPoint([latitude_deg, longitude_deg]);
     const px_per_m = 1 / this.metresPerPixel();
-    if (!this.#hasTiles) this.#grid(context, colors, px_per_m, width, height);
+    if (this.#hasGrid) this.#grid(context, colors, px_per_m, width, height);
     this.#draw({ context, colors, px_per_m, width, height, at });
   }
 

@@ -4,10 +4,18 @@ function segmentsOf(hash: string): string[] {
   return hash.replace(/^#\/?/, '').split('?')[0]!.split('/').filter(Boolean).map(decodeURIComponent);
 }
 
+/** The view that a sign-in at a provider leads away from. */
+const LEFT_VIEW = 'sightfix.left_view';
+
 class Router {
-  segments = $state<string[]>(segmentsOf(location.hash));
+  segments = $state<string[]>([]);
 
   constructor() {
+    const left = sessionStorage.getItem(LEFT_VIEW);
+    sessionStorage.removeItem(LEFT_VIEW);
+    // The provider leads back to the page without a fragment.
+    if (left && !location.hash) history.replaceState(null, '', left);
+    this.segments = segmentsOf(location.hash);
     addEventListener('hashchange', () => {
       this.segments = segmentsOf(location.hash);
     });
@@ -20,6 +28,11 @@ class Router {
 
 export function href(...segments: string[]): string {
   return `#/${segments.map(encodeURIComponent).join('/')}`;
+}
+
+/** Before the browser leaves for a provider: it is to come back to this view. */
+export function rememberView(): void {
+  if (router.segments[0] !== 'sign-in') sessionStorage.setItem(LEFT_VIEW, location.hash);
 }
 
 export const router = new Router();

@@ -1,7 +1,8 @@
 // The samples of one camera with what its active model answers for them.
-import { cameraPath, get, getAll, messageOf, post } from './api';
+import { cameraPath, get, getAll, post } from './api';
 import { distance_m } from './geo';
 import { footOf } from './image';
+import { failureOf, type Failure } from './failure';
 import type { FusedFix, Sample } from './types';
 
 /** Samples that are read for drawing; cameras with more are shown in part. */
@@ -22,7 +23,7 @@ export class Scene {
   points = $state.raw<ScenePoint[]>([]);
   total = $state(0);
   loading = $state(true);
-  error = $state('');
+  error = $state.raw<Failure>();
   readonly #camera: string;
   readonly #abort = new AbortController();
 
@@ -36,7 +37,7 @@ export class Scene {
 
   async load(hasModel: boolean): Promise<void> {
     this.loading = true;
-    this.error = '';
+    this.error = undefined;
     const signal = this.#abort.signal;
     try {
       const path = cameraPath(this.#camera, 'samples');
@@ -45,7 +46,7 @@ export class Scene {
       this.points = samples.map((sample) => ({ sample, foot: footOf(sample.bounding_box) }));
       if (hasModel) await this.#answer(signal);
     } catch (error) {
-      if (!signal.aborted) this.error = messageOf(error);
+      if (!signal.aborted) this.error = failureOf(error);
     } finally {
       this.loading = false;
     }
@@ -62,7 +63,7 @@ export class Scene {
       const added = samples.filter((sample) => !known.has(keyOf(sample)));
       if (added.length > 0) this.points = [...this.points, ...added.map((sample) => ({ sample, foot: footOf(sample.bounding_box) }))];
     } catch (error) {
-      if (!this.#abort.signal.aborted) this.error = messageOf(error);
+      if (!this.#abort.signal.aborted) this.error = failureOf(error);
     }
   }
 

@@ -1,9 +1,9 @@
 // Short messages of what was done or refused.
-import { messageOf } from './api';
+import { failureOf, type Failure } from './failure';
 
 export interface Toast {
   id: number;
-  text: string;
+  message: Failure;
   kind: 'good' | 'error';
 }
 
@@ -11,18 +11,18 @@ class ToastList {
   items = $state<Toast[]>([]);
   #next = 1;
 
-  #add(text: string, kind: Toast['kind']): void {
+  #add(message: Failure, kind: Toast['kind']): void {
     const id = this.#next++;
-    this.items.push({ id, text, kind });
+    this.items.push({ id, message, kind });
     setTimeout(() => this.remove(id), kind === 'error' ? 12_000 : 5_000);
   }
 
   good(text: string): void {
-    this.#add(text, 'good');
+    this.#add({ text }, 'good');
   }
 
   error(error: unknown): void {
-    this.#add(messageOf(error), 'error');
+    this.#add(failureOf(error), 'error');
   }
 
   remove(id: number): void {

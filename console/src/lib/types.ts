@@ -49,6 +49,8 @@ export interface Camera {
   target_classes: string[];
   labels: Record<string, string>;
   receivers: Receiver[];
+  /** Whose world tracks the camera contributes to. */
+  site?: string;
   retrain_when_moved: boolean;
   revision: number;
   created_at: string;
@@ -257,6 +259,17 @@ export interface Session {
   name?: string;
   open_access: boolean;
 }
+export interface AuditEntry {
+  number: number;
+  time: string;
+  actor: string;
+  address?: string;
+  request_id?: string;
+  /** What happened, such as `camera-created`. */
+  action: string;
+  subject?: string;
+  camera_id?: string;
+}
 export interface ApiKey {
   id: string;
   name: string;
@@ -266,4 +279,81 @@ export interface ApiKey {
   expires_at?: string;
   last_used_at?: string;
   revoked_at?: string;
+}
+export type ConnectionState = 'paused' | 'connecting' | 'running' | 'waiting';
+export interface LastMessage {
+  time: string;
+  subject: string;
+  text: string;
+  reading: string[];
+}
+export interface ConnectionStatus {
+  state: ConnectionState;
+  since?: string;
+  last_error?: { time: string; message: string };
+  last_message?: LastMessage;
+  messages: number;
+  items: number;
+  skipped: number;
+  rejected: number;
+  dropped: number;
+  acknowledged: number;
+  connects: number;
+  queued: number;
+  dead_letters: number;
+  lag_s?: number;
+}
+/** Where messages come from, or go to. */
+export interface ConnectionSettings {
+  address: string;
+  format: string;
+  topics?: string[];
+  topic?: string;
+  username?: string;
+  cameras?: Record<string, { camera_id: string }>;
+  camera_ids?: string[];
+  receiver_id?: string;
+  store_samples?: boolean;
+  min_interval_s?: number;
+}
+export interface Connection {
+  id: string;
+  display_name: string;
+  paused: boolean;
+  source?: ConnectionSettings;
+  sink?: ConnectionSettings;
+  secret_names: string[];
+  revision: number;
+  created_at: string;
+  status: ConnectionStatus;
+}
+export interface DeadLetter {
+  number: number;
+  id: string;
+  subject: string;
+  text: string;
+  created_at: string;
+  reason: string;
+}
+export interface Site {
+  id: string;
+  display_name: string;
+  cameras: number;
+}
+/** A target of a site, over all of its cameras. */
+export interface WorldTrack {
+  id: string;
+  /** Once a receiver is known. */
+  target_id?: string;
+  time: string;
+  velocity_east_m_s: number;
+  velocity_north_m_s: number;
+  covariance: Covariance;
+  r95_m: number;
+  sightings: { camera_id: string; tracker_id?: string; last_seen_at: string }[];
+  position: Position;
+}
+export interface WorldTrackFeature {
+  geometry: { coordinates: [number, number] };
+  properties: Omit<WorldTrack, 'position'>;
 }

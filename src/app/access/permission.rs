@@ -78,6 +78,7 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Public, "GET /readyz", "grpc.health.v1.Health/Watch"),
     operation(Read, "GET /metrics", ""),
     operation(Read, "GET /v1/server", ""),
+    operation(Read, "GET /v1/nodes", ""),
     operation(Read, "GET /v1/tiles", ""),
     operation(Read, "GET /v1/camera-statuses", ""),
     operation(Authenticated, "", "grpc.reflection.v1.ServerReflection/ServerReflectionInfo"),

@@ -22,12 +22,14 @@ pub enum NotStoredReason {
     TooLate,
     /// A box or fix of the same target and instant was there before.
     Duplicate,
+    /// It is a box with only a tracker's id, and its receiver is not sure enough.
+    Unmatched,
 }
 
 impl NotStoredReason {
-    const COUNT: usize = 5;
+    const COUNT: usize = 6;
     const ALL: [Self; Self::COUNT] =
-        [Self::NoTarget, Self::Refused, Self::Unpaired, Self::TooLate, Self::Duplicate];
+        [Self::NoTarget, Self::Refused, Self::Unpaired, Self::TooLate, Self::Duplicate, Self::Unmatched];
 }
 
 /// Items of a stream that are not part of a sample for one reason.

@@ -1,6 +1,6 @@
 //! The state in memory of one camera that exists, from its creation to its deletion.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
@@ -10,6 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::camera_events::CameraEventLog;
 use super::drift::DriftMonitor;
+use super::matching::LiveMatching;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
@@ -39,12 +40,16 @@ pub struct TargetUpdate {
 pub(in crate::app) struct CameraLive {
     pub(super) tracks: Tracks,
     pub(super) drift: DriftMonitor,
+    pub(super) matching: LiveMatching,
     pub(super) events: CameraEventLog<CameraEvent>,
     pub(super) moved: watch::Sender<Option<Arc<CameraMoved>>>,
     pub(super) recorder: Mutex<Weak<SampleRecorder>>,
     last_observed_at: Mutex<Option<Timestamp>>,
     open_streams: AtomicUsize,
     deleted: CancellationToken,
+    replaced: CancellationToken,
+    /// The fence under which it was changed last; 0 before the first.
+    tenure: AtomicI64,
 }
 
 impl CameraLive {
@@ -53,18 +58,40 @@ impl CameraLive {
         Arc::new(Self {
             tracks: Tracks::default(),
             drift: DriftMonitor::default(),
+            matching: LiveMatching::default(),
             events: CameraEventLog::new(event_log),
             moved: watch::channel(None).0,
             recorder: Mutex::new(Weak::new()),
             last_observed_at: Mutex::new(None),
             open_streams: AtomicUsize::new(0),
             deleted: CancellationToken::new(),
+            replaced: CancellationToken::new(),
+            tenure: AtomicI64::new(0),
         })
     }
 
     /// Ends the streams and listeners of a camera that was deleted.
     pub(in crate::app) fn end(&self) {
         self.deleted.cancel();
+    }
+
+    /// Takes the fence of a new tenure; false if another node may have had the camera since the one before.
+    pub(in crate::app) fn continue_under(&self, fence: i64) -> bool {
+        let before = self.tenure.swap(fence, Ordering::AcqRel);
+        before == 0 || before + 1 == fence
+    }
+
+    /// Ends the readers of a state that another one takes the place of.
+    pub(in crate::app) fn replace(&self) {
+        self.replaced.cancel();
+    }
+
+    pub(super) fn is_replaced(&self) -> bool {
+        self.replaced.is_cancelled()
+    }
+
+    pub(super) async fn replaced(&self) {
+        self.replaced.cancelled().await;
     }
 
     /// Whether the camera is deleted.

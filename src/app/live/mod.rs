@@ -12,12 +12,13 @@ mod camera_events;
 mod drift;
 mod event_log;
 mod history;
+mod matching;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
 pub(super) mod site;
 mod stream;
-mod sync;
+pub(super) mod sync;
 mod tracks;
 
 use std::sync::Arc;
@@ -26,13 +27,16 @@ use jiff::Timestamp;
 
 use self::camera::CameraLive;
 use self::camera_events::CameraEventReader;
+use self::matching::Identified;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
+use super::cluster::{CameraLease, Watch};
 use super::fusion::fuse_observed;
 use super::registry::ActiveCamera;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, Result, TargetId, TimeBounds,
+    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, ReceiverMatch, Result, TargetId,
+    TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
@@ -41,6 +45,7 @@ pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub use camera_events::{EventId, LostEvents};
+pub(super) use matching::MatchingSlot;
 pub(super) use retraining::RetrainSchedule;
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
@@ -59,6 +64,8 @@ pub struct ItemResult {
     pub track: Option<Arc<TrackPoint>>,
     /// The target's world track in the camera's site, as of the latest frame that was tracked there.
     pub world_track: Option<LiveId>,
+    /// The receiver that the target of a box carries which came with a tracker's id alone, if it was matched.
+    pub receiver_match: Option<ReceiverMatch>,
 }
 
 /// What happens in a camera's view, since the server was started.
@@ -72,18 +79,27 @@ pub struct CameraActivity {
     pub last_observed_at: Option<Timestamp>,
 }
 
-/// The events of one camera from some instant on; they end when it is deleted.
+/// The events of one camera from some instant on; they end when it is deleted, or another node has become its owner.
 pub struct CameraEvents {
     reader: CameraEventReader<CameraEvent>,
     live: Arc<CameraLive>,
+    watch: Watch,
 }
 
 impl CameraEvents {
-    /// The next event; `None` once the camera is deleted.
+    /// Whether they have ended since they continue elsewhere: the reader should ask again.
+    #[must_use]
+    pub fn continue_elsewhere(&self) -> bool {
+        self.watch.has_ended() || self.live.is_replaced()
+    }
+
+    /// The next event; `None` once the camera is deleted or goes on elsewhere.
     pub async fn next(&mut self) -> Option<Result<(EventId, Arc<CameraEvent>), LostEvents>> {
         tokio::select! {
             biased;
             () = self.live.deleted() => None,
+            () = self.live.replaced() => None,
+            () = self.watch.ended() => None,
             event = self.reader.next() => Some(event),
         }
     }
@@ -106,13 +122,30 @@ impl App {
     /// and fix.
     ///
     /// # Errors
-    /// `InvalidArgument` naming `time` for a time ahead of the server's clock; `Overloaded` if the camera
-    /// tracks as many targets as it may.
-    pub fn follow(&self, camera: &Arc<ActiveCamera>, observation: &Observation) -> Result<ItemResult> {
+    /// `CameraBetweenNodes` if the lease has ended; `InvalidArgument` naming `time` for a time ahead of the
+    /// server's clock; `Overloaded` if the camera tracks as many targets as it may.
+    pub fn follow(
+        &self,
+        (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
+        observation: &Observation,
+    ) -> Result<ItemResult> {
+        // A time that no track takes must not move the matching either.
         self.live_time_bounds().check(observation.time())?;
+        let identified = self.identify(camera, observation.clone());
+        self.follow_identified((camera, lease), identified)
+    }
+
+    fn follow_identified(
+        &self,
+        (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
+        identified: Identified,
+    ) -> Result<ItemResult> {
+        let now = self.clock.monotonic();
+        lease.check(now)?;
+        let Identified { observation, receiver_match, .. } = identified;
+        let observation = &observation;
         let model = camera.model();
         let regressor = model.map(|(regressor, _)| regressor);
-        let now = self.clock.monotonic();
         let ActiveCamera { image_size, e_gnss_m2, .. } = **camera;
         // A box without a model measures nothing, so it makes no target.
         let measures = regressor.is_some() || observation.fix().is_some();
@@ -148,7 +181,7 @@ impl App {
         if let Some(residual) = residual {
             self.hand_over(camera, residual);
         }
-        Ok(ItemResult { fused, track, world_track })
+        Ok(ItemResult { fused, track, world_track, receiver_match })
     }
 
     /// What happens in a camera's view.
@@ -163,18 +196,18 @@ impl App {
     /// Where every target of a camera is now, by target; those that expired are left out.
     ///
     /// # Errors
-    /// `CameraNotFound`.
+    /// `CameraNotFound`, `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub async fn tracks(&self, id: &CameraId) -> Result<Vec<Arc<TrackPoint>>> {
-        let camera = self.active_camera(id).await?;
+        let camera = self.readable_camera(id).await?;
         Ok(camera.live.tracks.latest(self.clock.monotonic()))
     }
 
     /// Where every target of a camera was, by target, each oldest first; those that expired are left out.
     ///
     /// # Errors
-    /// `CameraNotFound`.
+    /// As [`App::tracks`].
     pub async fn track_histories(&self, id: &CameraId) -> Result<Vec<Vec<Arc<TrackPoint>>>> {
-        let camera = self.active_camera(id).await?;
+        let camera = self.readable_camera(id).await?;
         let now = self.clock.monotonic();
         let latest = camera.live.tracks.latest(now);
         Ok(latest.iter().filter_map(|point| camera.live.tracks.history(&point.target_id, now)).collect())
@@ -183,9 +216,9 @@ impl App {
     /// Where a target was, oldest first, as far back as the history reaches.
     ///
     /// # Errors
-    /// `CameraNotFound`, `TrackNotFound`.
+    /// As [`App::tracks`]; `TrackNotFound`.
     pub async fn track_history(&self, id: &CameraId, target_id: &TargetId) -> Result<Vec<Arc<TrackPoint>>> {
-        let camera = self.active_camera(id).await?;
+        let camera = self.readable_camera(id).await?;
         let history = camera.live.tracks.history(target_id, self.clock.monotonic());
         history.ok_or_else(|| {
             let message = format!("camera {id} does not follow a target {target_id} now");
@@ -193,14 +226,31 @@ impl App {
         })
     }
 
+    /// A camera whose live state is read.
+    async fn readable_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
+        let camera = self.active_camera(id).await?;
+        self.check_readable(&camera).await?;
+        Ok(camera)
+    }
+
     /// Everything that happens in a camera's view from now on, or after the last event that the reader has
     /// seen. A reader that is too slow, or was away for too long, misses the oldest of what it has not read.
     ///
     /// # Errors
-    /// `CameraNotFound`.
+    /// As [`App::tracks`].
     pub async fn camera_events(&self, id: &CameraId, last_seen: Option<EventId>) -> Result<CameraEvents> {
+        let camera = self.readable_camera(id).await?;
+        let watch = self.watch_camera_owner(&camera);
+        Ok(CameraEvents { reader: camera.live.events.reader(last_seen), live: camera.live.clone(), watch })
+    }
+
+    /// What happens in a camera's view on this node alone, from now on.
+    ///
+    /// # Errors
+    /// `CameraNotFound`.
+    pub async fn own_camera_events(&self, id: &CameraId) -> Result<CameraEvents> {
         let live = self.active_camera(id).await?.live.clone();
-        Ok(CameraEvents { reader: live.events.reader(last_seen), live })
+        Ok(CameraEvents { reader: live.events.reader(None), live, watch: Watch::default() })
     }
 
     /// Whether a camera's active model no longer fits what the camera sees.

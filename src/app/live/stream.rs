@@ -14,6 +14,7 @@ use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
 use crate::admission::{ClientId, Lease};
 use crate::app::App;
+use crate::app::cluster::CameraLease;
 use crate::app::registry::ActiveCamera;
 use crate::domain::{
     CameraId, CameraMoved, Detection, Durability, Error, ErrorKind, LiveItem, Observation, Result, Sample,
@@ -73,6 +74,8 @@ pub struct LiveStream {
     app: App,
     /// As it was when the stream was opened; its key and its live state do not change.
     camera: Arc<ActiveCamera>,
+    /// `None` only while it is dropped.
+    lease: Option<CameraLease>,
     recording: Option<StreamRecording>,
     last_seq: u64,
     _slot: SlotGuard,
@@ -91,7 +94,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`; `InvalidArgument` naming `client_name`; `Overloaded` beyond the limits of
-    /// streams.
+    /// streams; `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub async fn open_stream(
         &self,
         id: &CameraId,
@@ -101,12 +104,13 @@ impl App {
         store_samples: Option<Durability>,
     ) -> Result<LiveStream> {
         check_text("client_name", client_name, LONGEST_CLIENT_NAME)?;
-        let camera = self.active_camera(id).await?;
+        self.active_camera(id).await?;
         let limits = &self.limits;
         // Names are the client's choice; its address is not.
         let client_lease = self.quotas.live_streams.try_acquire(client_id, 1)?;
         let slot =
             self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
+        let (camera, lease) = self.own_camera(id).await?;
         let recording = store_samples.map(|durability| StreamRecording {
             recorder: self.recorder_of(&camera),
             tracker: AckTracker::beginning_after(resume_after_seq, durability),
@@ -116,6 +120,7 @@ impl App {
             app: self.clone(),
             _count: camera.live.count_stream(),
             camera,
+            lease: Some(lease),
             recording,
             last_seq: resume_after_seq,
             _slot: slot,
@@ -139,9 +144,10 @@ impl App {
         let mut stream = self.open_stream(&camera.id, &name, client, 0, Some(durability)).await?;
         let mut followed = Vec::with_capacity(observations.len());
         for (seq, observation) in (1..).zip(observations) {
+            let tracker_id = observation.tracker_id().cloned();
             let (time, target_id, bounding_box, fix) = observation.into_parts();
-            let item =
-                LiveItem { time, target_id, receiver_id: None, bounding_box, fix, class: None, score: None };
+            let (receiver_id, class, score) = (None, None, None);
+            let item = LiveItem { time, target_id, tracker_id, receiver_id, bounding_box, fix, class, score };
             stream.check_seq(seq)?;
             followed.push(stream.take(camera, seq, item).await?);
         }
@@ -187,10 +193,22 @@ impl LiveStream {
         current.filter(|camera| camera.key == self.camera.key).ok_or_else(|| self.camera_deleted())
     }
 
-    /// Waits until the camera is deleted.
-    pub async fn deleted(&self) -> Error {
-        self.camera.live.deleted().await;
-        self.camera_deleted()
+    /// Waits until the camera is deleted, or this node is no longer surely its owner.
+    pub async fn ended(&self) -> Error {
+        let lost = async {
+            match &self.lease {
+                Some(lease) => lease.ended().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            () = self.camera.live.deleted() => self.camera_deleted(),
+            error = lost => error,
+        }
+    }
+
+    fn lease(&self) -> Result<&CameraLease> {
+        self.lease.as_ref().ok_or_else(|| self.camera_deleted())
     }
 
     fn camera_deleted(&self) -> Error {
@@ -232,9 +250,11 @@ impl LiveStream {
     /// Takes an item: its own position, its target's track with it, and its part in a sample.
     ///
     /// # Errors
-    /// `InvalidArgument` for neither box nor fix, or for a time ahead of the server's clock, naming the
+    /// `CameraBetweenNodes`, which ends the stream; `InvalidArgument` for neither box nor fix, or for a time ahead of the server's clock, naming the
     /// field; as [`App::follow`].
     pub async fn take(&self, camera: &Arc<ActiveCamera>, seq: u64, item: LiveItem) -> Result<ItemResult> {
+        let lease = self.lease()?;
+        lease.check(self.app.clock.monotonic())?;
         let (target_id, time) = match (item.target_id, &item.receiver_id) {
             (Some(target_id), _) => (Some(target_id), item.time),
             (None, Some(receiver_id)) => {
@@ -243,11 +263,17 @@ impl LiveStream {
             }
             (None, None) => (None, item.time),
         };
-        let observation = Observation::new(time, target_id, item.bounding_box, item.fix)?;
+        let observation = Observation::new(time, target_id, item.bounding_box, item.fix)?
+            .with_tracker_id(item.tracker_id)?;
         // A time that no track takes must not move the pairing either.
         self.app.live_time_bounds().check(time)?;
-        self.record(seq, &observation, item.class, item.score).await?;
-        self.app.follow(camera, &observation)
+        let identified = self.app.identify(camera, observation);
+        if identified.is_sure {
+            self.record(seq, &identified.observation, item.class, item.score).await?;
+        } else {
+            self.ack_without_storing(seq, NotStoredReason::Unmatched);
+        }
+        self.app.follow_identified((camera, lease), identified)
     }
 
     async fn record(
@@ -345,6 +371,8 @@ impl ChangeNotices {
 
 impl Drop for LiveStream {
     fn drop(&mut self) {
+        self.lease = None;
+        self.app.cluster.let_go();
         self.app.metrics.stream_closed();
     }
 }

@@ -29,7 +29,16 @@ struct Sampler<'a> {
 
 /// Posterior probabilities by receiver, then piece, of receivers with these chains, of which the first is
 /// empty.
-pub(super) fn posterior(chains: &[Vec<Chain>], pieces: usize, random: &mut impl Rng) -> Vec<Vec<f64>> {
+///
+/// `own_probability` says of each piece how probable it is that its target carries what a companion, unseen
+/// beside the piece, could carry as well. A companion of a chain's target is unseen beside all of its pieces, so the
+/// piece with the largest probability decides.
+pub(super) fn posterior(
+    chains: &[Vec<Chain>],
+    own_probability: &[f64],
+    random: &mut impl Rng,
+) -> Vec<Vec<f64>> {
+    let pieces = own_probability.len();
     let mut sampler = Sampler { chains, chosen: vec![0; chains.len()], owner: vec![None; pieces] };
     sampler.start();
     let rivals = rivals(chains, pieces);
@@ -42,8 +51,9 @@ pub(super) fn posterior(chains: &[Vec<Chain>], pieces: usize, random: &mut impl 
             let weights = sampler.draw(receiver, random);
             if sweep >= BURN_IN {
                 for (chain, weight) in chains[receiver].iter().zip(weights) {
+                    let own = chain.pieces.iter().map(|piece| own_probability[*piece]).fold(0.0, f64::max);
                     for piece in &chain.pieces {
-                        probability[receiver][*piece] += weight / (SWEEPS - BURN_IN) as f64;
+                        probability[receiver][*piece] += own * weight / (SWEEPS - BURN_IN) as f64;
                     }
                 }
             }

@@ -1,8 +1,8 @@
 //! People walk in company: who carries a receiver may be out of view or missed beside a target that is seen.
 //!
 //! The companion's boxes explain the fixes as well as the carrier's own would, for a receiver's bias is larger than the
-//! distance between them. So the posterior probability of a piece is divided between its target and a
-//! companion that is not seen, by their prior probabilities. A companion is unseen more often at the border of the view.
+//! distance between them. So the posterior probability of a chain is divided between its target and a companion that is
+//! seen beside none of its pieces, by their prior probabilities. A companion is unseen more often at the border of the view.
 
 use crate::domain::{BoundingBox, Detection};
 

@@ -205,7 +205,12 @@ pub(super) fn match_located(
         .iter()
         .map(|(fixes, offset_s)| table.chains(fixes, *offset_s, &model, &settings.chains))
         .collect();
-    let probabilities = posterior(&chains, table.pieces.len(), random);
+    let view = View::of(scene.detections);
+    let detections_of =
+        |piece: &Piece| -> &[usize] { &located.detections[piece.tracklet][piece.first..piece.end] };
+    let own = |piece: &Piece| view.own_probability(scene.detections, detections_of(piece));
+    let own: Vec<f64> = table.pieces.iter().map(own).collect();
+    let probabilities = posterior(&chains, &own, random);
     let most_probable = |at: usize| {
         let all = probabilities.iter().map(|own| own[at]).enumerate();
         all.max_by(|one, other| one.1.total_cmp(&other.1))
@@ -216,16 +221,12 @@ pub(super) fn match_located(
         cuts: table.pieces.len() - located.tracklets.len(),
         ..Matching::default()
     };
-    let view = View::of(scene.detections);
     for (at, piece) in table.pieces.iter().enumerate() {
         let Some((receiver, probability)) = most_probable(at) else { continue };
-        let Piece { tracklet, first, end } = *piece;
-        let detections = &located.detections[tracklet][first..end];
-        let probability = probability * view.own_probability(scene.detections, detections);
         if probability >= LEAST_PROBABILITY {
             matching.pieces.push(MatchedPiece {
-                tracker_id: scene.tracklets[tracklet].tracker_id.clone(),
-                detections: detections.to_vec(),
+                tracker_id: scene.tracklets[piece.tracklet].tracker_id.clone(),
+                detections: detections_of(piece).to_vec(),
                 receiver_id: scene.receiver_ids[receiver].clone(),
                 probability,
             });

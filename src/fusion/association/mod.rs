@@ -2,7 +2,7 @@
 //!
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/association.md` has the formulas and figures. The files in the order of their imports:
-//! `tracklet`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`.
+//! `tracklet`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`.
 //! What never happens here: I/O, clocks, randomness that is not handed in.
 
 mod assignment;
@@ -12,6 +12,7 @@ mod cuts;
 mod evidence;
 mod joint;
 mod links;
+mod live;
 mod matching;
 mod placement;
 mod recording;
@@ -19,6 +20,7 @@ mod tracklet;
 
 pub use self::chains::ChainSettings;
 pub use self::joint::{JointMatch, WorldScores, match_without_model};
+pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};
 pub use self::matching::{MatchSettings, MatchedPiece, Matching, match_with_model};
 
 #[cfg(test)]

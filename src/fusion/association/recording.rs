@@ -10,7 +10,7 @@ use crate::geo::{EastNorth, LocalPlane};
 use crate::model::Regressor;
 
 /// A gap between two boxes of one id that begins a new tracklet, s: trackers use ids again.
-const TRACKLET_GAP_S: f64 = 3.0;
+pub(super) const TRACKLET_GAP_S: f64 = 3.0;
 
 /// Detections by tracklet.
 #[derive(Debug, Clone, PartialEq)]

@@ -124,9 +124,20 @@ fn sampled_probabilities_are_those_of_the_enumeration() {
             }
         }
     }
-    let sampled = posterior(&chains, 2, &mut ChaCha8Rng::seed_from_u64(3));
+    let sampled = posterior(&chains, &[1.0; 2], &mut ChaCha8Rng::seed_from_u64(3));
     for (own, wanted) in sampled.iter().flatten().zip(expected.iter().flatten()) {
         assert!((own - wanted / total).abs() < 0.06, "{sampled:?} {expected:?} {total}");
+    }
+}
+
+#[test]
+fn a_companion_is_unseen_beside_all_pieces_of_a_chain() {
+    // Piece 0 is at the border of the view, piece 1 is not; piece 2 is at the border and nobody's continuation.
+    let chains =
+        vec![vec![chain(&[], -50.0), chain(&[0, 1], 0.0)], vec![chain(&[], -50.0), chain(&[2], 0.0)]];
+    let probability = posterior(&chains, &[0.80, 0.96, 0.80], &mut ChaCha8Rng::seed_from_u64(3));
+    for (own, wanted) in probability.iter().flatten().zip([0.96, 0.96, 0.0, 0.0, 0.0, 0.80]) {
+        assert!((own - wanted).abs() < 1e-6, "{probability:?}");
     }
 }
 

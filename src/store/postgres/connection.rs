@@ -61,6 +61,15 @@ pub(super) async fn open(url: &DatabaseUrl) -> Result<PgPool> {
     Ok(pool)
 }
 
+/// A connection of its own for the renewals of a node, made when it is first needed.
+///
+/// # Errors
+/// The URL cannot be read.
+pub(super) fn for_renewals(url: &DatabaseUrl) -> Result<PgPool> {
+    let pool = PgPoolOptions::new().max_connections(1).acquire_timeout(CONNECTION_WAIT);
+    Ok(pool.connect_lazy_with(options(url)?))
+}
+
 fn options(url: &DatabaseUrl) -> Result<PgConnectOptions> {
     let options = url.options()?.statement_cache_capacity(0).disable_statement_logging();
     // Floats come in binary form; some poolers refuse a connection that sets this.

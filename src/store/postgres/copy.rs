@@ -35,7 +35,7 @@ impl CopyTransaction for Copying {
         async move {
             sqlx::query_scalar(
                 "SELECT tablename::TEXT FROM pg_tables WHERE schemaname = current_schema() \
-                 AND tablename <> '_sqlx_migrations' ORDER BY tablename",
+                 AND tablename NOT IN ('_sqlx_migrations', 'nodes', 'camera_owners') ORDER BY tablename",
             )
             .fetch_all(&mut *self.0)
             .await

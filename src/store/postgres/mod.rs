@@ -19,6 +19,7 @@ mod keys;
 mod latest_runs;
 mod locks;
 mod models;
+mod nodes;
 mod outbox;
 mod retention;
 mod runs;
@@ -43,6 +44,8 @@ use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 use errors::failed;
 use group_commit::GroupWriter;
 
+pub use nodes::{Acquired, NodeLeases};
+
 /// The store of one database.
 #[derive(Clone)]
 pub(super) struct Store {
@@ -55,6 +58,7 @@ struct Inner {
     pool: PgPool,
     samples: GroupCommit,
     usage: Arc<Usage>,
+    leases: NodeLeases,
 }
 
 impl Store {
@@ -63,7 +67,8 @@ impl Store {
         let usage = Arc::new(Usage::new(options.limits));
         let writer = GroupWriter { pool: pool.clone(), usage: Arc::clone(&usage) };
         let samples = GroupCommit::start(Arc::new(writer));
-        let inner = Arc::new(Inner { pool, samples, usage });
+        let leases = NodeLeases { renewals: connection::for_renewals(url)?, pool: pool.clone() };
+        let inner = Arc::new(Inner { pool, samples, usage, leases });
         let store = Self { inner, actor: Arc::new(Actor::program(&options.role)) };
         store.count_all_samples().await?;
         Ok(store)
@@ -75,7 +80,12 @@ impl Store {
 
     pub(super) async fn close(&self) {
         self.inner.samples.close().await;
+        self.inner.leases.renewals.close().await;
         self.inner.pool.close().await;
+    }
+
+    pub(super) fn node_leases(&self) -> &NodeLeases {
+        &self.inner.leases
     }
 
     pub(super) async fn ping(&self) -> Result<()> {

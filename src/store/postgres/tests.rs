@@ -1,6 +1,6 @@
 //! What only PostgreSQL has: several processes, connections that end, migrations at once.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,10 +8,12 @@ use sqlx::Connection as _;
 use tempfile::TempDir;
 use uuid::Uuid;
 
-use crate::domain::{CameraId, Durability, ErrorKind, NewCamera, RunId};
+use crate::domain::{
+    CameraId, Durability, ErrorKind, NewCamera, NewSite, NodeId, NodeProfile, RunId, SiteId,
+};
 use crate::store::tests::copy::copy_and_compare;
 use crate::store::tests::{Fixture, Home, at, connect, id, new_database, options, sample};
-use crate::store::{DatabaseUrl, Location, SampleFilter, Store, StoreOptions};
+use crate::store::{Acquired, DatabaseUrl, Location, SampleFilter, Store, StoreOptions};
 
 const LEASE: Duration = Duration::from_secs(30);
 
@@ -212,4 +214,92 @@ async fn a_waiting_start_does_not_block_an_index_that_is_built_concurrently() {
 async fn a_folder_is_copied_into_a_database_and_back() {
     let folder = Home::Folder(Arc::new(TempDir::new().expect("a folder")));
     copy_and_compare(&Fixture::at(folder).await, &database().await).await;
+}
+
+/// A node that is registered, with the store that it would use.
+async fn registered(home: &Home, number: u128) -> (Store, NodeId) {
+    let (store, id) = (home.open().await, NodeId(Uuid::from_u128(number)));
+    let profile = NodeProfile {
+        url: Some(format!("http://node-{number}")),
+        role: "serve".to_owned(),
+        version: "0".to_owned(),
+        lease: LEASE,
+        started_at: at(number as i64),
+    };
+    store.node_leases().expect("a database").register(id, &profile, 1).await.expect("registered");
+    (store, id)
+}
+
+async fn acquire(store: &Store, camera: &str, node: NodeId) -> Acquired {
+    let key = store.camera(&id(camera)).await.expect("known").key;
+    store.node_leases().expect("a database").acquire(key, node).await.expect("works")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn of_nodes_that_acquire_at_once_one_owns_a_camera_and_its_whole_site() {
+    let home = database().await;
+    let nodes = [registered(&home, 1).await, registered(&home, 2).await, registered(&home, 3).await];
+    let store = &nodes[0].0;
+    let site = SiteId::new("port").expect("a slug");
+    store.insert_site(&NewSite::named(site.clone()), at(0)).await.expect("new");
+    for number in 0..12 {
+        let camera =
+            NewCamera { site: Some(site.clone()), ..NewCamera::named(id(&format!("of-site-{number}"))) };
+        store.insert_camera(&camera, at(0)).await.expect("new");
+        store.insert_camera(&NewCamera::named(id(&format!("alone-{number}"))), at(0)).await.expect("new");
+    }
+    let acquiring = (0..72).map(|n| {
+        let (store, node) = nodes[n % 3].clone();
+        let camera = format!("{}-{}", if n < 36 { "of-site" } else { "alone" }, (n / 3) % 12);
+        tokio::spawn(async move { (camera.clone(), node, acquire(&store, &camera, node).await) })
+    });
+    let mut owners: HashMap<String, HashSet<NodeId>> = HashMap::new();
+    for task in acquiring.collect::<Vec<_>>() {
+        let (camera, node, acquired) = task.await.expect("no panic");
+        if matches!(acquired, Acquired::Owned { fence: 1, is_takeover: false }) {
+            owners.entry(camera).or_default().insert(node);
+        }
+    }
+    assert!(owners.values().all(|owners| owners.len() == 1), "{owners:?}");
+    assert_eq!(owners.len(), 24, "every camera has an owner");
+    let of_site = owners.iter().filter(|(camera, _)| camera.starts_with("of-site"));
+    let of_site: HashSet<NodeId> = of_site.flat_map(|(_, owners)| owners.clone()).collect();
+    assert_eq!(of_site.len(), 1, "a site has one owner");
+}
+
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_node_owns_until_its_registration_ends_and_every_owner_has_a_higher_fence() {
+    let home = database().await;
+    let ((first, one), (second, two)) = (registered(&home, 1).await, registered(&home, 2).await);
+    first.insert_camera(&NewCamera::named(id("a")), at(0)).await.expect("new");
+    let key = first.camera(&id("a")).await.expect("known").key;
+    let (ours, others) =
+        (first.node_leases().expect("a database"), second.node_leases().expect("a database"));
+    let owned = |fence, is_takeover| Acquired::Owned { fence, is_takeover };
+    assert_eq!(acquire(&first, "a", one).await, owned(1, false));
+    assert_eq!(acquire(&second, "a", two).await, Acquired::OtherNode(one));
+    assert_eq!(others.camera_owner(key).await.expect("works"), Some(one));
+
+    // An observer that has not seen the latest renewal ends nothing.
+    assert!(ours.renew(one, 2, false).await.expect("works").is_some());
+    assert!(!others.end_unrenewed(one, 1).await.expect("works"));
+    assert_eq!(acquire(&second, "a", two).await, Acquired::OtherNode(one));
+    assert!(others.end_unrenewed(one, 2).await.expect("works"));
+    assert_eq!(acquire(&second, "a", two).await, owned(2, true));
+    // The node before learns of it whatever it tries.
+    assert!(ours.renew(one, 3, false).await.expect("works").is_none());
+    assert_eq!(acquire(&first, "a", one).await, Acquired::NotRegistered);
+    ours.release(one, &[(key, 1)]).await.expect("works");
+    assert_eq!(ours.camera_owner(key).await.expect("works"), Some(two));
+
+    // What is released under an old fence is not released.
+    assert_eq!(acquire(&second, "a", two).await, owned(3, false));
+    others.release(two, &[(key, 2)]).await.expect("works");
+    assert_eq!(ours.camera_owner(key).await.expect("works"), Some(two));
+    others.release(two, &[(key, 3)]).await.expect("works");
+    assert_eq!(ours.camera_owner(key).await.expect("works"), None);
+    second.delete_camera(&id("a"), None, at(1)).await.expect("deleted");
+    assert_eq!(others.nodes().await.expect("works").iter().map(|(_, cameras)| *cameras).sum::<u64>(), 0);
 }

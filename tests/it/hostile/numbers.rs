@@ -71,7 +71,8 @@ proptest! {
         fix in prop::option::of(wire_fix()),
     ) {
         let observation = wire::Observation {
-            time: "2026-01-01T00:00:00Z".into(), target_id: None, receiver_id: None, bounding_box, fix,
+            time: "2026-01-01T00:00:00Z".into(), target_id: None, receiver_id: None, tracker_id: None, bounding_box,
+            fix,
         };
         let bounds = TimeBounds::at("2026-06-01T00:00:00Z".parse().expect("an instant"));
         if let Ok(observation) = observation.to_domain(&bounds, None, &Receivers::default()) {

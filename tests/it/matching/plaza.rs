@@ -57,9 +57,10 @@ impl Plaza {
                 (camera, rows.map(|row| row.expect("a file").expect("a row")).collect())
             })
             .into();
+        // A person is also the id of an unbroken track.
         let persons = table("identity.csv")
             .iter()
-            .map(|row| ((row[0].to_owned(), row[1].to_owned()), row[2].to_owned()))
+            .flat_map(|row| [1, 2].map(|id| ((row[0].to_owned(), row[id].to_owned()), row[2].to_owned())))
             .collect();
         let mut truth: BTreeMap<String, Vec<(f64, Position)>> = BTreeMap::new();
         for row in table("truth.csv") {
@@ -154,6 +155,15 @@ impl Plaza {
         &self.persons[&(camera.to_owned(), own.target_id.as_str().to_owned())]
     }
 
+    /// The boxes of a camera as of a tracker whose ids never break.
+    fn unbroken(&self, camera: &str) -> Vec<Detection> {
+        let of = |own: &Detection| {
+            let target_id = TargetId::new(self.person(camera, own)).expect("an id");
+            Detection { target_id, ..own.clone() }
+        };
+        self.detections[camera].iter().map(of).collect()
+    }
+
     /// Mean error of regressed positions of all boxes, m.
     fn mean_error_m(&self, camera: &str, model: &Regressor) -> f64 {
         let boxes: Vec<&Detection> = self.detections[camera].iter().step_by(4).collect();
@@ -171,9 +181,14 @@ impl Plaza {
 
     /// True pairs: a tracker's id and the receiver of its person, with three fixes and more between its first
     /// and last box.
-    fn true_pairs(&self, camera: &str, fixes: &[ReceivedFix]) -> BTreeSet<(String, String)> {
+    fn true_pairs(
+        &self,
+        camera: &str,
+        boxes: &[Detection],
+        fixes: &[ReceivedFix],
+    ) -> BTreeSet<(String, String)> {
         let mut spans: BTreeMap<&str, (f64, f64)> = BTreeMap::new();
-        for own in &self.detections[camera] {
+        for own in boxes {
             let at_s = seconds(own.time);
             let span = spans.entry(own.target_id.as_str()).or_insert((at_s, at_s));
             *span = (span.0.min(at_s), span.1.max(at_s));
@@ -213,7 +228,13 @@ struct Score {
 }
 
 impl Score {
-    fn add(&mut self, plaza: &Plaza, camera: &str, fixes: &[ReceivedFix], matching: &Matching) {
+    fn add(
+        &mut self,
+        plaza: &Plaza,
+        camera: &str,
+        (boxes, fixes): (&[Detection], &[ReceivedFix]),
+        matching: &Matching,
+    ) {
         let mut found = BTreeSet::new();
         for piece in &matching.pieces {
             let person = &plaza.persons[&(camera.to_owned(), piece.tracker_id.as_str().to_owned())];
@@ -231,7 +252,7 @@ impl Score {
             }
         }
         self.found += found.len();
-        self.all += plaza.true_pairs(camera, fixes).len();
+        self.all += plaza.true_pairs(camera, boxes, fixes).len();
     }
 
     fn print(&self, name: &str) {
@@ -264,23 +285,28 @@ impl Score {
 #[ignore = "needs ../shared/data"]
 fn shared_plaza_pairs_with_a_known_model() {
     let plaza = Plaza::read();
-    let mut all = Score::default();
+    let (mut all, mut unbroken) = (Score::default(), Score::default());
     for camera in CAMERAS {
         let model = plaza.known_model(camera, &plaza.redrawn(TRAINING_DRAW));
         let mut score = Score::default();
         for draw in 1..=5 {
             let fixes = plaza.redrawn(draw);
-            let mut random = ChaCha8Rng::seed_from_u64(draw);
-            let settings = MatchSettings::default();
-            let boxes = &plaza.detections[camera];
-            let matching =
+            let matched = |boxes: &[Detection]| {
+                let mut random = ChaCha8Rng::seed_from_u64(draw);
+                let settings = MatchSettings::default();
                 match_with_model(boxes, &fixes, &Receivers::default(), &model, &settings, &mut random)
-                    .expect("within bounds");
-            score.add(&plaza, camera, &fixes, &matching);
-            all.add(&plaza, camera, &fixes, &matching);
+                    .expect("within bounds")
+            };
+            let boxes = &plaza.detections[camera];
+            let matching = matched(boxes);
+            score.add(&plaza, camera, (boxes, &fixes), &matching);
+            all.add(&plaza, camera, (boxes, &fixes), &matching);
+            let boxes = plaza.unbroken(camera);
+            unbroken.add(&plaza, camera, (&boxes, &fixes), &matched(&boxes));
         }
         score.print(camera);
     }
+    unbroken.print("all cameras, ids that never break");
     all.print("all cameras");
     assert!(all.precision() >= 0.95);
     // The goal for the share found is 0.6 (docs/association.md).
@@ -314,7 +340,7 @@ fn shared_plaza_without_a_model() {
                 Ok(joint) => {
                     let mean_m = plaza.mean_error_m(camera, &joint.model.load().expect("a model"));
                     let mut score = Score::default();
-                    score.add(&plaza, camera, &fixes, &joint.matching);
+                    score.add(&plaza, camera, (boxes, &fixes), &joint.matching);
                     println!(
                         "{camera}, draw {draw}: {mean_m:.2} m, with identities {known_m:.2} m; {:?}; {} of {} sure pairs right",
                         joint.scores, score.right, score.sure

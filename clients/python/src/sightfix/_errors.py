@@ -49,6 +49,8 @@ class Problem:
     """Id of the request, as in the server's log."""
     violations: tuple[Violation, ...] = ()
     """The fields at fault."""
+    owner: str | None = None
+    """Address of the node of the server that has the camera's live state, if it is another one."""
 
 
 class ProblemError(SightfixError):
@@ -104,7 +106,7 @@ class InsufficientStorageError(ProblemError):
 
 
 class UnavailableError(ProblemError):
-    """The server has too much to do or is shutting down: try again later."""
+    """The server has too much to do, is shutting down, or another node has the camera: try again later."""
 
 
 class ServerFaultError(ProblemError):
@@ -112,6 +114,7 @@ class ServerFaultError(ProblemError):
 
 
 BY_STATUS: dict[int, type[ProblemError]] = {
+    307: UnavailableError,
     401: UnauthenticatedError,
     403: PermissionDeniedError,
     404: NotFoundError,

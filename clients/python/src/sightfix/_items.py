@@ -16,6 +16,9 @@ class LiveItem:
     """The target. Without it there is a fused position but no track."""
     receiver_id: str | None = None
     """Which receiver measured the fix; instead of `target_id` for a fix alone."""
+    tracker_id: str | None = None
+    """Number that the camera's tracker gave a box whose target is not known; instead of `target_id`. The answer's
+    `receiver_match` says which receiver the target carries, as soon as that is sure."""
     bounding_box: BoundingBox | None = None
     """What the camera saw."""
     fix: Fix | None = None

@@ -71,6 +71,15 @@ def with_json(
     )
 
 
+def redirection(response: httpx.Response) -> str | None:
+    """The same request at the node of the server that answers it, never without the encryption that it had."""
+    location = response.headers.get("location")
+    if response.status_code != httpx.codes.TEMPORARY_REDIRECT or location is None:
+        return None
+    is_plain = response.request.url.scheme == "http"
+    return location if is_plain or location.startswith("https:") else None
+
+
 def query_parameters(query: Mapping[str, Parameter]) -> dict[str, str]:
     """Parameters as text, without those that are None. A trailing underscore of a name is dropped."""
     texts = {}
@@ -122,7 +131,8 @@ def problem_of(response: httpx.Response) -> ProblemError:
 
 def may_send_again(request: Request, status: int, problem: ProblemError) -> bool:
     """Whether a refused request may be sent again."""
-    refused_before_work = problem.kind == "overloaded" or status == httpx.codes.TOO_MANY_REQUESTS
+    refused = ("overloaded", "camera-between-nodes", "camera-on-other-node")
+    refused_before_work = problem.kind in refused or status == httpx.codes.TOO_MANY_REQUESTS
     retryable = (
         httpx.codes.TOO_MANY_REQUESTS,
         httpx.codes.BAD_GATEWAY,

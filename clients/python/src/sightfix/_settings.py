@@ -5,6 +5,7 @@ import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sightfix._errors import ProblemError
 from sightfix._request import RetryPolicy
 
 KEY_VARIABLE = "SIGHTFIX_API_KEY"
@@ -26,6 +27,12 @@ class Settings:
     def headers(self) -> dict[str, str]:
         """Headers of every request."""
         return {"authorization": f"Bearer {self.api_key}"} if self.api_key else {}
+
+    def node_of(self, failure: ProblemError | None) -> str:
+        """Where to go on after a failure: the node that the server names, which never costs the encryption."""
+        owner = failure.problem.owner if failure else None
+        is_plain = self.server.startswith("http:")
+        return owner if owner and (is_plain or owner.startswith("https:")) else self.server
 
     def tls_context(self) -> ssl.SSLContext:
         """Verifies the server by the given authority, or by those of the system."""

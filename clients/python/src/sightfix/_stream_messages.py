@@ -41,7 +41,8 @@ def to_message(item: LiveItem | Observation | Sample) -> messages.StreamItem:
             values.Fix(longitude_deg=fix.longitude_deg, latitude_deg=fix.latitude_deg, sigma_m=fix.sigma_m)
         )
     # Not every kind of item has these.
-    for name, attribute in (("receiver_id", "receiver_id"), ("class", "class_"), ("score", "score")):
+    optional = (("receiver_id", "receiver_id"), ("tracker_id", "tracker_id"), ("class", "class_"), ("score", "score"))
+    for name, attribute in optional:
         value = getattr(item, attribute, None)
         if value is not None:
             setattr(message, name, value)
@@ -80,7 +81,7 @@ def stream_failure(error: grpc.RpcError) -> StreamFailure:
 def server_details(call: Any) -> Problem:
     """The problem in the details of a status (google.rpc.Status in the trailing metadata)."""
     code, message = call.code().name, call.details() or ""
-    kind, trace_id, violations = "", "", []
+    kind, trace_id, owner, violations = "", "", None, []
     for key, value in call.trailing_metadata() or ():
         if key != "grpc-status-details-bin":
             continue
@@ -91,13 +92,21 @@ def server_details(call: Any) -> Problem:
                 error_details_pb2.RequestInfo(),
             )
             if detail.Unpack(info):
-                kind = info.reason
+                kind, owner = info.reason, info.metadata.get("owner")
             elif detail.Unpack(bad):
                 violations = [Violation(field=it.field, message=it.description) for it in bad.field_violations]
             elif detail.Unpack(request):
                 trace_id = request.request_id
     title = code.replace("_", " ").capitalize()
-    return Problem(status=0, kind=kind, title=title, detail=message, trace_id=trace_id, violations=tuple(violations))
+    return Problem(
+        status=0,
+        kind=kind,
+        title=title,
+        detail=message,
+        trace_id=trace_id,
+        violations=tuple(violations),
+        owner=owner,
+    )
 
 
 def closed_early() -> ProblemError:

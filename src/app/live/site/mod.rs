@@ -36,9 +36,9 @@ impl App {
     /// Where every target of a site is now.
     ///
     /// # Errors
-    /// `SiteNotFound`.
+    /// `SiteNotFound`, `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub async fn world_tracks(&self, id: &SiteId) -> Result<SiteTracks> {
-        let live = &self.active_site(id).await?.live;
+        let live = &self.readable_site(id).await?.live;
         // The event first: what is published in between is in both.
         let last_event = live.id_of(live.events.latest());
         Ok(SiteTracks { points: lock(&live.tracks).latest(), last_event })
@@ -47,9 +47,9 @@ impl App {
     /// Where a target was, oldest first, as far back as the history reaches.
     ///
     /// # Errors
-    /// `SiteNotFound`; `TrackNotFound` if the track has ended.
+    /// As [`App::world_tracks`]; `TrackNotFound` if the track has ended.
     pub async fn world_track_history(&self, id: &SiteId, track: LiveId) -> Result<Vec<Arc<WorldTrackPoint>>> {
-        let site = self.active_site(id).await?;
+        let site = self.readable_site(id).await?;
         let history = lock(&site.live.tracks).history(track);
         history.ok_or_else(|| {
             let message = format!("site {id} has no world track {track} now");
@@ -60,10 +60,18 @@ impl App {
     /// What happens at a site: behind an event, or from now on.
     ///
     /// # Errors
-    /// `SiteNotFound`.
+    /// As [`App::world_tracks`].
     pub async fn site_events(&self, id: &SiteId, after: Option<LiveId>) -> Result<SiteEvents> {
+        let site = self.readable_site(id).await?;
+        let watch = self.watch_site_owner(site.key);
+        Ok(SiteEvents::new(site.live.clone(), after, watch, self.metrics.clone()))
+    }
+
+    /// A site whose live state is read.
+    async fn readable_site(&self, id: &SiteId) -> Result<Arc<ActiveSite>> {
         let site = self.active_site(id).await?;
-        Ok(SiteEvents::new(site.live.clone(), after, self.metrics.clone()))
+        self.check_site_readable(id, site.key).await?;
+        Ok(site)
     }
 
     /// A site in memory; looks into the store for one that another process has created.

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::events::SiteEvent;
 use super::state::SiteLive;
+use crate::app::cluster::Watch;
 use crate::app::live::event_log::{EventReader, NextEvent};
 use crate::domain::LiveId;
 use crate::telemetry::Metrics;
@@ -51,7 +52,8 @@ impl LossReason {
     }
 }
 
-/// A reader of the events of one site; they end when the site is deleted.
+/// A reader of the events of one site; they end when the site is deleted, or another node has become the owner of its
+/// cameras.
 pub struct SiteEvents {
     live: Arc<SiteLive>,
     reader: EventReader<SiteEvent>,
@@ -60,10 +62,11 @@ pub struct SiteEvents {
     /// Why events are missing, if they are: a reader that has read one is too slow for the next.
     reason: LossReason,
     metrics: Metrics,
+    watch: Watch,
 }
 
 impl SiteEvents {
-    pub(super) fn new(live: Arc<SiteLive>, after: Option<LiveId>, metrics: Metrics) -> Self {
+    pub(super) fn new(live: Arc<SiteLive>, after: Option<LiveId>, watch: Watch, metrics: Metrics) -> Self {
         let is_other_epoch = after.is_some_and(|after| after.epoch != live.epoch);
         let number = match after {
             Some(after) if !is_other_epoch => after.number,
@@ -77,10 +80,16 @@ impl SiteEvents {
             reason: LossReason::Restarted,
         });
         let reason = if after.is_some() { LossReason::TooOld } else { LossReason::TooSlow };
-        Self { reader: live.events.reader(number), live, restarted, reason, metrics }
+        Self { reader: live.events.reader(number), live, restarted, reason, metrics, watch }
     }
 
-    /// The next event, or what was lost before it; `None` once the site is deleted. Cancelling the wait loses
+    /// Whether they have ended since they continue on another node: the reader should ask again.
+    #[must_use]
+    pub fn continue_elsewhere(&self) -> bool {
+        self.watch.has_ended()
+    }
+
+    /// The next event, or what was lost before it; `None` once the site is deleted or goes on elsewhere. Cancelling the wait loses
     /// nothing.
     pub async fn next(&mut self) -> Option<Result<StoredSiteEvent, LostSiteEvents>> {
         if let Some(lost) = self.restarted.take() {
@@ -89,6 +98,7 @@ impl SiteEvents {
         let next = tokio::select! {
             biased;
             () = self.live.ended.cancelled() => return None,
+            () = self.watch.ended() => return None,
             next = self.reader.next() => next,
         };
         Some(match next {

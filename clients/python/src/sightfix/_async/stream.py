@@ -60,9 +60,9 @@ class StreamOptions:
     """Whether `send` waits while answers are not read; else the oldest ones are dropped."""
 
 
-def open_channel(settings: Settings) -> grpc.aio.Channel:
-    """A connection, made when it is first needed and again after it broke."""
-    scheme, _, address = settings.server.partition("://")
+def open_channel(settings: Settings, server: str) -> grpc.aio.Channel:
+    """A connection to an address, made when it is first needed and again after it broke."""
+    scheme, _, address = server.partition("://")
     if scheme == "http":
         return grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS)
     authority, certificate, key = (
@@ -78,7 +78,9 @@ class Stream:
 
     After a broken connection or a restart of the server it reconnects with exponential back-off and sends again
     whatever was not acknowledged (not answered, if samples are not stored); sending an item twice is harmless.
-    Leaving the `with` block waits until everything is acknowledged. Answers are messages of `sightfix.v1`.
+    Where the server has several nodes, it goes on at the one that has the camera, and returns to the given address when
+    that one cannot be reached. Leaving the `with` block waits until everything is acknowledged. Answers are messages of
+    `sightfix.v1`.
     """
 
     def __init__(self, settings: Settings, options: StreamOptions) -> None:
@@ -241,17 +243,23 @@ class Stream:
 
     async def _run(self) -> None:
         """Opens streams until all items are done or no attempt is left."""
-        channel = open_channel(self._settings)
+        channels: dict[str, grpc.aio.Channel] = {}
+        server = self._settings.server
         try:
             while not self._is_finished:
-                await self._continue_after(await self._run_stream(FusionServiceStub(channel)))
+                if server not in channels:
+                    channels[server] = open_channel(self._settings, server)
+                ended = await self._run_stream(FusionServiceStub(channels[server]))
+                await self._continue_after(ended)
+                server = self._settings.node_of(ended)
         except Exception as error:
             async with self._changed:
                 failure = SightfixError(f"the stream failed: {error!r}")
                 failure.__cause__ = error
                 self._end(failure)
         finally:
-            await channel.close()
+            for channel in channels.values():
+                await channel.close()
 
     async def _continue_after(self, failure: ProblemError | None) -> None:
         """Decides after the end of a stream whether another one is to be opened, and waits until then."""
@@ -282,7 +290,9 @@ class Stream:
             self._reconnect_requested = False
             self._lost_on_stream = 0
             number = self._stream_number
-            call = self._call = stub.Stream(self._requests(number), metadata=tuple(self._settings.headers().items()))
+            # A balancer may choose the node by the camera.
+            metadata = (*self._settings.headers().items(), ("sightfix-camera", self._options.camera_id))
+            call = self._call = stub.Stream(self._requests(number), metadata=metadata)
         failure = None
         try:
             async for response in call:

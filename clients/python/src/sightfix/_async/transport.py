@@ -14,6 +14,7 @@ from sightfix._request import (
     may_send_again,
     problem_of,
     query_parameters,
+    redirection,
     retry_after_s,
     was_not_sent,
 )
@@ -70,10 +71,11 @@ class Transport:
     async def open(self, request: Request, *, read_timeout_s: float | None = None) -> AsyncIterator[httpx.Response]:
         """The response to a request, whose body can be read in parts. Raises as `send`."""
         failures = 0
+        node: str | None = None
         while True:
             wait_s: float | None = None
             try:
-                response = await self._http.send(self._build(request, read_timeout_s), stream=True)
+                response = await self._http.send(self._build(request, read_timeout_s, node), stream=True)
             except httpx.TransportError as error:
                 failure: SightfixError = ConnectionFailedError(f"{request.method} {request.path}: {error!r}")
                 failure.__cause__ = error
@@ -82,25 +84,30 @@ class Transport:
                 if response.is_success:
                     break
                 problem = await read_problem(response)
+                is_first, node = node is None, redirection(response)
+                if is_first and node is not None:
+                    continue
                 failure, wait_s = problem, retry_after_s(response)
                 is_retryable = may_send_again(request, response.status_code, problem)
             failures += 1
             if not is_retryable or failures >= self._retry.attempts:
                 raise failure
+            node = None
             await sleep(self._retry.delay_s(failures, wait_s))
         try:
             yield response
         finally:
             await response.aclose()
 
-    def _build(self, request: Request, read_timeout_s: float | None) -> httpx.Request:
+    def _build(self, request: Request, read_timeout_s: float | None, node: str | None) -> httpx.Request:
+        """The request as it is sent, or the same to the location that the server named."""
         body = request.body
         content = body if isinstance(body, bytes) or body is None else file_parts(body)
         files = {part: (file.name, file.read_bytes()) for part, file in request.files.items()}
         built = self._http.build_request(
             request.method,
-            request.path,
-            params=query_parameters(request.query),
+            node or request.path,
+            params=None if node else query_parameters(request.query),
             headers=dict(request.headers),
             content=content,
             files=files or None,

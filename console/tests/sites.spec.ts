@@ -1,0 +1,40 @@
+// A site: cameras that track their targets together.
+import { accessibilityFindings, expect, test } from './fixtures';
+import { addCamera, simulate, walk } from './world';
+
+test('two cameras of a site, named in their profiles, show one track per target', async ({ console: page, server }) => {
+  const world = simulate(13, [0, 0], 300);
+  await addCamera(server, 'north', 'North', world);
+  await addCamera(server, 'south', 'South', world);
+  for (const camera of ['north', 'south']) {
+    await page.goto(`${server.url}/#/cameras/${camera}/profile`);
+    await page.getByLabel(/^Site/).fill('plaza');
+    await page.getByRole('button', { name: 'Save' }).click();
+    await expect(page.getByText('revision 2')).toBeVisible();
+  }
+  expect((await server.request<{ cameras: number }>('GET', '/v1/sites/plaza')).cameras).toBe(2);
+
+  await page.getByRole('link', { name: 'Site plaza' }).click();
+  await expect(page.getByText('No target is tracked on this site now.')).toBeVisible();
+  await expect(page.getByRole('status').getByText('Live')).toBeVisible();
+  // Both see the same two people.
+  const stops = ['north', 'south'].map((camera) => walk(server, camera, world.live));
+  const targets = page.locator('.targets tbody tr');
+  await expect(targets.filter({ hasText: 'north, south' }).first()).toBeVisible({ timeout: 60_000 });
+  expect(await targets.count()).toBeLessThan(4);
+  // The tracks are drawn in the colour of what is fused.
+  const drawn = await page.locator('.plane-canvas').evaluate((element) => {
+    const canvas = element as HTMLCanvasElement;
+    const hex = getComputedStyle(document.documentElement).getPropertyValue('--fused').trim();
+    const color = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
+    const { data } = canvas.getContext('2d')!.getImageData(0, 0, canvas.width, canvas.height);
+    let count = 0;
+    for (let at = 0; at < data.length; at += 4) if (data[at + 3]! > 200 && color.every((value, channel) => Math.abs(value - data[at + channel]!) < 12)) count += 1;
+    return count;
+  });
+  expect(drawn).toBeGreaterThan(20);
+  expect(await accessibilityFindings(page)).toEqual([]);
+  stops.forEach((stop) => stop());
+  await page.goto(`${server.url}/#/cameras`);
+  await expect(page.getByRole('link', { name: 'plaza', exact: true })).toBeVisible();
+});

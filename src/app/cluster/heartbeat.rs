@@ -1,0 +1,154 @@
+//! What a node does by itself: renew, end the registrations of silent nodes, give up what nobody uses, hand over at its
+//! end.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use super::membership::Membership;
+use super::registration::Registration;
+use super::watches::Watched;
+use crate::app::App;
+use crate::domain::{Error, ErrorKind, NodeId, Result};
+use crate::shutdown::Shutdown;
+
+/// Renewals per lease.
+const RENEWALS: u32 = 4;
+/// How long a camera without streams and observations keeps its owner: as long as its tracks last.
+const UNUSED_TIME: Duration = Duration::from_secs(60);
+/// How often a node that shuts down looks whether it can give up more.
+const DRAIN_PAUSE: Duration = Duration::from_millis(50);
+const LEAST_PAUSE: Duration = Duration::from_millis(10);
+
+impl App {
+    /// Keeps this node registered and its ownerships up to date until the server shuts down, then hands over what it
+    /// owns as soon as nobody uses it here. A server that shares its database with no other has nothing to do.
+    pub async fn keep_registered(self, shutdown: Shutdown) {
+        let Some(membership) = self.cluster.membership() else { return };
+        tokio::select! {
+            // Renewals never wait for what else is to be done.
+            ((), ()) = async { tokio::join!(renew_on(&self, membership), tend_on(&self, membership)) } => {}
+            () = hand_over(membership, &shutdown) => {}
+        }
+        let registration = membership.registration.load_full();
+        registration.invalidate();
+        if let Err(error) = membership.leases.end(registration.id).await {
+            tracing::warn!(%error, "the registration of this node will end by its lease");
+        }
+    }
+}
+
+async fn renew_on(app: &App, membership: &Membership) {
+    let interval = membership.profile.lease / RENEWALS;
+    loop {
+        let renewed = tokio::time::timeout(membership.profile.lease / 2, renew(app, membership)).await;
+        let now = app.clock.monotonic();
+        let pause = match renewed.unwrap_or_else(|_| Err(no_answer())) {
+            Ok(()) => membership.next_silence().map_or(interval, |at| at.saturating_sub(now).min(interval)),
+            Err(error) => {
+                tracing::warn!(%error, "the registration of this node could not be renewed");
+                interval / RENEWALS
+            }
+        };
+        tokio::select! {
+            () = tokio::time::sleep(pause.max(LEAST_PAUSE)) => {}
+            () = membership.drain_begun.notified() => {}
+        }
+    }
+}
+
+/// One renewal; a node that was not heard of for too long registers again and owns nothing.
+async fn renew(app: &App, membership: &Membership) -> Result<()> {
+    let sent_at = app.clock.monotonic();
+    let registration = membership.registration.load_full();
+    if !registration.is_valid(sent_at) {
+        membership.lose(app);
+        return register_again(app, membership, &registration).await;
+    }
+    let is_draining = membership.is_draining.load(Ordering::Acquire);
+    let Some(nodes) = membership.leases.renew(registration.id, random(app), is_draining).await? else {
+        membership.lose(app);
+        return register_again(app, membership, &registration).await;
+    };
+    registration.extend(membership.valid_until(sent_at));
+    app.metrics.nodes(nodes.len());
+    let silent = membership.observe(nodes, registration.id, app.clock.monotonic());
+    for (id, renewal) in silent {
+        if membership.leases.end_unrenewed(id, renewal).await? {
+            tracing::warn!(node = %id, "a node has ended without a word: its cameras are free");
+        }
+    }
+    Ok(())
+}
+
+async fn register_again(app: &App, membership: &Membership, before: &Registration) -> Result<()> {
+    membership.leases.end(before.id).await?;
+    let sent_at = app.clock.monotonic();
+    let id = NodeId(app.randomness.uuid_v7(app.clock.now()));
+    membership.leases.register(id, &membership.profile, random(app)).await?;
+    membership.registration.store(Arc::new(Registration::new(id, membership.valid_until(sent_at))));
+    tracing::info!(node = %id, "this node is registered again");
+    Ok(())
+}
+
+/// Gives up what is not used any more, and ends readers whose camera or site another node owns.
+async fn tend_on(app: &App, membership: &Membership) {
+    loop {
+        tokio::time::sleep(membership.profile.lease / RENEWALS).await;
+        let now = app.clock.monotonic();
+        membership.give_up(|lease, is_used| {
+            let camera = app.registry.get(&lease.camera).filter(|camera| camera.key == lease.key);
+            // A camera that goes to another site goes to the node of that site.
+            let has_left = camera.is_none_or(|camera| camera.site != lease.site);
+            has_left || (!is_used && lease.unused_for(now) >= UNUSED_TIME)
+        });
+        app.metrics.owned_cameras(membership.owned());
+        let tended = async {
+            membership.release().await?;
+            end_watches(membership).await
+        };
+        if let Err(error) = tended.await {
+            tracing::warn!(%error, "cannot look for cameras that other nodes own");
+        }
+    }
+}
+
+async fn end_watches(membership: &Membership) -> Result<()> {
+    let (cameras, sites) = membership.watches.watched();
+    if cameras.is_empty() && sites.is_empty() {
+        return Ok(());
+    }
+    let own = membership.registration.load().id;
+    let (cameras, sites) = membership.leases.owned_by_others(own, &cameras, &sites).await?;
+    cameras.into_iter().map(Watched::Camera).for_each(|watched| membership.watches.end(watched));
+    sites.into_iter().map(Watched::Site).for_each(|watched| membership.watches.end(watched));
+    Ok(())
+}
+
+/// From the begin of the drain on: releases each camera once its last stream has been settled. Returns when nothing is
+/// left, or no time.
+async fn hand_over(membership: &Membership, shutdown: &Shutdown) {
+    shutdown.draining().await;
+    membership.begin_drain();
+    loop {
+        membership.give_up(|_, is_used| !is_used);
+        if membership.release().await.is_ok() && membership.owned() == 0 {
+            return;
+        }
+        tokio::select! {
+            () = membership.let_go.notified() => {}
+            () = tokio::time::sleep(DRAIN_PAUSE) => {}
+            () = shutdown.forced() => return,
+        }
+    }
+}
+
+fn no_answer() -> Error {
+    Error::refused(ErrorKind::Overloaded, "the database did not answer in time")
+}
+
+pub(super) fn random(app: &App) -> i64 {
+    let mut number = [0; 8];
+    app.randomness.fill(&mut number);
+    i64::from_le_bytes(number)
+}

@@ -1,0 +1,210 @@
+//! Which process has the live state of a camera.
+//!
+//! Tracks, pairing and the watch for moved cameras are in memory, so those of one camera, and of all cameras of one site,
+//! are on one node at a time: the owner. A node is registered in the database and renews its registration; it owns
+//! cameras as long as it is registered, so a renewal is one row however many cameras there are. Nobody has to be asked
+//! whether the node still owns a camera: it knows by its own clock until when nobody can have ended its registration.
+//! A server on a data folder owns everything.
+//!
+//! Samples need no fence: they are stored under the key of camera, target and time, so what two owners in turn, or a client
+//! that sends again, bring twice is stored once.
+
+mod camera_lease;
+mod heartbeat;
+mod membership;
+mod registration;
+mod watches;
+
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use self::camera_lease::{between_nodes, camera_text};
+use self::membership::Membership;
+use self::registration::Registration;
+use self::watches::Watched;
+use super::App;
+use super::registry::ActiveCamera;
+use crate::config::{Config, NodeRole};
+use crate::domain::{CameraId, Error, Node, NodeId, NodeProfile, Result, SiteId, SiteKey};
+
+pub use camera_lease::CameraLease;
+pub use watches::Watch;
+
+/// This process among those with the same database.
+#[derive(Default)]
+pub struct Cluster(OnceLock<Joined>);
+
+enum Joined {
+    Alone(NodeId, NodeProfile),
+    Shared(Box<Membership>),
+}
+
+/// What a process tells the others of itself.
+#[derive(Debug, Clone)]
+pub struct NodeSettings {
+    /// Where clients reach it.
+    pub url: Option<String>,
+    /// What it does.
+    pub role: NodeRole,
+    /// How long it counts as alive without another renewal.
+    pub lease: Duration,
+}
+
+impl NodeSettings {
+    /// Those of the settings; `url` is used where they name none.
+    #[must_use]
+    pub fn of(config: &Config, url: Option<String>) -> Self {
+        let answers = config.role.answers_clients();
+        Self {
+            url: config.advertised_url.clone().or(url).filter(|_| answers),
+            role: config.role,
+            lease: Duration::from_secs(config.node_lease_s.into()),
+        }
+    }
+}
+
+/// A node, for operators.
+#[derive(Debug, Clone)]
+pub struct NodeStatus {
+    /// The node.
+    pub node: Node,
+    /// Cameras that it owns.
+    pub cameras: u64,
+    /// Whether it is this process.
+    pub is_this: bool,
+}
+
+impl Cluster {
+    fn membership(&self) -> Option<&Membership> {
+        match self.0.get() {
+            Some(Joined::Shared(membership)) => Some(membership),
+            Some(Joined::Alone(..)) | None => None,
+        }
+    }
+
+    /// Tells that something which held a camera's lease is gone.
+    pub(super) fn let_go(&self) {
+        if let Some(membership) = self.membership() {
+            membership.let_go.notify_one();
+        }
+    }
+}
+
+impl App {
+    /// Registers this process where others share its database. [`App::keep_registered`] must run from then on.
+    ///
+    /// # Errors
+    /// The database does not answer.
+    pub async fn join(&self, settings: NodeSettings) -> Result<()> {
+        let id = NodeId(self.randomness.uuid_v7(self.clock.now()));
+        let NodeSettings { url, role, lease } = settings;
+        let profile = NodeProfile {
+            url,
+            role: role.as_str().to_owned(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            lease,
+            started_at: self.clock.now(),
+        };
+        let joined = match self.store.node_leases() {
+            None => {
+                self.metrics.nodes(1);
+                Joined::Alone(id, profile)
+            }
+            Some(leases) => {
+                let sent_at = self.clock.monotonic();
+                leases.register(id, &profile, heartbeat::random(self)).await?;
+                let registration = Registration::new(id, sent_at);
+                let membership = Membership::new(leases.clone(), profile, registration);
+                membership.registration.load().extend(membership.valid_until(sent_at));
+                Joined::Shared(Box::new(membership))
+            }
+        };
+        self.cluster.0.set(joined).map_err(|_| Error::fault("the process has joined already"))
+    }
+
+    /// A camera with the right to change its live state, which this node acquires if no other has it.
+    ///
+    /// # Errors
+    /// As [`App::active_camera`]; `CameraOnOtherNode`, `CameraBetweenNodes`.
+    pub async fn own_camera(&self, id: &CameraId) -> Result<(Arc<ActiveCamera>, CameraLease)> {
+        let camera = self.active_camera(id).await?;
+        let Some(membership) = self.cluster.membership() else {
+            return Ok((camera, CameraLease::of_only_node()));
+        };
+        let lease = membership.own(self, &camera).await?;
+        // A new owner begins with new live state.
+        Ok((self.active_camera(id).await?, lease))
+    }
+
+    /// Checks that the live state of a camera may be read here: this node owns it, or no other does.
+    ///
+    /// # Errors
+    /// `CameraOnOtherNode`, `CameraBetweenNodes`.
+    pub(super) async fn check_readable(&self, camera: &ActiveCamera) -> Result<()> {
+        let Some(membership) = self.cluster.membership() else { return Ok(()) };
+        if membership.held(camera.key, self.clock.monotonic()).is_some() {
+            return Ok(());
+        }
+        let owner = membership.leases.camera_owner(camera.key).await?;
+        self.check_owner(membership, &camera_text(&camera.id), owner)
+    }
+
+    /// Checks that the live state of a site may be read here.
+    ///
+    /// # Errors
+    /// As [`App::check_readable`].
+    pub(super) async fn check_site_readable(&self, id: &SiteId, site: SiteKey) -> Result<()> {
+        let Some(membership) = self.cluster.membership() else { return Ok(()) };
+        let owner = membership.leases.site_owner(site).await?;
+        self.check_owner(membership, &format!("site {id}"), owner)
+    }
+
+    fn check_owner(&self, membership: &Membership, owned: &str, owner: Option<NodeId>) -> Result<()> {
+        let (now, registration) = (self.clock.monotonic(), membership.registration.load());
+        match owner {
+            Some(other) if other != registration.id => Err(membership.elsewhere(owned, other, now)),
+            _ if registration.is_valid(now) => Ok(()),
+            _ => Err(between_nodes(owned)),
+        }
+    }
+
+    /// Until when a reader of a camera's live state is right here.
+    pub(super) fn watch_camera_owner(&self, camera: &ActiveCamera) -> Watch {
+        let membership = self.cluster.membership();
+        membership.map_or_else(Watch::default, |it| it.watches.begin(Watched::Camera(camera.key)))
+    }
+
+    /// Until when a reader of a site's live state is right here.
+    pub(super) fn watch_site_owner(&self, site: SiteKey) -> Watch {
+        let membership = self.cluster.membership();
+        membership.map_or_else(Watch::default, |it| it.watches.begin(Watched::Site(site)))
+    }
+
+    /// The nodes that share the database, by the time of their start.
+    ///
+    /// # Errors
+    /// The database does not answer.
+    pub async fn nodes(&self) -> Result<Vec<NodeStatus>> {
+        match self.cluster.0.get() {
+            None => Ok(Vec::new()),
+            Some(Joined::Alone(id, profile)) => {
+                let node = Node {
+                    id: *id,
+                    profile: profile.clone(),
+                    renewal: 0,
+                    is_draining: false,
+                    renewed_at: self.clock.now(),
+                };
+                let cameras = self.registry.select(|_| true).len() as u64;
+                Ok(vec![NodeStatus { node, cameras, is_this: true }])
+            }
+            Some(Joined::Shared(membership)) => {
+                let own = membership.registration.load().id;
+                let nodes = membership.leases.nodes().await?.into_iter();
+                let status =
+                    |(node, cameras): (Node, u64)| NodeStatus { is_this: node.id == own, node, cameras };
+                Ok(nodes.map(status).collect())
+            }
+        }
+    }
+}

@@ -19,6 +19,10 @@ use crate::exchange::RowRules;
 use crate::model::{Artifact, Regressor, ViewArea};
 use crate::store::Store;
 
+/// Cameras that a refresh loads before it shows them: every change copies the map, so that one at a time would cost the
+/// square of their number at the start of a server.
+const LOADED_BEFORE_SHOWN: usize = 512;
+
 /// Everything that answers for one camera.
 #[derive(Clone)]
 pub struct ActiveCamera {
@@ -147,28 +151,46 @@ impl Registry {
         for deleted in known.values().filter(|camera| keys.get(&camera.id) != Some(&camera.key)) {
             self.remove(&deleted.id);
         }
-        for (id, key, revision, active) in &versions {
-            let is_current = known.get(id).is_some_and(|camera| {
+        let is_current = |(id, key, revision, active): &&(CameraId, CameraKey, Revision, Option<u32>)| {
+            known.get(id).is_some_and(|camera| {
                 let version = camera.model.as_ref().map(|(_, version)| *version);
                 (camera.key, camera.revision, version) == (*key, *revision, *active)
-            });
-            if is_current {
-                continue;
+            })
+        };
+        let changed: Vec<_> = versions.iter().filter(|version| !is_current(version)).collect();
+        for group in changed.chunks(LOADED_BEFORE_SHOWN) {
+            let mut loaded = Vec::with_capacity(group.len());
+            for (id, ..) in group {
+                loaded.push((id, self.read(store, id).await));
             }
-            let loaded = match store.camera(id).await {
-                Ok(camera) => self.load(store, camera).await,
-                Err(error) => Err(error),
-            };
-            match loaded {
-                Ok(camera) => self.replace(|cameras| cameras.insert(id.clone(), camera.clone())),
-                Err(error) if error.kind() == ErrorKind::CameraNotFound => self.remove(id),
-                Err(error) => {
-                    tracing::error!(camera.id = %id, %error, "cannot read the camera");
-                    self.replace(|cameras| cameras.remove(id));
+            self.replace(|cameras| {
+                for (id, camera) in &loaded {
+                    match camera {
+                        Some(camera) => cameras.insert((*id).clone(), camera.clone()),
+                        None => cameras.remove(*id),
+                    };
                 }
-            }
+            });
         }
         Ok(())
+    }
+
+    /// A camera as it is stored; `None` if it has been deleted, which ends what listens to it, or cannot be read.
+    async fn read(&self, store: &Store, id: &CameraId) -> Option<Arc<ActiveCamera>> {
+        let loaded = match store.camera(id).await {
+            Ok(camera) => self.load(store, camera).await,
+            Err(error) => Err(error),
+        };
+        match loaded {
+            Ok(camera) => return Some(camera),
+            Err(error) if error.kind() == ErrorKind::CameraNotFound => {
+                if let Some(deleted) = self.get(id) {
+                    deleted.live.end();
+                }
+            }
+            Err(error) => tracing::error!(camera.id = %id, %error, "cannot read the camera"),
+        }
+        None
     }
 
     /// The cameras whose active model cannot be used, by id.

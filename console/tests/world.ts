@@ -64,8 +64,8 @@ export async function addCamera(server: Server, id: string, name: string, world:
   await server.train(id, { recipe: 'projective', epochs: 10 });
 }
 
-/** Lets people walk in a camera's view until the returned function is called. */
-export function walk(server: Server, id: string, rows: Row[]): () => void {
+/** Lets people, numbered from the first on, walk in a camera's view until the returned function is called. */
+export function walk(server: Server, id: string, rows: Row[], first = 1): () => void {
   const targets = [...new Set(rows.map((row) => row.target_id))];
   let step = 0;
   const timer = setInterval(() => {
@@ -74,7 +74,7 @@ export function walk(server: Server, id: string, rows: Row[]): () => void {
       const own = rows.filter((row) => row.target_id === target);
       const row = own[(step + person * 40) % own.length]!;
       // The second has no receiver.
-      return [{ time, target_id: `person-${person + 1}`, bounding_box: row.box, ...(person === 0 && row.fix ? { fix: row.fix } : {}) }];
+      return [{ time, target_id: `person-${first + person}`, bounding_box: row.box, ...(person === 0 && row.fix ? { fix: row.fix } : {}) }];
     });
     step += 1;
     void server.request('POST', `/v1/cameras/${id}/tracks`, { observations }).catch(() => undefined);

@@ -139,6 +139,17 @@ async fn delete_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPat
 #[expect(dead_code, reason = "for the description alone")]
 struct ModelFile(Vec<u8>);
 
+/// The format of a model version's file.
+#[derive(ToSchema)]
+#[schema(rename_all = "snake_case")]
+#[expect(dead_code, reason = "for the description alone")]
+enum FileFormat {
+    /// Weights and metadata, for import on another server.
+    Safetensors,
+    /// A graph for other runtimes.
+    Onnx,
+}
+
 /// Download a model version
 ///
 /// A safetensors file: the weights, and the metadata in its header. It can be imported on another
@@ -151,7 +162,7 @@ struct ModelFile(Vec<u8>);
     params(
         ("camera" = String, Path, description = "The camera's id"),
         ("model" = u32, Path, description = "The version's number"),
-        ("format" = Option<String>, Query, description = "`safetensors` (the default) or `onnx`"),
+        ("format" = inline(Option<FileFormat>), Query, description = "`safetensors` if left out"),
     ),
     responses((status = 200, description = "The file", content(
         (ModelFile = "application/vnd.safetensors"), (ModelFile = "application/octet-stream"),

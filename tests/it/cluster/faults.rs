@@ -58,8 +58,8 @@ async fn another_node_follows_one_that_was_killed() {
     let killed = Instant::now();
     let feed = feeding.await.expect("no panic");
     println!(
-        "killed: answered again after {:?}, {} attempts, {} redirects",
-        feed.answered_after(killed),
+        "killed: another node answers after {:?}, {} attempts, {} redirects",
+        feed.taken_over_after(killed, &url(&first)),
         feed.attempts,
         feed.redirects
     );
@@ -77,10 +77,11 @@ async fn a_node_that_shuts_down_hands_over_at_once() {
     create(&first, &json!({"id": "yard"})).await;
     let feeding = streaming(items(500), &[&first, &second]);
     until_stored(folder.path(), 100).await;
-    let ended = Instant::now();
+    let (ended, before) = (Instant::now(), url(&first));
     let terminated = tokio::task::spawn_blocking(move || first.terminate());
     let feed = feeding.await.expect("no panic");
-    println!("shut down: answered again after {:?}, {} attempts", feed.answered_after(ended), feed.attempts);
+    let took = feed.taken_over_after(ended, &before);
+    println!("shut down: another node answers after {took:?}, {} attempts", feed.attempts);
     assert!(terminated.await.expect("no panic"), "it ends in order");
     assert_eq!((feed.answered_by(), fence(folder.path(), "yard")), (&*url(&second), 2));
     assert_stored_once(&second, &feed).await;
@@ -204,7 +205,8 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
         let feeding = streaming(all[300 * round..300 * (round + 1)].to_vec(), &known);
         until_stored(folder.path(), before + random.random_range(5..120)).await;
         let owner = sql(folder.path(), "SELECT url FROM nodes JOIN camera_owners ON node_id = id");
-        let owner = nodes.iter().position(|server| url(server) == owner).expect("a node");
+        let (owner_url, owner) =
+            (owner.clone(), nodes.iter().position(|server| url(server) == owner).expect("a node"));
         let fence_before = fence(folder.path(), "yard");
         let began = Instant::now();
         let ended = match kind {
@@ -227,21 +229,20 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
         };
         let feed = feeding.await.expect("no panic");
         acknowledged += feed.acknowledged;
-        let (took, fence_after) = (feed.answered_after(began), fence(folder.path(), "yard"));
-        println!("round {round}: {kind:?}, answered after {took:?}, fence {fence_before} -> {fence_after}");
+        let fence_after = fence(folder.path(), "yard");
+        println!("round {round}: {kind:?}, fence {fence_before} -> {fence_after}");
+        if matches!(kind, FaultKind::Kill | FaultKind::Sleep) {
+            takeovers.push(feed.taken_over_after(began, &owner_url));
+        }
         match kind {
             FaultKind::Kill => nodes[owner] = node(folder.path()),
             FaultKind::Sleep => {
                 let mut late = Feed::new("yard", all[..1].to_vec());
                 signal(&nodes[owner], "-CONT");
                 // The first thing that it is asked, of a camera that another node owns.
-                two_owners += usize::from(late.stream(&url(&nodes[owner]), PACE).await.is_ok());
-                takeovers.push(took);
+                two_owners += usize::from(late.stream(&owner_url, PACE).await.is_ok());
             }
             FaultKind::ShutDown | FaultKind::EndConnections => {}
-        }
-        if matches!(kind, FaultKind::Kill) {
-            takeovers.push(took);
         }
         if let Some(ended) = ended {
             assert!(ended.await.expect("no panic"), "it ends in order");

@@ -113,10 +113,10 @@ impl Feed {
         panic!("{} of {} items are acknowledged", self.acknowledged, self.upto);
     }
 
-    /// Time from an instant to the first answer after it.
-    pub(super) fn answered_after(&self, instant: Instant) -> Duration {
-        let first = self.answers.iter().find(|(at, _)| *at > instant).expect("an answer");
-        first.0 - instant
+    /// Time from an instant to the first answer of another node than one.
+    pub(super) fn taken_over_after(&self, instant: Instant, from: &str) -> Duration {
+        let first = self.answers.iter().find(|(at, node)| *at > instant && node != from);
+        first.expect("an answer of another node").0 - instant
     }
 
     /// The node that gave the latest answer.

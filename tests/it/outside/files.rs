@@ -72,7 +72,7 @@ async fn files_are_only_written_where_the_operator_of_the_machine_says() {
     create_gate(&server).await;
     let draft = |address: &str, format: &str| json!({"id": "gpx", "sink": {"address": address, "format": format, "camera_ids": ["gate"]}});
     for (address, format) in [("file:", "json"), ("udp://127.0.0.1:9", "gpx"), ("file:///etc", "gpx")] {
-        let refused = server.post("/v1/connections", &draft(address, format)).await.expect(400);
+        let refused = server.post("/v1/connections", &draft(address, format)).await.expect(422);
         assert!(refused.text().contains("sink."), "{address} {format}: {}", refused.text());
     }
     server.post("/v1/connections", &draft("file:", "gpx")).await.expect(201);

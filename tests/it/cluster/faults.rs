@@ -181,14 +181,14 @@ enum FaultKind {
     EndConnections,
 }
 
-/// Faults of owners at random moments. `SIGHTFIX_CLUSTER_FAULTS` is their number, `SIGHTFIX_CLUSTER_SEED` the seed.
+/// Faults of owners at random moments. `CLUSTER_FAULTS` is their number, `CLUSTER_SEED` the seed.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs PostgreSQL: .ci/postgres"]
 async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
     let number = |name: &str, default: u64| {
         std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
     };
-    let (faults, seed) = (number("SIGHTFIX_CLUSTER_FAULTS", 6), number("SIGHTFIX_CLUSTER_SEED", 1));
+    let (faults, seed) = (number("CLUSTER_FAULTS", 6), number("CLUSTER_SEED", 1));
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folder = data_folder();
     let mut nodes: Vec<TestServer> = (0..3).map(|_| node(folder.path())).collect();

@@ -8,6 +8,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 use sightfix::grpc::proto;
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tonic::Code;
 use tonic_types::StatusExt as _;
@@ -25,14 +26,20 @@ fn signal(server: &TestServer, name: &str) {
     assert!(sent.expect("kill runs").success());
 }
 
-/// A stream of so many items that goes on beside the test, at these nodes.
-fn streaming(items: Vec<proto::StreamItem>, nodes: &[&TestServer]) -> JoinHandle<Feed> {
+/// A stream of items that runs beside the test, at these nodes. The second half waits until the sender says true: a fault
+/// always comes before the end.
+fn streaming(
+    items: Vec<proto::StreamItem>,
+    nodes: &[&TestServer],
+) -> (JoinHandle<Feed>, watch::Sender<bool>) {
     let nodes: Vec<_> = nodes.iter().map(|server| url(server)).collect();
-    tokio::spawn(async move {
-        let mut feed = Feed::new("yard", items);
+    let (go_on, goes_on) = watch::channel(false);
+    let feeding = tokio::spawn(async move {
+        let mut feed = Feed { goes_on, ..Feed::new("yard", items) };
         feed.resume_at(&nodes.iter().map(String::as_str).collect::<Vec<_>>()).await;
         feed
-    })
+    });
+    (feeding, go_on)
 }
 
 /// Until so many samples of the camera are stored.
@@ -52,10 +59,11 @@ async fn another_node_follows_one_that_was_killed() {
     let folder = data_folder();
     let (mut first, second) = (node(folder.path()), node(folder.path()));
     create(&first, &json!({"id": "yard"})).await;
-    let feeding = streaming(items(500), &[&first, &second]);
+    let (feeding, go_on) = streaming(items(500), &[&first, &second]);
     until_stored(folder.path(), 100).await;
     first.kill_now();
     let killed = Instant::now();
+    go_on.send(true).expect("the stream runs");
     let feed = feeding.await.expect("no panic");
     println!(
         "killed: another node answers after {:?}, {} attempts, {} redirects",
@@ -75,10 +83,11 @@ async fn a_node_that_shuts_down_hands_over_at_once() {
     let folder = data_folder();
     let (first, second) = (node(folder.path()), node(folder.path()));
     create(&first, &json!({"id": "yard"})).await;
-    let feeding = streaming(items(500), &[&first, &second]);
+    let (feeding, go_on) = streaming(items(500), &[&first, &second]);
     until_stored(folder.path(), 100).await;
     let (ended, before) = (Instant::now(), url(&first));
     let terminated = tokio::task::spawn_blocking(move || first.terminate());
+    go_on.send(true).expect("the stream runs");
     let feed = feeding.await.expect("no panic");
     let took = feed.taken_over_after(ended, &before);
     println!("shut down: another node answers after {took:?}, {} attempts", feed.attempts);
@@ -160,7 +169,8 @@ async fn connections_that_the_database_ends_lose_nothing_that_was_acknowledged()
     let folder = data_folder();
     let (first, second) = (node(folder.path()), node(folder.path()));
     create(&first, &json!({"id": "yard"})).await;
-    let feeding = streaming(items(500), &[&first, &second]);
+    let (feeding, go_on) = streaming(items(500), &[&first, &second]);
+    go_on.send(true).expect("the stream runs");
     let mut ended = 0;
     for stored in [50, 150, 250, 350] {
         until_stored(folder.path(), stored).await;
@@ -181,14 +191,14 @@ enum FaultKind {
     EndConnections,
 }
 
-/// Faults of owners at random moments. `SIGHTFIX_CLUSTER_FAULTS` is their number, `SIGHTFIX_CLUSTER_SEED` the seed.
+/// Faults of owners at random moments. `CLUSTER_FAULTS` is their number, `CLUSTER_SEED` the seed.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs PostgreSQL: .ci/postgres"]
 async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
     let number = |name: &str, default: u64| {
         std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
     };
-    let (faults, seed) = (number("SIGHTFIX_CLUSTER_FAULTS", 6), number("SIGHTFIX_CLUSTER_SEED", 1));
+    let (faults, seed) = (number("CLUSTER_FAULTS", 6), number("CLUSTER_SEED", 1));
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folder = data_folder();
     let mut nodes: Vec<TestServer> = (0..3).map(|_| node(folder.path())).collect();
@@ -202,7 +212,7 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
         let mut known: Vec<&TestServer> = nodes.iter().collect();
         let begin_at = random.random_range(0..known.len());
         known.rotate_left(begin_at);
-        let feeding = streaming(all[300 * round..300 * (round + 1)].to_vec(), &known);
+        let (feeding, go_on) = streaming(all[300 * round..300 * (round + 1)].to_vec(), &known);
         until_stored(folder.path(), before + random.random_range(5..120)).await;
         let owner = sql(folder.path(), "SELECT url FROM nodes JOIN camera_owners ON node_id = id");
         let (owner_url, owner) =
@@ -227,6 +237,7 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
                 None
             }
         };
+        go_on.send(true).expect("the stream runs");
         let feed = feeding.await.expect("no panic");
         acknowledged += feed.acknowledged;
         let fence_after = fence(folder.path(), "yard");

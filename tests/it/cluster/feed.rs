@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tonic::Status;
 use tonic::transport::Endpoint;
 use tonic_types::StatusExt as _;
@@ -25,6 +25,8 @@ pub(super) struct Feed {
     /// How many of them are sent.
     pub(super) upto: usize,
     pub(super) acknowledged: u64,
+    /// The second half of the items is sent once this is true.
+    pub(super) goes_on: watch::Receiver<bool>,
     /// When each answer came, and from which node.
     pub(super) answers: Vec<(Instant, String)>,
     pub(super) redirects: usize,
@@ -35,7 +37,9 @@ impl Feed {
     pub(super) fn new(camera: &str, items: Vec<proto::StreamItem>) -> Self {
         let camera = camera.to_owned();
         let upto = items.len();
-        Self { camera, items, upto, acknowledged: 0, answers: Vec::new(), redirects: 0, attempts: 0 }
+        // Without a sender, the value stays as it is.
+        let goes_on = watch::channel(true).1;
+        Self { camera, items, upto, acknowledged: 0, goes_on, answers: Vec::new(), redirects: 0, attempts: 0 }
     }
 
     /// Streams to a node from the last acknowledgement on, until all is acknowledged.
@@ -60,8 +64,12 @@ impl Feed {
         let mut responses = opened?.into_inner();
         let rest: Vec<_> =
             (1..).zip(self.items[..self.upto].to_vec()).skip(self.acknowledged as usize).collect();
+        let (half, mut goes_on) = (self.upto as u64 / 2, self.goes_on.clone());
         let mut sending = Some(tokio::spawn(async move {
             for (seq, item) in rest {
+                if seq > half && goes_on.wait_for(|goes_on| *goes_on).await.is_err() {
+                    return;
+                }
                 if sent.send(request(Sent::Item(proto::StreamItem { seq, ..item }))).await.is_err() {
                     return;
                 }

@@ -90,7 +90,9 @@ async fn what_finds_no_partner_is_said_and_nothing_is_stored_unasked() {
     let of_nobody = json!({"time": "2026-01-01T00:00:00Z", "fix": fix});
     let body = json!({"observations": [of_phone, of_nobody]});
     let answer = server.post(TRACKS, &body).await.expect(200).json();
-    let expected = json!({"in_samples": 0, "no_target": 1, "unpaired": 1, "too_late": 0, "duplicate": 0});
+    let expected = json!({
+        "in_samples": 0, "no_target": 1, "unpaired": 1, "unmatched": 0, "too_late": 0, "duplicate": 0
+    });
     assert_eq!(answer["stored"], expected, "{answer}");
     let unasked = server.post("/v1/cameras/yard/tracks", &body).await.expect(200).json();
     assert!(unasked.get("stored").is_none(), "{unasked}");

@@ -49,9 +49,9 @@ pub(super) fn estimate<'g>(predictor: &Predictor, boxes: Boxes<'g>) -> MapEstima
     let (own_edges, plausible_edges) = (edges_px(sides), edges_px(plausible_px));
     let square = |edge: usize| (plausible_edges[edge] - own_edges[edge]).square();
     let moved_px2 = (1..4).fold(square(0), |sum, edge| sum + square(edge)) / 4.0;
-    for edge in 0..4 {
-        let factor = deviation.weight * moved_px2 * UNEXPLAINED_SHARE;
-        covariance_m2 = with_outer(covariance_m2, [by_edge[0][edge], by_edge[1][edge]], Some(factor));
+    let factor = deviation.weight * moved_px2 * UNEXPLAINED_SHARE;
+    for (&east, &north) in by_edge[0].iter().zip(&by_edge[1]) {
+        covariance_m2 = with_outer(covariance_m2, [east, north], Some(factor));
     }
     MapEstimate {
         position_m: [0, 1].map(|axis| position_m[axis] + moved_m[axis]),

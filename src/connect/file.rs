@@ -64,30 +64,35 @@ impl FileSink {
         })
     }
 
-    /// Begins a file.
+    /// Begins a file; the oldest are deleted to make room for it.
     async fn begin(&mut self, time: Timestamp) -> Result<(), PeerError> {
-        self.delete_oldest().await?;
-        let path = self.unused_path(time).await?;
+        let files = self.files().await?;
+        let surplus = (files.len() + 1).saturating_sub(self.settings.max_files);
+        for path in files.iter().take(surplus) {
+            fs::remove_file(path).await?;
+        }
+        let path = self.next_path(&files, time);
         let content = TrackFile::new(self.settings.format);
         self.current = Some(OpenFile { path, began_at: time, content });
         Ok(())
     }
 
-    /// A name by the time, which no file of an earlier run has. Names sort as their times do.
-    async fn unused_path(&self, time: Timestamp) -> Result<PathBuf, PeerError> {
+    /// A name by the time, with a number above those of the files of the same second. Names sort as their files began.
+    fn next_path(&self, files: &[PathBuf], time: Timestamp) -> PathBuf {
         let name = time.strftime("%Y%m%dT%H%M%SZ").to_string();
+        let number_of = |path: &PathBuf| {
+            let rest = path.file_stem()?.to_str()?.strip_prefix(name.as_str())?;
+            Some(rest.strip_prefix('_').map_or(1, |number| number.parse().unwrap_or(1)))
+        };
         let ending = self.settings.format.ending();
-        let mut path = self.folder.join(format!("{name}.{ending}"));
-        let mut number = 1;
-        while fs::try_exists(&path).await? {
-            number += 1;
-            path = self.folder.join(format!("{name}_{number:03}.{ending}"));
-        }
-        Ok(path)
+        self.folder.join(match files.iter().filter_map(number_of).max() {
+            None => format!("{name}.{ending}"),
+            Some(last) => format!("{name}_{:03}.{ending}", last + 1_u32),
+        })
     }
 
-    /// Makes room for one file more.
-    async fn delete_oldest(&self) -> Result<(), PeerError> {
+    /// The files that are kept, the oldest first.
+    async fn files(&self) -> Result<Vec<PathBuf>, PeerError> {
         let mut files = Vec::new();
         let mut entries = fs::read_dir(&self.folder).await?;
         while let Some(entry) = entries.next_entry().await? {
@@ -97,11 +102,7 @@ impl FileSink {
             }
         }
         files.sort();
-        let surplus = (files.len() + 1).saturating_sub(self.settings.max_files);
-        for path in &files[..surplus.min(files.len())] {
-            fs::remove_file(path).await?;
-        }
-        Ok(())
+        Ok(files)
     }
 
     /// Writes the current file to the disk.

@@ -13,7 +13,9 @@ use hyper::header::CONTENT_TYPE;
 use hyper::http::HeaderValue;
 use jiff::Timestamp;
 use serde::Serialize;
-use utoipa::ToSchema;
+use utoipa::openapi::schema::{AnyOfBuilder, Schema};
+use utoipa::openapi::{Ref, RefOr};
+use utoipa::{PartialSchema, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -197,13 +199,26 @@ struct TrackFeatures {
     features: Vec<TrackFeature>,
 }
 
-/// Positions as features, or as moving features.
-#[derive(ToSchema)]
-#[serde(untagged)]
-#[expect(dead_code, reason = "the shapes of an answer, for the description alone")]
-enum TracksOrHistories {
-    Positions(TrackFeatures),
-    Histories(MovingFeatures),
+/// Positions as features, or as moving features: `anyOf`, since a collection without features is either.
+struct TracksOrHistories;
+
+impl PartialSchema for TracksOrHistories {
+    fn schema() -> RefOr<Schema> {
+        let any_of = AnyOfBuilder::new()
+            .item(Ref::from_schema_name(TrackFeatures::name()))
+            .item(Ref::from_schema_name(MovingFeatures::name()))
+            .description(Some("Positions as features, or as moving features."));
+        Schema::AnyOf(any_of.build()).into()
+    }
+}
+
+impl ToSchema for TracksOrHistories {
+    fn schemas(schemas: &mut Vec<(String, RefOr<Schema>)>) {
+        schemas.push((TrackFeatures::name().into_owned(), TrackFeatures::schema()));
+        schemas.push((MovingFeatures::name().into_owned(), MovingFeatures::schema()));
+        TrackFeatures::schemas(schemas);
+        MovingFeatures::schemas(schemas);
+    }
 }
 
 fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {

@@ -352,3 +352,9 @@ pub(crate) fn simulated_csv() -> String {
     write_samples(&mut csv, Format::Csv, &samples).expect("memory can be written");
     String::from_utf8(csv).expect("UTF-8")
 }
+
+/// The time now.
+pub(crate) fn now() -> jiff::Timestamp {
+    #[expect(clippy::disallowed_methods, reason = "the server reads the wall clock, too")]
+    jiff::Timestamp::now()
+}

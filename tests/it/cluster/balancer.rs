@@ -36,9 +36,11 @@ impl Balancer {
         let mut command = Command::new("nginx");
         command.args(["-p", folder.to_str().expect("UTF-8"), "-e", "stderr", "-c"]).arg(&file);
         let process = command.args(["-g", &global]).stdout(Stdio::null()).spawn().expect("nginx runs");
+        // Ended by Drop, whatever comes.
+        let balancer = Self { process, grpc, rest };
         for _ in 0..400 {
             if TcpStream::connect(grpc).await.is_ok() {
-                return Self { process, grpc, rest };
+                return balancer;
             }
             tokio::time::sleep(Duration::from_millis(25)).await;
         }

@@ -9,7 +9,7 @@ use serde_json::json;
 use sightfix::grpc::proto;
 
 use super::crowd::{Crowd, Recorded};
-use crate::harness::{TestServer, data_folder};
+use crate::harness::{TestServer, data_folder, now};
 use crate::live_client::{Client, channel, open, time, yard};
 
 /// Walkers of whom two carry phones.
@@ -159,7 +159,7 @@ async fn boxes_of_a_stream_are_matched_with_the_receivers_beside_them() {
     let mut client = open(&channel(&server).await, "edge", true).await;
     let rows = rows(&LIVE.recorded());
     let (first, last) = (rows[0].time, rows.last().expect("rows").time);
-    let shift = Timestamp::now().duration_since(last);
+    let shift = now().duration_since(last);
     let (before, behind): (Vec<&Row>, Vec<&Row>) =
         rows.iter().partition(|row| row.time.duration_since(first).as_secs_f64() <= SENT_FIRST_S);
     for row in &before {
@@ -200,7 +200,7 @@ async fn a_tracker_id_beside_a_target_is_refused() {
     let folder = data_folder();
     let server = yard(folder.path(), &[], json!({}), false).await;
     let bounding_box = json!({"left_px": 10.0, "top_px": 10.0, "width_px": 30.0, "height_px": 80.0});
-    let time = Timestamp::now();
+    let time = now();
     let both = json!({"time": time, "target_id": "a", "tracker_id": "7", "bounding_box": bounding_box});
     let problem = server.post("/v1/cameras/yard/tracks", &both).await.expect(422).json();
     assert!(problem.to_string().contains("tracker_id"), "{problem}");

@@ -4,8 +4,8 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::TcpStream;
 
-use super::peers::{Broker, connection_when, create_gate, now, patch, send_fix};
-use crate::harness::{TestServer, data_folder, own_address};
+use super::peers::{Broker, connection_when, create_gate, patch, send_fix};
+use crate::harness::{TestServer, data_folder, now, own_address};
 
 const TARGET: &str = "1607123955.475377-mxklsc";
 

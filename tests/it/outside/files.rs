@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use super::peers::{connection_when, create_gate, now, send_fix};
-use crate::harness::{TestServer, data_folder};
+use super::peers::{connection_when, create_gate, send_fix};
+use crate::harness::{TestServer, data_folder, now};
 
 /// Files of a folder, in the order of their names.
 fn files(folder: &Path) -> Vec<PathBuf> {

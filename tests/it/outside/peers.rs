@@ -74,12 +74,6 @@ impl Drop for Broker {
     }
 }
 
-/// The time now.
-pub(super) fn now() -> jiff::Timestamp {
-    #[expect(clippy::disallowed_methods, reason = "the server reads the wall clock, too")]
-    jiff::Timestamp::now()
-}
-
 /// Waits until something is true of a connection, and returns it.
 pub(super) async fn connection_when(
     server: &TestServer,

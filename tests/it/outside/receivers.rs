@@ -4,8 +4,8 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, UdpSocket};
 
-use super::peers::{connection_when, create_gate, now};
-use crate::harness::{TestServer, data_folder, own_address};
+use super::peers::{connection_when, create_gate};
+use crate::harness::{TestServer, data_folder, now, own_address};
 
 /// GGA and RMC of now, at 30.628 degrees north, 103.98678 degrees east.
 fn sentences() -> String {

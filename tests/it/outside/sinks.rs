@@ -14,8 +14,8 @@ use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, Buf
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio_rustls::TlsAcceptor;
 
-use super::peers::{connection_when, create_gate, now, patch, send_fix};
-use crate::harness::{TestServer, data_folder, own_address};
+use super::peers::{connection_when, create_gate, patch, send_fix};
+use crate::harness::{TestServer, data_folder, now, own_address};
 use crate::tls::Authority;
 
 /// A request as a receiver of webhooks sees it.

@@ -181,13 +181,14 @@ impl TestServer {
 
     /// Waits until the log has an entry of which this is true, and returns it.
     pub(crate) async fn logged(&self, is_wanted: impl Fn(&Value) -> bool) -> Value {
-        loop {
+        for _ in 0..2_400 {
             let found = self.log.lock().expect("no panic").iter().find(|entry| is_wanted(entry)).cloned();
             match found {
                 Some(entry) => return entry,
                 None => tokio::time::sleep(std::time::Duration::from_millis(50)).await,
             }
         }
+        panic!("the server's log has no such entry: {:?}", self.log.lock().expect("no panic"))
     }
 
     /// Where gRPC clients connect.

@@ -453,7 +453,7 @@ async fn follow(
         (followed, Some(StoredObservations::from(acknowledgement)))
     } else {
         let follow = |observation| app.follow((&camera, &lease), observation);
-        (observations.iter().map(follow).collect::<Result<Vec<_>>>()?, None)
+        (observations.into_iter().map(follow).collect::<Result<Vec<_>>>()?, None)
     };
     let items = followed.iter().map(Into::into).collect();
     Ok(json_of_about(&FollowedObservations { items, stored }, 64 + ITEM_BYTES * followed.len())?)

@@ -74,6 +74,30 @@ pub enum JobEnd<O> {
     Requeue,
 }
 
+/// What becomes of a job that its worker has finished.
+pub(super) struct Settled<O> {
+    /// Its state from now on; `None` if it returns to the queue.
+    pub(super) state: Option<JobState>,
+    pub(super) outcome: Option<String>,
+    pub(super) output: Option<O>,
+}
+
+impl<O> JobEnd<O> {
+    /// A job whose cancellation was requested is cancelled even if it succeeded or was returned.
+    pub(super) fn settle(self, cancel_requested: bool) -> Settled<O> {
+        let ended = |state, outcome, output| Settled { state: Some(state), outcome, output };
+        match self {
+            Self::Failed { outcome } => ended(JobState::Failed, Some(outcome), None),
+            Self::Cancelled => ended(JobState::Cancelled, None, None),
+            Self::Succeeded { .. } | Self::Requeue if cancel_requested => {
+                ended(JobState::Cancelled, None, None)
+            }
+            Self::Succeeded { output, outcome } => ended(JobState::Succeeded, outcome, Some(output)),
+            Self::Requeue => Settled { state: None, outcome: None, output: None },
+        }
+    }
+}
+
 /// A finished job: its camera, and the output to be stored in the same transaction.
 pub(super) struct Finished<O> {
     pub(super) camera_key: i64,

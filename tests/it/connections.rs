@@ -247,17 +247,13 @@ async fn one_address_gets_no_more_than_its_share_of_live_streams() {
 fn clients_that_come_at_once_need_not_wait_for_the_server() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
-    let signal = |name: &str| {
-        let status = std::process::Command::new("kill").args([name, &server.pid().to_string()]).status();
-        assert!(status.expect("kill runs").success());
-    };
     // A server that is stopped accepts nothing: what connects now, the system has queued.
-    signal("-STOP");
+    server.signal("-STOP");
     let connected = (0..500)
         .map_while(|_| TcpStream::connect_timeout(&server.address, Duration::from_secs(5)).ok())
         .collect::<Vec<_>>()
         .len();
-    signal("-CONT");
+    server.signal("-CONT");
     assert_eq!(connected, 500);
 }
 
@@ -292,9 +288,7 @@ fn the_server_shuts_down_before_a_container_is_killed() {
 async fn a_hangup_does_not_end_the_server() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
-    let pid = server.pid().to_string();
-    let status = std::process::Command::new("kill").args(["-HUP", &pid]).status();
-    assert!(status.expect("kill runs").success());
+    server.signal("-HUP");
     server.get("/livez").await.expect(200);
     assert!(server.terminate(), "it still ends in order");
 }

@@ -206,6 +206,12 @@ impl TestServer {
         self.process.id()
     }
 
+    /// Sends a signal, by the name that `kill` knows.
+    pub(crate) fn signal(&self, name: &str) {
+        let sent = Command::new("kill").args([name, &self.pid().to_string()]).status();
+        assert!(sent.expect("kill runs").success());
+    }
+
     /// Kills the process with SIGKILL.
     pub(crate) fn kill(mut self) {
         self.kill_now();
@@ -224,8 +230,7 @@ impl TestServer {
 
     /// Sends SIGTERM and waits; returns whether the server exited successfully.
     pub(crate) fn terminate(mut self) -> bool {
-        let pid = self.process.id().to_string();
-        assert!(Command::new("kill").args(["-TERM", &pid]).status().expect("kill runs").success());
+        self.signal("-TERM");
         self.process.wait().expect("the server ends").success()
     }
 

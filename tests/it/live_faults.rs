@@ -324,7 +324,7 @@ async fn a_wall_clock_that_jumps_back_keeps_no_target_out() {
         let time = Timestamp::from_second(wall_s.load(Ordering::SeqCst)).expect("in range");
         let target_id = Some(TargetId::new(name).expect("a name"));
         let fix = Fix { position: at(8.0, 47.0), sigma_m: None };
-        app.follow((&camera, &lease), &Observation::with_fix(time, target_id, None, fix))
+        app.follow((&camera, &lease), Observation::with_fix(time, target_id, None, fix))
     };
     for name in ["a", "b", "c", "d"] {
         follow(name).expect("followed");

@@ -2,7 +2,7 @@
 //! and the log filter that SIGHUP loads again.
 
 use std::net::SocketAddr;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 
 use http_body_util::{BodyExt as _, Empty};
 use hyper::body::Bytes;
@@ -153,13 +153,9 @@ async fn a_hangup_loads_the_log_filter_of_the_settings_again() {
     command.arg("--config").arg(&file).args(["serve", "--listen", "127.0.0.1:0", "--data"]);
     command.arg(folder.path().join("data")).stdout(Stdio::null());
     let server = TestServer::run(command);
-    let hang_up = || {
-        let status = Command::new("kill").args(["-HUP", &server.pid().to_string()]).status();
-        assert!(status.expect("kill runs").success());
-    };
     server.get("/v1/cameras?limit=7").await.expect(200);
     std::fs::write(&file, "log_filter = \"info,sightfix::requests=debug\"\n").expect("written");
-    hang_up();
+    server.signal("-HUP");
     let is_answer = |entry: &Value| entry["message"] == "answered";
     loop {
         server.get("/v1/cameras").await.expect(200);
@@ -171,7 +167,7 @@ async fn a_hangup_loads_the_log_filter_of_the_settings_again() {
     let entry = server.logged(is_answer).await;
     assert_eq!(entry["route"], "/v1/cameras", "{entry}");
     std::fs::write(&file, "log_filter = \"no such filter ===\"\n").expect("written");
-    hang_up();
+    server.signal("-HUP");
     let refused = server.logged(|entry| entry["message"] == "the log's filter stays").await;
     assert!(refused["error"].is_string(), "{refused}");
     assert!(server.terminate());

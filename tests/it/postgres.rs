@@ -1,7 +1,6 @@
 //! Several processes with one PostgreSQL database. `.ci/postgres` starts the server.
 
 use std::path::Path;
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
@@ -41,11 +40,6 @@ async fn until(server: &TestServer, path: &str, wanted: impl Fn(&Value) -> bool)
 
 fn trains(run: &Value) -> bool {
     run["state"] == "running" && run["progress"]["epoch"].as_u64() > Some(0)
-}
-
-fn signal(server: &TestServer, name: &str) {
-    let sent = Command::new("kill").args([name, &server.pid().to_string()]).status();
-    assert!(sent.expect("kill runs").success());
 }
 
 #[tokio::test]
@@ -93,12 +87,12 @@ async fn a_frozen_worker_can_neither_end_nor_overwrite_a_run() {
     let frozen = node(folder.path(), "train");
     let path = start_run(&server, &json!({"recipe": "paper", "seed": 7, "epochs": 400})).await;
     until(&server, &path, trains).await;
-    signal(&frozen, "-STOP");
+    frozen.signal("-STOP");
     let awake = node(folder.path(), "train");
     let ended = until(&server, &path, |run| run["ended_at"].is_string()).await;
     assert_eq!((&ended["state"], &ended["attempt"]), (&json!("succeeded"), &json!(2)), "{ended}");
 
-    signal(&frozen, "-CONT");
+    frozen.signal("-CONT");
     // Where it was stopped within a transaction the database has ended its connection, and its heartbeat fails.
     let gives_up = ["lost its lease", "is left to the next worker"];
     let lost = frozen.logged(|entry| gives_up.iter().any(|words| entry.to_string().contains(words))).await;

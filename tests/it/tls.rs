@@ -219,8 +219,7 @@ async fn a_changed_certificate_is_loaded_and_a_broken_one_is_not() {
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
     std::fs::write(&files.certificate, "no certificate").expect("a file");
-    let hangup = Command::new("kill").args(["-HUP", &server.pid().to_string()]).status();
-    assert!(hangup.expect("kill runs").success());
+    server.signal("-HUP");
     server
         .logged(|entry| entry["message"].as_str().is_some_and(|text| text.contains("cannot be used")))
         .await;

@@ -128,11 +128,11 @@ impl App {
     pub fn follow(
         &self,
         (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
-        observation: &Observation,
+        observation: Observation,
     ) -> Result<ItemResult> {
         // A time that no track takes must not move the matching either.
         self.live_time_bounds().check(observation.time())?;
-        let identified = self.identify(camera, observation.clone());
+        let identified = self.identify(camera, observation);
         self.follow_identified((camera, lease), identified)
     }
 

@@ -10,7 +10,8 @@ use super::Store;
 use super::errors::failed;
 use crate::domain::{Error, JobState, Result};
 use crate::store::jobs::{
-    self, COUNT_JOBS, Claim, Finished, Heartbeat, JobCounts, JobEnd, JobTable, lease_expired, lease_us,
+    self, COUNT_JOBS, Claim, Finished, Heartbeat, JobCounts, JobEnd, JobTable, Settled, lease_expired,
+    lease_us,
 };
 
 const LEASE_EXPIRED: &str = lease_expired!("?1");
@@ -145,8 +146,7 @@ impl Jobs {
     }
 
     /// Ends a job, or returns it to the queue, if the worker still owns its lease; `None` if it lost it,
-    /// and then nothing was changed. A job whose cancellation was requested is cancelled even if it
-    /// succeeded or was returned.
+    /// and then nothing was changed.
     pub(super) async fn finish<O>(
         &self,
         connection: &mut SqliteConnection,
@@ -157,23 +157,12 @@ impl Jobs {
         let Some((camera_key, cancel_requested)) = self.owns_lease(connection, (id, fence)).await? else {
             return Ok(None);
         };
-        let end = match end {
-            JobEnd::Succeeded { .. } | JobEnd::Requeue if cancel_requested => JobEnd::Cancelled,
-            end => end,
-        };
-        let mut stored = None;
-        match end {
-            JobEnd::Succeeded { output, outcome } => {
-                self.end(connection, id, JobState::Succeeded, outcome, now).await?;
-                stored = Some(output);
-            }
-            JobEnd::Failed { outcome } => {
-                self.end(connection, id, JobState::Failed, Some(outcome), now).await?;
-            }
-            JobEnd::Cancelled => self.end(connection, id, JobState::Cancelled, None, now).await?,
-            JobEnd::Requeue => self.requeue(connection, id).await?,
+        let Settled { state, outcome, output } = end.settle(cancel_requested);
+        match state {
+            Some(state) => self.end(connection, id, state, outcome, now).await?,
+            None => self.requeue(connection, id).await?,
         }
-        Ok(Some(Finished { camera_key, output: stored }))
+        Ok(Some(Finished { camera_key, output }))
     }
 
     async fn end(

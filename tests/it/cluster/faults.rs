@@ -1,7 +1,6 @@
 //! Nodes that end, sleep or lose the database in the middle of streams.
 
 use std::path::Path;
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use rand::{RngExt as _, SeedableRng as _};
@@ -20,11 +19,6 @@ use crate::live_client::{Received, Sent, begin, channel};
 
 const END_ALL_CONNECTIONS: &str = "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity \
                                    WHERE datname = current_database() AND pid <> pg_backend_pid()";
-
-fn signal(server: &TestServer, name: &str) {
-    let sent = Command::new("kill").args([name, &server.pid().to_string()]).status();
-    assert!(sent.expect("kill runs").success());
-}
 
 /// A stream of items that runs beside the test, at these nodes. The second half waits until the sender says true: a fault
 /// always comes before the end.
@@ -108,14 +102,14 @@ async fn a_node_that_slept_through_its_lease_answers_no_more() {
     create(&first, &json!({"id": "yard"})).await;
     let items = items(60);
     let mut sleeper = Sleeper::open(&first, &items[..20]).await;
-    signal(&first, "-STOP");
+    first.signal("-STOP");
     for item in &items[..20] {
         sleeper.stream.item(item.clone()).await;
     }
     let mut feed = Feed::new("yard", items);
     feed.resume_at(&[&url(&second)]).await;
     assert_eq!(fence(folder.path(), "yard"), 2);
-    signal(&first, "-CONT");
+    first.signal("-CONT");
     let (answers, ended) = sleeper.rest().await;
     let reason = ended.get_details_error_info().map(|info| info.reason).unwrap_or_default();
     println!("woke up: {answers} answers, then {ended}");
@@ -225,7 +219,7 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
                 None
             }
             FaultKind::Sleep => {
-                signal(&nodes[owner], "-STOP");
+                nodes[owner].signal("-STOP");
                 None
             }
             FaultKind::ShutDown => {
@@ -249,7 +243,7 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
             FaultKind::Kill => nodes[owner] = node(folder.path()),
             FaultKind::Sleep => {
                 let mut late = Feed::new("yard", all[..1].to_vec());
-                signal(&nodes[owner], "-CONT");
+                nodes[owner].signal("-CONT");
                 // The first thing that it is asked, of a camera that another node owns.
                 two_owners += usize::from(late.stream(&owner_url, PACE).await.is_ok());
             }

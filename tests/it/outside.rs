@@ -5,7 +5,7 @@
 mod broker;
 mod files;
 mod messages;
-mod peers;
+pub(crate) mod peers;
 mod receivers;
 mod resource;
 mod sinks;

@@ -140,7 +140,7 @@ async fn faults_of_the_database_lose_and_duplicate_nothing() {
     }
     let (mut acknowledged, mut two_owners, mut recoveries) = (0, 0, Vec::new());
     for (round, kind) in kinds.iter().enumerate() {
-        let run = json!({"seed": round, "epochs": 20});
+        let run = json!({"seed": round, "epochs": 4});
         cluster.nodes[round % 2].post(RUNS, &run).await.expect(202);
         let before = cluster.stored();
         let (go_on, goes_on) = watch::channel(false);

@@ -101,7 +101,7 @@ async fn a_thousand_cameras_lose_nothing_when_a_node_is_killed() {
     let (items, count) = (12, cameras.to_string());
     let recording = recording(files.path(), items);
     let arguments = ["--camera-prefix", "city", "--cameras", &count, "--rate", "0.8", "--attempts", "30"];
-    let arguments = [&arguments[..], &["--response-timeout-s", "5"]].concat();
+    let arguments = [&arguments[..], &["--response-timeout-s", "20"]].concat();
     let replaying = replay(&format!("http://{}", balancer.grpc), &recording, &arguments);
     until_stored(folder.path(), cameras * items as u64 / 3).await;
     let owned = "SELECT count(*) FROM camera_owners JOIN nodes ON nodes.id = node_id WHERE url = ";

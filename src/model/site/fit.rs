@@ -1,5 +1,7 @@
 //! The fit of a site: robust starts per camera, then all cameras together.
 
+use std::ops::ControlFlow;
+
 use super::ground_map::GroundMap;
 use super::input::{FEWEST_ROWS, SiteFitError, SiteFitInput, SiteFix, foot_and_size, is_foot_cut};
 use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
@@ -18,9 +20,12 @@ const FOOT_SIGMA_RANGE_PX: [f64; 2] = [0.5, 50.0];
 const ROUNDS: usize = 3;
 /// Share of the transfers that counts as independent: a detector's error lasts for some frames.
 const INDEPENDENT_TRANSFERS: f64 = 0.25;
-/// Most fixes of one receiver, and most transfers between two cameras: more are thinned evenly.
+/// Fixes of all receivers and of one, and transfers between all cameras and between two: more are thinned evenly.
+const MAX_ROWS: usize = 20_000;
 const MAX_RECEIVER_ROWS: usize = 300;
-const MAX_TRANSFERS: usize = 4_000;
+const LEAST_RECEIVER_ROWS: usize = 10;
+const MAX_TRANSFERS: usize = 60_000;
+const MAX_PAIR_TRANSFERS: usize = 4_000;
 /// Median of a chi-square variable with 2 degrees of freedom: 2 ln 2.
 const MEDIAN_CHI_SQUARE: f64 = 1.386;
 
@@ -29,6 +34,17 @@ const MEDIAN_CHI_SQUARE: f64 = 1.386;
 /// # Errors
 /// A camera has too few rows, or there is no finite solution.
 pub fn fit_site(input: &SiteFitInput<'_>) -> Result<SiteMaps, SiteFitError> {
+    fit_site_observed(input, &mut || ControlFlow::Continue(()))
+}
+
+/// The same under an observer that is asked before each step, and ends the fit by a break.
+///
+/// # Errors
+/// As [`fit_site`], and [`SiteFitError::Cancelled`].
+pub fn fit_site_observed(
+    input: &SiteFitInput<'_>,
+    observer: &mut dyn FnMut() -> ControlFlow<()>,
+) -> Result<SiteMaps, SiteFitError> {
     let receivers = receiver_rows(input);
     let transfers = transfers(input);
     let mut maps = initial_maps(input.image_sizes.len(), &receivers, &transfers)?;
@@ -39,10 +55,10 @@ pub fn fit_site(input: &SiteFitInput<'_>) -> Result<SiteMaps, SiteFitError> {
         foot_sigma_px: FIRST_FOOT_SIGMA_PX,
         transfer_weight: INDEPENDENT_TRANSFERS,
     };
-    let mut covariance = problem.solve(&mut maps).ok_or(SiteFitError::NoSolution)?;
+    let mut covariance = problem.solve(&mut maps, observer)?;
     for _ in 1..ROUNDS {
         problem.estimate_noise(&maps);
-        covariance = problem.solve(&mut maps).ok_or(SiteFitError::NoSolution)?;
+        covariance = problem.solve(&mut maps, observer)?;
     }
     let views_px = (0..maps.len()).map(|camera| view_px(&problem, camera)).collect();
     Ok(SiteMaps {
@@ -91,7 +107,9 @@ fn receiver_rows(input: &SiteFitInput<'_>) -> Vec<Vec<FixRow>> {
         let position = [fix.position.east_m, fix.position.north_m];
         (!feet.is_empty()).then_some(FixRow { time_s: fix.time_s, position, feet })
     };
-    let of_receiver = |own: &[&SiteFix]| thinned(own.iter().filter_map(row).collect(), MAX_RECEIVER_ROWS);
+    let receivers = fixes.chunk_by(|one, next| one.receiver == next.receiver).count();
+    let most = (MAX_ROWS / receivers.max(1)).clamp(LEAST_RECEIVER_ROWS, MAX_RECEIVER_ROWS);
+    let of_receiver = |own: &[&SiteFix]| thinned(own.iter().filter_map(row).collect(), most);
     let all = fixes.chunk_by(|one, next| one.receiver == next.receiver).map(of_receiver);
     all.filter(|rows| !rows.is_empty()).collect()
 }
@@ -110,10 +128,9 @@ fn transfers(input: &SiteFitInput<'_>) -> Vec<Transfer> {
         both_ways.push(Transfer { cameras: [to, from], feet: [feet[1], feet[0]] });
     }
     both_ways.sort_by_key(|transfer| transfer.cameras);
-    both_ways
-        .chunk_by(|one, next| one.cameras == next.cameras)
-        .flat_map(|own| thinned(own.to_vec(), MAX_TRANSFERS))
-        .collect()
+    let ways = both_ways.chunk_by(|one, next| one.cameras == next.cameras);
+    let most = (MAX_TRANSFERS / ways.clone().count().max(1)).min(MAX_PAIR_TRANSFERS);
+    ways.flat_map(|own| thinned(own.to_vec(), most)).collect()
 }
 
 fn thinned<T>(rows: Vec<T>, most: usize) -> Vec<T> {

@@ -9,9 +9,12 @@
 //! `rho(x) = k^2 ln(1 + x / k^2)` is Cauchy's loss. In metres the pairs would pull all maps together to a point;
 //! in pixels they do not.
 
+use std::ops::ControlFlow;
+
 use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
 
 use super::ground_map::{GroundMap, GroundTangent, PARAMETERS};
+use super::input::SiteFitError;
 use crate::domain::GaussMarkovNoise;
 use crate::model::encoder::gaussian_process::projective_mean::Box4;
 
@@ -66,16 +69,26 @@ pub(super) struct FixResiduals {
 }
 
 impl LeastSquaresProblem {
-    /// Refines the maps; returns their parameters' covariance, `None` if there is no finite solution.
-    pub(super) fn solve(&self, maps: &mut Vec<GroundMap>) -> Option<DMatrix<f64>> {
+    /// Refines the maps; returns their parameters' covariance. The observer is asked before each step.
+    ///
+    /// # Errors
+    /// There is no finite solution, or the observer breaks.
+    pub(super) fn solve(
+        &self,
+        maps: &mut Vec<GroundMap>,
+        observer: &mut dyn FnMut() -> ControlFlow<()>,
+    ) -> Result<DMatrix<f64>, SiteFitError> {
         let mut damping = 1e-3;
         let mut normal = self.normal_equations(maps);
         for _ in 0..STEPS {
+            if observer().is_break() {
+                return Err(SiteFitError::Cancelled);
+            }
             let mut damped = normal.matrix.clone();
             for at in 0..damped.nrows() {
                 damped[(at, at)] *= 1.0 + damping;
             }
-            let step = damped.cholesky()?.solve(&normal.right);
+            let step = damped.cholesky().ok_or(SiteFitError::NoSolution)?.solve(&normal.right);
             let moved: Vec<GroundMap> = maps
                 .iter()
                 .zip(step.as_slice().chunks(PARAMETERS))
@@ -98,8 +111,9 @@ impl LeastSquaresProblem {
                 }
             }
         }
-        let covariance = normal.matrix.cholesky()?.inverse();
-        covariance.iter().all(|value| value.is_finite()).then_some(covariance)
+        let covariance = normal.matrix.cholesky().ok_or(SiteFitError::NoSolution)?.inverse();
+        let is_finite = covariance.iter().all(|value| value.is_finite());
+        is_finite.then_some(covariance).ok_or(SiteFitError::NoSolution)
     }
 
     /// Sum of squares of the whitened residuals of the fixes.

@@ -26,6 +26,7 @@ mod runs;
 mod sample_retention;
 mod sample_table;
 mod samples;
+mod site_runs;
 mod sites;
 #[cfg(test)]
 mod tests;

@@ -4,7 +4,7 @@
 //! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
 //! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
 //! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`;
-//! `recipe` and `stored` connect both to the rest of the module. Random starts have a seed of their own.
+//! `recipe` and `stored` connect both to the rest of the module; `foot_map` takes the map of another fit. Random starts have a seed of their own.
 
 pub(crate) mod box_plausibility;
 mod candidate;
@@ -12,6 +12,7 @@ mod companion;
 mod edge_noise;
 mod f_distribution;
 mod fit;
+mod foot_map;
 mod ground_camera;
 mod groups;
 mod hyperparameters;
@@ -29,6 +30,8 @@ mod upright_camera;
 
 pub use box_plausibility::RecentBoxes;
 pub(crate) use companion::EPOCHS;
+pub(crate) use fit::SHARED_BIAS_SHARE;
+pub(crate) use foot_map::{FittedFootMap, FootCovariance, widen_map};
 pub use ground_camera::{GroundCamera, GroundPoint};
 pub(crate) use leave_out::{SequenceMean, widening};
 pub(crate) use noise::{Epoch, ReceiverNoise};

@@ -84,7 +84,13 @@ fn fit(
     fixes: &[SiteFix],
     pairs: &[SitePair],
 ) -> Result<SiteMaps, SiteFitError> {
-    fit_site(&SiteFitInput { image_sizes, fixes, pairs, correlation: RECEIVER_CORRELATION })
+    fit_site(&SiteFitInput {
+        image_sizes,
+        fixes,
+        pairs,
+        correlation: RECEIVER_CORRELATION,
+        target_height_m: None,
+    })
 }
 
 impl TrainedSite {

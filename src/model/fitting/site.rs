@@ -20,7 +20,7 @@ use crate::domain::{
 };
 use crate::geo::{EastNorth, LocalPlane};
 use crate::model::artifact::{Artifact, FORMAT, ModelParts};
-use crate::model::encoder::gaussian_process::{EPOCHS, SHARED_BIAS_SHARE, widen_map};
+use crate::model::encoder::gaussian_process::{EPOCHS, SHARED_BIAS_SHARE, target_height_m, widen_map};
 use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
 use crate::model::regressor::Regressor;
 use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
@@ -32,10 +32,13 @@ use crate::model::site::{
 use crate::model::uncertainty::calibration::calibrate_reconstruction;
 use crate::model::uncertainty::coverage::Coverage;
 use crate::model::uncertainty::error_model::{set_image_size, set_uncalibrated};
+use crate::statistics::median;
 
 /// Names of the candidates in a model's report.
 const TOGETHER: &str = "site/together";
 const APART: &str = "site/apart";
+/// A squared residual counts at most this many times their median.
+const LARGEST_SQUARE_RATIO: f64 = 10.0;
 
 /// One camera of a site to be trained.
 #[derive(Debug, Clone, Copy)]
@@ -93,12 +96,15 @@ pub fn fit_site_models(
     let samples: Vec<&[Sample]> = cameras.iter().map(|camera| camera.samples).collect();
     let plane = rows.first().map(|own| own.plane).ok_or_else(|| unusable("there is no camera".to_owned()))?;
     let site = SiteRows::new(&samples, &plane);
-    let fit = SiteFit { cameras, rows: &rows, plane, groups: Groups::new(&site), site, joint_training, seed };
+    let classes = samples.iter().flat_map(|own| own.iter().map(|sample| sample.class.as_ref()));
+    let target_height_m = target_height_m(classes);
+    let groups = Groups::new(&site);
+    let fit = SiteFit { cameras, rows: &rows, plane, groups, site, joint_training, target_height_m, seed };
     let mut run = FitRun { observer, progress: RunProgress::default() };
-    run.progress.epochs = fit.groups.count + 1 + EPOCHS * cameras.len() as u32;
-    let validation = fit.cross_validate(&mut run)?;
+    run.progress.epochs = 2 * fit.groups.count + 1 + EPOCHS * cameras.len() as u32;
+    let (form, validation) = fit.select(&mut run)?;
     fit.begin(&mut run, "final fit".to_owned())?;
-    let maps = fit.fit(&fit.site.fixes, &fit.pairs(|_| true), &mut run)?;
+    let maps = fit.fit(form, &fit.site.fixes, &fit.pairs(|_| true), &mut run)?;
     let cameras = (0..cameras.len())
         .map(|camera| fit.model(camera, &maps, &validation, &mut run))
         .collect::<Result<_, FitError>>()?;
@@ -182,6 +188,24 @@ struct Validation {
     disagreement: [Mean; 2],
 }
 
+/// What the maps are fitted to besides the feet of boxes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum MapForm {
+    /// Nothing.
+    Foot,
+    /// The heights of boxes: cameras are upright, and targets of one kind are about equally tall.
+    Upright,
+}
+
+impl MapForm {
+    const fn as_str(self) -> &'static str {
+        match self {
+            Self::Foot => "feet alone",
+            Self::Upright => "upright cameras",
+        }
+    }
+}
+
 /// A site under training.
 struct SiteFit<'a> {
     cameras: &'a [SiteCamera<'a>],
@@ -191,6 +215,8 @@ struct SiteFit<'a> {
     groups: Groups,
     site: SiteRows<'a>,
     joint_training: &'a JointTraining,
+    /// Median height of the targets, m, and the standard deviation of its logarithm.
+    target_height_m: (f64, f64),
     seed: u64,
 }
 
@@ -208,10 +234,35 @@ impl SiteFit<'_> {
         self.site.pairs.iter().filter(|pair| keep(pair)).map(|pair| pair.pair).collect()
     }
 
+    /// The form of the maps whose held-out residuals are the smaller, by their mean squares over all cameras with every
+    /// square bounded.
+    fn select(&self, run: &mut FitRun<'_>) -> Result<(MapForm, Validation), FitError> {
+        let foot = self.cross_validate(MapForm::Foot, run)?;
+        let upright = match self.cross_validate(MapForm::Upright, run) {
+            Err(FitError::Unusable(_)) => return Ok((MapForm::Foot, foot)),
+            upright => upright?,
+        };
+        let squares = |validation: &Validation| -> Vec<f64> {
+            let residuals = validation.cameras.iter().flat_map(|own| &own.together.residuals);
+            residuals.map(|[east, north]| east * east + north * north).collect()
+        };
+        let (of_foot, of_upright) = (squares(&foot), squares(&upright));
+        let bound_m2 = LARGEST_SQUARE_RATIO * median(of_foot.clone());
+        let score = |squares: Vec<f64>| squares.into_iter().map(|square| square.min(bound_m2)).sum::<f64>();
+        let is_upright = score(of_upright) < score(of_foot);
+        Ok(if is_upright { (MapForm::Upright, upright) } else { (MapForm::Foot, foot) })
+    }
+
     /// Fits the maps of all cameras.
-    fn fit(&self, fixes: &[SiteFix], pairs: &[SitePair], run: &mut FitRun<'_>) -> Result<SiteMaps, FitError> {
+    fn fit(
+        &self,
+        form: MapForm,
+        fixes: &[SiteFix],
+        pairs: &[SitePair],
+        run: &mut FitRun<'_>,
+    ) -> Result<SiteMaps, FitError> {
         let image_sizes: Vec<_> = self.cameras.iter().map(|camera| camera.image_size).collect();
-        self.observed(&image_sizes, fixes, pairs, run).map_err(|error| match error {
+        self.observed(form, &image_sizes, fixes, pairs, run).map_err(|error| match error {
             SiteFitError::Cancelled => FitError::Cancelled,
             SiteFitError::TooFewRows { camera } => unusable(format!(
                 "of camera {} are too few, or of too few receivers: without a quarter of the receivers, which is held \
@@ -225,20 +276,32 @@ impl SiteFit<'_> {
 
     fn observed(
         &self,
+        form: MapForm,
         image_sizes: &[Option<ImageSize>],
         fixes: &[SiteFix],
         pairs: &[SitePair],
         run: &mut FitRun<'_>,
     ) -> Result<SiteMaps, SiteFitError> {
-        let input = SiteFitInput { image_sizes, fixes, pairs, correlation: RECEIVER_CORRELATION };
+        let input = SiteFitInput {
+            image_sizes,
+            fixes,
+            pairs,
+            correlation: RECEIVER_CORRELATION,
+            target_height_m: (form == MapForm::Upright).then_some(self.target_height_m),
+        };
         fit_site_observed(&input, &mut || (run.observer)(FitEvent::Progress(&run.progress)))
     }
 
     /// Each camera on the fixes of the receivers that it sees; `None` where these are too few.
-    fn fit_apart(&self, fixes: &[SiteFix], run: &mut FitRun<'_>) -> Result<Vec<Option<SiteMaps>>, FitError> {
+    fn fit_apart(
+        &self,
+        form: MapForm,
+        fixes: &[SiteFix],
+        run: &mut FitRun<'_>,
+    ) -> Result<Vec<Option<SiteMaps>>, FitError> {
         let of_camera = |(index, camera): (usize, &SiteCamera<'_>)| {
             let own: Vec<SiteFix> = fixes.iter().filter_map(|fix| fix.seen_by(index)).collect();
-            match self.observed(&[camera.image_size], &own, &[], run) {
+            match self.observed(form, &[camera.image_size], &own, &[], run) {
                 Ok(maps) => Ok(Some(maps)),
                 Err(SiteFitError::Cancelled) => Err(FitError::Cancelled),
                 Err(_) => Ok(None),
@@ -248,7 +311,7 @@ impl SiteFit<'_> {
     }
 
     /// Leaves out each group in turn.
-    fn cross_validate(&self, run: &mut FitRun<'_>) -> Result<Validation, FitError> {
+    fn cross_validate(&self, form: MapForm, run: &mut FitRun<'_>) -> Result<Validation, FitError> {
         let empty = |rows: &TrainingRows| HeldOutResiduals {
             residuals: vec![[0.0; 2]; rows.rows.len()],
             predicted_m2: vec![0.0; rows.rows.len()],
@@ -261,13 +324,14 @@ impl SiteFit<'_> {
         let cameras = self.rows.iter().enumerate().map(camera_validation).collect();
         let mut validation = Validation { cameras, disagreement: [Mean::default(); 2] };
         for group in 0..self.groups.count {
-            self.begin(run, format!("held-out group {} of {}", group + 1, self.groups.count))?;
+            let phase = format!("{}: held-out group {} of {}", form.as_str(), group + 1, self.groups.count);
+            self.begin(run, phase)?;
             let is_kept = |receiver, time_s| self.groups.of(receiver, time_s) != group;
             let kept = self.site.fixes.iter().filter(|fix| is_kept(fix.receiver, fix.time_s));
             let fixes: Vec<SiteFix> = kept.cloned().collect();
             let pairs = self.pairs(|pair| is_kept(pair.receiver, pair.time_s));
-            let together = self.fit(&fixes, &pairs, run)?;
-            let apart = self.fit_apart(&fixes, run)?;
+            let together = self.fit(form, &fixes, &pairs, run)?;
+            let apart = self.fit_apart(form, &fixes, run)?;
             for (camera, own) in validation.cameras.iter_mut().enumerate() {
                 self.predict(camera, group, (&together, camera), &own.groups, &mut own.together);
                 own.apart = own.apart.take().zip(apart[camera].as_ref()).map(|(mut residuals, maps)| {

@@ -8,6 +8,7 @@ use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
 use super::maps::SiteMaps;
 use crate::domain::GaussMarkovNoise;
 use crate::model::encoder::gaussian_process::projective_mean::Box4;
+use crate::model::encoder::gaussian_process::{FootPrior, UprightGeometry};
 use crate::statistics::median;
 
 /// Standard deviation per axis of the fixes and of the feet before they are estimated, m and px.
@@ -18,6 +19,8 @@ const SIGMA_RANGE_M: [f64; 2] = [0.02, 100.0];
 const FOOT_SIGMA_RANGE_PX: [f64; 2] = [0.5, 50.0];
 /// Rounds of solution and noise estimate.
 const ROUNDS: usize = 3;
+/// The same where the heights of boxes are told by a prior that is linearised anew in each.
+const UPRIGHT_ROUNDS: usize = 6;
 /// Share of the transfers that counts as independent: a detector's error lasts for some frames.
 const INDEPENDENT_TRANSFERS: f64 = 0.25;
 /// Fixes of all receivers and of one, and transfers between all cameras and between two: more are thinned evenly.
@@ -41,23 +44,27 @@ pub fn fit_site(input: &SiteFitInput<'_>) -> Result<SiteMaps, SiteFitError> {
 ///
 /// # Errors
 /// As [`fit_site`], and [`SiteFitError::Cancelled`].
-pub fn fit_site_observed(
+pub(crate) fn fit_site_observed(
     input: &SiteFitInput<'_>,
     observer: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Result<SiteMaps, SiteFitError> {
     let receivers = receiver_rows(input);
     let transfers = transfers(input);
     let mut maps = initial_maps(input.image_sizes.len(), &receivers, &transfers)?;
+    let mut geometries = upright_geometries(input, &receivers, &mut maps);
     let mut problem = LeastSquaresProblem {
         receivers,
         transfers,
         noise: GaussMarkovNoise::new(FIRST_SIGMA_M, input.correlation),
         foot_sigma_px: FIRST_FOOT_SIGMA_PX,
         transfer_weight: INDEPENDENT_TRANSFERS,
+        foot_priors: foot_priors(&mut geometries, &maps),
     };
     let mut covariance = problem.solve(&mut maps, observer)?;
-    for _ in 1..ROUNDS {
+    let rounds = if geometries.iter().any(Option::is_some) { UPRIGHT_ROUNDS } else { ROUNDS };
+    for _ in 1..rounds {
         problem.estimate_noise(&maps);
+        problem.foot_priors = foot_priors(&mut geometries, &maps);
         covariance = problem.solve(&mut maps, observer)?;
     }
     let views_px = (0..maps.len()).map(|camera| view_px(&problem, camera)).collect();
@@ -136,6 +143,44 @@ fn transfers(input: &SiteFitInput<'_>) -> Vec<Transfer> {
 fn thinned<T>(rows: Vec<T>, most: usize) -> Vec<T> {
     let stride = rows.len().div_ceil(most).max(1);
     rows.into_iter().step_by(stride).collect()
+}
+
+/// The cameras whose boxes tell their geometry, if that is asked for; their maps begin there.
+fn upright_geometries(
+    input: &SiteFitInput<'_>,
+    receivers: &[Vec<FixRow>],
+    maps: &mut [GroundMap],
+) -> Vec<Option<UprightGeometry>> {
+    let of_camera = |(camera, map): (usize, &mut GroundMap)| {
+        let (target_height_m, image_size) = (input.target_height_m?, input.image_sizes[camera]?);
+        let (mut boxes, mut positions) = (Vec::new(), Vec::new());
+        for (receiver, rows) in (0..).zip(receivers) {
+            for row in rows {
+                for (_, foot) in row.feet.iter().filter(|(at, _)| *at == camera) {
+                    boxes.push((receiver, *foot));
+                    positions.push(row.position);
+                }
+            }
+        }
+        let feet: Vec<Box4> = boxes.iter().map(|(_, foot)| *foot).collect();
+        let rows = (&feet[..], &positions[..]);
+        let (geometry, placed) = UprightGeometry::new(&boxes, image_size, target_height_m, &map.0, rows)?;
+        map.0 = placed;
+        Some(geometry)
+    };
+    maps.iter_mut().enumerate().map(of_camera).collect()
+}
+
+/// What the boxes' heights say, linearised at the maps. A camera that is none there goes on without.
+fn foot_priors(geometries: &mut [Option<UprightGeometry>], maps: &[GroundMap]) -> Vec<Option<FootPrior>> {
+    let of_camera = |(geometry, map): (&mut Option<UprightGeometry>, &GroundMap)| {
+        let prior = geometry.as_mut()?.prior_at(&map.0);
+        if prior.is_none() {
+            *geometry = None;
+        }
+        prior
+    };
+    geometries.iter_mut().zip(maps).map(of_camera).collect()
 }
 
 /// Robust starts: from fixes where a camera has enough, else from targets in common with cameras that have a

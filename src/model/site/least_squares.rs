@@ -3,7 +3,7 @@
 //! ```text
 //! cost = sum_receivers |W (z - mean_c f_c(box_c))|^2            fixes, whitened per receiver
 //!      + w sum_pairs rho(|f_b^-1(f_a(box_a)) - box_b|^2 / s^2)  feet carried from view a to view b, px
-//!      + sum (p / sigma_prior)^2
+//!      + sum (p / sigma_prior)^2 + sum (p - p_0)' P (p - p_0)    weak prior; what the boxes' heights say, if asked
 //! ```
 //!
 //! `rho(x) = k^2 ln(1 + x / k^2)` is Cauchy's loss. In metres the pairs would pull all maps together to a point;
@@ -11,11 +11,12 @@
 
 use std::ops::ControlFlow;
 
-use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
+use nalgebra::{DMatrix, DVector, Matrix2, SVector, Vector2};
 
 use super::ground_map::{GroundMap, GroundTangent, PARAMETERS};
 use super::input::SiteFitError;
 use crate::domain::GaussMarkovNoise;
+use crate::model::encoder::gaussian_process::FootPrior;
 use crate::model::encoder::gaussian_process::projective_mean::Box4;
 
 /// Standardised distance at which a pair has half its weight.
@@ -52,6 +53,8 @@ pub(super) struct LeastSquaresProblem {
     pub(super) foot_sigma_px: f64,
     /// Weight of a transfer: neighbours in time are not independent.
     pub(super) transfer_weight: f64,
+    /// What the heights of boxes say of each camera's parameters, if anything.
+    pub(super) foot_priors: Vec<Option<FootPrior>>,
 }
 
 /// Gauss-Newton matrix and gradient.
@@ -152,7 +155,27 @@ impl LeastSquaresProblem {
 
     fn cost(&self, maps: &[GroundMap]) -> f64 {
         let transfers: f64 = self.transfers.iter().map(|it| self.transfer_cost(maps, it)).sum();
-        self.fix_residuals(maps).square_sum + transfers + prior_cost(maps)
+        self.fix_residuals(maps).square_sum + transfers + prior_cost(maps) + self.foot_prior_cost(maps)
+    }
+
+    fn foot_prior_cost(&self, maps: &[GroundMap]) -> f64 {
+        let of_map = |(map, prior): (&GroundMap, &Option<FootPrior>)| {
+            let FootPrior { centre, precision } = prior.as_ref()?;
+            let apart = SVector::<f64, PARAMETERS>::from_column_slice(map.parameters()) - centre;
+            Some(apart.dot(&(precision * apart)))
+        };
+        maps.iter().zip(&self.foot_priors).filter_map(of_map).sum()
+    }
+
+    fn add_foot_prior(prior: &FootPrior, map: &GroundMap, first: usize, normal: &mut NormalEquations) {
+        let FootPrior { centre, precision } = prior;
+        let pull = precision * (centre - SVector::<f64, PARAMETERS>::from_column_slice(map.parameters()));
+        for row in 0..PARAMETERS {
+            normal.right[first + row] += pull[row];
+            for column in 0..PARAMETERS {
+                normal.matrix[(first + row, first + column)] += precision[(row, column)];
+            }
+        }
     }
 
     fn transfer_cost(&self, maps: &[GroundMap], transfer: &Transfer) -> f64 {
@@ -176,6 +199,11 @@ impl LeastSquaresProblem {
                 let index = PARAMETERS * camera + at;
                 normal.matrix[(index, index)] += variance.recip();
                 normal.right[index] -= parameter / variance;
+            }
+        }
+        for (camera, (map, prior)) in maps.iter().zip(&self.foot_priors).enumerate() {
+            if let Some(prior) = prior {
+                Self::add_foot_prior(prior, map, PARAMETERS * camera, &mut normal);
             }
         }
         for rows in &self.receivers {

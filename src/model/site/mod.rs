@@ -16,7 +16,8 @@ mod stored;
 #[cfg(test)]
 mod tests;
 
-pub use fit::{fit_site, fit_site_observed};
+pub use fit::fit_site;
+pub(crate) use fit::fit_site_observed;
 pub use input::{RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SitePair};
 pub use maps::{SiteMaps, SitePosition};
 pub use rows::box_at;

@@ -84,13 +84,7 @@ fn fit(
     fixes: &[SiteFix],
     pairs: &[SitePair],
 ) -> Result<SiteMaps, SiteFitError> {
-    fit_site(&SiteFitInput {
-        image_sizes,
-        fixes,
-        pairs,
-        correlation: RECEIVER_CORRELATION,
-        target_height_m: None,
-    })
+    fit_site(&SiteFitInput { image_sizes, fixes, pairs, correlation: RECEIVER_CORRELATION })
 }
 
 impl TrainedSite {

@@ -20,7 +20,10 @@ use crate::domain::{
 };
 use crate::geo::{EastNorth, LocalPlane};
 use crate::model::artifact::{Artifact, FORMAT, ModelParts};
-use crate::model::encoder::gaussian_process::{EPOCHS, SHARED_BIAS_SHARE, target_height_m, widen_map};
+use crate::model::encoder::features::features_of;
+use crate::model::encoder::gaussian_process::{
+    EPOCHS, SHARED_BIAS_SHARE, UprightStarts, target_height_m, widen_map,
+};
 use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
 use crate::model::regressor::Regressor;
 use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
@@ -98,8 +101,10 @@ pub fn fit_site_models(
     let site = SiteRows::new(&samples, &plane);
     let classes = samples.iter().flat_map(|own| own.iter().map(|sample| sample.class.as_ref()));
     let target_height_m = target_height_m(classes);
+    let upright = cameras.iter().zip(&rows).map(|(camera, own)| upright_starts(camera, own, target_height_m));
+    let upright = upright.collect();
     let groups = Groups::new(&site);
-    let fit = SiteFit { cameras, rows: &rows, plane, groups, site, joint_training, target_height_m, seed };
+    let fit = SiteFit { cameras, rows: &rows, plane, groups, site, joint_training, upright, seed };
     let mut run = FitRun { observer, progress: RunProgress::default() };
     run.progress.epochs = 2 * fit.groups.count + 1 + EPOCHS * cameras.len() as u32;
     let (form, validation) = fit.select(&mut run)?;
@@ -119,6 +124,16 @@ pub fn fit_site_models(
 fn training_rows(camera: &SiteCamera<'_>) -> Result<TrainingRows, FitError> {
     let rows = TrainingRows::new(camera.samples);
     Ok(rows.map_err(|error| unusable(format!("of camera {}: {error}", camera.id)))?.thinned(MAX_ROWS))
+}
+
+/// The heights of boxes need no fix, so that boxes of held-out receivers are among them.
+fn upright_starts(
+    camera: &SiteCamera<'_>,
+    rows: &TrainingRows,
+    target_height_m: (f64, f64),
+) -> Option<UprightStarts> {
+    let boxes: Vec<_> = rows.rows.iter().map(|row| (row.target, features_of(&row.bounding_box))).collect();
+    UprightStarts::new(&boxes, camera.image_size?, target_height_m)
 }
 
 fn unusable(message: String) -> FitError {
@@ -215,8 +230,8 @@ struct SiteFit<'a> {
     groups: Groups,
     site: SiteRows<'a>,
     joint_training: &'a JointTraining,
-    /// Median height of the targets, m, and the standard deviation of its logarithm.
-    target_height_m: (f64, f64),
+    /// The cameras that the heights of boxes allow, where these are known.
+    upright: Vec<Option<UprightStarts>>,
     seed: u64,
 }
 
@@ -238,6 +253,9 @@ impl SiteFit<'_> {
     /// square bounded.
     fn select(&self, run: &mut FitRun<'_>) -> Result<(MapForm, Validation), FitError> {
         let foot = self.cross_validate(MapForm::Foot, run)?;
+        if self.upright.iter().all(Option::is_none) {
+            return Ok((MapForm::Foot, foot));
+        }
         let upright = match self.cross_validate(MapForm::Upright, run) {
             Err(FitError::Unusable(_)) => return Ok((MapForm::Foot, foot)),
             upright => upright?,
@@ -262,7 +280,7 @@ impl SiteFit<'_> {
         run: &mut FitRun<'_>,
     ) -> Result<SiteMaps, FitError> {
         let image_sizes: Vec<_> = self.cameras.iter().map(|camera| camera.image_size).collect();
-        self.observed(form, &image_sizes, fixes, pairs, run).map_err(|error| match error {
+        self.observed(self.upright_of(form), &image_sizes, fixes, pairs, run).map_err(|error| match error {
             SiteFitError::Cancelled => FitError::Cancelled,
             SiteFitError::TooFewRows { camera } => unusable(format!(
                 "of camera {} are too few, or of too few receivers: without a quarter of the receivers, which is held \
@@ -274,22 +292,24 @@ impl SiteFit<'_> {
         })
     }
 
+    /// What the heights of boxes say, if the form uses it.
+    fn upright_of(&self, form: MapForm) -> &[Option<UprightStarts>] {
+        match form {
+            MapForm::Foot => &[],
+            MapForm::Upright => &self.upright,
+        }
+    }
+
     fn observed(
         &self,
-        form: MapForm,
+        upright: &[Option<UprightStarts>],
         image_sizes: &[Option<ImageSize>],
         fixes: &[SiteFix],
         pairs: &[SitePair],
         run: &mut FitRun<'_>,
     ) -> Result<SiteMaps, SiteFitError> {
-        let input = SiteFitInput {
-            image_sizes,
-            fixes,
-            pairs,
-            correlation: RECEIVER_CORRELATION,
-            target_height_m: (form == MapForm::Upright).then_some(self.target_height_m),
-        };
-        fit_site_observed(&input, &mut || (run.observer)(FitEvent::Progress(&run.progress)))
+        let input = SiteFitInput { image_sizes, fixes, pairs, correlation: RECEIVER_CORRELATION };
+        fit_site_observed(&input, upright, &mut || (run.observer)(FitEvent::Progress(&run.progress)))
     }
 
     /// Each camera on the fixes of the receivers that it sees; `None` where these are too few.
@@ -301,7 +321,8 @@ impl SiteFit<'_> {
     ) -> Result<Vec<Option<SiteMaps>>, FitError> {
         let of_camera = |(index, camera): (usize, &SiteCamera<'_>)| {
             let own: Vec<SiteFix> = fixes.iter().filter_map(|fix| fix.seen_by(index)).collect();
-            match self.observed(form, &[camera.image_size], &own, &[], run) {
+            let upright = self.upright_of(form).get(index).map_or(&[][..], std::slice::from_ref);
+            match self.observed(upright, &[camera.image_size], &own, &[], run) {
                 Ok(maps) => Ok(Some(maps)),
                 Err(SiteFitError::Cancelled) => Err(FitError::Cancelled),
                 Err(_) => Ok(None),

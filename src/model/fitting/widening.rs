@@ -38,12 +38,7 @@ pub(super) fn held_out_widening(
     noise: &GaussMarkovNoise,
 ) -> Result<f64, FitError> {
     let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
-    let coloured_share = 1.0 - noise.correlation.white_share;
-    let receiver = ReceiverNoise {
-        short_m2: coloured_share * noise.variance_m2,
-        short_time_s: noise.correlation.time_constant_s,
-        ..ReceiverNoise::white(noise.correlation.white_share * noise.variance_m2)
-    };
+    let receiver = ReceiverNoise::of_gauss_markov(noise);
     let mut means = Vec::new();
     for group in 0..=groups.iter().copied().max().unwrap_or(0) {
         let members: Vec<usize> = (0..groups.len()).filter(|row| groups[*row] == group).collect();

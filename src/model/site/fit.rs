@@ -8,7 +8,7 @@ use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
 use super::maps::SiteMaps;
 use crate::domain::GaussMarkovNoise;
 use crate::model::encoder::gaussian_process::projective_mean::Box4;
-use crate::model::encoder::gaussian_process::{FootPrior, UprightGeometry};
+use crate::model::encoder::gaussian_process::{FootPrior, UprightGeometry, UprightStarts};
 use crate::statistics::median;
 
 /// Standard deviation per axis of the fixes and of the feet before they are estimated, m and px.
@@ -21,8 +21,6 @@ const FOOT_SIGMA_RANGE_PX: [f64; 2] = [0.5, 50.0];
 const ROUNDS: usize = 3;
 /// The same where the heights of boxes are told by a prior that is linearised anew in each.
 const UPRIGHT_ROUNDS: usize = 6;
-/// Share of the transfers that counts as independent: a detector's error lasts for some frames.
-const INDEPENDENT_TRANSFERS: f64 = 0.25;
 /// Fixes of all receivers and of one, and transfers between all cameras and between two: more are thinned evenly.
 const MAX_ROWS: usize = 20_000;
 const MAX_RECEIVER_ROWS: usize = 300;
@@ -37,29 +35,26 @@ const MEDIAN_CHI_SQUARE: f64 = 1.386;
 /// # Errors
 /// A camera has too few rows, or there is no finite solution.
 pub fn fit_site(input: &SiteFitInput<'_>) -> Result<SiteMaps, SiteFitError> {
-    fit_site_observed(input, &mut || ControlFlow::Continue(()))
+    fit_site_observed(input, &[], &mut || ControlFlow::Continue(()))
 }
 
-/// The same under an observer that is asked before each step, and ends the fit by a break.
+/// The same under an observer that is asked before each step, and ends the fit by a break. `upright` are the cameras that
+/// the heights of boxes allow, by camera, if these are to have a say.
 ///
 /// # Errors
 /// As [`fit_site`], and [`SiteFitError::Cancelled`].
 pub(crate) fn fit_site_observed(
     input: &SiteFitInput<'_>,
+    upright: &[Option<UprightStarts>],
     observer: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Result<SiteMaps, SiteFitError> {
     let receivers = receiver_rows(input);
     let transfers = transfers(input);
     let mut maps = initial_maps(input.image_sizes.len(), &receivers, &transfers)?;
-    let mut geometries = upright_geometries(input, &receivers, &mut maps);
-    let mut problem = LeastSquaresProblem {
-        receivers,
-        transfers,
-        noise: GaussMarkovNoise::new(FIRST_SIGMA_M, input.correlation),
-        foot_sigma_px: FIRST_FOOT_SIGMA_PX,
-        transfer_weight: INDEPENDENT_TRANSFERS,
-        foot_priors: foot_priors(&mut geometries, &maps),
-    };
+    let mut geometries = upright_geometries(upright, &receivers, &mut maps);
+    let noise = GaussMarkovNoise::new(FIRST_SIGMA_M, input.correlation);
+    let mut problem = LeastSquaresProblem::new(receivers, transfers, noise, FIRST_FOOT_SIGMA_PX);
+    problem.foot_priors = foot_priors(&mut geometries, &maps);
     let mut covariance = problem.solve(&mut maps, observer)?;
     let rounds = if geometries.iter().any(Option::is_some) { UPRIGHT_ROUNDS } else { ROUNDS };
     for _ in 1..rounds {
@@ -72,7 +67,7 @@ pub(crate) fn fit_site_observed(
         maps,
         covariance,
         foot_sigma_px: problem.foot_sigma_px,
-        noise: problem.noise,
+        noise: problem.noise(),
         image_sizes: input.image_sizes.to_vec(),
         views_px,
     })
@@ -86,8 +81,8 @@ impl LeastSquaresProblem {
         let freedom = residuals.count as f64 - 8.0 * maps.len() as f64;
         if freedom > 0.0 {
             let scale = residuals.square_sum / freedom;
-            let sigma_m = (self.noise.variance_m2 * scale).sqrt().clamp(SIGMA_RANGE_M[0], SIGMA_RANGE_M[1]);
-            self.noise = GaussMarkovNoise::new(sigma_m, self.noise.correlation);
+            let sigma_m = (self.noise().variance_m2 * scale).sqrt().clamp(SIGMA_RANGE_M[0], SIGMA_RANGE_M[1]);
+            self.set_noise(GaussMarkovNoise::new(sigma_m, self.noise().correlation));
         }
         let distances = self.transfer_distances(maps);
         if distances.len() >= FEWEST_ROWS {
@@ -145,26 +140,19 @@ fn thinned<T>(rows: Vec<T>, most: usize) -> Vec<T> {
     rows.into_iter().step_by(stride).collect()
 }
 
-/// The cameras whose boxes tell their geometry, if that is asked for; their maps begin there.
+/// The geometries by the heights of boxes; the maps of those cameras begin there.
 fn upright_geometries(
-    input: &SiteFitInput<'_>,
+    upright: &[Option<UprightStarts>],
     receivers: &[Vec<FixRow>],
     maps: &mut [GroundMap],
 ) -> Vec<Option<UprightGeometry>> {
     let of_camera = |(camera, map): (usize, &mut GroundMap)| {
-        let (target_height_m, image_size) = (input.target_height_m?, input.image_sizes[camera]?);
-        let (mut boxes, mut positions) = (Vec::new(), Vec::new());
-        for (receiver, rows) in (0..).zip(receivers) {
-            for row in rows {
-                for (_, foot) in row.feet.iter().filter(|(at, _)| *at == camera) {
-                    boxes.push((receiver, *foot));
-                    positions.push(row.position);
-                }
-            }
-        }
-        let feet: Vec<Box4> = boxes.iter().map(|(_, foot)| *foot).collect();
-        let rows = (&feet[..], &positions[..]);
-        let (geometry, placed) = UprightGeometry::new(&boxes, image_size, target_height_m, &map.0, rows)?;
+        let starts = upright.get(camera)?.as_ref()?;
+        let rows = receivers.iter().flatten();
+        let own = rows.flat_map(|row| row.feet.iter().map(move |foot| (foot, row.position)));
+        let own = own.filter(|((at, _), _)| *at == camera).map(|((_, foot), position)| (*foot, position));
+        let (feet, positions): (Vec<Box4>, Vec<[f64; 2]>) = own.unzip();
+        let (geometry, placed) = UprightGeometry::new(starts, &map.0, (&feet, &positions))?;
         map.0 = placed;
         Some(geometry)
     };

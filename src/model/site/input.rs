@@ -50,9 +50,6 @@ pub struct SiteFitInput<'a> {
     pub pairs: &'a [SitePair],
     /// Correlation over time of the receivers' errors; their variance is estimated.
     pub correlation: NoiseCorrelation,
-    /// Median height of the targets, m, and the standard deviation of its logarithm, if the heights of boxes are to tell
-    /// the geometry of the cameras whose image size is known.
-    pub target_height_m: Option<(f64, f64)>,
 }
 
 /// Why there are no maps.

@@ -63,13 +63,8 @@ fn world(seed: u64) -> World {
 
 fn fitted(world: &World, pairs: &[SitePair]) -> SiteMaps {
     let size = Some(ImageSize::new(1280, 720).expect("valid"));
-    let input = SiteFitInput {
-        image_sizes: &[size, size],
-        fixes: &world.fixes,
-        pairs,
-        correlation: CORRELATION,
-        target_height_m: None,
-    };
+    let input =
+        SiteFitInput { image_sizes: &[size, size], fixes: &world.fixes, pairs, correlation: CORRELATION };
     fit_site(&input).expect("a solution")
 }
 
@@ -139,13 +134,8 @@ fn a_camera_without_fixes_is_fitted_by_its_neighbour() {
     let maps = fitted(&one_sided, &one_sided.pairs);
     assert!(disagreement_m(&maps, &one_sided) < 0.5);
     let size = [None, None];
-    let input = SiteFitInput {
-        image_sizes: &size,
-        fixes: &one_sided.fixes,
-        pairs: &[],
-        correlation: CORRELATION,
-        target_height_m: None,
-    };
+    let input =
+        SiteFitInput { image_sizes: &size, fixes: &one_sided.fixes, pairs: &[], correlation: CORRELATION };
     assert_eq!(fit_site(&input).err(), Some(SiteFitError::TooFewRows { camera: 1 }));
 }
 

@@ -16,7 +16,7 @@ fn simulated(seed: u64) -> SimulatedSite {
         walkers: 14,
         vehicles: 0,
         receiver_share: 0.7,
-        duration_s: 240.0,
+        duration_s: 150.0,
         ..SiteOptions::default()
     })
 }
@@ -80,7 +80,7 @@ fn fitted(seed: u64) -> SiteModels {
 fn models_of_one_site_agree_on_people_they_have_not_seen() {
     let (mut together_m, mut apart_m) = (0.0, 0.0);
     let (mut inside, mut relative, mut pairs) = ([0.0; 2], 0.0, 0.0);
-    for seed in 1..=4 {
+    for seed in 1..=3 {
         let models = fitted(seed);
         let [together, apart] = models.disagreement_m.map(|it| it.expect("the views overlap"));
         (together_m, apart_m) = (together_m + together, apart_m + apart);
@@ -121,8 +121,8 @@ fn models_of_one_site_agree_on_people_they_have_not_seen() {
     let (coverage, relative) = (inside[0] / inside[1], relative / pairs);
     println!(
         "cameras disagree by {:.3} m, {:.3} m one by one; coverage {coverage:.3}, of differences {relative:.3}",
-        together_m / 4.0,
-        apart_m / 4.0
+        together_m / 3.0,
+        apart_m / 3.0
     );
     assert!(together_m < apart_m, "{together_m} {apart_m}");
     assert!((0.85..=1.0).contains(&coverage), "{coverage}");

@@ -27,7 +27,7 @@ fn site(seed: u64) -> SimulatedSite {
         walkers: 14,
         vehicles: 0,
         receiver_share: 0.7,
-        duration_s: 240.0,
+        duration_s: 150.0,
         ..SiteOptions::default()
     })
 }
@@ -78,7 +78,7 @@ async fn create(server: &TestServer, site: &SimulatedSite, second_samples: usize
 /// Waits until a run is as wanted.
 async fn until(server: &TestServer, path: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     let mut seen = Value::Null;
-    for _ in 0..2_400 {
+    for _ in 0..6_000 {
         seen = server.get(path).await.expect(200).json();
         if wanted(&seen) {
             return seen;
@@ -206,7 +206,7 @@ async fn world_tracks_state_the_error_that_the_cameras_have_in_common() {
         .collect();
     feed(&server, &fresh).await;
     let (mut inside, mut all, mut error_m, mut radius_m) = (0.0, 0.0, 0.0, 0.0);
-    while all < 150.0 {
+    while all < 100.0 {
         for event in live.until("track", 1).await.into_iter().filter(|event| event.name == "track") {
             let properties = &event.data["properties"];
             let Some(target) = properties["sightings"][0]["tracker_id"].as_str() else { continue };
@@ -317,7 +317,7 @@ async fn a_cancelled_run_stores_nothing_and_both_interfaces_show_it_alike() {
 }
 
 async fn running(folder: &Path) -> (TestServer, String) {
-    let settings = [("SIGHTFIX_TRAINING__LEASE_S", "1")];
+    let settings = [("SIGHTFIX_TRAINING__LEASE_S", "3")];
     let server = TestServer::start_with(folder, &settings);
     create(&server, &site(1), usize::MAX).await;
     let path = start(&server).await;
@@ -330,7 +330,7 @@ async fn a_run_whose_worker_was_killed_is_made_again_and_never_half_of_it() {
     let folder = data_folder();
     let (server, path) = running(folder.path()).await;
     server.kill();
-    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_TRAINING__LEASE_S", "1")]);
+    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_TRAINING__LEASE_S", "3")]);
     assert_eq!(active_models(&server).await, [Value::Null, Value::Null]);
     let ended = until(&server, &path, has_ended).await;
     assert_eq!((&ended["state"], &ended["attempt"]), (&json!("succeeded"), &json!(2)), "{ended}");

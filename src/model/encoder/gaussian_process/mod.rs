@@ -35,10 +35,10 @@ pub(crate) use fit::SHARED_BIAS_SHARE;
 pub(crate) use foot_map::{FittedFootMap, FootCovariance, widen_map};
 pub use ground_camera::{GroundCamera, GroundPoint};
 pub(crate) use leave_out::{SequenceMean, widening};
-pub(crate) use noise::{Epoch, ReceiverNoise};
+pub(crate) use noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, receiver_correlation, target_height_m};
 pub(crate) use sessions::weighted_mean;
-pub(crate) use upright_geometry::{FootPrior, UprightGeometry};
+pub(crate) use upright_geometry::{FootPrior, UprightGeometry, UprightStarts};
 
 #[cfg(test)]
 mod tests;

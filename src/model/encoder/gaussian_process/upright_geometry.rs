@@ -14,6 +14,28 @@ pub(crate) struct FootPrior {
     pub(crate) precision: SMatrix<f64, FOOT_COEFFICIENTS, FOOT_COEFFICIENTS>,
 }
 
+/// The cameras that the heights of boxes allow, without place and direction.
+#[derive(Debug, Clone)]
+pub(crate) struct UprightStarts {
+    camera: UprightCamera,
+    starts: Vec<Parameters>,
+}
+
+impl UprightStarts {
+    /// From boxes in the order of their targets' numbers; `None` where they determine none. `target_height_m` is the
+    /// median height of a target with the standard deviation of its logarithm.
+    pub(crate) fn new(
+        boxes: &[(u32, Box4)],
+        image_size: ImageSize,
+        target_height_m: (f64, f64),
+    ) -> Option<Self> {
+        let size_px = (f64::from(image_size.width_px()), f64::from(image_size.height_px()));
+        let camera = UprightCamera::new(boxes, size_px, target_height_m)?;
+        let starts = camera.starts();
+        (!starts.is_empty()).then_some(Self { camera, starts })
+    }
+}
+
 /// An upright camera at the parameters about which its prior is linearised.
 #[derive(Debug, Clone)]
 pub(crate) struct UprightGeometry {
@@ -22,17 +44,13 @@ pub(crate) struct UprightGeometry {
 }
 
 impl UprightGeometry {
-    /// The camera that suits the boxes (by target) and, of those that do, places the feet nearest to their positions, with
-    /// its homography in the scales of `mean`; `None` where the boxes determine none.
+    /// Of the cameras that suit the boxes the one that places feet nearest to their positions, with its homography in
+    /// the scales of `mean`.
     pub(crate) fn new(
-        boxes: &[(u32, Box4)],
-        image_size: ImageSize,
-        target_height_m: (f64, f64),
+        UprightStarts { camera, starts }: &UprightStarts,
         mean: &ProjectiveMean,
         (feet, positions): (&[Box4], &[[f64; 2]]),
     ) -> Option<(Self, ProjectiveMean)> {
-        let size_px = (f64::from(image_size.width_px()), f64::from(image_size.height_px()));
-        let camera = UprightCamera::new(boxes, size_px, target_height_m)?;
         let of_start = |start: &Parameters| {
             let at = camera.placed(start, mean, feet, positions);
             camera.prior_on_coefficients(&at, mean)?;
@@ -43,10 +61,9 @@ impl UprightGeometry {
             };
             Some((median(feet.iter().zip(positions).map(miss_m).collect()), at, placed))
         };
-        let starts = camera.starts();
         let best = starts.iter().filter_map(of_start).min_by(|one, other| one.0.total_cmp(&other.0));
         let (_, at, placed) = best?;
-        Some((Self { camera, at }, placed))
+        Some((Self { camera: camera.clone(), at }, placed))
     }
 
     /// Linearises at the camera that has a homography to first order; returns the prior there.

@@ -12,6 +12,9 @@ use crate::geo::LocalPlane;
 /// Boxes on both sides of an instant are joined by a line over at most this long a gap, s.
 const LONGEST_BOX_GAP_S: f64 = 1.1;
 
+/// Boxes of one camera in the order of time, by receiver.
+type BoxesByReceiver = BTreeMap<u32, Vec<(Timestamp, BoundingBox)>>;
+
 /// A pair of boxes with its target.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TargetPair {
@@ -41,7 +44,7 @@ impl<'a> SiteRows<'a> {
             samples().map(|sample| (&sample.target_id, 0)).collect();
         receivers.values_mut().zip(0..).for_each(|(number, next)| *number = next);
         let mut instants = BTreeMap::new();
-        let mut boxes = vec![BTreeMap::<u32, Vec<(Timestamp, BoundingBox)>>::new(); cameras.len()];
+        let mut boxes = vec![BoxesByReceiver::new(); cameras.len()];
         for (samples, own) in cameras.iter().zip(&mut boxes) {
             for sample in *samples {
                 let receiver = receivers[&sample.target_id];
@@ -53,7 +56,7 @@ impl<'a> SiteRows<'a> {
         let mut rows =
             Self { receivers, fixes: Vec::with_capacity(instants.len()), pairs: Vec::new(), start };
         for ((receiver, time), position) in instants {
-            let of_camera = |(camera, own): (usize, &BTreeMap<u32, Vec<(Timestamp, BoundingBox)>>)| {
+            let of_camera = |(camera, own): (usize, &BoxesByReceiver)| {
                 Some((camera, box_at(own.get(&receiver)?, |timed| *timed, time)?))
             };
             let seen: Vec<(usize, BoundingBox)> = boxes.iter().enumerate().filter_map(of_camera).collect();

@@ -85,6 +85,8 @@ pub struct Parts {
     pub connection_board: ConnectionBoard,
     /// Where their sinks write files, if they may: set by the server at its start.
     pub export_folder: OnceLock<PathBuf>,
+    /// Serial devices that their sources may read: set by the server at its start.
+    pub serial_devices: OnceLock<Vec<PathBuf>>,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -153,6 +155,7 @@ impl App {
             site_registry,
             connection_board: ConnectionBoard::default(),
             export_folder: OnceLock::new(),
+            serial_devices: OnceLock::new(),
             access,
             clock,
             randomness,

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 
 use super::credentials::PeerError;
-use super::source::Message;
+use super::source::{Message, Settled};
 use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
 use crate::domain::{
@@ -220,7 +220,7 @@ impl Intake {
     ///
     /// # Errors
     /// Samples could not be stored: nothing behind is acknowledged.
-    pub(super) fn settled(&mut self) -> Result<Vec<(u64, Result<(), String>)>> {
+    pub(super) fn settled(&mut self) -> Result<Vec<Settled>> {
         let mut settled = Vec::new();
         while let Some(message) = self.pending.front() {
             for (camera, seq) in &message.items {
@@ -231,7 +231,7 @@ impl Intake {
                 }
             }
             if let Some(message) = self.pending.pop_front() {
-                settled.push((message.receipt, message.outcome));
+                settled.push(Settled { receipt: message.receipt, outcome: message.outcome });
             }
         }
         Ok(settled)

@@ -27,6 +27,7 @@ mod sample_retention;
 mod sample_table;
 mod samples;
 mod sites;
+mod source_offsets;
 #[cfg(test)]
 mod tests;
 mod training;

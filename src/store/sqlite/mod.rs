@@ -32,6 +32,7 @@ mod sample_table;
 mod samples;
 mod server_lock;
 mod sites;
+mod source_offsets;
 mod space;
 #[cfg(test)]
 mod tests;

@@ -204,8 +204,8 @@ impl Registry {
         faults
     }
 
-    /// Prepares a camera's live state for changes under a fence; whether it begins anew, since another node may have had
-    /// it in between.
+    /// Prepares a camera's live state for changes under a fence; whether it was cleared, since another node may have
+    /// owned the camera in between.
     pub(super) async fn begin_tenure(&self, id: &CameraId, key: CameraKey, fence: i64) -> bool {
         let _change = self.change.lock().await;
         let Some(known) = self.get(id).filter(|known| known.key == key) else { return false };
@@ -216,8 +216,8 @@ impl Registry {
         let tenure = fence.cast_unsigned().rotate_right(16);
         let live = CameraLive::new(self.event_log(key).wrapping_add(tenure));
         live.continue_under(fence);
-        let anew = Arc::new(ActiveCamera { live, ..ActiveCamera::clone(&known) });
-        self.replace(|cameras| cameras.insert(id.clone(), anew.clone()));
+        let cleared = Arc::new(ActiveCamera { live, ..ActiveCamera::clone(&known) });
+        self.replace(|cameras| cameras.insert(id.clone(), cleared.clone()));
         true
     }
 

@@ -84,11 +84,11 @@ impl SiteRegistry {
         Ok(())
     }
 
-    /// Begins a site's tracks and events anew, since another node had its cameras in between.
+    /// Clears a site's tracks and events, since another node had its cameras in between.
     ///
     /// # Errors
     /// As [`SiteRegistry::refresh_site`].
-    pub(super) async fn begin_anew(&self, store: &Store, id: &SiteId) -> Result<()> {
+    pub(super) async fn reset(&self, store: &Store, id: &SiteId) -> Result<()> {
         self.forget_site(id).await;
         self.refresh_site(store, id).await.map(drop)
     }

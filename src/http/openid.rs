@@ -75,7 +75,7 @@ async fn finish_sign_in(CallerApp(app): CallerApp, uri: Uri, headers: HeaderMap)
     Ok(answer_person(finish(&app, &uri, &headers).await, &headers)?)
 }
 
-/// The answer for whoever asks. A person sees the console, which names the kind of refusal in their language; a program
+/// The answer by what the request accepts. A person sees the console, which names the kind of refusal in their language; a program
 /// gets the problem. Faults stay as they are, so that they are logged.
 fn answer_person(answer: Result<Response>, headers: &HeaderMap) -> Result<Response> {
     let reads_html = |accepted: &HeaderValue| accepted.to_str().is_ok_and(|it| it.contains("text/html"));

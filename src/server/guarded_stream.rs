@@ -1,7 +1,8 @@
 //! A client's stream, over TLS or not, with a deadline for its first bytes, one for every write that makes no
-//! progress, and a limit on HTTP/2 control frames.
+//! progress, a limit on HTTP/2 control frames, and a close that waits for what the client still sends.
 
 use std::io;
+use std::mem::MaybeUninit;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -15,6 +16,13 @@ use super::frame_limit::{FrameLimit, PREFACE};
 use crate::config::Limits;
 use crate::telemetry::CloseReason;
 
+/// How long what the client still sends is read and discarded after the server's last byte. The kernel resets a
+/// connection that is closed with unread bytes, and the reset may overtake the last answer (RFC 9112, section 9.6).
+const LINGER_TIME: Duration = Duration::from_secs(1);
+
+/// Bytes that are discarded at once.
+const DISCARDED_BYTES: usize = 4 << 10;
+
 pub(super) struct GuardedStream<S> {
     stream: S,
     activity: Arc<Activity>,
@@ -26,6 +34,8 @@ pub(super) struct GuardedStream<S> {
     write_time: Duration,
     /// Runs while the client takes nothing of what is written.
     write: Option<Pin<Box<Sleep>>>,
+    /// Runs from the server's last byte.
+    linger: Option<Pin<Box<Sleep>>>,
 }
 
 impl<S> GuardedStream<S> {
@@ -38,6 +48,7 @@ impl<S> GuardedStream<S> {
             first_bytes: Some(Box::pin(tokio::time::sleep(limits.header_time()))),
             write_time: limits.idle_time(),
             write: None,
+            linger: None,
         }
     }
 
@@ -89,7 +100,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for GuardedStream<S> {
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for GuardedStream<S> {
+impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for GuardedStream<S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -116,7 +127,21 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for GuardedStream<S> {
         Pin::new(&mut self.stream).poll_flush(context)
     }
 
+    /// Ends the server's side, and waits until the client has ended its own, for at most [`LINGER_TIME`].
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
+        let Self { stream, linger, .. } = &mut *self;
+        if linger.is_none() {
+            ready!(Pin::new(&mut *stream).poll_shutdown(context))?;
+        }
+        let deadline = linger.get_or_insert_with(|| Box::pin(tokio::time::sleep(LINGER_TIME)));
+        let mut discarded = [MaybeUninit::uninit(); DISCARDED_BYTES];
+        while deadline.as_mut().poll(context).is_pending() {
+            let mut buffer = ReadBuf::uninit(&mut discarded);
+            let read = ready!(Pin::new(&mut *stream).poll_read(context, &mut buffer));
+            if read.is_err() || buffer.filled().is_empty() {
+                break;
+            }
+        }
+        Poll::Ready(Ok(()))
     }
 }

@@ -99,7 +99,7 @@ impl Membership {
                 if app.registry.begin_tenure(&camera.id, camera.key, fence).await
                     && let Some(site) = camera.site.as_ref().filter(|site| !self.holds_camera_of(site))
                 {
-                    app.site_registry.begin_anew(&app.store, site).await?;
+                    app.site_registry.reset(&app.store, site).await?;
                 }
                 Ok(self.hold(HeldLease::new(camera, fence, registration, now)))
             }

@@ -27,7 +27,7 @@ const CONNECTION_WAIT: Duration = Duration::from_secs(10);
 const SCHEMA_WAIT: Duration = Duration::from_secs(120);
 const SCHEMA_PAUSE: Duration = Duration::from_millis(100);
 
-/// A reader sees one state of the database. Whoever holds locks for longer than these times is interrupted.
+/// A reader sees one state of the database. A transaction that holds locks for longer than these times is interrupted.
 const BEGIN_READ: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; DEALLOCATE ALL; SET LOCAL statement_timeout = '60s'; \
                           SET LOCAL idle_in_transaction_session_timeout = '60s'";
 const BEGIN_SYNCED: &str = "BEGIN; DEALLOCATE ALL; SET LOCAL statement_timeout = '60s'; SET LOCAL lock_timeout = '5s'; \

@@ -13,7 +13,8 @@ use crate::exchange::SerialLine;
 pub(super) fn open(line: &SerialLine) -> Result<Receiver, PeerError> {
     let path = line.path.display();
     // Opening other devices may have effects, and opening a named pipe waits.
-    if !std::fs::metadata(&line.path)?.file_type().is_char_device() {
+    let found = std::fs::metadata(&line.path).map_err(|error| PeerError(format!("{path}: {error}")))?;
+    if !found.file_type().is_char_device() {
         return Err(PeerError(format!("{path} is no serial device")));
     }
     let flags = OFlags::RDONLY | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;

@@ -50,7 +50,7 @@ impl Cluster {
     /// Has kcat write a message to a partition.
     fn publish(&self, partition: u32, message: &str) {
         let mut command = Command::new("kcat");
-        command.args(["-b", &self.address, "-P", "-t", TOPIC, "-p", &partition.to_string(), "-D", "\\x00"]);
+        command.args(["-b", &self.address, "-P", "-t", TOPIC, "-p", &partition.to_string()]);
         let mut process = command.stdin(Stdio::piped()).spawn().expect("kcat is installed");
         process.stdin.take().expect("piped").write_all(message.as_bytes()).expect("it reads");
         assert!(process.wait().expect("it ends").success());
@@ -104,10 +104,6 @@ fn source(cluster: &Cluster) -> Value {
     }})
 }
 
-async fn count_samples(server: &TestServer) -> Value {
-    server.get("/v1/cameras/gate/samples/count").await.expect(200).json()["count"].clone()
-}
-
 #[tokio::test]
 #[ignore = "needs kcat"]
 async fn a_broker_of_kafka_is_read_on_behind_what_is_stored_also_after_a_kill() {
@@ -146,7 +142,10 @@ async fn a_broker_of_kafka_is_read_on_behind_what_is_stored_also_after_a_kill() 
     }
     let status = connection_when(&server, "detector", |status| status["acknowledged"] == 2).await;
     assert_eq!(status["status"]["messages"], 2, "{status}");
-    assert_eq!(count_samples(&server).await, 3);
+    // A box whose fix comes late is stored without it.
+    let camera = server.get("/v1/cameras/gate").await.expect(200).json();
+    let stored = |field: &str| camera[field].as_u64().expect("a number");
+    assert_eq!(stored("samples") + stored("samples_without_fix"), 3, "{camera}");
 }
 
 #[tokio::test]
@@ -171,8 +170,8 @@ async fn a_broker_of_kafka_may_go_and_a_topic_may_begin_again() {
     cluster.publish(0, &detection(now(), "4"));
     let address = json!({"source": {"address": format!("kafka://{}", cluster.address)}});
     patch(&server, "detector", &address).await.expect(200);
-    let status = connection_when(&server, "detector", |status| status["acknowledged"] == 1).await;
-    assert_eq!(status["status"]["items"], 1, "{status}");
+    let status = connection_when(&server, "detector", |status| status["acknowledged"] == 4).await;
+    assert_eq!(status["status"]["items"], 4, "{status}");
 }
 
 #[tokio::test]

@@ -185,11 +185,7 @@ fn measurement_in(plane: &LocalPlane, observed: &ObservedPositions<'_>, with_fix
         let point = from_model_plane(observed.independent.regressed);
         let Regression { covariance, box_noise, .. } = observed.independent;
         let scale = observed.independent.normal_scale();
-        MeasuredPosition {
-            position: point,
-            covariance: covariance.scaled(scale),
-            white: Some(box_noise.scaled(scale)),
-        }
+        MeasuredPosition { position: point, covariance, white: Some(box_noise), stated_scale: scale }
     });
     Measurement { time: observed.time, fix, regressed }
 }

@@ -8,6 +8,11 @@ use crate::geo::EastNorth;
 
 /// Consecutive rejections before a source may be reacquired.
 const MIN_REJECTIONS: u32 = 5;
+/// Rejections in a row that agree with each other, and their least duration, s, after which a track without another
+/// source restarts from them: track initiation by 3 of 3 (Bar-Shalom, Li and Kirubarajan 2001, 1.3). A detector that
+/// takes another target for a moment is not followed.
+const MIN_AGREEING: u32 = 3;
+const AGREEING_S: f64 = 1.0;
 /// A source counts as active for this long after its last accepted measurement, s.
 pub(super) const ACTIVE_S: f64 = 10.0;
 
@@ -41,12 +46,28 @@ pub(super) struct SourceHistory {
     rejected_since: Option<Timestamp>,
     /// Consecutive rejections since then.
     rejections: u32,
+    agreeing: Option<Agreeing>,
+}
+
+/// The latest rejections that agree with each other.
+#[derive(Debug, Clone, Copy)]
+struct Agreeing {
+    since: Timestamp,
+    latest: (Timestamp, EastNorth),
+    count: u32,
+}
+
+/// How far apart two positions of one target may be: its speed, m/s, and the distance that the noise explains, m.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Reach {
+    pub(super) speed_m_s: f64,
+    pub(super) noise_m: f64,
 }
 
 impl SourceHistory {
     /// The history after an accepted measurement.
     pub(super) const fn accepted(time: Timestamp) -> Self {
-        Self { accepted_at: Some(time), rejected_since: None, rejections: 0 }
+        Self { accepted_at: Some(time), rejected_since: None, rejections: 0, agreeing: None }
     }
 
     /// Counts a rejection. Returns the length of the series of rejections in s, once it has
@@ -55,6 +76,18 @@ impl SourceHistory {
         self.rejections += 1;
         let rejected_s = elapsed_s(*self.rejected_since.get_or_insert(now), now);
         (self.rejections >= MIN_REJECTIONS && rejected_s >= reacquire_after_s).then_some(rejected_s)
+    }
+
+    /// Notes where a rejected position was; whether it and those before it agree with each other for long enough to be
+    /// of a target of their own.
+    pub(super) fn agree_on(&mut self, now: Timestamp, position: EastNorth, reach: Reach) -> bool {
+        let before = self.agreeing.filter(|it| {
+            let (at, latest) = it.latest;
+            latest.distance_m(position) <= reach.noise_m + reach.speed_m_s * elapsed_s(at, now)
+        });
+        let (since, count) = before.map_or((now, 1), |it| (it.since, it.count + 1));
+        self.agreeing = Some(Agreeing { since, latest: (now, position), count });
+        count >= MIN_AGREEING && elapsed_s(since, now) >= AGREEING_S
     }
 
     pub(super) fn is_active(&self, now: Timestamp) -> bool {

@@ -6,7 +6,8 @@
 
 use jiff::Timestamp;
 
-use super::gate::{ACTIVE_S, GateOutcome, Reacquisition, SourceHistory};
+use super::camera_error::CameraError;
+use super::gate::{ACTIVE_S, GateOutcome, Reach, Reacquisition, SourceHistory};
 use super::measurement::{MeasuredPosition, Measurement, MeasurementSource, RejectionReason};
 use super::mode_filter::{
     GNSS_BIAS, ModeFilter, NoiseDecomposition, POSITION, PredictedMeasurement, VELOCITY,
@@ -22,6 +23,8 @@ const STATIONARY: usize = 0;
 
 /// Floor of a mode probability inside a logarithm or a division.
 const MIN_PROBABILITY: f64 = 1e-12;
+/// Largest speed of a target in units of the speed envelope.
+const LARGEST_SPEED_RATIO: f64 = 3.0;
 /// Probability that a mode needs before its speed counts as observed.
 const SPEED_MODE_PROBABILITY: f64 = 0.3;
 
@@ -35,6 +38,7 @@ pub(super) struct ImmFilter {
     /// By `MeasurementSource as usize`.
     histories: [SourceHistory; 2],
     last_regressed_at: Option<Timestamp>,
+    camera: CameraError,
     /// Square of the highest speed observed with confidence, decaying, m2/s2.
     speed_envelope_m2_s2: f64,
 }
@@ -60,6 +64,7 @@ impl ImmFilter {
             mode_probabilities: initial_probabilities(motion),
             histories,
             last_regressed_at: (source == MeasurementSource::Regressed).then_some(time),
+            camera: CameraError::new(settings, (source == MeasurementSource::Regressed).then_some(&measured)),
             speed_envelope_m2_s2: motion.min_speed_m_s.powi(2),
         }
     }
@@ -74,6 +79,7 @@ impl ImmFilter {
         self.time = time;
         self.mix(motion, step_s);
         self.update_speed_envelope(motion, step_s);
+        self.camera.travel(self.mean_speed_m_s() * step_s);
         // Stationary variance of the agile velocity = speed envelope: density = 2 v^2 / tau.
         let agile_m2_s3 = 2.0 * self.speed_envelope_m2_s2 / motion.agile_time_constant_s;
         for mode in &mut self.modes {
@@ -122,6 +128,14 @@ impl ImmFilter {
         }
     }
 
+    /// Speed of the mixture's mean velocity, m/s.
+    fn mean_speed_m_s(&self) -> f64 {
+        let mean = |state: usize| -> f64 {
+            self.modes.iter().zip(self.mode_probabilities).map(|(mode, share)| share * mode.mean[state]).sum()
+        };
+        mean(VELOCITY).hypot(mean(VELOCITY + 1))
+    }
+
     /// Propagates to the measurement's instant and processes its positions, the regressed one first.
     /// The outcomes are in that order.
     pub(super) fn step(
@@ -130,11 +144,11 @@ impl ImmFilter {
         measurement: &Measurement,
     ) -> [Option<GateOutcome>; 2] {
         self.predict(settings, measurement.time);
-        let is_elsewhere = measurement
-            .regressed
+        let regressed = measurement.regressed.map(|it| self.camera.at_place(settings, it));
+        let is_elsewhere = regressed
             .zip(measurement.fix)
             .is_some_and(|(regressed, fix)| self.is_elsewhere(settings, regressed, fix));
-        let regressed = measurement.regressed.map(|measured| {
+        let regressed = regressed.map(|measured| {
             if is_elsewhere {
                 return self.restart(settings, MeasurementSource::Regressed, measured);
             }
@@ -160,7 +174,7 @@ impl ImmFilter {
             east_m: fix.position.east_m - regressed.position.east_m,
             north_m: fix.position.north_m - regressed.position.north_m,
         };
-        let pair_nis = fix.covariance.plus(regressed.covariance).mahalanobis_squared(difference);
+        let pair_nis = fix.covariance.plus(regressed.covariance.scaled(regressed.stated_scale)).mahalanobis_squared(difference);
         let is_outside = |source, measured| {
             let inflation = self.correlated_noise_inflation(settings, source);
             let decomposition = NoiseDecomposition::new(settings, source, measured, inflation);
@@ -226,6 +240,7 @@ impl ImmFilter {
         self.histories[source as usize] = SourceHistory::accepted(self.time);
         if source == MeasurementSource::Regressed {
             self.last_regressed_at = Some(self.time);
+            self.camera = CameraError::new(settings, Some(&measured));
         }
         outcome
     }
@@ -253,11 +268,16 @@ impl ImmFilter {
         decomposition: &NoiseDecomposition,
     ) -> Reacquisition {
         let now = self.time;
-        let history = &mut self.histories[source as usize];
-        let Some(rejected_s) = history.record_rejection(now, settings.reacquire_after_s) else {
-            return Reacquisition::Rejected;
-        };
         let other_is_active = self.histories[1 - source as usize].is_active(now);
+        let reach = self.reach(settings, decomposition);
+        let history = &mut self.histories[source as usize];
+        let is_another = history.agree_on(now, measured.position, reach) && !other_is_active;
+        let rejected_s = history.record_rejection(now, settings.reacquire_after_s);
+        if is_another {
+            *self = Self::new(settings, now, source, measured);
+            return Reacquisition::Reinitialized;
+        }
+        let Some(rejected_s) = rejected_s else { return Reacquisition::Rejected };
         if other_is_active {
             let mut candidate = self.clone();
             for mode in &mut candidate.modes {
@@ -280,8 +300,17 @@ impl ImmFilter {
         Reacquisition::Rejected
     }
 
+    /// How far a target may be from a position that was measured before, with the noise of the latest one.
+    fn reach(&self, settings: &TrackSettings, decomposition: &NoiseDecomposition) -> Reach {
+        let white_m2 = decomposition.white.east_m2 + decomposition.white.north_m2;
+        Reach {
+            speed_m_s: LARGEST_SPEED_RATIO * self.speed_envelope_m2_s2.sqrt(),
+            noise_m: (settings.gate * white_m2).sqrt(),
+        }
+    }
+
     fn predict_measurement(&self, decomposition: &NoiseDecomposition) -> [PredictedMeasurement; MODES] {
-        std::array::from_fn(|mode| self.modes[mode].predict_measurement(decomposition))
+        std::array::from_fn(|mode| self.modes[mode].predict_measurement(decomposition, self.camera.stated_scale))
     }
 
     /// The chi-square gate: `nis`, of the mixture, or the penalised NIS of the best mode is within
@@ -306,11 +335,11 @@ impl ImmFilter {
             mean[1] += probability * innovation[1];
         }
         let mut covariance = PlaneCovariance::default();
-        for (PredictedMeasurement { innovation, innovation_covariance, .. }, probability) in
+        for (PredictedMeasurement { innovation, stated_covariance, .. }, probability) in
             predicted.iter().zip(self.mode_probabilities)
         {
             let deviation = PlaneCovariance::outer(innovation[0] - mean[0], innovation[1] - mean[1]);
-            covariance = covariance.plus(innovation_covariance.plus(deviation).scaled(probability));
+            covariance = covariance.plus(stated_covariance.plus(deviation).scaled(probability));
         }
         let innovation = EastNorth { east_m: mean[0], north_m: mean[1] };
         (innovation, covariance.mahalanobis_squared(innovation))
@@ -320,9 +349,9 @@ impl ImmFilter {
     /// target that sets out fits the agile mode well, though the mixture hardly predicts it.
     fn min_mode_nis(&self, predicted: &[PredictedMeasurement; MODES]) -> f64 {
         let penalised = predicted.iter().zip(self.mode_probabilities).map(
-            |(PredictedMeasurement { innovation, innovation_covariance, .. }, probability)| {
+            |(PredictedMeasurement { innovation, stated_covariance, .. }, probability)| {
                 let innovation = EastNorth { east_m: innovation[0], north_m: innovation[1] };
-                innovation_covariance.mahalanobis_squared(innovation)
+                stated_covariance.mahalanobis_squared(innovation)
                     - 2.0 * probability.max(MIN_PROBABILITY).ln()
             },
         );
@@ -361,7 +390,8 @@ impl ImmFilter {
                 north_m2: mode.covariance[(POSITION + 1, POSITION + 1)],
                 east_north_m2: mode.covariance[(POSITION, POSITION + 1)],
             };
-            covariance = covariance.plus(position.plus(deviation).scaled(probability));
+            let stated = position.plus(mode.camera_share().scaled(self.camera.stated_scale - 1.0));
+            covariance = covariance.plus(stated.plus(deviation).scaled(probability));
         }
         TrackState {
             time: self.time,

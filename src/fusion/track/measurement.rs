@@ -15,13 +15,17 @@ pub struct MeasuredPosition {
     pub covariance: PlaneCovariance,
     /// Of it, the white part, m2; `None` for the share of the track's settings.
     pub white: Option<PlaneCovariance>,
+    /// Factor of the normal distribution that has the stated 95 % radius, at least 1 where the covariance is itself
+    /// uncertain. It widens the gate and what the track states, not the weight of the source: the variance that is
+    /// expected weighs best, however uncertain it is.
+    pub stated_scale: f64,
 }
 
 impl MeasuredPosition {
     /// A position with `R = variance_m2 * I`: the squared sigma of a fix, or `e_regression_m2`.
     #[must_use]
     pub const fn isotropic(position: EastNorth, variance_m2: f64) -> Self {
-        Self { position, covariance: PlaneCovariance::isotropic(variance_m2), white: None }
+        Self { position, covariance: PlaneCovariance::isotropic(variance_m2), white: None, stated_scale: 1.0 }
     }
 }
 

@@ -8,6 +8,7 @@
 //! and the filter is replayed from the last checkpoint before them, so the order of arrival does
 //! not change the state by a single bit. What never happens here: clocks, I/O, pixels, degrees.
 
+mod camera_error;
 mod gate;
 mod imm_filter;
 mod measurement;

@@ -68,6 +68,8 @@ pub(super) struct PredictedMeasurement {
     pub(super) innovation: [f64; 2],
     /// Innovation covariance S, m2.
     pub(super) innovation_covariance: PlaneCovariance,
+    /// S with the camera's bias as uncertain as it is stated, m2: for the gate.
+    pub(super) stated_covariance: PlaneCovariance,
     /// Cross-covariance `P H'` of the state with the measured position.
     cross_covariance: SMatrix<f64, STATES, 2>,
 }
@@ -227,6 +229,15 @@ impl ModeFilter {
         }
     }
 
+    /// The part of the position's covariance that the camera's bias causes, m2, `P_pc P_pc'`: the error of an estimate
+    /// that is linear in the measurements has the covariance `P_pc` with a bias of variance 1.
+    pub(super) fn camera_share(&self) -> PlaneCovariance {
+        let of = |state| {
+            PlaneCovariance::outer(self.covariance[(POSITION, state)], self.covariance[(POSITION + 1, state)])
+        };
+        of(CAMERA_BIAS).plus(of(CAMERA_BIAS + 1))
+    }
+
     /// Sets a bias to 0 with a wide variance, uncorrelated with everything else.
     pub(super) fn reset_bias(&mut self, bias: usize) {
         for state in [bias, bias + 1] {
@@ -236,7 +247,11 @@ impl ModeFilter {
     }
 
     /// Innovation, its covariance `S = H P H' + white` and `P H'`, with `H = [I 0 .. L ..]`.
-    pub(super) fn predict_measurement(&self, decomposition: &NoiseDecomposition) -> PredictedMeasurement {
+    pub(super) fn predict_measurement(
+        &self,
+        decomposition: &NoiseDecomposition,
+        camera_scale: f64,
+    ) -> PredictedMeasurement {
         // H applied to a vector over the states.
         let measured = |of: &dyn Fn(usize) -> f64| {
             let mut sum = [of(POSITION), of(POSITION + 1)];
@@ -257,9 +272,13 @@ impl ModeFilter {
         let [east_m2, _] = measured(&|state| cross[(state, 0)]);
         let [east_north_m2, north_m2] = measured(&|state| cross[(state, 1)]);
         let predicted = PlaneCovariance { east_m2, north_m2, east_north_m2 };
+        let innovation_covariance = predicted.plus(decomposition.white);
+        let camera = [CAMERA_BIAS, CAMERA_BIAS + 1]
+            .map(|state| PlaneCovariance::outer(cross[(state, 0)], cross[(state, 1)]));
         PredictedMeasurement {
             innovation,
-            innovation_covariance: predicted.plus(decomposition.white),
+            innovation_covariance,
+            stated_covariance: innovation_covariance.plus(camera[0].plus(camera[1]).scaled(camera_scale - 1.0)),
             cross_covariance: cross,
         }
     }
@@ -267,7 +286,7 @@ impl ModeFilter {
     /// The Kalman update `K = P H' S^-1`. Returns the log-likelihood of the measurement without its
     /// constant, `-(d' S^-1 d + ln det S) / 2`.
     pub(super) fn update(&mut self, predicted: &PredictedMeasurement) -> f64 {
-        let PredictedMeasurement { innovation, innovation_covariance, cross_covariance: cross } = predicted;
+        let PredictedMeasurement { innovation, innovation_covariance, cross_covariance: cross, .. } = predicted;
         let determinant = innovation_covariance.determinant();
         let inverse = [
             innovation_covariance.north_m2 / determinant,

@@ -43,10 +43,10 @@ use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
-pub use cluster::{CameraLease, Cluster, NodeSettings, NodeStatus, Watch};
+pub use cluster::{CameraLease, Cluster, ConnectionLease, NodeSettings, NodeStatus, Watch};
 pub use connections::{
-    ConnectionBoard, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage, LiveConnection,
-    PushedMessage, connection_settings,
+    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage,
+    LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};

@@ -6,7 +6,7 @@ mod broker;
 mod files;
 mod kafka;
 mod messages;
-mod peers;
+pub(crate) mod peers;
 mod receivers;
 mod resource;
 mod sinks;

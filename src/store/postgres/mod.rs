@@ -8,6 +8,7 @@ mod audit;
 mod camera_moves;
 mod cameras;
 mod connection;
+mod connection_owners;
 mod connections;
 mod copy;
 mod errors;
@@ -45,6 +46,7 @@ use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 use errors::failed;
 use group_commit::GroupWriter;
 
+pub use connection_owners::ConnectionReports;
 pub use nodes::{Acquired, NodeLeases};
 
 /// The store of one database.

@@ -175,6 +175,7 @@ impl Server {
         let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
         if config.role.works_on_jobs() {
             shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
+            shutdown.spawn(worker::train_sites(app.clone(), config.training.clone(), shutdown.clone()));
             shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         }
         if config.role.answers_clients() {

@@ -33,6 +33,7 @@ mod sample;
 mod sample_overflow;
 mod score;
 mod site;
+mod site_training;
 mod time;
 mod training;
 
@@ -66,9 +67,10 @@ pub use sample::{Association, Sample, SampleCount, StoredSample};
 pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
+pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport, SiteTrainingRun};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
-    HeldOutSampleError, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingReport,
-    TrainingRun,
+    HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,
+    TrainingReport, TrainingRun,
 };

@@ -32,6 +32,7 @@ pub(super) const TABLES: &[Table] = &[
     Table { name: "training_runs", key: "id" },
     Table { name: "training_epochs", key: "run_id, epoch" },
     Table { name: "training_log", key: "run_id, line_number" },
+    Table { name: "site_training_runs", key: "id" },
     Table { name: "evaluations", key: "id" },
     Table { name: "api_keys", key: "id" },
     Table { name: "audit_log", key: "number" },

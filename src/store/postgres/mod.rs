@@ -27,6 +27,7 @@ mod runs;
 mod sample_retention;
 mod sample_table;
 mod samples;
+mod site_runs;
 mod sites;
 mod source_offsets;
 #[cfg(test)]

@@ -31,6 +31,7 @@ mod sample_retention;
 mod sample_table;
 mod samples;
 mod server_lock;
+mod site_runs;
 mod sites;
 mod source_offsets;
 mod space;

@@ -9,6 +9,7 @@ pub(super) mod group;
 mod models;
 mod runs;
 mod samples;
+mod site_runs;
 
 use std::sync::Arc;
 
@@ -166,6 +167,7 @@ pub(super) fn metadata() -> ModelMetadata {
         held_out: None,
         candidates: Vec::new(),
         report: None,
+        joint_training: None,
         parameters: std::collections::BTreeMap::new(),
     }
 }

@@ -75,6 +75,8 @@ pub struct Config {
     /// Folder below which sinks of connections write files (`file:`), each in a folder of its own; without it there are
     /// no such sinks.
     pub export_folder: Option<PathBuf>,
+    /// Serial devices that sources of connections may read (`serial:`), as their addresses name them.
+    pub serial_devices: Vec<PathBuf>,
     /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
     pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
@@ -325,11 +327,12 @@ impl Default for Config {
             openid: OpenIdSettings::default(),
             api_key: None,
             log_format: LogFormat::Text,
-            log_filter: "info".to_owned(),
+            log_filter: "info,rskafka=off".to_owned(),
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
             export_folder: None,
+            serial_devices: Vec::new(),
             connections: Vec::new(),
             console: Console::default(),
             limits: Limits::default(),

@@ -106,6 +106,7 @@ impl Server {
         if let Some(folder) = &config.export_folder {
             app.export_folder.get_or_init(|| folder.clone());
         }
+        app.serial_devices.get_or_init(|| config.serial_devices.clone());
         let tls = Tls::load(&config.tls)?;
         if tls.as_ref().is_some_and(|tls| tls.takes_client_certificates()) {
             app.access.close();

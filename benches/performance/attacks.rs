@@ -22,7 +22,7 @@ const EACH: usize = 300;
 /// Places for requests, so that three times the capacity is reached on any machine.
 const PLACES: usize = 8;
 /// Observations of a request whose cost is that of its work, not of its transport.
-const ITEMS: usize = 200;
+const ITEMS: usize = 1_000;
 /// Both ends are descriptors of this process, of which many systems allow 20,000.
 const IDLE_CONNECTIONS: usize = 9_600;
 

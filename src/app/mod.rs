@@ -44,10 +44,10 @@ use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
-pub use cluster::{CameraLease, Cluster, NodeSettings, NodeStatus, Watch};
+pub use cluster::{CameraLease, Cluster, ConnectionLease, NodeSettings, NodeStatus, Watch};
 pub use connections::{
-    ConnectionBoard, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage, LiveConnection,
-    PushedMessage, connection_settings,
+    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage,
+    LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
@@ -87,6 +87,8 @@ pub struct Parts {
     pub connection_board: ConnectionBoard,
     /// Where their sinks write files, if they may: set by the server at its start.
     pub export_folder: OnceLock<PathBuf>,
+    /// Serial devices that their sources may read: set by the server at its start.
+    pub serial_devices: OnceLock<Vec<PathBuf>>,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -157,6 +159,7 @@ impl App {
             site_registry,
             connection_board: ConnectionBoard::default(),
             export_folder: OnceLock::new(),
+            serial_devices: OnceLock::new(),
             access,
             clock,
             randomness,

@@ -5,18 +5,16 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use tokio::sync::Notify;
-
 use super::credentials::PeerError;
 use super::open;
 use super::sink::Outcomes;
-use crate::app::{App, ConnectionState, LastMessage, LiveConnection};
+use crate::app::{App, ConnectionLease, ConnectionState, LastMessage, LiveConnection};
 use crate::domain::{ConnectionId, ConnectionKey, OutboxMessage};
 use crate::exchange::{Secrets, SinkSettings};
 
 /// Messages that are read from the outbox at a time.
 const BATCH: u32 = 256;
-/// The outbox is looked at this often without a notice: dead letters may have been put back.
+/// The outbox is looked at this often without a notice: other nodes fill it, and dead letters may have been put back.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 
 /// Delivers the outbox of one sink.
@@ -28,7 +26,7 @@ pub(super) struct Delivery<'a> {
     pub(super) secrets: &'a Secrets,
     pub(super) client_id: &'a str,
     pub(super) live: &'a Arc<LiveConnection>,
-    pub(super) queued: &'a Notify,
+    pub(super) lease: &'a ConnectionLease,
 }
 
 impl Delivery<'_> {
@@ -43,9 +41,13 @@ impl Delivery<'_> {
             if messages.is_empty() {
                 tokio::select! {
                     // Elapsed is no failure.
-                    _ = tokio::time::timeout(LOOK_EVERY, self.queued.notified()) => continue,
+                    _ = tokio::time::timeout(LOOK_EVERY, self.live.queued.notified()) => continue,
                     error = sink.failed() => return Err(error),
                 }
+            }
+            // A process that was stopped delivers nothing that the next owner has delivered since.
+            if !self.lease.is_valid(clock.monotonic()) {
+                return std::future::pending().await;
             }
             let mut outcomes = Outcomes::new();
             let delivered = sink.deliver(&messages, &mut outcomes).await;

@@ -2,11 +2,12 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 
 use super::credentials::PeerError;
-use super::source::Message;
+use super::source::{Message, Settled};
 use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
 use crate::domain::{
@@ -18,6 +19,10 @@ use crate::exchange::{
     decoder,
 };
 
+/// How long a source waits for a camera that another node has, and how often it looks. Meanwhile it reads nothing, so that
+/// nothing is lost that its peer cannot send again.
+const OWNING_TIME: Duration = Duration::from_secs(30);
+const OWNING_PAUSE: Duration = Duration::from_millis(200);
 /// The name that stands for any camera of a sender.
 const ANY_CAMERA: &str = "*";
 
@@ -186,13 +191,14 @@ impl Intake {
         };
         if let Some(last_seq) = last_seq {
             let name = format!("connection {} {camera}", self.id);
-            let opened =
-                self.app.open_stream(camera, &name, ClientId::UNKNOWN, last_seq, self.durability).await;
-            let stream = opened.map_err(|error| match error.kind() {
-                ErrorKind::CameraNotFound => error,
-                // No fault of the item: it must come again.
-                _ => Error::fault(error),
-            })?;
+            let stream =
+                open_stream(&self.app, camera, &name, last_seq, self.durability).await.map_err(|error| {
+                    match error.kind() {
+                        ErrorKind::CameraNotFound => error,
+                        // No fault of the item: it must come again.
+                        _ => Error::fault(error),
+                    }
+                })?;
             self.streams.insert(camera.clone(), CameraStream { stream, last_seq });
         }
         self.streams.get_mut(camera).ok_or_else(|| Error::fault("the stream was just opened"))
@@ -220,7 +226,7 @@ impl Intake {
     ///
     /// # Errors
     /// Samples could not be stored: nothing behind is acknowledged.
-    pub(super) fn settled(&mut self) -> Result<Vec<(u64, Result<(), String>)>> {
+    pub(super) fn settled(&mut self) -> Result<Vec<Settled>> {
         let mut settled = Vec::new();
         while let Some(message) = self.pending.front() {
             for (camera, seq) in &message.items {
@@ -231,11 +237,36 @@ impl Intake {
                 }
             }
             if let Some(message) = self.pending.pop_front() {
-                settled.push((message.receipt, message.outcome));
+                settled.push(Settled { receipt: message.receipt, outcome: message.outcome });
             }
         }
         Ok(settled)
     }
+}
+
+/// Opens a stream of a camera, which another node gives up for it if it has the camera.
+async fn open_stream(
+    app: &App,
+    camera: &CameraId,
+    name: &str,
+    last_seq: u64,
+    durability: Option<Durability>,
+) -> Result<LiveStream> {
+    let until = app.clock.monotonic() + OWNING_TIME;
+    loop {
+        match app.open_stream(camera, name, ClientId::UNKNOWN, last_seq, durability).await {
+            Err(error) if is_elsewhere(error.kind()) && app.clock.monotonic() < until => {
+                app.want_camera(camera).await?;
+                tokio::time::sleep(OWNING_PAUSE).await;
+            }
+            opened => return opened,
+        }
+    }
+}
+
+/// Whether another node has a camera, or may have it.
+const fn is_elsewhere(kind: ErrorKind) -> bool {
+    matches!(kind, ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }
 
 /// Whether an error concerns one item, so that the rest goes on.

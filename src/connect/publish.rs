@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::mpsc;
 use tokio_util::task::AbortOnDropHandle;
 
 use crate::app::{App, CameraEvent, LiveConnection, TrackPoint};
@@ -29,8 +29,6 @@ pub(super) struct Publisher<'a> {
     pub(super) key: ConnectionKey,
     pub(super) settings: &'a SinkSettings,
     pub(super) live: &'a Arc<LiveConnection>,
-    /// Tells that the outbox has something new.
-    pub(super) queued: &'a Notify,
 }
 
 impl Publisher<'_> {
@@ -87,7 +85,7 @@ impl Publisher<'_> {
             }
         }
         batch.clear();
-        self.queued.notify_one();
+        self.live.queued.notify_one();
     }
 
     /// Whether a target's last position was sent long enough ago.

@@ -1,6 +1,10 @@
-//! A task per connection.
+//! Tasks of connections.
+//!
+//! A source has one task, on the node that owns it. A sink has two: its publisher runs on every node, for each publishes the
+//! tracks of the cameras that it owns, and its delivery on the node that owns the sink, so that nobody gets a message
+//! twice.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,7 +12,6 @@ use std::time::Duration;
 
 use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
-use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -19,45 +22,153 @@ use super::intake::Intake;
 use super::open;
 use super::publish::Publisher;
 use super::source::SourceIdentity;
-use crate::app::{App, ConnectionState, LiveConnection, connection_settings};
+use crate::app::{
+    App, ConnectionLease, ConnectionState, LiveConnection, ReportedStatuses, connection_groups,
+    connection_settings,
+};
 use crate::backoff::Backoff;
-use crate::domain::{Connection, ConnectionId, ConnectionKey, Result, Revision};
-use crate::exchange::{Secrets, SinkSettings, SourceSettings};
+use crate::domain::{CameraId, Connection, ConnectionId, ConnectionKey, Result, Revision};
+use crate::exchange::{ConnectionSettings, Secrets, SinkSettings, SourceSettings};
 use crate::shutdown::Shutdown;
 
-/// How often connections are looked for that another process has changed.
-const LOOK_EVERY: Duration = Duration::from_secs(2);
+/// How often connections are looked for that another process has changed, or has ceased to run.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// How often unsettled messages are looked at.
 const SETTLE_EVERY: Duration = Duration::from_millis(20);
 /// Connections read at a time.
 const PAGE: u32 = 256;
 
-/// A connection's task, by what it was started for.
-struct RunningTask {
+/// What a task does for a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum Part {
+    /// Reads the source.
+    Intake,
+    /// Fills the outbox.
+    Publisher,
+    /// Empties the outbox.
+    Delivery,
+}
+
+/// What a task was started for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct TaskVersion {
     key: ConnectionKey,
     revision: Revision,
+    fence: i64,
+}
+
+struct RunningTask {
+    version: TaskVersion,
     cancel: CancellationToken,
     handle: JoinHandle<()>,
 }
 
-/// Runs all connections that are not paused, until the server shuts down.
+/// A connection that is not paused, with its settings.
+struct ActiveConnection {
+    connection: Connection,
+    settings: ConnectionSettings,
+    secrets: Secrets,
+}
+
+/// A task that should be running, and the right to what it does.
+struct WantedTask {
+    active: Arc<ActiveConnection>,
+    part: Part,
+    lease: ConnectionLease,
+}
+
+/// Runs the parts of all connections that this node has to run, until the server shuts down.
 pub async fn run(app: App, shutdown: Shutdown) {
-    let mut running: HashMap<ConnectionId, RunningTask> = HashMap::new();
-    let tasks = TaskTracker::new();
+    let mut supervisor = Supervisor {
+        app,
+        running: HashMap::new(),
+        tasks: TaskTracker::new(),
+        unreadable: HashSet::new(),
+        reported: ReportedStatuses::default(),
+    };
     while !shutdown.is_draining() {
-        match all_connections(&app).await {
-            Ok(connections) => adjust(&app, &mut running, connections, &tasks),
-            Err(error) => tracing::error!(%error, "cannot look for changed connections"),
+        if let Err(error) = supervisor.look().await {
+            tracing::error!(%error, "cannot look for changed connections");
         }
         tokio::select! {
             () = shutdown.draining() => {}
-            () = app.connection_board.changed() => {}
+            () = supervisor.app.connection_board.changed() => {}
             () = tokio::time::sleep(LOOK_EVERY) => {}
         }
     }
-    running.values().for_each(|task| task.cancel.cancel());
-    tasks.close();
-    tasks.wait().await;
+    supervisor.running.values().for_each(|task| task.cancel.cancel());
+    supervisor.tasks.close();
+    supervisor.tasks.wait().await;
+}
+
+struct Supervisor {
+    app: App,
+    running: HashMap<(ConnectionId, Part), RunningTask>,
+    tasks: TaskTracker,
+    /// Connections whose settings could not be read, which is logged once.
+    unreadable: HashSet<(ConnectionKey, Revision)>,
+    reported: ReportedStatuses,
+}
+
+impl Supervisor {
+    /// Starts and ends tasks, so that they are those of the stored connections, and tells other nodes what they do.
+    async fn look(&mut self) -> Result<()> {
+        let connections = all_connections(&self.app).await?;
+        let active: Vec<_> = connections
+            .into_iter()
+            .filter(|connection| !connection.profile.paused)
+            .filter_map(|connection| self.read(connection).map(Arc::new))
+            .collect();
+        let site_of = |camera: &CameraId| self.app.registry.get(camera).and_then(|known| known.site.clone());
+        let keyed = active.iter().map(|active| (active.connection.key, &active.settings));
+        let groups = connection_groups(keyed, site_of);
+        let leases = self.app.own_connections(&groups).await?;
+        self.adjust(active.into_iter().flat_map(|active| wanted_tasks(active, &leases)).collect());
+        self.app.report_connections(&mut self.reported).await
+    }
+
+    fn read(&mut self, connection: Connection) -> Option<ActiveConnection> {
+        match connection_settings(&connection) {
+            Ok((settings, secrets)) => Some(ActiveConnection { connection, settings, secrets }),
+            Err(error) => {
+                if self.unreadable.insert((connection.key, connection.revision)) {
+                    tracing::error!(connection = %connection.id(), %error, "the stored settings cannot be read");
+                }
+                None
+            }
+        }
+    }
+
+    fn adjust(&mut self, wanted: Vec<WantedTask>) {
+        let versions: HashMap<_, _> = wanted.iter().map(|task| (task.id(), task.version())).collect();
+        let is_wanted = |id: &(ConnectionId, Part), task: &RunningTask| {
+            versions.get(id) == Some(&task.version) && !task.handle.is_finished()
+        };
+        let mut ending: HashMap<_, _> = self.running.extract_if(|id, task| !is_wanted(id, task)).collect();
+        ending.values().for_each(|task| task.cancel.cancel());
+        for task in wanted {
+            let id = task.id();
+            if self.running.contains_key(&id) {
+                continue;
+            }
+            let (version, cancel) = (task.version(), CancellationToken::new());
+            // A port or a session that the one before holds must be free.
+            let before = ending.remove(&id).map(|task| task.handle);
+            let handle = self.tasks.spawn(run_task(self.app.clone(), task, before, cancel.clone()));
+            self.running.insert(id, RunningTask { version, cancel, handle });
+        }
+    }
+}
+
+impl WantedTask {
+    fn id(&self) -> (ConnectionId, Part) {
+        (self.active.connection.id().clone(), self.part)
+    }
+
+    fn version(&self) -> TaskVersion {
+        let Connection { key, revision, .. } = self.active.connection;
+        TaskVersion { key, revision, fence: self.lease.fence() }
+    }
 }
 
 async fn all_connections(app: &App) -> Result<Vec<Connection>> {
@@ -71,69 +182,56 @@ async fn all_connections(app: &App) -> Result<Vec<Connection>> {
     }
 }
 
-/// Starts and ends tasks, so that they are those of the stored connections.
-fn adjust(
-    app: &App,
-    running: &mut HashMap<ConnectionId, RunningTask>,
-    connections: Vec<Connection>,
-    tasks: &TaskTracker,
-) {
-    let wanted: HashMap<ConnectionId, Connection> = connections
-        .into_iter()
-        .filter(|connection| !connection.profile.paused)
-        .map(|connection| (connection.id().clone(), connection))
-        .collect();
-    let is_wanted = |id: &ConnectionId, task: &RunningTask| {
-        wanted.get(id).is_some_and(|it| (it.key, it.revision) == (task.key, task.revision))
-    };
-    let mut ending: HashMap<_, _> = running.extract_if(|id, task| !is_wanted(id, task)).collect();
-    ending.values().for_each(|task| task.cancel.cancel());
-    for (id, connection) in wanted {
-        if running.contains_key(&id) {
-            continue;
-        }
-        let (key, revision) = (connection.key, connection.revision);
-        let cancel = CancellationToken::new();
-        // A port or a session that the one before holds must be free.
-        let before = ending.remove(&id).map(|task| task.handle);
-        let handle = tasks.spawn(run_connection(app.clone(), connection, before, cancel.clone()));
-        running.insert(id, RunningTask { key, revision, cancel, handle });
-    }
+/// The tasks of a connection on a node with these leases.
+fn wanted_tasks(
+    active: Arc<ActiveConnection>,
+    leases: &HashMap<ConnectionKey, ConnectionLease>,
+) -> Vec<WantedTask> {
+    let owned = if active.settings.source.is_some() { Part::Intake } else { Part::Delivery };
+    let lease = leases.get(&active.connection.key).cloned();
+    let publisher = (owned == Part::Delivery).then_some((Part::Publisher, ConnectionLease::of_every_node()));
+    let parts = lease.map(|lease| (owned, lease)).into_iter().chain(publisher);
+    parts.map(|(part, lease)| WantedTask { active: active.clone(), part, lease }).collect()
 }
 
-async fn run_connection(
-    app: App,
-    connection: Connection,
-    before: Option<JoinHandle<()>>,
-    cancel: CancellationToken,
-) {
+async fn run_task(app: App, task: WantedTask, before: Option<JoinHandle<()>>, cancel: CancellationToken) {
     if let Some(before) = before {
         // A task that panicked has ended, too.
         let _ = before.await;
     }
-    let live = app.live_connection(&connection);
+    let live = app.live_connection(&task.active.connection);
     tokio::select! {
         () = cancel.cancelled() => {}
-        () = keep_open(&app, &connection, &live) => {}
+        () = task.lease.ended(&app.clock) => {}
+        () = run_part(&app, &task, &live) => {}
     }
-    live.enter(ConnectionState::Paused, app.clock.now());
+    if task.part != Part::Publisher {
+        live.enter(ConnectionState::Paused, app.clock.now());
+    }
 }
 
-/// Runs a connection again and again, with growing pauses while it fails.
-async fn keep_open(app: &App, connection: &Connection, live: &Arc<LiveConnection>) {
-    let (settings, secrets) = match connection_settings(connection) {
-        Ok(read) => read,
-        Err(error) => {
-            tracing::error!(connection = %connection.id(), %error, "the stored settings cannot be read");
-            return std::future::pending().await;
+async fn run_part(app: &App, task: &WantedTask, live: &Arc<LiveConnection>) {
+    let ActiveConnection { connection, settings, secrets } = &*task.active;
+    match (task.part, &settings.source, &settings.sink) {
+        (Part::Intake, Some(settings), _) => {
+            retried(app, connection, live, Work::Source { settings, secrets }).await;
         }
-    };
-    match (&settings.source, &settings.sink) {
-        (Some(source), _) => {
-            retried(app, connection, live, Work::Source { settings: source, secrets: &secrets }).await;
+        (Part::Publisher, _, Some(settings)) => publish(app, connection, settings, live).await,
+        (Part::Delivery, _, Some(settings)) => {
+            let client_id = client_id(connection);
+            let delivery = Delivery {
+                app,
+                id: connection.id(),
+                key: connection.key,
+                settings,
+                secrets,
+                client_id: &client_id,
+                live,
+                lease: &task.lease,
+            };
+            retried(app, connection, live, Work::Delivery(delivery)).await;
         }
-        (None, Some(sink)) => run_sink(app, connection, sink, &secrets, live).await,
-        (None, None) => std::future::pending().await,
+        _ => std::future::pending().await,
     }
 }
 
@@ -189,7 +287,7 @@ async fn run_source(
     progressed: &AtomicBool,
 ) -> Result<Infallible, PeerError> {
     let identity = SourceIdentity { client_id: client_id(connection), is_lasting: true };
-    let mut source = open::source(settings, secrets, &identity, live, &app.limits).await?;
+    let mut source = open::source(app, connection, settings, secrets, &identity, live).await?;
     let mut intake = Intake::new(app.clone(), connection.id().clone(), live.clone(), settings)?;
     live.enter(ConnectionState::Running, app.clock.now());
     live.update(|status| status.connects += 1);
@@ -206,37 +304,14 @@ async fn run_source(
             continue;
         }
         let count = settled.len() as u64;
-        for (receipt, outcome) in settled {
-            source.settle(receipt, outcome).await?;
-        }
+        source.settle(settled).await?;
         live.update(|status| status.acknowledged += count);
     }
 }
 
-async fn run_sink(
-    app: &App,
-    connection: &Connection,
-    settings: &SinkSettings,
-    secrets: &Secrets,
-    live: &Arc<LiveConnection>,
-) {
-    let (key, queued) = (connection.key, Notify::new());
-    let client_id = client_id(connection);
-    let publisher = Publisher { app, key, settings, live, queued: &queued };
-    let delivery = Delivery {
-        app,
-        id: connection.id(),
-        key,
-        settings,
-        secrets,
-        client_id: &client_id,
-        live,
-        queued: &queued,
-    };
-    tokio::select! {
-        Err(error) = publisher.run() => {
-            tracing::error!(connection = %connection.id(), %error, "positions cannot be queued");
-        }
-        () = retried(app, connection, live, Work::Delivery(delivery)) => {}
-    }
+async fn publish(app: &App, connection: &Connection, settings: &SinkSettings, live: &Arc<LiveConnection>) {
+    let Err(error) = Publisher { app, key: connection.key, settings, live }.run().await;
+    tracing::error!(connection = %connection.id(), %error, "positions cannot be queued");
+    // Its settings name no cameras that it could read.
+    std::future::pending().await
 }

@@ -7,12 +7,14 @@ use super::intake::describe;
 use super::open;
 use super::publish::payload;
 use super::sink::Outcomes;
-use super::source::SourceIdentity;
+use super::source::{Settled, SourceIdentity};
 use crate::app::{App, ConnectionState, LastMessage, connection_settings};
 use crate::domain::{CameraId, Connection, OutboxMessage, Result, TargetId};
 use crate::exchange::{MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, decoder};
 use crate::geo::{PlaneCovariance, Position};
 
+/// How often the status of a running source is looked at.
+const WATCH_EVERY: Duration = Duration::from_millis(100);
 /// The target of test messages.
 const TEST_TARGET: &str = "sightfix-test";
 
@@ -53,18 +55,19 @@ pub async fn try_connection(app: &App, connection: &Connection, wait: Duration) 
 
 /// The last message of a source that runs.
 async fn watch(app: &App, connection: &Connection, wait: Duration) -> Result<Option<LastMessage>, PeerError> {
-    let live = app.live_connection(connection);
-    let shown = live.reached(|status| {
-        status.last_message.is_some()
-            || (status.state == ConnectionState::Waiting && status.last_error.is_some())
-    });
-    let has_come = tokio::time::timeout(wait, shown).await.is_ok();
-    let status = live.status();
-    match (status.last_message, status.last_error) {
-        (Some(message), _) => Ok(Some(message)),
-        (None, Some((_, error))) => Err(PeerError(error)),
-        (None, None) if has_come => Ok(None),
-        (None, None) => Err(PeerError(format!("nothing came within {} s", wait.as_secs()))),
+    let until = app.clock.monotonic() + wait;
+    loop {
+        // Another node may run it.
+        let (status, ..) = app.connection_status(connection).await?;
+        let is_last = app.clock.monotonic() >= until;
+        match (status.last_message, status.last_error) {
+            (Some(message), _) => return Ok(Some(message)),
+            (None, Some((_, error))) if is_last || status.state == ConnectionState::Waiting => {
+                return Err(PeerError(error));
+            }
+            _ if is_last => return Err(PeerError(format!("nothing came within {} s", wait.as_secs()))),
+            _ => tokio::time::sleep(WATCH_EVERY).await,
+        }
     }
 }
 
@@ -80,7 +83,7 @@ async fn try_source(
         is_lasting: false,
     };
     let live = app.live_connection(connection);
-    let mut source = open::source(settings, secrets, &identity, &live, &app.limits).await?;
+    let mut source = open::source(app, connection, settings, secrets, &identity, &live).await?;
     let message = source.next().await?;
     let now = app.clock.now();
     let context = MessageContext { received_at: now, time_bounds: app.live_time_bounds() };
@@ -91,7 +94,8 @@ async fn try_source(
         }
         Err(reason) => vec![format!("rejected: {reason}")],
     };
-    source.settle(message.receipt, Err("the connection is only tried".to_owned())).await?;
+    let outcome = Err("the connection is only tried".to_owned());
+    source.settle(vec![Settled { receipt: message.receipt, outcome }]).await?;
     Ok(Some(LastMessage::new(now, message.subject, &message.payload, reading)))
 }
 

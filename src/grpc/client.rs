@@ -75,6 +75,8 @@ pub struct ClientError {
     pub message: String,
     /// Whether the same may go well later: the line broke, or the server has too much to do.
     pub retryable: bool,
+    /// Address of the node that does what was asked for, where the server is one of several.
+    pub owner: Option<String>,
 }
 
 impl fmt::Display for ClientError {
@@ -89,13 +91,16 @@ impl ClientError {
     /// An error of the line that no status tells of.
     #[must_use]
     pub fn broken_line(message: &str) -> Self {
-        Self { reason: "broken-line".to_owned(), message: message.to_owned(), retryable: true }
+        Self { reason: "broken-line".to_owned(), message: message.to_owned(), retryable: true, owner: None }
     }
 }
 
 impl From<Status> for ClientError {
     fn from(status: Status) -> Self {
-        let server_reason = status.get_details_error_info().map(|info| info.reason);
+        let (server_reason, owner) = status
+            .get_details_error_info()
+            .map(|mut info| (info.reason, info.metadata.remove("owner")))
+            .unzip();
         let retryable = match status.code() {
             Code::Unavailable | Code::DeadlineExceeded | Code::Aborted | Code::Internal => true,
             // The line's own faults come under these codes, without any details.
@@ -107,7 +112,7 @@ impl From<Status> for ClientError {
             "" => status.code().description().to_owned(),
             message => message.to_owned(),
         };
-        Self { reason, message, retryable }
+        Self { reason, message, retryable, owner: owner.flatten() }
     }
 }
 
@@ -129,6 +134,7 @@ impl Connection {
             reason: "invalid-argument".to_owned(),
             message,
             retryable: false,
+            owner: None,
         };
         if !server.starts_with("http://") {
             return Err(refused(format!("`{server}` must begin with http://")));
@@ -268,6 +274,10 @@ mod tests {
         let error = ClientError::from(Status::with_error_details(Code::ResourceExhausted, "no", details));
         assert_eq!((error.reason.as_str(), error.retryable), ("too-large", false));
         assert_eq!(error.to_string(), "no (too-large)");
+        let owner = [("owner".to_owned(), "http://node-2:8080".to_owned())];
+        let details = ErrorDetails::with_error_info("camera-on-other-node", "sightfix", HashMap::from(owner));
+        let error = ClientError::from(Status::with_error_details(Code::Unavailable, "no", details));
+        assert_eq!((error.owner.as_deref(), error.retryable), (Some("http://node-2:8080"), true));
     }
 
     #[tokio::test]

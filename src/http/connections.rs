@@ -115,11 +115,24 @@ struct LastError {
     message: String,
 }
 
-/// What a connection does, since the server was started.
+/// The node that runs a connection.
+#[derive(Serialize, ToSchema)]
+struct ConnectionNode {
+    /// Its id, as in `/v1/nodes`.
+    id: String,
+    /// Where clients reach it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    url: Option<String>,
+}
+
+/// What a connection does, since the server was started; counts are those of all nodes.
 #[derive(Serialize, ToSchema)]
 struct ConnectionStatus {
     /// State.
     state: State,
+    /// The node that runs it, where several share a database; missing while none does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    node: Option<ConnectionNode>,
     /// Since when.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
@@ -204,9 +217,10 @@ impl Connection {
 
     /// With what it does now.
     async fn with_status(app: &App, connection: domain::Connection) -> Result<Self> {
-        let (status, outbox) = app.connection_status(&connection).await?;
+        let (status, node, outbox) = app.connection_status(&connection).await?;
         let status = ConnectionStatus {
             state: status.state.into(),
+            node: node.map(|node| ConnectionNode { id: node.id.to_string(), url: node.url }),
             since: status.since,
             last_error: status.last_error.map(|(time, message)| LastError { time, message }),
             last_message: status.last_message.map(Into::into),
@@ -465,6 +479,7 @@ impl FromRequest<Rest> for MessageBody {
     request_body(content = String, description = "A message of the source's format", content_type = "*/*"),
     responses(
         (status = 204, description = "It was taken"),
+        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
     )
 )]

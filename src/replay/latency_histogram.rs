@@ -41,6 +41,10 @@ impl LatencyHistogram {
         Duration::from_micros(self.histogram.value_at_quantile(share)).min(self.max)
     }
 
+    pub(super) fn is_empty(&self) -> bool {
+        self.histogram.is_empty()
+    }
+
     /// The largest value; exact.
     pub(super) const fn max(&self) -> Duration {
         self.max

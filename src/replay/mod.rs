@@ -3,11 +3,12 @@
 //!
 //! Each simulated camera is one task with one stream. It takes items from its [`PacedFeed`] when they
 //! are due and holds them in its [`ResendBuffer`] until they are done; after a failure it waits
-//! ([`Backoff`]), opens another stream and resumes after the last acknowledgement. What never happens
+//! ([`Backoff`]), opens another stream, at the node that the server names if it names one, and resumes after the last acknowledgement. What never happens
 //! here: files, flags, unbounded memory, randomness without a seed.
 
 mod fault_injection;
 mod latency_histogram;
+mod nodes;
 mod options;
 mod paced_feed;
 mod progress;
@@ -27,6 +28,7 @@ use tokio_util::sync::CancellationToken;
 use crate::backoff::Backoff;
 use crate::grpc::client::{ClientError, Connection};
 use fault_injection::FaultInjector;
+use nodes::NodeConnections;
 use paced_feed::{PacedFeed, ReplaySchedule};
 use report::Counts;
 use resend_buffer::ResendBuffer;
@@ -55,12 +57,15 @@ pub async fn replay(
 ) -> Result<ReplayReport, ClientError> {
     let connections = options.cameras.div_ceil(STREAMS_PER_CONNECTION).max(1);
     let connections: Vec<_> = (0..connections)
-        .map(|_| Connection::to(&options.server, options.key.as_ref()))
-        .collect::<Result<_, _>>()?;
+        .map(|_| {
+            let server = Connection::to(&options.server, options.key.as_ref())?;
+            Ok((server, Arc::new(NodeConnections::default())))
+        })
+        .collect::<Result<_, ClientError>>()?;
     let started = Instant::now();
     let cameras = (0..options.cameras).map(|number| {
-        let connection = connections[number % connections.len()].clone();
-        let link = Link { connection, counters: counters.clone() };
+        let (server, nodes) = connections[number % connections.len()].clone();
+        let link = Link { server, nodes, counters: counters.clone() };
         let camera = simulated_camera(number, recording.clone(), &options, link, started);
         tokio::spawn(camera.run(stop.clone()))
     });

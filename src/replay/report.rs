@@ -27,11 +27,13 @@ pub(super) struct Counts {
     pub(super) streams: u64,
     pub(super) reconnects: u64,
     pub(super) reconnect_requests: u64,
+    pub(super) redirects: u64,
     pub(super) broken: BTreeMap<String, u64>,
     pub(super) cameras_moved: u64,
     pub(super) model_versions: BTreeSet<u32>,
     pub(super) max_lag: Duration,
     pub(super) latencies: LatencyHistogram,
+    pub(super) recoveries: LatencyHistogram,
     pub(super) faults: FaultCounts,
     pub(super) given_up: u64,
     pub(super) reasons: Vec<String>,
@@ -51,11 +53,13 @@ impl Counts {
         self.streams += other.streams;
         self.reconnects += other.reconnects;
         self.reconnect_requests += other.reconnect_requests;
+        self.redirects += other.redirects;
         add_each(&mut self.broken, other.broken);
         self.cameras_moved += other.cameras_moved;
         self.model_versions.extend(other.model_versions);
         self.max_lag = self.max_lag.max(other.max_lag);
         self.latencies.add(&other.latencies);
+        self.recoveries.add(&other.recoveries);
         self.faults.lost += other.faults.lost;
         self.faults.duplicated += other.faults.duplicated;
         self.faults.reordered += other.faults.reordered;
@@ -105,6 +109,8 @@ pub struct ReplayReport {
     pub unacknowledged: Option<u64>,
     /// Latency from sending an item to its answer.
     pub latency_ms: LatencyMs,
+    /// Time from the failure of a stream to the next answer or acknowledgement; `None` if none failed.
+    pub recovery_ms: Option<LatencyMs>,
     /// Largest lag of sending behind the pace, ms.
     pub furthest_behind_ms: f64,
     /// Streams opened.
@@ -113,6 +119,8 @@ pub struct ReplayReport {
     pub reconnects: u64,
     /// Requests of the server to reconnect.
     pub invitations: u64,
+    /// Streams that another node of the server was named for.
+    pub redirects: u64,
     /// Streams that failed or could not be opened, by reason.
     pub broken: BTreeMap<String, u64>,
     /// Alarms that a camera has moved.
@@ -140,6 +148,17 @@ pub struct LatencyMs {
     pub max: f64,
 }
 
+impl LatencyMs {
+    fn of(latencies: &LatencyHistogram) -> Self {
+        let quantile = |share| ms(latencies.quantile(share));
+        Self { p50: quantile(0.5), p90: quantile(0.9), p99: quantile(0.99), max: ms(latencies.max()) }
+    }
+}
+
+const fn ms(duration: Duration) -> f64 {
+    duration.as_secs_f64() * 1e3
+}
+
 /// Number of injected faults.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Injected {
@@ -153,8 +172,6 @@ pub struct Injected {
 
 impl ReplayReport {
     pub(super) fn new(counts: Counts, cameras: usize, elapsed: Duration, must_acknowledge: bool) -> Self {
-        let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
-        let quantile = |share| ms(counts.latencies.quantile(share));
         let refused: u64 = counts.refused.values().sum();
         let elapsed_s = elapsed.as_secs_f64();
         Self {
@@ -168,16 +185,13 @@ impl ReplayReport {
             unanswered: counts.unanswered,
             acknowledged: must_acknowledge.then_some(counts.acknowledged),
             unacknowledged: must_acknowledge.then_some(counts.unacknowledged),
-            latency_ms: LatencyMs {
-                p50: quantile(0.5),
-                p90: quantile(0.9),
-                p99: quantile(0.99),
-                max: ms(counts.latencies.max()),
-            },
+            latency_ms: LatencyMs::of(&counts.latencies),
+            recovery_ms: (!counts.recoveries.is_empty()).then(|| LatencyMs::of(&counts.recoveries)),
             furthest_behind_ms: ms(counts.max_lag),
             streams: counts.streams,
             reconnects: counts.reconnects,
             invitations: counts.reconnect_requests,
+            redirects: counts.redirects,
             cameras_moved: counts.cameras_moved,
             injected: Injected {
                 lost: counts.faults.lost,
@@ -226,7 +240,13 @@ impl fmt::Display for ReplayReport {
             "streams {}, reconnects {}, requested by the server {}, items sent again {resent}",
             self.streams, self.reconnects, self.invitations
         )?;
+        if self.redirects > 0 {
+            writeln!(out, "redirected to other nodes {}", self.redirects)?;
+        }
         each(out, "broken", &self.broken)?;
+        if let Some(LatencyMs { p50, p99, max, .. }) = self.recovery_ms {
+            writeln!(out, "failure to answer: p50 {p50:.0} ms, p99 {p99:.0} ms, max {max:.0} ms")?;
+        }
         let Injected { lost, duplicated, reordered } = self.injected;
         if lost + duplicated + reordered > 0 {
             writeln!(out, "injected faults: lost {lost}, duplicated {duplicated}, reordered {reordered}")?;

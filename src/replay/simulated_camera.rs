@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::time::{sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
+use super::nodes::NodeConnections;
 use super::options::ReplayOptions;
 use super::paced_feed::PacedFeed;
 use super::progress::Counters;
@@ -20,8 +21,10 @@ use crate::grpc::proto::stream_answer::Outcome;
 
 /// What several cameras share.
 pub(super) struct Link {
-    /// Connection to the server.
-    pub(super) connection: Connection,
+    /// Connection to the server, or to what stands before its nodes.
+    pub(super) server: Connection,
+    /// Connections to its nodes.
+    pub(super) nodes: Arc<NodeConnections>,
     /// Progress of all cameras.
     pub(super) counters: Arc<Counters>,
 }
@@ -35,6 +38,12 @@ pub(super) struct SimulatedCamera {
     buffer: ResendBuffer,
     backoff: Backoff,
     link: Link,
+    /// Where the next stream is opened.
+    connection: Connection,
+    /// Whether nothing was answered since another node was named.
+    is_redirected: bool,
+    /// Since when nothing has been answered after a failure.
+    broken_at: Option<Instant>,
     is_stopped: bool,
     counts: Counts,
 }
@@ -87,8 +96,20 @@ impl SimulatedCamera {
             store_samples: options.store_samples,
         };
         let id_suffix = (round > 0).then(|| format!("@{round}"));
-        let counts = Counts::default();
-        Self { options, opening, id_suffix, feed, buffer, backoff, link, is_stopped: false, counts }
+        Self {
+            options,
+            opening,
+            id_suffix,
+            feed,
+            buffer,
+            backoff,
+            connection: link.server.clone(),
+            link,
+            is_redirected: false,
+            broken_at: None,
+            is_stopped: false,
+            counts: Counts::default(),
+        }
     }
 
     /// Streams until all items are done or no attempt is left.
@@ -107,7 +128,14 @@ impl SimulatedCamera {
                 }
                 Err(error) => error,
             };
-            *self.counts.broken.entry(error.reason.clone()).or_default() += 1;
+            let is_redirected = self.follow(&error);
+            if is_redirected && !std::mem::replace(&mut self.is_redirected, true) {
+                continue;
+            }
+            if !is_redirected {
+                *self.counts.broken.entry(error.reason.clone()).or_default() += 1;
+                self.broken_at.get_or_insert_with(Instant::now);
+            }
             let delay = if error.retryable { self.backoff.next_delay() } else { None };
             let Some(delay) = delay else {
                 self.counts.record_give_up(&error);
@@ -122,6 +150,19 @@ impl SimulatedCamera {
         self.counts.acknowledged = self.counts.items - self.counts.unacknowledged;
         self.counts.faults = self.feed.counts();
         self.counts
+    }
+
+    /// Goes on at the node that an error names; whether it names one.
+    fn follow(&mut self, error: &ClientError) -> bool {
+        let named = error.owner.as_deref().map(|url| self.link.nodes.to(url, self.options.key.as_ref()));
+        // A node that this client cannot reach is reached through the server, if at all.
+        let Some(Ok(node)) = named else {
+            self.connection = self.link.server.clone();
+            return false;
+        };
+        self.connection = node;
+        self.counts.redirects += 1;
+        true
     }
 
     /// Runs one stream from its opening to its end.
@@ -139,7 +180,7 @@ impl SimulatedCamera {
     async fn open(&mut self) -> Result<(ItemSender, Events), ClientError> {
         self.opening.resume_after_seq = self.buffer.resume_after();
         let opened = timeout(self.options.response_timeout, async {
-            let (sender, mut events) = self.link.connection.open(&self.opening).await?;
+            let (sender, mut events) = self.connection.open(&self.opening).await?;
             match events.next().await? {
                 Some(Event::Opened { model_version }) => Ok((sender, events, model_version)),
                 _ => Err(ClientError::broken_line("the server did not open the stream")),
@@ -239,11 +280,19 @@ impl SimulatedCamera {
             Event::Answer(answer) => self.handle_answer(&answer, state),
             Event::Acknowledged { seq } => {
                 if self.buffer.acknowledge(seq) {
-                    self.backoff.reset();
+                    self.progressed();
                 }
             }
             Event::CameraMoved(_) => self.counts.cameras_moved += 1,
             Event::Reconnect { .. } => state.reconnect_requested = true,
+        }
+    }
+
+    fn progressed(&mut self) {
+        self.backoff.reset();
+        self.is_redirected = false;
+        if let Some(broken_at) = self.broken_at.take() {
+            self.counts.recoveries.record(broken_at.elapsed());
         }
     }
 
@@ -256,7 +305,7 @@ impl SimulatedCamera {
         let Some(Answered { latency, is_first }) = self.buffer.answer(answer.seq, state.last_event_at) else {
             return;
         };
-        self.backoff.reset();
+        self.progressed();
         self.counts.latencies.record(latency);
         if let Some(Outcome::Fused(fused)) = &answer.outcome {
             self.counts.model_versions.extend(fused.model_version);

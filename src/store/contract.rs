@@ -14,11 +14,11 @@ use super::{
 use crate::domain::ErrorKind;
 use crate::domain::{
     ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId,
-    ConnectionKey, DeadLetter, Detection, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
-    EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
-    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision, RunId,
-    RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun, StoredSample,
-    TrainingOptions, TrainingRun,
+    ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob,
+    EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata,
+    ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision,
+    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
+    SourceOffset, StoredSample, TrainingOptions, TrainingRun,
 };
 use crate::geo::Position;
 
@@ -596,4 +596,17 @@ contract! {
     /// # Errors
     /// Faults only.
     fn outbox_counts(&self, key: ConnectionKey) -> Result<OutboxCounts>;
+
+    /// How far a source has read the partitions of its topics.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn source_offsets(&self, key: ConnectionKey) -> Result<Vec<SourceOffset>>;
+
+    /// Stores how far a source has read partitions, all or none. A connection that was deleted has no offsets. A power cut
+    /// may undo what is stored as `relaxed`; then messages are read again.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InsufficientStorage`]; then none is stored.
+    fn store_source_offsets(&self, key: ConnectionKey, offsets: &[SourceOffset], durability: Durability) -> Result<()>;
 }

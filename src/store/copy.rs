@@ -39,6 +39,7 @@ pub(super) const TABLES: &[Table] = &[
     Table { name: "idempotency_keys", key: "number" },
     Table { name: "connections", key: "key" },
     Table { name: "outbox", key: "number" },
+    Table { name: "source_offsets", key: "connection_key, topic, partition_number" },
 ];
 
 /// Tables whose keys are numbered and never used twice, with the column.

@@ -23,7 +23,7 @@ use tonic::metadata::AsciiMetadataValue;
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 
-use crate::harness::{Answer, TestServer, data_folder, run, sightfix};
+use crate::harness::{Answer, TestServer, data_folder, run, sightfix, store_arguments};
 
 const ROLES: [Role; 4] = [Role::Viewer, Role::Edge, Role::Operator, Role::Admin];
 const UNAUTHENTICATED: &str = "16";
@@ -410,7 +410,10 @@ async fn an_address_that_others_reach_needs_a_key() {
     let path = folder.path().to_str().expect("UTF-8").to_owned();
     let serve = || {
         let mut command = sightfix();
-        command.args(["serve", "--listen", "0.0.0.0:0", "--data", &path]).stdout(Stdio::null());
+        command
+            .args(["serve", "--listen", "0.0.0.0:0"])
+            .args(store_arguments(folder.path()))
+            .stdout(Stdio::null());
         command
     };
     let refused = serve().output().expect("the binary runs");

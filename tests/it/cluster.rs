@@ -1,8 +1,12 @@
 //! Live streams of several serving processes with one PostgreSQL database. `.ci/postgres` starts the server.
 
 mod balancer;
+mod connections;
+mod database;
+mod database_faults;
 mod faults;
 mod feed;
+mod replay;
 
 use std::path::Path;
 use std::process::Command;

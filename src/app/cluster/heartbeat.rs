@@ -104,6 +104,7 @@ async fn tend_on(app: &App, membership: &Membership) {
         });
         app.metrics.owned_cameras(membership.owned());
         let tended = async {
+            give_up_wanted(membership).await?;
             membership.release().await?;
             end_watches(membership).await
         };
@@ -111,6 +112,15 @@ async fn tend_on(app: &App, membership: &Membership) {
             tracing::warn!(%error, "cannot look for cameras that other nodes own");
         }
     }
+}
+
+/// Gives up the cameras that sources of other nodes feed; who streams to them goes there.
+async fn give_up_wanted(membership: &Membership) -> Result<()> {
+    let wanted = membership.leases.wanted_by_others(membership.registration.load().id).await?;
+    if !wanted.is_empty() {
+        membership.give_up(|lease, _| wanted.contains(&lease.key));
+    }
+    Ok(())
 }
 
 async fn end_watches(membership: &Membership) -> Result<()> {
@@ -132,7 +142,9 @@ async fn hand_over(membership: &Membership, shutdown: &Shutdown) {
     membership.begin_drain();
     loop {
         membership.give_up(|_, is_used| !is_used);
-        if membership.release().await.is_ok() && membership.owned() == 0 {
+        let cameras = membership.release().await;
+        let connections = membership.release_connections(|_| true).await;
+        if cameras.and(connections).is_ok() && membership.owned() == 0 && !membership.holds_connections() {
             return;
         }
         tokio::select! {

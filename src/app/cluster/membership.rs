@@ -9,12 +9,14 @@ use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
 use super::camera_lease::{CameraLease, HeldLease, between_nodes, camera_text};
+use super::connection_lease::HeldConnection;
 use super::registration::Registration;
 use super::watches::Watches;
 use crate::app::App;
 use crate::app::live::sync::lock;
 use crate::app::registry::ActiveCamera;
-use crate::domain::{CameraKey, Error, Node, NodeId, NodeProfile, Result, SiteId};
+use crate::config::NodeRole;
+use crate::domain::{CameraKey, ConnectionKey, Error, Node, NodeId, NodeProfile, Result, SiteId};
 use crate::store::{Acquired, NodeLeases};
 
 /// Acquisitions of one camera follow one another; those of others share these locks.
@@ -30,6 +32,8 @@ pub(super) struct Membership {
     /// Notified when something that held a lease is gone.
     pub(super) let_go: Notify,
     pub(super) watches: Watches,
+    /// Connections that this node runs.
+    pub(super) connections: Mutex<HashMap<ConnectionKey, Arc<HeldConnection>>>,
     held: Mutex<HashMap<CameraKey, Arc<HeldLease>>>,
     /// Given up here, but not yet in the database.
     unreleased: Mutex<Vec<(CameraKey, i64)>>,
@@ -53,6 +57,7 @@ impl Membership {
             drain_begun: Notify::new(),
             let_go: Notify::new(),
             watches: Watches::default(),
+            connections: Mutex::default(),
             held: Mutex::default(),
             unreleased: Mutex::default(),
             others: Mutex::default(),
@@ -174,6 +179,7 @@ impl Membership {
         let lost = std::mem::take(&mut *lock(&self.held));
         lock(&self.unreleased).clear();
         lost.values().for_each(|lease| lease.ended.cancel());
+        lock(&self.connections).drain().for_each(|(_, lease)| lease.ended.cancel());
         if !lost.is_empty() {
             tracing::warn!(
                 cameras = lost.len(),
@@ -199,6 +205,14 @@ impl Membership {
     /// When the first of the other nodes will have been silent for its lease.
     pub(super) fn next_silence(&self) -> Option<Duration> {
         lock(&self.others).values().map(|other| other.same_since + other.node.profile.lease).min()
+    }
+
+    /// Nodes that answer clients and go on doing so, this one among them.
+    pub(super) fn serving_nodes(&self) -> usize {
+        let is_serving = |other: &&ObservedNode| {
+            !other.node.is_draining && other.node.profile.role != NodeRole::Train.as_str()
+        };
+        1 + lock(&self.others).values().filter(is_serving).count()
     }
 
     /// What a client hears whose camera or site another node owns: its address, unless that node seems to be gone or is going.

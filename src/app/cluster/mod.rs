@@ -4,12 +4,14 @@
 //! are on one node at a time: the owner. A node is registered in the database and renews its registration; it owns
 //! cameras as long as it is registered, so a renewal is one row however many cameras there are. Nobody has to be asked
 //! whether the node still owns a camera: it knows by its own clock until when nobody can have ended its registration.
-//! A server on a data folder owns everything.
+//! A server on a data folder owns everything. Connections with other systems have owners by the same rule.
 //!
 //! Samples need no fence: they are stored under the key of camera, target and time, so what two owners in turn, or a client
 //! that sends again, bring twice is stored once.
 
 mod camera_lease;
+mod connection_lease;
+mod connections;
 mod heartbeat;
 mod membership;
 mod registration;
@@ -28,6 +30,7 @@ use crate::config::{Config, NodeRole};
 use crate::domain::{CameraId, Error, Node, NodeId, NodeProfile, Result, SiteId, SiteKey};
 
 pub use camera_lease::CameraLease;
+pub use connection_lease::ConnectionLease;
 pub use watches::Watch;
 
 /// This process among those with the same database.

@@ -22,6 +22,12 @@ impl Registration {
         as_ns(now) < self.valid_until_ns.load(Ordering::Acquire)
     }
 
+    /// How long it surely lasts without another renewal; `None` once it may have ended.
+    pub(super) fn time_left(&self, now: Duration) -> Option<Duration> {
+        let left = self.valid_until_ns.load(Ordering::Acquire).checked_sub(as_ns(now))?;
+        (left > 0).then(|| Duration::from_nanos(left))
+    }
+
     pub(super) fn extend(&self, valid_until: Duration) {
         self.valid_until_ns.store(as_ns(valid_until), Ordering::Release);
     }

@@ -2,6 +2,8 @@
 //!
 //! Here they are created, changed and watched; `connect` runs them.
 
+mod groups;
+mod reports;
 mod status;
 
 use std::collections::BTreeMap;
@@ -15,8 +17,10 @@ use crate::domain::{
     Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
     OutboxCounts, Result, check_text,
 };
-use crate::exchange::{ConnectionDraft, ConnectionSettings, Secrets};
+use crate::exchange::{ConnectionDraft, ConnectionSettings, Scheme, Secrets};
 
+pub use groups::connection_groups;
+pub use reports::{ConnectionNode, ReportedStatuses};
 pub use status::{
     ConnectionBoard, ConnectionState, ConnectionStatus, LastMessage, LiveConnection, PushedMessage,
 };
@@ -159,20 +163,20 @@ impl App {
         Ok(())
     }
 
-    /// What a connection does, and what is in its outbox.
+    /// What a connection does, the node that runs it if several share the database, and what is in its outbox.
     ///
     /// # Errors
     /// A fault of the store.
     pub async fn connection_status(
         &self,
         connection: &Connection,
-    ) -> Result<(ConnectionStatus, OutboxCounts)> {
-        let mut status = self.live_connection(connection).status();
+    ) -> Result<(ConnectionStatus, Option<ConnectionNode>, OutboxCounts)> {
+        let (mut status, node) = self.status_on_any_node(connection).await?;
         let outbox = self.store.outbox_counts(connection.key).await?;
         if let Some(oldest_at) = outbox.oldest_at {
             status.lag_s = Some(self.clock.now().duration_since(oldest_at).as_secs_f64().max(0.0));
         }
-        Ok((status, outbox))
+        Ok((status, node, outbox))
     }
 
     /// The live part of a connection.
@@ -219,16 +223,14 @@ impl App {
     /// # Errors
     /// `PermissionDenied` for a key that is restricted to other cameras than the source names;
     /// `ConnectionNotFound`; `ConnectionNotReceiving` if it is paused or has another kind of address; `Overloaded`
-    /// while its queue is full; `MalformedBody` for a message that cannot be read.
+    /// while its queue is full; `MalformedBody` for a message that cannot be read; `CameraOnOtherNode`,
+    /// `CameraBetweenNodes` where another node runs the source.
     pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<()> {
         let connection = self.store.connection(id).await?;
-        let not_receiving = || {
-            let message =
-                format!("connection {id} takes no messages: it is paused, or its address is not push:");
-            Error::refused(ErrorKind::ConnectionNotReceiving, message)
-        };
         self.authorize_source(&connection)?;
-        let inlet = self.live_connection(&connection).inlet().ok_or_else(not_receiving)?;
+        let Some(inlet) = self.live_connection(&connection).inlet() else {
+            return Err(self.not_receiving(&connection).await?);
+        };
         let (settled, settlement) = oneshot::channel();
         let sender = self.caller().actor().name.to_string();
         inlet.try_send(PushedMessage { sender, payload, settled }).map_err(|_| {
@@ -237,8 +239,23 @@ impl App {
         match settlement.await {
             Ok(Ok(())) => Ok(()),
             Ok(Err(reason)) => Err(Error::refused(ErrorKind::MalformedBody, reason)),
-            Err(_) => Err(not_receiving()),
+            Err(_) => Err(self.not_receiving(&connection).await?),
         }
+    }
+
+    /// Why this node takes no messages for a connection.
+    async fn not_receiving(&self, connection: &Connection) -> Result<Error> {
+        let (settings, _) = connection_settings(connection)?;
+        let address = settings.source.as_ref().map(|source| source.address()).transpose()?;
+        if !connection.profile.paused
+            && address.is_some_and(|address| address.scheme == Scheme::Push)
+            && let Some(elsewhere) = self.source_elsewhere(connection.id(), connection.key).await?
+        {
+            return Ok(elsewhere);
+        }
+        let id = connection.id();
+        let message = format!("connection {id} takes no messages: it is paused, or its address is not push:");
+        Ok(Error::refused(ErrorKind::ConnectionNotReceiving, message))
     }
 
     /// Checks that the caller may reach every camera that a source feeds.

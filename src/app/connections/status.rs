@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
 use tokio::sync::{Notify, mpsc, oneshot};
 
@@ -14,8 +15,9 @@ use crate::domain::{ConnectionId, ConnectionKey};
 const SHOWN_BYTES: usize = 4_096;
 
 /// State of a connection.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, IntoStaticStr)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, IntoStaticStr, Serialize, Deserialize)]
 #[strum(serialize_all = "snake_case")]
+#[serde(rename_all = "snake_case")]
 pub enum ConnectionState {
     /// At rest, as the operator wants it.
     #[default]
@@ -29,7 +31,7 @@ pub enum ConnectionState {
 }
 
 /// A message as it came or went, with what was read from it.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LastMessage {
     /// When.
     pub time: Timestamp,
@@ -51,7 +53,8 @@ impl LastMessage {
 }
 
 /// What a connection does.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct ConnectionStatus {
     /// State.
     pub state: ConnectionState,
@@ -79,6 +82,20 @@ pub struct ConnectionStatus {
     pub lag_s: Option<f64>,
 }
 
+impl ConnectionStatus {
+    /// Makes the counts the sums of what several nodes have counted.
+    pub(super) fn set_counts<'a>(&mut self, all: impl Iterator<Item = &'a Self> + Clone) {
+        let sum = |count: fn(&Self) -> u64| -> u64 { all.clone().map(count).sum() };
+        self.messages = sum(|it| it.messages);
+        self.items = sum(|it| it.items);
+        self.skipped = sum(|it| it.skipped);
+        self.rejected = sum(|it| it.rejected);
+        self.dropped = sum(|it| it.dropped);
+        self.acknowledged = sum(|it| it.acknowledged);
+        self.connects = sum(|it| it.connects);
+    }
+}
+
 /// A message that a client hands to a connection, with the way back.
 pub struct PushedMessage {
     /// Who sends it.
@@ -95,7 +112,8 @@ pub struct LiveConnection {
     status: Mutex<ConnectionStatus>,
     /// The way to the running source, where it takes pushed messages.
     inlet: Mutex<Option<mpsc::Sender<PushedMessage>>>,
-    changed: Notify,
+    /// Tells that the outbox of a sink has something new.
+    pub queued: Notify,
 }
 
 impl LiveConnection {
@@ -108,7 +126,6 @@ impl LiveConnection {
     /// Changes what is known of it.
     pub fn update(&self, change: impl FnOnce(&mut ConnectionStatus)) {
         change(&mut lock(&self.status));
-        self.changed.notify_waiters();
     }
 
     /// Enters a state.
@@ -127,19 +144,6 @@ impl LiveConnection {
 
     pub(in crate::app) fn inlet(&self) -> Option<mpsc::Sender<PushedMessage>> {
         lock(&self.inlet).clone()
-    }
-
-    /// Waits until something is true of its status.
-    pub async fn reached(&self, is_reached: impl Fn(&ConnectionStatus) -> bool) {
-        loop {
-            let changed = self.changed.notified();
-            tokio::pin!(changed);
-            changed.as_mut().enable();
-            if is_reached(&lock(&self.status)) {
-                return;
-            }
-            changed.await;
-        }
     }
 }
 
@@ -163,6 +167,11 @@ impl ConnectionBoard {
                 connection
             }
         }
+    }
+
+    /// What is known of each.
+    pub(super) fn statuses(&self) -> HashMap<ConnectionKey, ConnectionStatus> {
+        lock(&self.live).values().map(|(key, connection)| (*key, connection.status())).collect()
     }
 
     pub(super) fn forget(&self, id: &ConnectionId) {

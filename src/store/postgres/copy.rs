@@ -35,7 +35,8 @@ impl CopyTransaction for Copying {
         async move {
             sqlx::query_scalar(
                 "SELECT tablename::TEXT FROM pg_tables WHERE schemaname = current_schema() \
-                 AND tablename NOT IN ('_sqlx_migrations', 'nodes', 'camera_owners') ORDER BY tablename",
+                 AND tablename NOT IN ('_sqlx_migrations', 'nodes', 'camera_owners', 'connection_owners', \
+                 'connection_statuses') ORDER BY tablename",
             )
             .fetch_all(&mut *self.0)
             .await

@@ -23,6 +23,8 @@ pub(super) enum Limit {
     Keys = 4,
     /// Number of connections with other systems.
     Connections = 5,
+    /// One owner of all connections that belong together.
+    ConnectionOwners = 6,
 }
 
 /// Waits until no other transaction may change how far a limit is used.

@@ -8,6 +8,7 @@ mod audit;
 mod camera_moves;
 mod cameras;
 mod connection;
+mod connection_owners;
 mod connections;
 mod copy;
 mod errors;
@@ -28,6 +29,7 @@ mod sample_table;
 mod samples;
 mod site_runs;
 mod sites;
+mod source_offsets;
 #[cfg(test)]
 mod tests;
 mod training;
@@ -45,6 +47,7 @@ use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 use errors::failed;
 use group_commit::GroupWriter;
 
+pub use connection_owners::ConnectionReports;
 pub use nodes::{Acquired, NodeLeases};
 
 /// The store of one database.

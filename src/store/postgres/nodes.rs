@@ -174,16 +174,56 @@ impl NodeLeases {
         if let Some(other) = owner(&mut transaction, camera, site, Some(id)).await? {
             return Ok(Acquired::OtherNode(other));
         }
-        sqlx::query("UPDATE camera_owners SET node_id = $2, fence = $3 WHERE camera_key = $1")
-            .bind(camera.0)
-            .bind(id.to_string())
-            .bind(fence + 1)
-            .execute(&mut *transaction)
-            .await
-            .map_err(failed)?;
+        sqlx::query(
+            "UPDATE camera_owners SET node_id = $2, fence = $3, wanted_by = NULL WHERE camera_key = $1",
+        )
+        .bind(camera.0)
+        .bind(id.to_string())
+        .bind(fence + 1)
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
         transaction.commit().await.map_err(failed)?;
         let is_takeover = before.is_some_and(|before| before != id.to_string());
         Ok(Acquired::Owned { fence: fence + 1, is_takeover })
+    }
+
+    /// Asks the owner of a camera, and of all cameras of its site, to give them up for a node; until that node owns them,
+    /// no other acquires them.
+    ///
+    /// # Errors
+    /// `CameraNotFound`; as [`NodeLeases::register`].
+    pub async fn want(&self, camera: CameraKey, id: NodeId) -> Result<()> {
+        let mut transaction = begin_write(&self.pool, Durability::Synced).await?;
+        let (_, _, site) = lock_ownership(&mut transaction, camera).await?;
+        sqlx::query(
+            "UPDATE camera_owners SET wanted_by = $3 WHERE wanted_by IS DISTINCT FROM $3 AND camera_key = ANY(ARRAY( \
+             SELECT $1::BIGINT UNION SELECT key FROM cameras WHERE site_key = $2))",
+        )
+        .bind(camera.0)
+        .bind(site)
+        .bind(id.to_string())
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        transaction.commit().await.map_err(failed)
+    }
+
+    /// Cameras of a node that another registered node has asked for.
+    ///
+    /// # Errors
+    /// As [`NodeLeases::register`].
+    pub async fn wanted_by_others(&self, id: NodeId) -> Result<Vec<CameraKey>> {
+        let mut reader = begin_read(&self.pool).await?;
+        let wanted: Vec<i64> = sqlx::query_scalar(
+            "SELECT camera_key FROM camera_owners JOIN nodes ON nodes.id = wanted_by \
+             WHERE node_id = $1 AND wanted_by IS NOT NULL AND wanted_by <> $1",
+        )
+        .bind(id.to_string())
+        .fetch_all(&mut *reader)
+        .await
+        .map_err(failed)?;
+        Ok(wanted.into_iter().map(CameraKey).collect())
     }
 
     /// Releases cameras that a node still owns under these fences.
@@ -289,7 +329,7 @@ fn read_node(row: NodeRow) -> Result<Node> {
     })
 }
 
-fn node_id(text: &str) -> Result<NodeId> {
+pub(super) fn node_id(text: &str) -> Result<NodeId> {
     Uuid::parse_str(text).map(NodeId).map_err(Error::fault)
 }
 
@@ -329,7 +369,7 @@ async fn lock_ownership(
     Ok((before, fence, site))
 }
 
-/// The registered node, other than one, that owns a camera, or else another camera of its site.
+/// The registered node, other than one, that owns a camera, or else another camera of its site, or else has asked for them.
 async fn owner(
     connection: &mut PgConnection,
     camera: CameraKey,
@@ -337,9 +377,11 @@ async fn owner(
     except: Option<NodeId>,
 ) -> Result<Option<NodeId>> {
     let owner: Option<String> = sqlx::query_scalar(
-        "SELECT owned.node_id FROM camera_owners owned JOIN nodes ON nodes.id = owned.node_id \
+        "SELECT nodes.id FROM camera_owners owned \
+         CROSS JOIN LATERAL (VALUES (owned.node_id, TRUE), (owned.wanted_by, FALSE)) AS named (id, owns) \
+         JOIN nodes ON nodes.id = named.id \
          WHERE owned.camera_key = ANY(ARRAY(SELECT $1::BIGINT UNION SELECT key FROM cameras WHERE site_key = $2)) \
-         AND owned.node_id IS DISTINCT FROM $3 ORDER BY owned.camera_key = $1 DESC LIMIT 1",
+         AND named.id IS DISTINCT FROM $3 ORDER BY named.owns DESC, owned.camera_key = $1 DESC LIMIT 1",
     )
     .bind(camera.0)
     .bind(site)

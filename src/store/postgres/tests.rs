@@ -9,7 +9,8 @@ use tempfile::TempDir;
 use uuid::Uuid;
 
 use crate::domain::{
-    CameraId, Durability, ErrorKind, NewCamera, NewSite, NodeId, NodeProfile, RunId, SiteId,
+    CameraId, ConnectionId, Durability, ErrorKind, NewCamera, NewConnection, NewSite, NodeId, NodeProfile,
+    RunId, SiteId,
 };
 use crate::store::tests::copy::copy_and_compare;
 use crate::store::tests::{Fixture, Home, at, connect, id, new_database, options, sample};
@@ -302,4 +303,84 @@ async fn a_node_owns_until_its_registration_ends_and_every_owner_has_a_higher_fe
     assert_eq!(ours.camera_owner(key).await.expect("works"), None);
     second.delete_camera(&id("a"), None, at(1)).await.expect("deleted");
     assert_eq!(others.nodes().await.expect("works").iter().map(|(_, cameras)| *cameras).sum::<u64>(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn of_nodes_that_acquire_at_once_one_runs_a_group_of_connections() {
+    let home = database().await;
+    let nodes = [registered(&home, 1).await, registered(&home, 2).await, registered(&home, 3).await];
+    let mut keys = Vec::new();
+    for number in 0..20 {
+        let profile = NewConnection {
+            id: ConnectionId::new(&format!("source-{number}")).expect("a slug"),
+            display_name: String::new(),
+            paused: false,
+            settings: "{}".to_owned(),
+            secrets: "{}".to_owned(),
+        };
+        keys.push(nodes[0].0.insert_connection(&profile, at(0)).await.expect("new").key);
+    }
+    let acquiring = (0..60).map(|n| {
+        let (store, node) = nodes[n % 3].clone();
+        let group = keys[n / 3 / 4 * 4..][..4].to_vec();
+        tokio::spawn(async move {
+            let leases = store.node_leases().expect("a database");
+            leases.acquire_connections(node, &group, &group).await.expect("works")
+        })
+    });
+    for task in acquiring.collect::<Vec<_>>() {
+        task.await.expect("no panic");
+    }
+    let leases = nodes[0].0.node_leases().expect("a database");
+    let owners = leases.connection_owners().await.expect("works");
+    for group in keys.chunks(4) {
+        let owners: HashSet<_> = group.iter().map(|key| owners.get(key).expect("an owner")).collect();
+        assert_eq!(owners.len(), 1, "{owners:?}");
+    }
+
+    // A report of a node counts as long as it is registered.
+    let owner = owners[&keys[0]];
+    leases.store_connection_statuses(owner, &[(keys[0], "one".to_owned())]).await.expect("works");
+    leases.store_connection_statuses(owner, &[(keys[0], "two".to_owned())]).await.expect("works");
+    let reports = leases.connection_reports(keys[0]).await.expect("works");
+    assert_eq!(reports.statuses, [(owner, "two".to_owned())]);
+    assert_eq!(reports.owner.map(|(node, _)| node), Some(owner));
+    leases.end(owner).await.expect("works");
+    let reports = leases.connection_reports(keys[0]).await.expect("works");
+    assert_eq!((reports.owner, reports.statuses), (None, Vec::new()));
+    let other = nodes.iter().map(|(_, node)| *node).find(|node| *node != owner).expect("another");
+    let fences = leases.acquire_connections(other, &keys[..4], &keys[..2]).await.expect("works");
+    let fences: [_; 2] = fences.try_into().expect("both");
+    assert!(fences.iter().all(|(_, fence)| *fence >= 2), "{fences:?}");
+    leases.release_connections(other, &[fences[0], (fences[1].0, 1)]).await.expect("works");
+    let owners = leases.connection_owners().await.expect("works");
+    let of_group = fences.map(|(key, _)| owners.get(&key));
+    assert_eq!(of_group, [None, Some(&other)], "an old fence releases nothing");
+}
+
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_camera_that_is_wanted_goes_to_nobody_else() {
+    let home = database().await;
+    let ((first, one), (second, two)) = (registered(&home, 1).await, registered(&home, 2).await);
+    let (third, three) = registered(&home, 3).await;
+    first.insert_camera(&NewCamera::named(id("a")), at(0)).await.expect("new");
+    let key = first.camera(&id("a")).await.expect("known").key;
+    let leases = first.node_leases().expect("a database");
+    assert_eq!(acquire(&first, "a", one).await, Acquired::Owned { fence: 1, is_takeover: false });
+    leases.want(key, two).await.expect("works");
+    assert_eq!(leases.wanted_by_others(one).await.expect("works"), [key]);
+    assert_eq!(acquire(&second, "a", two).await, Acquired::OtherNode(one), "until it is given up");
+    leases.release(one, &[(key, 1)]).await.expect("works");
+    assert_eq!(acquire(&first, "a", one).await, Acquired::OtherNode(two));
+    assert_eq!(acquire(&third, "a", three).await, Acquired::OtherNode(two));
+    assert_eq!(acquire(&second, "a", two).await, Acquired::Owned { fence: 2, is_takeover: false });
+    assert_eq!(leases.wanted_by_others(two).await.expect("works"), []);
+    // Once it is owned, or the one that wants it is gone, it is as any other.
+    leases.want(key, three).await.expect("works");
+    leases.end(three).await.expect("works");
+    assert_eq!(leases.wanted_by_others(two).await.expect("works"), []);
+    leases.release(two, &[(key, 2)]).await.expect("works");
+    assert_eq!(acquire(&first, "a", one).await, Acquired::Owned { fence: 3, is_takeover: false });
 }

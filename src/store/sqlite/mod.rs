@@ -33,6 +33,7 @@ mod samples;
 mod server_lock;
 mod site_runs;
 mod sites;
+mod source_offsets;
 mod space;
 #[cfg(test)]
 mod tests;

@@ -2,6 +2,7 @@
 //! server's database, a database of its own on that server (`.ci/postgres`).
 
 mod cameras;
+mod connections;
 pub(super) mod copy;
 mod evaluations;
 pub(super) mod group;

@@ -15,14 +15,14 @@ use crate::harness::{TestServer, data_folder, own_address};
 const CONFIGURATION: &str = include_str!("../../../deploy/cluster/nginx.conf");
 
 /// nginx on two free ports; ended when dropped.
-struct Balancer {
+pub(super) struct Balancer {
     process: Child,
-    grpc: SocketAddr,
+    pub(super) grpc: SocketAddr,
     rest: SocketAddr,
 }
 
 impl Balancer {
-    async fn start(folder: &Path, nodes: &[&TestServer]) -> Self {
+    pub(super) async fn start(folder: &Path, nodes: &[&TestServer]) -> Self {
         let (rest, grpc) = (own_address(), own_address());
         let mut text =
             CONFIGURATION.replace("8080;\n    listen 8081", &format!("{rest};\n    listen {grpc}"));

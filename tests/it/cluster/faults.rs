@@ -176,6 +176,11 @@ async fn connections_that_the_database_ends_lose_nothing_that_was_acknowledged()
     assert_stored_once(&second, &feed).await;
 }
 
+/// A number of the environment.
+pub(super) fn number_of(name: &str, default: u64) -> u64 {
+    std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
+}
+
 /// What happens to the owner in the middle of a stream.
 #[derive(Debug, Clone, Copy)]
 enum FaultKind {
@@ -189,10 +194,7 @@ enum FaultKind {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs PostgreSQL: .ci/postgres"]
 async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
-    let number = |name: &str, default: u64| {
-        std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
-    };
-    let (faults, seed) = (number("CLUSTER_FAULTS", 6), number("CLUSTER_SEED", 1));
+    let (faults, seed) = (number_of("CLUSTER_FAULTS", 6), number_of("CLUSTER_SEED", 1));
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folder = data_folder();
     let mut nodes: Vec<TestServer> = (0..3).map(|_| node(folder.path())).collect();

@@ -127,6 +127,12 @@ impl Feed {
         first.expect("an answer of another node").0 - instant
     }
 
+    /// The longest time between two answers, the second of them after an instant.
+    pub(super) fn longest_silence_after(&self, instant: Instant) -> Duration {
+        let pairs = self.answers.windows(2).filter(|pair| pair[1].0 > instant);
+        pairs.map(|pair| pair[1].0 - pair[0].0).max().unwrap_or_default()
+    }
+
     /// The node that gave the latest answer.
     pub(super) fn answered_by(&self) -> &str {
         &self.answers.last().expect("an answer").1

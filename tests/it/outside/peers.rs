@@ -9,23 +9,50 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::harness::{TestServer, own_address};
+use crate::tls::Authority;
 
 /// A mosquitto of its own, which keeps sessions in memory; killed when dropped.
-pub(super) struct Broker {
+pub(crate) struct Broker {
     process: Child,
-    pub(super) port: u16,
+    pub(crate) port: u16,
+    /// How its own clients reach it.
+    client_arguments: Vec<String>,
     _folder: TempDir,
 }
 
 impl Broker {
-    pub(super) fn start() -> Self {
+    pub(crate) fn start() -> Self {
         Self::start_at(own_address().port())
     }
 
-    pub(super) fn start_at(port: u16) -> Self {
+    pub(crate) fn start_at(port: u16) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
+        Self::start_in(folder, port, "", vec!["-h".to_owned(), "127.0.0.1".to_owned()])
+    }
+
+    /// One that is reached by TLS alone, with a certificate of the authority for `localhost`.
+    pub(super) fn start_encrypted(authority: &Authority) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (certificate, key) = authority.issue();
+        let file = |name: &str, content: String| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, content).expect("a file can be written");
+            path.to_str().expect("text").to_owned()
+        };
+        let trusted = file("ca.pem", authority.certificate.pem());
+        let settings = format!(
+            "certfile {}\nkeyfile {}\n",
+            file("certificate.pem", certificate.pem()),
+            file("key.pem", key.serialize_pem())
+        );
+        let client_arguments = ["-h", "localhost", "--cafile", &trusted].map(str::to_owned).to_vec();
+        Self::start_in(folder, own_address().port(), &settings, client_arguments)
+    }
+
+    fn start_in(folder: TempDir, port: u16, settings: &str, client_arguments: Vec<String>) -> Self {
         let path = folder.path().join("mosquitto.conf");
-        let text = format!("listener {port} 127.0.0.1\nallow_anonymous true\n");
+        // As the superuser it would become another user, who cannot read the folder.
+        let text = format!("user root\nlistener {port} 127.0.0.1\nallow_anonymous true\n{settings}");
         std::fs::write(&path, text).expect("a file can be written");
         let mut command = Command::new("mosquitto");
         command.arg("-c").arg(&path).stdout(Stdio::null()).stderr(Stdio::null());
@@ -33,13 +60,14 @@ impl Broker {
         while std::net::TcpStream::connect(("127.0.0.1", port)).is_err() {
             std::thread::sleep(Duration::from_millis(20));
         }
-        Self { process, port, _folder: folder }
+        Self { process, port, client_arguments, _folder: folder }
     }
 
     /// Publishes with QoS 1 by mosquitto's own client.
-    pub(super) fn publish(&self, topic: &str, message: &str) {
+    pub(crate) fn publish(&self, topic: &str, message: &str) {
         let mut command = Command::new("mosquitto_pub");
-        command.args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-q", "1", "-t", topic, "-s"]);
+        command.args(&self.client_arguments);
+        command.args(["-p", &self.port.to_string(), "-q", "1", "-t", topic, "-s"]);
         let mut process = command.stdin(Stdio::piped()).spawn().expect("mosquitto-clients is installed");
         let mut input = process.stdin.take().expect("piped");
         input.write_all(message.as_bytes()).expect("it reads");
@@ -49,19 +77,20 @@ impl Broker {
 
     fn subscriber(&self, topic: &str) -> Command {
         let mut command = Command::new("mosquitto_sub");
-        command.args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-V", "5", "-q", "1", "-t", topic]);
+        command.args(&self.client_arguments);
+        command.args(["-p", &self.port.to_string(), "-V", "5", "-q", "1", "-t", topic]);
         command.args(["-i", "subscriber", "-c", "-x", "600"]);
         command
     }
 
     /// Has the broker keep the messages of a topic from now on, in a session of mosquitto's own client.
-    pub(super) fn subscribe(&self, topic: &str) {
+    pub(crate) fn subscribe(&self, topic: &str) {
         let status = self.subscriber(topic).arg("-E").status().expect("mosquitto-clients is installed");
         assert!(status.success());
     }
 
     /// The first messages of that session, as lines of topic and payload.
-    pub(super) fn received(&self, topic: &str, count: u32) -> String {
+    pub(crate) fn received(&self, topic: &str, count: u32) -> String {
         let output = self.subscriber(topic).args(["-v", "-C", &count.to_string()]).output();
         String::from_utf8(output.expect("mosquitto-clients is installed").stdout).expect("text")
     }
@@ -75,7 +104,7 @@ impl Drop for Broker {
 }
 
 /// Waits until something is true of a connection, and returns it.
-pub(super) async fn connection_when(
+pub(crate) async fn connection_when(
     server: &TestServer,
     id: &str,
     is_wanted: impl Fn(&Value) -> bool,
@@ -92,13 +121,13 @@ pub(super) async fn connection_when(
 }
 
 /// A camera `gate` of 1280 x 720 px.
-pub(super) async fn create_gate(server: &TestServer) {
+pub(crate) async fn create_gate(server: &TestServer) {
     let camera = json!({"id": "gate", "image_size": {"width_px": 1280, "height_px": 720}});
     server.post("/v1/cameras", &camera).await.expect(201);
 }
 
 /// Sends a fix of a target of the camera `gate`; stores samples if asked to.
-pub(super) async fn send_fix(
+pub(crate) async fn send_fix(
     server: &TestServer,
     target: &str,
     time: &str,
@@ -113,7 +142,7 @@ pub(super) async fn send_fix(
 }
 
 /// Changes a connection, whatever its revision.
-pub(super) async fn patch(server: &TestServer, id: &str, change: &Value) -> crate::harness::Answer {
+pub(crate) async fn patch(server: &TestServer, id: &str, change: &Value) -> crate::harness::Answer {
     let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
     server.send("PATCH", &format!("/v1/connections/{id}"), &headers, Bytes::from(change.to_string())).await
 }

@@ -1,0 +1,79 @@
+//! What connections do, as every node shows it.
+
+use std::collections::HashMap;
+
+use super::status::{ConnectionState, ConnectionStatus};
+use crate::app::App;
+use crate::domain::{Connection, ConnectionKey, Error, NodeId, Result};
+use crate::store::ConnectionReports;
+
+/// The node that runs a connection.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ConnectionNode {
+    /// Its id.
+    pub id: NodeId,
+    /// Where clients reach it, if that is known.
+    pub url: Option<String>,
+}
+
+/// What this node has told the others.
+#[derive(Default)]
+pub struct ReportedStatuses {
+    node: Option<NodeId>,
+    statuses: HashMap<ConnectionKey, ConnectionStatus>,
+}
+
+impl App {
+    /// Tells other nodes what has changed of the connections that run here, if there are other nodes.
+    ///
+    /// # Errors
+    /// The database does not answer.
+    pub async fn report_connections(&self, reported: &mut ReportedStatuses) -> Result<()> {
+        let Some(node) = self.reporting_node() else { return Ok(()) };
+        if reported.node.replace(node) != Some(node) {
+            reported.statuses.clear();
+        }
+        let mut statuses = self.connection_board.statuses();
+        // What nothing is known of needs no report.
+        statuses.retain(|key, status| *reported.statuses.entry(*key).or_default() != *status);
+        if statuses.is_empty() {
+            return Ok(());
+        }
+        let texts = statuses.iter().map(|(key, status)| {
+            serde_json::to_string(status).map(|text| (*key, text)).map_err(Error::fault)
+        });
+        self.store_connection_statuses(node, &texts.collect::<Result<Vec<_>>>()?).await?;
+        reported.statuses.extend(statuses);
+        Ok(())
+    }
+
+    /// What a connection does, whichever node runs it, and that node. Counts are those of all nodes.
+    ///
+    /// # Errors
+    /// The database does not answer.
+    pub(super) async fn status_on_any_node(
+        &self,
+        connection: &Connection,
+    ) -> Result<(ConnectionStatus, Option<ConnectionNode>)> {
+        let own = self.live_connection(connection).status();
+        let (Some(reports), Some(node)) =
+            (self.connection_reports(connection.key).await?, self.reporting_node())
+        else {
+            return Ok((own, None));
+        };
+        let ConnectionReports { owner, statuses } = reports;
+        let others = statuses.into_iter().filter(|(reporter, _)| *reporter != node);
+        // A report that another version wrote may be unreadable, which is no reason to show nothing.
+        let others =
+            others.filter_map(|(reporter, text)| Some((reporter, serde_json::from_str(&text).ok()?)));
+        let all: HashMap<NodeId, ConnectionStatus> = others.chain([(node, own)]).collect();
+        let of_owner = owner.as_ref().and_then(|(id, _)| all.get(id)).cloned();
+        let mut shown = of_owner.unwrap_or_else(|| {
+            let state =
+                if connection.profile.paused { ConnectionState::Paused } else { ConnectionState::Waiting };
+            ConnectionStatus { state, ..ConnectionStatus::default() }
+        });
+        shown.set_counts(all.values());
+        Ok((shown, owner.map(|(id, url)| ConnectionNode { id, url })))
+    }
+}

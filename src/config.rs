@@ -75,6 +75,8 @@ pub struct Config {
     /// Folder below which sinks of connections write files (`file:`), each in a folder of its own; without it there are
     /// no such sinks.
     pub export_folder: Option<PathBuf>,
+    /// Serial devices that sources of connections may read (`serial:`), as their addresses name them.
+    pub serial_devices: Vec<PathBuf>,
     /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
     pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
@@ -226,7 +228,7 @@ pub struct Limits {
     pub live_idle_s: u64,
     /// Seconds after which the client of a live stream is asked to open another.
     pub live_age_s: u64,
-    /// Training runs that have not ended, over all cameras.
+    /// Training runs that have not ended, over all cameras; also over all sites.
     pub live_runs: u32,
     /// Passes of one training run.
     pub epochs: u32,
@@ -235,6 +237,10 @@ pub struct Limits {
     pub retrain_pause_s: u32,
     /// Samples with a fix of one training run; the latest are taken.
     pub samples_per_run: u32,
+    /// Samples with a fix of one training run of a site, of all its cameras; the latest of each are taken.
+    pub samples_per_site_run: u32,
+    /// Cameras of one training run of a site.
+    pub cameras_per_site_run: u32,
     /// Boxes without a fix of one training run or evaluation; more are thinned evenly.
     pub boxes_without_fix_per_run: u32,
     /// Evaluations that have not ended, over all cameras.
@@ -321,11 +327,12 @@ impl Default for Config {
             openid: OpenIdSettings::default(),
             api_key: None,
             log_format: LogFormat::Text,
-            log_filter: "info".to_owned(),
+            log_filter: "info,rskafka=off".to_owned(),
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),
             export_folder: None,
+            serial_devices: Vec::new(),
             connections: Vec::new(),
             console: Console::default(),
             limits: Limits::default(),
@@ -386,6 +393,8 @@ impl Default for Limits {
             epochs: 10_000,
             retrain_pause_s: 15,
             samples_per_run: 100_000,
+            samples_per_site_run: 100_000,
+            cameras_per_site_run: 16,
             boxes_without_fix_per_run: 20_000,
             live_evaluations: 64,
             evaluation_seeds: 20,

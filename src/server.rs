@@ -106,6 +106,7 @@ impl Server {
         if let Some(folder) = &config.export_folder {
             app.export_folder.get_or_init(|| folder.clone());
         }
+        app.serial_devices.get_or_init(|| config.serial_devices.clone());
         let tls = Tls::load(&config.tls)?;
         if tls.as_ref().is_some_and(|tls| tls.takes_client_certificates()) {
             app.access.close();
@@ -174,6 +175,7 @@ impl Server {
         let Self { config, app, listener, monitoring, tls, proxies, shutdown } = self;
         if config.role.works_on_jobs() {
             shutdown.spawn(worker::train(app.clone(), config.training.clone(), shutdown.clone()));
+            shutdown.spawn(worker::train_sites(app.clone(), config.training.clone(), shutdown.clone()));
             shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         }
         if config.role.answers_clients() {

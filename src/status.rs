@@ -76,7 +76,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::IdempotencyKeyReused => {
             (422, code::INVALID_ARGUMENT, "The idempotency key was used for another request")
         }
-        Kind::RunLive => (409, code::FAILED_PRECONDITION, "The camera has a training run that has not ended"),
+        Kind::RunLive => (409, code::FAILED_PRECONDITION, "There is a training run that has not ended"),
         Kind::RunEnded => (409, code::FAILED_PRECONDITION, "The training run has ended"),
         Kind::EvaluationEnded => (409, code::FAILED_PRECONDITION, "The evaluation has ended"),
         Kind::ModelActive => (409, code::FAILED_PRECONDITION, "The model version is the active one"),

@@ -5,6 +5,7 @@
 
 mod attacks;
 mod beside;
+mod connections;
 mod database;
 mod fuse;
 mod guarded;
@@ -24,7 +25,7 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() {
     // cargo passes flags of its own, such as --bench.
     let wanted: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
-    let parts: [(&str, fn()); 11] = [
+    let parts: [(&str, fn()); 12] = [
         ("fuse", fuse::run),
         ("http", transports::http),
         ("grpc", transports::grpc),
@@ -36,6 +37,7 @@ fn main() {
         ("attacks", attacks::run),
         ("guarded", guarded::run),
         ("database", database::run),
+        ("connections", connections::run),
     ];
     for (name, part) in parts {
         if wanted.is_empty() || wanted.iter().any(|wish| wish == name) {

@@ -24,6 +24,7 @@ mod recording;
 mod registry;
 mod samples;
 mod site_registry;
+mod site_training;
 mod sites;
 mod spool;
 mod training;
@@ -62,6 +63,7 @@ pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedPar
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
+pub use site_training::SiteRunRequest;
 pub use spool::{Content, Spool, SpoolLeases, Spooled};
 pub use training::RunRequest;
 
@@ -85,6 +87,8 @@ pub struct Parts {
     pub connection_board: ConnectionBoard,
     /// Where their sinks write files, if they may: set by the server at its start.
     pub export_folder: OnceLock<PathBuf>,
+    /// Serial devices that their sources may read: set by the server at its start.
+    pub serial_devices: OnceLock<Vec<PathBuf>>,
     /// Keys and sessions, ready to answer.
     pub access: Access,
     /// What time it is.
@@ -101,6 +105,8 @@ pub struct Parts {
     pub pairings: Semaphore,
     /// Notifies workers of queued training runs.
     pub training_queue: JobQueue,
+    /// Notifies workers of queued training runs of sites.
+    pub site_training_queue: JobQueue,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
     /// Which nodes there are, and what this one owns.
@@ -153,6 +159,7 @@ impl App {
             site_registry,
             connection_board: ConnectionBoard::default(),
             export_folder: OnceLock::new(),
+            serial_devices: OnceLock::new(),
             access,
             clock,
             randomness,
@@ -161,6 +168,7 @@ impl App {
             metrics,
             pairings,
             training_queue: JobQueue::default(),
+            site_training_queue: JobQueue::default(),
             evaluation_queue: JobQueue::default(),
             cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),

@@ -16,7 +16,7 @@ use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 use crate::store::SampleFilter;
 
 /// How often a watched run is read from the store.
-const WATCH_INTERVAL: Duration = Duration::from_millis(200);
+pub(super) const WATCH_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A request for a training run; what is left out comes from the profile.
 #[derive(Debug, Clone, Copy, Default)]

@@ -3,23 +3,26 @@
 use std::path::Path;
 
 use clap::Args;
-use futures_util::StreamExt as _;
+use futures_util::{Stream, StreamExt as _};
 
 use super::progress::Progress;
 use super::summary::SummaryFlags;
-use super::{DataFolder, MissingData, camera_id, open_app, runtime};
-use crate::app::{App, RunRequest};
+use super::{DataFolder, MissingData, camera_id, open_app, runtime, site_id};
+use crate::app::{App, RunRequest, SiteRunRequest};
 use crate::config::Config;
-use crate::domain::{CameraId, JobState, Recipe, RunProgress, TrainingRun};
+use crate::domain::{CameraId, JobState, Recipe, Result, RunProgress, SiteId, TrainingRun};
 use crate::shutdown::Shutdown;
 use crate::worker;
 
-/// Train a camera's model from its samples
+/// Train a camera's model from its samples, or those of all cameras of a site together
 #[derive(Args)]
 pub(super) struct Train {
     /// The camera's id
-    #[arg(long, value_name = "ID", value_parser = camera_id)]
-    camera: CameraId,
+    #[arg(long, value_name = "ID", value_parser = camera_id, required_unless_present = "site")]
+    camera: Option<CameraId>,
+    /// The site's id: its cameras are trained together, and their versions become active together or not at all
+    #[arg(long, value_name = "ID", value_parser = site_id, conflicts_with_all = ["camera", "recipe", "epochs"])]
+    site: Option<SiteId>,
     /// Recipe [default: that of the camera's profile]
     #[arg(long, value_name = "RECIPE")]
     recipe: Option<Recipe>,
@@ -40,28 +43,57 @@ impl Train {
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix train", MissingData::Refuse).await?;
-            let request = RunRequest {
-                recipe: self.recipe,
-                seed: self.seed,
-                epochs: self.epochs,
-                ..RunRequest::default()
+            let ended = match (&self.camera, &self.site) {
+                (Some(camera), _) => self.train_camera(&app, &settings, camera).await,
+                (None, Some(site)) => self.train_site(&app, &settings, site).await,
+                (None, None) => Err(anyhow::anyhow!("name a camera or a site")),
             };
-            let ended = train(&app, &settings, &self.camera, request).await;
             app.store.close().await;
-            let ended = ended?;
-            let outcome = ended.outcome.as_deref().unwrap_or("no outcome was recorded");
-            anyhow::ensure!(ended.state == JobState::Succeeded, "{}: {outcome}", ended.state.as_str());
-            let summary = self.summary.summary(None);
-            summary.document(&serde_json::json!({
-                "run": ended.id.to_string(),
-                "model_version": ended.model_version,
-                "outcome": outcome,
-                "report": ended.report,
-            }))?;
-            summary.line(&format_args!("version {} {outcome}", ended.model_version.unwrap_or_default()))?;
-            ended.report.as_ref().map_or(Ok(()), |report| summary.line(report))
+            ended
         })
     }
+
+    async fn train_camera(&self, app: &App, settings: &Config, camera: &CameraId) -> anyhow::Result<()> {
+        let request =
+            RunRequest { recipe: self.recipe, seed: self.seed, epochs: self.epochs, ..RunRequest::default() };
+        let ended = train(app, settings, camera, request).await?;
+        let outcome = succeeded(ended.state, ended.outcome.as_deref())?;
+        let summary = self.summary.summary(None);
+        summary.document(&serde_json::json!({
+            "run": ended.id.to_string(),
+            "model_version": ended.model_version,
+            "outcome": outcome,
+            "report": ended.report,
+        }))?;
+        summary.line(&format_args!("version {} {outcome}", ended.model_version.unwrap_or_default()))?;
+        ended.report.as_ref().map_or(Ok(()), |report| summary.line(report))
+    }
+
+    async fn train_site(&self, app: &App, settings: &Config, site: &SiteId) -> anyhow::Result<()> {
+        let request = SiteRunRequest { seed: self.seed, ..SiteRunRequest::default() };
+        let queued = app.start_site_run(site, request, None).await?;
+        let shutdown = Shutdown::new();
+        shutdown.spawn(worker::train_sites(app.clone(), settings.training.clone(), shutdown.clone()));
+        let changes = app.watch_site_run(site, queued.id).await?;
+        let ended = watched(queued, changes, |run| (run.state, &run.progress)).await?;
+        shutdown.drain_with_timeout(settings.limits.drain_time()).await;
+        let outcome = succeeded(ended.state, ended.outcome.as_deref())?;
+        let summary = self.summary.summary(None);
+        summary.document(&serde_json::json!({
+            "run": ended.id.to_string(),
+            "outcome": outcome,
+            "report": ended.report,
+        }))?;
+        summary.line(&outcome)?;
+        ended.report.as_ref().map_or(Ok(()), |report| summary.line(report))
+    }
+}
+
+/// The outcome of a run that has succeeded; an error for any other.
+fn succeeded(state: JobState, outcome: Option<&str>) -> anyhow::Result<&str> {
+    let outcome = outcome.unwrap_or("no outcome was recorded");
+    anyhow::ensure!(state == JobState::Succeeded, "{}: {outcome}", state.as_str());
+    Ok(outcome)
 }
 
 /// Queues a run, starts a worker in this process (a server on the same folder may claim the run first),
@@ -75,22 +107,33 @@ pub(super) async fn train(
     let queued = app.start_run(camera, request).await?;
     let shutdown = Shutdown::new();
     shutdown.spawn(worker::train(app.clone(), settings.training.clone(), shutdown.clone()));
-    let mut progress = Progress::new("{bar:40} {pos}/{len} epochs {msg}");
-    let mut latest = queued.clone();
-    let mut changes = std::pin::pin!(app.watch_run(camera, queued.id).await?);
+    let changes = app.watch_run(camera, queued.id).await?;
+    let latest = watched(queued, changes, |run| (run.state, &run.progress)).await?;
+    shutdown.drain_with_timeout(settings.limits.drain_time()).await;
+    Ok(latest)
+}
+
+/// Shows the progress of a run until it has ended.
+async fn watched<R>(
+    queued: R,
+    changes: impl Stream<Item = Result<R>>,
+    of: impl Fn(&R) -> (JobState, &RunProgress),
+) -> anyhow::Result<R> {
+    let mut bar = Progress::new("{bar:40} {pos}/{len} epochs {msg}");
+    let mut latest = queued;
+    let mut changes = std::pin::pin!(changes);
     while let Some(run) = changes.next().await {
         latest = run?;
-        let RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. } = &latest.progress;
+        let (state, RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. }) = of(&latest);
         let remaining = remaining_s.map(|seconds| format!(", {seconds:.0} s left")).unwrap_or_default();
         // Before the first epoch there is nothing to count and no error scale.
         let message = match (phase.as_str(), *epoch) {
-            ("", _) => latest.state.as_str().to_owned(),
+            ("", _) => state.as_str().to_owned(),
             (phase, 0) => format!("{phase}{remaining}"),
             (phase, _) => format!("{phase}, Es {error_scale:.3}{remaining}"),
         };
-        progress.set((*epoch).into(), (*epochs).into(), &message);
+        bar.set((*epoch).into(), (*epochs).into(), &message);
     }
-    progress.finish();
-    shutdown.drain_with_timeout(settings.limits.drain_time()).await;
+    bar.finish();
     Ok(latest)
 }

@@ -52,6 +52,7 @@ impl Config {
             .with_list_parse_key("allowed_hosts")
             .with_list_parse_key("cors_origins")
             .with_list_parse_key("trusted_proxies")
+            .with_list_parse_key("serial_devices")
             .with_list_parse_key("tls.client_camera_ids")
             .with_list_parse_key("openid.scopes")
             .with_list_parse_key("openid.admins")

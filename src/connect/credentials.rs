@@ -1,6 +1,6 @@
 //! What opens a connection, and why it does not open.
 
-use crate::exchange::Secrets;
+use crate::exchange::{SaslMechanism, Secrets};
 
 /// Why a connection does not work now; it is opened again.
 #[derive(Debug, thiserror::Error)]
@@ -28,6 +28,8 @@ impl From<&str> for PeerError {
 /// What opens connections: credentials and trust.
 pub(super) struct Credentials<'a> {
     pub(super) username: Option<&'a str>,
+    /// How the user signs in to Kafka.
+    pub(super) sasl_mechanism: Option<SaslMechanism>,
     pub(super) ca_certificate: Option<&'a str>,
     pub(super) secrets: &'a Secrets,
 }

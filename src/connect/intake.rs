@@ -7,7 +7,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use super::credentials::PeerError;
-use super::source::Message;
+use super::source::{Message, Settled};
 use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
 use crate::domain::{
@@ -226,7 +226,7 @@ impl Intake {
     ///
     /// # Errors
     /// Samples could not be stored: nothing behind is acknowledged.
-    pub(super) fn settled(&mut self) -> Result<Vec<(u64, Result<(), String>)>> {
+    pub(super) fn settled(&mut self) -> Result<Vec<Settled>> {
         let mut settled = Vec::new();
         while let Some(message) = self.pending.front() {
             for (camera, seq) in &message.items {
@@ -237,7 +237,7 @@ impl Intake {
                 }
             }
             if let Some(message) = self.pending.pop_front() {
-                settled.push((message.receipt, message.outcome));
+                settled.push(Settled { receipt: message.receipt, outcome: message.outcome });
             }
         }
         Ok(settled)

@@ -1,4 +1,4 @@
-//! Lines over TCP: from a peer that is connected to, or from clients that connect.
+//! Lines: of a peer that is connected to, of clients that connect, or of a serial device.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -12,9 +12,10 @@ use tokio::task::JoinSet;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::credentials::{Credentials, PeerError};
-use super::peer::{ByteStream, connect};
+use super::peer::connect;
+use super::serial;
 use super::source::{Message, Source};
-use crate::exchange::{Address, Scheme};
+use crate::exchange::{Address, Scheme, SerialLine};
 
 /// Asks gpsd for its reports.
 const GPSD_WATCH: &[u8] = b"?WATCH={\"enable\":true,\"json\":true};\n";
@@ -63,9 +64,11 @@ impl<S: AsyncRead + Unpin> LineReader<S> {
     }
 }
 
+type Input = Box<dyn AsyncRead + Send + Unpin>;
+
 /// Lines of a peer.
 pub(super) struct LineSource {
-    reader: LineReader<Box<dyn ByteStream>>,
+    reader: LineReader<Input>,
     peer: String,
 }
 
@@ -81,7 +84,14 @@ impl LineSource {
             stream.flush().await?;
         }
         let peer = format!("{}:{}", address.host, address.port);
-        Ok(Self { reader: LineReader::new(stream, max_bytes), peer })
+        let input: Input = Box::new(stream);
+        Ok(Self { reader: LineReader::new(input, max_bytes), peer })
+    }
+
+    pub(super) fn open_serial(line: &SerialLine, max_bytes: usize) -> Result<Self, PeerError> {
+        let input: Input = Box::new(serial::open(line)?);
+        let peer = line.path.display().to_string();
+        Ok(Self { reader: LineReader::new(input, max_bytes), peer })
     }
 }
 

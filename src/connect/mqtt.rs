@@ -27,7 +27,7 @@ use tokio_util::task::AbortOnDropHandle;
 use super::credentials::{Credentials, PeerError};
 use super::peer::{OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
-use super::source::{Message, Source, SourceIdentity};
+use super::source::{Message, Settled, Source, SourceIdentity};
 use crate::config::Limits;
 use crate::domain::OutboxMessage;
 use crate::exchange::{Address, Scheme};
@@ -242,10 +242,14 @@ impl Source for MqttSource {
         })
     }
 
-    fn settle(&mut self, receipt: u64, _outcome: Result<(), String>) -> BoxFuture<'_, Result<(), PeerError>> {
+    fn settle(&mut self, settled: Vec<Settled>) -> BoxFuture<'_, Result<(), PeerError>> {
         Box::pin(async move {
-            let Some(publish) = self.unsettled.remove(&receipt) else { return Ok(()) };
-            self.link.client.ack(&publish).await.map_err(|error| PeerError(error.to_string()))
+            for Settled { receipt, .. } in settled {
+                if let Some(publish) = self.unsettled.remove(&receipt) {
+                    self.link.client.ack(&publish).await.map_err(|error| PeerError(error.to_string()))?;
+                }
+            }
+            Ok(())
         })
     }
 }

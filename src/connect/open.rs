@@ -6,26 +6,28 @@ use super::credentials::{Credentials, PeerError};
 use super::file::{FileSettings, FileSink};
 use super::sink::Sink;
 use super::source::{Source, SourceIdentity};
-use super::{lines, mqtt, nats, push, stream, udp, webhook};
+use super::{kafka, lines, mqtt, nats, push, stream, udp, webhook};
 use crate::app::{App, LiveConnection};
-use crate::config::Limits;
-use crate::domain::ConnectionId;
-use crate::exchange::{OutgoingFormat, Scheme, Secrets, SinkSettings, SourceSettings};
+use crate::domain::{Connection, ConnectionId};
+use crate::exchange::{Address, OutgoingFormat, Scheme, Secrets, SerialLine, SinkSettings, SourceSettings};
 
 /// Time after which a new file begins, s.
 const DEFAULT_ROTATE_S: f64 = 3_600.0;
 
 /// Opens a source.
 pub(super) async fn source(
+    app: &App,
+    connection: &Connection,
     settings: &SourceSettings,
     secrets: &Secrets,
     identity: &SourceIdentity,
     live: &Arc<LiveConnection>,
-    limits: &Limits,
 ) -> Result<Box<dyn Source>, PeerError> {
+    let limits = &app.limits;
     let address = settings.address()?;
     let credentials = Credentials {
         username: settings.username.as_deref(),
+        sasl_mechanism: settings.sasl_mechanism,
         ca_certificate: settings.ca_certificate.as_deref(),
         secrets,
     };
@@ -34,6 +36,15 @@ pub(super) async fn source(
         Scheme::Mqtt | Scheme::Mqtts => Box::new(
             mqtt::MqttSource::open(&address, &settings.topics, &credentials, identity, limits).await?,
         ),
+        Scheme::Kafka | Scheme::Kafkas => {
+            let brokers = kafka::Brokers::open(&address, &credentials, &identity.client_id).await?;
+            let offsets = identity.is_lasting.then(|| (app.store.clone(), connection.key));
+            let reader = kafka::SourceReader { offsets, queue };
+            Box::new(reader.open(brokers, settings.topics.iter().cloned().collect()).await?)
+        }
+        Scheme::Serial => {
+            Box::new(lines::LineSource::open_serial(&serial_line(app, &address)?, message_bytes)?)
+        }
         Scheme::Tcp | Scheme::Tls | Scheme::Gpsd => {
             Box::new(lines::LineSource::connect(&address, &credentials, message_bytes).await?)
         }
@@ -57,6 +68,7 @@ pub(super) async fn sink(
     let address = settings.address()?;
     let credentials = Credentials {
         username: settings.username.as_deref(),
+        sasl_mechanism: settings.sasl_mechanism,
         ca_certificate: settings.ca_certificate.as_deref(),
         secrets,
     };
@@ -71,14 +83,27 @@ pub(super) async fn sink(
         Scheme::Http | Scheme::Https => {
             Box::new(webhook::Webhook::open(&address, &credentials, media_type, app.clock.clone()).await?)
         }
+        Scheme::Kafka | Scheme::Kafkas => {
+            Box::new(kafka::KafkaSink::open(&address, &credentials, client_id, media_type).await?)
+        }
         Scheme::Nats => Box::new(nats::NatsSink::open(&address, &credentials).await?),
         Scheme::Tcp | Scheme::Tls => Box::new(stream::StreamSink::open(&address, &credentials).await?),
         Scheme::Udp => Box::new(udp::UdpSink::open(&address, settings.multicast_ttl.unwrap_or(1)).await?),
         Scheme::File => Box::new(file_sink(app, connection, settings).await?),
-        Scheme::TcpListen | Scheme::Gpsd | Scheme::Push => {
+        Scheme::TcpListen | Scheme::Gpsd | Scheme::Serial | Scheme::Push => {
             return Err("a sink cannot have this address".into());
         }
     })
+}
+
+/// The serial device of an address, if the operator of the machine lets it be read.
+fn serial_line(app: &App, address: &Address) -> Result<SerialLine, PeerError> {
+    let line = address.serial_line()?;
+    if app.serial_devices.get().is_some_and(|devices| devices.contains(&line.path)) {
+        return Ok(line);
+    }
+    let path = line.path.display();
+    Err(PeerError(format!("{path} may not be read; name it in the setting serial_devices of the server")))
 }
 
 async fn file_sink(

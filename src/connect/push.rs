@@ -7,7 +7,7 @@ use futures_util::future::BoxFuture;
 use tokio::sync::{mpsc, oneshot};
 
 use super::credentials::PeerError;
-use super::source::{Message, Source};
+use super::source::{Message, Settled, Source};
 use crate::app::{LiveConnection, PushedMessage};
 
 /// Takes what `App::push_message` hands in, while it exists.
@@ -43,10 +43,12 @@ impl Source for PushSource {
         })
     }
 
-    fn settle(&mut self, receipt: u64, outcome: Result<(), String>) -> BoxFuture<'_, Result<(), PeerError>> {
-        if let Some(settled) = self.unsettled.remove(&receipt) {
-            // The client may have gone.
-            let _ = settled.send(outcome);
+    fn settle(&mut self, settled: Vec<Settled>) -> BoxFuture<'_, Result<(), PeerError>> {
+        for Settled { receipt, outcome } in settled {
+            if let Some(answer) = self.unsettled.remove(&receipt) {
+                // The client may have gone.
+                let _ = answer.send(outcome);
+            }
         }
         Box::pin(async { Ok(()) })
     }

@@ -7,7 +7,7 @@ use super::credentials::PeerError;
 
 /// A message as it came.
 pub(super) struct Message {
-    /// Names it when it is settled.
+    /// Identifies it when it is settled.
     pub(super) receipt: u64,
     /// Its topic, or the address of its sender.
     pub(super) subject: String,
@@ -19,12 +19,18 @@ pub(super) trait Source: Send {
     /// The next message. Cancelling the wait loses none.
     fn next(&mut self) -> BoxFuture<'_, Result<Message, PeerError>>;
 
-    /// Tells the peer what became of a message: what was to be stored of it is stored, or it cannot be read. Called in
-    /// the order of the messages.
-    fn settle(&mut self, receipt: u64, outcome: Result<(), String>) -> BoxFuture<'_, Result<(), PeerError>> {
-        let _ = (receipt, outcome);
+    /// Tells the peer what became of messages, in their order.
+    fn settle(&mut self, settled: Vec<Settled>) -> BoxFuture<'_, Result<(), PeerError>> {
+        drop(settled);
         Box::pin(async { Ok(()) })
     }
+}
+
+/// What became of a message.
+pub(super) struct Settled {
+    pub(super) receipt: u64,
+    /// `Ok` when all is stored that was to be stored of it, else why it cannot be read.
+    pub(super) outcome: Result<(), String>,
 }
 
 /// Who a source is to its peer.

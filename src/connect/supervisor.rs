@@ -287,7 +287,7 @@ async fn run_source(
     progressed: &AtomicBool,
 ) -> Result<Infallible, PeerError> {
     let identity = SourceIdentity { client_id: client_id(connection), is_lasting: true };
-    let mut source = open::source(settings, secrets, &identity, live, &app.limits).await?;
+    let mut source = open::source(app, connection, settings, secrets, &identity, live).await?;
     let mut intake = Intake::new(app.clone(), connection.id().clone(), live.clone(), settings)?;
     live.enter(ConnectionState::Running, app.clock.now());
     live.update(|status| status.connects += 1);
@@ -304,9 +304,7 @@ async fn run_source(
             continue;
         }
         let count = settled.len() as u64;
-        for (receipt, outcome) in settled {
-            source.settle(receipt, outcome).await?;
-        }
+        source.settle(settled).await?;
         live.update(|status| status.acknowledged += count);
     }
 }

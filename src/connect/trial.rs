@@ -7,7 +7,7 @@ use super::intake::describe;
 use super::open;
 use super::publish::payload;
 use super::sink::Outcomes;
-use super::source::SourceIdentity;
+use super::source::{Settled, SourceIdentity};
 use crate::app::{App, ConnectionState, LastMessage, connection_settings};
 use crate::domain::{CameraId, Connection, OutboxMessage, Result, TargetId};
 use crate::exchange::{MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, decoder};
@@ -83,7 +83,7 @@ async fn try_source(
         is_lasting: false,
     };
     let live = app.live_connection(connection);
-    let mut source = open::source(settings, secrets, &identity, &live, &app.limits).await?;
+    let mut source = open::source(app, connection, settings, secrets, &identity, &live).await?;
     let message = source.next().await?;
     let now = app.clock.now();
     let context = MessageContext { received_at: now, time_bounds: app.live_time_bounds() };
@@ -94,7 +94,8 @@ async fn try_source(
         }
         Err(reason) => vec![format!("rejected: {reason}")],
     };
-    source.settle(message.receipt, Err("the connection is only tried".to_owned())).await?;
+    let outcome = Err("the connection is only tried".to_owned());
+    source.settle(vec![Settled { receipt: message.receipt, outcome }]).await?;
     Ok(Some(LastMessage::new(now, message.subject, &message.payload, reading)))
 }
 

@@ -63,6 +63,10 @@ pub enum AuditAction {
     SamplesDeleted,
     /// Stored samples were replaced by those of an import.
     SamplesReplaced,
+    /// A training run of a site was queued.
+    SiteRunStarted,
+    /// A training run of a site was cancelled.
+    SiteRunCancelled,
     /// A training run was queued.
     RunStarted,
     /// A training run was cancelled.

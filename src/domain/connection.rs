@@ -92,6 +92,17 @@ pub struct OutboxMessage {
     pub created_at: Timestamp,
 }
 
+/// How far a source has read a partition of a topic.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SourceOffset {
+    /// Name of the topic.
+    pub topic: String,
+    /// Number of its partition.
+    pub partition: i32,
+    /// Offset of the first message that is not settled.
+    pub next_offset: i64,
+}
+
 /// A message that the receiver refused, or that could not be delivered for too long.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeadLetter {

@@ -71,7 +71,7 @@ pub enum ErrorKind {
     NoEarlierModel,
     /// The stored model version is damaged or cannot be loaded.
     ModelUnusable,
-    /// The camera has a training run that has not ended.
+    /// The camera, or the site, has a training run that has not ended.
     RunLive,
     /// The idempotency key was used for another request.
     IdempotencyKeyReused,

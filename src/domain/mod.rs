@@ -33,6 +33,7 @@ mod sample;
 mod sample_overflow;
 mod score;
 mod site;
+mod site_training;
 mod time;
 mod training;
 
@@ -41,7 +42,9 @@ pub use audit::{Actor, AuditAction, AuditEntry, AuditNumber};
 pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, ExpectedVersion, NewCamera, Revision};
 pub use checksum::model_sha256;
-pub use connection::{Connection, ConnectionKey, DeadLetter, NewConnection, OutboxCounts, OutboxMessage};
+pub use connection::{
+    Connection, ConnectionKey, DeadLetter, NewConnection, OutboxCounts, OutboxMessage, SourceOffset,
+};
 pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
@@ -64,9 +67,10 @@ pub use sample::{Association, Sample, SampleCount, StoredSample};
 pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
+pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport, SiteTrainingRun};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
-    HeldOutSampleError, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions, TrainingReport,
-    TrainingRun,
+    HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,
+    TrainingReport, TrainingRun,
 };

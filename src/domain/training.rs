@@ -199,6 +199,19 @@ impl fmt::Display for TrainingReport {
     }
 }
 
+/// Of which joint training a model version is part: its map's error is correlated with those of the other cameras'
+/// versions of the same run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct JointTraining {
+    /// The site.
+    pub site_id: String,
+    /// The run.
+    pub run_id: String,
+    /// The cameras, in the order of the weights.
+    pub cameras: Vec<String>,
+}
+
 /// Metadata of a model version: all but its weights. This is a document format: it is stored,
 /// downloaded and imported as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -239,6 +252,9 @@ pub struct ModelMetadata {
     /// What the run found out; `None` for models of earlier releases.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub report: Option<TrainingReport>,
+    /// The run that trained it together with the other cameras of its site, if one did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joint_training: Option<JointTraining>,
     /// Names and values of the recipe's scalar parameters (noise floors, calibration factors).
     pub parameters: std::collections::BTreeMap<String, f64>,
 }

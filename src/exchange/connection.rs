@@ -8,12 +8,11 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::address::{Address, Scheme};
 use super::messages::MessageFormat;
 use super::track_files::TrackFileFormat;
 use crate::domain::{CameraId, Error, ImageSize, ReceiverId, Result, TargetId, check_text};
 
-/// Longest address, bytes.
-const MAX_ADDRESS_BYTES: usize = 512;
 /// Cameras that a connection may name.
 const MAX_CAMERAS: usize = 1_024;
 /// Topics that a source may subscribe to.
@@ -76,24 +75,42 @@ pub struct StreamSize {
     pub height_px: u32,
 }
 
+/// How a user signs in to Kafka (SASL).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SaslMechanism {
+    /// The password is sent as it is (RFC 4616).
+    Plain,
+    /// A challenge is answered, with SHA-256 (RFC 7677).
+    #[serde(rename = "scram_sha_256")]
+    ScramSha256,
+    /// A challenge is answered, with SHA-512.
+    #[serde(rename = "scram_sha_512")]
+    ScramSha512,
+}
+
 /// Where detections or fixes come from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SourceSettings {
-    /// `mqtt://HOST[:1883]` and `mqtts://HOST[:8883]` subscribe; `tcp://`, `tls://` and `gpsd://HOST[:2947]` connect and
-    /// read lines; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
+    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]` and `kafkas://HOST[:9093]` subscribe; `tcp://`,
+    /// `tls://` and `gpsd://HOST[:2947]` connect and read lines; `serial:///dev/DEVICE?baud=4800` reads lines of a serial
+    /// device of the server's machine; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
     /// `POST /v1/connections/{connection}/messages`.
     #[schema(max_length = 512, example = "mqtt://broker.example.org:1883")]
     pub address: String,
     /// What the messages are.
     pub format: MessageFormat,
-    /// Topics of MQTT, with its wildcards.
+    /// Topics of MQTT, with its wildcards, or of Kafka.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schema(max_items = 64, example = json!(["frigate/events"]))]
     pub topics: Vec<String>,
     /// Name of the user, where the peer asks for one; the secret `password` belongs to it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub username: Option<String>,
+    /// How a user signs in to Kafka; `plain` if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sasl_mechanism: Option<SaslMechanism>,
     /// Authority of the peer's certificate (PEM); those of the operating system if left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_certificate: Option<String>,
@@ -144,21 +161,25 @@ impl OutgoingFormat {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SinkSettings {
-    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]` and `nats://HOST[:4222]` publish; `http://` and `https://` post (a webhook); `tcp://`,
-    /// `tls://` and `udp://HOST:PORT`, also of a multicast group, send; `file:` writes files to the folder of the setting
+    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]`, `kafkas://HOST[:9093]` and `nats://HOST[:4222]`
+    /// publish; `http://` and `https://` post (a webhook); `tcp://`, `tls://` and `udp://HOST:PORT`, also of a multicast group, send; `file:` writes files to the folder of the setting
     /// `export_folder`.
     #[schema(max_length = 512, example = "https://hooks.example.org/positions")]
     pub address: String,
     /// What is sent.
     #[serde(default)]
     pub format: OutgoingFormat,
-    /// Topic of MQTT, or subject of NATS; `{camera}` and `{target}` are replaced by their ids. `sightfix/{camera}/{target}`
-    /// if left out, with points for NATS.
+    /// Topic of MQTT or Kafka, or subject of NATS; `{camera}` and `{target}` are replaced by their ids.
+    /// `sightfix/{camera}/{target}` if left out, with points for NATS, and `sightfix` for Kafka, whose messages have the key
+    /// `{camera}/{target}`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub topic: Option<String>,
     /// Name of the user, where the peer asks for one; the secret `password` belongs to it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub username: Option<String>,
+    /// How a user signs in to Kafka; `plain` if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sasl_mechanism: Option<SaslMechanism>,
     /// Authority of the peer's certificate (PEM); those of the operating system if left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_certificate: Option<String>,
@@ -241,139 +262,6 @@ impl Secrets {
     }
 }
 
-/// The part of an address before the host.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[expect(missing_docs, reason = "each is the scheme of its name")]
-pub enum Scheme {
-    Mqtt,
-    Mqtts,
-    Tcp,
-    Tls,
-    TcpListen,
-    Udp,
-    Gpsd,
-    Push,
-    Http,
-    Https,
-    Nats,
-    File,
-}
-
-impl Scheme {
-    const SOURCES: [Self; 8] =
-        [Self::Mqtt, Self::Mqtts, Self::Tcp, Self::Tls, Self::TcpListen, Self::Udp, Self::Gpsd, Self::Push];
-    const SINKS: [Self; 9] = [
-        Self::Mqtt,
-        Self::Mqtts,
-        Self::Nats,
-        Self::Tcp,
-        Self::Tls,
-        Self::Udp,
-        Self::Http,
-        Self::Https,
-        Self::File,
-    ];
-    /// What is no address of another machine.
-    const LOCAL: [Self; 2] = [Self::Push, Self::File];
-
-    const fn as_str(self) -> &'static str {
-        match self {
-            Self::Mqtt => "mqtt",
-            Self::Mqtts => "mqtts",
-            Self::Tcp => "tcp",
-            Self::Tls => "tls",
-            Self::TcpListen => "tcp-listen",
-            Self::Udp => "udp",
-            Self::Gpsd => "gpsd",
-            Self::Push => "push",
-            Self::Http => "http",
-            Self::Https => "https",
-            Self::Nats => "nats",
-            Self::File => "file",
-        }
-    }
-
-    const fn default_port(self) -> Option<u16> {
-        match self {
-            Self::Mqtt => Some(1883),
-            Self::Mqtts => Some(8883),
-            Self::Gpsd => Some(2947),
-            Self::Http => Some(80),
-            Self::Https => Some(443),
-            Self::Nats => Some(4222),
-            Self::Tcp | Self::Tls | Self::TcpListen | Self::Udp | Self::Push | Self::File => None,
-        }
-    }
-}
-
-/// Where a peer is.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Address {
-    /// How it is reached.
-    pub scheme: Scheme,
-    /// Name or address of its machine; without the brackets of IPv6.
-    pub host: String,
-    /// Its port.
-    pub port: u16,
-    /// Path and query of a webhook, from `/` on.
-    pub path: String,
-}
-
-impl Address {
-    /// Reads an address of one of these schemes.
-    ///
-    /// # Errors
-    /// `InvalidArgument` naming `address`.
-    fn parse(text: &str, schemes: &[Scheme]) -> Result<Self> {
-        let invalid = |message: String| Error::invalid("address", message);
-        check_text("address", text, MAX_ADDRESS_BYTES)?;
-        let local = Scheme::LOCAL.into_iter().filter(|scheme| schemes.contains(scheme));
-        if let Some(scheme) = local.into_iter().find(|scheme| text == format!("{}:", scheme.as_str())) {
-            return Ok(Self { scheme, host: String::new(), port: 0, path: String::new() });
-        }
-        let named = text.split_once("://").and_then(|(name, rest)| {
-            Some((
-                schemes.iter().copied().find(|it| it.as_str() == name && !Scheme::LOCAL.contains(it))?,
-                rest,
-            ))
-        });
-        let Some((scheme, rest)) = named else {
-            let known: Vec<String> = schemes.iter().map(|it| format!("{}:", it.as_str())).collect();
-            return Err(invalid(format!("must begin with one of {}", known.join(", "))));
-        };
-        let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
-        if authority.contains('@') {
-            return Err(invalid("must not contain a user; give username and the secret password".to_owned()));
-        }
-        let has_path = matches!(scheme, Scheme::Http | Scheme::Https);
-        if !has_path && !matches!(path, "" | "/") {
-            return Err(invalid("must end behind the port".to_owned()));
-        }
-        if path.contains(|it: char| it.is_whitespace() || !it.is_ascii()) {
-            return Err(invalid("must be ASCII without spaces".to_owned()));
-        }
-        let (host, port) = match authority.rsplit_once(':') {
-            Some((host, port)) if !port.ends_with(']') => {
-                let port = port.parse().ok().filter(|port| *port > 0);
-                (host, Some(port.ok_or_else(|| invalid("has no port from 1 to 65535".to_owned()))?))
-            }
-            _ => (authority, None),
-        };
-        let host = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
-        let is_host = |byte: u8| byte.is_ascii_alphanumeric() || b".-_:".contains(&byte);
-        if host.is_empty() || !host.bytes().all(is_host) {
-            return Err(invalid("has no host".to_owned()));
-        }
-        let port = port.or(scheme.default_port());
-        Ok(Self {
-            scheme,
-            host: host.to_owned(),
-            port: port.ok_or_else(|| invalid("must name a port, as in HOST:PORT".to_owned()))?,
-            path: if path.is_empty() { "/".to_owned() } else { path.to_owned() },
-        })
-    }
-}
-
 impl ConnectionSettings {
     /// Checks the settings as a whole.
     ///
@@ -401,19 +289,23 @@ impl SourceSettings {
     /// # Errors
     /// `InvalidArgument` naming `address`.
     pub fn address(&self) -> Result<Address> {
-        Address::parse(&self.address, &Scheme::SOURCES)
+        Address::parse(&self.address, Scheme::SOURCES)
     }
 
     fn check(&self) -> Result<()> {
         let address = self.address()?;
-        let subscribes = matches!(address.scheme, Scheme::Mqtt | Scheme::Mqtts);
-        if subscribes == self.topics.is_empty() || self.topics.len() > MAX_TOPICS {
-            return Err(Error::invalid("topics", "must be 1 to 64 for MQTT, and none for other addresses"));
+        if address.scheme.subscribes() == self.topics.is_empty() || self.topics.len() > MAX_TOPICS {
+            let rule = "must be 1 to 64 for MQTT and Kafka, and none for other addresses";
+            return Err(Error::invalid("topics", rule));
         }
         for topic in &self.topics {
             check_text("topics", topic, 1_024)?;
+            if address.scheme.is_kafka() && !is_kafka_topic(topic) {
+                return Err(Error::invalid("topics", KAFKA_TOPIC_RULE));
+            }
         }
         check_username(self.username.as_deref())?;
+        check_sasl(self.sasl_mechanism, address.scheme, self.username.as_deref())?;
         if self.format.brings_fixes() && self.camera_ids.is_empty() {
             return Err(Error::invalid("camera_ids", "must name the cameras that the fixes are for"));
         }
@@ -482,11 +374,12 @@ impl SinkSettings {
     /// # Errors
     /// `InvalidArgument` naming `address`.
     pub fn address(&self) -> Result<Address> {
-        Address::parse(&self.address, &Scheme::SINKS)
+        Address::parse(&self.address, Scheme::SINKS)
     }
 
     fn check(&self) -> Result<()> {
-        let writes_files = self.address()?.scheme == Scheme::File;
+        let scheme = self.address()?.scheme;
+        let writes_files = scheme == Scheme::File;
         if writes_files != self.format.track_file().is_some() {
             return Err(Error::invalid(
                 "format",
@@ -494,16 +387,21 @@ impl SinkSettings {
             ));
         }
         check_username(self.username.as_deref())?;
+        check_sasl(self.sasl_mechanism, scheme, self.username.as_deref())?;
         if self.camera_ids.is_empty() {
             return Err(Error::invalid("camera_ids", "must name the cameras whose tracks are sent"));
         }
         self.cameras()?;
         if let Some(topic) = &self.topic {
             check_text("topic", topic, 1_024)?;
-            let wildcards: &[char] =
-                if self.address.starts_with("nats:") { &[' ', '*', '>'] } else { &['+', '#'] };
+            let wildcards: &[char] = if scheme == Scheme::Nats { &[' ', '*', '>'] } else { &['+', '#'] };
             if topic.contains(wildcards) {
                 return Err(Error::invalid("topic", "must not contain wildcards"));
+            }
+            // With the longest ids.
+            let longest = topic.replace("{camera}", &"c".repeat(63)).replace("{target}", &"t".repeat(128));
+            if scheme.is_kafka() && !is_kafka_topic(&longest) {
+                return Err(Error::invalid("topic", KAFKA_TOPIC_RULE));
             }
         }
         for (field, value, least) in [
@@ -533,17 +431,39 @@ impl SinkSettings {
         cameras(&self.camera_ids)
     }
 
-    /// The topic of a target, or its subject in NATS. Characters that separate levels there, or are wildcards, become
-    /// `_` in its id.
+    /// Where a target's position goes: its topic, its subject in NATS, or `TOPIC/KEY` in Kafka, whose keys are
+    /// `CAMERA/TARGET`. Characters of the target's id that topics cannot have, or that separate their levels, become `_`.
     #[must_use]
     pub fn topic_of(&self, camera: &CameraId, target: &TargetId) -> String {
-        let is_nats = self.address.starts_with("nats:");
-        let special: &[char] = if is_nats { &[' ', '.', '*', '>'] } else { &['/', '+', '#'] };
-        let default = if is_nats { "sightfix.{camera}.{target}" } else { "sightfix/{camera}/{target}" };
+        let scheme = self.address.split_once(':').map_or("", |(scheme, _)| scheme);
+        let (default, special): (&str, fn(char) -> bool) = match scheme {
+            "nats" => ("sightfix.{camera}.{target}", |it| " .*>".contains(it)),
+            "kafka" | "kafkas" => ("sightfix", |it| !is_kafka_character(it)),
+            _ => ("sightfix/{camera}/{target}", |it| "/+#".contains(it)),
+        };
         let template = self.topic.as_deref().unwrap_or(default);
-        let target = target.as_str().replace(special, "_");
-        template.replace("{camera}", camera.as_str()).replace("{target}", &target)
+        let level = target.as_str().replace(special, "_");
+        let topic = template.replace("{camera}", camera.as_str()).replace("{target}", &level);
+        if scheme.starts_with("kafka") { format!("{topic}/{camera}/{target}") } else { topic }
     }
+}
+
+/// What names of topics may have in Kafka.
+const KAFKA_TOPIC_RULE: &str = "must be 1 to 249 letters, digits, dots, hyphens and underscores for Kafka";
+
+const fn is_kafka_character(it: char) -> bool {
+    it.is_ascii_alphanumeric() || matches!(it, '.' | '-' | '_')
+}
+
+fn is_kafka_topic(name: &str) -> bool {
+    (1..=249).contains(&name.len()) && name.chars().all(is_kafka_character) && !matches!(name, "." | "..")
+}
+
+fn check_sasl(mechanism: Option<SaslMechanism>, scheme: Scheme, username: Option<&str>) -> Result<()> {
+    if mechanism.is_some() && (!scheme.is_kafka() || username.is_none()) {
+        return Err(Error::invalid("sasl_mechanism", "is for Kafka with a username"));
+    }
+    Ok(())
 }
 
 fn cameras(ids: &[String]) -> Result<Vec<CameraId>> {

@@ -10,6 +10,7 @@
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
+mod address;
 mod columns;
 mod connection;
 mod csv_header;
@@ -39,9 +40,10 @@ mod track_files;
 pub mod wire;
 mod write;
 
+pub use address::{Address, Scheme, SerialLine};
 pub use connection::{
-    Address, CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, Scheme, Secrets,
-    SinkSettings, SourceSettings,
+    CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, SaslMechanism, Secrets, SinkSettings,
+    SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};

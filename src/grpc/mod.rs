@@ -22,6 +22,7 @@ mod outbox;
 mod pages;
 mod pairings;
 mod samples;
+mod site_training;
 mod sites;
 mod statuses;
 mod stream;

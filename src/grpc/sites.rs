@@ -1,14 +1,17 @@
 //! `SiteService`: sites, and the requests for their tracks.
 
-use super::convert::{of_field, position, required, site_id, timestamp};
+use prost::Message as _;
+
+use super::convert::{instant, of_field, position, required, run_id, site_id, timestamp};
+use super::idempotency::idempotent;
 use super::mask::named_fields;
 use super::pages;
 use super::proto;
 use super::proto::site_service_server::SiteService;
 use super::statuses::{Reply, answer, client_id, request_id};
 use super::world_tracks::{Events, events, live_id};
-use crate::app::App;
-use crate::domain::{NewSite, Result, Revision, Site, SiteChange, SiteId};
+use crate::app::{App, SiteRunRequest};
+use crate::domain::{NewSite, Result, Revision, RunId, Site, SiteChange, SiteId};
 use crate::shutdown::Shutdown;
 
 pub(super) struct Sites {
@@ -114,6 +117,65 @@ impl SiteService for Sites {
             let history = app.world_track_history(&site, live_id::of_track(&asked.track_id)?).await?;
             let points = history.iter().map(|point| point.as_ref().into()).collect();
             Ok(proto::GetWorldTrackResponse { points })
+        })
+        .await
+    }
+
+    async fn start_site_training_run(
+        &self,
+        request: tonic::Request<proto::StartSiteTrainingRunRequest>,
+    ) -> Reply<proto::StartSiteTrainingRunResponse> {
+        let idempotent = idempotent(&request, "StartSiteTrainingRun");
+        answer(&self.app, request, |app, asked| async move {
+            let idempotent = idempotent?;
+            if let Some(request) = &idempotent {
+                request.hasher.update(&asked.encode_to_vec());
+            }
+            let options = SiteRunRequest {
+                seed: asked.seed,
+                from: instant(asked.from, "from")?,
+                until: instant(asked.until, "until")?,
+            };
+            let run = app.start_site_run(&site_id(&asked.site_id)?, options, idempotent).await?;
+            Ok(proto::StartSiteTrainingRunResponse { run: Some(run.into()) })
+        })
+        .await
+    }
+
+    async fn get_site_training_run(
+        &self,
+        request: tonic::Request<proto::GetSiteTrainingRunRequest>,
+    ) -> Reply<proto::GetSiteTrainingRunResponse> {
+        answer(&self.app, request, |app, asked| async move {
+            let run = app.site_run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            Ok(proto::GetSiteTrainingRunResponse { run: Some(run.into()) })
+        })
+        .await
+    }
+
+    async fn list_site_training_runs(
+        &self,
+        request: tonic::Request<proto::ListSiteTrainingRunsRequest>,
+    ) -> Reply<proto::ListSiteTrainingRunsResponse> {
+        answer(&self.app, request, |app, asked| async move {
+            let site = site_id(&asked.site_id)?;
+            let size = pages::size(asked.page_size, &app.limits)?;
+            let page = app.site_runs(&site, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
+            Ok(proto::ListSiteTrainingRunsResponse {
+                next_page_token: pages::token(page.next.as_ref()),
+                runs: page.items.into_iter().map(Into::into).collect(),
+            })
+        })
+        .await
+    }
+
+    async fn cancel_site_training_run(
+        &self,
+        request: tonic::Request<proto::CancelSiteTrainingRunRequest>,
+    ) -> Reply<proto::CancelSiteTrainingRunResponse> {
+        answer(&self.app, request, |app, asked| async move {
+            let run = app.cancel_site_run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            Ok(proto::CancelSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await
     }

@@ -114,6 +114,18 @@ impl<S: Send + Sync> FromRequestParts<S> for RunPath {
     }
 }
 
+/// A training run of a site of the path.
+pub(super) struct SiteRunPath(pub(super) SiteId, pub(super) RunId);
+
+impl<S: Send + Sync> FromRequestParts<S> for SiteRunPath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        let SiteRunSegments { site, run } = path(parts, state).await?;
+        Ok(Self(site_of(&site)?, run.parse()?))
+    }
+}
+
 /// A target of the path. What is no name of a target names none that is followed.
 pub(super) struct TargetPath(pub(super) CameraId, pub(super) TargetId);
 
@@ -173,6 +185,12 @@ struct SiteSegment {
 struct WorldTrackSegments {
     site: String,
     track: String,
+}
+
+#[derive(Deserialize)]
+struct SiteRunSegments {
+    site: String,
+    run: String,
 }
 
 #[derive(Deserialize)]

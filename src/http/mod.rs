@@ -39,6 +39,7 @@ mod samples;
 mod server_info;
 mod service;
 mod session;
+mod site_training_runs;
 mod sites;
 #[cfg(test)]
 mod tests;
@@ -214,6 +215,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(cameras::routes())
         .merge(camera_statuses::routes())
         .merge(sites::routes())
+        .merge(site_training_runs::routes())
         .merge(world_tracks::routes())
         .merge(connections::routes())
         .merge(samples::routes())

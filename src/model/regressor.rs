@@ -4,9 +4,10 @@ use super::artifact::{ModelParts, TrackNoiseModel};
 use super::encoder::Encoder;
 use super::encoder::features::{Encoded, reconstruction_error};
 use super::encoder::gaussian_process::RecentBoxes;
+use super::site::JointMap;
 use super::uncertainty::coverage::CoverageLookup;
 use super::uncertainty::error_model::{BoxError, ErrorModel};
-use crate::domain::{BoundingBox, ImageSize, Result};
+use crate::domain::{BoundingBox, ImageSize, Result, RunId};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
 use crate::statistics::R95_PER_SIGMA;
 
@@ -75,6 +76,7 @@ pub struct Regressor {
     added_m2: f64,
     pub(super) error_model: ErrorModel,
     pub(super) encoder: Encoder,
+    joint_map: Option<JointMap>,
 }
 
 impl Regressor {
@@ -83,6 +85,7 @@ impl Regressor {
     pub(super) fn build(mut parts: ModelParts) -> Result<Self> {
         let error_model = ErrorModel::build(&mut parts)?;
         let encoder = Encoder::build(&mut parts)?;
+        let joint_map = JointMap::take(&mut parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
         let track_noise = TrackNoiseModel::read(&parts)?;
         let white_share = parts.parameter_or("unrest_share", DEFAULT_WHITE_SHARE)?.clamp(0.0, 1.0);
@@ -97,6 +100,7 @@ impl Regressor {
             added_m2: 0.0,
             error_model,
             encoder,
+            joint_map,
         })
     }
 
@@ -149,6 +153,22 @@ impl Regressor {
     #[must_use]
     pub const fn uses_fix(&self) -> bool {
         matches!(self.encoder, Encoder::Paper(_))
+    }
+
+    /// The error that cameras which were trained together have in common at a box: the run that trained them, and the
+    /// part of [`Regression::covariance`] of this box that no averaging over them removes, m2. `None` for a
+    /// camera that was trained by itself: how much of its error others share is unknown then.
+    #[must_use]
+    pub fn joint_error(
+        &self,
+        bounding_box: &BoundingBox,
+        regression: &Regression,
+    ) -> Option<(RunId, PlaneCovariance)> {
+        let joint = self.joint_map.as_ref()?;
+        let map_m2 = regression.covariance.minus(regression.box_noise);
+        let common_m2 = self.encoder.widened(joint.common_m2(bounding_box));
+        let is_part = common_m2.is_finite() && map_m2.minus(common_m2).is_positive();
+        Some((joint.run(), if is_part { common_m2 } else { map_m2 }))
     }
 
     /// Position of a box's target, with its error. Only the recipe `paper` uses the fix, which is among

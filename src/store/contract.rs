@@ -8,16 +8,17 @@ use jiff::Timestamp;
 
 use super::{
     Claim, Heartbeat, IdempotencyRecord, JobCounts, JobEnd, KeysVersion, RunEnd, SampleFilter, SampleKey,
-    StorageStatus, Store, StoredAnswer, StoredHeldOutError, on_backend,
+    SiteRunEnd, StorageStatus, Store, StoredAnswer, StoredHeldOutError, on_backend,
 };
 #[cfg(doc)]
 use crate::domain::ErrorKind;
 use crate::domain::{
     ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId,
-    ConnectionKey, DeadLetter, Detection, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
-    EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
-    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision, RunId,
-    RunProgress, SecretDigest, Site, SiteId, SiteKey, StoredSample, TrainingOptions, TrainingRun,
+    ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob,
+    EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata,
+    ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision,
+    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
+    SourceOffset, StoredSample, TrainingOptions, TrainingRun,
 };
 use crate::geo::Position;
 
@@ -339,6 +340,57 @@ contract! {
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunLive`].
     fn delete_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<()>;
 
+    /// Queues a run over all cameras of a site; of several requests with the same record, the first queues a run and
+    /// the others get it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RunLive`] if the site has a run that has not ended,
+    /// [`ErrorKind::Overloaded`] if all sites together have `max_live` of them;
+    /// [`ErrorKind::IdempotencyKeyReused`] for a key of another request.
+    fn insert_site_run(&self, run: RunId, site: &SiteId, options: &SiteTrainingOptions, max_live: u32, record: Option<&IdempotencyRecord>, now: Timestamp) -> Result<SiteTrainingRun>;
+
+    /// One run of a site.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RunNotFound`].
+    fn site_run(&self, site: &SiteId, run: RunId) -> Result<SiteTrainingRun>;
+
+    /// A page of a site's runs, newest first, before an id.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteNotFound`].
+    fn site_runs(&self, site: &SiteId, before: Option<RunId>, limit: u32) -> Result<Vec<SiteTrainingRun>>;
+
+    /// Claims the oldest run of a site that is queued or whose lease has expired. Its attempt and fence go up by one;
+    /// its progress is reset.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn claim_site_run(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<SiteTrainingRun>>>;
+
+    /// Renews the lease and stores the run's progress.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn heartbeat_site_run(&self, run: RunId, fence: i64, progress: &RunProgress, lease: Duration, now: Timestamp) -> Result<Heartbeat>;
+
+    /// Cancels a run: at once where no worker holds a live lease on it, otherwise at its worker's next heartbeat. Once
+    /// this has returned, the run produces no models any more.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunEnded`].
+    fn cancel_site_run(&self, site: &SiteId, run: RunId, now: Timestamp) -> Result<SiteTrainingRun>;
+
+    /// Ends a run, or returns it to the queue, if the worker still owns its lease; `None` if it lost it, and then
+    /// nothing was changed. The models of all cameras, their activation and the run's state are one transaction. The run
+    /// fails, and nothing else is stored, if a camera was deleted, has left the site, or has another active version than
+    /// its model was compared with. A run whose cancellation was requested is cancelled even if it succeeded or
+    /// was returned.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn finish_site_run(&self, run: RunId, fence: i64, end: SiteRunEnd<'_>, now: Timestamp) -> Result<Option<SiteTrainingRun>>;
+
     /// Queues an evaluation.
     ///
     /// # Errors
@@ -544,4 +596,17 @@ contract! {
     /// # Errors
     /// Faults only.
     fn outbox_counts(&self, key: ConnectionKey) -> Result<OutboxCounts>;
+
+    /// How far a source has read the partitions of its topics.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn source_offsets(&self, key: ConnectionKey) -> Result<Vec<SourceOffset>>;
+
+    /// Stores how far a source has read partitions, all or none. A connection that was deleted has no offsets. A power cut
+    /// may undo what is stored as `relaxed`; then messages are read again.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InsufficientStorage`]; then none is stored.
+    fn store_source_offsets(&self, key: ConnectionKey, offsets: &[SourceOffset], durability: Durability) -> Result<()>;
 }

@@ -32,12 +32,14 @@ pub(super) const TABLES: &[Table] = &[
     Table { name: "training_runs", key: "id" },
     Table { name: "training_epochs", key: "run_id, epoch" },
     Table { name: "training_log", key: "run_id, line_number" },
+    Table { name: "site_training_runs", key: "id" },
     Table { name: "evaluations", key: "id" },
     Table { name: "api_keys", key: "id" },
     Table { name: "audit_log", key: "number" },
     Table { name: "idempotency_keys", key: "number" },
     Table { name: "connections", key: "key" },
     Table { name: "outbox", key: "number" },
+    Table { name: "source_offsets", key: "connection_key, topic, partition_number" },
 ];
 
 /// Tables whose keys are numbered and never used twice, with the column.

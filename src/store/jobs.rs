@@ -47,7 +47,7 @@ pub struct LiveJobs {
 /// Jobs that have not ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct JobCounts {
-    /// Training runs.
+    /// Training runs, of cameras and of sites.
     pub training: LiveJobs,
     /// Evaluations.
     pub evaluation: LiveJobs,
@@ -98,9 +98,9 @@ impl<O> JobEnd<O> {
     }
 }
 
-/// A finished job: its camera, and the output to be stored in the same transaction.
+/// A finished job: the key of what it belongs to, and the output to be stored in the same transaction.
 pub(super) struct Finished<O> {
-    pub(super) camera_key: i64,
+    pub(super) owner_key: i64,
     pub(super) output: Option<O>,
 }
 
@@ -151,6 +151,8 @@ pub(super) use lease_expired;
 /// A table of jobs. Only its fixed text goes into statements; values are bound.
 pub(super) struct JobTable {
     pub(super) table: &'static str,
+    /// Column of what a job belongs to.
+    pub(super) owner: &'static str,
     /// What messages call the table's jobs.
     pub(super) plural: &'static str,
     /// Assignments that reset the table's own columns of progress.
@@ -167,13 +169,23 @@ pub(super) fn run_priority(actor: &Actor) -> i64 {
 
 pub(super) const RUNS: JobTable = JobTable {
     table: "training_runs",
+    owner: "camera_key",
     plural: "training runs",
     reset_progress: "epoch_done = 0, epochs_planned = 0, reconstruction_error = 0, regression_error = 0, error_scale = 0",
     order: "priority DESC, id",
 };
 
+pub(super) const SITE_RUNS: JobTable = JobTable {
+    table: "site_training_runs",
+    owner: "site_key",
+    plural: "training runs of sites",
+    reset_progress: RUNS.reset_progress,
+    order: "id",
+};
+
 pub(super) const EVALUATIONS: JobTable = JobTable {
     table: "evaluations",
+    owner: "camera_key",
     plural: "evaluations",
     reset_progress: "steps_done = 0, steps_planned = 0",
     order: "id",
@@ -204,6 +216,7 @@ impl JobCounts {
 }
 
 /// The statement of [`JobCounts::of`]'s rows.
-pub(super) const COUNT_JOBS: &str = "SELECT 'training', state, count(*) FROM training_runs WHERE state IN ('queued', 'running') GROUP BY 2 \
+pub(super) const COUNT_JOBS: &str = "SELECT 'training', state, count(*) FROM (SELECT state FROM training_runs \
+     UNION ALL SELECT state FROM site_training_runs) AS runs WHERE state IN ('queued', 'running') GROUP BY 2 \
      UNION ALL \
      SELECT 'evaluation', state, count(*) FROM evaluations WHERE state IN ('queued', 'running') GROUP BY 2";

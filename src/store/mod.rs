@@ -44,6 +44,7 @@ pub use rows::keys::KeysVersion;
 pub use rows::models::{NewModel, StoredHeldOutError};
 pub use rows::runs::{RunEnd, RunOutput};
 pub use rows::samples::{SampleFilter, SampleKey};
+pub use rows::site_runs::{SiteCameraOutput, SiteRunEnd, SiteRunOutput};
 pub use sqlite::{
     DatabaseReport, ExistingFile, Occupant, Restored, back_up, disk_available_bytes, has_database, inspect,
     restore, server_of,

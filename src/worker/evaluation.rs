@@ -30,7 +30,7 @@ impl Job for EvaluationJob {
     type Output = Evaluated;
 
     fn identity(&self) -> JobIdentity<'_> {
-        JobIdentity { id: self.id.0, camera: &self.camera_id, attempt: self.attempt }
+        JobIdentity { id: self.id.0, camera: Some(&self.camera_id), site: None, attempt: self.attempt }
     }
 
     fn queue(app: &App) -> &JobQueue {

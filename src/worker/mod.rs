@@ -8,6 +8,7 @@
 mod evaluation;
 mod job_thread;
 mod promotion;
+mod site_training;
 mod training;
 
 use std::sync::Arc;
@@ -19,7 +20,8 @@ use uuid::Uuid;
 use crate::app::{App, JobQueue};
 use crate::config::Workers;
 use crate::domain::{
-    CameraId, Detection, Error, ErrorKind, EvaluationJob, JobState, Result, Sample, StoredSample, TrainingRun,
+    CameraId, Detection, Error, ErrorKind, EvaluationJob, JobState, Result, Sample, SiteId, SiteTrainingRun,
+    StoredSample, TrainingRun,
 };
 use crate::shutdown::Shutdown;
 use crate::store::{Claim, Heartbeat, SampleFilter};
@@ -36,9 +38,15 @@ const MAX_ATTEMPTS: u32 = 5;
 /// Samples read at a time.
 const PAGE_SAMPLES: u32 = 10_000;
 
-/// Works on queued training runs until the server shuts down.
+/// Works on queued training runs of cameras until the server shuts down.
 pub async fn train(app: App, settings: Workers, shutdown: Shutdown) {
     work::<TrainingRun>(app, settings, shutdown).await;
+}
+
+/// Works on queued training runs of sites until the server shuts down, one at a time: each has the samples of all its
+/// cameras in memory.
+pub async fn train_sites(app: App, settings: Workers, shutdown: Shutdown) {
+    work::<SiteTrainingRun>(app, Workers { workers: settings.workers.min(1), ..settings }, shutdown).await;
 }
 
 /// Works on queued evaluations until the server shuts down.
@@ -52,7 +60,8 @@ type Work<J> = Box<dyn FnOnce(&ProgressSink<<J as Job>::Progress>) -> <J as Job>
 /// What the log and the rules of attempts need of a job.
 struct JobIdentity<'a> {
     id: Uuid,
-    camera: &'a CameraId,
+    camera: Option<&'a CameraId>,
+    site: Option<&'a SiteId>,
     attempt: u32,
 }
 
@@ -137,9 +146,10 @@ async fn work<J: Job>(app: App, settings: Workers, shutdown: Shutdown) {
 
 /// Runs one claimed job to its end, whatever that is.
 async fn run_to_end<J: Job>(app: &App, claim: Claim<J>, lease: Duration, shutdown: &Shutdown) {
-    let JobIdentity { id, camera, attempt } = claim.job.identity();
+    let JobIdentity { id, camera, site, attempt } = claim.job.identity();
     let started = Instant::now();
-    tracing::info!(job.id = %id, camera.id = %camera, attempt, "{} begins", J::NAME);
+    let (camera, site) = (camera.map(tracing::field::display), site.map(tracing::field::display));
+    tracing::info!(job.id = %id, camera.id = camera, site.id = site, attempt, "{} begins", J::NAME);
     let state = match run_attempt(app, &claim, lease, shutdown).await {
         Ok(Some(state)) => state,
         Ok(None) => {

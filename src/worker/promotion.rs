@@ -31,6 +31,23 @@ pub(super) struct PromotionDecision {
     pub(super) reason: String,
 }
 
+/// Whether to activate the new versions of all cameras of a site, and what was found per camera.
+pub(super) struct SitePromotion {
+    pub(super) activate: bool,
+    /// A sentence for the operator.
+    pub(super) reason: String,
+    /// In the order of the candidates.
+    pub(super) cameras: Vec<CameraPromotion>,
+}
+
+/// What was found of one camera of a site.
+pub(super) struct CameraPromotion {
+    /// The active version, if there is one.
+    pub(super) compared_with: Option<u32>,
+    /// A sentence for the operator.
+    pub(super) comparison: String,
+}
+
 /// A fitted model that asks for promotion.
 pub(super) struct PromotionCandidate<'a> {
     pub(super) artifact: &'a Artifact,
@@ -54,6 +71,14 @@ struct Comparison {
 }
 
 impl Comparison {
+    fn plus(&self, other: &Self) -> Self {
+        Self {
+            samples: self.samples + other.samples,
+            new_m: self.new_m + other.new_m,
+            active_m: self.active_m + other.active_m,
+        }
+    }
+
     fn add(&mut self, new_m: f64, active_m: f64) {
         self.samples += 1.0;
         self.new_m += new_m;
@@ -67,12 +92,52 @@ impl Comparison {
 
     /// Means in m: of the new version, then of the active one.
     fn describe(&self, number: u32) -> String {
+        self.describe_against(&format!("version {number}"))
+    }
+
+    fn describe_against(&self, other: &str) -> String {
         format!(
-            "{:.3} m from {} held-out fixes against {:.3} m of version {number}",
+            "{:.3} m from {} held-out fixes against {:.3} m of {other}",
             self.new_m / self.samples,
             self.samples,
             self.active_m / self.samples
         )
+    }
+}
+
+/// What is known of a new version and the active one.
+enum Finding {
+    /// There is nothing to compare with, or nothing that could be compared.
+    Decided(PromotionDecision),
+    /// Both were measured.
+    Measured(Measured),
+}
+
+/// A new version and the active one on held-out samples.
+struct Measured {
+    /// Number of the active version.
+    number: u32,
+    /// On the samples that the active version was held to.
+    own: Comparison,
+    /// On those and the new version's.
+    all: Comparison,
+}
+
+impl Measured {
+    fn decide(&self) -> PromotionDecision {
+        let Self { number, own, all } = self;
+        if own.new_is_worse(TOLERANCE) {
+            keep(
+                *number,
+                &format!("on the samples that it was held to, the new one is {}", own.describe(*number)),
+            )
+        } else if all.new_is_worse(1.0) {
+            keep(*number, &all.describe(*number))
+        } else if all.samples == 0.0 {
+            activate(format!("version {number} has no held-out samples that count any more"))
+        } else {
+            activate(all.describe(*number))
+        }
     }
 }
 
@@ -102,15 +167,67 @@ pub(super) async fn decide(
     id: &CameraId,
     new: &PromotionCandidate<'_>,
 ) -> Result<PromotionDecision> {
-    let camera = app.store.camera(id).await?;
-    let Some(number) = camera.active_model else {
-        return Ok(activate("the camera had no model".to_owned()));
+    Ok(match measure(app, id, app.store.camera(id).await?.active_model, new).await? {
+        Finding::Decided(decision) => decision,
+        Finding::Measured(measured) => measured.decide(),
+    })
+}
+
+/// Compares the new versions of all cameras of a site with the active ones, by the rule of [`decide`] for the set: on the
+/// held-out samples of all cameras together the new versions must be no worse, and no camera's may be worse by more than
+/// the scatter between two fits ([`TOLERANCE`]). Either all become active or none.
+pub(super) async fn decide_site(
+    app: &App,
+    candidates: &[(&CameraId, PromotionCandidate<'_>)],
+) -> Result<SitePromotion> {
+    let mut cameras = Vec::with_capacity(candidates.len());
+    let mut objection = None;
+    let mut all = Comparison::default();
+    for (id, candidate) in candidates {
+        let active = app.store.camera(id).await?.active_model;
+        let (is_worse, comparison) = match measure(app, id, active, candidate).await? {
+            Finding::Decided(PromotionDecision { activate, reason }) => (!activate, reason),
+            Finding::Measured(measured) => {
+                all = all.plus(&measured.all);
+                let is_worse = measured.own.new_is_worse(TOLERANCE) || measured.all.new_is_worse(TOLERANCE);
+                (is_worse, measured.all.describe(measured.number))
+            }
+        };
+        if is_worse && objection.is_none() {
+            objection = Some(format!("of camera {id}: {comparison}"));
+        }
+        cameras.push(CameraPromotion { compared_with: active, comparison });
+    }
+    let measured = all.describe_against("the active versions");
+    if objection.is_none() && all.new_is_worse(1.0) {
+        objection = Some(format!("over all cameras, {measured}"));
+    }
+    let count = cameras.len();
+    let reason = match &objection {
+        Some(objection) => format!(
+            "no version became active: {objection}; activate them camera by camera if they are the better"
+        ),
+        None if all.samples == 0.0 => format!("the versions of all {count} cameras became active together"),
+        None => format!("the versions of all {count} cameras became active together: {measured}"),
+    };
+    Ok(SitePromotion { activate: objection.is_none(), reason, cameras })
+}
+
+/// Measures a new version and the active one.
+async fn measure(
+    app: &App,
+    id: &CameraId,
+    active: Option<u32>,
+    new: &PromotionCandidate<'_>,
+) -> Result<Finding> {
+    let Some(number) = active else {
+        return Ok(Finding::Decided(activate("the camera had no model".to_owned())));
     };
     let Some((active, _)) = app.registry.refresh_camera(&app.store, id).await?.model.clone() else {
-        return Ok(activate(format!("version {number} cannot be used")));
+        return Ok(Finding::Decided(activate(format!("version {number} cannot be used"))));
     };
     if new.held_out.is_empty() {
-        return Ok(keep(number, "the new one has no held-out errors to compare"));
+        return Ok(Finding::Decided(keep(number, "the new one has no held-out errors to compare")));
     }
     let moved_at = app.store.camera_move(id, number).await?.map(|moved| moved.began_at);
     let counts =
@@ -118,21 +235,12 @@ pub(super) async fn decide(
     let stored = app.store.held_out_errors(id, number).await?;
     if stored.is_empty() {
         let recorded = app.store.model(id, number).await?.metadata;
-        return Ok(against_recorded(number, new, &active, &recorded));
+        let comparison = against_recorded(new, &active, &recorded);
+        return Ok(Finding::Measured(Measured { number, own: Comparison::default(), all: comparison }));
     }
     let own = on_active_samples(new, &stored, &counts)?;
-    let mut all = on_new_samples(new, &active, &stored, &counts);
-    (all.samples, all.new_m, all.active_m) =
-        (all.samples + own.samples, all.new_m + own.new_m, all.active_m + own.active_m);
-    Ok(if own.new_is_worse(TOLERANCE) {
-        keep(number, &format!("on the samples that it was held to, the new one is {}", own.describe(number)))
-    } else if all.new_is_worse(1.0) {
-        keep(number, &all.describe(number))
-    } else if all.samples == 0.0 {
-        activate(format!("version {number} has no held-out samples that count any more"))
-    } else {
-        activate(all.describe(number))
-    })
+    let all = on_new_samples(new, &active, &stored, &counts).plus(&own);
+    Ok(Finding::Measured(Measured { number, own, all }))
 }
 
 /// Both versions on the stored held-out samples of the active one. The new version's error there is its own
@@ -194,20 +302,14 @@ fn on_new_samples(
 /// Against a version without stored held-out errors (imported, or of an earlier release): its error is the
 /// larger of what its metadata state and what it shows on the new version's samples.
 fn against_recorded(
-    number: u32,
     new: &PromotionCandidate<'_>,
     active: &Regressor,
     recorded: &ModelMetadata,
-) -> PromotionDecision {
+) -> Comparison {
     let everything = on_new_samples(new, active, &[], &|_| true);
     let recorded_m = recorded.held_out.as_ref().map_or(0.0, |held_out| held_out.mean_to_fix_m);
     let active_m = everything.active_m.max(recorded_m * everything.samples);
-    let comparison = Comparison { active_m, ..everything };
-    if comparison.new_is_worse(1.0) {
-        keep(number, &comparison.describe(number))
-    } else {
-        activate(comparison.describe(number))
-    }
+    Comparison { active_m, ..everything }
 }
 
 fn activate(why: String) -> PromotionDecision {

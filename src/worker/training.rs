@@ -17,7 +17,7 @@ use crate::telemetry::{JobMetrics, Metrics};
 /// What a fit has reported since the last look.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Update {
-    progress: RunProgress,
+    pub(super) progress: RunProgress,
     epochs: Vec<EpochReport>,
     notes: Vec<String>,
 }
@@ -47,7 +47,7 @@ impl Job for TrainingRun {
     type Output = Fitted;
 
     fn identity(&self) -> JobIdentity<'_> {
-        JobIdentity { id: self.id.0, camera: &self.camera_id, attempt: self.attempt }
+        JobIdentity { id: self.id.0, camera: Some(&self.camera_id), site: None, attempt: self.attempt }
     }
 
     fn queue(app: &App) -> &JobQueue {
@@ -146,7 +146,8 @@ impl Job for TrainingRun {
     }
 }
 
-fn report(sink: &ProgressSink<Update>, event: FitEvent<'_>) -> std::ops::ControlFlow<()> {
+/// Tells an observer of the job what a fit reports.
+pub(super) fn report(sink: &ProgressSink<Update>, event: FitEvent<'_>) -> std::ops::ControlFlow<()> {
     sink.update(|update| match event {
         FitEvent::Progress(progress) => {
             update.progress.clone_from(progress);

@@ -60,6 +60,7 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("rustls_native_certs", &["tls_client"]),
     ("ring", &["openid"]),
     ("rumqttc", &["connect"]),
+    ("rskafka", &["connect"]),
     ("hmac", &["connect"]),
     ("clap", &["cli"]),
     ("clap_complete", &["cli"]),

@@ -1,9 +1,10 @@
 //! Connections with other systems: their messages, brokers, receivers, webhooks, Cursor on Target, files. Tests whose names
-//! contain `broker` start a real mosquitto or nats-server; they are ignored by default, and `.ci/run` installs both and
-//! runs them.
+//! contain `broker` start a real mosquitto or nats-server, or librdkafka's mock cluster; they are ignored by default, and
+//! `.ci/run` installs what they need and runs them.
 
 mod broker;
 mod files;
+mod kafka;
 mod messages;
 pub(crate) mod peers;
 mod receivers;

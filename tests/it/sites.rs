@@ -2,4 +2,5 @@
 
 mod resource;
 mod tracks;
+mod training;
 mod two_cameras;

@@ -17,18 +17,20 @@ export interface Kind {
 }
 
 const MQTT = 'mqtt://broker:1883';
+const KAFKA = 'kafka://broker:9092';
 const detector = (key: string, text: TextKey, addresses: string[]): Kind => ({ key, text, direction: 'source', format: key, addresses, fields: ['topics', 'cameras', 'store_samples', 'username', 'ca_certificate'] });
 const receiver = (key: string, text: TextKey, addresses: string[], fields: Field[] = []): Kind => ({ key, text, direction: 'source', format: key, addresses, fields: ['topics', 'camera_ids', ...fields, 'store_samples', 'username', 'ca_certificate'] });
 const sink = (key: string, text: TextKey, format: string, addresses: string[], fields: Field[]): Kind => ({ key, text, direction: 'sink', format, addresses, fields: ['camera_ids', ...fields, 'min_interval_s'] });
 
 export const KINDS: Kind[] = [
   detector('frigate', 'connections.kind.frigate', [MQTT, 'push:']),
-  detector('deepstream', 'connections.kind.deepstream', [MQTT, 'push:']),
+  detector('deepstream', 'connections.kind.deepstream', [MQTT, KAFKA, 'push:']),
   detector('onvif', 'connections.kind.onvif', ['push:', MQTT]),
-  receiver('nmea', 'connections.kind.nmea', ['tcp://receiver:4001', 'udp://0.0.0.0:10110', 'tcp-listen://0.0.0.0:10110', MQTT], ['receiver_id']),
+  receiver('nmea', 'connections.kind.nmea', ['tcp://receiver:4001', 'udp://0.0.0.0:10110', 'tcp-listen://0.0.0.0:10110', 'serial:///dev/ttyUSB0?baud=4800', MQTT], ['receiver_id']),
   receiver('gpsd', 'connections.kind.gpsd', ['gpsd://localhost:2947']),
   receiver('traccar', 'connections.kind.traccar', ['push:']),
   sink('mqtt', 'connections.kind.mqtt', 'json', [MQTT, 'mqtts://broker:8883'], ['topic', 'username', 'ca_certificate']),
+  sink('kafka', 'connections.kind.kafka', 'json', [KAFKA, 'kafkas://broker:9093'], ['topic', 'username', 'ca_certificate']),
   sink('nats', 'connections.kind.nats', 'json', ['nats://localhost:4222'], ['topic', 'username']),
   sink('webhook', 'connections.kind.webhook', 'json', ['https://hooks.example.org/positions'], ['ca_certificate']),
   sink('cot', 'connections.kind.cot', 'cot', ['udp://239.2.3.1:6969', 'tcp://tak.example.org:8087', 'tls://tak.example.org:8089'], ['cot', 'ca_certificate']),
@@ -36,11 +38,11 @@ export const KINDS: Kind[] = [
 
 const schemeOf = (address: string): string => address.split(':')[0]!;
 /** The name of a user, its password and an authority belong to addresses that have a peer to sign in at. */
-const isEncrypted = (address: string): boolean => /^(mqtts|tls|https)$/.test(schemeOf(address));
+const isEncrypted = (address: string): boolean => /^(mqtts|kafkas|tls|https)$/.test(schemeOf(address));
 
 /** Fields of a kind that an address leaves open. */
 export function fieldsOf(kind: Kind, address: string): Field[] {
-  const isBroker = /^(mqtts?|nats)$/.test(schemeOf(address));
+  const isBroker = /^(mqtts?|kafkas?|nats)$/.test(schemeOf(address));
   return kind.fields.filter((field) => {
     if (field === 'topics' || field === 'topic' || field === 'username') return isBroker;
     return field === 'ca_certificate' ? isEncrypted(address) : true;
@@ -51,7 +53,7 @@ export function fieldsOf(kind: Kind, address: string): Field[] {
 export function secretsOf(kind: Kind, address: string): Secret[] {
   const scheme = schemeOf(address);
   return [
-    ...(/^(mqtts?|nats)$/.test(scheme) ? (['password'] as const) : []),
+    ...(/^(mqtts?|kafkas?|nats)$/.test(scheme) ? (['password'] as const) : []),
     ...(kind.direction === 'sink' && /^https?$/.test(scheme) ? (['signing_key', 'authorization'] as const) : []),
     ...(isEncrypted(address) ? (['client_certificate', 'client_key'] as const) : []),
   ];

@@ -7,15 +7,14 @@ use jiff::Timestamp;
 use super::box_figures::{BoxFigures, BoxRecord};
 use super::recording::{LabelledBox, RecordedFix, SiteRecording};
 use super::world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};
-use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation, ReceiverId};
+use crate::domain::{BoundingBox, ImageSize, ReceiverId};
 use crate::fusion::world::{CameraFrame, WorldDetection, WorldTrackSettings, WorldTracker};
 use crate::geo::PlaneCovariance;
-use crate::model::{SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, fit_site};
+use crate::model::{
+    RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, box_at,
+    fit_site,
+};
 
-/// Correlation of the receivers' errors that the fit assumes.
-const RECEIVER_CORRELATION: NoiseCorrelation = NoiseCorrelation { white_share: 0.08, time_constant_s: 30.0 };
-/// Boxes on both sides of a fix are joined by a line over at most this long a gap, s.
-const LONGEST_BOX_GAP_S: f64 = 1.1;
 /// A track is reported at an instant if a camera measured it within this time, s.
 const REPORTED_WITHIN_S: f64 = 0.05;
 
@@ -69,11 +68,7 @@ pub fn train_site(recording: &SiteRecording, training: SiteTraining) -> Result<T
         }
         SiteTraining::Apart => (0..recording.cameras.len())
             .map(|camera| {
-                let of_camera = |fix: &SiteFix| {
-                    let (_, bounding_box) = fix.boxes.iter().find(|(at, _)| *at == camera)?;
-                    Some(SiteFix { boxes: vec![(0, *bounding_box)], ..fix.clone() })
-                };
-                let own: Vec<SiteFix> = fixes.iter().filter_map(of_camera).collect();
+                let own: Vec<SiteFix> = fixes.iter().filter_map(|fix| fix.seen_by(camera)).collect();
                 fit(&[recording.image_size], &own, &[]).map_err(|error| match error {
                     SiteFitError::TooFewRows { .. } => SiteFitError::TooFewRows { camera },
                     other => other,
@@ -127,7 +122,7 @@ pub fn site_fit_rows(recording: &SiteRecording) -> (Vec<SiteFix>, Vec<SitePair>)
         let boxes: Vec<(usize, BoundingBox)> = by_camera
             .iter()
             .enumerate()
-            .filter_map(|(camera, targets)| Some((camera, box_at(targets.get(&target)?, fix.time)?)))
+            .filter_map(|(camera, targets)| Some((camera, labelled_box_at(targets.get(&target)?, fix.time)?)))
             .collect();
         (!boxes.is_empty()).then(|| SiteFix {
             receiver: fix.receiver as u32,
@@ -154,23 +149,8 @@ pub fn site_fit_rows(recording: &SiteRecording) -> (Vec<SiteFix>, Vec<SitePair>)
     (recording.fixes.iter().filter_map(site_fix).collect(), pairs.collect())
 }
 
-/// The box of a target at an instant, on the line between those before and after.
-fn box_at(boxes: &[&LabelledBox], time: Timestamp) -> Option<BoundingBox> {
-    let next = boxes.partition_point(|labelled| labelled.time < time);
-    let after = boxes.get(next)?;
-    if after.time == time {
-        return Some(after.bounding_box);
-    }
-    let before = boxes[next.checked_sub(1)?];
-    let gap_s = after.time.duration_since(before.time).as_secs_f64();
-    if gap_s > LONGEST_BOX_GAP_S {
-        return None;
-    }
-    let part = time.duration_since(before.time).as_secs_f64() / gap_s;
-    let (from, to) = (before.bounding_box.sides_px(), after.bounding_box.sides_px());
-    let [left_px, top_px, width_px, height_px] =
-        std::array::from_fn(|side| from[side] + part * (to[side] - from[side]));
-    BoundingBox::new(left_px, top_px, width_px, height_px).ok()
+fn labelled_box_at(boxes: &[&LabelledBox], time: Timestamp) -> Option<BoundingBox> {
+    box_at(boxes, |labelled| (labelled.time, labelled.bounding_box), time)
 }
 
 /// Tracks the boxes of some cameras and scores the tracks against the truth; `visible` is the recording whose boxes

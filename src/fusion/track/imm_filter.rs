@@ -174,7 +174,10 @@ impl ImmFilter {
             east_m: fix.position.east_m - regressed.position.east_m,
             north_m: fix.position.north_m - regressed.position.north_m,
         };
-        let pair_nis = fix.covariance.plus(regressed.covariance.scaled(regressed.stated_scale)).mahalanobis_squared(difference);
+        let pair_nis = fix
+            .covariance
+            .plus(regressed.covariance.scaled(regressed.stated_scale))
+            .mahalanobis_squared(difference);
         let is_outside = |source, measured| {
             let inflation = self.correlated_noise_inflation(settings, source);
             let decomposition = NoiseDecomposition::new(settings, source, measured, inflation);
@@ -310,7 +313,9 @@ impl ImmFilter {
     }
 
     fn predict_measurement(&self, decomposition: &NoiseDecomposition) -> [PredictedMeasurement; MODES] {
-        std::array::from_fn(|mode| self.modes[mode].predict_measurement(decomposition, self.camera.stated_scale))
+        std::array::from_fn(|mode| {
+            self.modes[mode].predict_measurement(decomposition, self.camera.stated_scale)
+        })
     }
 
     /// The chi-square gate: `nis`, of the mixture, or the penalised NIS of the best mode is within

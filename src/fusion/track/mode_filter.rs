@@ -278,7 +278,8 @@ impl ModeFilter {
         PredictedMeasurement {
             innovation,
             innovation_covariance,
-            stated_covariance: innovation_covariance.plus(camera[0].plus(camera[1]).scaled(camera_scale - 1.0)),
+            stated_covariance: innovation_covariance
+                .plus(camera[0].plus(camera[1]).scaled(camera_scale - 1.0)),
             cross_covariance: cross,
         }
     }
@@ -286,7 +287,8 @@ impl ModeFilter {
     /// The Kalman update `K = P H' S^-1`. Returns the log-likelihood of the measurement without its
     /// constant, `-(d' S^-1 d + ln det S) / 2`.
     pub(super) fn update(&mut self, predicted: &PredictedMeasurement) -> f64 {
-        let PredictedMeasurement { innovation, innovation_covariance, cross_covariance: cross, .. } = predicted;
+        let PredictedMeasurement { innovation, innovation_covariance, cross_covariance: cross, .. } =
+            predicted;
         let determinant = innovation_covariance.determinant();
         let inverse = [
             innovation_covariance.north_m2 / determinant,

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use bytes::Bytes;
 
 use self::tensors::{LARGEST_MAGNITUDE, Tensors, is_usable};
-use crate::domain::{Error, FeatureScale, ModelMetadata, Recipe, Result};
+use crate::domain::{Error, FeatureScale, JointTraining, ModelMetadata, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane, Position};
 
 pub use self::tensors::LARGEST_WEIGHTS_BYTES;
@@ -51,6 +51,7 @@ impl Artifact {
             error_scale: positive("error_scale", metadata.error_scale)?,
             e_gnss_m2: positive("e_gnss_m2", metadata.e_gnss_m2)?,
             parameters: metadata.parameters.clone(),
+            joint_training: metadata.joint_training.clone(),
             tensors: Tensors::from_bytes(&self.weights)?,
         })
     }
@@ -81,6 +82,8 @@ pub(crate) struct ModelParts {
     pub(crate) e_gnss_m2: f64,
     /// The recipe's scalars by name.
     pub(crate) parameters: BTreeMap<String, f64>,
+    /// The run that trained it together with other cameras, if one did.
+    pub(crate) joint_training: Option<JointTraining>,
     pub(crate) tensors: Tensors,
 }
 
@@ -99,6 +102,7 @@ impl ModelParts {
             error_scale: 1.0,
             e_gnss_m2,
             parameters: BTreeMap::new(),
+            joint_training: None,
             tensors: Tensors::default(),
         }
     }

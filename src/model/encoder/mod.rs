@@ -19,7 +19,7 @@ use self::paper::PaperEncoder;
 use self::projective::{GeometricCovariance, ProjectiveEncoder};
 use super::artifact::ModelParts;
 use crate::domain::{BoundingBox, Error, Recipe, Result};
-use crate::geo::LocalPlane;
+use crate::geo::{LocalPlane, PlaneCovariance};
 
 /// The encoder of a loaded model, by recipe.
 #[derive(Debug, Clone)]
@@ -47,6 +47,18 @@ impl Encoder {
                 return Err(Error::invalid("metadata.recipe", message));
             }
         })
+    }
+
+    /// The error that a map and others have in common (m2), as this encoder states it: widened as the map's own, and
+    /// with the bias that all receivers have in common.
+    pub(crate) fn widened(&self, common_m2: PlaneCovariance) -> PlaneCovariance {
+        match self {
+            Self::GaussianProcess(map) => {
+                let bias = PlaneCovariance::isotropic(map.predictor.shared_bias_m2);
+                common_m2.scaled(map.predictor.widening).plus(bias)
+            }
+            Self::Paper(_) | Self::Hybrid(_) | Self::Projective(_) => common_m2,
+        }
     }
 
     /// Position and reconstruction of a box alone.

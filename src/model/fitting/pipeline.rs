@@ -32,9 +32,9 @@ use crate::model::uncertainty::calibration::{HeldOut, calibrate, calibrate_recon
 use crate::model::uncertainty::error_model::set_image_size;
 
 /// Rows that a fit uses at most: neighbours repeat each other, and time and memory stay bounded.
-const MAX_ROWS: usize = 20_000;
+pub(super) const MAX_ROWS: usize = 20_000;
 /// Least error variance of a receiver that is estimated, m2.
-const LEAST_GNSS_VARIANCE_M2: f64 = 1e-4;
+pub(super) const LEAST_GNSS_VARIANCE_M2: f64 = 1e-4;
 
 /// What a fit learns from.
 #[derive(Debug, Clone, Copy)]
@@ -159,7 +159,7 @@ fn selected(recipe: Recipe, name: Option<&str>) -> Result<Vec<&'static Candidate
 
 /// The receiver's error variance per axis (m2): as stated, else the variance of the fixes about the
 /// geometric map.
-fn receiver_variance(
+pub(super) fn receiver_variance(
     rows: &TrainingRows,
     known: GnssError,
     noise: &GaussMarkovNoise,
@@ -328,6 +328,7 @@ fn artifact_of(
             held_out: Some(held_out),
             candidates: reports,
             report: Some(report),
+            joint_training: None,
             parameters: parts.parameters,
         },
         weights,

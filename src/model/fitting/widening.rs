@@ -7,9 +7,7 @@ use crate::model::progress::FitError;
 use crate::model::regressor::Regressor;
 use crate::model::samples::rows::{TrainingRow, TrainingRows};
 
-/// Widens the stated radius of a calibrated model by one factor, at least 1, at which the mean residuals of
-/// the left-out sequences (the rows of one target within one group) are as large as receiver and map
-/// state together, beyond chance.
+/// Widens the stated radius of a calibrated model by its [`held_out_widening`].
 ///
 /// # Errors
 /// [`FitError::Fault`] if the model cannot be used.
@@ -20,13 +18,27 @@ pub(super) fn widen_radius(
     residuals_m: &[[f64; 2]],
     noise: &GaussMarkovNoise,
 ) -> Result<(), FitError> {
+    let factor = held_out_widening(parts, rows, groups, residuals_m, noise)?;
+    let r95_scale = parts.positive_parameter("r95_scale").map_err(FitError::fault)?;
+    parts.set("r95_scale", factor.sqrt() * r95_scale);
+    parts.set("held_out_widening", factor);
+    Ok(())
+}
+
+/// The factor of the stated variance, at least 1, at which the mean residuals of the left-out sequences (the rows of one
+/// target within one group) are as large as receiver and map state together, beyond chance.
+///
+/// # Errors
+/// [`FitError::Fault`] if the model cannot be used.
+pub(super) fn held_out_widening(
+    parts: &ModelParts,
+    rows: &TrainingRows,
+    groups: &[u32],
+    residuals_m: &[[f64; 2]],
+    noise: &GaussMarkovNoise,
+) -> Result<f64, FitError> {
     let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
-    let coloured_share = 1.0 - noise.correlation.white_share;
-    let receiver = ReceiverNoise {
-        short_m2: coloured_share * noise.variance_m2,
-        short_time_s: noise.correlation.time_constant_s,
-        ..ReceiverNoise::white(noise.correlation.white_share * noise.variance_m2)
-    };
+    let receiver = ReceiverNoise::of_gauss_markov(noise);
     let mut means = Vec::new();
     for group in 0..=groups.iter().copied().max().unwrap_or(0) {
         let members: Vec<usize> = (0..groups.len()).filter(|row| groups[*row] == group).collect();
@@ -45,9 +57,5 @@ pub(super) fn widen_radius(
             });
         }
     }
-    let factor = widening(&means);
-    let r95_scale = parts.positive_parameter("r95_scale").map_err(FitError::fault)?;
-    parts.set("r95_scale", factor.sqrt() * r95_scale);
-    parts.set("held_out_widening", factor);
-    Ok(())
+    Ok(widening(&means))
 }

@@ -1,11 +1,14 @@
 //! The fit of a site: robust starts per camera, then all cameras together.
 
+use std::ops::ControlFlow;
+
 use super::ground_map::GroundMap;
 use super::input::{FEWEST_ROWS, SiteFitError, SiteFitInput, SiteFix, foot_and_size, is_foot_cut};
 use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
 use super::maps::SiteMaps;
 use crate::domain::GaussMarkovNoise;
 use crate::model::encoder::gaussian_process::projective_mean::Box4;
+use crate::model::encoder::gaussian_process::{FootPrior, UprightGeometry, UprightStarts};
 use crate::statistics::median;
 
 /// Standard deviation per axis of the fixes and of the feet before they are estimated, m and px.
@@ -16,11 +19,14 @@ const SIGMA_RANGE_M: [f64; 2] = [0.02, 100.0];
 const FOOT_SIGMA_RANGE_PX: [f64; 2] = [0.5, 50.0];
 /// Rounds of solution and noise estimate.
 const ROUNDS: usize = 3;
-/// Share of the transfers that counts as independent: a detector's error lasts for some frames.
-const INDEPENDENT_TRANSFERS: f64 = 0.25;
-/// Most fixes of one receiver, and most transfers between two cameras: more are thinned evenly.
+/// The same where the heights of boxes are told by a prior that is linearised anew in each.
+const UPRIGHT_ROUNDS: usize = 6;
+/// Fixes of all receivers and of one, and transfers between all cameras and between two: more are thinned evenly.
+const MAX_ROWS: usize = 20_000;
 const MAX_RECEIVER_ROWS: usize = 300;
-const MAX_TRANSFERS: usize = 4_000;
+const LEAST_RECEIVER_ROWS: usize = 10;
+const MAX_TRANSFERS: usize = 60_000;
+const MAX_PAIR_TRANSFERS: usize = 4_000;
 /// Median of a chi-square variable with 2 degrees of freedom: 2 ln 2.
 const MEDIAN_CHI_SQUARE: f64 = 1.386;
 
@@ -29,27 +35,39 @@ const MEDIAN_CHI_SQUARE: f64 = 1.386;
 /// # Errors
 /// A camera has too few rows, or there is no finite solution.
 pub fn fit_site(input: &SiteFitInput<'_>) -> Result<SiteMaps, SiteFitError> {
+    fit_site_observed(input, &[], &mut || ControlFlow::Continue(()))
+}
+
+/// The same under an observer that is asked before each step, and ends the fit by a break. `upright` are the cameras that
+/// the heights of boxes allow, by camera, if these are to have a say.
+///
+/// # Errors
+/// As [`fit_site`], and [`SiteFitError::Cancelled`].
+pub(crate) fn fit_site_observed(
+    input: &SiteFitInput<'_>,
+    upright: &[Option<UprightStarts>],
+    observer: &mut dyn FnMut() -> ControlFlow<()>,
+) -> Result<SiteMaps, SiteFitError> {
     let receivers = receiver_rows(input);
     let transfers = transfers(input);
     let mut maps = initial_maps(input.image_sizes.len(), &receivers, &transfers)?;
-    let mut problem = LeastSquaresProblem {
-        receivers,
-        transfers,
-        noise: GaussMarkovNoise::new(FIRST_SIGMA_M, input.correlation),
-        foot_sigma_px: FIRST_FOOT_SIGMA_PX,
-        transfer_weight: INDEPENDENT_TRANSFERS,
-    };
-    let mut covariance = problem.solve(&mut maps).ok_or(SiteFitError::NoSolution)?;
-    for _ in 1..ROUNDS {
+    let mut geometries = upright_geometries(upright, &receivers, &mut maps);
+    let noise = GaussMarkovNoise::new(FIRST_SIGMA_M, input.correlation);
+    let mut problem = LeastSquaresProblem::new(receivers, transfers, noise, FIRST_FOOT_SIGMA_PX);
+    problem.foot_priors = foot_priors(&mut geometries, &maps);
+    let mut covariance = problem.solve(&mut maps, observer)?;
+    let rounds = if geometries.iter().any(Option::is_some) { UPRIGHT_ROUNDS } else { ROUNDS };
+    for _ in 1..rounds {
         problem.estimate_noise(&maps);
-        covariance = problem.solve(&mut maps).ok_or(SiteFitError::NoSolution)?;
+        problem.foot_priors = foot_priors(&mut geometries, &maps);
+        covariance = problem.solve(&mut maps, observer)?;
     }
     let views_px = (0..maps.len()).map(|camera| view_px(&problem, camera)).collect();
     Ok(SiteMaps {
         maps,
         covariance,
         foot_sigma_px: problem.foot_sigma_px,
-        noise: problem.noise,
+        noise: problem.noise(),
         image_sizes: input.image_sizes.to_vec(),
         views_px,
     })
@@ -63,8 +81,8 @@ impl LeastSquaresProblem {
         let freedom = residuals.count as f64 - 8.0 * maps.len() as f64;
         if freedom > 0.0 {
             let scale = residuals.square_sum / freedom;
-            let sigma_m = (self.noise.variance_m2 * scale).sqrt().clamp(SIGMA_RANGE_M[0], SIGMA_RANGE_M[1]);
-            self.noise = GaussMarkovNoise::new(sigma_m, self.noise.correlation);
+            let sigma_m = (self.noise().variance_m2 * scale).sqrt().clamp(SIGMA_RANGE_M[0], SIGMA_RANGE_M[1]);
+            self.set_noise(GaussMarkovNoise::new(sigma_m, self.noise().correlation));
         }
         let distances = self.transfer_distances(maps);
         if distances.len() >= FEWEST_ROWS {
@@ -91,7 +109,9 @@ fn receiver_rows(input: &SiteFitInput<'_>) -> Vec<Vec<FixRow>> {
         let position = [fix.position.east_m, fix.position.north_m];
         (!feet.is_empty()).then_some(FixRow { time_s: fix.time_s, position, feet })
     };
-    let of_receiver = |own: &[&SiteFix]| thinned(own.iter().filter_map(row).collect(), MAX_RECEIVER_ROWS);
+    let receivers = fixes.chunk_by(|one, next| one.receiver == next.receiver).count();
+    let most = (MAX_ROWS / receivers.max(1)).clamp(LEAST_RECEIVER_ROWS, MAX_RECEIVER_ROWS);
+    let of_receiver = |own: &[&SiteFix]| thinned(own.iter().filter_map(row).collect(), most);
     let all = fixes.chunk_by(|one, next| one.receiver == next.receiver).map(of_receiver);
     all.filter(|rows| !rows.is_empty()).collect()
 }
@@ -110,15 +130,45 @@ fn transfers(input: &SiteFitInput<'_>) -> Vec<Transfer> {
         both_ways.push(Transfer { cameras: [to, from], feet: [feet[1], feet[0]] });
     }
     both_ways.sort_by_key(|transfer| transfer.cameras);
-    both_ways
-        .chunk_by(|one, next| one.cameras == next.cameras)
-        .flat_map(|own| thinned(own.to_vec(), MAX_TRANSFERS))
-        .collect()
+    let ways = both_ways.chunk_by(|one, next| one.cameras == next.cameras);
+    let most = (MAX_TRANSFERS / ways.clone().count().max(1)).min(MAX_PAIR_TRANSFERS);
+    ways.flat_map(|own| thinned(own.to_vec(), most)).collect()
 }
 
 fn thinned<T>(rows: Vec<T>, most: usize) -> Vec<T> {
     let stride = rows.len().div_ceil(most).max(1);
     rows.into_iter().step_by(stride).collect()
+}
+
+/// The geometries by the heights of boxes; the maps of those cameras begin there.
+fn upright_geometries(
+    upright: &[Option<UprightStarts>],
+    receivers: &[Vec<FixRow>],
+    maps: &mut [GroundMap],
+) -> Vec<Option<UprightGeometry>> {
+    let of_camera = |(camera, map): (usize, &mut GroundMap)| {
+        let starts = upright.get(camera)?.as_ref()?;
+        let rows = receivers.iter().flatten();
+        let own = rows.flat_map(|row| row.feet.iter().map(move |foot| (foot, row.position)));
+        let own = own.filter(|((at, _), _)| *at == camera).map(|((_, foot), position)| (*foot, position));
+        let (feet, positions): (Vec<Box4>, Vec<[f64; 2]>) = own.unzip();
+        let (geometry, placed) = UprightGeometry::new(starts, &map.0, (&feet, &positions))?;
+        map.0 = placed;
+        Some(geometry)
+    };
+    maps.iter_mut().enumerate().map(of_camera).collect()
+}
+
+/// What the boxes' heights say, linearised at the maps. A camera that is none there goes on without.
+fn foot_priors(geometries: &mut [Option<UprightGeometry>], maps: &[GroundMap]) -> Vec<Option<FootPrior>> {
+    let of_camera = |(geometry, map): (&mut Option<UprightGeometry>, &GroundMap)| {
+        let prior = geometry.as_mut()?.prior_at(&map.0);
+        if prior.is_none() {
+            *geometry = None;
+        }
+        prior
+    };
+    geometries.iter_mut().zip(maps).map(of_camera).collect()
 }
 
 /// Robust starts: from fixes where a camera has enough, else from targets in common with cameras that have a

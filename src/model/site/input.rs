@@ -3,6 +3,11 @@
 use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation};
 use crate::geo::EastNorth;
 
+/// Correlation over time of the receivers' errors that a fit assumes: that of phones, in the open and near walls. A
+/// receiver with whiter errors only gets too wide a covariance by it.
+pub const RECEIVER_CORRELATION: NoiseCorrelation =
+    NoiseCorrelation { white_share: 0.08, time_constant_s: 30.0 };
+
 /// A fix with the boxes of its carrier at the same instant, in all cameras that see it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SiteFix {
@@ -14,6 +19,15 @@ pub struct SiteFix {
     pub position: EastNorth,
     /// Index of the camera and box; at least one.
     pub boxes: Vec<(usize, BoundingBox)>,
+}
+
+impl SiteFix {
+    /// The same fix as the fit of one camera alone takes it; `None` if the camera does not see its carrier.
+    #[must_use]
+    pub fn seen_by(&self, camera: usize) -> Option<Self> {
+        let (_, bounding_box) = self.boxes.iter().find(|(at, _)| *at == camera)?;
+        Some(Self { boxes: vec![(0, *bounding_box)], ..self.clone() })
+    }
 }
 
 /// One target in two cameras at one instant.
@@ -47,6 +61,9 @@ pub enum SiteFitError {
         /// Index of the camera.
         camera: usize,
     },
+    /// The caller wanted it to end.
+    #[error("cancelled")]
+    Cancelled,
     /// The least-squares problem has no finite solution.
     #[error("the cameras' maps have no finite solution: the fixes and boxes do not fit one ground plane")]
     NoSolution,

@@ -3,18 +3,24 @@
 //! ```text
 //! cost = sum_receivers |W (z - mean_c f_c(box_c))|^2            fixes, whitened per receiver
 //!      + w sum_pairs rho(|f_b^-1(f_a(box_a)) - box_b|^2 / s^2)  feet carried from view a to view b, px
-//!      + sum (p / sigma_prior)^2
+//!      + sum (p / sigma_prior)^2 + sum (p - p_0)' P (p - p_0)    weak prior; what the boxes' heights say, if asked
 //! ```
 //!
 //! `rho(x) = k^2 ln(1 + x / k^2)` is Cauchy's loss. In metres the pairs would pull all maps together to a point;
 //! in pixels they do not.
 
-use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
+use std::ops::ControlFlow;
+
+use nalgebra::{DMatrix, DVector, Matrix2, SVector, Vector2};
 
 use super::ground_map::{GroundMap, GroundTangent, PARAMETERS};
+use super::input::SiteFitError;
 use crate::domain::GaussMarkovNoise;
 use crate::model::encoder::gaussian_process::projective_mean::Box4;
+use crate::model::encoder::gaussian_process::{Epoch, FootPrior, ReceiverNoise, ReceiverWhitener};
 
+/// Share of the transfers that counts as independent: a detector's error lasts for some frames.
+const INDEPENDENT_TRANSFERS: f64 = 0.25;
 /// Standardised distance at which a pair has half its weight.
 const CAUCHY_SCALE: f64 = 2.0;
 /// Cost of a pair whose foot cannot be carried over, in squared standard deviations.
@@ -38,17 +44,17 @@ pub(super) struct Transfer {
 }
 
 /// All rows with their noise.
-#[derive(Debug, Clone)]
 pub(super) struct LeastSquaresProblem {
     /// Fixes by receiver, in the order of time.
     pub(super) receivers: Vec<Vec<FixRow>>,
     pub(super) transfers: Vec<Transfer>,
-    /// Noise of the fixes per axis.
-    pub(super) noise: GaussMarkovNoise,
     /// Standard deviation of a foot per axis, px.
     pub(super) foot_sigma_px: f64,
-    /// Weight of a transfer: neighbours in time are not independent.
-    pub(super) transfer_weight: f64,
+    /// What the heights of boxes say of each camera's parameters, if anything.
+    pub(super) foot_priors: Vec<Option<FootPrior>>,
+    /// Noise of the fixes per axis, and the filters that whiten each receiver's.
+    noise: GaussMarkovNoise,
+    whiteners: Vec<ReceiverWhitener>,
 }
 
 /// Gauss-Newton matrix and gradient.
@@ -66,16 +72,45 @@ pub(super) struct FixResiduals {
 }
 
 impl LeastSquaresProblem {
-    /// Refines the maps; returns their parameters' covariance, `None` if there is no finite solution.
-    pub(super) fn solve(&self, maps: &mut Vec<GroundMap>) -> Option<DMatrix<f64>> {
+    pub(super) fn new(
+        receivers: Vec<Vec<FixRow>>,
+        transfers: Vec<Transfer>,
+        noise: GaussMarkovNoise,
+        foot_sigma_px: f64,
+    ) -> Self {
+        let whiteners = whiteners(&receivers, &noise);
+        Self { receivers, transfers, foot_sigma_px, foot_priors: Vec::new(), noise, whiteners }
+    }
+
+    pub(super) const fn noise(&self) -> GaussMarkovNoise {
+        self.noise
+    }
+
+    pub(super) fn set_noise(&mut self, noise: GaussMarkovNoise) {
+        self.whiteners = whiteners(&self.receivers, &noise);
+        self.noise = noise;
+    }
+
+    /// Refines the maps; returns their parameters' covariance. The observer is asked before each step.
+    ///
+    /// # Errors
+    /// There is no finite solution, or the observer breaks.
+    pub(super) fn solve(
+        &self,
+        maps: &mut Vec<GroundMap>,
+        observer: &mut dyn FnMut() -> ControlFlow<()>,
+    ) -> Result<DMatrix<f64>, SiteFitError> {
         let mut damping = 1e-3;
         let mut normal = self.normal_equations(maps);
         for _ in 0..STEPS {
+            if observer().is_break() {
+                return Err(SiteFitError::Cancelled);
+            }
             let mut damped = normal.matrix.clone();
             for at in 0..damped.nrows() {
                 damped[(at, at)] *= 1.0 + damping;
             }
-            let step = damped.cholesky()?.solve(&normal.right);
+            let step = damped.cholesky().ok_or(SiteFitError::NoSolution)?.solve(&normal.right);
             let moved: Vec<GroundMap> = maps
                 .iter()
                 .zip(step.as_slice().chunks(PARAMETERS))
@@ -98,22 +133,24 @@ impl LeastSquaresProblem {
                 }
             }
         }
-        let covariance = normal.matrix.cholesky()?.inverse();
-        covariance.iter().all(|value| value.is_finite()).then_some(covariance)
+        let covariance = normal.matrix.cholesky().ok_or(SiteFitError::NoSolution)?.inverse();
+        let is_finite = covariance.iter().all(|value| value.is_finite());
+        is_finite.then_some(covariance).ok_or(SiteFitError::NoSolution)
     }
 
     /// Sum of squares of the whitened residuals of the fixes.
     pub(super) fn fix_residuals(&self, maps: &[GroundMap]) -> FixResiduals {
         let mut residuals = FixResiduals { square_sum: 0.0, count: 0 };
-        for rows in &self.receivers {
-            let Some(factor) = self.receiver_covariance(rows).cholesky() else { continue };
-            for axis in 0..2 {
-                let misfit = DVector::from_iterator(
-                    rows.len(),
-                    rows.iter().map(|row| row.position[axis] - mean_position(maps, row)[axis]),
-                );
-                residuals.square_sum += factor.solve(&misfit).dot(&misfit);
-                residuals.count += rows.len();
+        for (rows, whitener) in self.receivers.iter().zip(&self.whiteners) {
+            let misfits = rows.iter().map(|row| {
+                let mean_m = mean_position(maps, row);
+                [row.position[0] - mean_m[0], row.position[1] - mean_m[1]]
+            });
+            let (mut east, mut north): (Vec<f64>, Vec<f64>) = misfits.map(|[e, n]| (e, n)).unzip();
+            for column in [&mut east, &mut north] {
+                whitener.apply(column);
+                residuals.square_sum += column.iter().map(|value| value * value).sum::<f64>();
+                residuals.count += column.len();
             }
         }
         residuals
@@ -128,24 +165,36 @@ impl LeastSquaresProblem {
         self.transfers.iter().filter_map(squared).collect()
     }
 
-    fn receiver_covariance(&self, rows: &[FixRow]) -> DMatrix<f64> {
-        DMatrix::from_fn(rows.len(), rows.len(), |one, other| {
-            let lag_s = (rows[one].time_s - rows[other].time_s).abs();
-            let coloured = self.noise.coloured_variance_m2() * self.noise.correlation.decay(lag_s);
-            if one == other { coloured + self.noise.white_variance_m2().max(1e-4) } else { coloured }
-        })
-    }
-
     fn cost(&self, maps: &[GroundMap]) -> f64 {
         let transfers: f64 = self.transfers.iter().map(|it| self.transfer_cost(maps, it)).sum();
-        self.fix_residuals(maps).square_sum + transfers + prior_cost(maps)
+        self.fix_residuals(maps).square_sum + transfers + prior_cost(maps) + self.foot_prior_cost(maps)
+    }
+
+    fn foot_prior_cost(&self, maps: &[GroundMap]) -> f64 {
+        let of_map = |(map, prior): (&GroundMap, &Option<FootPrior>)| {
+            let FootPrior { centre, precision } = prior.as_ref()?;
+            let apart = SVector::<f64, PARAMETERS>::from_column_slice(map.parameters()) - centre;
+            Some(apart.dot(&(precision * apart)))
+        };
+        maps.iter().zip(&self.foot_priors).filter_map(of_map).sum()
+    }
+
+    fn add_foot_prior(prior: &FootPrior, map: &GroundMap, first: usize, normal: &mut NormalEquations) {
+        let FootPrior { centre, precision } = prior;
+        let pull = precision * (centre - SVector::<f64, PARAMETERS>::from_column_slice(map.parameters()));
+        for row in 0..PARAMETERS {
+            normal.right[first + row] += pull[row];
+            for column in 0..PARAMETERS {
+                normal.matrix[(first + row, first + column)] += precision[(row, column)];
+            }
+        }
     }
 
     fn transfer_cost(&self, maps: &[GroundMap], transfer: &Transfer) -> f64 {
         let squared = Carried::new(maps, transfer)
             .map_or(LOST_PAIR, |it| it.residual_px.norm_squared() / self.carried_variance_px2(&it));
         let scale = CAUCHY_SCALE * CAUCHY_SCALE;
-        self.transfer_weight * scale * (squared.min(LOST_PAIR) / scale).ln_1p()
+        INDEPENDENT_TRANSFERS * scale * (squared.min(LOST_PAIR) / scale).ln_1p()
     }
 
     fn carried_variance_px2(&self, carried: &Carried) -> f64 {
@@ -164,66 +213,105 @@ impl LeastSquaresProblem {
                 normal.right[index] -= parameter / variance;
             }
         }
-        for rows in &self.receivers {
-            self.add_receiver(maps, rows, &mut normal);
+        for (camera, (map, prior)) in maps.iter().zip(&self.foot_priors).enumerate() {
+            if let Some(prior) = prior {
+                Self::add_foot_prior(prior, map, PARAMETERS * camera, &mut normal);
+            }
         }
-        for transfer in &self.transfers {
-            self.add_transfer(maps, transfer, &mut normal);
+        for (rows, whitener) in self.receivers.iter().zip(&self.whiteners) {
+            add_receiver(maps, rows, whitener, &mut normal);
+        }
+        for own in self.transfers.chunk_by(|one, next| one.cameras == next.cameras) {
+            self.add_transfers(maps, own, &mut normal);
         }
         normal.cost = self.cost(maps);
         normal
     }
 
-    fn add_receiver(&self, maps: &[GroundMap], rows: &[FixRow], normal: &mut NormalEquations) {
-        let Some(factor) = self.receiver_covariance(rows).cholesky() else { return };
-        let cameras = cameras_of(rows);
-        let column_of = |camera: usize| cameras.partition_point(|&other| other < camera) * PARAMETERS;
-        for axis in 0..2 {
-            let mut jacobian = DMatrix::<f64>::zeros(rows.len(), PARAMETERS * cameras.len());
-            let mut misfit = DVector::<f64>::zeros(rows.len());
-            for (at, row) in rows.iter().enumerate() {
-                let share = 1.0 / row.feet.len() as f64;
-                misfit[at] = row.position[axis];
-                for (camera, foot) in &row.feet {
-                    let tangent = maps[*camera].tangent(foot);
-                    misfit[at] -= share * tangent.position[axis];
-                    for (offset, slope) in tangent.by_parameters[axis].iter().enumerate() {
-                        jacobian[(at, column_of(*camera) + offset)] += share * slope;
+    /// Adds the transfers between two cameras.
+    fn add_transfers(&self, maps: &[GroundMap], transfers: &[Transfer], normal: &mut NormalEquations) {
+        let mut matrix = [[0.0; 2 * PARAMETERS]; 2 * PARAMETERS];
+        let mut right = [0.0; 2 * PARAMETERS];
+        for transfer in transfers {
+            let Some(carried) = Carried::new(maps, transfer) else { continue };
+            let variance_px2 = self.carried_variance_px2(&carried);
+            let squared = carried.residual_px.norm_squared() / variance_px2;
+            if squared > LOST_PAIR {
+                continue;
+            }
+            let weight =
+                INDEPENDENT_TRANSFERS / (1.0 + squared / (CAUCHY_SCALE * CAUCHY_SCALE)) / variance_px2;
+            let residual_px = [carried.residual_px[0], carried.residual_px[1]];
+            for (slopes, residual_px) in carried.slopes().iter().zip(residual_px) {
+                for (row, slope) in slopes.iter().enumerate() {
+                    right[row] -= weight * slope * residual_px;
+                    for (sum, other) in matrix[row].iter_mut().zip(slopes) {
+                        *sum += weight * slope * other;
                     }
                 }
             }
-            let weighted = factor.solve(&jacobian);
-            let (matrix, right) = (jacobian.transpose() * &weighted, weighted.transpose() * misfit);
-            for one in 0..matrix.nrows() {
-                let row = global_index(&cameras, one);
-                normal.right[row] += right[one];
-                for other in 0..matrix.ncols() {
-                    normal.matrix[(row, global_index(&cameras, other))] += matrix[(one, other)];
-                }
-            }
         }
+        let Some([from, to]) = transfers.first().map(|transfer| transfer.cameras) else { return };
+        normal.add(&[from, to], &right, |row, column| matrix[row][column]);
     }
+}
 
-    fn add_transfer(&self, maps: &[GroundMap], transfer: &Transfer, normal: &mut NormalEquations) {
-        let Some(carried) = Carried::new(maps, transfer) else { return };
-        let variance_px2 = self.carried_variance_px2(&carried);
-        let squared = carried.residual_px.norm_squared() / variance_px2;
-        if squared > LOST_PAIR {
-            return;
-        }
-        let weight = self.transfer_weight / (1.0 + squared / (CAUCHY_SCALE * CAUCHY_SCALE)) / variance_px2;
-        let [from, to] = transfer.cameras.map(|camera| PARAMETERS * camera);
-        let slopes = carried.slopes();
-        let index = |at: usize| if at < PARAMETERS { from + at } else { to + at - PARAMETERS };
-        for (slopes, residual_px) in slopes.iter().zip(&carried.residual_px) {
-            for (one, slope) in slopes.iter().enumerate() {
-                normal.right[index(one)] -= weight * slope * residual_px;
-                for (other, other_slope) in slopes.iter().enumerate() {
-                    normal.matrix[(index(one), index(other))] += weight * slope * other_slope;
-                }
+impl NormalEquations {
+    /// Adds a part over the parameters of some cameras.
+    fn add(&mut self, cameras: &[usize], right: &[f64], matrix: impl Fn(usize, usize) -> f64) {
+        for (one, value) in right.iter().enumerate() {
+            let row = global_index(cameras, one);
+            self.right[row] += value;
+            for other in 0..right.len() {
+                self.matrix[(row, global_index(cameras, other))] += matrix(one, other);
             }
         }
     }
+}
+
+fn add_receiver(
+    maps: &[GroundMap],
+    rows: &[FixRow],
+    whitener: &ReceiverWhitener,
+    normal: &mut NormalEquations,
+) {
+    let cameras = cameras_of(rows);
+    for axis in 0..2 {
+        // The derivatives by each parameter, then the misfit.
+        let mut columns = vec![vec![0.0; rows.len()]; PARAMETERS * cameras.len() + 1];
+        for (at, row) in rows.iter().enumerate() {
+            let share = 1.0 / row.feet.len() as f64;
+            let mut misfit_m = row.position[axis];
+            for (camera, foot) in &row.feet {
+                let first = PARAMETERS * cameras.partition_point(|other| other < camera);
+                let tangent = maps[*camera].tangent(foot);
+                misfit_m -= share * tangent.position[axis];
+                for (offset, slope) in tangent.by_parameters[axis].iter().enumerate() {
+                    columns[first + offset][at] += share * slope;
+                }
+            }
+            if let Some(misfits) = columns.last_mut() {
+                misfits[at] = misfit_m;
+            }
+        }
+        columns.iter_mut().for_each(|column| whitener.apply(column));
+        let Some((misfit, slopes)) = columns.split_last() else { continue };
+        let right: Vec<f64> = slopes.iter().map(|own| dot(own, misfit)).collect();
+        normal.add(&cameras, &right, |one, other| dot(&slopes[one], &slopes[other]));
+    }
+}
+
+fn dot(one: &[f64], other: &[f64]) -> f64 {
+    one.iter().zip(other).map(|(one, other)| one * other).sum()
+}
+
+fn whiteners(receivers: &[Vec<FixRow>], noise: &GaussMarkovNoise) -> Vec<ReceiverWhitener> {
+    let noise = ReceiverNoise::of_gauss_markov(noise);
+    let of_receiver = |rows: &Vec<FixRow>| {
+        let epochs: Vec<Epoch> = rows.iter().map(|row| Epoch { time_s: row.time_s, sequence: 0 }).collect();
+        ReceiverWhitener::new(&epochs, &noise, &vec![0.0; rows.len()])
+    };
+    receivers.iter().map(of_receiver).collect()
 }
 
 /// A foot carried from one view into another.

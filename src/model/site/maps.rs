@@ -6,6 +6,7 @@ use super::ground_map::{GroundMap, PARAMETERS};
 use super::input::{foot_and_size, is_foot_cut};
 use crate::domain::{BoundingBox, GaussMarkovNoise, ImageSize};
 use crate::geo::{EastNorth, PlaneCovariance};
+use crate::model::encoder::gaussian_process::{FittedFootMap, FootCovariance};
 
 /// Standard deviation of the foot of a box that the image border cuts, relative to its height.
 const CUT_FOOT_SHARE: f64 = 0.25;
@@ -57,6 +58,19 @@ impl SiteMaps {
     #[must_use]
     pub const fn receiver_noise(&self) -> GaussMarkovNoise {
         self.noise
+    }
+
+    /// The map of a camera with its own covariance; `shared_bias_m2` is the variance per axis of the bias that all
+    /// receivers have in common.
+    pub(crate) fn foot_map(&self, camera: usize, shared_bias_m2: f64, freedom: f64) -> FittedFootMap {
+        let first = PARAMETERS * camera;
+        FittedFootMap {
+            mean: self.maps[camera].0.clone(),
+            covariance: FootCovariance::from_fn(|row, column| self.covariance[(first + row, first + column)]),
+            foot_sigma_px: self.foot_sigma_px,
+            shared_bias_m2,
+            freedom,
+        }
     }
 
     /// Number of cameras.

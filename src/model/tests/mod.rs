@@ -1,6 +1,7 @@
 //! The public interface of the module, and the explicit kernels against candle's own.
 
 mod behaviour;
+mod site;
 
 use std::ops::ControlFlow;
 

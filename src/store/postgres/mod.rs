@@ -27,7 +27,9 @@ mod runs;
 mod sample_retention;
 mod sample_table;
 mod samples;
+mod site_runs;
 mod sites;
+mod source_offsets;
 #[cfg(test)]
 mod tests;
 mod training;

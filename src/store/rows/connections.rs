@@ -2,7 +2,7 @@
 
 use crate::domain::{
     Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
-    OutboxMessage, Result,
+    OutboxMessage, Result, SourceOffset,
 };
 use crate::store::row_decoder::{RowDecoder, StoredRow};
 
@@ -69,4 +69,13 @@ pub(in crate::store) fn read_message(fields: &mut RowDecoder<'_>) -> Result<Outb
 pub(in crate::store) fn read_dead_letter<'r>(row: impl Into<StoredRow<'r>>) -> Result<DeadLetter> {
     let mut fields = RowDecoder::new("outbox", row);
     Ok(DeadLetter { message: read_message(&mut fields)?, reason: fields.get()? })
+}
+
+pub(in crate::store) fn read_source_offset<'r>(row: impl Into<StoredRow<'r>>) -> Result<SourceOffset> {
+    let mut fields = RowDecoder::new("source_offsets", row);
+    Ok(SourceOffset {
+        topic: fields.get()?,
+        partition: fields.parse(|number: i64| i32::try_from(number))?,
+        next_offset: fields.get()?,
+    })
 }

@@ -10,4 +10,5 @@ pub(super) mod keys;
 pub(super) mod models;
 pub(super) mod runs;
 pub(super) mod samples;
+pub(super) mod site_runs;
 pub(super) mod sites;

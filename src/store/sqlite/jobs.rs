@@ -17,6 +17,7 @@ use crate::store::jobs::{
 const LEASE_EXPIRED: &str = lease_expired!("?1");
 
 pub(super) const RUNS: Jobs = Jobs(&jobs::RUNS);
+pub(super) const SITE_RUNS: Jobs = Jobs(&jobs::SITE_RUNS);
 pub(super) const EVALUATIONS: Jobs = Jobs(&jobs::EVALUATIONS);
 
 impl Store {
@@ -99,7 +100,7 @@ impl Jobs {
         })
     }
 
-    /// The job's camera and whether its cancellation was requested, if the fence is still the newest and
+    /// The key of what the job belongs to, and whether its cancellation was requested, if the fence is still the newest and
     /// the job runs.
     pub(super) async fn owns_lease(
         &self,
@@ -107,8 +108,8 @@ impl Jobs {
         (id, fence): (Uuid, i64),
     ) -> Result<Option<(i64, bool)>> {
         let sql = format!(
-            "SELECT camera_key, cancel_requested FROM {} WHERE id = ? AND fence = ? AND state = 'running'",
-            self.0.table
+            "SELECT {}, cancel_requested FROM {} WHERE id = ? AND fence = ? AND state = 'running'",
+            self.0.owner, self.0.table
         );
         let owned: Option<(i64, i64)> = sqlx::query_as(AssertSqlSafe(sql))
             .bind(id.to_string())
@@ -116,7 +117,7 @@ impl Jobs {
             .fetch_optional(connection)
             .await
             .map_err(failed)?;
-        Ok(owned.map(|(camera_key, cancel_requested)| (camera_key, cancel_requested != 0)))
+        Ok(owned.map(|(owner_key, cancel_requested)| (owner_key, cancel_requested != 0)))
     }
 
     /// Cancels a job that has not ended: at once where no worker holds a live lease on it, otherwise at
@@ -154,7 +155,7 @@ impl Jobs {
         end: JobEnd<O>,
         now: Timestamp,
     ) -> Result<Option<Finished<O>>> {
-        let Some((camera_key, cancel_requested)) = self.owns_lease(connection, (id, fence)).await? else {
+        let Some((owner_key, cancel_requested)) = self.owns_lease(connection, (id, fence)).await? else {
             return Ok(None);
         };
         let Settled { state, outcome, output } = end.settle(cancel_requested);
@@ -162,7 +163,7 @@ impl Jobs {
             Some(state) => self.end(connection, id, state, outcome, now).await?,
             None => self.requeue(connection, id).await?,
         }
-        Ok(Some(Finished { camera_key, output }))
+        Ok(Some(Finished { owner_key, output }))
     }
 
     async fn end(

@@ -31,7 +31,9 @@ mod sample_retention;
 mod sample_table;
 mod samples;
 mod server_lock;
+mod site_runs;
 mod sites;
+mod source_offsets;
 mod space;
 #[cfg(test)]
 mod tests;

@@ -205,7 +205,7 @@ impl Store {
         };
         let mut activated = None;
         if let Some(RunOutput { model, activate: wanted }) = finished.output {
-            let key = finished.camera_key;
+            let key = finished.owner_key;
             let number = add_model(&mut transaction, key, Some(run), &model, now).await?;
             if wanted {
                 activate(&mut transaction, key, number, now).await?;

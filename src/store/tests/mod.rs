@@ -2,12 +2,14 @@
 //! server's database, a database of its own on that server (`.ci/postgres`).
 
 mod cameras;
+mod connections;
 pub(super) mod copy;
 mod evaluations;
 pub(super) mod group;
 mod models;
 mod runs;
 mod samples;
+mod site_runs;
 
 use std::sync::Arc;
 
@@ -165,6 +167,7 @@ pub(super) fn metadata() -> ModelMetadata {
         held_out: None,
         candidates: Vec::new(),
         report: None,
+        joint_training: None,
         parameters: std::collections::BTreeMap::new(),
     }
 }

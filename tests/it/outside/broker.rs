@@ -6,6 +6,7 @@ use tokio::net::TcpStream;
 
 use super::peers::{Broker, connection_when, create_gate, patch, send_fix};
 use crate::harness::{TestServer, data_folder, now, own_address};
+use crate::tls::Authority;
 
 const TARGET: &str = "1607123955.475377-mxklsc";
 
@@ -156,6 +157,45 @@ async fn positions_are_published_to_a_broker_also_those_of_its_absence() {
         messages.iter().map(|(_, message)| message["time"].as_str().expect("a time")).collect();
     assert!(times.is_sorted() && times.len() == 3, "{times:?}");
     connection_when(&server, "positions", |status| status["queued"] == 0).await;
+}
+
+#[tokio::test]
+#[ignore = "needs mosquitto"]
+async fn an_encrypted_broker_is_used_only_if_its_certificate_is_trusted() {
+    let (authority, other) = (Authority::new(), Authority::new());
+    let broker = Broker::start_encrypted(&authority);
+    broker.subscribe("sightfix/gate/van");
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let mut source = frigate(&broker);
+    source["source"]["store_samples"] = json!(false);
+    source["source"]["address"] = json!(format!("mqtts://localhost:{}", broker.port));
+    source["source"]["ca_certificate"] = json!(other.certificate.pem());
+    server.post("/v1/connections", &source).await.expect(201);
+    let sink = json!({"id": "positions", "sink": {
+        "address": format!("mqtts://127.0.0.1:{}", broker.port), "camera_ids": ["gate"], "min_interval_s": 0,
+        "ca_certificate": authority.certificate.pem(),
+    }});
+    server.post("/v1/connections", &sink).await.expect(201);
+    for (id, cause) in [("frigate", "an authority that did not sign"), ("positions", "another name")] {
+        let waiting = connection_when(&server, id, |status| status["state"] == "waiting").await;
+        let error = waiting["status"]["last_error"]["message"].as_str().expect("an error");
+        assert!(error.contains("certificate"), "{cause}: {error}");
+        assert_eq!(waiting["status"]["connects"], 0, "{cause}");
+    }
+
+    let trust = json!({"source": {"ca_certificate": authority.certificate.pem()}});
+    patch(&server, "frigate", &trust).await.expect(200);
+    let name = json!({"sink": {"address": format!("mqtts://localhost:{}", broker.port)}});
+    patch(&server, "positions", &name).await.expect(200);
+    connection_when(&server, "frigate", |status| status["state"] == "running").await;
+    broker.publish("frigate/events", &frigate_update(now()));
+    connection_when(&server, "frigate", |status| status["acknowledged"] == 1).await;
+    connection_when(&server, "positions", |status| status["state"] == "running").await;
+    send_fix(&server, "van", &now().to_string(), 103.98678, false).await;
+    let output = broker.received("sightfix/gate/van", 1);
+    assert!(output.starts_with("sightfix/gate/van {"), "{output}");
 }
 
 /// Reads a message of a subscription: its subject, headers and payload.

@@ -9,11 +9,14 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::harness::{TestServer, own_address};
+use crate::tls::Authority;
 
 /// A mosquitto of its own, which keeps sessions in memory; killed when dropped.
 pub(crate) struct Broker {
     process: Child,
     pub(crate) port: u16,
+    /// How its own clients reach it.
+    client_arguments: Vec<String>,
     _folder: TempDir,
 }
 
@@ -24,8 +27,32 @@ impl Broker {
 
     pub(crate) fn start_at(port: u16) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
+        Self::start_in(folder, port, "", vec!["-h".to_owned(), "127.0.0.1".to_owned()])
+    }
+
+    /// One that is reached by TLS alone, with a certificate of the authority for `localhost`.
+    pub(super) fn start_encrypted(authority: &Authority) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (certificate, key) = authority.issue();
+        let file = |name: &str, content: String| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, content).expect("a file can be written");
+            path.to_str().expect("text").to_owned()
+        };
+        let trusted = file("ca.pem", authority.certificate.pem());
+        let settings = format!(
+            "certfile {}\nkeyfile {}\n",
+            file("certificate.pem", certificate.pem()),
+            file("key.pem", key.serialize_pem())
+        );
+        let client_arguments = ["-h", "localhost", "--cafile", &trusted].map(str::to_owned).to_vec();
+        Self::start_in(folder, own_address().port(), &settings, client_arguments)
+    }
+
+    fn start_in(folder: TempDir, port: u16, settings: &str, client_arguments: Vec<String>) -> Self {
         let path = folder.path().join("mosquitto.conf");
-        let text = format!("listener {port} 127.0.0.1\nallow_anonymous true\n");
+        // As the superuser it would become another user, who cannot read the folder.
+        let text = format!("user root\nlistener {port} 127.0.0.1\nallow_anonymous true\n{settings}");
         std::fs::write(&path, text).expect("a file can be written");
         let mut command = Command::new("mosquitto");
         command.arg("-c").arg(&path).stdout(Stdio::null()).stderr(Stdio::null());
@@ -33,13 +60,14 @@ impl Broker {
         while std::net::TcpStream::connect(("127.0.0.1", port)).is_err() {
             std::thread::sleep(Duration::from_millis(20));
         }
-        Self { process, port, _folder: folder }
+        Self { process, port, client_arguments, _folder: folder }
     }
 
     /// Publishes with QoS 1 by mosquitto's own client.
     pub(crate) fn publish(&self, topic: &str, message: &str) {
         let mut command = Command::new("mosquitto_pub");
-        command.args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-q", "1", "-t", topic, "-s"]);
+        command.args(&self.client_arguments);
+        command.args(["-p", &self.port.to_string(), "-q", "1", "-t", topic, "-s"]);
         let mut process = command.stdin(Stdio::piped()).spawn().expect("mosquitto-clients is installed");
         let mut input = process.stdin.take().expect("piped");
         input.write_all(message.as_bytes()).expect("it reads");
@@ -49,7 +77,8 @@ impl Broker {
 
     fn subscriber(&self, topic: &str) -> Command {
         let mut command = Command::new("mosquitto_sub");
-        command.args(["-h", "127.0.0.1", "-p", &self.port.to_string(), "-V", "5", "-q", "1", "-t", topic]);
+        command.args(&self.client_arguments);
+        command.args(["-p", &self.port.to_string(), "-V", "5", "-q", "1", "-t", topic]);
         command.args(["-i", "subscriber", "-c", "-x", "600"]);
         command
     }

@@ -1,5 +1,6 @@
 //! Receivers whose fixes come live.
 
+use rustix::pty::OpenptFlags;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, UdpSocket};
@@ -122,4 +123,108 @@ async fn traccar_hands_in_positions_and_is_answered_when_they_are_taken() {
     assert!(refused.text().contains("latitude"), "{}", refused.text());
     server.send("DELETE", "/v1/connections/receiver", &[], "").await.expect(204);
     server.post(path, &position).await.expect(404);
+}
+
+/// A serial line whose other end is held here. Its device has a name of its own, as that of an adapter by its number, so
+/// that it can be pulled out and plugged in again.
+struct SerialLine {
+    folder: tempfile::TempDir,
+    receiver: Option<std::fs::File>,
+}
+
+impl SerialLine {
+    fn new() -> Self {
+        Self { folder: tempfile::tempdir_in("/dev/shm").expect("a folder"), receiver: None }
+    }
+
+    fn device(&self, name: &str) -> String {
+        self.folder.path().join(name).to_str().expect("text").to_owned()
+    }
+
+    fn plug_in(&mut self) {
+        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+        let receiver = rustix::pty::openpt(flags).expect("a pseudo-terminal");
+        rustix::pty::grantpt(&receiver).expect("granted");
+        rustix::pty::unlockpt(&receiver).expect("unlocked");
+        let name = rustix::pty::ptsname(&receiver, Vec::new()).expect("a name").into_string().expect("text");
+        std::os::unix::fs::symlink(name, self.device("receiver")).expect("a link");
+        self.receiver = Some(receiver.into());
+    }
+
+    fn pull_out(&mut self) {
+        std::fs::remove_file(self.device("receiver")).expect("the link");
+        self.receiver = None;
+    }
+
+    fn send(&mut self, text: &str) {
+        let receiver = self.receiver.as_mut().expect("plugged in");
+        std::io::Write::write_all(receiver, text.as_bytes()).expect("written");
+    }
+}
+
+#[tokio::test]
+async fn a_serial_receiver_may_be_pulled_out_and_plugged_in_again() {
+    let mut line = SerialLine::new();
+    line.plug_in();
+    let device = line.device("receiver");
+    let folder = data_folder();
+    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_SERIAL_DEVICES", &device)]);
+    create_gate(&server).await;
+    let source = json!({"address": format!("serial://{device}?baud=38400"), "format": "nmea", "camera_ids": ["gate"],
+        "receiver_id": "boat"});
+    server.post("/v1/connections", &json!({"id": "receiver", "source": source})).await.expect(201);
+    connection_when(&server, "receiver", |status| status["state"] == "running").await;
+    line.send(&sentences());
+    let status =
+        connection_when(&server, "receiver", |status| status["messages"] == 2).await["status"].clone();
+    assert_eq!(
+        (&status["items"], &status["last_message"]["subject"]),
+        (&json!(1), &json!(device)),
+        "{status}"
+    );
+    assert_tracked(&server, "boat").await;
+
+    line.pull_out();
+    connection_when(&server, "receiver", |status| status["state"] == "waiting").await;
+    line.plug_in();
+    connection_when(&server, "receiver", |status| status["connects"] == 2).await;
+    line.send("!AIVDM,1,1,,B,177KQJ5000G?tO`K>RA1wUbN0TKH,0*5C\r\n");
+    connection_when(&server, "receiver", |status| status["items"] == 2).await;
+}
+
+#[tokio::test]
+async fn only_serial_devices_that_the_operator_of_the_machine_names_are_read() {
+    let mut line = SerialLine::new();
+    line.plug_in();
+    std::fs::write(line.device("file"), "a secret").expect("a file");
+    let devices = format!("{},/dev/null", line.device("file"));
+    let folder = data_folder();
+    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_SERIAL_DEVICES", &devices)]);
+    create_gate(&server).await;
+    let draft = |id: &str, device: &str| {
+        let source =
+            json!({"address": format!("serial://{device}"), "format": "nmea", "camera_ids": ["gate"]});
+        json!({"id": id, "source": source})
+    };
+    for address in [
+        "/etc/passwd",
+        "/dev/../etc/passwd",
+        "/dev/",
+        "receiver/dev/ttyUSB0",
+        "/dev/ttyUSB0?baud=1200",
+        "/dev/ttyUSB0?",
+    ] {
+        let refused = server.post("/v1/connections", &draft("wrong", address)).await.expect(422);
+        assert!(refused.text().contains("source.address"), "{address}: {}", refused.text());
+    }
+    for (id, device, reason) in [
+        ("unnamed", line.device("receiver"), "serial_devices"),
+        ("file", line.device("file"), "is no serial device"),
+        ("null", "/dev/null".to_owned(), "is no serial device"),
+    ] {
+        server.post("/v1/connections", &draft(id, &device)).await.expect(201);
+        let status = connection_when(&server, id, |status| status["state"] == "waiting").await;
+        let error = status["status"]["last_error"]["message"].as_str().expect("an error");
+        assert!(error.contains(reason) && !error.contains("secret"), "{id}: {error}");
+    }
 }

@@ -214,7 +214,7 @@ async fn cursor_on_target_events_go_over_tcp_and_over_udp() {
 }
 
 /// A server that wants a client certificate of the authority.
-fn tls_acceptor(authority: &Authority) -> TlsAcceptor {
+pub(super) fn tls_acceptor(authority: &Authority) -> TlsAcceptor {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let mut roots = RootCertStore::empty();
     roots.add(authority.certificate.der().clone()).expect("an authority");

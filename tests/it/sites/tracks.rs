@@ -15,20 +15,20 @@ use crate::harness::{TestServer, data_folder};
 use crate::live_client::channel;
 
 /// An event stream of a site.
-struct Events {
+pub(super) struct Events {
     body: Incoming,
     buffer: String,
 }
 
 /// One event: its name, its id and its data.
-struct SiteEvent {
-    name: String,
+pub(super) struct SiteEvent {
+    pub(super) name: String,
     id: String,
-    data: Value,
+    pub(super) data: Value,
 }
 
 impl Events {
-    async fn open(server: &TestServer, after: &str) -> Self {
+    pub(super) async fn open(server: &TestServer, after: &str) -> Self {
         let headers: &[(&str, &str)] = if after.is_empty() { &[] } else { &[("last-event-id", after)] };
         let response = server.open("GET", "/v1/sites/square/events", headers, "").await;
         assert_eq!(response.status(), 200);
@@ -56,7 +56,7 @@ impl Events {
     }
 
     /// Events until so many of a name have come.
-    async fn until(&mut self, name: &str, count: usize) -> Vec<SiteEvent> {
+    pub(super) async fn until(&mut self, name: &str, count: usize) -> Vec<SiteEvent> {
         let mut events: Vec<SiteEvent> = Vec::new();
         while events.iter().filter(|event| event.name == name).count() < count {
             events.push(self.next().await.expect("no end"));

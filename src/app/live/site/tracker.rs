@@ -13,7 +13,7 @@ use super::published::{WorldSighting, WorldTrackPoint};
 use super::state::SiteLive;
 use crate::app::live::sync::lock;
 use crate::config::Limits;
-use crate::domain::{CameraId, LiveId, ReceiverId, TargetId};
+use crate::domain::{CameraId, LiveId, ReceiverId, RunId, TargetId};
 use crate::fusion::frame_assembler::{AssembledFrame, FrameAssembler, FrameLimits, PushOutcome};
 use crate::fusion::world::{
     CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
@@ -26,6 +26,8 @@ use crate::telemetry::{Metrics, SiteItemOutcome};
 const ANNOUNCE_STEP: SignedDuration = SignedDuration::from_millis(200);
 /// A target counts as the carrier of a receiver until this long after its latest fix.
 const CARRIER_FOR: Duration = Duration::from_secs(60);
+/// A camera counts as one of the site's until this long after its latest box.
+const CAMERA_FOR: Duration = Duration::from_secs(60);
 
 /// Where frames come from. Cameras sort before receivers, so that a box is tracked before the fix of its instant.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -47,11 +49,21 @@ pub(super) struct SiteTracker {
     number_offset: u64,
     /// The highest number that was announced.
     highest_number: u64,
+    /// The cameras of which boxes came lately.
+    cameras: HashMap<CameraId, SeenModel>,
     /// Targets of which fixes came.
     carriers: HashMap<TargetId, Carrier>,
     /// The tracks whose start was announced and whose end was not, each with the latest instant at which its
     /// position was announced.
     announced: HashMap<LiveId, Option<Timestamp>>,
+}
+
+/// The model by which a camera's boxes were located.
+struct SeenModel {
+    /// The run that trained it together with other cameras, if one did.
+    joint_run: Option<RunId>,
+    /// Reading of the monotonic clock when its latest box came.
+    noted_at: Duration,
 }
 
 /// A target that carries a receiver.
@@ -94,6 +106,7 @@ impl SiteTracker {
             active: None,
             number_offset: 0,
             highest_number: 0,
+            cameras: HashMap::new(),
             carriers: HashMap::new(),
             announced: HashMap::new(),
         }
@@ -102,7 +115,11 @@ impl SiteTracker {
     /// Takes an item; [`Self::advance`] tracks what is complete.
     pub(super) fn push(&mut self, item: SiteItem, now: Duration) {
         let (source, is_pacing) = match (&item.source, &item.target_id) {
-            (ItemSource::Box { .. }, _) => (Source::Camera(item.camera.clone()), true),
+            (ItemSource::Box { joint, .. }, _) => {
+                let seen = SeenModel { joint_run: joint.map(|(run, _)| run), noted_at: now };
+                self.cameras.insert(item.camera.clone(), seen);
+                (Source::Camera(item.camera.clone()), true)
+            }
             (ItemSource::Fix { .. }, Some(target_id)) => {
                 if !self.note_carrier(&item.camera, target_id, item.time, now) {
                     return;
@@ -253,10 +270,19 @@ impl SiteTracker {
         is_held
     }
 
+    /// The run that trained the models of all cameras together of which boxes came lately.
+    fn joint_run(&mut self, now: Duration) -> Option<RunId> {
+        self.cameras.retain(|_, seen| now.saturating_sub(seen.noted_at) < CAMERA_FOR);
+        let mut runs = self.cameras.values().map(|seen| seen.joint_run);
+        let first = runs.next()??;
+        runs.all(|run| run == Some(first)).then_some(first)
+    }
+
     fn track_boxes(&mut self, camera: CameraId, time: Timestamp, items: &[SiteItem]) {
+        let Some(now) = self.active.as_ref().map(|active| active.tracked_at) else { return };
+        let joint_run = self.joint_run(now);
         let Some(active) = &mut self.active else { return };
         let plane = *active.tracker.plane();
-        let now = active.tracked_at;
         let carries = |camera: &CameraId, target_id: &TargetId| {
             let carrier = self.carriers.get(target_id).filter(|carrier| !carrier.is_outdated(now));
             carrier.is_some_and(|carrier| carrier.cameras.contains(camera))
@@ -264,7 +290,7 @@ impl SiteTracker {
         let mut detections = Vec::with_capacity(items.len());
         let settings = active.tracker.settings();
         for item in items {
-            let detection = detection_of(item, &plane, settings, carries);
+            let detection = detection_of(item, &plane, settings, joint_run, carries);
             self.metrics.site_item(detection.as_ref().err().copied().unwrap_or(SiteItemOutcome::Tracked));
             detections.extend(detection);
         }
@@ -399,15 +425,16 @@ impl Carrier {
     }
 }
 
-/// A box in the plane of the tracker, or why it is not tracked. `carries` tells whether a receiver of the target is
-/// known.
+/// A box in the plane of the tracker, or why it is not tracked. `joint_run` is the run that trained all cameras together;
+/// `carries` tells whether a receiver of the target is known.
 fn detection_of(
     item: &SiteItem,
     plane: &LocalPlane,
     settings: &WorldTrackSettings,
+    joint_run: Option<RunId>,
     carries: impl Fn(&CameraId, &TargetId) -> bool,
 ) -> Result<WorldDetection, SiteItemOutcome> {
-    let ItemSource::Box { covariance_m2, map_covariance_m2, .. } = &item.source else {
+    let ItemSource::Box { covariance_m2, map_covariance_m2, joint, .. } = &item.source else {
         return Err(SiteItemOutcome::OutOfRange);
     };
     let position = plane.to_plane_within_range(item.position).ok_or(SiteItemOutcome::OutOfRange)?;
@@ -416,15 +443,21 @@ fn detection_of(
         return Err(SiteItemOutcome::Uncertain);
     }
     let carrier = item.target_id.clone().filter(|target_id| carries(&item.camera, target_id));
+    let common_m2 = joint.filter(|(run, _)| Some(*run) == joint_run).map(|(_, common_m2)| common_m2);
+    let (covariance_m2, common_covariance_m2) = match common_m2 {
+        // What the cameras have in common is in every measurement alike: the filter has the rest.
+        Some(common_m2) => (covariance_m2.minus(common_m2), common_m2),
+        // The error of a map does not average out over frames. How much of it other cameras share is unknown where
+        // they were not trained together: all of it is stated, so averaging over cameras gains nothing in the
+        // stated error.
+        None => (*covariance_m2, *map_covariance_m2),
+    };
     Ok(WorldDetection {
         tracker_id: item.target_id.clone(),
         receiver: carrier.map(ReceiverId::from),
         position,
-        covariance_m2: *covariance_m2,
-        // The error of a map does not average out over frames. How much of it other cameras share is unknown as long
-        // as the maps of a site are not fitted together: all of it is stated, so averaging over cameras gains
-        // nothing in the stated error.
-        common_covariance_m2: *map_covariance_m2,
+        covariance_m2,
+        common_covariance_m2,
     })
 }
 
@@ -461,6 +494,7 @@ mod tests {
                 source: ItemSource::Box {
                     covariance_m2: PlaneCovariance::isotropic(self.box_variance_m2),
                     map_covariance_m2: PlaneCovariance::isotropic(0.16),
+                    joint: None,
                     model_origin: origin,
                 },
             };

@@ -22,7 +22,7 @@ const MAX_ROWS: usize = 20_000;
 const MIN_WEIGHT: f64 = 0.02;
 /// Standard deviation of a bias that all receivers share, as a share of that of the coloured part of their
 /// error: no training sample can show it, so it is a prior.
-const SHARED_BIAS_SHARE: f64 = 0.1;
+pub(crate) const SHARED_BIAS_SHARE: f64 = 0.1;
 /// Degrees of freedom that the prior of the slow part is worth: a logarithm with a standard deviation of 0.5
 /// has about the tails of an inverse chi-square with four.
 const PRIOR_FREEDOM: f64 = 4.0;

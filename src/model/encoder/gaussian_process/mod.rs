@@ -4,7 +4,7 @@
 //! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
 //! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
 //! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`;
-//! `recipe` and `stored` connect both to the rest of the module. Random starts have a seed of their own.
+//! `recipe` and `stored` connect both to the rest of the module; `foot_map` takes the map of another fit, and `upright_geometry` gives it a prior. Random starts have a seed of their own.
 
 pub(crate) mod box_plausibility;
 mod candidate;
@@ -12,6 +12,7 @@ mod companion;
 mod edge_noise;
 mod f_distribution;
 mod fit;
+mod foot_map;
 mod ground_camera;
 mod groups;
 mod hyperparameters;
@@ -26,14 +27,18 @@ mod recipe;
 mod sessions;
 mod stored;
 mod upright_camera;
+mod upright_geometry;
 
 pub use box_plausibility::RecentBoxes;
 pub(crate) use companion::EPOCHS;
+pub(crate) use fit::SHARED_BIAS_SHARE;
+pub(crate) use foot_map::{FittedFootMap, FootCovariance, widen_map};
 pub use ground_camera::{GroundCamera, GroundPoint};
 pub(crate) use leave_out::{SequenceMean, widening};
-pub(crate) use noise::{Epoch, ReceiverNoise};
+pub(crate) use noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, receiver_correlation, target_height_m};
 pub(crate) use sessions::weighted_mean;
+pub(crate) use upright_geometry::{FootPrior, UprightGeometry, UprightStarts};
 
 #[cfg(test)]
 mod tests;

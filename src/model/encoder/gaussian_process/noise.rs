@@ -6,8 +6,12 @@
 //! filter's innovations are independent with a known variance, so least squares on them is exact
 //! generalised least squares in linear time (Bar-Shalom, Li and Kirubarajan 2001, sections 5.2 and 8.2).
 
+use crate::domain::GaussMarkovNoise;
+
 /// Squared normalised innovation of both axes from which a row counts less (2 degrees of freedom, 98 %).
 const CREDIBLE_NIS: f64 = 8.0;
+/// Least white variance of a fix, m2: its rounding.
+const MIN_WHITE_M2: f64 = 1e-4;
 
 /// Variances per axis and time constant of one receiver's error.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,6 +31,15 @@ pub(crate) struct ReceiverNoise {
 impl ReceiverNoise {
     pub(crate) const fn white(white_m2: f64) -> Self {
         Self { white_m2, short_m2: 0.0, short_time_s: 1.0, session_m2: 0.0, session_time_s: 1.0 }
+    }
+
+    /// Noise without a slow process.
+    pub(crate) fn of_gauss_markov(noise: &GaussMarkovNoise) -> Self {
+        Self {
+            short_m2: noise.coloured_variance_m2(),
+            short_time_s: noise.correlation.time_constant_s,
+            ..Self::white(noise.white_variance_m2().max(MIN_WHITE_M2))
+        }
     }
 
     /// Variance of one fix per axis, m2.

@@ -69,11 +69,7 @@ pub(crate) fn fit(
     epochs: u32,
     phase: &mut Phase<'_, '_>,
 ) -> Result<FittedEncoder, FitError> {
-    let map_rows = MapRows {
-        epochs: rows.rows.iter().map(|row| Epoch { time_s: row.time_s, sequence: row.target }).collect(),
-        boxes: rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect(),
-        labels_m: rows.rows.iter().map(|row| [row.label.east_m, row.label.north_m]).collect(),
-    };
+    let map_rows = map_rows(rows);
     let unpaired = settings.unpaired.iter().map(|own| (own.target, features_of(&own.bounding_box)));
     let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
     let mut boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
@@ -121,8 +117,17 @@ pub(crate) fn receiver_correlation(parts: &ModelParts) -> Option<(NoiseCorrelati
     Some((correlation, session_m2 / (within_m2 + session_m2)))
 }
 
+/// Training rows as a map is fitted to them.
+pub(super) fn map_rows(rows: &TrainingRows) -> MapRows {
+    MapRows {
+        epochs: rows.rows.iter().map(|row| Epoch { time_s: row.time_s, sequence: row.target }).collect(),
+        boxes: rows.rows.iter().map(|row| features_of(&row.bounding_box)).collect(),
+        labels_m: rows.rows.iter().map(|row| [row.label.east_m, row.label.north_m]).collect(),
+    }
+}
+
 /// White share of the error variance: what the detector's noise makes of it, over the training boxes.
-fn white_share(predictor: &Predictor, rows: &MapRows) -> f64 {
+pub(super) fn white_share(predictor: &Predictor, rows: &MapRows) -> f64 {
     let (mut white_m2, mut all_m2) = (0.0, 0.0);
     for sides in rows.boxes.iter().step_by(rows.boxes.len().div_ceil(500)) {
         let prediction = predictor.predict(sides, None);

@@ -17,7 +17,7 @@ const MAX_MAPS: usize = 4;
 const MEAN_SCALARS: usize = 7;
 const CELL_NUMBERS: usize = 17;
 const MAPS: &str = "gaussian_process.maps";
-const WIDENING: &str = "gaussian_process.widening";
+pub(super) const WIDENING: &str = "gaussian_process.widening";
 const SHARED_BIAS: &str = "gaussian_process.shared_bias_m2";
 
 impl Predictor {

@@ -1,0 +1,219 @@
+//! Addresses of connections: what is reached, and how.
+
+use crate::domain::{Error, Result, check_text};
+
+/// Longest address, bytes.
+const MAX_ADDRESS_BYTES: usize = 512;
+
+/// The part of an address before the host.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(missing_docs, reason = "each is the scheme of its name")]
+pub enum Scheme {
+    Mqtt,
+    Mqtts,
+    Tcp,
+    Tls,
+    TcpListen,
+    Udp,
+    Gpsd,
+    Push,
+    Http,
+    Https,
+    Nats,
+    Kafka,
+    Kafkas,
+    Serial,
+    File,
+}
+
+impl Scheme {
+    pub(super) const SOURCES: &[Self] = &[
+        Self::Mqtt,
+        Self::Mqtts,
+        Self::Kafka,
+        Self::Kafkas,
+        Self::Tcp,
+        Self::Tls,
+        Self::TcpListen,
+        Self::Udp,
+        Self::Serial,
+        Self::Gpsd,
+        Self::Push,
+    ];
+    pub(super) const SINKS: &[Self] = &[
+        Self::Mqtt,
+        Self::Mqtts,
+        Self::Kafka,
+        Self::Kafkas,
+        Self::Nats,
+        Self::Tcp,
+        Self::Tls,
+        Self::Udp,
+        Self::Http,
+        Self::Https,
+        Self::File,
+    ];
+    /// What is complete without an address.
+    const BARE: [Self; 2] = [Self::Push, Self::File];
+    /// Kinds whose messages have topics that are subscribed to.
+    const SUBSCRIBED: [Self; 4] = [Self::Mqtt, Self::Mqtts, Self::Kafka, Self::Kafkas];
+
+    const fn as_str(self) -> &'static str {
+        match self {
+            Self::Mqtt => "mqtt",
+            Self::Mqtts => "mqtts",
+            Self::Tcp => "tcp",
+            Self::Tls => "tls",
+            Self::TcpListen => "tcp-listen",
+            Self::Udp => "udp",
+            Self::Gpsd => "gpsd",
+            Self::Push => "push",
+            Self::Http => "http",
+            Self::Https => "https",
+            Self::Nats => "nats",
+            Self::Kafka => "kafka",
+            Self::Kafkas => "kafkas",
+            Self::Serial => "serial",
+            Self::File => "file",
+        }
+    }
+
+    const fn default_port(self) -> Option<u16> {
+        match self {
+            Self::Mqtt => Some(1883),
+            Self::Mqtts => Some(8883),
+            Self::Gpsd => Some(2947),
+            Self::Http => Some(80),
+            Self::Https => Some(443),
+            Self::Nats => Some(4222),
+            Self::Kafka => Some(9092),
+            Self::Kafkas => Some(9093),
+            Self::Tcp | Self::Tls | Self::TcpListen | Self::Udp | Self::Push | Self::Serial | Self::File => {
+                None
+            }
+        }
+    }
+
+    /// Whether a source of this kind subscribes to topics.
+    pub(super) fn subscribes(self) -> bool {
+        Self::SUBSCRIBED.contains(&self)
+    }
+
+    /// Whether it is Kafka, plain or encrypted.
+    pub(super) const fn is_kafka(self) -> bool {
+        matches!(self, Self::Kafka | Self::Kafkas)
+    }
+}
+
+/// Where a peer is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Address {
+    /// How it is reached.
+    pub scheme: Scheme,
+    /// Name or address of its machine; without the brackets of IPv6.
+    pub host: String,
+    /// Its port.
+    pub port: u16,
+    /// Path and query, from `/` on, of a webhook or a serial device.
+    pub path: String,
+}
+
+impl Address {
+    /// Reads an address of one of these schemes.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `address`.
+    pub(super) fn parse(text: &str, schemes: &[Scheme]) -> Result<Self> {
+        let invalid = |message: String| Error::invalid("address", message);
+        check_text("address", text, MAX_ADDRESS_BYTES)?;
+        let mut bare = Scheme::BARE.into_iter().filter(|scheme| schemes.contains(scheme));
+        if let Some(scheme) = bare.find(|scheme| text == format!("{}:", scheme.as_str())) {
+            return Ok(Self { scheme, host: String::new(), port: 0, path: String::new() });
+        }
+        let named = text.split_once("://").and_then(|(name, rest)| {
+            Some((
+                schemes.iter().copied().find(|it| it.as_str() == name && !Scheme::BARE.contains(it))?,
+                rest,
+            ))
+        });
+        let Some((scheme, rest)) = named else {
+            let known: Vec<String> = schemes.iter().map(|it| format!("{}:", it.as_str())).collect();
+            return Err(invalid(format!("must begin with one of {}", known.join(", "))));
+        };
+        if scheme == Scheme::Serial {
+            let address = Self { scheme, host: String::new(), port: 0, path: rest.to_owned() };
+            return address.serial_line().map(|_| address);
+        }
+        let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+        if authority.contains('@') {
+            return Err(invalid("must not contain a user; give username and the secret password".to_owned()));
+        }
+        let has_path = matches!(scheme, Scheme::Http | Scheme::Https);
+        if !has_path && !matches!(path, "" | "/") {
+            return Err(invalid("must end behind the port".to_owned()));
+        }
+        if path.contains(|it: char| it.is_whitespace() || !it.is_ascii()) {
+            return Err(invalid("must be ASCII without spaces".to_owned()));
+        }
+        let (host, port) = match authority.rsplit_once(':') {
+            Some((host, port)) if !port.ends_with(']') => {
+                let port = port.parse().ok().filter(|port| *port > 0);
+                (host, Some(port.ok_or_else(|| invalid("has no port from 1 to 65535".to_owned()))?))
+            }
+            _ => (authority, None),
+        };
+        let host = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
+        let is_host = |byte: u8| byte.is_ascii_alphanumeric() || b".-_:".contains(&byte);
+        if host.is_empty() || !host.bytes().all(is_host) {
+            return Err(invalid("has no host".to_owned()));
+        }
+        let port = port.or(scheme.default_port());
+        Ok(Self {
+            scheme,
+            host: host.to_owned(),
+            port: port.ok_or_else(|| invalid("must name a port, as in HOST:PORT".to_owned()))?,
+            path: if path.is_empty() { "/".to_owned() } else { path.to_owned() },
+        })
+    }
+
+    /// The serial device of an address such as `serial:///dev/ttyUSB0?baud=4800`.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `address`.
+    pub fn serial_line(&self) -> Result<SerialLine> {
+        let invalid = |message: &str| Error::invalid("address", message);
+        let (path, query) =
+            self.path.split_once('?').map_or((self.path.as_str(), None), |(path, query)| (path, Some(query)));
+        let is_device = path.strip_prefix("/dev/").is_some_and(|rest| {
+            !rest.is_empty() && rest.split('/').all(|part| !matches!(part, "" | "." | ".."))
+        });
+        if !is_device || path.contains(char::is_control) {
+            return Err(invalid("must name a device below /dev/, such as serial:///dev/ttyUSB0?baud=4800"));
+        }
+        let baud = match query {
+            None => Some(SerialLine::NMEA_BAUD),
+            Some(query) => query.strip_prefix("baud=").and_then(|baud| baud.parse().ok()),
+        };
+        let baud = baud.filter(|baud| SerialLine::BAUDS.contains(baud));
+        let baud = baud.ok_or_else(|| {
+            let known: Vec<String> = SerialLine::BAUDS.iter().map(u32::to_string).collect();
+            invalid(&format!("must end behind the device, or with ?baud= and one of {}", known.join(", ")))
+        })?;
+        Ok(SerialLine { path: path.into(), baud })
+    }
+}
+
+/// A serial device with the speed of its line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SerialLine {
+    /// Its path, below `/dev/`.
+    pub path: std::path::PathBuf,
+    /// Bits per second.
+    pub baud: u32,
+}
+
+impl SerialLine {
+    /// Speed of NMEA 0183; AIS receivers have 38400.
+    const NMEA_BAUD: u32 = 4_800;
+    const BAUDS: [u32; 9] = [4_800, 9_600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600];
+}

@@ -1,0 +1,48 @@
+//! How far sources have read the partitions of their topics.
+
+use super::Store;
+use super::errors::failed;
+use crate::domain::{ConnectionKey, Durability, Result, SourceOffset};
+use crate::store::rows::connections::read_source_offset;
+
+impl Store {
+    pub(in crate::store) async fn source_offsets(&self, key: ConnectionKey) -> Result<Vec<SourceOffset>> {
+        let mut reader = self.reader().await?;
+        let rows = sqlx::query(
+            "SELECT topic, partition_number, next_offset FROM source_offsets WHERE connection_key = $1 \
+             ORDER BY topic, partition_number",
+        )
+        .bind(key.0)
+        .fetch_all(&mut *reader)
+        .await
+        .map_err(failed)?;
+        rows.iter().map(read_source_offset).collect()
+    }
+
+    pub(in crate::store) async fn store_source_offsets(
+        &self,
+        key: ConnectionKey,
+        offsets: &[SourceOffset],
+        durability: Durability,
+    ) -> Result<()> {
+        let mut transaction = match durability {
+            Durability::Synced => self.writer().await?,
+            Durability::Relaxed => self.relaxed_writer().await?,
+        };
+        for offset in offsets {
+            sqlx::query(
+                "INSERT INTO source_offsets (connection_key, topic, partition_number, next_offset) \
+                 SELECT key, $1, $2, $3 FROM connections WHERE key = $4 \
+                 ON CONFLICT (connection_key, topic, partition_number) DO UPDATE SET next_offset = excluded.next_offset",
+            )
+            .bind(&offset.topic)
+            .bind(i64::from(offset.partition))
+            .bind(offset.next_offset)
+            .bind(key.0)
+            .execute(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        }
+        transaction.commit().await.map_err(failed)
+    }
+}

@@ -1,0 +1,286 @@
+//! Training runs of sites: jobs whose output is a model version of each camera.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use sqlx::{SqliteConnection, SqliteExecutor};
+
+use super::Store;
+use super::errors::failed;
+use super::idempotency::{find_answer, insert_answer};
+use super::jobs::SITE_RUNS;
+use super::models::{activate, add_model};
+use super::retention::prune_models;
+use crate::domain::{
+    AuditAction, Error, Result, RunId, RunProgress, SiteId, SiteTrainingOptions, SiteTrainingReport,
+    SiteTrainingRun,
+};
+use crate::store::jobs::{Claim, Heartbeat, JobEnd};
+use crate::store::refusals::{no_run, no_site};
+use crate::store::rows::audit::{Change, version};
+use crate::store::rows::idempotency::IdempotencyRecord;
+use crate::store::rows::site_runs::{
+    SiteCameraOutput, SiteRunEnd, SiteRunOutput, check_no_live_site_run, check_site_run_not_ended,
+    conflict_of, read_site_run, select_site_runs as select, site_run_of,
+};
+
+impl Store {
+    pub(in crate::store) async fn insert_site_run(
+        &self,
+        run: RunId,
+        site: &SiteId,
+        options: &SiteTrainingOptions,
+        max_live: u32,
+        record: Option<&IdempotencyRecord>,
+        now: Timestamp,
+    ) -> Result<SiteTrainingRun> {
+        let mut writer = self.growing().await?;
+        let mut transaction = writer.begin().await?;
+        let key = site_key(&mut *transaction, site).await?;
+        if let Some(record) = record {
+            let caller = (&*self.actor, &record.key);
+            if let Some(answer) = find_answer(&mut *transaction, self.limits(), caller, now).await? {
+                let first = answer.to_request(&record.digest)?.parse()?;
+                return site_run_of(find_run(&mut *transaction, first).await?, site, first);
+            }
+            insert_answer(&mut transaction, self.limits(), (&self.actor, record), &run.to_string(), now)
+                .await?;
+        }
+        prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
+        check_no_live_site_run(live_run(&mut transaction, key).await?)?;
+        SITE_RUNS.check_capacity(&mut transaction, max_live).await?;
+        sqlx::query(
+            "INSERT INTO site_training_runs (id, site_key, seed, from_us, until_us, state, created_at_us) \
+             VALUES (?, ?, ?, ?, ?, 'queued', ?)",
+        )
+        .bind(run.to_string())
+        .bind(key)
+        .bind(options.seed.cast_signed())
+        .bind(options.from.map(Timestamp::as_microsecond))
+        .bind(options.until.map(Timestamp::as_microsecond))
+        .bind(now.as_microsecond())
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        self.record(&mut transaction, change(AuditAction::SiteRunStarted, site, run), now).await?;
+        let stored = find_run(&mut *transaction, run).await?;
+        transaction.commit().await.map_err(failed)?;
+        stored.ok_or_else(|| no_run(run))
+    }
+
+    pub(in crate::store) async fn site_run(&self, site: &SiteId, run: RunId) -> Result<SiteTrainingRun> {
+        site_key(self.readers(), site).await?;
+        site_run_of(find_run(self.readers(), run).await?, site, run)
+    }
+
+    pub(in crate::store) async fn site_runs(
+        &self,
+        site: &SiteId,
+        before: Option<RunId>,
+        limit: u32,
+    ) -> Result<Vec<SiteTrainingRun>> {
+        let key = site_key(self.readers(), site).await?;
+        // "~" sorts behind all UUIDs.
+        let before = before.map_or_else(|| "~".to_owned(), |run| run.to_string());
+        let rows =
+            sqlx::query(select!("WHERE runs.site_key = ? AND runs.id < ? ORDER BY runs.id DESC LIMIT ?"))
+                .bind(key)
+                .bind(before)
+                .bind(i64::from(limit))
+                .fetch_all(self.readers())
+                .await
+                .map_err(failed)?;
+        rows.iter().map(read_site_run).collect()
+    }
+
+    pub(in crate::store) async fn claim_site_run(
+        &self,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Option<Claim<SiteTrainingRun>>> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let Some(claim) = SITE_RUNS.claim(&mut transaction, lease, now).await? else { return Ok(None) };
+        let id = RunId(claim.job);
+        let job = find_run(&mut *transaction, id).await?.ok_or_else(|| no_run(id))?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
+    }
+
+    pub(in crate::store) async fn heartbeat_site_run(
+        &self,
+        run: RunId,
+        fence: i64,
+        progress: &RunProgress,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Heartbeat> {
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
+        let heartbeat = SITE_RUNS.heartbeat(&mut transaction, (run.0, fence), lease, now).await?;
+        if heartbeat == Heartbeat::Lost {
+            return Ok(heartbeat);
+        }
+        sqlx::query(
+            "UPDATE site_training_runs SET phase = ?, epoch_done = ?, epochs_planned = ?, \
+             reconstruction_error = ?, regression_error = ?, error_scale = ?, remaining_s = ? \
+             WHERE id = ?",
+        )
+        .bind(&progress.phase)
+        .bind(i64::from(progress.epoch))
+        .bind(i64::from(progress.epochs))
+        .bind(progress.reconstruction_error)
+        .bind(progress.regression_error)
+        .bind(progress.error_scale)
+        .bind(progress.remaining_s)
+        .bind(run.to_string())
+        .execute(&mut *transaction)
+        .await
+        .map_err(failed)?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(heartbeat)
+    }
+
+    pub(in crate::store) async fn cancel_site_run(
+        &self,
+        site: &SiteId,
+        run: RunId,
+        now: Timestamp,
+    ) -> Result<SiteTrainingRun> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        site_key(&mut *transaction, site).await?;
+        let stored = site_run_of(find_run(&mut *transaction, run).await?, site, run)?;
+        check_site_run_not_ended(&stored)?;
+        SITE_RUNS.cancel(&mut transaction, run.0, now).await?;
+        self.record(&mut transaction, change(AuditAction::SiteRunCancelled, site, run), now).await?;
+        let stored = find_run(&mut *transaction, run).await?;
+        transaction.commit().await.map_err(failed)?;
+        stored.ok_or_else(|| no_run(run))
+    }
+
+    pub(in crate::store) async fn finish_site_run(
+        &self,
+        run: RunId,
+        fence: i64,
+        end: SiteRunEnd<'_>,
+        now: Timestamp,
+    ) -> Result<Option<SiteTrainingRun>> {
+        let mut writer = self.synced().await?;
+        let mut transaction = writer.begin().await?;
+        let end = without_conflict(&mut transaction, (run, fence), end).await?;
+        let Some(finished) = SITE_RUNS.finish(&mut transaction, (run.0, fence), end, now).await? else {
+            return Ok(None);
+        };
+        if let Some(SiteRunOutput { mut report, models }) = finished.output {
+            let activates = report.is_activated;
+            for (output, finding) in models.iter().zip(&mut report.cameras) {
+                finding.model_version = self.add_site_model(&mut transaction, output, activates, now).await?;
+            }
+            store_report(&mut transaction, run, &report).await?;
+        }
+        let stored = find_run(&mut *transaction, run).await?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(stored)
+    }
+
+    /// Stores the model of one camera, and activates it where the set is; returns its number.
+    async fn add_site_model(
+        &self,
+        connection: &mut SqliteConnection,
+        output: &SiteCameraOutput<'_>,
+        activates: bool,
+        now: Timestamp,
+    ) -> Result<u32> {
+        let key = output.key.0;
+        let number = add_model(connection, key, None, &output.model, now).await?;
+        if activates {
+            activate(connection, key, number, now).await?;
+            let change = Change::of_camera(AuditAction::ModelActivated, output.camera, Some(version(number)));
+            self.record(connection, change, now).await?;
+        }
+        prune_models(connection, key, self.limits().models_per_camera).await?;
+        Ok(number)
+    }
+}
+
+/// A success becomes a failure where the cameras are not what they were when the run read them.
+async fn without_conflict<'a>(
+    connection: &mut SqliteConnection,
+    (run, fence): (RunId, i64),
+    end: SiteRunEnd<'a>,
+) -> Result<SiteRunEnd<'a>> {
+    let JobEnd::Succeeded { output, .. } = &end else { return Ok(end) };
+    let Some((site_key, _)) = SITE_RUNS.owns_lease(connection, (run.0, fence)).await? else { return Ok(end) };
+    for output in &output.models {
+        let stored = sqlx::query_as("SELECT site_key, active_model FROM cameras WHERE key = ?")
+            .bind(output.key.0)
+            .fetch_optional(&mut *connection)
+            .await
+            .map_err(failed)?;
+        if let Some(outcome) = conflict_of(output, stored, site_key) {
+            return Ok(JobEnd::Failed { outcome });
+        }
+    }
+    Ok(end)
+}
+
+async fn store_report(
+    connection: &mut SqliteConnection,
+    run: RunId,
+    report: &SiteTrainingReport,
+) -> Result<()> {
+    sqlx::query("UPDATE site_training_runs SET report = ? WHERE id = ?")
+        .bind(serde_json::to_string(report).map_err(Error::fault)?)
+        .bind(run.to_string())
+        .execute(connection)
+        .await
+        .map_err(failed)?;
+    Ok(())
+}
+
+fn change(action: AuditAction, site: &SiteId, run: RunId) -> Change<'static> {
+    Change::of(action, format!("site {site}, training run {run}"))
+}
+
+async fn site_key(executor: impl SqliteExecutor<'_>, id: &SiteId) -> Result<i64> {
+    sqlx::query_scalar("SELECT key FROM sites WHERE id = ?")
+        .bind(id.as_str())
+        .fetch_optional(executor)
+        .await
+        .map_err(failed)?
+        .ok_or_else(|| no_site(id))
+}
+
+async fn live_run(connection: &mut SqliteConnection, site_key: i64) -> Result<Option<String>> {
+    sqlx::query_scalar(
+        "SELECT id FROM site_training_runs WHERE site_key = ? AND state IN ('queued', 'running')",
+    )
+    .bind(site_key)
+    .fetch_optional(connection)
+    .await
+    .map_err(failed)
+}
+
+/// Deletes the oldest ended runs of a site beyond a number.
+async fn prune_runs(connection: &mut SqliteConnection, site_key: i64, keep: u32) -> Result<()> {
+    sqlx::query(
+        "DELETE FROM site_training_runs WHERE id IN (SELECT id FROM site_training_runs WHERE site_key = ? \
+         AND state NOT IN ('queued', 'running') ORDER BY id DESC LIMIT -1 OFFSET ?)",
+    )
+    .bind(site_key)
+    .bind(i64::from(keep))
+    .execute(connection)
+    .await
+    .map_err(failed)?;
+    Ok(())
+}
+
+async fn find_run(executor: impl SqliteExecutor<'_>, run: RunId) -> Result<Option<SiteTrainingRun>> {
+    let row = sqlx::query(select!("WHERE runs.id = ?"))
+        .bind(run.to_string())
+        .fetch_optional(executor)
+        .await
+        .map_err(failed)?;
+    row.as_ref().map(read_site_run).transpose()
+}

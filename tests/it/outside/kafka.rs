@@ -137,15 +137,14 @@ async fn a_broker_of_kafka_is_read_on_behind_what_is_stored_also_after_a_kill() 
     cluster.publish(2, &detection(time, "8"));
     let server = TestServer::start(folder.path());
     connection_when(&server, "detector", |status| status["items"] == 2).await;
-    for target in ["7", "8"] {
-        send_fix(&server, target, &format!("{time:.3}"), 103.98678, true).await;
-    }
+    // Each is answered once its fix is stored or can no longer be; a box does not wait that long for the second.
+    let text = format!("{time:.3}");
+    let fix = |target| send_fix(&server, target, &text, 103.98678, true);
+    tokio::join!(fix("7"), fix("8"));
     let status = connection_when(&server, "detector", |status| status["acknowledged"] == 2).await;
     assert_eq!(status["status"]["messages"], 2, "{status}");
-    // A box whose fix comes late is stored without it.
     let camera = server.get("/v1/cameras/gate").await.expect(200).json();
-    let stored = |field: &str| camera[field].as_u64().expect("a number");
-    assert_eq!(stored("samples") + stored("samples_without_fix"), 3, "{camera}");
+    assert_eq!(camera["samples"], 3, "{camera}");
 }
 
 #[tokio::test]

@@ -227,7 +227,8 @@ async fn world_tracks_state_the_error_that_the_cameras_have_in_common() {
         error_m / all,
         radius_m / all
     );
-    assert!(coverage > 0.85 && radius_m < 6.0 * error_m, "{coverage}");
+    // All positions share one draw of the receivers' errors, so the share is that of one draw too.
+    assert!(coverage > 0.7 && radius_m < 6.0 * error_m, "{coverage}");
 }
 
 /// Boxes frame by frame; every camera's tracker knows the target's name.

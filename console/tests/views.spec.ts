@@ -91,6 +91,11 @@ async function look(page: Page, server: Server, path: string, ready: (page: Page
   await ready(page);
   // The emulated preference may reach a new page after its first view; colours that change meanwhile have no contrast.
   await expect(page.locator('html')).toHaveAttribute('data-theme', theme);
+  // Transitions to the colours of the theme begin with the next frame.
+  await page.evaluate(async () => {
+    for (let frame = 0; frame < 2; frame += 1) await new Promise(requestAnimationFrame);
+    await Promise.all(document.getAnimations().filter(({ effect }) => Number.isFinite(effect?.getComputedTiming().endTime)).map(({ finished }) => finished.catch(() => undefined)));
+  });
 }
 
 test('every view is accessible, fits and can be shown', async ({ console: page, server }) => {

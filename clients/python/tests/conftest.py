@@ -3,6 +3,7 @@
 The binary is that of the environment variable SIGHTFIX, or the debug build.
 """
 
+import csv
 import os
 import signal
 import socket
@@ -96,6 +97,36 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     rows = ["--samples", "240", "--test-out", str(test), "--test-samples", "120"]
     subprocess.run([BINARY, "simulate", "square", "--out", str(training), *rows], check=True, capture_output=True)
     return training, test
+
+
+@pytest.fixture(scope="session")
+def site_recording(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Rows for training by camera of a site: the boxes of those who carry a receiver, with its fixes."""
+    folder = tmp_path_factory.mktemp("site")
+    scene = ["--cameras", "2", "--walkers", "10", "--vehicles", "0", "--receivers", "1"]
+    length = ["--duration-s", "60", "--frame-interval-s", "1"]
+    subprocess.run([BINARY, "simulate", "site", "--out", str(folder), *scene, *length], check=True, capture_output=True)
+
+    def rows(name: str) -> Iterator[dict[str, str]]:
+        with (folder / name).open(newline="") as file:
+            yield from csv.DictReader(file)
+
+    person = {(row["camera"], row["target_id"]): row["person"] for row in rows("identity.csv")}
+    # `phone-3` is carried by `person-3`.
+    fixes = {(row["time"], row["receiver_id"].replace("phone", "person")): row for row in rows("fixes.csv")}
+    files = {}
+    for camera in ("c1", "c2"):
+        files[camera] = folder / f"{camera}.csv"
+        with files[camera].open("w", newline="") as file:
+            box = ["time", "target_id", "left", "top", "width", "height"]
+            writer = csv.DictWriter(file, [*box, "longitude", "latitude"], extrasaction="ignore")
+            writer.writeheader()
+            for row in rows(f"detections_{camera}.csv"):
+                target_id = person[camera, row["target_id"]]
+                fix = fixes.get((row["time"], target_id))
+                if fix is not None:
+                    writer.writerow(fix | row | {"target_id": target_id})
+    return files
 
 
 @pytest.fixture(scope="session")

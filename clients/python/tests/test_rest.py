@@ -28,7 +28,7 @@ from sightfix import (
     UnauthenticatedError,
     WaitTimeoutError,
 )
-from sightfix.models import TrackUpdate, TrainingRun
+from sightfix.models import SiteTrainingRun, TrackUpdate, TrainingRun
 from tests.conftest import ServerProcess, admin_key
 
 NOON = datetime(2026, 1, 1, 12, tzinfo=UTC)
@@ -246,6 +246,61 @@ def test_a_site_tracks_targets_over_its_cameras(trained: ServerProcess) -> None:
             client.sites.get("harbour")
 
 
+def site_with_samples(client: Client, files: dict[str, Path]) -> None:
+    client.sites.create(id="street")
+    for camera, file in files.items():
+        client.cameras.create(id=camera, site="street", image_size=ImageSize(width_px=1280, height_px=720))
+        assert client.samples.import_file(camera, file).rejected == 0
+
+
+def test_the_cameras_of_a_site_are_trained_together(
+    client: Client, site_recording: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    site_with_samples(client, site_recording)
+    states: list[SiteTrainingRun] = []
+    run, again = (client.site_training_runs.start("street", seed=3, idempotency_key="tonight") for _ in range(2))
+    assert run.id == again.id
+    ended = client.site_training_runs.wait(run, progress=True, on_progress=states.append, poll_s=0.05)
+    assert (ended.state, ended.seed, ended.site_id, states[-1]) == ("succeeded", 3, "street", ended)
+    assert ended.progress.epoch == ended.progress.epochs > 0
+    assert "succeeded" in capsys.readouterr().err
+    report = ended.report
+    assert report is not None
+    assert [(it.camera_id, it.model_version) for it in report.cameras] == [("c1", 1), ("c2", 1)]
+    assert report.is_activated
+    assert [client.cameras.get(camera).active_model for camera in site_recording] == [1, 1]
+    assert report.disagreement_m is not None
+    assert report.disagreement_apart_m is not None
+    assert 0 < report.disagreement_m < report.disagreement_apart_m
+    assert ended.report_text
+    assert [it.id for it in client.site_training_runs.list("street")] == [run.id]
+    assert client.site_training_runs.get("street", run.id) == ended
+    with pytest.raises(ConflictError):
+        client.site_training_runs.cancel("street", run.id)
+
+
+def test_a_run_of_a_site_is_cancelled_or_refused(client: Client, site_recording: dict[str, Path]) -> None:
+    client.sites.create(id="empty")
+    with pytest.raises(InvalidRequestError) as refused:
+        client.site_training_runs.start("empty")
+    assert refused.value.kind == "unusable-samples"
+    with pytest.raises(NotFoundError):
+        next(client.site_training_runs.list("elsewhere"))
+    site_with_samples(client, site_recording)
+    with pytest.raises(InvalidRequestError):
+        client.site_training_runs.start("street", from_=NOON + timedelta(days=10_000))
+    run = client.site_training_runs.start("street")
+    with pytest.raises(ConflictError):
+        client.site_training_runs.start("street")
+    with pytest.raises(WaitTimeoutError):
+        client.site_training_runs.wait(run, timeout_s=0.0)
+    client.site_training_runs.cancel("street", run.id)
+    with pytest.raises(JobFailedError) as failed:
+        client.site_training_runs.wait(run)
+    assert failed.value.job.state == "cancelled"
+    assert [client.cameras.get(camera).active_model for camera in site_recording] == [None, None]
+
+
 def test_events_of_a_site_are_watched(server: ServerProcess) -> None:
     with Client(server.url) as client:
         client.sites.create(id="mall")
@@ -387,5 +442,22 @@ def test_the_asynchronous_client_has_the_same_methods(server: ServerProcess, rec
             assert len(await client.fusions.fuse_batch("square", observations)) == 240
             with pytest.raises(NotFoundError):
                 await client.cameras.get("yard")
+
+    asyncio.run(scenario())
+
+
+def test_the_asynchronous_client_trains_a_site(server: ServerProcess, site_recording: dict[str, Path]) -> None:
+    with Client(server.url) as client:
+        site_with_samples(client, site_recording)
+
+    async def scenario() -> None:
+        async with AsyncClient(server.url) as client:
+            run = await client.site_training_runs.start("street")
+            ended = await client.site_training_runs.wait(run, poll_s=0.1)
+            assert [it async for it in client.site_training_runs.list("street")] == [ended]
+            assert ended.report is not None
+            assert [it.camera_id for it in ended.report.cameras] == ["c1", "c2"]
+            with pytest.raises(ConflictError):
+                await client.site_training_runs.cancel("street", run.id)
 
     asyncio.run(scenario())

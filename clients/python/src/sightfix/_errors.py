@@ -4,9 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sightfix.models import Evaluation, TrainingRun, Violation
+from sightfix.models import Evaluation, SiteTrainingRun, TrainingRun, Violation
 
 TYPE_PREFIX = "urn:sightfix:problem:"
+
+Job = TrainingRun | SiteTrainingRun | Evaluation
+"""What the server works on in the background."""
 
 
 class SightfixError(Exception):
@@ -20,7 +23,7 @@ class ConnectionFailedError(SightfixError):
 class JobFailedError(SightfixError):
     """A training run or an evaluation failed or was cancelled."""
 
-    def __init__(self, job: TrainingRun | Evaluation) -> None:
+    def __init__(self, job: Job) -> None:
         super().__init__(f"{job.id} is {job.state}: {job.outcome or 'no reason given'}")
         self.job = job
 

@@ -3,7 +3,8 @@
 from types import TracebackType
 from typing import Any
 
-from sightfix.models import Evaluation, TrainingRun
+from sightfix._errors import Job
+from sightfix.models import Evaluation
 
 
 class ProgressBar:
@@ -27,7 +28,7 @@ class ProgressBar:
         if self._bar is not None:
             self._bar.close()
 
-    def update(self, job: TrainingRun | Evaluation) -> None:
+    def update(self, job: Job) -> None:
         """Shows the state of a job."""
         if self._bar is None:
             return
@@ -36,12 +37,12 @@ class ProgressBar:
         self._bar.refresh()
 
 
-def steps(job: TrainingRun | Evaluation) -> tuple[int, int]:
+def steps(job: Job) -> tuple[int, int]:
     """How many steps are done, and how many there are."""
-    if isinstance(job, TrainingRun):
-        done, total = job.progress.epoch, job.progress.epochs
-    else:
+    if isinstance(job, Evaluation):
         done, total = job.progress.steps_done, job.progress.steps
+    else:
+        done, total = job.progress.epoch, job.progress.epochs
     # How many there are is unknown before the first one.
     total = max(total, 1)
     return (total, total) if job.state == "succeeded" else (min(done, total), total)

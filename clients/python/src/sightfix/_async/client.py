@@ -17,6 +17,7 @@ from sightfix._async.fusions import Fusions
 from sightfix._async.keys import Keys
 from sightfix._async.models import Models
 from sightfix._async.samples import Samples
+from sightfix._async.site_training_runs import SiteTrainingRuns
 from sightfix._async.sites import Sites
 from sightfix._async.tracks import Tracks
 from sightfix._async.training_runs import TrainingRuns
@@ -76,6 +77,7 @@ class AsyncClient:
         self.tracks = Tracks(self._transport)
         self.evaluations = Evaluations(self._transport)
         self.sites = Sites(self._transport)
+        self.site_training_runs = SiteTrainingRuns(self._transport)
         self.keys = Keys(self._transport)
 
     async def __aenter__(self) -> Self:

@@ -7,9 +7,9 @@ from typing import TypeVar
 from sightfix._errors import JobFailedError, WaitTimeoutError
 from sightfix._progress import ProgressBar
 from sightfix._runtime.asynchronous import Reader, sleep
-from sightfix.models import Evaluation, TrainingRun
+from sightfix.models import Evaluation, SiteTrainingRun, TrainingRun
 
-J = TypeVar("J", TrainingRun, Evaluation)
+J = TypeVar("J", TrainingRun, SiteTrainingRun, Evaluation)
 
 
 async def wait_for_job(

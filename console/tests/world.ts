@@ -57,6 +57,28 @@ function moved(csv: string, [east_deg, north_deg]: [number, number]): string {
   return [head, ...rows].join('\n') + '\n';
 }
 
+/** Samples of the cameras `c1` and `c2`, whose views overlap: the boxes of those who carry a receiver, with its fixes. */
+export function simulateSite(walkers: number, duration_s: number): Record<string, string> {
+  const folder = mkdtempSync(join(tmpdir(), 'sightfix-site-'));
+  const scene = ['--cameras', '2', '--walkers', String(walkers), '--vehicles', '0', '--receivers', '1', '--duration-s', String(duration_s)];
+  execFileSync(BINARY, ['simulate', 'site', '--out', folder, ...scene], { stdio: 'ignore' });
+  const cells = (name: string): string[][] => readFileSync(join(folder, name), 'utf8').trim().split(/\r?\n/).slice(1).map((line) => line.split(','));
+  // The columns of each file are in docs/world-tracks.md; `phone-3` is carried by `person-3`.
+  const people = new Map(cells('identity.csv').map(([camera, id, person]) => [`${camera} ${id}`, person!]));
+  const fixes = new Map(cells('fixes.csv').map(([time, receiver, ...position]) => [`${time} ${receiver!.replace('phone', 'person')}`, position]));
+  const samplesOf = (camera: string): string => {
+    const rows = cells(`detections_${camera}.csv`).flatMap(([time, id, left, top, width, height]) => {
+      const person = people.get(`${camera} ${id}`);
+      const position = fixes.get(`${time} ${person}`);
+      return position ? [[time, person, left, top, width, height, ...position].join(',')] : [];
+    });
+    return ['time,target_id,left,top,width,height,longitude,latitude', ...rows].join('\n');
+  };
+  const samples = Object.fromEntries(['c1', 'c2'].map((camera) => [camera, samplesOf(camera)]));
+  rmSync(folder, { recursive: true });
+  return samples;
+}
+
 /** A trained camera. */
 export async function addCamera(server: Server, id: string, name: string, world: SimulatedCamera, labels: Record<string, string> = {}): Promise<void> {
   await server.request('POST', '/v1/cameras', { id, display_name: name, image_size: { width_px: 1280, height_px: 720 }, labels });

@@ -120,7 +120,12 @@ export async function getAll<T>(path: string, most: number, signal?: AbortSignal
 
 /** A path below a camera. */
 export function cameraPath(camera: string, ...rest: string[]): string {
-  return ['/v1/cameras', camera, ...rest].map((part, at) => (at === 0 ? part : encodeURIComponent(part))).join('/');
+  return ['/v1/cameras', ...[camera, ...rest].map(encodeURIComponent)].join('/');
+}
+
+/** A path below a site. */
+export function sitePath(site: string, ...rest: string[]): string {
+  return ['/v1/sites', ...[site, ...rest].map(encodeURIComponent)].join('/');
 }
 
 /** Rejected rows as a file that a spreadsheet opens. */

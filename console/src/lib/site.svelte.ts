@@ -1,5 +1,5 @@
 // The targets of a site as its cameras measure them together.
-import { get } from './api';
+import { get, sitePath } from './api';
 import { listen } from './events';
 import type { Position, WorldTrack, WorldTrackFeature } from './types';
 
@@ -32,7 +32,7 @@ export class SiteLive {
   #frame = 0;
 
   constructor(site: string) {
-    const path = `/v1/sites/${encodeURIComponent(site)}`;
+    const path = sitePath(site);
     const change = (kind: TrackChange['kind']) => (data: unknown) => {
       this.changes = [{ ...(data as Omit<TrackChange, 'kind'>), kind }, ...this.changes].slice(0, MOST_CHANGES);
     };

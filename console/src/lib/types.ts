@@ -133,6 +133,40 @@ export interface TrainingRun {
   started_at?: string;
   ended_at?: string;
 }
+/** How long a run that has ended took, s. */
+export function ranFor({ started_at, ended_at }: { started_at?: string; ended_at?: string }): number | undefined {
+  return started_at && ended_at ? (Date.parse(ended_at) - Date.parse(started_at)) / 1000 : undefined;
+}
+export interface SiteCameraFinding {
+  camera_id: string;
+  model_version: number;
+  samples: number;
+  held_out_m: number;
+  held_out_apart_m?: number;
+  coverage95_of_fixes: number;
+  comparison: string;
+}
+export interface SiteTrainingRun {
+  id: string;
+  site_id: string;
+  seed: number;
+  from?: string;
+  until?: string;
+  state: JobState;
+  progress: RunProgress;
+  report?: {
+    is_activated: boolean;
+    receivers: number;
+    pairs: number;
+    disagreement_m?: number;
+    disagreement_apart_m?: number;
+    cameras: SiteCameraFinding[];
+  };
+  outcome?: string;
+  created_at: string;
+  started_at?: string;
+  ended_at?: string;
+}
 export interface EpochReport {
   epoch: number;
   loss: number;

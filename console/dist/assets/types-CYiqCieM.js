@@ -1,1 +1,0 @@
-function e(e){return e===`queued`||e===`running`||e===`cancelling`}export{e as t};

@@ -1,0 +1,1 @@
+function e(e){return e===`queued`||e===`running`||e===`cancelling`}function t({started_at:e,ended_at:t}){return e&&t?(Date.parse(t)-Date.parse(e))/1e3:void 0}export{t as n,e as t};

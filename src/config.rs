@@ -35,6 +35,8 @@ pub struct Config {
     /// Address of this process for clients that others with the same database redirect here, such as
     /// `https://node-1.example.org:8443`; by default that of `listen`, if it names one machine.
     pub advertised_url: Option<String>,
+    /// What happens to a request for the live state of a camera that another process has: `redirect`, or `proxy`.
+    pub camera_on_other_node: OtherNode,
     /// Seconds after which the live streams of a silent process go to another one with the same database.
     pub node_lease_s: u32,
     /// Address of the one port for REST and gRPC.
@@ -83,6 +85,16 @@ pub struct Config {
     pub console: Console,
     /// What an outside client may make large.
     pub limits: Limits,
+}
+
+/// What happens to a request for the live state of a camera that another process has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum OtherNode {
+    /// The client gets the address of the other process: 307, or `UNAVAILABLE` with `owner` in `ErrorInfo`.
+    Redirect,
+    /// The request is sent on to that process.
+    Proxy,
 }
 
 /// What a process does of the work that all processes with one database share.
@@ -201,7 +213,7 @@ pub struct Limits {
     pub connections: usize,
     /// Streams per HTTP/2 connection.
     pub streams_per_connection: u32,
-    /// Requests worked on at a time; one counts from the end of its body to the begin of its answer.
+    /// Requests worked on at a time; one counts from the end of its body to the start of its answer.
     pub requests: usize,
     /// How many of `requests` are reserved for fusions.
     pub reserved_requests: usize,
@@ -281,6 +293,8 @@ pub struct Limits {
     pub site_events: usize,
     /// Samples of one camera.
     pub samples_per_camera: u64,
+    /// Days that samples are kept, by their times; 0 is without end.
+    pub sample_days: u32,
     /// What happens beyond `samples_per_camera`: `refuse`, or `delete_oldest`.
     pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
@@ -314,6 +328,7 @@ impl Default for Config {
             database: None,
             role: NodeRole::Both,
             advertised_url: None,
+            camera_on_other_node: OtherNode::Redirect,
             node_lease_s: 4,
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             metrics_listen: None,
@@ -415,6 +430,7 @@ impl Default for Limits {
             tracks_per_site: 1_024,
             site_events: 4_096,
             samples_per_camera: 10_000_000,
+            sample_days: 0,
             sample_overflow: SampleOverflow::Refuse,
             samples: 100_000_000,
             models_per_camera: 100,

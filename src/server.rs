@@ -11,6 +11,7 @@ mod connection;
 mod connection_gate;
 mod cors;
 mod credentials;
+mod forward;
 mod frame_limit;
 mod guarded_stream;
 mod host_check;
@@ -26,11 +27,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
+use jiff::SignedDuration;
 use tokio::net::TcpListener;
 
 use crate::app::{App, NodeSettings, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
-use crate::config::Config;
+use crate::config::{Config, OtherNode};
 use crate::connect;
 use crate::domain::{Error, KeySecret};
 use crate::exchange::ConnectionDraft;
@@ -42,6 +44,7 @@ use crate::telemetry::Metrics;
 use crate::worker;
 
 use connection_gate::ConnectionGate;
+use forward::Forwarder;
 use host_check::HostCheck;
 use pipeline::RequestPipeline;
 use proxies::TrustedProxies;
@@ -182,6 +185,7 @@ impl Server {
             shutdown.spawn(connect::run(app.clone(), shutdown.clone()));
         }
         shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
+        shutdown.spawn(retention_loop(app.clone(), shutdown.clone()));
         shutdown.spawn(app.clone().keep_registered(shutdown.clone()));
         let mut allowed_hosts = config.allowed_hosts.clone();
         // Clients are redirected to this name.
@@ -191,7 +195,11 @@ impl Server {
         let cors = cors::layer(&config.cors_origins);
         let gate = ConnectionGate::new(&config.limits, proxies.clone());
         let pipeline = Arc::new(if config.role.answers_clients() {
-            RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, &shutdown)
+            let forwarder = match config.camera_on_other_node {
+                OtherNode::Redirect => None,
+                OtherNode::Proxy => Some(Forwarder::new(config.limits.message_bytes, &shutdown)?),
+            };
+            RequestPipeline::new(app.clone(), config.console, hosts, proxies, cors, forwarder, &shutdown)
         } else {
             RequestPipeline::monitoring(app.clone(), hosts, &shutdown)
         });
@@ -273,7 +281,7 @@ async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
             () = shutdown.draining() => return,
             () = tokio::time::sleep(REFRESH_EVERY) => {}
         }
-        app.metrics.upkeep();
+        app.metrics.maintenance_round();
         reloader.reload_certificate(false).await;
         if let Err(error) = app.site_registry.refresh(&app.store).await {
             tracing::error!(%error, "cannot look for changed sites");
@@ -294,6 +302,39 @@ async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
         if let Err(error) = app.retrain_moved().await {
             tracing::error!(%error, "cannot retrain moved cameras");
         }
+    }
+}
+
+/// Time between deletions of old samples, and before another attempt where one failed.
+const RETENTION_EVERY: Duration = Duration::from_secs(3_600);
+const RETENTION_RETRY: Duration = Duration::from_secs(60);
+
+/// Deletes samples that are older than `limits.sample_days`, and prepares the tables of the weeks to come.
+async fn retention_loop(app: App, shutdown: Shutdown) {
+    let work = async {
+        loop {
+            let now = app.clock.now();
+            let since = match app.limits.sample_days {
+                0 => None,
+                days => now.checked_sub(SignedDuration::from_hours(24 * i64::from(days))).ok(),
+            };
+            let pause = match app.store.retain_samples(since, now).await {
+                Ok(0) => RETENTION_EVERY,
+                Ok(deleted) => {
+                    tracing::info!(deleted, "samples older than limits.sample_days were deleted");
+                    RETENTION_EVERY
+                }
+                Err(error) => {
+                    tracing::warn!(%error, "old samples could not be deleted; it is tried again");
+                    RETENTION_RETRY
+                }
+            };
+            tokio::time::sleep(pause).await;
+        }
+    };
+    tokio::select! {
+        () = shutdown.draining() => {}
+        () = work => {}
     }
 }
 

@@ -88,7 +88,7 @@ impl fmt::Display for ClientError {
 impl std::error::Error for ClientError {}
 
 impl ClientError {
-    /// An error of the line that no status tells of.
+    /// A transport error without a gRPC status.
     #[must_use]
     pub fn broken_line(message: &str) -> Self {
         Self { reason: "broken-line".to_owned(), message: message.to_owned(), retryable: true, owner: None }

@@ -55,7 +55,7 @@ use proto::site_service_server::SiteServiceServer;
 use proto::track_service_server::TrackServiceServer;
 use proto::training_service_server::TrainingServiceServer;
 
-pub use statuses::{explain, trailers};
+pub use statuses::{explain, owner, trailers};
 
 /// Messages, services and clients generated from `proto/`.
 #[expect(clippy::allow_attributes, reason = "generated code")]

@@ -18,6 +18,8 @@ use crate::telemetry::RequestId;
 
 /// Who speaks in `ErrorInfo`.
 const DOMAIN: &str = "sightfix";
+/// Key of the address of the node to ask instead, in the metadata of `ErrorInfo`.
+const OWNER: &str = "owner";
 /// Clients take no more than some kB of headers, and texts may quote what they sent.
 const LONGEST_TEXT: usize = 400;
 /// The same for each text about a field at fault.
@@ -86,7 +88,7 @@ pub(super) fn to_status(error: &Error, id: &RequestId) -> Status {
         metadata.insert("conflicting_id".to_owned(), id.clone());
     }
     if let Error::Refused(Refusal { other_node: Some(url), .. }) = error {
-        metadata.insert("owner".to_owned(), url.clone());
+        metadata.insert(OWNER.to_owned(), url.clone());
     }
     let mut details = ErrorDetails::with_error_info(row.slug, DOMAIN, metadata);
     details.set_request_info(id.as_str(), "");
@@ -139,6 +141,13 @@ pub fn explain<B>(mut response: Response<B>, id: &RequestId) -> Response<B> {
     // All of it was made here from text, so it fits into headers.
     let _ = to_status(&error, id).add_header(response.headers_mut());
     response
+}
+
+/// The address of the node that answers instead, of the head of a response that names one.
+#[must_use]
+pub fn owner(headers: &HeaderMap) -> Option<String> {
+    let status = Status::from_header_map(headers).filter(|status| status.code() == Code::Unavailable)?;
+    status.get_details_error_info()?.metadata.remove(OWNER)
 }
 
 /// Why a client's message could not be read, from what tonic says of it.

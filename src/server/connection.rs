@@ -178,7 +178,7 @@ impl ConnectionServer {
         }
     }
 
-    /// What comes of the begin of a connection, if it comes in the time of a request's headers.
+    /// The first bytes of a connection, if they arrive within the time limit of request headers.
     async fn in_time<T>(&self, begin: impl Future<Output = std::io::Result<T>>) -> Option<T> {
         let begun = tokio::select! {
             begun = tokio::time::timeout(self.limits.header_time(), begin) => begun,

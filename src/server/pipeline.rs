@@ -21,6 +21,7 @@ use tracing::{Instrument as _, Span};
 
 use super::activity::{GRPC_STATUS, ObservedBody, OpenRequest};
 use super::credentials::credential;
+use super::forward::Forwarder;
 use super::host_check::HostCheck;
 use super::peer::Peer;
 use super::proxies::TrustedProxies;
@@ -70,6 +71,8 @@ pub(super) struct RequestPipeline {
     app: App,
     http: http::Transport,
     grpc: Router,
+    /// `None` where clients are redirected.
+    forwarder: Option<Forwarder>,
     hosts: HostCheck,
     proxies: TrustedProxies,
     shutdown: Shutdown,
@@ -96,9 +99,11 @@ impl RequestPipeline {
         hosts: HostCheck,
         proxies: TrustedProxies,
         cors: Option<CorsLayer>,
+        forwarder: Option<Forwarder>,
         shutdown: &Shutdown,
     ) -> Self {
         Self {
+            forwarder,
             http: http::Transport::new(app.clone(), console, shutdown.clone()),
             grpc: grpc::router(&app, shutdown).into_axum_router(),
             hosts,
@@ -116,6 +121,7 @@ impl RequestPipeline {
         Self {
             http: http::Transport::monitoring(app.clone(), shutdown.clone()),
             grpc: Router::new(),
+            forwarder: None,
             hosts,
             proxies: TrustedProxies::default(),
             cors: None,
@@ -418,12 +424,18 @@ impl RequestPipeline {
         let time = Duration::from_secs(self.app.limits.request_s);
         // An import stream reports by itself what it has stored of a body that was refused.
         let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
-        let answer = async {
+        let answer_here = |request| async move {
             if !is_grpc {
                 return self.http.answer(request).await;
             }
             let answer = self.grpc.clone().call(request).await;
             answer.unwrap_or_else(|never| match never {})
+        };
+        let answer = async {
+            match &self.forwarder {
+                Some(forwarder) => forwarder.answer(request, is_grpc, answer_here).await,
+                None => answer_here(request).await,
+            }
         };
         let answer = tokio::select! {
             biased;

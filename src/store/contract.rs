@@ -523,6 +523,13 @@ contract! {
     /// Faults only.
     fn maintain(&self) -> Result<StorageStatus>;
 
+    /// Makes room for the samples of the weeks to come, where they are stored by week, and deletes those of before an
+    /// instant; there, weeks that are over at that instant. Returns how many.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Overloaded`] while others use what is to be dropped. The next call goes on.
+    fn retain_samples(&self, since: Option<Timestamp>, now: Timestamp) -> Result<u64>;
+
     /// Stores a new connection with revision 1.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! Background jobs as every backend tells of them: claim, lease, heartbeat, fence.
+//! Background jobs as every backend reports them: claim, lease, heartbeat, fence.
 //!
 //! A worker that claims a job gets a lease, which it renews by heartbeats, and a fencing token, which goes
 //! up by one with every claim. A worker that stops sending heartbeats loses its lease; the next claim raises

@@ -6,6 +6,7 @@ mod database;
 mod database_faults;
 mod faults;
 mod feed;
+mod proxy;
 mod replay;
 
 use std::path::Path;

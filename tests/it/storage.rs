@@ -403,3 +403,26 @@ async fn the_oldest_samples_give_way_where_the_settings_say_so() {
     let other = server.get("/v1/cameras/d/samples/count").await.expect(200).json();
     assert_eq!(other["count"], 10, "other cameras keep theirs");
 }
+
+/// Rows of [`csv`] are years old; what is imported later goes with the next hour.
+#[tokio::test]
+async fn samples_older_than_the_days_of_the_setting_are_deleted() {
+    let folder = data_folder();
+    let now = jiff::Timestamp::now();
+    let young = csv(0..0) + &format!("{now},young,10,20,30,60,103.9,30.6\n");
+    {
+        let server = TestServer::start(folder.path());
+        create_camera(&server, "c").await.expect(201);
+        import(&server, SAMPLES, csv(0..90)).await.expect(200);
+        import(&server, SAMPLES, young).await.expect(200);
+        assert_eq!(server.get("/v1/cameras/c").await.expect(200).json()["samples"], 91);
+    }
+    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__SAMPLE_DAYS", "30")]);
+    while server.get("/v1/cameras/c").await.expect(200).json()["samples"] != 1 {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let stored = server.get(SAMPLES).await.expect(200).json();
+    assert_eq!(stored["items"][0]["target_id"], "young");
+    let line = server.logged(|line| line["deleted"] == 90).await;
+    assert!(line.to_string().contains("limits.sample_days"), "{line}");
+}

@@ -34,9 +34,10 @@ impl CopyTransaction for Copying {
     fn tables(&mut self) -> BoxFuture<'_, Result<Vec<String>>> {
         async move {
             sqlx::query_scalar(
-                "SELECT tablename::TEXT FROM pg_tables WHERE schemaname = current_schema() \
-                 AND tablename NOT IN ('_sqlx_migrations', 'nodes', 'camera_owners', 'connection_owners', \
-                 'connection_statuses') ORDER BY tablename",
+                "SELECT relname::TEXT FROM pg_class WHERE relnamespace = current_schema()::REGNAMESPACE \
+                 AND (relkind = 'p' OR relkind = 'r' AND NOT relispartition AND relname !~ '^samples_.*[0-9]{8}$') \
+                 AND relname NOT IN ('_sqlx_migrations', 'nodes', 'camera_owners', 'connection_owners', \
+                 'connection_statuses') ORDER BY relname::TEXT COLLATE \"C\"",
             )
             .fetch_all(&mut *self.0)
             .await
@@ -87,7 +88,7 @@ impl CopyTransaction for Copying {
                     return Ok(());
                 }
             }
-            // Whoever compares the rows has ended with an error if this fails.
+            // This fails only if the comparison of the rows has ended with an error.
             let _ = batches.send(rows).await;
             Ok(())
         }

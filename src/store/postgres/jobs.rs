@@ -8,8 +8,9 @@ use uuid::Uuid;
 
 use super::Store;
 use super::errors::failed;
+use super::finite;
 use super::locks::{Limit, lock_limit};
-use crate::domain::{Error, JobState, Result};
+use crate::domain::{Error, JobState, Result, RunProgress};
 use crate::store::jobs::{
     self, COUNT_JOBS, Claim, Finished, Heartbeat, JobCounts, JobEnd, JobTable, Settled, lease_expired,
     lease_us,
@@ -48,6 +49,70 @@ impl Jobs {
     pub(super) async fn lock(&self, connection: &mut PgConnection, id: Uuid) -> Result<()> {
         let sql = format!("SELECT id FROM {} WHERE id = $1 FOR UPDATE", self.0.table);
         sqlx::query(AssertSqlSafe(sql)).bind(id.to_string()).execute(connection).await.map_err(failed)?;
+        Ok(())
+    }
+
+    /// The job of this owner that has not ended.
+    pub(super) async fn live_of(
+        &self,
+        connection: &mut PgConnection,
+        owner_key: i64,
+    ) -> Result<Option<String>> {
+        let JobTable { table, owner, .. } = self.0;
+        let sql = format!("SELECT id FROM {table} WHERE {owner} = $1 AND state IN ('queued', 'running')");
+        sqlx::query_scalar(AssertSqlSafe(sql))
+            .bind(owner_key)
+            .fetch_optional(connection)
+            .await
+            .map_err(failed)
+    }
+
+    /// Deletes the oldest ended jobs of an owner beyond a number.
+    pub(super) async fn prune_ended(
+        &self,
+        connection: &mut PgConnection,
+        owner_key: i64,
+        keep: u32,
+    ) -> Result<()> {
+        let JobTable { table, owner, .. } = self.0;
+        let sql = format!(
+            "DELETE FROM {table} WHERE id IN (SELECT id FROM {table} WHERE {owner} = $1 \
+             AND state NOT IN ('queued', 'running') ORDER BY id DESC OFFSET $2)"
+        );
+        sqlx::query(AssertSqlSafe(sql))
+            .bind(owner_key)
+            .bind(i64::from(keep))
+            .execute(connection)
+            .await
+            .map_err(failed)?;
+        Ok(())
+    }
+
+    /// Stores the progress of a training run.
+    pub(super) async fn record_progress(
+        &self,
+        connection: &mut PgConnection,
+        id: Uuid,
+        progress: &RunProgress,
+    ) -> Result<()> {
+        let sql = format!(
+            "UPDATE {} SET phase = $1, epoch_done = $2, epochs_planned = $3, \
+             reconstruction_error = $4, regression_error = $5, error_scale = $6, remaining_s = $7 \
+             WHERE id = $8",
+            self.0.table
+        );
+        sqlx::query(AssertSqlSafe(sql))
+            .bind(&progress.phase)
+            .bind(i64::from(progress.epoch))
+            .bind(i64::from(progress.epochs))
+            .bind(finite(progress.reconstruction_error))
+            .bind(finite(progress.regression_error))
+            .bind(finite(progress.error_scale))
+            .bind(progress.remaining_s)
+            .bind(id.to_string())
+            .execute(connection)
+            .await
+            .map_err(failed)?;
         Ok(())
     }
 

@@ -25,6 +25,8 @@ pub(super) enum Limit {
     Connections = 5,
     /// One owner of all connections that belong together.
     ConnectionOwners = 6,
+    /// Which weeks of samples have a partition.
+    SamplePartitions = 7,
 }
 
 /// Waits until no other transaction may change how far a limit is used.

@@ -24,6 +24,7 @@ mod nodes;
 mod outbox;
 mod retention;
 mod runs;
+mod sample_partitions;
 mod sample_retention;
 mod sample_table;
 mod samples;

@@ -119,20 +119,6 @@ pub(super) async fn prune_models(connection: &mut PgConnection, camera_key: i64,
     Ok(())
 }
 
-/// Deletes the oldest ended runs of a camera beyond a number.
-pub(super) async fn prune_runs(connection: &mut PgConnection, camera_key: i64, keep: u32) -> Result<()> {
-    sqlx::query(
-        "DELETE FROM training_runs WHERE id IN (SELECT id FROM training_runs WHERE camera_key = $1 \
-         AND state NOT IN ('queued', 'running') ORDER BY id DESC OFFSET $2)",
-    )
-    .bind(camera_key)
-    .bind(i64::from(keep))
-    .execute(connection)
-    .await
-    .map_err(failed)?;
-    Ok(())
-}
-
 /// Deletes the oldest ended evaluations beyond a number.
 pub(super) async fn prune_evaluations(connection: &mut PgConnection, keep: u32) -> Result<()> {
     sqlx::query(

@@ -8,11 +8,10 @@ use sqlx::PgConnection;
 use super::Store;
 use super::cameras::{camera_key, lock_camera};
 use super::errors::failed;
-use super::finite;
 use super::idempotency::{find_answer, insert_answer, lock_key};
 use super::jobs::RUNS;
 use super::models::{activate, add_model};
-use super::retention::{prune_models, prune_runs};
+use super::retention::prune_models;
 use crate::domain::{AuditAction, CameraId, Result, RunId, RunProgress, TrainingOptions, TrainingRun};
 use crate::store::jobs::{Claim, Heartbeat, run_priority};
 use crate::store::refusals::no_run;
@@ -66,8 +65,8 @@ impl Store {
             insert_answer(&mut transaction, self.limits(), (&self.actor, record), &run.to_string(), now)
                 .await?;
         }
-        prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
-        check_no_live_run(live_run(&mut transaction, key).await?)?;
+        RUNS.prune_ended(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
+        check_no_live_run(RUNS.live_of(&mut transaction, key).await?)?;
         RUNS.check_capacity(&mut transaction, max_live).await?;
         sqlx::query(
             "INSERT INTO training_runs (id, camera_key, recipe, seed, epochs, from_us, until_us, state, \
@@ -151,21 +150,7 @@ impl Store {
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }
-        sqlx::query(
-            "UPDATE training_runs SET phase = $1, epoch_done = $2, epochs_planned = $3, \
-             reconstruction_error = $4, regression_error = $5, error_scale = $6, remaining_s = $7 WHERE id = $8",
-        )
-        .bind(&progress.phase)
-        .bind(i64::from(progress.epoch))
-        .bind(i64::from(progress.epochs))
-        .bind(finite(progress.reconstruction_error))
-        .bind(finite(progress.regression_error))
-        .bind(finite(progress.error_scale))
-        .bind(progress.remaining_s)
-        .bind(run.to_string())
-        .execute(&mut *transaction)
-        .await
-        .map_err(failed)?;
+        RUNS.record_progress(&mut transaction, run.0, progress).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(heartbeat)
     }
@@ -238,16 +223,6 @@ async fn lock_camera_of(connection: &mut PgConnection, run: RunId) -> Result<()>
     .await
     .map_err(failed)?;
     Ok(())
-}
-
-async fn live_run(connection: &mut PgConnection, camera_key: i64) -> Result<Option<String>> {
-    sqlx::query_scalar(
-        "SELECT id FROM training_runs WHERE camera_key = $1 AND state IN ('queued', 'running')",
-    )
-    .bind(camera_key)
-    .fetch_optional(connection)
-    .await
-    .map_err(failed)
 }
 
 async fn find_run(connection: &mut PgConnection, run: RunId) -> Result<Option<TrainingRun>> {

@@ -1,4 +1,4 @@
-//! The oldest samples of a camera give way to new ones, where the operator has chosen so.
+//! The oldest samples are deleted, where the operator has chosen so: beyond a number for each camera, or an age.
 
 use sqlx::{AssertSqlSafe, PgConnection};
 
@@ -9,6 +9,8 @@ use crate::store::rows::samples::SampleTable;
 
 /// Beyond its limit a camera is cut to this share of it, so that not every import deletes.
 const KEPT_PER_MILLE: u64 = 990;
+/// Rows of one camera that a transaction deletes by age.
+const BATCH: i64 = 10_000;
 
 /// Deletes the oldest samples of a camera that has more than `limit`. Samples of one instant stay or go together.
 pub(super) async fn delete_oldest(connection: &mut PgConnection, camera_key: i64, limit: u64) -> Result<()> {
@@ -34,7 +36,34 @@ pub(super) async fn delete_oldest(connection: &mut PgConnection, camera_key: i64
     .await
     .map_err(failed)?;
     let Some(newest_deleted_us) = newest_deleted_us else { return Ok(()) };
-    for table in [SampleTable::WithFix, SampleTable::WithoutFix] {
+    delete_upto(connection, camera_key, newest_deleted_us).await?;
+    Ok(())
+}
+
+/// Deletes the oldest samples of a camera from before an instant, some ten thousand at most; returns how many.
+pub(super) async fn delete_batch(
+    connection: &mut PgConnection,
+    camera_key: i64,
+    before_us: i64,
+) -> Result<u64> {
+    let newest_of_batch_us: Option<i64> = sqlx::query_scalar(
+        "SELECT time_us FROM (SELECT time_us FROM samples WHERE camera_key = $1 AND time_us < $2 \
+         UNION ALL SELECT time_us FROM samples_without_fix WHERE camera_key = $1 AND time_us < $2) AS times \
+         ORDER BY time_us LIMIT 1 OFFSET $3",
+    )
+    .bind(camera_key)
+    .bind(before_us)
+    .bind(BATCH - 1)
+    .fetch_optional(&mut *connection)
+    .await
+    .map_err(failed)?;
+    delete_upto(connection, camera_key, newest_of_batch_us.unwrap_or(before_us - 1)).await
+}
+
+/// Deletes the samples of a camera up to an instant, and counts them no more; returns how many.
+async fn delete_upto(connection: &mut PgConnection, camera_key: i64, newest_deleted_us: i64) -> Result<u64> {
+    let mut all = 0;
+    for table in SampleTable::ALL {
         let sql = format!("DELETE FROM {table} WHERE camera_key = $1 AND time_us <= $2");
         let deleted = sqlx::query(AssertSqlSafe(sql))
             .bind(camera_key)
@@ -44,6 +73,7 @@ pub(super) async fn delete_oldest(connection: &mut PgConnection, camera_key: i64
             .map_err(failed)?
             .rows_affected();
         subtract(connection, table, camera_key, deleted).await?;
+        all += deleted;
     }
-    Ok(())
+    Ok(all)
 }

@@ -7,7 +7,6 @@ use sqlx::PgConnection;
 
 use super::Store;
 use super::errors::failed;
-use super::finite;
 use super::idempotency::{find_answer, insert_answer, lock_key};
 use super::jobs::SITE_RUNS;
 use super::models::{activate, add_model};
@@ -47,8 +46,8 @@ impl Store {
             insert_answer(&mut transaction, self.limits(), (&self.actor, record), &run.to_string(), now)
                 .await?;
         }
-        prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
-        check_no_live_site_run(live_run(&mut transaction, key).await?)?;
+        SITE_RUNS.prune_ended(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
+        check_no_live_site_run(SITE_RUNS.live_of(&mut transaction, key).await?)?;
         SITE_RUNS.check_capacity(&mut transaction, max_live).await?;
         sqlx::query(
             "INSERT INTO site_training_runs (id, site_key, seed, from_us, until_us, state, created_at_us) \
@@ -122,22 +121,7 @@ impl Store {
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }
-        sqlx::query(
-            "UPDATE site_training_runs SET phase = $1, epoch_done = $2, epochs_planned = $3, \
-             reconstruction_error = $4, regression_error = $5, error_scale = $6, remaining_s = $7 \
-             WHERE id = $8",
-        )
-        .bind(&progress.phase)
-        .bind(i64::from(progress.epoch))
-        .bind(i64::from(progress.epochs))
-        .bind(finite(progress.reconstruction_error))
-        .bind(finite(progress.regression_error))
-        .bind(finite(progress.error_scale))
-        .bind(progress.remaining_s)
-        .bind(run.to_string())
-        .execute(&mut *transaction)
-        .await
-        .map_err(failed)?;
+        SITE_RUNS.record_progress(&mut transaction, run.0, progress).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(heartbeat)
     }
@@ -262,30 +246,6 @@ async fn lock_site(connection: &mut PgConnection, id: &SiteId) -> Result<i64> {
         .await
         .map_err(failed)?
         .ok_or_else(|| no_site(id))
-}
-
-async fn live_run(connection: &mut PgConnection, site_key: i64) -> Result<Option<String>> {
-    sqlx::query_scalar(
-        "SELECT id FROM site_training_runs WHERE site_key = $1 AND state IN ('queued', 'running')",
-    )
-    .bind(site_key)
-    .fetch_optional(connection)
-    .await
-    .map_err(failed)
-}
-
-/// Deletes the oldest ended runs of a site beyond a number.
-async fn prune_runs(connection: &mut PgConnection, site_key: i64, keep: u32) -> Result<()> {
-    sqlx::query(
-        "DELETE FROM site_training_runs WHERE id IN (SELECT id FROM site_training_runs WHERE site_key = $1 \
-         AND state NOT IN ('queued', 'running') ORDER BY id DESC OFFSET $2)",
-    )
-    .bind(site_key)
-    .bind(i64::from(keep))
-    .execute(connection)
-    .await
-    .map_err(failed)?;
-    Ok(())
 }
 
 async fn find_run(connection: &mut PgConnection, run: RunId) -> Result<Option<SiteTrainingRun>> {

@@ -55,6 +55,9 @@ pub(in crate::store) fn keep_last(samples: &mut Vec<StoredSample>) -> u64 {
 }
 
 impl SampleTable {
+    /// Both.
+    pub(in crate::store) const ALL: [Self; 2] = [Self::WithFix, Self::WithoutFix];
+
     /// The table of a sample.
     pub(in crate::store) const fn of(sample: &StoredSample) -> Self {
         if sample.fix.is_some() { Self::WithFix } else { Self::WithoutFix }
@@ -105,7 +108,7 @@ impl SampleFilter {
 
     pub(in crate::store) fn tables(&self) -> &'static [SampleTable] {
         match self.has_fix {
-            None => &[SampleTable::WithFix, SampleTable::WithoutFix],
+            None => &SampleTable::ALL,
             Some(true) => &[SampleTable::WithFix],
             Some(false) => &[SampleTable::WithoutFix],
         }

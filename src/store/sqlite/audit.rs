@@ -1,4 +1,4 @@
-//! The audit log, written in the transaction of what it tells of.
+//! The audit log, written in the transaction of the change that it records.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;

@@ -78,7 +78,7 @@ impl CopyTransaction for Copying {
                     return Ok(());
                 }
             }
-            // Whoever compares the rows has ended with an error if this fails.
+            // This fails only if the comparison of the rows has ended with an error.
             let _ = batches.send(rows).await;
             Ok(())
         }

@@ -90,7 +90,7 @@ async fn store(
     let admitted = admit(&mut cameras, &space.usage, group);
     let mut outcomes = outcomes_before(&admitted, group, replaced);
     // Those with a fix first: of two rows of one key, the one with a fix is stored.
-    for table in [SampleTable::WithFix, SampleTable::WithoutFix] {
+    for table in SampleTable::ALL {
         let (rows, borders) = rows_of(table, group, &admitted, counting);
         if !insert(connection, table, (&rows, &borders), &mut outcomes).await? {
             return Ok(None);

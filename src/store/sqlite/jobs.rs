@@ -8,7 +8,7 @@ use uuid::Uuid;
 
 use super::Store;
 use super::errors::failed;
-use crate::domain::{Error, JobState, Result};
+use crate::domain::{Error, JobState, Result, RunProgress};
 use crate::store::jobs::{
     self, COUNT_JOBS, Claim, Finished, Heartbeat, JobCounts, JobEnd, JobTable, Settled, lease_expired,
     lease_us,
@@ -42,6 +42,70 @@ impl Jobs {
         let sql = format!("SELECT count(*) FROM {table} WHERE state IN ('queued', 'running')");
         let live: i64 = sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(connection).await.map_err(failed)?;
         self.0.check_capacity(live, max_live)
+    }
+
+    /// The job of this owner that has not ended.
+    pub(super) async fn live_of(
+        &self,
+        connection: &mut SqliteConnection,
+        owner_key: i64,
+    ) -> Result<Option<String>> {
+        let JobTable { table, owner, .. } = self.0;
+        let sql = format!("SELECT id FROM {table} WHERE {owner} = ? AND state IN ('queued', 'running')");
+        sqlx::query_scalar(AssertSqlSafe(sql))
+            .bind(owner_key)
+            .fetch_optional(connection)
+            .await
+            .map_err(failed)
+    }
+
+    /// Deletes the oldest ended jobs of an owner beyond a number.
+    pub(super) async fn prune_ended(
+        &self,
+        connection: &mut SqliteConnection,
+        owner_key: i64,
+        keep: u32,
+    ) -> Result<()> {
+        let JobTable { table, owner, .. } = self.0;
+        let sql = format!(
+            "DELETE FROM {table} WHERE id IN (SELECT id FROM {table} WHERE {owner} = ? \
+             AND state NOT IN ('queued', 'running') ORDER BY id DESC LIMIT -1 OFFSET ?)"
+        );
+        sqlx::query(AssertSqlSafe(sql))
+            .bind(owner_key)
+            .bind(i64::from(keep))
+            .execute(connection)
+            .await
+            .map_err(failed)?;
+        Ok(())
+    }
+
+    /// Stores the progress of a training run.
+    pub(super) async fn record_progress(
+        &self,
+        connection: &mut SqliteConnection,
+        id: Uuid,
+        progress: &RunProgress,
+    ) -> Result<()> {
+        let sql = format!(
+            "UPDATE {} SET phase = ?, epoch_done = ?, epochs_planned = ?, \
+             reconstruction_error = ?, regression_error = ?, error_scale = ?, remaining_s = ? \
+             WHERE id = ?",
+            self.0.table
+        );
+        sqlx::query(AssertSqlSafe(sql))
+            .bind(&progress.phase)
+            .bind(i64::from(progress.epoch))
+            .bind(i64::from(progress.epochs))
+            .bind(progress.reconstruction_error)
+            .bind(progress.regression_error)
+            .bind(progress.error_scale)
+            .bind(progress.remaining_s)
+            .bind(id.to_string())
+            .execute(connection)
+            .await
+            .map_err(failed)?;
+        Ok(())
     }
 
     /// Claims the job that comes first of those that are queued or whose lease has expired. Attempt and fence go up by one;

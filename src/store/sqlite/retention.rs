@@ -127,20 +127,6 @@ pub(super) async fn prune_models(
     Ok(())
 }
 
-/// Deletes the oldest ended runs of a camera beyond a number.
-pub(super) async fn prune_runs(connection: &mut SqliteConnection, camera_key: i64, keep: u32) -> Result<()> {
-    sqlx::query(
-        "DELETE FROM training_runs WHERE id IN (SELECT id FROM training_runs WHERE camera_key = ? \
-         AND state NOT IN ('queued', 'running') ORDER BY id DESC LIMIT -1 OFFSET ?)",
-    )
-    .bind(camera_key)
-    .bind(keep)
-    .execute(connection)
-    .await
-    .map_err(failed)?;
-    Ok(())
-}
-
 /// Deletes the oldest ended evaluations beyond a number.
 pub(super) async fn prune_evaluations(connection: &mut SqliteConnection, keep: u32) -> Result<()> {
     sqlx::query(

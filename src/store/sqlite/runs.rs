@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use sqlx::{SqliteConnection, SqliteExecutor};
+use sqlx::SqliteExecutor;
 
 use super::Store;
 use super::cameras::camera_key;
@@ -11,7 +11,7 @@ use super::errors::failed;
 use super::idempotency::{find_answer, insert_answer};
 use super::jobs::RUNS;
 use super::models::{activate, add_model};
-use super::retention::{prune_models, prune_runs};
+use super::retention::prune_models;
 use crate::domain::{AuditAction, CameraId, Result, RunId, RunProgress, TrainingOptions, TrainingRun};
 use crate::store::jobs::{Claim, Heartbeat, run_priority};
 use crate::store::refusals::no_run;
@@ -69,8 +69,8 @@ impl Store {
             insert_answer(&mut transaction, self.limits(), (&self.actor, record), &run.to_string(), now)
                 .await?;
         }
-        prune_runs(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
-        check_no_live_run(live_run(&mut transaction, key).await?)?;
+        RUNS.prune_ended(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
+        check_no_live_run(RUNS.live_of(&mut transaction, key).await?)?;
         RUNS.check_capacity(&mut transaction, max_live).await?;
         sqlx::query(
             "INSERT INTO training_runs (id, camera_key, recipe, seed, epochs, from_us, until_us, state, \
@@ -153,21 +153,7 @@ impl Store {
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }
-        sqlx::query(
-            "UPDATE training_runs SET phase = ?, epoch_done = ?, epochs_planned = ?, \
-             reconstruction_error = ?, regression_error = ?, error_scale = ?, remaining_s = ? WHERE id = ?",
-        )
-        .bind(&progress.phase)
-        .bind(progress.epoch)
-        .bind(progress.epochs)
-        .bind(progress.reconstruction_error)
-        .bind(progress.regression_error)
-        .bind(progress.error_scale)
-        .bind(progress.remaining_s)
-        .bind(run.to_string())
-        .execute(&mut *transaction)
-        .await
-        .map_err(failed)?;
+        RUNS.record_progress(&mut transaction, run.0, progress).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(heartbeat)
     }
@@ -228,14 +214,6 @@ impl Store {
         transaction.commit().await.map_err(failed)?;
         Ok(stored)
     }
-}
-
-async fn live_run(connection: &mut SqliteConnection, camera_key: i64) -> Result<Option<String>> {
-    sqlx::query_scalar("SELECT id FROM training_runs WHERE camera_key = ? AND state IN ('queued', 'running')")
-        .bind(camera_key)
-        .fetch_optional(connection)
-        .await
-        .map_err(failed)
 }
 
 async fn find_run(executor: impl SqliteExecutor<'_>, run: RunId) -> Result<Option<TrainingRun>> {

@@ -162,6 +162,48 @@ async fn a_sample_with_a_fix_takes_the_place_of_one_without_and_never_the_revers
 }
 
 #[tokio::test]
+async fn samples_of_before_an_instant_are_deleted_and_counted_no_more() {
+    const DAY: i64 = 86_400;
+    let timed = |second| Sample { time: at(second), ..sample(0, "a") };
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    // The first days of a week in 2093; those of 1970 are older than any partition.
+    let week = 6_420 * 7 * DAY;
+    assert_eq!(store.retain_samples(None, at(week)).await.expect("works"), 0);
+    store.insert_camera(&NewCamera::named(id("other")), at(0)).await.expect("new");
+    let late = [week - 1, week, week + 3 * DAY, week + 7 * DAY, week + 8 * DAY, week + 60 * DAY];
+    for camera in [&camera, &id("other")] {
+        let rows = (0..12_000).chain(late).map(|second| timed(second).into());
+        let boxes = [1, week + 1, week + 7 * DAY + 1];
+        let boxes = boxes.map(|second| StoredSample { time: at(second), ..without_fix(0, "b") });
+        let inserted = store.insert_samples(camera, rows.chain(boxes).collect(), Durability::Synced).await;
+        assert_eq!(inserted.expect("stored").accepted, 12_009);
+    }
+    let stored = async || {
+        let samples = store.samples(&camera, &SampleFilter::default(), None, 100).await.expect("read");
+        let times: Vec<_> = samples.iter().map(|sample| sample.time.as_second() - week).collect();
+        (
+            times,
+            store.camera(&camera).await.expect("known").samples,
+            store.maintain().await.expect("works").samples,
+        )
+    };
+    let deleted = store.retain_samples(Some(at(week)), at(week + 9 * DAY)).await.expect("works");
+    assert_eq!(deleted, 2 * 12_002);
+    let kept = vec![0, 1, 3 * DAY, 7 * DAY, 7 * DAY + 1, 8 * DAY, 60 * DAY];
+    assert_eq!(stored().await, (kept, SampleCount { all: 7, without_fix: 2 }, 14));
+    let deleted = store.retain_samples(Some(at(week + 7 * DAY)), at(week + 9 * DAY)).await.expect("works");
+    assert_eq!(deleted, 2 * 3);
+    let kept = vec![7 * DAY, 7 * DAY + 1, 8 * DAY, 60 * DAY];
+    assert_eq!(stored().await, (kept, SampleCount { all: 4, without_fix: 1 }, 8));
+    assert_eq!(store.retain_samples(Some(at(week + 7 * DAY)), at(week + 9 * DAY)).await.expect("works"), 0);
+    // What comes late goes with the next call.
+    let late = store.insert_samples(&camera, vec![timed(week + 2)], Durability::Synced).await;
+    assert_eq!(late.expect("stored").accepted, 1);
+    assert_eq!(store.retain_samples(Some(at(week + 7 * DAY)), at(week + 9 * DAY)).await.expect("works"), 1);
+    assert_eq!(stored().await.2, 8);
+}
+
+#[tokio::test]
 async fn boxes_without_a_fix_are_thinned_evenly_and_alike_each_time() {
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
     let targets = ["a", "b", "c", "d", "e"];

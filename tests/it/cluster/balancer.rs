@@ -80,9 +80,9 @@ async fn streams_and_requests_of_a_camera_meet_behind_nginx() {
         .arg(format!("http://{}/v1/cameras/yard/tracks", balancer.rest))
         .output()
         .expect("curl runs");
-    let told = String::from_utf8_lossy(&output.stdout).into_owned();
-    println!("through nginx: {told}; the owner is {owner}");
-    assert!(told.starts_with("200 "), "{told} {}", String::from_utf8_lossy(&output.stderr));
+    let printed = String::from_utf8_lossy(&output.stdout).into_owned();
+    println!("through nginx: {printed}; the owner is {owner}");
+    assert!(printed.starts_with("200 "), "{printed} {}", String::from_utf8_lossy(&output.stderr));
 
     // The owner is killed; its camera goes to a node that nginx still knows.
     let mut nodes = nodes;

@@ -69,12 +69,30 @@ impl Nodes {
         self.database.number(fence)
     }
 
-    /// The node that owns the camera.
-    fn owner(&self) -> usize {
+    /// The node that owns the camera, as soon as one does.
+    async fn owner(&self) -> usize {
         let owner = "SELECT url FROM nodes JOIN camera_owners ON node_id = nodes.id \
                      JOIN cameras ON key = camera_key WHERE cameras.id = 'yard'";
-        let owner = self.database.sql(owner).expect("the database answers");
-        self.nodes.iter().position(|server| url(server) == owner).expect("a node")
+        loop {
+            let owner = self.database.sql(owner).expect("the database answers");
+            match self.nodes.iter().position(|server| url(server) == owner) {
+                Some(owner) => return owner,
+                None => tokio::time::sleep(Duration::from_millis(20)).await,
+            }
+        }
+    }
+
+    /// Queues a training run; a node that has just lost its connections asks for another attempt.
+    async fn start_run(&self, round: usize) {
+        let run = json!({"seed": round, "epochs": 4});
+        loop {
+            let answer = self.nodes[round % 2].post(RUNS, &run).await;
+            if answer.status != 503 {
+                answer.expect(202);
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
     }
 
     /// Injects a fault and takes it back after `duration`; whether the node that was cut off was the owner beside another one.
@@ -91,7 +109,7 @@ impl Nodes {
                 tokio::time::sleep(duration).await;
             }
             FaultKind::Partition => {
-                let (owner, fence) = (self.owner(), self.fence());
+                let (owner, fence) = (self.owner().await, self.fence());
                 self.links[owner].cut();
                 while self.fence() == fence {
                     tokio::time::sleep(Duration::from_millis(20)).await;
@@ -140,8 +158,7 @@ async fn faults_of_the_database_lose_and_duplicate_nothing() {
     }
     let (mut acknowledged, mut two_owners, mut recoveries) = (0, 0, Vec::new());
     for (round, kind) in kinds.iter().enumerate() {
-        let run = json!({"seed": round, "epochs": 4});
-        cluster.nodes[round % 2].post(RUNS, &run).await.expect(202);
+        cluster.start_run(round).await;
         let before = cluster.stored();
         let (go_on, goes_on) = watch::channel(false);
         let mut feed =

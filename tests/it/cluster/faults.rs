@@ -108,13 +108,14 @@ async fn a_node_that_slept_through_its_lease_answers_no_more() {
     }
     let mut feed = Feed::new("yard", items);
     feed.resume_at(&[&url(&second)]).await;
-    assert_eq!(fence(folder.path(), "yard"), 2);
+    let fence_of_second = fence(folder.path(), "yard");
+    assert!(fence_of_second >= 2, "{fence_of_second}");
     first.signal("-CONT");
     let (answers, ended) = sleeper.rest().await;
     let reason = ended.get_details_error_info().map(|info| info.reason).unwrap_or_default();
     println!("woke up: {answers} answers, then {ended}");
     assert_eq!((answers, ended.code(), &*reason), (0, Code::Unavailable, "camera-between-nodes"), "{ended}");
-    assert_eq!(fence(folder.path(), "yard"), 2, "one owner");
+    assert_eq!(fence(folder.path(), "yard"), fence_of_second, "one owner");
     // It registers again, and knows who the owner is.
     super::until_status(&first, "/v1/cameras/yard/tracks", 307).await;
     assert_stored_once(&first, &feed).await;
@@ -176,6 +177,17 @@ async fn connections_that_the_database_ends_lose_nothing_that_was_acknowledged()
     assert_stored_once(&second, &feed).await;
 }
 
+/// The node that owns the camera, as soon as one does.
+async fn owner(folder: &Path, nodes: &[TestServer]) -> usize {
+    loop {
+        let owner = sql(folder, "SELECT url FROM nodes JOIN camera_owners ON node_id = id");
+        match nodes.iter().position(|server| url(server) == owner) {
+            Some(owner) => return owner,
+            None => tokio::time::sleep(Duration::from_millis(20)).await,
+        }
+    }
+}
+
 /// A number of the environment.
 pub(super) fn number_of(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
@@ -210,9 +222,8 @@ async fn faults_of_owners_at_random_moments_lose_and_duplicate_nothing() {
         known.rotate_left(begin_at);
         let (feeding, go_on) = streaming(all[300 * round..300 * (round + 1)].to_vec(), &known);
         until_stored(folder.path(), before + random.random_range(5..120)).await;
-        let owner = sql(folder.path(), "SELECT url FROM nodes JOIN camera_owners ON node_id = id");
-        let (owner_url, owner) =
-            (owner.clone(), nodes.iter().position(|server| url(server) == owner).expect("a node"));
+        let owner = owner(folder.path(), &nodes).await;
+        let owner_url = url(&nodes[owner]);
         let fence_before = fence(folder.path(), "yard");
         let began = Instant::now();
         let ended = match kind {

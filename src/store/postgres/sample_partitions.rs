@@ -1,0 +1,184 @@
+//! The partitions of samples: one table per week of their time, added before the week begins and dropped as a whole.
+//!
+//! Migration 0018 makes one partition of everything before a week, and a default one. Weeks are those of the Unix epoch.
+
+use jiff::Timestamp;
+use jiff::tz::TimeZone;
+use sqlx::{AssertSqlSafe, PgConnection};
+
+use super::Store;
+use super::errors::failed;
+use super::locks::{Limit, try_lock_limit};
+use super::sample_retention::delete_batch;
+use crate::domain::{Error, Result};
+use crate::store::rows::samples::SampleTable;
+
+const WEEK_US: i64 = 7 * 86_400 * 1_000_000;
+/// Weeks behind the present one that have a partition already.
+const WEEKS_AHEAD: i64 = 2;
+/// Length of a day in the name of a partition: year, month, day.
+const DAY_LENGTH: usize = 8;
+/// Counting the rows of a week may take long; nobody waits for them.
+const NO_TIMEOUT: &str = "SET LOCAL statement_timeout = 0";
+
+impl Store {
+    pub(in crate::store) async fn retain_samples(
+        &self,
+        since: Option<Timestamp>,
+        now: Timestamp,
+    ) -> Result<u64> {
+        let mut deleted = 0;
+        for table in SampleTable::ALL {
+            self.add_partitions(table, now).await?;
+            if let Some(since) = since {
+                self.detach_before(table, since).await?;
+            }
+            for partition in self.detached(table).await? {
+                deleted += self.drop_detached(table, &partition).await?;
+            }
+        }
+        match since {
+            Some(since) => Ok(deleted + self.delete_before(week_of(since)).await?),
+            None => Ok(deleted),
+        }
+    }
+
+    async fn add_partitions(&self, table: SampleTable, now: Timestamp) -> Result<()> {
+        let mut transaction = self.writer().await?;
+        if !try_lock_limit(&mut transaction, Limit::SamplePartitions).await.map_err(failed)? {
+            return Ok(());
+        }
+        let stored = partitions(&mut transaction, table).await?;
+        // The first of them says where weeks begin to have partitions of their own.
+        let first = stored.iter().map(|name| day_of(name)).min();
+        let weeks = (0..=WEEKS_AHEAD).map(|ahead| week_of(now) + ahead * WEEK_US);
+        for week_us in weeks {
+            let day = day(week_us)?;
+            let name = format!("{table}_{day}");
+            if first.is_none_or(|first| &*day < first) || stored.contains(&name) {
+                continue;
+            }
+            let sql = format!(
+                "CREATE TABLE {name} PARTITION OF {table} FOR VALUES FROM ({week_us}) TO ({})",
+                week_us + WEEK_US
+            );
+            sqlx::raw_sql(AssertSqlSafe(sql)).execute(&mut *transaction).await.map_err(failed)?;
+        }
+        transaction.commit().await.map_err(failed)
+    }
+
+    /// Takes the weeks that are over before an instant out of the table. No row can come to them any more.
+    async fn detach_before(&self, table: SampleTable, since: Timestamp) -> Result<()> {
+        let mut transaction = self.writer().await?;
+        if !try_lock_limit(&mut transaction, Limit::SamplePartitions).await.map_err(failed)? {
+            return Ok(());
+        }
+        let first_kept = day(week_of(since))?;
+        for name in partitions(&mut transaction, table).await? {
+            if is_week(table, &name) && day_of(&name) < &*first_kept {
+                let sql = format!("ALTER TABLE {table} DETACH PARTITION {name}");
+                sqlx::raw_sql(AssertSqlSafe(sql)).execute(&mut *transaction).await.map_err(failed)?;
+            }
+        }
+        transaction.commit().await.map_err(failed)
+    }
+
+    /// Weeks that were taken out and are not dropped yet, by this process or by one that ended in between.
+    async fn detached(&self, table: SampleTable) -> Result<Vec<String>> {
+        let mut reader = self.reader().await?;
+        let names: Vec<String> = sqlx::query_scalar(
+            "SELECT relname::TEXT FROM pg_class WHERE relnamespace = current_schema()::REGNAMESPACE \
+             AND relkind = 'r' AND NOT relispartition ORDER BY 1",
+        )
+        .fetch_all(&mut *reader)
+        .await
+        .map_err(failed)?;
+        Ok(names.into_iter().filter(|name| is_week(table, name)).collect())
+    }
+
+    /// Counts the samples of a detached week no more, and drops it; returns how many there were.
+    async fn drop_detached(&self, table: SampleTable, name: &str) -> Result<u64> {
+        let mut transaction = self.writer().await?;
+        if !try_lock_limit(&mut transaction, Limit::SamplePartitions).await.map_err(failed)? {
+            return Ok(0);
+        }
+        sqlx::raw_sql(NO_TIMEOUT).execute(&mut *transaction).await.map_err(failed)?;
+        let counter = table.counter();
+        let sql = format!(
+            "WITH gone AS (SELECT camera_key, count(*) AS rows FROM {name} GROUP BY camera_key), \
+             changed AS (UPDATE sample_counts SET {counter} = GREATEST({counter} - gone.rows, 0) FROM gone \
+             WHERE sample_counts.camera_key = gone.camera_key) \
+             SELECT coalesce(sum(rows), 0)::BIGINT FROM gone"
+        );
+        let rows: i64 =
+            sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(&mut *transaction).await.map_err(failed)?;
+        let sql = format!("DROP TABLE {name}");
+        sqlx::raw_sql(AssertSqlSafe(sql)).execute(&mut *transaction).await.map_err(failed)?;
+        transaction.commit().await.map_err(failed)?;
+        Ok(rows.unsigned_abs())
+    }
+
+    /// Deletes what no partition of a week holds, camera by camera and in short transactions.
+    async fn delete_before(&self, before_us: i64) -> Result<u64> {
+        let mut reader = self.reader().await?;
+        let cameras: Vec<i64> = sqlx::query_scalar(
+            "SELECT camera_key FROM sample_counts AS counts WHERE EXISTS (SELECT 1 FROM samples \
+             WHERE samples.camera_key = counts.camera_key AND time_us < $1) \
+             OR EXISTS (SELECT 1 FROM samples_without_fix AS boxes WHERE boxes.camera_key = counts.camera_key \
+             AND time_us < $1) ORDER BY camera_key",
+        )
+        .bind(before_us)
+        .fetch_all(&mut *reader)
+        .await
+        .map_err(failed)?;
+        reader.commit().await.map_err(failed)?;
+        let mut deleted = 0;
+        for camera_key in cameras {
+            loop {
+                let mut transaction = self.writer().await?;
+                let rows = delete_batch(&mut transaction, camera_key, before_us).await?;
+                transaction.commit().await.map_err(failed)?;
+                if rows == 0 {
+                    break;
+                }
+                deleted += rows;
+            }
+        }
+        Ok(deleted)
+    }
+}
+
+/// Partitions with a day in their name: those of weeks, and that of everything before.
+async fn partitions(connection: &mut PgConnection, table: SampleTable) -> Result<Vec<String>> {
+    let names: Vec<String> = sqlx::query_scalar(
+        "SELECT inhrelid::REGCLASS::TEXT FROM pg_inherits WHERE inhparent = $1::REGCLASS ORDER BY 1",
+    )
+    .bind(table.to_string())
+    .fetch_all(connection)
+    .await
+    .map_err(failed)?;
+    let has_day = |name: &String| day_of(name).bytes().all(|byte| byte.is_ascii_digit());
+    Ok(names.into_iter().filter(has_day).collect())
+}
+
+/// The last characters of a name: the first day of a week, or of the first week behind.
+fn day_of(name: &str) -> &str {
+    name.len().checked_sub(DAY_LENGTH).and_then(|start| name.get(start..)).unwrap_or(name)
+}
+
+/// Whether a name is that of a week of this table.
+fn is_week(table: SampleTable, name: &str) -> bool {
+    let day = name.strip_prefix(&*table.to_string()).and_then(|rest| rest.strip_prefix('_'));
+    day.is_some_and(|day| day.len() == DAY_LENGTH && day.bytes().all(|byte| byte.is_ascii_digit()))
+}
+
+/// Start of the week of an instant, microseconds.
+fn week_of(time: Timestamp) -> i64 {
+    time.as_microsecond().div_euclid(WEEK_US) * WEEK_US
+}
+
+/// A day in the name of a partition; days are in the order of time.
+fn day(time_us: i64) -> Result<String> {
+    let time = Timestamp::from_microsecond(time_us).map_err(Error::fault)?;
+    Ok(time.to_zoned(TimeZone::UTC).strftime("%Y%m%d").to_string())
+}

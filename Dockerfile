@@ -6,7 +6,7 @@ WORKDIR /build
 COPY . .
 RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/build/target \
     cargo build --release --locked \
-    && objcopy --strip-debug target/release/sightfix /usr/local/bin/sightfix && mkdir /data
+    && cp target/release/sightfix /usr/local/bin/sightfix && mkdir /data
 
 # The C library, certificates and nothing else: no shell, no package manager.
 FROM gcr.io/distroless/cc-debian12

@@ -1,10 +1,10 @@
 //! Training runs of sites: start, list, cancel, watch. `worker` runs them.
 
-use futures_util::{Stream, StreamExt as _, stream};
+use futures_util::Stream;
 use jiff::Timestamp;
 
 use super::idempotency::record_of;
-use super::training::{WATCH_INTERVAL, check_extent};
+use super::training::{check_extent, watch_changes};
 use super::{App, Page, page_of};
 use crate::domain::{
     Camera, Error, ErrorKind, IdempotentRequest, Result, RunId, SiteId, SiteTrainingOptions, SiteTrainingRun,
@@ -128,20 +128,13 @@ impl App {
     ) -> Result<impl Stream<Item = Result<SiteTrainingRun>> + Send + use<>> {
         let first = self.store.site_run(id, run).await?;
         let (app, id) = (self.clone(), id.clone());
-        let later = stream::unfold(Some(first.clone()), move |shown| {
-            let (app, id) = (app.clone(), id.clone());
-            async move {
-                let shown = shown.filter(|run| !run.state.has_ended())?;
-                loop {
-                    tokio::time::sleep(WATCH_INTERVAL).await;
-                    match app.store.site_run(&id, run).await {
-                        Ok(seen) if seen == shown => {}
-                        Ok(seen) => return Some((Ok(seen.clone()), Some(seen))),
-                        Err(error) => return Some((Err(error), None)),
-                    }
-                }
-            }
-        });
-        Ok(stream::once(async move { Ok(first) }).chain(later))
+        Ok(watch_changes(
+            first,
+            |run| run.state,
+            move || {
+                let (app, id) = (app.clone(), id.clone());
+                async move { app.store.site_run(&id, run).await }
+            },
+        ))
     }
 }

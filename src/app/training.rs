@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use super::idempotency::record_of;
 use super::{App, Page, page_of};
 use crate::domain::{
-    CameraId, EpochReport, Error, ErrorKind, IdempotentRequest, Recipe, Result, RunId, TimeRange,
+    CameraId, EpochReport, Error, ErrorKind, IdempotentRequest, JobState, Recipe, Result, RunId, TimeRange,
     TrainingOptions, TrainingRun,
 };
 use crate::geo::{Position, distance_m};
@@ -16,7 +16,7 @@ use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 use crate::store::SampleFilter;
 
 /// How often a watched run is read from the store.
-pub(super) const WATCH_INTERVAL: Duration = Duration::from_millis(200);
+const WATCH_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A request for a training run; what is left out comes from the profile.
 #[derive(Debug, Clone, Copy, Default)]
@@ -153,22 +153,39 @@ impl App {
     ) -> Result<impl Stream<Item = Result<TrainingRun>> + Send + use<>> {
         let first = self.store.run(id, run).await?;
         let (app, id) = (self.clone(), id.clone());
-        let later = stream::unfold(Some(first.clone()), move |shown| {
-            let (app, id) = (app.clone(), id.clone());
-            async move {
-                let shown = shown.filter(|run| !run.state.has_ended())?;
-                loop {
-                    tokio::time::sleep(WATCH_INTERVAL).await;
-                    match app.store.run(&id, run).await {
-                        Ok(seen) if seen == shown => {}
-                        Ok(seen) => return Some((Ok(seen.clone()), Some(seen))),
-                        Err(error) => return Some((Err(error), None)),
-                    }
-                }
-            }
-        });
-        Ok(stream::once(async move { Ok(first) }).chain(later))
+        Ok(watch_changes(
+            first,
+            |run| run.state,
+            move || {
+                let (app, id) = (app.clone(), id.clone());
+                async move { app.store.run(&id, run).await }
+            },
+        ))
     }
+}
+
+/// A run now, and at each change that `read` shows, until it has ended or cannot be read.
+pub(super) fn watch_changes<R, F>(
+    first: R,
+    state: fn(&R) -> JobState,
+    read: impl FnMut() -> F + Send,
+) -> impl Stream<Item = Result<R>> + Send
+where
+    R: Clone + PartialEq + Send,
+    F: Future<Output = Result<R>> + Send,
+{
+    let later = stream::unfold((Some(first.clone()), read), move |(shown, mut read)| async move {
+        let shown = shown.filter(|run| !state(run).has_ended())?;
+        loop {
+            tokio::time::sleep(WATCH_INTERVAL).await;
+            match read().await {
+                Ok(seen) if seen == shown => {}
+                Ok(seen) => return Some((Ok(seen.clone()), (Some(seen), read))),
+                Err(error) => return Some((Err(error), (None, read))),
+            }
+        }
+    });
+    stream::once(async move { Ok(first) }).chain(later)
 }
 
 /// Refuses samples that no recipe can be fitted to, before a run is queued; the fit checks more.

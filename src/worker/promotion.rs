@@ -107,8 +107,10 @@ impl Comparison {
 
 /// What is known of a new version and the active one.
 enum Finding {
-    /// There is nothing to compare with, or nothing that could be compared.
-    Decided(PromotionDecision),
+    /// No active version can be used, for this reason.
+    NoRival(String),
+    /// The version of this number is active, and the new one cannot be compared with it, for this reason.
+    Incomparable(u32, &'static str),
     /// Both were measured.
     Measured(Measured),
 }
@@ -134,9 +136,9 @@ impl Measured {
         } else if all.new_is_worse(1.0) {
             keep(*number, &all.describe(*number))
         } else if all.samples == 0.0 {
-            activate(format!("version {number} has no held-out samples that count any more"))
+            activate(&format!("version {number} has no held-out samples that count any more"))
         } else {
-            activate(all.describe(*number))
+            activate(&all.describe(*number))
         }
     }
 }
@@ -168,7 +170,8 @@ pub(super) async fn decide(
     new: &PromotionCandidate<'_>,
 ) -> Result<PromotionDecision> {
     Ok(match measure(app, id, app.store.camera(id).await?.active_model, new).await? {
-        Finding::Decided(decision) => decision,
+        Finding::NoRival(why) => activate(&why),
+        Finding::Incomparable(number, why) => keep(number, why),
         Finding::Measured(measured) => measured.decide(),
     })
 }
@@ -186,7 +189,8 @@ pub(super) async fn decide_site(
     for (id, candidate) in candidates {
         let active = app.store.camera(id).await?.active_model;
         let (is_worse, comparison) = match measure(app, id, active, candidate).await? {
-            Finding::Decided(PromotionDecision { activate, reason }) => (!activate, reason),
+            Finding::NoRival(why) => (false, why),
+            Finding::Incomparable(_, why) => (true, why.to_owned()),
             Finding::Measured(measured) => {
                 all = all.plus(&measured.all);
                 let is_worse = measured.own.new_is_worse(TOLERANCE) || measured.all.new_is_worse(TOLERANCE);
@@ -221,13 +225,13 @@ async fn measure(
     new: &PromotionCandidate<'_>,
 ) -> Result<Finding> {
     let Some(number) = active else {
-        return Ok(Finding::Decided(activate("the camera had no model".to_owned())));
+        return Ok(Finding::NoRival("the camera had no model".to_owned()));
     };
     let Some((active, _)) = app.registry.refresh_camera(&app.store, id).await?.model.clone() else {
-        return Ok(Finding::Decided(activate(format!("version {number} cannot be used"))));
+        return Ok(Finding::NoRival(format!("version {number} cannot be used")));
     };
     if new.held_out.is_empty() {
-        return Ok(Finding::Decided(keep(number, "the new one has no held-out errors to compare")));
+        return Ok(Finding::Incomparable(number, "the new one has no held-out errors to compare"));
     }
     let moved_at = app.store.camera_move(id, number).await?.map(|moved| moved.began_at);
     let counts =
@@ -312,7 +316,7 @@ fn against_recorded(
     Comparison { active_m, ..everything }
 }
 
-fn activate(why: String) -> PromotionDecision {
+fn activate(why: &str) -> PromotionDecision {
     PromotionDecision { activate: true, reason: format!("became active: {why}") }
 }
 

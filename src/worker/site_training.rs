@@ -85,8 +85,7 @@ impl Job for SiteTrainingRun {
     ) -> Result<Option<JobState>> {
         let Ended { output: Fitted { outcome, cameras }, mut progress, shutting_down } = ended;
         if outcome.is_ok() {
-            progress.progress.epoch = progress.progress.epochs;
-            progress.progress.remaining_s = Some(0.0);
+            progress.complete();
         }
         if matches!(Self::record(app, claim, progress, lease).await?, Heartbeat::Lost) {
             return Ok(None);

@@ -29,6 +29,14 @@ impl JobProgress for Update {
     }
 }
 
+impl Update {
+    /// Notes that the fit is done. A recipe may do less than planned: the chosen candidate has no network, for one.
+    pub(super) fn complete(&mut self) {
+        self.progress.epoch = self.progress.epochs;
+        self.progress.remaining_s = Some(0.0);
+    }
+}
+
 /// How a fit ended, and its samples.
 pub(super) struct Fitted {
     outcome: std::result::Result<Model, FitError>,
@@ -118,9 +126,7 @@ impl Job for TrainingRun {
     ) -> Result<Option<JobState>> {
         let Ended { output: Fitted { outcome, samples }, mut progress, shutting_down } = ended;
         if outcome.is_ok() {
-            // A recipe may do less than planned: the chosen candidate has no network, for one.
-            progress.progress.epoch = progress.progress.epochs;
-            progress.progress.remaining_s = Some(0.0);
+            progress.complete();
         }
         if matches!(Self::record(app, claim, progress, lease).await?, Heartbeat::Lost) {
             return Ok(None);

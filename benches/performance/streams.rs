@@ -13,7 +13,7 @@ use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::fusion_service_server::{FusionService, FusionServiceServer};
 use sightfix::grpc::proto::stream_request::Kind as Sent;
-use sightfix::grpc::proto::stream_response::Kind as Told;
+use sightfix::grpc::proto::stream_response::Kind as Received;
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, mpsc};
 use tonic::transport::{Channel, Endpoint};
@@ -56,9 +56,9 @@ impl FusionService for Echo {
         let answers = request.into_inner().map(move |message| {
             let kind = match message?.kind {
                 Some(Sent::Item(item)) => {
-                    Told::Answer(Box::new(proto::StreamAnswer { seq: item.seq, ..made.clone() }))
+                    Received::Answer(Box::new(proto::StreamAnswer { seq: item.seq, ..made.clone() }))
                 }
-                _ => Told::Opened(proto::StreamOpened::default()),
+                _ => Received::Opened(proto::StreamOpened::default()),
             };
             Ok(proto::StreamResponse { kind: Some(kind) })
         });
@@ -149,8 +149,8 @@ async fn open(
     let opening = proto::StreamOpening { camera_id: camera.to_owned(), client_name, ..Default::default() };
     items.send(proto::StreamRequest { kind: Some(Sent::Opening(opening)) }).await.expect("room");
     let messages = stream::unfold(queue, |mut queue| async move { queue.recv().await.map(|it| (it, queue)) });
-    let told = FusionServiceClient::new(channel).stream(messages).await.expect("a stream").into_inner();
-    (items, told)
+    let responses = FusionServiceClient::new(channel).stream(messages).await.expect("a stream").into_inner();
+    (items, responses)
 }
 
 /// Items per second over so many streams, each with its items in flight.
@@ -167,7 +167,8 @@ async fn throughput(
         let (camera, mut feed) =
             (camera.to_owned(), Feed::new(observations, format!("target-{index}"), None));
         clients.spawn(async move {
-            let (items, mut told) = open(connect(address).await, &camera, format!("bench-{index}")).await;
+            let (items, mut responses) =
+                open(connect(address).await, &camera, format!("bench-{index}")).await;
             let room = Arc::new(Semaphore::new(IN_FLIGHT));
             let places = room.clone();
             let sending = tokio::spawn(async move {
@@ -179,8 +180,8 @@ async fn throughput(
             });
             let mut answered = 0;
             while answered < each {
-                let message = told.message().await.expect("no end").expect("no end");
-                if let Some(Told::Answer(answer)) = message.kind {
+                let message = responses.message().await.expect("no end").expect("no end");
+                if let Some(Received::Answer(answer)) = message.kind {
                     let track = answer.track.expect("the target is followed");
                     let late = proto::track_rejection::Reason::TooLate;
                     assert!(track.rejections.iter().all(|rejection| rejection.reason() != late), "{track:?}");
@@ -198,13 +199,13 @@ async fn throughput(
 /// An answer as the server gives it.
 async fn sample_answer(served: &Served, observations: &Arc<Vec<Observation>>) -> proto::StreamAnswer {
     let mut feed = Feed::new(observations, "target-0".to_owned(), None);
-    let (items, mut told) =
+    let (items, mut responses) =
         open(connect(served.address).await, served.camera.as_str(), "probe".to_owned()).await;
     items.send(feed.item()).await.expect("room");
     items.send(feed.item()).await.expect("room");
     loop {
-        let message = told.message().await.expect("no end").expect("no end");
-        if let Some(Told::Answer(answer)) = message.kind
+        let message = responses.message().await.expect("no end").expect("no end");
+        if let Some(Received::Answer(answer)) = message.kind
             && answer.seq == 2
         {
             return *answer;
@@ -259,7 +260,7 @@ async fn many(served: &Served, observations: &Arc<Vec<Observation>>) -> Vec<f64>
         let step = Duration::from_secs_f64(1.0 / RATE_HZ);
         let mut feed = Feed::new(observations, format!("many-{index}"), Some(step));
         clients.spawn(async move {
-            let (items, mut told) = open(channel, &camera, format!("many-{index}")).await;
+            let (items, mut responses) = open(channel, &camera, format!("many-{index}")).await;
             let count = (RATE_HZ * SECONDS) as usize;
             let (sent, mut when) = mpsc::unbounded_channel();
             // Spread over one interval, as cameras are.
@@ -275,8 +276,8 @@ async fn many(served: &Served, observations: &Arc<Vec<Observation>>) -> Vec<f64>
             });
             let mut times = Vec::with_capacity(count);
             while times.len() < count {
-                let message = told.message().await.expect("no end").expect("no end");
-                if matches!(message.kind, Some(Told::Answer(_))) {
+                let message = responses.message().await.expect("no end").expect("no end");
+                if matches!(message.kind, Some(Received::Answer(_))) {
                     times.push(when.recv().await.expect("was sent").elapsed().as_secs_f64());
                 }
             }

@@ -8,7 +8,7 @@ use super::Check;
 use crate::config::Config;
 
 const TIMEOUT: Duration = Duration::from_secs(2);
-/// Begin of the answer of a server that is alive.
+/// First bytes of the answer of a server that is alive.
 const ALIVE: &str = "HTTP/1.1 200";
 
 pub(super) async fn check(config: &Config) -> Check {

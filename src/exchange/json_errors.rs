@@ -16,7 +16,7 @@ pub(super) fn refusal_of(path: &str, error: &serde_json::Error) -> Error {
     Error::field(ErrorKind::MalformedBody, path, format!("not JSON: {what}{place}"))
 }
 
-/// The name at the begin of the parser's message, and what follows it.
+/// The name at the start of the parser's message, and what follows it.
 fn quoted<'m>(message: &'m str, begin: &str) -> Option<(&'m str, &'m str)> {
     message.strip_prefix(begin).and_then(|rest| rest.split_once('`'))
 }

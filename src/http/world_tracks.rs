@@ -288,7 +288,7 @@ enum SiteEventBody {
 /// Server-sent events: `track` with a position as a GeoJSON feature when a target was measured, at most five a
 /// second and track; `track_started`, `handed_over` from camera to camera, `identified` by a receiver, `merged` and
 /// `track_ended`. Each has an id; a client that connects again with `last-event-id`, as browsers do by themselves,
-/// continues behind it. `lost` tells of events that are not kept any more. They end when the site is deleted.
+/// continues behind it. `lost` counts events that are no longer stored. They end when the site is deleted.
 #[utoipa::path(
     get, path = "/v1/sites/{site}/events", tag = "sites",
     params(

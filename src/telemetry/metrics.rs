@@ -114,7 +114,7 @@ impl Metrics {
 
     /// Gathers recorded times into their buckets. They pile up until then, so this must run every
     /// few seconds whether anybody reads the metrics or not.
-    pub fn upkeep(&self) {
+    pub fn maintenance_round(&self) {
         self.handle.run_upkeep();
     }
 

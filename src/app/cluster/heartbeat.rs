@@ -135,7 +135,7 @@ async fn end_watches(membership: &Membership) -> Result<()> {
     Ok(())
 }
 
-/// From the begin of the drain on: releases each camera once its last stream has been settled. Returns when nothing is
+/// Once the drain has started: releases each camera once its last stream has been settled. Returns when nothing is
 /// left, or no time.
 async fn hand_over(membership: &Membership, shutdown: &Shutdown) {
     shutdown.draining().await;

@@ -16,7 +16,7 @@ pub struct ConnectionNode {
     pub url: Option<String>,
 }
 
-/// What this node has told the others.
+/// What this node has reported to the others.
 #[derive(Default)]
 pub struct ReportedStatuses {
     node: Option<NodeId>,

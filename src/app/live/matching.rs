@@ -19,7 +19,7 @@ use crate::fusion::association::{
 };
 use crate::model::Regressor;
 
-/// Time from the begin of one round of matching to that of the next at least.
+/// Least time between the starts of two rounds of matching.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
 /// Matching of one camera takes at most this share of a core; all cameras together take one core.
 const MAX_LOAD: f64 = 0.1;
@@ -36,7 +36,7 @@ struct State {
     window: LiveWindow,
     matches: LiveMatches,
     is_running: bool,
-    /// Earliest begin of the next round, by the monotonic clock.
+    /// Earliest start of the next round, by the monotonic clock.
     next_at: Duration,
 }
 

@@ -19,7 +19,7 @@ const SIGMA_RANGE_M: [f64; 2] = [0.02, 100.0];
 const FOOT_SIGMA_RANGE_PX: [f64; 2] = [0.5, 50.0];
 /// Rounds of solution and noise estimate.
 const ROUNDS: usize = 3;
-/// The same where the heights of boxes are told by a prior that is linearised anew in each.
+/// The same where a prior on the heights of boxes is linearised again in each.
 const UPRIGHT_ROUNDS: usize = 6;
 /// Fixes of all receivers and of one, and transfers between all cameras and between two: more are thinned evenly.
 const MAX_ROWS: usize = 20_000;

@@ -167,7 +167,7 @@ async fn owner_of(response: Response<Body>, is_grpc: bool, is_live: bool) -> (Re
         return (Response::from_parts(parts, body), None);
     };
     let owner = first.as_ref().ok().and_then(Frame::trailers_ref).and_then(grpc_owner);
-    let body = Body::new(FirstThen { first: Some(first), rest: body });
+    let body = Body::new(Replay { read: VecDeque::from([first]), rest: body, end: None });
     (Response::from_parts(parts, body), owner)
 }
 
@@ -190,7 +190,7 @@ struct Recorded {
     /// `None` once it belongs to the request to another node.
     rest: Option<Body>,
     /// `None` once more was read than is recorded.
-    read: Option<VecDeque<Frame<Bytes>>>,
+    read: Option<VecDeque<Result<Frame<Bytes>, axum::Error>>>,
     /// How much more may be recorded, bytes.
     room_bytes: usize,
 }
@@ -209,7 +209,7 @@ impl Record {
         self.lock().read = None;
     }
 
-    /// The whole body from its begin, unless more was read than is recorded. The reader here gets no more of it.
+    /// The whole body from its start, unless more was read than is recorded. The reader here gets no more of it.
     fn replay(&self) -> Option<Replay> {
         let mut recorded = self.lock();
         let read = recorded.read.take()?;
@@ -223,7 +223,7 @@ impl Recorded {
         match self.room_bytes.checked_sub(data.len()) {
             Some(room_bytes) => {
                 self.room_bytes = room_bytes;
-                read.push_back(Frame::data(data.clone()));
+                read.push_back(Ok(Frame::data(data.clone())));
             }
             None => self.read = None,
         }
@@ -262,9 +262,9 @@ impl HttpBody for RecordedBody {
     }
 }
 
-/// The body as another node reads it: what was read here, then the rest.
+/// A body from its start: what was read of it, then the rest.
 struct Replay {
-    read: VecDeque<Frame<Bytes>>,
+    read: VecDeque<Result<Frame<Bytes>, axum::Error>>,
     rest: Body,
     /// When it ends, whatever the client still sends.
     end: Option<BoxFuture<'static, ()>>,
@@ -286,7 +286,7 @@ impl HttpBody for Replay {
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
         if let Some(frame) = self.read.pop_front() {
-            return Poll::Ready(Some(Ok(frame)));
+            return Poll::Ready(Some(frame));
         }
         if self.end.as_mut().is_some_and(|end| end.poll_unpin(context).is_ready()) {
             self.end = None;
@@ -297,30 +297,5 @@ impl HttpBody for Replay {
 
     fn is_end_stream(&self) -> bool {
         self.read.is_empty() && self.rest.is_end_stream()
-    }
-}
-
-/// A response whose first frame was looked at.
-struct FirstThen {
-    first: Option<Result<Frame<Bytes>, axum::Error>>,
-    rest: Body,
-}
-
-impl HttpBody for FirstThen {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        match self.first.take() {
-            Some(first) => Poll::Ready(Some(first)),
-            None => Pin::new(&mut self.rest).poll_frame(context),
-        }
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.first.is_none() && self.rest.is_end_stream()
     }
 }

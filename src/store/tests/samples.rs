@@ -166,8 +166,8 @@ async fn samples_of_before_an_instant_are_deleted_and_counted_no_more() {
     const DAY: i64 = 86_400;
     let timed = |second| Sample { time: at(second), ..sample(0, "a") };
     let Fixture { store, camera, folder: _folder } = Fixture::new().await;
-    // The first days of a week in 2093; those of 1970 are older than any partition.
-    let week = 6_420 * 7 * DAY;
+    // A Thursday of 2093 begins a week; the first samples are older than any partition.
+    let week = 6_420 * 7 * DAY - at(0).as_second();
     assert_eq!(store.retain_samples(None, at(week)).await.expect("works"), 0);
     store.insert_camera(&NewCamera::named(id("other")), at(0)).await.expect("new");
     let late = [week - 1, week, week + 3 * DAY, week + 7 * DAY, week + 8 * DAY, week + 60 * DAY];
@@ -180,7 +180,8 @@ async fn samples_of_before_an_instant_are_deleted_and_counted_no_more() {
     }
     let stored = async || {
         let samples = store.samples(&camera, &SampleFilter::default(), None, 100).await.expect("read");
-        let times: Vec<_> = samples.iter().map(|sample| sample.time.as_second() - week).collect();
+        let times: Vec<_> =
+            samples.iter().map(|sample| sample.time.as_second() - at(week).as_second()).collect();
         (
             times,
             store.camera(&camera).await.expect("known").samples,

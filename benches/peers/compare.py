@@ -13,7 +13,6 @@ import io
 import json
 import math
 import os
-import random
 import re
 import shutil
 import signal
@@ -194,7 +193,7 @@ class Side:
             env={**os.environ, **self.environment(data)},
         )  # fmt: skip
         answered: Figure | None = None
-        seen = set()
+        seen: set[int] = set()
         while len(seen) < self.workers:
             if self.process.poll() is not None or time.monotonic() - began > 120:
                 fail(f"{self.name} does not start:\n{(data / 'log.txt').read_text()}")
@@ -273,8 +272,8 @@ class Side:
         """Requests per second, and the 99th percentile of the latency in ms."""
         threads, spent = min(connections, CORES), cpu_s(self.pid)
         output = subprocess.run(
-            ["wrk", "--timeout", "60", "-t", str(threads), "-c", str(connections), "-d", str(seconds), "-s", str(HERE / "fuse.lua"),
-             f"http://127.0.0.1:{self.port}/v1/cameras/{CAMERA}/fusions", "--", str(bodies)],
+            ["wrk", "--timeout", "60", "-t", str(threads), "-c", str(connections), "-d", str(seconds),
+             "-s", str(HERE / "fuse.lua"), f"http://127.0.0.1:{self.port}/v1/cameras/{CAMERA}/fusions", "--", str(bodies)],
             capture_output=True, text=True, check=False,
         )  # fmt: skip
         figures = re.search(r"^figures (\d+) (\d+) (\d+) (\d+) (\d+)$", output.stdout, re.MULTILINE)
@@ -477,8 +476,8 @@ def measure(
             rate, late = side.load(single, CONNECTIONS, seconds)
             return {"many": rate, "late": late}
         case "batch":
-            rate, spent = side.load(many, CONNECTIONS, seconds)[0]
-            return {"batch": (rate * PER_REQUEST, spent and spent * PER_REQUEST)}
+            clock, spent = side.load(many, CONNECTIONS, seconds)[0]
+            return {"batch": (clock * PER_REQUEST, spent * PER_REQUEST if spent else None)}
         case "csv":
             return {"csv": side.import_rows(camera, world.csv, "text/csv")}
         case "json":

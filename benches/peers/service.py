@@ -18,14 +18,14 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NotRequired
 
 import torch
 from fastapi import FastAPI, HTTPException, Request, Response
 from pydantic import AwareDatetime, BaseModel, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss
-from typing_extensions import NotRequired, TypedDict
+from typing_extensions import TypedDict
 
 INPUTS, HIDDEN = 4, 32
 EPOCHS, BATCH, LEARNING_RATE = 100, 512, 0.005
@@ -202,6 +202,13 @@ def features(left: float, top: float, width: float, height: float) -> tuple[floa
 
 class AutoEncoder(nn.Module):
     """Net of one camera, whose bottleneck is the standardised position in the plane about the origin."""
+
+    input_mean: Tensor
+    input_std: Tensor
+    position_mean_m: Tensor
+    position_std_m: Tensor
+    origin_deg: Tensor
+    error_scale_m2: Tensor
 
     def __init__(self) -> None:
         super().__init__()

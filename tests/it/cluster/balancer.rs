@@ -31,8 +31,9 @@ impl Balancer {
         }
         let file = folder.join("nginx.conf");
         std::fs::write(&file, text).expect("written");
+        // Every stream of a node that is killed is an error to nginx; the tests report what came of them.
         let global =
-            format!("daemon off; pid {}; error_log stderr warn;", folder.join("nginx.pid").display());
+            format!("daemon off; pid {}; error_log stderr crit;", folder.join("nginx.pid").display());
         let mut command = Command::new("nginx");
         command.args(["-p", folder.to_str().expect("UTF-8"), "-e", "stderr", "-c"]).arg(&file);
         let process = command.args(["-g", &global]).stdout(Stdio::null()).spawn().expect("nginx runs");

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use futures_util::stream;
 use serde_json::{Value, json};
+use sightfix::clock::Clock;
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::model_service_client::ModelServiceClient;
@@ -408,7 +409,7 @@ async fn the_oldest_samples_give_way_where_the_settings_say_so() {
 #[tokio::test]
 async fn samples_older_than_the_days_of_the_setting_are_deleted() {
     let folder = data_folder();
-    let now = jiff::Timestamp::now();
+    let now = Clock::system().now();
     let young = csv(0..0) + &format!("{now},young,10,20,30,60,103.9,30.6\n");
     {
         let server = TestServer::start(folder.path());

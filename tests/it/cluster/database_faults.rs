@@ -194,22 +194,27 @@ async fn faults_of_the_database_lose_and_duplicate_nothing() {
         until_ended(&cluster.nodes[round % 2]).await;
     }
     let (stored, runs) = (cluster.stored(), "SELECT count(*) FROM training_runs WHERE state = 'succeeded'");
+    // A full disk fails a run for good, and says so.
+    let full = "SELECT count(*) FROM training_runs \
+                WHERE state = 'failed' AND outcome LIKE 'the disk of the database is full%'";
     let distinct = cluster.database.number(
         "SELECT count(DISTINCT time_us) FROM samples JOIN cameras ON key = camera_key WHERE id = 'yard'",
     );
-    let succeeded = cluster.database.number(runs);
+    let (succeeded, failed) = (cluster.database.number(runs), cluster.database.number(full));
+    let full_disks = kinds.iter().filter(|kind| **kind == FaultKind::FullDisk).count() as u64;
     let models = cluster.database.number("SELECT count(*) FROM models WHERE run_id IS NOT NULL");
     recoveries.sort_unstable();
     println!(
-        "| faults | acknowledged | lost | duplicated | two owners | runs ended, versions | longest without an answer, ms |\n\
-         | {} | {acknowledged} | {} | {} | {two_owners} | {succeeded}, {models} | {} |",
+        "| faults | acknowledged | lost | duplicated | two owners | runs succeeded, versions | runs failed by a full disk | longest without an answer, ms |\n\
+         | {} | {acknowledged} | {} | {} | {two_owners} | {succeeded}, {models} | {failed} | {} |",
         kinds.len(),
         acknowledged.saturating_sub(distinct),
         stored - distinct,
         recoveries.last().map_or(0, Duration::as_millis)
     );
     assert_eq!((stored, distinct, two_owners), (acknowledged, acknowledged, 0));
-    assert_eq!((succeeded, models), (kinds.len() as u64, kinds.len() as u64), "every run ends, and once");
+    assert_eq!((succeeded + failed, models), (kinds.len() as u64, succeeded), "every run ends, and once");
+    assert!(failed <= full_disks, "{failed} runs failed, the disk was full {full_disks} times");
 }
 
 /// Waits until no training run is queued or running.

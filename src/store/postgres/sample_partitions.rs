@@ -55,7 +55,8 @@ impl Store {
         for week_us in weeks {
             let day = day(week_us)?;
             let name = format!("{table}_{day}");
-            if first.is_none_or(|first| &*day < first) || stored.contains(&name) {
+            let is_wanted = first.is_some_and(|first| &*day >= first) && !stored.contains(&name);
+            if !is_wanted || has_default_rows(&mut transaction, table, week_us).await? {
                 continue;
             }
             let sql = format!(
@@ -159,6 +160,18 @@ async fn partitions(connection: &mut PgConnection, table: SampleTable) -> Result
     .map_err(failed)?;
     let has_day = |name: &String| day_of(name).bytes().all(|byte| byte.is_ascii_digit());
     Ok(names.into_iter().filter(has_day).collect())
+}
+
+/// Whether samples of a week came before anything had added its partition. PostgreSQL refuses a partition of rows that
+/// the default one holds; they stay there, and are deleted in batches.
+async fn has_default_rows(connection: &mut PgConnection, table: SampleTable, week_us: i64) -> Result<bool> {
+    let sql = format!("SELECT EXISTS (SELECT 1 FROM {table}_other WHERE time_us >= $1 AND time_us < $2)");
+    sqlx::query_scalar(AssertSqlSafe(sql))
+        .bind(week_us)
+        .bind(week_us + WEEK_US)
+        .fetch_one(connection)
+        .await
+        .map_err(failed)
 }
 
 /// The last characters of a name: the first day of a week, or of the first week behind.

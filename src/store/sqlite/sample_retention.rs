@@ -82,7 +82,7 @@ pub(super) async fn delete_oldest(
 }
 
 /// Deletes the oldest samples of a camera from before an instant, some ten thousand at most; returns how many.
-pub(super) async fn delete_batch(
+async fn delete_batch(
     connection: &mut SqliteConnection,
     camera_key: i64,
     before_us: i64,

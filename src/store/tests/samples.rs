@@ -202,6 +202,11 @@ async fn samples_of_before_an_instant_are_deleted_and_counted_no_more() {
     assert_eq!(late.expect("stored").accepted, 1);
     assert_eq!(store.retain_samples(Some(at(week + 7 * DAY)), at(week + 9 * DAY)).await.expect("works"), 1);
     assert_eq!(stored().await.2, 8);
+    // So do samples that were stored weeks before they were expected.
+    let deleted = store.retain_samples(Some(at(week + 14 * DAY)), at(week + 45 * DAY)).await.expect("works");
+    assert_eq!((deleted, stored().await.0), (2 * 3, vec![60 * DAY]));
+    let deleted = store.retain_samples(Some(at(week + 63 * DAY)), at(week + 65 * DAY)).await.expect("works");
+    assert_eq!((deleted, stored().await.2), (2, 0));
 }
 
 #[tokio::test]

@@ -82,11 +82,7 @@ pub(super) async fn delete_oldest(
 }
 
 /// Deletes the oldest samples of a camera from before an instant, some ten thousand at most; returns how many.
-async fn delete_batch(
-    connection: &mut SqliteConnection,
-    camera_key: i64,
-    before_us: i64,
-) -> Result<u64> {
+async fn delete_batch(connection: &mut SqliteConnection, camera_key: i64, before_us: i64) -> Result<u64> {
     let newest_of_batch_us: Option<i64> = sqlx::query_scalar(
         "SELECT time_us FROM (SELECT time_us FROM samples WHERE camera_key = ?1 AND time_us < ?2 \
          UNION ALL SELECT time_us FROM samples_without_fix WHERE camera_key = ?1 AND time_us < ?2 \

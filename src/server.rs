@@ -32,7 +32,7 @@ use tokio::net::TcpListener;
 
 use crate::app::{App, NodeSettings, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
-use crate::config::{Config, OtherNode};
+use crate::config::{Config, NodeRole, OtherNode};
 use crate::connect;
 use crate::domain::{Error, KeySecret};
 use crate::exchange::ConnectionDraft;
@@ -126,6 +126,9 @@ impl Server {
                 .with_context(|| format!("cannot listen on {address}, the setting metrics_listen"))
         });
         let monitoring = monitoring.transpose()?;
+        if config.role.answers_clients() {
+            refresh_registries(&app).await?;
+        }
         app.join(NodeSettings::of(&config, reachable_url(&listener, tls.is_some())?)).await?;
         Ok(Self { config, app, listener, monitoring, tls, proxies, shutdown: Shutdown::new() })
     }
@@ -184,7 +187,7 @@ impl Server {
         if config.role.answers_clients() {
             shutdown.spawn(connect::run(app.clone(), shutdown.clone()));
         }
-        shutdown.spawn(maintenance_loop(reloader, shutdown.clone()));
+        shutdown.spawn(maintenance_loop(reloader, config.role, shutdown.clone()));
         shutdown.spawn(retention_loop(app.clone(), shutdown.clone()));
         shutdown.spawn(app.clone().keep_registered(shutdown.clone()));
         let mut allowed_hosts = config.allowed_hosts.clone();
@@ -273,7 +276,7 @@ async fn prepare_access(app: &App, config: &Config) -> anyhow::Result<()> {
 /// Time between writes of when keys were used last, in rounds of the maintenance.
 const STORE_USES_EVERY: u32 = 30;
 
-async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
+async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown) {
     let app = &reloader.app;
     let mut round = 0;
     loop {
@@ -283,12 +286,12 @@ async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
         }
         app.metrics.maintenance_round();
         reloader.reload_certificate(false).await;
-        if let Err(error) = app.site_registry.refresh(&app.store).await {
-            tracing::error!(%error, "cannot look for changed sites");
-        }
         gather_figures(app).await;
-        if let Err(error) = app.registry.refresh(&app.store).await {
-            tracing::error!(%error, "cannot look for changed cameras");
+        // A worker reads what it trains when it trains it.
+        if role.answers_clients()
+            && let Err(error) = refresh_registries(app).await
+        {
+            tracing::error!(%error, "cannot look for changed sites and cameras");
         }
         if let Err(error) = app.access.refresh(&app.store, app.clock.now()).await {
             tracing::error!(%error, "cannot look for changed keys");
@@ -303,6 +306,11 @@ async fn maintenance_loop(reloader: Reloader, shutdown: Shutdown) {
             tracing::error!(%error, "cannot retrain moved cameras");
         }
     }
+}
+
+async fn refresh_registries(app: &App) -> Result<(), Error> {
+    app.site_registry.refresh(&app.store).await?;
+    app.registry.refresh(&app.store).await
 }
 
 /// Time between deletions of old samples, and before another attempt where one failed.

@@ -127,7 +127,7 @@ pub struct Parts {
 const CLOSE_TIME: Duration = Duration::from_secs(2);
 
 impl App {
-    /// An application over an opened store, its registry filled.
+    /// An application over an opened store. Cameras are loaded when they are asked for, or all by [`Registry::refresh`].
     ///
     /// # Errors
     /// A fault if the store cannot be read.
@@ -145,9 +145,7 @@ impl App {
         if filled > 0 {
             tracing::info!(models = filled, "stored checksums of model versions of an earlier release");
         }
-        registry.refresh(&store).await?;
         let site_registry = SiteRegistry::new(randomness.clone(), limits.site_events);
-        site_registry.refresh(&store).await?;
         let access = Access::default();
         access.refresh(&store, clock.now()).await?;
         let pairings = Semaphore::new(limits.pairings);

@@ -183,7 +183,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`; `ModelUnusable` if the stored version cannot be loaded.
     pub async fn activate_model(&self, id: &CameraId, number: u32) -> Result<Camera> {
-        load_model(&self.store, id, number).await?;
+        load_model(id, number, self.store.model_content(id, number).await?)?;
         let camera = self.store.activate_model(id, number, self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;
         Ok(camera)

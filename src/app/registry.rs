@@ -3,7 +3,7 @@
 //! A request reads the map that is current at that moment; a change replaces it. Reading never waits for
 //! the database.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
@@ -12,16 +12,21 @@ use tokio::sync::Mutex;
 
 use super::live::camera::CameraLive;
 use crate::domain::{
-    Camera, CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, ImageSize,
+    CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, ImageSize, ModelMetadata,
     Receivers, Result, Revision, SiteId, TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::model::{Artifact, Regressor, ViewArea};
-use crate::store::Store;
+use crate::store::{CameraContent, CameraVersion, CameraVersions, ChangeMark, Store};
 
-/// Cameras that a refresh loads before it shows them: every change copies the map, so that one at a time would cost the
-/// square of their number at the start of a server.
-const LOADED_BEFORE_SHOWN: usize = 512;
+/// Cameras that a refresh reads at once.
+const READ_AT_ONCE: usize = 256;
+/// Loaded cameras that a refresh shows at once. Every change copies the map, so that few at a time would cost the square
+/// of their number at the start of a server.
+const SHOWN_AT_ONCE: usize = 4_096;
+/// A refresh reads what has changed since the one before; one of so many compares all cameras, whatever a server that
+/// was restored, copied or replaced says of its changes.
+const REFRESHES_OF_CHANGES: u32 = 150;
 
 /// Everything that answers for one camera.
 #[derive(Clone)]
@@ -86,12 +91,21 @@ impl ActiveCamera {
     }
 }
 
+/// Until where the last refresh has read.
+#[derive(Default)]
+struct Refreshed {
+    /// `None` before the first one, and after one that could not read every camera.
+    upto: Option<ChangeMark>,
+    /// Refreshes since one that read all.
+    of_changes: u32,
+}
+
 /// All cameras, by id.
 #[derive(Default)]
 pub struct Registry {
     cameras: ArcSwap<HashMap<CameraId, Arc<ActiveCamera>>>,
     /// Held from reading the store to replacing the map, so that no change undoes a later one.
-    change: Mutex<()>,
+    change: Mutex<Refreshed>,
     /// Tells this run of the server apart from others.
     run_id: u64,
 }
@@ -125,18 +139,18 @@ impl Registry {
     /// `CameraNotFound`; a fault if the store cannot be read.
     pub async fn refresh_camera(&self, store: &Store, id: &CameraId) -> Result<Arc<ActiveCamera>> {
         let _change = self.change.lock().await;
-        let camera = match store.camera(id).await {
-            Err(error) if error.kind() == ErrorKind::CameraNotFound => {
-                self.remove(id);
-                return Err(error);
-            }
-            camera => self.load(store, camera?).await?,
-        };
-        self.replace(|cameras| cameras.insert(id.clone(), camera.clone()));
-        Ok(camera)
+        let read = store.camera_contents(std::slice::from_ref(id)).await?.pop();
+        let loaded = read.ok_or_else(|| Error::fault("the store answers for no camera"))?;
+        let loaded = loaded.and_then(|content| self.load(content));
+        match &loaded {
+            Ok(camera) => self.replace(|cameras| cameras.insert(id.clone(), camera.clone())),
+            Err(error) if error.kind() == ErrorKind::CameraNotFound => self.remove(id),
+            Err(_) => {}
+        }
+        loaded
     }
 
-    /// Brings all cameras up to date, including changes of another process on the same file.
+    /// Brings all cameras up to date, including changes of other processes.
     ///
     /// A model that cannot be loaded leaves its camera without one ([`ActiveCamera::model_fault`]), so that one
     /// damaged row does not keep others from being served. It is tried again with every refresh.
@@ -144,24 +158,45 @@ impl Registry {
     /// # Errors
     /// A fault if the store cannot be read.
     pub async fn refresh(&self, store: &Store) -> Result<()> {
-        let _change = self.change.lock().await;
-        let versions = store.camera_versions().await?;
+        let mut change = self.change.lock().await;
+        // Whatever goes wrong, the next refresh reads all.
+        let Refreshed { upto, of_changes } = std::mem::take(&mut *change);
+        let since = upto.filter(|_| of_changes < REFRESHES_OF_CHANGES);
+        let CameraVersions { versions, deleted, upto } = store.camera_versions(since).await?;
         let known = self.cameras.load_full();
-        let keys: HashMap<_, _> = versions.iter().map(|(id, key, ..)| (id, *key)).collect();
-        for deleted in known.values().filter(|camera| keys.get(&camera.id) != Some(&camera.key)) {
-            self.remove(&deleted.id);
+        let deleted = deleted.unwrap_or_else(|| missing(&known, &versions));
+        for (id, key) in deleted {
+            if known.get(&id).is_some_and(|camera| camera.key == key) {
+                self.remove(&id);
+            }
         }
-        let is_current = |(id, key, revision, active): &&(CameraId, CameraKey, Revision, Option<u32>)| {
-            known.get(id).is_some_and(|camera| {
-                let version = camera.model.as_ref().map(|(_, version)| *version);
-                (camera.key, camera.revision, version) == (*key, *revision, *active)
-            })
-        };
-        let changed: Vec<_> = versions.iter().filter(|version| !is_current(version)).collect();
-        for group in changed.chunks(LOADED_BEFORE_SHOWN) {
-            let mut loaded = Vec::with_capacity(group.len());
-            for (id, ..) in group {
-                loaded.push((id, self.read(store, id).await));
+        let is_complete = self.read(store, &stale(&known, versions)).await?;
+        if is_complete {
+            *change = Refreshed { upto, of_changes: if since.is_some() { of_changes + 1 } else { 0 } };
+        }
+        Ok(())
+    }
+
+    /// Loads cameras as they are stored; whether all could be read.
+    async fn read(&self, store: &Store, ids: &[CameraId]) -> Result<bool> {
+        let mut is_complete = true;
+        for shown in ids.chunks(SHOWN_AT_ONCE) {
+            let mut loaded = Vec::with_capacity(shown.len());
+            for group in shown.chunks(READ_AT_ONCE) {
+                for (id, content) in group.iter().zip(store.camera_contents(group).await?) {
+                    match content.and_then(|content| self.load(content)) {
+                        Ok(camera) => loaded.push((id, Some(camera))),
+                        Err(error) => {
+                            if error.kind() == ErrorKind::CameraNotFound {
+                                self.end(id);
+                            } else {
+                                tracing::error!(camera.id = %id, %error, "cannot read the camera");
+                                is_complete = false;
+                            }
+                            loaded.push((id, None));
+                        }
+                    }
+                }
             }
             self.replace(|cameras| {
                 for (id, camera) in &loaded {
@@ -172,25 +207,7 @@ impl Registry {
                 }
             });
         }
-        Ok(())
-    }
-
-    /// A camera as it is stored; `None` if it has been deleted, which ends what listens to it, or cannot be read.
-    async fn read(&self, store: &Store, id: &CameraId) -> Option<Arc<ActiveCamera>> {
-        let loaded = match store.camera(id).await {
-            Ok(camera) => self.load(store, camera).await,
-            Err(error) => Err(error),
-        };
-        match loaded {
-            Ok(camera) => return Some(camera),
-            Err(error) if error.kind() == ErrorKind::CameraNotFound => {
-                if let Some(deleted) = self.get(id) {
-                    deleted.live.end();
-                }
-            }
-            Err(error) => tracing::error!(camera.id = %id, %error, "cannot read the camera"),
-        }
-        None
+        Ok(is_complete)
     }
 
     /// The cameras whose active model cannot be used, by id.
@@ -229,10 +246,15 @@ impl Registry {
     }
 
     fn remove(&self, id: &CameraId) {
+        self.end(id);
+        self.replace(|cameras| cameras.remove(id));
+    }
+
+    /// Ends what listens to a camera.
+    fn end(&self, id: &CameraId) {
         if let Some(camera) = self.get(id) {
             camera.live.end();
         }
-        self.replace(|cameras| cameras.remove(id));
     }
 
     fn replace<T>(&self, change: impl Fn(&mut HashMap<CameraId, Arc<ActiveCamera>>) -> T) {
@@ -243,25 +265,22 @@ impl Registry {
         });
     }
 
-    async fn load(&self, store: &Store, camera: Camera) -> Result<Arc<ActiveCamera>> {
-        let id = camera.id();
+    fn load(&self, content: CameraContent) -> Result<Arc<ActiveCamera>> {
+        let CameraContent { camera, moved, model: stored } = content;
+        let (id, moved) = (camera.id(), moved.map(Arc::new));
         let known = self.get(id);
         let same = known.as_ref().filter(|known| known.key == camera.key);
         if let (Some(replaced), None) = (&known, same) {
             replaced.live.end();
         }
-        let moved = match camera.active_model {
-            Some(number) => store.camera_move(id, number).await?.map(Arc::new),
-            None => None,
-        };
         let loaded = same
             .filter(|known| known.moved == moved)
             .and_then(|known| Some((known.model.clone()?, known.model_summary.clone()?)));
         let mut model_fault = None;
-        let model = match (camera.active_model, loaded) {
+        let model = match (camera.active_model.zip(stored), loaded) {
             (None, _) => None,
-            (Some(number), Some(loaded)) if loaded.0.1 == number => Some(loaded),
-            (Some(number), _) => match load_model(store, id, number).await {
+            (Some((number, _)), Some(loaded)) if loaded.0.1 == number => Some(loaded),
+            (Some((number, stored)), _) => match stored.and_then(|stored| load_model(id, number, stored)) {
                 Ok((regressor, summary)) => {
                     // The error that the model states must contain the shift that was found.
                     let regressor = match &moved {
@@ -322,16 +341,38 @@ impl Registry {
     }
 }
 
+/// The known cameras that are not among all those stored.
+fn missing(
+    known: &HashMap<CameraId, Arc<ActiveCamera>>,
+    stored: &[CameraVersion],
+) -> Vec<(CameraId, CameraKey)> {
+    let keys: HashMap<_, _> = stored.iter().map(|version| (&version.id, version.key)).collect();
+    let missing = known.values().filter(|camera| keys.get(&camera.id) != Some(&camera.key));
+    missing.map(|camera| (camera.id.clone(), camera.key)).collect()
+}
+
+/// The cameras to read: those that are known in another version or not at all, and those whose model could not be used.
+fn stale(known: &HashMap<CameraId, Arc<ActiveCamera>>, versions: Vec<CameraVersion>) -> Vec<CameraId> {
+    let is_current = |version: &CameraVersion| {
+        known.get(&version.id).is_some_and(|camera| {
+            let active = camera.model.as_ref().map(|(_, number)| *number);
+            (camera.key, camera.revision, active) == (version.key, version.revision, version.active_model)
+        })
+    };
+    let faulty = known.values().filter(|camera| camera.model_fault.is_some()).map(|camera| camera.id.clone());
+    let changed = versions.into_iter().filter(|version| !is_current(version)).map(|version| version.id);
+    changed.chain(faulty).collect::<BTreeSet<_>>().into_iter().collect()
+}
+
 /// A stored model version, ready to answer.
 ///
 /// # Errors
-/// `ModelNotFound`; `ModelUnusable` if what is stored is damaged or does not pass the checks of a model.
-pub(super) async fn load_model(
-    store: &Store,
+/// `ModelUnusable` if what is stored is damaged or does not pass the checks of a model.
+pub(super) fn load_model(
     id: &CameraId,
     number: u32,
+    (metadata, weights): (ModelMetadata, Vec<u8>),
 ) -> Result<(Regressor, ModelSummary)> {
-    let (metadata, weights) = store.model_content(id, number).await?;
     let artifact = Artifact { metadata, weights: weights.into() };
     let loaded = artifact.load().and_then(|regressor| {
         let view_area = artifact.view_area(&regressor)?;

@@ -99,11 +99,10 @@ impl Fuse {
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix fuse", MissingData::Refuse).await?;
-            let camera = app.camera(id).await?;
-            let serving = app.registry.get(id).context("the camera was deleted")?;
+            let serving = app.active_camera(id).await?;
             app.store.close().await;
             let (regressor, number) = serving.model.clone().with_context(|| {
-                format!("camera {} has no active model: train it first (sightfix train)", camera.id())
+                format!("camera {id} has no active model: train it first (sightfix train)")
             })?;
             Ok(FusionModel {
                 regressor,

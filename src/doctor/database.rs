@@ -108,6 +108,7 @@ async fn faults(config: &Config, clock: &Clock) -> Result<Vec<String>> {
     let store = Store::open_at(&store_location(config)?, options).await?;
     let app =
         App::new(store, clock.clone(), Randomness::system(), config.limits.clone(), Metrics::new()).await?;
+    app.registry.refresh(&app.store).await?;
     let faults = app.registry.model_faults();
     app.close().await;
     Ok(faults.into_iter().map(|(camera, fault)| format!("camera {camera}: {}", fault.reason)).collect())

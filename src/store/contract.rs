@@ -7,18 +7,19 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use super::{
-    Claim, Heartbeat, IdempotencyRecord, JobCounts, JobEnd, KeysVersion, RunEnd, SampleFilter, SampleKey,
-    SiteRunEnd, StorageStatus, Store, StoredAnswer, StoredHeldOutError, on_backend,
+    CameraContent, CameraVersions, ChangeMark, Claim, Heartbeat, IdempotencyRecord, JobCounts, JobEnd,
+    KeysVersion, RunEnd, SampleFilter, SampleKey, SiteRunEnd, StorageStatus, Store, StoredAnswer,
+    StoredHeldOutError, on_backend,
 };
 #[cfg(doc)]
 use crate::domain::ErrorKind;
 use crate::domain::{
-    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId,
-    ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob,
-    EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata,
-    ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision,
-    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
-    SourceOffset, StoredSample, TrainingOptions, TrainingRun,
+    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraMoved, Connection, ConnectionId, ConnectionKey,
+    DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
+    EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
+    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision, RunId,
+    RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun, SourceOffset,
+    StoredSample, TrainingOptions, TrainingRun,
 };
 use crate::geo::Position;
 
@@ -55,11 +56,18 @@ contract! {
     /// Faults only.
     fn cameras(&self, site: Option<&SiteId>, after: Option<&CameraId>, limit: u32) -> Result<Vec<Camera>>;
 
-    /// Id, key, revision and active model of every camera: enough to see what has changed.
+    /// The cameras that have changed since a mark, or all without one: enough to see which ones to read. Misses nothing
+    /// that is committed, for deletions that are a day old at most.
     ///
     /// # Errors
     /// Faults only.
-    fn camera_versions(&self) -> Result<Vec<(CameraId, CameraKey, Revision, Option<u32>)>>;
+    fn camera_versions(&self, since: Option<ChangeMark>) -> Result<CameraVersions>;
+
+    /// What is needed to answer for each of some cameras, in their order.
+    ///
+    /// # Errors
+    /// Faults only; for one camera [`ErrorKind::CameraNotFound`], or a fault of its rows.
+    fn camera_contents(&self, ids: &[CameraId]) -> Result<Vec<Result<CameraContent>>>;
 
     /// Puts a profile in the place of the stored one and counts its revision up, if the stored
     /// revision is the expected one.

@@ -39,6 +39,7 @@ pub use jobs::{Claim, Heartbeat, JobCounts, JobEnd, LiveJobs};
 pub use limits::{StorageStatus, StoreLimits};
 pub use location::{DatabaseUrl, Location};
 pub use postgres::{Acquired, ConnectionReports, NodeLeases};
+pub use rows::cameras::{CameraContent, CameraVersion, CameraVersions, ChangeMark};
 pub use rows::idempotency::{IdempotencyRecord, StoredAnswer};
 pub use rows::keys::KeysVersion;
 pub use rows::models::{NewModel, StoredHeldOutError};

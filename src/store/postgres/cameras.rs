@@ -8,11 +8,10 @@ use super::Store;
 use super::errors::failed;
 use super::locks::{Limit, lock_limit};
 use crate::domain::{
-    AuditAction, Camera, CameraId, CameraKey, Error, ExpectedVersion, GnssBiasSigma, GnssError, NewCamera,
-    Result, Revision, SiteId, TargetClass,
+    AuditAction, Camera, CameraId, Error, ExpectedVersion, GnssBiasSigma, GnssError, NewCamera, Result,
+    SiteId, TargetClass,
 };
 use crate::store::refusals::no_camera;
-use crate::store::row_decoder::RowDecoder;
 use crate::store::rows::audit::Change;
 use crate::store::rows::cameras::{
     camera_columns as columns, camera_exists, check_limit, check_site, check_version, has_live_run,
@@ -84,24 +83,6 @@ impl Store {
             .await
             .map_err(failed)?;
         rows.iter().map(read_camera).collect()
-    }
-
-    pub(in crate::store) async fn camera_versions(
-        &self,
-    ) -> Result<Vec<(CameraId, CameraKey, Revision, Option<u32>)>> {
-        let mut reader = self.reader().await?;
-        let rows = sqlx::query("SELECT id, key, revision, active_model FROM cameras")
-            .fetch_all(&mut *reader)
-            .await
-            .map_err(failed)?;
-        let read = |row| {
-            let mut fields = RowDecoder::new("cameras", row);
-            let id = fields.parse(CameraId::new)?;
-            let key = CameraKey(fields.get()?);
-            let revision = fields.revision()?;
-            Ok((id, key, revision, fields.optional_count()?))
-        };
-        rows.iter().map(read).collect()
     }
 
     pub(in crate::store) async fn replace_camera(

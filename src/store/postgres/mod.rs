@@ -5,6 +5,8 @@
 //! table (`locks`). Locks are taken in this order: cameras by their keys, an idempotency key, jobs, limits. Jobs are claimed with `SKIP LOCKED`.
 
 mod audit;
+mod camera_changes;
+mod camera_contents;
 mod camera_moves;
 mod cameras;
 mod connection;

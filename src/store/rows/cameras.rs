@@ -5,12 +5,61 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::domain::{
-    Camera, CameraId, CameraKey, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssBiasSigma, GnssError,
-    ImageSize, NewCamera, Receiver, ReceiverId, Receivers, Result, SampleCount, SigmaM, SiteId, TargetClass,
-    TargetId,
+    Camera, CameraId, CameraKey, CameraMoved, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssBiasSigma,
+    GnssError, ImageSize, ModelMetadata, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision,
+    SampleCount, SigmaM, SiteId, TargetClass, TargetId,
 };
 use crate::store::refusals::unknown_site;
 use crate::store::row_decoder::{RowDecoder, StoredRow};
+
+/// Which camera there is, and in which state.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CameraVersion {
+    /// Its id.
+    pub id: CameraId,
+    /// Which one of those that had this id.
+    pub key: CameraKey,
+    /// Revision of its profile.
+    pub revision: Revision,
+    /// Its active model version.
+    pub active_model: Option<u32>,
+}
+
+/// Until where changes of cameras have been read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ChangeMark(pub(in crate::store) u64);
+
+/// Which cameras there are, or what has changed among them.
+#[derive(Debug)]
+pub struct CameraVersions {
+    /// Those that have changed, and maybe some that have not; or all.
+    pub versions: Vec<CameraVersion>,
+    /// Those that were deleted; `None` where `versions` has all that there are.
+    pub deleted: Option<Vec<(CameraId, CameraKey)>>,
+    /// What to ask with next; `None` on a store that reads all in any case.
+    pub upto: Option<ChangeMark>,
+}
+
+/// All that is needed to answer for a camera, of one moment.
+pub struct CameraContent {
+    /// Its profile.
+    pub camera: Camera,
+    /// The pose change that was detected with its active model.
+    pub moved: Option<CameraMoved>,
+    /// Metadata and weights of its active model, or why they cannot be used.
+    pub model: Option<Result<(ModelMetadata, Vec<u8>)>>,
+}
+
+/// Columns: id, key, revision, active model.
+pub(in crate::store) fn read_version<'r>(row: impl Into<StoredRow<'r>>) -> Result<CameraVersion> {
+    let mut fields = RowDecoder::new("cameras", row);
+    Ok(CameraVersion {
+        id: fields.parse(CameraId::new)?,
+        key: CameraKey(fields.get()?),
+        revision: fields.revision()?,
+        active_model: fields.optional_count()?,
+    })
+}
 
 /// Columns to select, in the order of [`read_camera`].
 macro_rules! camera_columns {

@@ -7,15 +7,14 @@ use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 use super::Store;
 use super::errors::failed;
 use crate::domain::{
-    AuditAction, Camera, CameraId, CameraKey, Error, ExpectedVersion, GnssBiasSigma, GnssError, ImageSize,
-    NewCamera, Result, Revision, SiteId, TargetClass,
+    AuditAction, Camera, CameraId, Error, ExpectedVersion, GnssBiasSigma, GnssError, ImageSize, NewCamera,
+    Result, SiteId, TargetClass,
 };
 use crate::store::refusals::no_camera;
-use crate::store::row_decoder::RowDecoder;
 use crate::store::rows::audit::Change;
 use crate::store::rows::cameras::{
-    camera_columns as columns, camera_exists, check_limit, check_site, check_version, has_live_run,
-    read_camera, write_receivers,
+    CameraContent, CameraVersions, ChangeMark, camera_columns as columns, camera_exists, check_limit,
+    check_site, check_version, has_live_run, read_camera, read_version, write_receivers,
 };
 
 type Query = sqlx::query::Query<'static, Sqlite, SqliteArguments>;
@@ -81,21 +80,37 @@ impl Store {
         rows.iter().map(read_camera).collect()
     }
 
+    /// One process changes most of what is in a folder: all cameras are read each time.
     pub(in crate::store) async fn camera_versions(
         &self,
-    ) -> Result<Vec<(CameraId, CameraKey, Revision, Option<u32>)>> {
+        _since: Option<ChangeMark>,
+    ) -> Result<CameraVersions> {
         let rows = sqlx::query("SELECT id, key, revision, active_model FROM cameras")
             .fetch_all(self.readers())
             .await
             .map_err(failed)?;
-        let read = |row| {
-            let mut fields = RowDecoder::new("cameras", row);
-            let id = fields.parse(CameraId::new)?;
-            let key = CameraKey(fields.get()?);
-            let revision = fields.revision()?;
-            Ok((id, key, revision, fields.optional_count()?))
+        let versions = rows.iter().map(read_version).collect::<Result<_>>()?;
+        Ok(CameraVersions { versions, deleted: None, upto: None })
+    }
+
+    pub(in crate::store) async fn camera_contents(
+        &self,
+        ids: &[CameraId],
+    ) -> Result<Vec<Result<CameraContent>>> {
+        let mut contents = Vec::with_capacity(ids.len());
+        for id in ids {
+            contents.push(self.camera_content(id).await);
+        }
+        Ok(contents)
+    }
+
+    async fn camera_content(&self, id: &CameraId) -> Result<CameraContent> {
+        let camera = self.camera(id).await?;
+        let Some(active) = camera.active_model else {
+            return Ok(CameraContent { camera, moved: None, model: None });
         };
-        rows.iter().map(read).collect()
+        let moved = self.camera_move(id, active).await?;
+        Ok(CameraContent { camera, moved, model: Some(self.model_content(id, active).await) })
     }
 
     pub(in crate::store) async fn replace_camera(

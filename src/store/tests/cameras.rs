@@ -1,9 +1,11 @@
+use std::collections::BTreeMap;
+
 use super::*;
 use crate::domain::{
     Camera, ClockOffset, GnssBiasSigma, GnssError, ImageSize, Receiver, ReceiverId, Receivers, Revision,
     SampleCount, SigmaM, TargetClass,
 };
-use crate::store::SampleFilter;
+use crate::store::{CameraVersion, ChangeMark, SampleFilter};
 
 /// A profile in which every field says something.
 fn full(name: &str) -> NewCamera {
@@ -161,4 +163,75 @@ async fn a_corrupt_row_is_a_fault_that_names_its_place() {
     for part in ["cameras", "recipe", "id=square", "must be one of"] {
         assert!(text.contains(part), "{part} is missing in: {text}");
     }
+}
+
+/// Cameras as a process knows them that reads what has changed, by id.
+#[derive(Default)]
+struct Follower {
+    known: BTreeMap<CameraId, CameraVersion>,
+    upto: Option<ChangeMark>,
+}
+
+impl Follower {
+    /// Reads the changes, and returns how many cameras were listed.
+    async fn follow(&mut self, store: &Store) -> usize {
+        let changes = store.camera_versions(self.upto).await.expect("read");
+        match changes.deleted {
+            Some(deleted) => self.known.retain(|id, version| !deleted.contains(&(id.clone(), version.key))),
+            None => self.known.clear(),
+        }
+        let listed = changes.versions.len();
+        self.known.extend(changes.versions.into_iter().map(|version| (version.id.clone(), version)));
+        self.upto = changes.upto;
+        let all = store.camera_versions(None).await.expect("read").versions;
+        assert_eq!(self.known, all.into_iter().map(|version| (version.id.clone(), version)).collect());
+        listed
+    }
+}
+
+#[tokio::test]
+async fn who_reads_the_changes_of_cameras_knows_all_of_them() {
+    let Fixture { store, camera, folder } = Fixture::new().await;
+    let mut follower = Follower::default();
+    assert_eq!(follower.follow(&store).await, 1);
+    for name in ["a", "b", "c"] {
+        store.insert_camera(&full(name), at(1)).await.expect("new");
+    }
+    follower.follow(&store).await;
+    assert_eq!(follower.known.len(), 4);
+    store.replace_camera(&NewCamera::named(id("a")), None, at(2)).await.expect("changed");
+    store.insert_model(&camera, &metadata(), b"w", at(2)).await.expect("stored");
+    store.activate_model(&camera, 1, at(2)).await.expect("active");
+    store.delete_camera(&id("b"), None, at(2)).await.expect("deleted");
+    store.delete_camera(&id("c"), None, at(2)).await.expect("deleted");
+    store.insert_camera(&full("c"), at(3)).await.expect("new under the same id");
+    follower.follow(&store).await;
+    assert_eq!(follower.known.keys().map(CameraId::as_str).collect::<Vec<_>>(), ["a", "c", "square"]);
+    assert_eq!(follower.known[&camera].active_model, Some(1));
+    assert_eq!(follower.known[&id("a")].revision, Revision(2));
+    // Only a database says what has changed.
+    let unchanged = follower.follow(&store).await;
+    let is_database = matches!(folder, Home::Database(_));
+    assert!(if is_database { unchanged <= 3 } else { unchanged == 3 }, "{unchanged}");
+}
+
+#[tokio::test]
+async fn contents_of_cameras_come_in_the_order_asked_for() {
+    let Fixture { store, camera, folder: _folder } = Fixture::new().await;
+    store.insert_camera(&full("a"), at(1)).await.expect("new");
+    for weights in [b"one", b"two"] {
+        store.insert_model(&camera, &metadata(), weights, at(1)).await.expect("stored");
+    }
+    store.activate_model(&camera, 2, at(2)).await.expect("active");
+    let asked = [camera.clone(), id("none"), id("a")];
+    let mut contents = store.camera_contents(&asked).await.expect("read").into_iter();
+    let mut next = || contents.next().expect("one each");
+    let square = next().expect("known");
+    assert_eq!(square.camera, store.camera(&camera).await.expect("known"));
+    assert_eq!(square.moved, None);
+    assert_eq!(square.model.expect("active").expect("sound"), (metadata(), b"two".to_vec()));
+    assert_eq!(next().err().expect("unknown").kind(), ErrorKind::CameraNotFound);
+    let a = next().expect("known");
+    assert_eq!(a.camera.profile, full("a"));
+    assert!(a.model.is_none());
 }

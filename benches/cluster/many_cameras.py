@@ -2,7 +2,7 @@
 
 Usage: python3 benches/cluster/many_cameras.py URL [CAMERAS]
 
-URL is an empty PostgreSQL database on this machine; psql and a release build are needed (SIGHTFIX, by default
+URL is an empty PostgreSQL database on this machine, or one that an earlier run has filled; psql and a release build are needed (SIGHTFIX, by default
 target/release/sightfix). One simulated camera is trained; the others have a copy of its model. Three nodes answer, two
 processes train. Prints a Markdown table.
 """
@@ -16,11 +16,13 @@ import sys
 import tempfile
 import time
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 SERVING, TRAINING = 3, 2
 IDLE_S = 20
 ACTIVATIONS = 20
+LONGEST_S = 30
 TICKS = os.sysconf("SC_CLK_TCK")
 BINARY = os.environ.get("SIGHTFIX", "target/release/sightfix")
 
@@ -53,7 +55,7 @@ def sightfix(*arguments: str, **environment: str) -> None:
 def fill(url: str, cameras: int) -> None:
     """One trained camera, and copies of it."""
     with tempfile.TemporaryDirectory() as folder:
-        sightfix("simulate", "square", "--out", folder, "--seed", "7")
+        sightfix("simulate", "square", "--out", f"{folder}/train.csv", "--seed", "7")
         sightfix("import", f"{folder}/train.csv", "--camera", "trained", "--create", SIGHTFIX_DATABASE=url)
         for seed in ["1", "2"]:
             sightfix("train", "--camera", "trained", "--seed", seed, SIGHTFIX_DATABASE=url)
@@ -101,6 +103,10 @@ class Node:
             except OSError:
                 time.sleep(0.02)
 
+    def version(self, observation: dict) -> int:
+        """The version by which it answers."""
+        return self.ask("/v1/cameras/trained/fusions", observation)["items"][0]["model_version"]
+
     def resident_mib(self) -> float:
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1]) / 1024
@@ -133,12 +139,8 @@ def activations(nodes: list[Node]) -> list[float]:
         began = time.monotonic()
         waiting = list(nodes)
         while waiting:
-            waiting = [
-                node
-                for node in waiting
-                if node.ask("/v1/cameras/trained/fusions", observation).get("model_version")
-                != version
-            ]
+            assert time.monotonic() < began + LONGEST_S, "a node goes on with the version before"
+            waiting = [node for node in waiting if node.version(observation) != version]
             time.sleep(0.01)
         seconds.append(time.monotonic() - began)
     return seconds
@@ -146,7 +148,8 @@ def activations(nodes: list[Node]) -> list[float]:
 
 def main() -> None:
     url, cameras = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 100_000
-    fill(url, cameras)
+    if sql(url, "SELECT to_regclass('cameras') IS NULL") == "t":
+        fill(url, cameras)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         nodes, workers = [Node(url, "serve", folder, cameras)], []
@@ -157,10 +160,11 @@ def main() -> None:
         try:
             nodes += [Node(url, "serve", folder, cameras) for _ in range(SERVING - 1)]
             workers = [Node(url, "train", folder, cameras) for _ in range(TRAINING)]
-            nodes_s = [node.wait() for node in nodes[1:]]
-            workers_s = [node.wait() for node in workers]
+            with ThreadPoolExecutor() as waiting:
+                started = list(waiting.map(Node.wait, [*nodes[1:], *workers]))
+            nodes_s, workers_s = started[: SERVING - 1], started[SERVING - 1 :]
             print(f"| start of {SERVING - 1} more at once, slowest | {max(nodes_s):.1f} s |")
-            print(f"| start of {TRAINING} training processes at once, slowest | {max(workers_s):.1f} s |")
+            print(f"| start of {TRAINING} training processes beside them, slowest | {max(workers_s):.1f} s |")
             print(f"| memory of a serving node | {nodes[0].resident_mib():.0f} MiB |")
             print(f"| memory of a training process | {workers[0].resident_mib():.0f} MiB |")
             time.sleep(5)

@@ -53,6 +53,16 @@ impl CameraError {
         };
         MeasuredPosition { covariance: bias.plus(white), white: Some(white), ..measured }
     }
+
+    /// Correlation of the bias, in standard deviations, of the latest box with that of a box at the target's place: the smaller of
+    /// the two errors is part of the larger one, and the rest of that is another error.
+    pub(super) fn correlation(&self, settings: &TrackSettings, at_place: &MeasuredPosition) -> f64 {
+        let trace_m2 = |it: PlaneCovariance| it.east_m2 + it.north_m2;
+        let Some(known_m2) = self.bias.map(trace_m2) else { return 1.0 };
+        let bias_m2 = trace_m2(at_place.covariance.minus(white(settings, at_place)));
+        let (smaller_m2, larger_m2) = (known_m2.min(bias_m2), known_m2.max(bias_m2));
+        if smaller_m2 > 0.0 { (smaller_m2 / larger_m2).sqrt() } else { 0.0 }
+    }
 }
 
 fn white(settings: &TrackSettings, measured: &MeasuredPosition) -> PlaneCovariance {

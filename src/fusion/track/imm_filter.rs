@@ -10,7 +10,7 @@ use super::camera_error::CameraError;
 use super::gate::{ACTIVE_S, GateOutcome, Reach, Reacquisition, SourceHistory};
 use super::measurement::{MeasuredPosition, Measurement, MeasurementSource, RejectionReason};
 use super::mode_filter::{
-    GNSS_BIAS, ModeFilter, NoiseDecomposition, POSITION, PredictedMeasurement, VELOCITY,
+    CAMERA_BIAS, GNSS_BIAS, ModeFilter, NoiseDecomposition, POSITION, PredictedMeasurement, VELOCITY,
 };
 use super::settings::{MotionModel, TrackSettings};
 use super::state::{TrackState, Velocity};
@@ -145,6 +145,12 @@ impl ImmFilter {
     ) -> [Option<GateOutcome>; 2] {
         self.predict(settings, measurement.time);
         let regressed = measurement.regressed.map(|it| self.camera.at_place(settings, it));
+        if let Some(regressed) = &regressed {
+            let correlation = self.camera.correlation(settings, regressed);
+            for mode in &mut self.modes {
+                mode.decorrelate(CAMERA_BIAS, correlation);
+            }
+        }
         let is_elsewhere = regressed
             .zip(measurement.fix)
             .is_some_and(|(regressed, fix)| self.is_elsewhere(settings, regressed, fix));
@@ -386,7 +392,7 @@ impl ImmFilter {
                 *value += probability * component;
             }
         }
-        let mut covariance = PlaneCovariance::default();
+        let (mut covariance, mut lasting) = (PlaneCovariance::default(), PlaneCovariance::default());
         for (mode, probability) in self.modes.iter().zip(self.mode_probabilities) {
             let deviation =
                 PlaneCovariance::outer(mode.mean[POSITION] - mean[0], mode.mean[POSITION + 1] - mean[1]);
@@ -396,7 +402,13 @@ impl ImmFilter {
                 east_north_m2: mode.covariance[(POSITION, POSITION + 1)],
             };
             let stated = position.plus(mode.camera_share().scaled(self.camera.stated_scale - 1.0));
+            lasting = lasting.plus(mode.lasting_error().scaled(probability));
             covariance = covariance.plus(stated.plus(deviation).scaled(probability));
+        }
+        let [stated_m2, lasting_m2] = [covariance, lasting].map(|it| it.east_m2 + it.north_m2);
+        // No average over boxes is stated to be better than a box, for a model's errors at two places may be one.
+        if lasting_m2 > stated_m2 {
+            covariance = covariance.plus(lasting.scaled(1.0 - stated_m2 / lasting_m2));
         }
         TrackState {
             time: self.time,

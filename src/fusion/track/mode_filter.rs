@@ -42,6 +42,9 @@ pub(super) type StateCovariance = SMatrix<f64, STATES, STATES>;
 pub(super) struct ModeFilter {
     pub(super) mean: State,
     pub(super) covariance: StateCovariance,
+    /// `M`, the derivative of the mean by the camera's lasting error d, in its standard deviations: an error of all boxes
+    /// that is not estimated (a consider parameter; Bierman 1977, VIII). `z = p + L_d d`, so `M <- M + K (L_d - H M)`.
+    response: SMatrix<f64, STATES, 2>,
 }
 
 /// A measured position with its error split into a bias and a white part.
@@ -51,6 +54,8 @@ pub(super) struct NoiseDecomposition {
     pub(super) biases: [ObservedBias; 2],
     /// Covariance of the white part, m2.
     pub(super) white: PlaneCovariance,
+    /// `L_d`, the symmetric square root of the stated covariance of a box's position, m; 0 for a fix.
+    pub(super) lasting_root_m: [f64; 3],
 }
 
 /// A bias as it enters a measurement.
@@ -72,6 +77,8 @@ pub(super) struct PredictedMeasurement {
     pub(super) stated_covariance: PlaneCovariance,
     /// Cross-covariance `P H'` of the state with the measured position.
     cross_covariance: SMatrix<f64, STATES, 2>,
+    /// `L_d - H M`, the derivative of the innovation (row) by the camera's lasting error (column), m.
+    lasting: [[f64; 2]; 2],
 }
 
 impl NoiseDecomposition {
@@ -91,6 +98,12 @@ impl NoiseDecomposition {
         let white = measured.white.unwrap_or_else(|| within.scaled(white_share));
         Self {
             position: measured.position,
+            lasting_root_m: match source {
+                MeasurementSource::Fix => [0.0; 3],
+                MeasurementSource::Regressed => {
+                    measured.covariance.scaled(measured.stated_scale).square_root_m()
+                }
+            },
             biases: [
                 ObservedBias { state: bias, root_m: within.minus(white).square_root_m() },
                 ObservedBias { state: SESSION_BIAS, root_m: session.square_root_m() },
@@ -130,14 +143,23 @@ impl ModeFilter {
                 covariance[(POSITION + row, POSITION + column)] = *value;
             }
         }
-        Self { mean, covariance }
+        let mut response = SMatrix::zeros();
+        let [east, north, east_north] = decomposition.lasting_root_m;
+        for (row, values) in [[east, east_north], [east_north, north]].into_iter().enumerate() {
+            for (column, value) in values.into_iter().enumerate() {
+                response[(POSITION + row, column)] = value;
+            }
+        }
+        Self { mean, covariance, response }
     }
 
     /// Mean and covariance of a mixture with the given weights, which sum to 1 (moment matching).
     pub(super) fn moment_match<const N: usize>(components: &[Self; N], weights: [f64; N]) -> Self {
         let mut mean = State::zeros();
+        let mut response = SMatrix::zeros();
         for (component, weight) in components.iter().zip(weights) {
             mean += component.mean * weight;
+            response += component.response * weight;
         }
         let mut covariance = StateCovariance::zeros();
         for (component, weight) in components.iter().zip(weights) {
@@ -146,12 +168,14 @@ impl ModeFilter {
                 covariance += (component.covariance + deviation * deviation.transpose()) * weight;
             }
         }
-        Self { mean, covariance }
+        Self { mean, covariance, response }
     }
 
     /// Multiplies one state component by a factor, its covariances with it.
     fn scale(&mut self, state: usize, factor: f64) {
         self.mean[state] *= factor;
+        self.response[(state, 0)] *= factor;
+        self.response[(state, 1)] *= factor;
         for other in 0..STATES {
             self.covariance[(state, other)] *= factor;
             self.covariance[(other, state)] *= factor;
@@ -173,11 +197,15 @@ impl ModeFilter {
             ),
         ];
         for (bias, rate) in rates {
-            let decay = (-rate).exp();
-            for state in [bias, bias + 1] {
-                self.scale(state, decay);
-                self.covariance[(state, state)] += 1.0 - decay * decay;
-            }
+            self.decorrelate(bias, (-rate).exp());
+        }
+    }
+
+    /// Propagates a bias of unit variance to one that is correlated with it.
+    pub(super) fn decorrelate(&mut self, bias: usize, correlation: f64) {
+        for state in [bias, bias + 1] {
+            self.scale(state, correlation);
+            self.covariance[(state, state)] += 1.0 - correlation * correlation;
         }
     }
 
@@ -208,6 +236,9 @@ impl ModeFilter {
         for axis in 0..2 {
             let (position, velocity) = (POSITION + axis, VELOCITY + axis);
             self.mean[position] += integrated_decay_s * self.mean[velocity];
+            for column in 0..2 {
+                self.response[(position, column)] += integrated_decay_s * self.response[(velocity, column)];
+            }
             for other in 0..STATES {
                 self.covariance[(position, other)] += integrated_decay_s * self.covariance[(velocity, other)];
             }
@@ -238,6 +269,14 @@ impl ModeFilter {
         of(CAMERA_BIAS).plus(of(CAMERA_BIAS + 1))
     }
 
+    /// Covariance of the position, m2, if all boxes shared one error: `M_p M_p'`.
+    pub(super) fn lasting_error(&self) -> PlaneCovariance {
+        let of = |column| {
+            PlaneCovariance::outer(self.response[(POSITION, column)], self.response[(POSITION + 1, column)])
+        };
+        of(0).plus(of(1))
+    }
+
     /// Sets a bias to 0 with a wide variance, uncorrelated with everything else.
     pub(super) fn reset_bias(&mut self, bias: usize) {
         for state in [bias, bias + 1] {
@@ -262,6 +301,13 @@ impl ModeFilter {
             sum
         };
         let [east_m, north_m] = measured(&|state| self.mean[state]);
+        let [root_east, root_north, root_east_north] = decomposition.lasting_root_m;
+        let of_east = measured(&|state| self.response[(state, 0)]);
+        let of_north = measured(&|state| self.response[(state, 1)]);
+        let lasting = [
+            [root_east - of_east[0], root_east_north - of_north[0]],
+            [root_east_north - of_east[1], root_north - of_north[1]],
+        ];
         let innovation = [decomposition.position.east_m - east_m, decomposition.position.north_m - north_m];
         let mut cross = SMatrix::<f64, STATES, 2>::zeros();
         for state in 0..STATES {
@@ -281,14 +327,16 @@ impl ModeFilter {
             stated_covariance: innovation_covariance
                 .plus(camera[0].plus(camera[1]).scaled(camera_scale - 1.0)),
             cross_covariance: cross,
+            lasting,
         }
     }
 
     /// The Kalman update `K = P H' S^-1`. Returns the log-likelihood of the measurement without its
     /// constant, `-(d' S^-1 d + ln det S) / 2`.
     pub(super) fn update(&mut self, predicted: &PredictedMeasurement) -> f64 {
-        let PredictedMeasurement { innovation, innovation_covariance, cross_covariance: cross, .. } =
-            predicted;
+        let PredictedMeasurement {
+            innovation, innovation_covariance, cross_covariance: cross, lasting, ..
+        } = predicted;
         let determinant = innovation_covariance.determinant();
         let inverse = [
             innovation_covariance.north_m2 / determinant,
@@ -299,6 +347,9 @@ impl ModeFilter {
             let (east, north) = (cross[(state, 0)], cross[(state, 1)]);
             let gain = [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
             self.mean[state] += gain[0] * innovation[0] + gain[1] * innovation[1];
+            for column in 0..2 {
+                self.response[(state, column)] += gain[0] * lasting[0][column] + gain[1] * lasting[1][column];
+            }
             for other in 0..=state {
                 let reduction = gain[0] * cross[(other, 0)] + gain[1] * cross[(other, 1)];
                 let value = self.covariance[(state, other)] - reduction;

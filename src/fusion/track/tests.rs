@@ -5,7 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::domain::{GaussMarkovNoise, GnssError, NoiseCorrelation, Recipe};
-use crate::geo::EastNorth;
+use crate::geo::{EastNorth, PlaneCovariance};
 use crate::model::{FitOptions, TimedResidual, estimate_gnss_noise, fit};
 use crate::simulation::{
     Options, SimulatedPositions, Walk, at_s, simulate as simulate_world, standard_normal, stream,
@@ -119,6 +119,48 @@ fn the_positions_of_a_stationary_target_are_averaged() {
     assert!(summary.error_m < 1.3, "{summary:?}");
     assert!(summary.error_m < 0.9 * summary.two_step_error_m, "{summary:?}");
     assert!((0.90..0.99).contains(&summary.inside), "{summary:?}");
+}
+
+/// A box alone, north of the track's origin by a constant error.
+fn box_at(seconds: f64, east_m: f64, variance_m2: f64) -> Measurement {
+    let position = EastNorth { east_m, north_m: 3.0 };
+    let white = PlaneCovariance::isotropic(0.1 * variance_m2);
+    let regressed =
+        MeasuredPosition { white: Some(white), ..MeasuredPosition::isotropic(position, variance_m2) };
+    Measurement { time: at_s(seconds), fix: None, regressed: Some(regressed) }
+}
+
+#[test]
+fn boxes_of_another_error_say_nothing_of_the_error_in_between() {
+    // At the image's border the stated error is five times that inside, and the error itself is the same.
+    let variance_m2 = |second: u32| if second % 10 < 3 { 100.0 } else { 4.0 };
+    let boxes = |second: u32| box_at(second.into(), 9.0 * f64::from(second), variance_m2(second));
+    let mut track = Track::start(TrackSettings::default(), &boxes(0)).expect("a box");
+    for second in 1..60 {
+        let state = track.update(&boxes(second));
+        assert!(state.r95_m > 4.0, "{second}: {state:?}");
+    }
+}
+
+#[test]
+fn many_boxes_are_not_stated_to_be_better_than_one() {
+    let settings = TrackSettings {
+        regression: RegressionNoise { correlation_length_m: 1.0, ..RegressionNoise::default() },
+        ..TrackSettings::default()
+    };
+    let mut track = Track::start(settings, &box_at(0.0, 0.0, 4.0)).expect("a box");
+    for second in 1..120 {
+        let state = track.update(&box_at(second.into(), 9.0 * f64::from(second), 4.0));
+        assert!(state.r95_m > 4.5, "{second}: {state:?}");
+    }
+    // Fixes say more than boxes do, where they are better.
+    for second in 120..240 {
+        let fix =
+            MeasuredPosition::isotropic(EastNorth { east_m: 9.0 * f64::from(second), north_m: 0.0 }, 0.04);
+        let boxes = box_at(second.into(), 9.0 * f64::from(second), 4.0);
+        track.update(&Measurement { fix: Some(fix), ..boxes });
+    }
+    assert!(track.state_at(track.measured_at()).r95_m < 2.0);
 }
 
 #[test]

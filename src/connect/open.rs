@@ -73,7 +73,7 @@ pub(super) async fn sink(
         secrets,
     };
     let media_type = match settings.format {
-        OutgoingFormat::Cot => "application/xml",
+        OutgoingFormat::Cot | OutgoingFormat::Onvif => "application/xml",
         OutgoingFormat::Json | OutgoingFormat::Gpx | OutgoingFormat::Kml => "application/json",
     };
     Ok(match address.scheme {

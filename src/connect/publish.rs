@@ -9,7 +9,9 @@ use tokio_util::task::AbortOnDropHandle;
 
 use crate::app::{App, CameraEvent, LiveConnection, TrackPoint};
 use crate::domain::{CameraId, ConnectionKey, OutboxMessage, Result, TargetId};
-use crate::exchange::{OutgoingFormat, OutgoingPosition, SinkSettings, cot_event, position_json};
+use crate::exchange::{
+    OutgoingFormat, OutgoingPosition, SinkSettings, cot_event, onvif_frame, position_json,
+};
 
 /// Time over which messages are gathered for one transaction.
 const GATHERING: Duration = Duration::from_millis(100);
@@ -143,6 +145,7 @@ pub(super) fn payload(settings: &SinkSettings, position: &OutgoingPosition<'_>) 
     match settings.format {
         // Files are written from the same objects.
         OutgoingFormat::Json | OutgoingFormat::Gpx | OutgoingFormat::Kml => position_json(position),
+        OutgoingFormat::Onvif => onvif_frame(position),
         OutgoingFormat::Cot => {
             let cot_type = settings.cot_type.as_deref().unwrap_or(DEFAULT_COT_TYPE);
             cot_event(position, cot_type, settings.stale_s.unwrap_or(DEFAULT_STALE_S))

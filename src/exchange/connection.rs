@@ -139,6 +139,8 @@ pub enum OutgoingFormat {
     Json,
     /// A Cursor on Target event (XML, version 2.0) per position.
     Cot,
+    /// An ONVIF metadata frame (XML, `tt:MetadataStream`) with the object's geolocation per position.
+    Onvif,
     /// Tracks in files of GPX 1.1, for the address `file:`.
     Gpx,
     /// Tracks in files of KML 2.2, for the address `file:`.
@@ -150,7 +152,7 @@ impl OutgoingFormat {
     #[must_use]
     pub const fn track_file(self) -> Option<TrackFileFormat> {
         match self {
-            Self::Json | Self::Cot => None,
+            Self::Json | Self::Cot | Self::Onvif => None,
             Self::Gpx => Some(TrackFileFormat::Gpx),
             Self::Kml => Some(TrackFileFormat::Kml),
         }

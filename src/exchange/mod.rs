@@ -53,7 +53,7 @@ pub use format::{FixFormat, Format};
 pub use messages::{
     DetectedBox, MessageContext, MessageDecoder, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
 };
-pub use outgoing::{OutgoingPosition, cot_event, position_json};
+pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use rows::{
     ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
 };

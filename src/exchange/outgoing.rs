@@ -1,4 +1,4 @@
-//! Positions as other systems take them: JSON, and Cursor on Target.
+//! Positions as other systems take them: JSON, Cursor on Target, and ONVIF metadata.
 
 use std::fmt::Write as _;
 
@@ -93,6 +93,34 @@ pub fn cot_event(position: &OutgoingPosition<'_>, cot_type: &str, stale_s: f64) 
         east.hypot(north),
     );
     event.into_bytes()
+}
+
+/// A position as a frame of an ONVIF metadata stream (`tt:MetadataStream`, Analytics Service Specification), without a line
+/// break within: the object's `GeoLocation` and speed, without a shape.
+///
+/// The frame's `Source` is the camera. An `ObjectId` must be a whole number: the CRC-32 of the target's id, which is itself
+/// an attribute beside it, as is the 95 % radius; the schema allows attributes of other namespaces.
+#[must_use]
+pub fn onvif_frame(position: &OutgoingPosition<'_>) -> Vec<u8> {
+    let [east, north] = position.velocity_m_s;
+    let mut frame = String::with_capacity(512);
+    let _ = writeln!(
+        frame,
+        "<tt:MetadataStream xmlns:tt=\"http://www.onvif.org/ver10/schema\" xmlns:sf=\"urn:sightfix\"><tt:VideoAnalytics>\
+         <tt:Frame UtcTime=\"{:.3}\" Source=\"{}\"><tt:Object ObjectId=\"{}\" sf:target_id=\"{}\" sf:r95_m=\"{:.2}\">\
+         <tt:Appearance><tt:GeoLocation lon=\"{:.7}\" lat=\"{:.7}\"/></tt:Appearance>\
+         <tt:Behaviour><tt:Speed>{:.2}</tt:Speed></tt:Behaviour>\
+         </tt:Object></tt:Frame></tt:VideoAnalytics></tt:MetadataStream>",
+        position.time,
+        escaped(position.camera_id.as_str()),
+        crc32fast::hash(position.target_id.as_str().as_bytes()),
+        escaped(position.target_id.as_str()),
+        position.r95_m,
+        position.position.longitude_deg(),
+        position.position.latitude_deg(),
+        east.hypot(north),
+    );
+    frame.into_bytes()
 }
 
 /// Text of an XML attribute or element.

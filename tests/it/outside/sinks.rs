@@ -213,6 +213,42 @@ async fn cursor_on_target_events_go_over_tcp_and_over_udp() {
     patch(&server, "tak", &json!({"paused": true})).await.expect(200);
 }
 
+#[tokio::test]
+async fn onvif_frames_have_the_geolocation_of_objects() {
+    let socket = UdpSocket::bind("127.0.0.1:0").await.expect("a port");
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let address = format!("udp://{}", socket.local_addr().expect("an address"));
+    let sink = json!({"address": address, "format": "onvif", "camera_ids": ["gate"], "min_interval_s": 0});
+    server.post("/v1/connections", &json!({"id": "vms", "sink": sink})).await.expect(201);
+    connection_when(&server, "vms", |status| status["state"] == "running").await;
+    send_fixes(&server, "van <1>", 1).await;
+    let mut datagram = vec![0; 4_096];
+    let bytes = socket.recv(&mut datagram).await.expect("a datagram");
+    let frame = std::str::from_utf8(&datagram[..bytes]).expect("UTF-8");
+    assert_eq!(attribute(frame, "xmlns:tt"), "http://www.onvif.org/ver10/schema");
+    assert_eq!(attribute(frame, "Source"), "gate");
+    assert_eq!(attribute(frame, "sf:target_id"), "van &lt;1&gt;");
+    assert!(attribute(frame, "ObjectId").parse::<u32>().is_ok(), "{frame}");
+    assert!(attribute(frame, "UtcTime").parse::<jiff::Timestamp>().is_ok(), "{frame}");
+    assert!(attribute(frame, "sf:r95_m").parse::<f64>().expect("m") > 0.0, "{frame}");
+    let degrees = |name| attribute(frame, name).parse::<f64>().expect("degrees");
+    assert!((degrees("lon") - 103.98678).abs() < 1e-6 && (degrees("lat") - 30.628).abs() < 1e-2, "{frame}");
+    let mut open = Vec::new();
+    let mut reader = quick_xml::Reader::from_str(frame);
+    loop {
+        match reader.read_event().expect("XML") {
+            quick_xml::events::Event::Start(element) => open.push(element.local_name().as_ref().to_owned()),
+            quick_xml::events::Event::Empty(element) if element.local_name().as_ref() == "GeoLocation" => {
+                break;
+            }
+            event => assert!(!matches!(event, quick_xml::events::Event::Eof), "{frame}"),
+        }
+    }
+    assert_eq!(open, ["MetadataStream", "VideoAnalytics", "Frame", "Object", "Appearance"]);
+}
+
 /// A server that wants a client certificate of the authority.
 pub(super) fn tls_acceptor(authority: &Authority) -> TlsAcceptor {
     let provider = Arc::new(rustls::crypto::ring::default_provider());

@@ -16,6 +16,8 @@ use crate::exchange::{Secrets, SinkSettings};
 const BATCH: u32 = 256;
 /// The outbox is looked at this often without a notice: other nodes fill it, and dead letters may have been put back.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// The publisher of the same process begins beside the delivery.
+const PUBLISHER_WAIT: Duration = Duration::from_secs(1);
 
 /// Delivers the outbox of one sink.
 pub(super) struct Delivery<'a> {
@@ -34,6 +36,8 @@ impl Delivery<'_> {
     pub(super) async fn run(&self, progressed: &AtomicBool) -> Result<Infallible, PeerError> {
         let clock = &self.app.clock;
         let mut sink = open::sink(self.app, self.id, self.settings, self.secrets, self.client_id).await?;
+        // A sink that is seen running misses no position of this process's cameras.
+        let _ = tokio::time::timeout(PUBLISHER_WAIT, self.live.publishing.wait()).await;
         self.live.enter(ConnectionState::Running, clock.now());
         self.live.update(|status| status.connects += 1);
         loop {

@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_util::task::AbortOnDropHandle;
 
-use crate::app::{App, CameraEvent, LiveConnection, TrackPoint};
+use crate::app::{App, CameraEvent, CameraEvents, LiveConnection, TrackPoint};
 use crate::domain::{CameraId, ConnectionKey, OutboxMessage, Result, TargetId};
 use crate::exchange::{
     OutgoingFormat, OutgoingPosition, SinkSettings, cot_event, onvif_frame, position_json,
@@ -37,13 +37,14 @@ impl Publisher<'_> {
     pub(super) async fn run(self) -> Result<std::convert::Infallible> {
         let (points, mut incoming) = mpsc::channel(self.app.limits.connection_queue);
         let cameras = self.settings.cameras()?;
-        let _readers: Vec<_> = cameras
-            .into_iter()
-            .map(|camera| {
-                let reader = read_camera(self.app.clone(), camera, points.clone(), self.live.clone());
-                AbortOnDropHandle::new(tokio::spawn(reader))
-            })
-            .collect();
+        let mut readers = Vec::with_capacity(cameras.len());
+        for camera in cameras {
+            let events = self.app.own_camera_events(&camera).await.ok();
+            let reader = read_camera(self.app.clone(), camera, events, points.clone(), self.live.clone());
+            readers.push(AbortOnDropHandle::new(tokio::spawn(reader)));
+        }
+        // Set before, where the settings have changed since.
+        let _ = self.live.publishing.set(());
         let mut last_sent = HashMap::new();
         let mut batch = Vec::new();
         loop {
@@ -157,11 +158,15 @@ pub(super) fn payload(settings: &SinkSettings, position: &OutgoingPosition<'_>) 
 async fn read_camera(
     app: App,
     camera: CameraId,
+    mut opened: Option<CameraEvents>,
     points: mpsc::Sender<(CameraId, Arc<TrackPoint>)>,
     live: Arc<LiveConnection>,
 ) {
     loop {
-        if let Ok(mut events) = app.own_camera_events(&camera).await {
+        if opened.is_none() {
+            opened = app.own_camera_events(&camera).await.ok();
+        }
+        if let Some(mut events) = opened.take() {
             while let Some(event) = events.next().await {
                 match event {
                     Ok((_, event)) => {

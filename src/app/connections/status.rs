@@ -7,7 +7,7 @@ use bytes::Bytes;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
-use tokio::sync::{Notify, mpsc, oneshot};
+use tokio::sync::{Notify, SetOnce, mpsc, oneshot};
 
 use crate::domain::{ConnectionId, ConnectionKey};
 
@@ -114,6 +114,8 @@ pub struct LiveConnection {
     inlet: Mutex<Option<mpsc::Sender<PushedMessage>>>,
     /// Tells that the outbox of a sink has something new.
     pub queued: Notify,
+    /// Set once this process reads the tracks of a sink's cameras.
+    pub publishing: SetOnce<()>,
 }
 
 impl LiveConnection {

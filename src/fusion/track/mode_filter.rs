@@ -77,7 +77,7 @@ pub(super) struct PredictedMeasurement {
     pub(super) stated_covariance: PlaneCovariance,
     /// Cross-covariance `P H'` of the state with the measured position.
     cross_covariance: SMatrix<f64, STATES, 2>,
-    /// `L_d - H M`, the derivative of the innovation (row) by the camera's lasting error (column), m.
+    /// `L_d - H M`, m: the derivatives of the innovation (east, north) by each component of the camera's lasting error.
     lasting: [[f64; 2]; 2],
 }
 
@@ -305,8 +305,8 @@ impl ModeFilter {
         let of_east = measured(&|state| self.response[(state, 0)]);
         let of_north = measured(&|state| self.response[(state, 1)]);
         let lasting = [
-            [root_east - of_east[0], root_east_north - of_north[0]],
-            [root_east_north - of_east[1], root_north - of_north[1]],
+            [root_east - of_east[0], root_east_north - of_east[1]],
+            [root_east_north - of_north[0], root_north - of_north[1]],
         ];
         let innovation = [decomposition.position.east_m - east_m, decomposition.position.north_m - north_m];
         let mut cross = SMatrix::<f64, STATES, 2>::zeros();
@@ -347,8 +347,8 @@ impl ModeFilter {
             let (east, north) = (cross[(state, 0)], cross[(state, 1)]);
             let gain = [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
             self.mean[state] += gain[0] * innovation[0] + gain[1] * innovation[1];
-            for column in 0..2 {
-                self.response[(state, column)] += gain[0] * lasting[0][column] + gain[1] * lasting[1][column];
+            for (column, [east, north]) in lasting.iter().enumerate() {
+                self.response[(state, column)] += gain[0] * east + gain[1] * north;
             }
             for other in 0..=state {
                 let reduction = gain[0] * cross[(other, 0)] + gain[1] * cross[(other, 1)];

@@ -11,6 +11,9 @@ use crate::store::refusals::no_camera;
 use crate::store::rows::cameras::{CameraContent, camera_columns as columns, read_camera};
 use crate::store::rows::models::{read_content, read_move};
 
+/// Id of the camera, metadata document, weights and checksum.
+type StoredModel = (String, Vec<u8>, Vec<u8>, Option<String>);
+
 impl Store {
     pub(in crate::store) async fn camera_contents(
         &self,
@@ -33,7 +36,7 @@ impl Store {
         .fetch_all(&mut *reader)
         .await
         .map_err(failed)?;
-        let models: Vec<(String, Vec<u8>, Vec<u8>, Option<String>)> = sqlx::query_as(
+        let models: Vec<StoredModel> = sqlx::query_as(
             "SELECT cameras.id, convert_to(metadata, 'UTF8'), weights, sha256 \
              FROM models JOIN cameras ON cameras.key = camera_key AND number = active_model \
              WHERE cameras.id = ANY($1::TEXT[])",

@@ -85,7 +85,7 @@ async fn a_frozen_worker_can_neither_end_nor_overwrite_a_run() {
     let server = node(folder.path(), "serve");
     with_samples(&server).await;
     let frozen = node(folder.path(), "train");
-    let path = start_run(&server, &json!({"recipe": "paper", "seed": 7, "epochs": 400})).await;
+    let path = start_run(&server, &json!({"recipe": "paper", "seed": 7, "epochs": 10_000})).await;
     until(&server, &path, trains).await;
     frozen.signal("-STOP");
     let awake = node(folder.path(), "train");

@@ -212,7 +212,7 @@ impl TestServer {
         assert!(sent.expect("kill runs").success());
         // A thread stops when it runs next: until all have, the process goes on.
         while name == "-STOP" && !self.is_stopped() {
-            std::thread::sleep(Duration::from_millis(1));
+            std::thread::sleep(std::time::Duration::from_millis(1));
         }
     }
 

@@ -84,7 +84,7 @@ test('a site is trained together: started, cancelled, started again, reported', 
   }
 
   // Past runs are looked at again.
-  const past = page.locator('table.runs tbody tr');
+  const past = page.locator('tbody tr:has(button[aria-pressed])');
   await expect(past).toHaveCount(2);
   await expect(past.first()).toContainText(`${apart} → ${together}`);
   await expect(past.first()).toContainText('Camera c1, Camera c2');
@@ -139,7 +139,7 @@ test.describe('a refused run', () => {
     });
     await start.click();
     await expect(page.getByText('There is a training run that has not ended:')).toBeVisible();
-    await expect(page.locator('table.runs tbody tr').locator('td').nth(1)).toHaveText('7');
+    await expect(page.locator('tbody tr:has(button[aria-pressed])').locator('td').nth(1)).toHaveText('7');
     // A camera alone is not trained together with anything.
     for (const { id, state } of await runsOf(server)) if (state === 'queued' || state === 'running') await server.request('POST', `${RUNS}/${id}/cancel`).catch(() => undefined);
     await server.request('PATCH', '/v1/cameras/c2', { site: null }, 'application/merge-patch+json', { 'if-match': '*' });

@@ -36,7 +36,7 @@ async function showNotActivated(page: Page, { id, report }: SiteTrainingRun): Pr
 
 test('a site is trained together: started, cancelled, started again, reported', async ({ console: page, server }) => {
   test.setTimeout(1_200_000);
-  await addSite(server, simulateSite(14, 300));
+  await addSite(server, simulateSite(14, 600));
   await page.goto(`${server.url}/#/sites/street`);
   await expect(page.getByRole('heading', { name: 'No training run of this site yet' })).toBeVisible();
   const start = page.getByRole('button', { name: 'Start training' });
@@ -44,11 +44,11 @@ test('a site is trained together: started, cancelled, started again, reported', 
   await expect(page.getByRole('progressbar', { name: 'Progress of the training run' })).toBeVisible();
   await expect(start).toBeDisabled();
   await expect(page.getByText('One run per site at a time.')).toBeVisible();
+  expect(await accessibilityFindings(page), 'running').toEqual([]);
   // Progress is read again and again: the first answer has none.
   await expect(page.getByText(/^epoch [1-9]\d* of \d+$/)).toBeVisible({ timeout: 600_000 });
   const share = Number(await page.getByRole('progressbar').getAttribute('aria-valuenow'));
   expect(share).toBeGreaterThan(0);
-  expect(await accessibilityFindings(page)).toEqual([]);
   await page.getByRole('button', { name: 'Cancel' }).click();
   await expect(page.getByRole('status').getByText('cancelled')).toBeVisible({ timeout: 120_000 });
   expect(await activeModels(server)).toEqual([undefined, undefined]);

@@ -144,7 +144,7 @@ impl Registry {
         let loaded = loaded.and_then(|content| self.load(content));
         match &loaded {
             Ok(camera) => self.replace(|cameras| cameras.insert(id.clone(), camera.clone())),
-            Err(error) if error.kind() == ErrorKind::CameraNotFound => self.remove(id),
+            Err(error) if error.kind() == ErrorKind::CameraNotFound => self.remove(vec![id.clone()]),
             Err(_) => {}
         }
         loaded
@@ -165,11 +165,8 @@ impl Registry {
         let CameraVersions { versions, deleted, upto } = store.camera_versions(since).await?;
         let known = self.cameras.load_full();
         let deleted = deleted.unwrap_or_else(|| missing(&known, &versions));
-        for (id, key) in deleted {
-            if known.get(&id).is_some_and(|camera| camera.key == key) {
-                self.remove(&id);
-            }
-        }
+        let is_known = |(id, key): &(CameraId, CameraKey)| known.get(id).is_some_and(|it| it.key == *key);
+        self.remove(deleted.into_iter().filter(is_known).map(|(id, _)| id).collect());
         let is_complete = self.read(store, &stale(&known, versions)).await?;
         if is_complete {
             *change = Refreshed { upto, of_changes: if since.is_some() { of_changes + 1 } else { 0 } };
@@ -242,12 +239,21 @@ impl Registry {
     /// have read the camera before it was deleted.
     pub async fn forget(&self, id: &CameraId) {
         let _change = self.change.lock().await;
-        self.remove(id);
+        self.remove(vec![id.clone()]);
     }
 
-    fn remove(&self, id: &CameraId) {
-        self.end(id);
-        self.replace(|cameras| cameras.remove(id));
+    fn remove(&self, ids: Vec<CameraId>) {
+        if ids.is_empty() {
+            return;
+        }
+        for id in &ids {
+            self.end(id);
+        }
+        self.replace(|cameras| {
+            for id in &ids {
+                cameras.remove(id);
+            }
+        });
     }
 
     /// Ends what listens to a camera.

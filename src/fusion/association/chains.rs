@@ -2,7 +2,7 @@
 
 use super::evidence::{EvidenceModel, LikelihoodRatio};
 use super::links::links;
-use super::tracklet::{Residual, SceneMotion, TimedFix, Tracklet};
+use super::tracklet::{MAX_OVERLAP_S, Residual, SceneMotion, TimedFix, Tracklet, concurrent};
 
 /// A part of a tracklet between two cuts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,10 +26,6 @@ pub struct ChainSettings {
     pub max_chains: usize,
     /// Largest gap between two points of a tracklet to interpolate over, s.
     pub max_gap_s: f64,
-    /// Overlap of two pieces of one chain that is tolerated, s.
-    pub max_overlap_s: f64,
-    /// Factor on log-likelihood ratios: what the model of the noise leaves out makes them overstated.
-    pub tempering: f64,
     /// Probability that the carrier of a receiver is among the boxes.
     pub seen_probability: f64,
     /// Log odds per second that a carrier is seen rather than not, beside the rest.
@@ -45,8 +41,6 @@ impl Default for ChainSettings {
             max_pieces: 100,
             max_chains: 60,
             max_gap_s: 2.5,
-            max_overlap_s: 0.6,
-            tempering: 0.7,
             seen_probability: 0.8,
             seen_per_s: 0.2,
             switch_probability: 0.2,
@@ -91,10 +85,7 @@ impl PieceTable {
         let log_prior = tracks
             .iter()
             .map(|own| {
-                let [from_s, to_s] = own.span_s();
-                let overlap_s: f64 =
-                    tracks.iter().map(|other| overlap_s([from_s, to_s], other.span_s())).sum();
-                let concurrent = (overlap_s / (to_s - from_s).max(0.5)).max(1.0);
+                let concurrent = concurrent(own.span_s(), tracks.iter().map(Tracklet::span_s));
                 (settings.seen_probability / concurrent).ln()
             })
             .collect();
@@ -169,7 +160,7 @@ impl PieceTable {
         settings: &ChainSettings,
     ) -> Option<Partial> {
         let [from_s, to_s] = self.tracks[at].span_s();
-        if own.pieces.len() >= settings.max_pieces || from_s < own.end_s - settings.max_overlap_s {
+        if own.pieces.len() >= settings.max_pieces || from_s < own.end_s - MAX_OVERLAP_S {
             return None;
         }
         let last = own.pieces.last();
@@ -185,7 +176,7 @@ impl PieceTable {
         let ratio = own.ratio.extended(residuals, model);
         let covered_s = residuals.last()?.fix.time_s - residuals.first()?.fix.time_s;
         let log_prior = own.log_prior + step + settings.seen_per_s * covered_s;
-        let log_weight = settings.tempering * ratio.log_ratio + log_prior;
+        let log_weight = ratio.log_ratio + log_prior;
         // A piece that contradicts the others so much is no part of the chain.
         (log_weight > own.log_weight - MAX_LOSS).then(|| {
             let mut pieces = own.pieces.clone();
@@ -247,8 +238,4 @@ struct Partial {
 fn prune(beam: &mut Vec<Partial>, most: usize) {
     beam[1..].sort_by(|one, other| other.log_weight.total_cmp(&one.log_weight));
     beam.truncate(most.max(1));
-}
-
-fn overlap_s([from_s, to_s]: [f64; 2], [other_from_s, other_to_s]: [f64; 2]) -> f64 {
-    (to_s.min(other_to_s) - from_s.max(other_from_s)).max(0.0)
 }

@@ -2,7 +2,8 @@
 //!
 //! The companion's boxes explain the fixes as well as the carrier's own would, for a receiver's bias is larger than the
 //! distance between them. So the posterior probability of a piece is divided between its target and a
-//! companion that is not seen, by their prior probabilities. A companion is unseen more often at the border of the view.
+//! companion that is not seen, by their prior probabilities. A companion is unseen more often at the border of the view;
+//! but while the target is inside, a companion is inside as well, and has boxes of its own.
 
 use crate::domain::{BoundingBox, Detection};
 
@@ -12,6 +13,8 @@ const IN_COMPANY: f64 = 0.4;
 const MISSED: f64 = 0.1;
 /// Probability that the companion of a target at the border of the view is out of view.
 const OUT_OF_VIEW: f64 = 0.5;
+/// A companion is still out of view after the target has been inside for this time with probability 1/e, s.
+const ENTERING_S: f64 = 2.0;
 /// Distance of companions in the image, in heights of their boxes.
 const APART_HEIGHTS: f64 = 0.7;
 
@@ -38,10 +41,15 @@ impl View {
         centre_px - self.left_px < apart_px || self.right_px - centre_px < apart_px
     }
 
-    /// Probability that the target of a piece, rather than an unseen companion, is the one whose place its boxes show.
+    /// Probability that the target of a piece, rather than an unseen companion, is the one whose place its boxes show. The
+    /// piece is in order of time.
     pub(super) fn own_probability(&self, detections: &[Detection], piece: &[usize]) -> f64 {
-        let at_border = piece.iter().filter(|at| self.is_at_border(&detections[**at].bounding_box)).count();
-        let border_share = at_border as f64 / piece.len().max(1) as f64;
-        1.0 / (1.0 + IN_COMPANY * (MISSED + OUT_OF_VIEW * border_share))
+        let steps = piece.windows(2).map(|step| [0, 1].map(|at| &detections[step[at]]));
+        let inside_s: f64 = steps
+            .filter(|step| step.iter().all(|own| !self.is_at_border(&own.bounding_box)))
+            .map(|[from, to]| to.time.duration_since(from.time).as_secs_f64())
+            .sum();
+        let unseen = MISSED + OUT_OF_VIEW * (-inside_s / ENTERING_S).exp();
+        1.0 / (1.0 + IN_COMPANY * unseen)
     }
 }

@@ -31,7 +31,7 @@ const SHIFTS: [f64; 6] = [0.21, 0.33, 0.45, 0.57, 0.69, 0.81];
 /// Shifts are at least this long, s: beyond the memory of walks and of receivers' errors.
 const LEAST_SHIFT_S: f64 = 25.0;
 /// The score of the best world exceeds that of all wrong ones by at least this.
-const MIN_MARGIN: f64 = 6.0;
+const MIN_MARGIN: f64 = 8.0;
 /// The best world exceeds every other world of the same recording by at least this.
 const MIN_MODE_MARGIN: f64 = 3.0;
 /// Two placements closer than this are one world, m.

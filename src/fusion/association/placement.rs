@@ -8,10 +8,13 @@
 //! expectation-maximisation: soft assignment of receivers to tracklets, then the least-squares (w, t) in
 //! closed form. `docs/association.md` has the formulas.
 
+use std::cmp::Ordering;
+
 use nalgebra::{Complex, DMatrix};
 
+use super::disjoint;
 use super::evidence::{EvidenceModel, MAP_TIME_CONSTANT_S, free_log_likelihood};
-use super::tracklet::{TimedFix, Tracklet};
+use super::tracklet::{TimedFix, Tracklet, concurrent};
 
 type C = Complex<f64>;
 
@@ -25,8 +28,6 @@ const MAX_GAP_S: f64 = 2.5;
 const SEEN_PROBABILITY: f64 = 0.8;
 /// Largest factor between the ground by usual heights and the true one.
 const MAX_SCALE: f64 = 100.0;
-/// Log weights below it add nothing to the prior of a receiver whose carrier is not seen.
-const NEGLIGIBLE: f64 = -20.0;
 const YAWS: usize = 48;
 /// Longest pairs whose position suggests a translation for each yaw.
 const GRID_PAIRS: usize = 80;
@@ -41,7 +42,7 @@ const TEMPERING: f64 = 0.6;
 pub(super) struct Placement {
     turn: C,
     shift_m: C,
-    /// Sum over receivers of the log of prior plus evidence.
+    /// Sum over receivers of the log of their evidence, and the log priors of ground and scale.
     pub(super) score: f64,
 }
 
@@ -64,8 +65,10 @@ impl Placement {
 
 /// Quadratic form of one pair.
 struct Pair {
-    receiver: usize,
-    log_prior: f64,
+    /// First and last instant of the tracklet, s.
+    span_s: [f64; 2],
+    /// Log prior odds that the receiver's carrier is the target of the tracklet.
+    log_prior_odds: f64,
     /// Log-likelihood ratio at residuals of zero.
     peak: f64,
     ones: f64,
@@ -103,17 +106,63 @@ impl Pair {
         self.peak - 0.5 * squared
     }
 
-    /// Log of prior times tempered ratio.
+    /// The longest first, by the weight of its fixes.
+    fn by_length(one: &&Self, other: &&Self) -> Ordering {
+        other.ones.total_cmp(&one.ones)
+    }
+
+    /// Log of prior odds times tempered ratio.
     #[inline]
     fn log_weight(&self, at: &Coefficients) -> f64 {
-        TEMPERING * self.log_ratio(at) + self.log_prior
+        TEMPERING * self.log_ratio(at) + self.log_prior_odds
+    }
+}
+
+/// The tracklets that the carrier of one receiver may have, in the order of their last instants.
+struct ReceiverPairs {
+    pairs: Vec<Pair>,
+    /// By pair, the number of those that end before it begins.
+    before: Vec<usize>,
+}
+
+impl ReceiverPairs {
+    fn new(tracklets: &[Tracklet], fixes: &[TimedFix], model: &EvidenceModel, map_sigma_m: f64) -> Self {
+        let mut pairs: Vec<Pair> =
+            tracklets.iter().filter_map(|own| pair(own, fixes, model, map_sigma_m)).collect();
+        pairs.sort_by(|one, other| one.span_s[1].total_cmp(&other.span_s[1]));
+        let spans_s: Vec<[f64; 2]> = pairs.iter().map(|own| own.span_s).collect();
+        for own in &mut pairs {
+            let candidates = concurrent(own.span_s, spans_s.iter().copied());
+            own.log_prior_odds = (SEEN_PROBABILITY / (1.0 - SEEN_PROBABILITY) / candidates).ln();
+        }
+        Self { pairs, before: disjoint::ended_before(&spans_s) }
+    }
+
+    fn longest(&self, most: usize) -> Vec<&Pair> {
+        let mut order: Vec<&Pair> = self.pairs.iter().collect();
+        order.sort_by(Pair::by_length);
+        order.truncate(most);
+        order
+    }
+
+    fn log_weights(&self, at: &Coefficients) -> impl Iterator<Item = (f64, usize)> {
+        self.pairs.iter().map(|own| own.log_weight(at)).zip(self.before.iter().copied())
+    }
+
+    /// Log-likelihood ratio of the receiver's fixes at a placement, over all sets of tracklets that its carrier may have.
+    fn log_evidence(&self, at: &Coefficients) -> f64 {
+        disjoint::log_sums(self.log_weights(at)).last().copied().unwrap_or(0.0)
+    }
+
+    /// Probability of each pair at a placement.
+    fn probabilities(&self, at: &Coefficients) -> Vec<f64> {
+        disjoint::probabilities(&self.log_weights(at).collect::<Vec<_>>())
     }
 }
 
 /// The pairs of a recording under one ground plane.
 pub(super) struct PlacementSearch {
-    pairs: Vec<Pair>,
-    receivers: usize,
+    pairs: Vec<ReceiverPairs>,
     /// Standard deviation of the logarithm of the scale.
     scale_sigma: f64,
     /// Log prior density of the ground plane, a part of every score.
@@ -131,57 +180,34 @@ impl PlacementSearch {
         map_sigma_m: f64,
         (scale_sigma, log_prior): (f64, f64),
     ) -> Self {
-        let mut pairs = Vec::new();
-        for (receiver, fixes) in receivers.iter().enumerate() {
-            let of_receiver = pairs.len();
-            for tracklet in tracklets {
-                pairs.extend(pair(receiver, tracklet, fixes, model, map_sigma_m));
-            }
-            let candidates = (pairs.len() - of_receiver).max(1) as f64;
-            for own in &mut pairs[of_receiver..] {
-                own.log_prior = (SEEN_PROBABILITY / candidates).ln();
-            }
-        }
+        let pairs =
+            receivers.iter().map(|fixes| ReceiverPairs::new(tracklets, fixes, model, map_sigma_m)).collect();
         let all: Vec<C> = tracklets
             .iter()
             .flat_map(|own| &own.points)
             .map(|point| C::new(point.position.east_m, point.position.north_m))
             .collect();
         let stride = all.len().div_ceil(200).max(1);
-        Self {
-            pairs,
-            receivers: receivers.len(),
-            scale_sigma,
-            log_prior,
-            points: all.into_iter().step_by(stride).collect(),
-        }
+        Self { pairs, scale_sigma, log_prior, points: all.into_iter().step_by(stride).collect() }
     }
 
     /// Log-likelihood ratio of each pair where ground and plane are the same.
     #[cfg(test)]
     pub(super) fn log_ratios_at_identity(&self) -> Vec<f64> {
-        self.pairs
-            .iter()
+        self.all_pairs()
             .map(|pair| pair.log_ratio(&Coefficients::new(C::new(1.0, 0.0), C::default())))
             .collect()
     }
 
-    fn scores(&self, turn: C, shift: C) -> Vec<f64> {
-        let mut sums = vec![1.0 - SEEN_PROBABILITY; self.receivers];
-        let at = Coefficients::new(turn, shift);
-        for pair in &self.pairs {
-            let log_weight = pair.log_weight(&at);
-            if log_weight > NEGLIGIBLE {
-                sums[pair.receiver] += log_weight.exp();
-            }
-        }
-        sums.iter_mut().for_each(|sum| *sum = sum.ln());
-        sums
+    fn all_pairs(&self) -> impl Iterator<Item = &Pair> {
+        self.pairs.iter().flat_map(|own| &own.pairs)
     }
 
     fn score(&self, turn: C, shift: C) -> f64 {
         let scale = turn.norm().ln() / self.scale_sigma;
-        self.scores(turn, shift).iter().sum::<f64>() + self.log_prior - 0.5 * scale * scale
+        let at = Coefficients::new(turn, shift);
+        let evidence: f64 = self.pairs.iter().map(|own| own.log_evidence(&at)).sum();
+        evidence + self.log_prior - 0.5 * scale * scale
     }
 
     /// The best placements that differ from each other, the best first. The best starts lie mostly about the best
@@ -204,8 +230,7 @@ impl PlacementSearch {
 
     /// The placement that each pair alone suggests.
     fn suggested(&self) -> Vec<Placement> {
-        self.pairs
-            .iter()
+        self.all_pairs()
             .filter_map(|pair| {
                 let moved = pair.gz - pair.g.conj() * pair.z / pair.ones;
                 let spread = pair.gg - pair.g.norm_sqr() / pair.ones;
@@ -220,18 +245,11 @@ impl PlacementSearch {
 
     /// For each yaw the translations that the longest pairs suggest.
     fn grid(&self) -> Vec<Placement> {
-        let mut order: Vec<&Pair> = self.pairs.iter().collect();
-        order.sort_by(|one, other| other.ones.total_cmp(&one.ones));
         // Pairs of a few receivers only would all be wrong where these are out of view.
-        let mut longest: Vec<&Pair> = Vec::new();
-        let per_receiver = (GRID_PAIRS / self.receivers.max(1)).max(4);
-        let mut counts = vec![0; self.receivers];
-        for pair in order {
-            if counts[pair.receiver] < per_receiver && longest.len() < GRID_PAIRS {
-                counts[pair.receiver] += 1;
-                longest.push(pair);
-            }
-        }
+        let per_receiver = (GRID_PAIRS / self.pairs.len().max(1)).max(4);
+        let mut longest: Vec<&Pair> = self.pairs.iter().flat_map(|own| own.longest(per_receiver)).collect();
+        longest.sort_by(Pair::by_length);
+        longest.truncate(GRID_PAIRS);
         let mut best = Vec::with_capacity(YAWS * 3);
         for step in 0..YAWS {
             let turn = C::from_polar(1.0, step as f64 / YAWS as f64 * std::f64::consts::TAU);
@@ -271,14 +289,12 @@ impl PlacementSearch {
     }
 
     fn maximised(&self, turn: C, shift: C) -> Option<Placement> {
-        let totals = self.scores(turn, shift);
         let (mut ones, mut gg) = (0.0, 0.0);
         let (mut z, mut g, mut gz) = (C::default(), C::default(), C::default());
         let at = Coefficients::new(turn, shift);
-        for pair in &self.pairs {
-            let log_weight = pair.log_weight(&at) - totals[pair.receiver];
-            if log_weight > -9.0 {
-                let weight = TEMPERING * log_weight.exp();
+        for own in &self.pairs {
+            for (pair, probability) in own.pairs.iter().zip(own.probabilities(&at)) {
+                let weight = TEMPERING * probability;
                 ones += weight * pair.ones;
                 gg += weight * pair.gg;
                 z += pair.z * weight;
@@ -310,13 +326,7 @@ fn distinct(sorted: &[Placement], points: &[C], most: usize, apart_m: f64) -> Ve
     kept
 }
 
-fn pair(
-    receiver: usize,
-    tracklet: &Tracklet,
-    fixes: &[TimedFix],
-    model: &EvidenceModel,
-    map_sigma_m: f64,
-) -> Option<Pair> {
+fn pair(tracklet: &Tracklet, fixes: &[TimedFix], model: &EvidenceModel, map_sigma_m: f64) -> Option<Pair> {
     let residuals = tracklet.residuals(fixes, 0.0, MAX_GAP_S);
     let stride = residuals.len().div_ceil(MAX_FIXES).max(1);
     let rows: Vec<_> = residuals.into_iter().step_by(stride).collect();
@@ -346,8 +356,8 @@ fn pair(
     factor.l_dirty().solve_lower_triangular_mut(&mut columns);
     let dot = |a: usize, b: usize| columns.column(a).dot(&columns.column(b));
     Some(Pair {
-        receiver,
-        log_prior: 0.0,
+        span_s: tracklet.span_s(),
+        log_prior_odds: 0.0,
         peak,
         ones: dot(0, 0),
         z: C::new(dot(0, 1), dot(0, 2)),

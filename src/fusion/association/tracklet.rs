@@ -2,6 +2,9 @@
 
 use crate::geo::EastNorth;
 
+/// Overlap of two tracklets of one target that is tolerated, s: trackers hold on to a target for some frames.
+pub(super) const MAX_OVERLAP_S: f64 = 0.6;
+
 /// Position of a tracklet at one instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct TrackPoint {
@@ -97,6 +100,12 @@ impl Tracklet {
             })
             .collect()
     }
+}
+
+/// Mean number of tracklets with these spans that are seen at the same time as one with the first span, itself included.
+pub(super) fn concurrent([from_s, to_s]: [f64; 2], spans_s: impl Iterator<Item = [f64; 2]>) -> f64 {
+    let overlaps_s = spans_s.map(|[first_s, last_s]| (to_s.min(last_s) - from_s.max(first_s)).max(0.0));
+    (overlaps_s.sum::<f64>() / (to_s - from_s).max(0.5)).max(1.0)
 }
 
 /// How the targets of a scene move.

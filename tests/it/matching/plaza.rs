@@ -223,6 +223,9 @@ struct Score {
     right: usize,
     found: usize,
     all: usize,
+    /// Boxes of right pairs from 0.9 on, and of all true pairs.
+    boxes_found: usize,
+    boxes_all: usize,
     /// By stated probability from 0, 0.3, 0.5, 0.7, 0.9, 0.95: sum stated, right, number.
     bins: [(f64, usize, usize); 6],
 }
@@ -247,23 +250,28 @@ impl Score {
                 self.sure += 1;
                 self.right += usize::from(is_right);
                 if is_right {
+                    self.boxes_found += piece.detections.len();
                     found.insert((piece.tracker_id.clone(), piece.receiver_id.clone()));
                 }
             }
         }
         self.found += found.len();
-        self.all += plaza.true_pairs(camera, boxes, fixes).len();
+        let pairs = plaza.true_pairs(camera, boxes, fixes);
+        self.all += pairs.len();
+        let carried: BTreeSet<&str> = pairs.iter().map(|(tracker_id, _)| tracker_id.as_str()).collect();
+        self.boxes_all += boxes.iter().filter(|own| carried.contains(own.target_id.as_str())).count();
     }
 
     fn print(&self, name: &str) {
         println!(
-            "{name}: {} pairs from 0.9 on, {} right ({:.3}); {} of {} pairs found ({:.3})",
+            "{name}: {} pairs from 0.9 on, {} right ({:.3}); {} of {} pairs found ({:.3}), {:.3} of their boxes",
             self.sure,
             self.right,
             self.precision(),
             self.found,
             self.all,
-            self.found as f64 / self.all.max(1) as f64
+            self.found as f64 / self.all.max(1) as f64,
+            self.boxes_found as f64 / self.boxes_all.max(1) as f64
         );
         for (stated, right, number) in self.bins {
             let number = number.max(1) as f64;
@@ -289,7 +297,7 @@ fn shared_plaza_pairs_with_a_known_model() {
     for camera in CAMERAS {
         let model = plaza.known_model(camera, &plaza.redrawn(TRAINING_DRAW));
         let mut score = Score::default();
-        for draw in 1..=5 {
+        for draw in 1..=20 {
             let fixes = plaza.redrawn(draw);
             let matched = |boxes: &[Detection]| {
                 let mut random = ChaCha8Rng::seed_from_u64(draw);
@@ -310,7 +318,7 @@ fn shared_plaza_pairs_with_a_known_model() {
     all.print("all cameras");
     assert!(all.precision() >= 0.95);
     // The goal for the share found is 0.6 (docs/association.md).
-    assert!(all.found as f64 >= 0.25 * all.all as f64);
+    assert!(all.found as f64 >= 0.35 * all.all as f64);
     assert!((all.stated() - all.precision()).abs() <= 0.05, "stated {}", all.stated());
 }
 

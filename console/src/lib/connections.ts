@@ -34,6 +34,7 @@ export const KINDS: Kind[] = [
   sink('nats', 'connections.kind.nats', 'json', ['nats://localhost:4222'], ['topic', 'username']),
   sink('webhook', 'connections.kind.webhook', 'json', ['https://hooks.example.org/positions'], ['ca_certificate']),
   sink('cot', 'connections.kind.cot', 'cot', ['udp://239.2.3.1:6969', 'tcp://tak.example.org:8087', 'tls://tak.example.org:8089'], ['cot', 'ca_certificate']),
+  sink('onvif-frames', 'connections.kind.onvifFrames', 'onvif', ['udp://239.2.3.1:6970', 'tcp://vms.example.org:6970', 'tls://vms.example.org:6971', MQTT], ['topic', 'username', 'ca_certificate']),
 ];
 
 const schemeOf = (address: string): string => address.split(':')[0]!;
@@ -65,7 +66,7 @@ export function kindOf({ source, sink: target }: Connection): Kind | undefined {
   if (!target) return undefined;
   const scheme = schemeOf(target.address);
   const sinks = KINDS.filter((kind) => kind.direction === 'sink' && kind.format === target.format);
-  return sinks.find((kind) => kind.addresses.some((address) => schemeOf(address).replace(/s$/, '') === scheme.replace(/s$/, ''))) ?? sinks.find(({ key }) => key === 'cot');
+  return sinks.find((kind) => kind.addresses.some((address) => schemeOf(address).replace(/s$/, '') === scheme.replace(/s$/, ''))) ?? (sinks.length === 1 ? sinks[0] : undefined);
 }
 
 /** What a form holds; texts are empty where nothing is given. */

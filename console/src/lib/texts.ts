@@ -519,6 +519,7 @@ const table = {
   'connections.kind.nats': ['NATS', 'NATS'],
   'connections.kind.nmea': ['NMEA receiver or AIS', 'NMEA-Empfänger oder AIS'],
   'connections.kind.onvif': ['ONVIF metadata', 'ONVIF-Metadaten'],
+  'connections.kind.onvifFrames': ['ONVIF frames with positions', 'ONVIF-Frames mit Positionen'],
   'connections.kind.traccar': ['Traccar', 'Traccar'],
   'connections.kind.webhook': ['Webhook', 'Webhook'],
   'connections.lag': ['Lag', 'Rückstand'],

@@ -8,6 +8,7 @@ mod status;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::sync::oneshot;
@@ -24,6 +25,9 @@ pub use reports::{ConnectionNode, ReportedStatuses};
 pub use status::{
     ConnectionBoard, ConnectionState, ConnectionStatus, LastMessage, LiveConnection, PushedMessage,
 };
+
+/// A source that was created or resumed begins beside the answer; a message that comes before it waits for at most so long.
+const SOURCE_START: Duration = Duration::from_secs(2);
 
 /// A connection as a caller describes it.
 #[derive(Debug, Clone)]
@@ -68,6 +72,13 @@ impl ConnectionRequest {
             secrets: serde_json::to_string(&secrets).map_err(Error::fault)?,
         })
     }
+}
+
+/// Whether a connection is a source that takes messages by HTTP.
+fn takes_messages(connection: &Connection) -> Result<bool> {
+    let (settings, _) = connection_settings(connection)?;
+    let address = settings.source.as_ref().map(|source| source.address()).transpose()?;
+    Ok(!connection.profile.paused && address.is_some_and(|address| address.scheme == Scheme::Push))
 }
 
 /// The stored settings of a connection.
@@ -228,8 +239,16 @@ impl App {
     pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<()> {
         let connection = self.store.connection(id).await?;
         self.authorize_source(&connection)?;
-        let Some(inlet) = self.live_connection(&connection).inlet() else {
-            return Err(self.not_receiving(&connection).await?);
+        let live = self.live_connection(&connection);
+        let inlet = match live.inlet() {
+            Some(inlet) => inlet,
+            None => match self.not_receiving(&connection).await? {
+                error if error.kind() != ErrorKind::ConnectionNotReceiving => return Err(error),
+                error if takes_messages(&connection)? => {
+                    live.opened_inlet(SOURCE_START).await.ok_or(error)?
+                }
+                error => return Err(error),
+            },
         };
         let (settled, settlement) = oneshot::channel();
         let sender = self.caller().actor().name.to_string();
@@ -245,10 +264,7 @@ impl App {
 
     /// Why this node takes no messages for a connection.
     async fn not_receiving(&self, connection: &Connection) -> Result<Error> {
-        let (settings, _) = connection_settings(connection)?;
-        let address = settings.source.as_ref().map(|source| source.address()).transpose()?;
-        if !connection.profile.paused
-            && address.is_some_and(|address| address.scheme == Scheme::Push)
+        if takes_messages(connection)?
             && let Some(elsewhere) = self.source_elsewhere(connection.id(), connection.key).await?
         {
             return Ok(elsewhere);

@@ -2,12 +2,13 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use bytes::Bytes;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
-use tokio::sync::{Notify, SetOnce, mpsc, oneshot};
+use tokio::sync::{Notify, SetOnce, mpsc, oneshot, watch};
 
 use crate::domain::{ConnectionId, ConnectionKey};
 
@@ -111,7 +112,7 @@ pub struct PushedMessage {
 pub struct LiveConnection {
     status: Mutex<ConnectionStatus>,
     /// The way to the running source, where it takes pushed messages.
-    inlet: Mutex<Option<mpsc::Sender<PushedMessage>>>,
+    inlet: watch::Sender<Option<mpsc::Sender<PushedMessage>>>,
     /// Tells that the outbox of a sink has something new.
     pub queued: Notify,
     /// Set once this process reads the tracks of a sink's cameras.
@@ -141,11 +142,18 @@ impl LiveConnection {
 
     /// Opens or closes the way for pushed messages.
     pub fn set_inlet(&self, inlet: Option<mpsc::Sender<PushedMessage>>) {
-        *lock(&self.inlet) = inlet;
+        self.inlet.send_replace(inlet);
     }
 
     pub(in crate::app) fn inlet(&self) -> Option<mpsc::Sender<PushedMessage>> {
-        lock(&self.inlet).clone()
+        self.inlet.borrow().clone()
+    }
+
+    /// The same once it is open; `None` if it is not within that time.
+    pub(in crate::app) async fn opened_inlet(&self, within: Duration) -> Option<mpsc::Sender<PushedMessage>> {
+        let mut inlet = self.inlet.subscribe();
+        let opened = tokio::time::timeout(within, inlet.wait_for(Option::is_some)).await;
+        opened.ok()?.ok()?.clone()
     }
 }
 

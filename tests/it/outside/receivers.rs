@@ -109,7 +109,7 @@ async fn gpsd_is_asked_for_its_reports() {
 async fn traccar_hands_in_positions_and_is_answered_when_they_are_taken() {
     let (server, _folder) =
         start(json!({"address": "push:", "format": "traccar", "camera_ids": ["gate"]})).await;
-    connection_when(&server, "receiver", |status| status["state"] == "running").await;
+    // The source begins beside the answer to its creation; a message that comes first waits for it.
     let now = now();
     let position = json!({
         "position": {"id": 7, "deviceId": 3, "fixTime": format!("{now:.3}"), "valid": true,

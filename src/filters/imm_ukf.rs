@@ -124,8 +124,7 @@ impl ImmUkf {
             for (mode, log_probability) in modes.iter_mut().zip(&mut self.log_probabilities) {
                 *log_probability += update(mode, position, variance_m2);
             }
-            log_likelihood = log_sum_exp(self.log_probabilities);
-            self.log_probabilities = self.log_probabilities.map(|log| log - log_likelihood);
+            (self.log_probabilities, log_likelihood) = normalize(self.log_probabilities);
         }
         self.modes = Some(modes);
         Some(self.estimate(&modes, log_likelihood))
@@ -178,8 +177,8 @@ fn transition(options: &ImmUkfOptions, seconds: f64) -> [[f64; 2]; 2] {
 fn mix(modes: &[Mode; 2], log_probabilities: [f64; 2], transition: &[[f64; 2]; 2]) -> ([Mode; 2], [f64; 2]) {
     let into = |mode: usize| {
         let joint = [0, 1].map(|from| log_probabilities[from] + transition[from][mode].ln());
-        let total = log_sum_exp(joint);
-        (moment_match(modes, joint.map(|log| (log - total).exp())), total)
+        let (normalized, total) = normalize(joint);
+        (moment_match(modes, normalized.map(f64::exp)), total)
     };
     let ((cruise, log_cruise), (turn, log_turn)) = (into(0), into(1));
     ([cruise, turn], [log_cruise, log_turn])
@@ -281,9 +280,14 @@ fn square_root(covariance: &Covariance) -> Covariance {
     Covariance::from_diagonal(&covariance.diagonal().map(|value| value.max(0.0).sqrt()))
 }
 
-fn log_sum_exp(logs: [f64; 2]) -> f64 {
+/// Logarithms of numbers scaled to a sum of 1, and the logarithm of their sum (log-sum-exp). The largest is
+/// subtracted first: of logarithms near -1e9, as of a fix that is 10 km away, the total alone has a rounding
+/// error of 1e-7, which would be that of the probabilities.
+fn normalize(logs: [f64; 2]) -> ([f64; 2], f64) {
     let largest = logs[0].max(logs[1]);
-    largest + logs.map(|log| (log - largest).exp()).iter().sum::<f64>().ln()
+    let relative = logs.map(|log| log - largest);
+    let total = relative.iter().map(|log| log.exp()).sum::<f64>().ln();
+    (relative.map(|log| log - total), largest + total)
 }
 
 #[cfg(test)]

@@ -164,6 +164,15 @@ fn a_distant_fix_leaves_probabilities_normalised() {
     assert!((sum - 1.0).abs() < 1e-9 && estimate.log_likelihood.is_finite(), "{estimate:?}");
 }
 
+#[test]
+fn the_mode_probabilities_of_a_fix_twenty_kilometres_away_sum_to_one() {
+    let mut filter = ImmUkf::new(ImmUkfOptions::from_acceleration(1.0));
+    filter.step(0.01, fix_at(9_914.1, -682.0)).expect("initialised");
+    let estimate = filter.step(0.015_213_4, fix_at(-8_824.7, -7_078.8)).expect("initialised");
+    let sum: f64 = estimate.mode_probabilities.iter().sum();
+    assert!((sum - 1.0).abs() < 1e-9, "{estimate:?}");
+}
+
 proptest! {
     #[test]
     fn the_filter_stays_finite_on_any_input(

@@ -23,6 +23,8 @@ const EACH: usize = 300;
 /// holds its place for as long as a core works on it, so that as many places as cores would never all be taken: with many
 /// places the cores are the limit, with one of them refusals are.
 const PLACES: [(usize, usize); 2] = [(8, 2), (1, 1)];
+/// Connections that offer three times the capacity together.
+const OFFERING_CONNECTIONS: usize = 24;
 /// Observations of a request whose cost is that of its work, not of its transport.
 const ITEMS: usize = 1_000;
 /// Both ends are descriptors of this process, of which many systems allow 20,000.
@@ -195,9 +197,8 @@ fn at_three_times_the_capacity(places: usize, connections: usize) {
     let request = load::post(&path, "application/json", &request_body(&observations));
     let rate = |connections, pause| runtime.block_on(offered(served.address, &request, connections, pause));
     let (capacity, _) = rate(connections, Duration::ZERO);
-    let connections = 24;
-    let pause = Duration::from_secs_f64(connections as f64 / (3.0 * capacity));
-    let (goodput, refusals_ms) = rate(connections, pause);
+    let pause = Duration::from_secs_f64(OFFERING_CONNECTIONS as f64 / (3.0 * capacity));
+    let (goodput, refusals_ms) = rate(OFFERING_CONNECTIONS, pause);
     let quantile = |share: f64| refusals_ms.get((refusals_ms.len() as f64 * share) as usize);
     println!(
         "| {places} | {capacity:.0} requests/s | {:.2} | {} | {:.2} ms | {:.2} ms |",

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use tokio::sync::oneshot;
+use tokio::sync::{mpsc, oneshot};
 
 use super::{App, Page, page_of};
 use crate::domain::{
@@ -74,11 +74,9 @@ impl ConnectionRequest {
     }
 }
 
-/// Whether a connection is a source that takes messages by HTTP.
-fn takes_messages(connection: &Connection) -> Result<bool> {
-    let (settings, _) = connection_settings(connection)?;
-    let address = settings.source.as_ref().map(|source| source.address()).transpose()?;
-    Ok(!connection.profile.paused && address.is_some_and(|address| address.scheme == Scheme::Push))
+fn not_receiving(id: &ConnectionId) -> Error {
+    let message = format!("connection {id} takes no messages: it is paused, or its address is not push:");
+    Error::refused(ErrorKind::ConnectionNotReceiving, message)
 }
 
 /// The stored settings of a connection.
@@ -239,17 +237,7 @@ impl App {
     pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<()> {
         let connection = self.store.connection(id).await?;
         self.authorize_source(&connection)?;
-        let live = self.live_connection(&connection);
-        let inlet = match live.inlet() {
-            Some(inlet) => inlet,
-            None => match self.not_receiving(&connection).await? {
-                error if error.kind() != ErrorKind::ConnectionNotReceiving => return Err(error),
-                error if takes_messages(&connection)? => {
-                    live.opened_inlet(SOURCE_START).await.ok_or(error)?
-                }
-                error => return Err(error),
-            },
-        };
+        let inlet = self.inlet(&connection).await?;
         let (settled, settlement) = oneshot::channel();
         let sender = self.caller().actor().name.to_string();
         inlet.try_send(PushedMessage { sender, payload, settled }).map_err(|_| {
@@ -258,20 +246,31 @@ impl App {
         match settlement.await {
             Ok(Ok(())) => Ok(()),
             Ok(Err(reason)) => Err(Error::refused(ErrorKind::MalformedBody, reason)),
-            Err(_) => Err(self.not_receiving(&connection).await?),
+            Err(_) => {
+                self.check_receiving(&connection).await?;
+                Err(not_receiving(id))
+            }
         }
     }
 
-    /// Why this node takes no messages for a connection.
-    async fn not_receiving(&self, connection: &Connection) -> Result<Error> {
-        if takes_messages(connection)?
-            && let Some(elsewhere) = self.source_elsewhere(connection.id(), connection.key).await?
-        {
-            return Ok(elsewhere);
+    /// The way to the running source of a connection, which may only just begin.
+    async fn inlet(&self, connection: &Connection) -> Result<mpsc::Sender<PushedMessage>> {
+        let live = self.live_connection(connection);
+        if let Some(inlet) = live.inlet() {
+            return Ok(inlet);
         }
-        let id = connection.id();
-        let message = format!("connection {id} takes no messages: it is paused, or its address is not push:");
-        Ok(Error::refused(ErrorKind::ConnectionNotReceiving, message))
+        self.check_receiving(connection).await?;
+        live.opened_inlet(SOURCE_START).await.ok_or_else(|| not_receiving(connection.id()))
+    }
+
+    /// Checks that a connection is a source that takes messages by HTTP, on this node.
+    async fn check_receiving(&self, connection: &Connection) -> Result<()> {
+        let (settings, _) = connection_settings(connection)?;
+        let address = settings.source.as_ref().map(|source| source.address()).transpose()?;
+        if connection.profile.paused || address.is_none_or(|address| address.scheme != Scheme::Push) {
+            return Err(not_receiving(connection.id()));
+        }
+        self.source_elsewhere(connection.id(), connection.key).await?.map_or(Ok(()), Err)
     }
 
     /// Checks that the caller may reach every camera that a source feeds.

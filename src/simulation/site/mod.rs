@@ -25,6 +25,8 @@ use crate::domain::{
 };
 use crate::geo::{EastNorth, LocalPlane, Position};
 
+/// Width of the narrowest box that is detected, px.
+const NARROWEST_BOX_PX: f64 = 1.0;
 /// A phone's error: 8 % of its variance is white.
 const RECEIVER_CORRELATION: NoiseCorrelation = NoiseCorrelation { white_share: 0.08, time_constant_s: 30.0 };
 /// A box of which less than this share of a side is inside the image is not detected.
@@ -219,7 +221,8 @@ impl<'a> Observer<'a> {
         let cut = [edges[0].max(0.0), edges[1].max(0.0), edges[2].min(width_px), edges[3].min(height_px)];
         let is_visible = cut[2] - cut[0] > MIN_VISIBLE_SHARE * (edges[2] - edges[0])
             && cut[3] - cut[1] > MIN_VISIBLE_SHARE * (edges[3] - edges[1]);
-        let large_enough = edges[3] - edges[1] >= self.options.smallest_box_px;
+        let large_enough =
+            edges[3] - edges[1] >= self.options.smallest_box_px && cut[2] - cut[0] >= NARROWEST_BOX_PX;
         BoundingBox::new(cut[0], cut[1], cut[2] - cut[0], cut[3] - cut[1])
             .ok()
             .filter(|_| is_visible && large_enough)

@@ -75,6 +75,7 @@ fn frames(spacing_m: f64) -> Vec<CameraFrame> {
                         north_m: at[1] + 0.15 * random.sample::<f64, _>(StandardNormal),
                     },
                     covariance_m2: PlaneCovariance::isotropic(0.04),
+                    offset_covariance_m2: PlaneCovariance::isotropic(0.02),
                     common_covariance_m2: PlaneCovariance::isotropic(0.3),
                 })
                 .collect();

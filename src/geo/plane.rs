@@ -21,6 +21,18 @@ pub struct EastNorth {
 }
 
 impl EastNorth {
+    /// The sum, m.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
+        Self { east_m: self.east_m + other.east_m, north_m: self.north_m + other.north_m }
+    }
+
+    /// This less another one, m.
+    #[must_use]
+    pub fn minus(self, other: Self) -> Self {
+        Self { east_m: self.east_m - other.east_m, north_m: self.north_m - other.north_m }
+    }
+
     /// Euclidean distance, m.
     #[must_use]
     pub fn distance_m(self, other: Self) -> f64 {

@@ -2,6 +2,8 @@
 //!
 //! What never happens here: degrees, time, anything beyond two axes.
 
+use nalgebra::Matrix2;
+
 use super::EastNorth;
 
 /// 95 % radius of a bivariate normal distribution divided by its larger principal standard deviation,
@@ -148,10 +150,27 @@ impl PlaneCovariance {
             / determinant
     }
 
+    /// As a matrix, m2, axes east and north.
+    #[must_use]
+    pub const fn matrix_m2(self) -> Matrix2<f64> {
+        Matrix2::new(self.east_m2, self.east_north_m2, self.east_north_m2, self.north_m2)
+    }
+
     /// Rows of the matrix, m2.
     #[must_use]
     pub const fn rows_m2(self) -> [[f64; 2]; 2] {
         [[self.east_m2, self.east_north_m2], [self.east_north_m2, self.north_m2]]
+    }
+}
+
+impl From<Matrix2<f64>> for PlaneCovariance {
+    /// The symmetric part of a matrix, m2, axes east and north.
+    fn from(matrix: Matrix2<f64>) -> Self {
+        Self {
+            east_m2: matrix[(0, 0)],
+            north_m2: matrix[(1, 1)],
+            east_north_m2: 0.5 * (matrix[(0, 1)] + matrix[(1, 0)]),
+        }
     }
 }
 

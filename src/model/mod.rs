@@ -28,7 +28,7 @@ pub use fitting::{
     estimate_gnss_noise, fit, fit_site_models, fit_with,
 };
 pub use progress::{FitError, FitEvent};
-pub use regressor::{Regression, Regressor};
+pub use regressor::{JointError, Regression, Regressor};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use samples::sequences::fix_sequences;
 pub use site::{

@@ -11,6 +11,30 @@ use crate::domain::{BoundingBox, ImageSize, Result, RunId};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
 use crate::statistics::R95_PER_SIGMA;
 
+/// How the error of a box's position divides among cameras that were trained together, m2: parts of
+/// [`Regression::covariance`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JointError {
+    /// The run that trained them.
+    pub run: RunId,
+    /// What their maps have in common: no averaging over them removes it.
+    pub common_m2: PlaneCovariance,
+    /// What of the box's noise lasts while the target moves some metres.
+    pub lasting_noise_m2: PlaneCovariance,
+}
+
+impl JointError {
+    /// The same in other units: covariances times a factor.
+    #[must_use]
+    pub fn scaled(self, factor: f64) -> Self {
+        Self {
+            common_m2: self.common_m2.scaled(factor),
+            lasting_noise_m2: self.lasting_noise_m2.scaled(factor),
+            ..self
+        }
+    }
+}
+
 /// White share of a regression's error variance where the model does not state it.
 const DEFAULT_WHITE_SHARE: f64 = 0.3;
 /// Range of the error variance, m2: weights and radii are finite for every box.
@@ -155,20 +179,23 @@ impl Regressor {
         matches!(self.encoder, Encoder::Paper(_))
     }
 
-    /// The error that cameras which were trained together have in common at a box: the run that trained them, and the
-    /// part of [`Regression::covariance`] of this box that no averaging over them removes, m2. `None` for a
-    /// camera that was trained by itself: how much of its error others share is unknown then.
+    /// How the error of a box's position divides among cameras that were trained together. `None` for a camera that
+    /// was trained by itself: how much of its error others share is unknown then.
     #[must_use]
-    pub fn joint_error(
-        &self,
-        bounding_box: &BoundingBox,
-        regression: &Regression,
-    ) -> Option<(RunId, PlaneCovariance)> {
+    pub fn joint_error(&self, bounding_box: &BoundingBox, regression: &Regression) -> Option<JointError> {
         let joint = self.joint_map.as_ref()?;
         let map_m2 = regression.covariance.minus(regression.box_noise);
-        let common_m2 = self.encoder.widened(joint.common_m2(bounding_box));
-        let is_part = common_m2.is_finite() && map_m2.minus(common_m2).is_positive();
-        Some((joint.run(), if is_part { common_m2 } else { map_m2 }))
+        let located = joint.locate(bounding_box);
+        let common_m2 = self.encoder.widened(located.common_m2);
+        let part_of = |part: PlaneCovariance, whole: PlaneCovariance| {
+            let is_part = part.is_finite() && whole.minus(part).is_positive();
+            if is_part { part } else { whole }
+        };
+        Some(JointError {
+            run: joint.run(),
+            common_m2: part_of(common_m2, map_m2),
+            lasting_noise_m2: part_of(located.lasting_noise_m2, regression.box_noise),
+        })
     }
 
     /// Position of a box's target, with its error. Only the recipe `paper` uses the fix, which is among

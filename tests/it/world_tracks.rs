@@ -30,8 +30,8 @@ fn figure(case: &Value, name: &str) -> f64 {
     case[name].as_f64().unwrap_or_else(|| panic!("{name} of {case}"))
 }
 
-/// Cameras trained together keep identities from view to view as well as the truth would, and know what error they
-/// have in common; cameras trained apart do not.
+/// Cameras trained together keep identities from view to view as well as the truth would, and have smaller errors
+/// than cameras trained apart.
 #[test]
 fn a_simulated_site_is_tracked_over_all_its_cameras() {
     let folder = data_folder();
@@ -45,7 +45,7 @@ fn a_simulated_site_is_tracked_over_all_its_cameras() {
     assert!(lost(together, "mota") <= 0.05 && lost(together, "idf1") <= 0.05, "{together} {oracle}");
     assert!(lost(degraded, "identity_f1_by_boxes") <= 0.15, "{degraded} {oracle}");
     assert!(figure(together, "mota") > figure(apart, "mota"), "{apart}");
-    assert!(figure(together, "coverage95") > figure(apart, "coverage95"), "{apart}");
+    assert!(figure(together, "mean_error_m") < figure(apart, "mean_error_m"), "{apart}");
 }
 
 #[test]
@@ -102,13 +102,16 @@ fn shared_plaza_is_tracked_over_three_cameras() {
     let plaza = shared("plaza");
     let cases = evaluate(&plaza, "1920x1080", &[]);
     let [together, oracle, degraded, ..] = &cases[..] else { panic!("{cases:?}") };
-    // The goal is 0.97 (docs/world-tracks.md).
-    assert!(figure(together, "identity_f1_by_boxes") >= 0.94, "{together}");
+    assert!(figure(together, "identity_f1_by_boxes") >= 0.95, "{together}");
     assert!(figure(together, "handover_rate") >= 0.85, "{together}");
     assert!(figure(oracle, "mota") - figure(together, "mota") <= 0.03, "{oracle}");
     assert!(figure(oracle, "idf1") - figure(together, "idf1") <= 0.03, "{oracle}");
     assert!(figure(degraded, "identity_f1_by_boxes") >= 0.9, "{degraded}");
     let redrawn = evaluate(&plaza, "1920x1080", &["--redraws", "20"]);
+    // The goals are 0.97, 0.92 and at most 0.02 less than by true identities (docs/world-tracks.md).
+    assert!(figure(&redrawn[0], "identity_f1_by_boxes") >= 0.965, "{}", redrawn[0]);
+    assert!(figure(&redrawn[2], "identity_f1_by_boxes") >= 0.915, "{}", redrawn[2]);
+    assert!(figure(&redrawn[1], "idf1") - figure(&redrawn[0], "idf1") <= 0.02, "{}", redrawn[0]);
     assert!((0.88..=0.99).contains(&figure(&redrawn[0], "coverage95")), "{}", redrawn[0]);
     // Cameras see other targets, near or far, so each is compared on those in its view.
     for alone in &redrawn[5..] {

@@ -139,12 +139,17 @@ pub fn site_fit_rows(recording: &SiteRecording) -> (Vec<SiteFix>, Vec<SitePair>)
             }
         }
     }
-    let pairs = at_once.values().flat_map(|seen| {
-        seen.iter().enumerate().flat_map(move |(index, one)| {
-            seen[index + 1..]
-                .iter()
-                .map(move |other| SitePair { cameras: [one.0, other.0], boxes: [one.1, other.1] })
-        })
+    let pairs = at_once.iter().flat_map(|((time, target), seen)| {
+        let time_s = time.duration_since(start).as_secs_f64();
+        let pair = move |one: &(usize, BoundingBox), other: &(usize, BoundingBox)| SitePair {
+            target: *target as u32,
+            time_s,
+            cameras: [one.0, other.0],
+            boxes: [one.1, other.1],
+        };
+        seen.iter()
+            .enumerate()
+            .flat_map(move |(index, one)| seen[index + 1..].iter().map(move |other| pair(one, other)))
     });
     (recording.fixes.iter().filter_map(site_fix).collect(), pairs.collect())
 }
@@ -222,7 +227,8 @@ fn detection(
         tracker_id: Some(labelled.tracker_id.clone()),
         receiver: named.and_then(|target| ReceiverId::new(recording.targets[target].as_str()).ok()),
         position: located.position,
-        covariance_m2: located.box_noise_m2.plus(located.relative_m2),
+        covariance_m2: located.box_noise_m2,
+        offset_covariance_m2: located.relative_m2.plus(located.lasting_noise_m2),
         common_covariance_m2: located.common_m2,
     }
 }

@@ -59,7 +59,7 @@ fn run(settings: TrackSettings, walk: &Walk, seeds: std::ops::Range<u64>, second
             summary.error_m += state.position.distance_m(*truth);
             summary.gnss_error_m += fix.position.distance_m(*truth);
             summary.two_step_error_m += two_step.distance_m(*truth);
-            summary.nees += state.covariance.mahalanobis_squared(minus(state.position, *truth));
+            summary.nees += state.covariance.mahalanobis_squared(state.position.minus(*truth));
             summary.inside += f64::from(u8::from(state.position.distance_m(*truth) <= state.r95_m));
             summary.rejected += state.rejected.len();
             for innovation in &state.innovations {
@@ -75,10 +75,6 @@ fn run(settings: TrackSettings, walk: &Walk, seeds: std::ops::Range<u64>, second
     summary.inside /= steps;
     summary.nis = summary.nis.map(|sum| sum / steps);
     summary
-}
-
-fn minus(a: EastNorth, b: EastNorth) -> EastNorth {
-    EastNorth { east_m: a.east_m - b.east_m, north_m: a.north_m - b.north_m }
 }
 
 /// A fix alone, with the square of its sigma.
@@ -201,7 +197,7 @@ fn the_estimated_noise_improves_tracks_of_white_and_of_correlated_receivers() {
 
 fn residual(measurement: &Measurement) -> TimedResidual {
     let (fix, regressed) = (measurement.fix.expect("there"), measurement.regressed.expect("there"));
-    TimedResidual { time: measurement.time, difference: minus(fix.position, regressed.position) }
+    TimedResidual { time: measurement.time, difference: fix.position.minus(regressed.position) }
 }
 
 #[test]

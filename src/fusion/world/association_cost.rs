@@ -1,13 +1,14 @@
 //! How unlikely it is that a detection is of a track: the cost of the pair in the assignment.
 //!
 //! ```text
-//! cost = -ln(exp(-c) + kappa)      c = (d^2 + ln |S|) / 2 - bonus of the own id
+//! cost = ln beta - ln(exp(-c) + kappa)      c = (d^2 + ln |S|) / 2 - bonus of the own id
 //! ```
 //!
-//! d^2 is the squared Mahalanobis distance of detection and prediction, S its covariance (Blackman and Popoli
-//! 1999, 6.4). `kappa` is 0 but for a target that the camera's own tracker follows without a gap: it may move
-//! beyond the motion model.
+//! d^2 is the squared Mahalanobis distance of detection and prediction, S its covariance, beta the density of targets
+//! without a track, so that a detection starts one at the cost 0 (Blackman and Popoli 1999, 6.4). `kappa` is 0 but
+//! for a target that the camera's own tracker follows without a gap: it may move beyond the motion model.
 
+use super::camera_offset::CameraOffset;
 use super::frame::{CameraFrame, WorldDetection};
 use super::settings::WorldTrackSettings;
 use super::world_track::{WorldTrack, seconds_from};
@@ -28,6 +29,8 @@ pub(super) struct PredictedTrack<'a> {
     frame: &'a CameraFrame,
     /// The id that the camera's tracker gave the target last.
     tracker_id: Option<&'a TargetId>,
+    /// The camera's offset when it saw the target last, and the time since, s.
+    offset: Option<(CameraOffset, f64)>,
     position: EastNorth,
     covariance_m2: PlaneCovariance,
     /// Distance within which the camera's tracker may follow the target, m; 0 if it does not.
@@ -45,11 +48,39 @@ impl<'a> PredictedTrack<'a> {
         };
         let (position, covariance_m2) = (track.filter.position(), track.gating_covariance());
         let tracker_id = sighting.and_then(|sighting| sighting.tracker_id.as_ref());
-        Self { track, frame, tracker_id, position, covariance_m2, followed_within_m }
+        let offset = sighting.map(|sighting| (sighting.offset, since_s));
+        Self { track, frame, tracker_id, offset, position, covariance_m2, followed_within_m }
     }
 
-    /// The cost of a detection; `None` beyond the gates.
-    pub(super) fn cost(&self, detection: &WorldDetection, settings: &WorldTrackSettings) -> Option<f64> {
+    /// The offset that a detection is expected to have.
+    pub(super) fn offset(&self, detection: &WorldDetection, settings: &WorldTrackSettings) -> CameraOffset {
+        let own_m2 = detection.offset_covariance_m2;
+        match self.offset {
+            Some((offset, since_s)) => offset.after(since_s, settings.offset_time_constant_s, own_m2),
+            None => CameraOffset::unknown(own_m2, self.track.offset_covariance_m2),
+        }
+    }
+
+    /// The innovation of a detection, m, and its covariance, m2.
+    pub(super) fn innovation(
+        &self,
+        detection: &WorldDetection,
+        settings: &WorldTrackSettings,
+    ) -> (EastNorth, PlaneCovariance) {
+        let offset = self.offset(detection, settings);
+        let position = self.track.moved_to_state_time(detection.position, self.frame.time);
+        let noise_m2 = settings.measurement_covariance(detection);
+        let s = self.covariance_m2.plus(noise_m2).plus(offset.covariance_m2);
+        (offset.removed_from(position).minus(self.position), s)
+    }
+
+    /// The cost of a detection where targets without a track have that density (1/m2); `None` beyond the gates.
+    pub(super) fn cost(
+        &self,
+        detection: &WorldDetection,
+        birth_density_per_m2: f64,
+        settings: &WorldTrackSettings,
+    ) -> Option<f64> {
         let same_receiver = match (&self.track.receiver, &detection.receiver) {
             (Some(own), Some(other)) if own != other => return None,
             (Some(_), Some(_)) => true,
@@ -57,9 +88,7 @@ impl<'a> PredictedTrack<'a> {
             _ if self.track.is_measured_by_receiver() => return None,
             _ => false,
         };
-        let s = self.covariance_m2.plus(settings.measurement_covariance(detection));
-        let position = self.track.moved_to_state_time(detection.position, self.frame.time);
-        let difference = difference_m(position, self.position);
+        let (difference, s) = self.innovation(detection, settings);
         let distance_m2 = difference.east_m.powi(2) + difference.north_m.powi(2);
         // d^2 is at least the squared distance divided by the trace of S.
         let least = distance_m2 / (s.east_m2 + s.north_m2);
@@ -76,13 +105,9 @@ impl<'a> PredictedTrack<'a> {
         }
         let bonus = if is_own { settings.own_id_bonus } else { 0.0 };
         let gaussian = 0.5 * (squared.min(RECEIVER_BONUS) + s.determinant().ln()) - bonus;
-        let kappa = if is_followed { settings.followed_density_per_m2 } else { 0.0 };
-        let cost = if kappa > 0.0 { -((-gaussian).exp() + kappa).ln() } else { gaussian };
+        let kappa = if is_followed { settings.followed_density_ratio * birth_density_per_m2 } else { 0.0 };
+        let log_density = if kappa > 0.0 { ((-gaussian).exp() + kappa).ln() } else { -gaussian };
+        let cost = birth_density_per_m2.ln() - log_density;
         Some(if same_receiver { cost - RECEIVER_BONUS } else { cost })
     }
-}
-
-/// `one - other`, m.
-pub(super) fn difference_m(one: EastNorth, other: EastNorth) -> EastNorth {
-    EastNorth { east_m: one.east_m - other.east_m, north_m: one.north_m - other.north_m }
 }

@@ -28,7 +28,7 @@ impl ConstantVelocityFilter {
     /// At a measured position, with a velocity about zero.
     pub(super) fn new(position: EastNorth, r: PlaneCovariance, speed_sigma_m_s: f64) -> Self {
         let mut covariance = Matrix4::zeros();
-        covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(&matrix(r));
+        covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(&r.matrix_m2());
         covariance[(2, 2)] = speed_sigma_m_s * speed_sigma_m_s;
         covariance[(3, 3)] = speed_sigma_m_s * speed_sigma_m_s;
         let mean = Vector4::new(position.east_m, position.north_m, 0.0, 0.0);
@@ -62,7 +62,7 @@ impl ConstantVelocityFilter {
     /// Takes a measured position in; `r` is the covariance of its error, m2.
     pub(super) fn update(&mut self, measured: EastNorth, r: PlaneCovariance) {
         let measured = Vector2::new(measured.east_m, measured.north_m);
-        let log_likelihoods = [0, 1].map(|mode| self.modes[mode].update(measured, matrix(r)));
+        let log_likelihoods = [0, 1].map(|mode| self.modes[mode].update(measured, r.matrix_m2()));
         let largest = log_likelihoods[0].max(log_likelihoods[1]);
         let weights: [f64; 2] = std::array::from_fn(|mode| {
             (self.mode_probabilities[mode] * (log_likelihoods[mode] - largest).exp()).max(LEAST_PROBABILITY)
@@ -75,7 +75,7 @@ impl ConstantVelocityFilter {
     pub(super) fn inflate_position(&mut self, added: PlaneCovariance) {
         for mode in &mut self.modes {
             let mut position = mode.covariance.fixed_view_mut::<2, 2>(0, 0);
-            position += matrix(added);
+            position += added.matrix_m2();
         }
     }
 
@@ -148,9 +148,4 @@ fn moment_match(modes: &[Gaussian; 2], weights: [f64; 2]) -> Gaussian {
     let apart = modes[0].mean - modes[1].mean;
     let covariance = modes[0].covariance * p + modes[1].covariance * q + apart * apart.transpose() * (p * q);
     Gaussian { mean, covariance }
-}
-
-fn matrix(covariance: PlaneCovariance) -> Matrix2<f64> {
-    let PlaneCovariance { east_m2, north_m2, east_north_m2 } = covariance;
-    Matrix2::new(east_m2, east_north_m2, east_north_m2, north_m2)
 }

@@ -28,9 +28,9 @@ pub struct CameraFrame {
     pub detections: Vec<WorldDetection>,
 }
 
-/// One detection as a position in the site's plane. Its error has three parts: the box's noise, the error of the
-/// camera's own map, and the error that the maps of all cameras of the site have in common because they were
-/// trained on the same receivers.
+/// One detection as a position in the site's plane. Its error has three parts: the box's noise, what lasts of the
+/// camera's own error, and the error that the maps of all cameras of the site have in common because they were trained
+/// on the same receivers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldDetection {
     /// The id that the camera's own tracker gave the target.
@@ -39,9 +39,11 @@ pub struct WorldDetection {
     pub receiver: Option<ReceiverId>,
     /// Regressed position, m.
     pub position: EastNorth,
-    /// Covariance of the error that differs between cameras: the box's noise and the camera's own part of its
-    /// map's error (V_rel), m2.
+    /// Covariance of the error that differs from box to box, m2.
     pub covariance_m2: PlaneCovariance,
+    /// Covariance of the error that differs between cameras and lasts while the target moves some metres: the camera's
+    /// own part of its map's error (V_rel) and the lasting part of the box's, m2.
+    pub offset_covariance_m2: PlaneCovariance,
     /// Covariance of the error that all cameras have in common at that place (V_com), m2; zero if unknown.
     pub common_covariance_m2: PlaneCovariance,
 }

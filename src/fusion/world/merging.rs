@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 
-use super::association_cost::difference_m;
 use super::frame::WorldTrackId;
 use super::settings::WorldTrackSettings;
 use super::world_track::{WorldTrack, seconds_from};
@@ -75,7 +74,8 @@ fn is_comparable(one: &WorldTrack, other: &WorldTrack) -> bool {
 }
 
 fn are_at_one_place(one: &WorldTrack, other: &WorldTrack) -> bool {
-    let difference = difference_m(one.filter.position(), other.filter.position());
-    let covariance = one.gating_covariance().plus(other.gating_covariance());
+    let difference = one.filter.position().minus(other.filter.position());
+    let offsets_m2 = one.offset_covariance_m2.plus(other.offset_covariance_m2);
+    let covariance = one.gating_covariance().plus(other.gating_covariance()).plus(offsets_m2);
     covariance.mahalanobis_squared(difference) <= SAME_PLACE
 }

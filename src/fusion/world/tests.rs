@@ -27,6 +27,7 @@ fn seen(position: EastNorth, tracker_id: Option<&str>) -> WorldDetection {
         receiver: None,
         position,
         covariance_m2: PlaneCovariance::isotropic(0.04),
+        offset_covariance_m2: PlaneCovariance::isotropic(0.01),
         common_covariance_m2: PlaneCovariance::isotropic(0.25),
     }
 }
@@ -251,4 +252,60 @@ fn a_lost_track_is_reported_once() {
     let lost = tracker.advance(at_s(4.0));
     assert!(matches!(lost[..], [TimedEvent { event: WorldEvent::Lost { .. }, .. }]), "{lost:?}");
     assert!(tracker.advance(at_s(5.0)).is_empty());
+}
+
+/// Two people side by side, 1.1 m apart, whom camera b sees half a metre beside camera a; after 20 s the tracker of
+/// camera b exchanges their ids. Returns how many boxes are on the other one's track after that.
+fn exchanged_boxes(settings: WorldTrackSettings) -> usize {
+    let plane = *tracker().plane();
+    let (mut tracker, mut random) = (WorldTracker::new(plane, settings), stream(3, 0));
+    let mut tracks = Vec::new();
+    let mut exchanged = 0;
+    for step in 0..80 {
+        let seconds = 0.5 * f64::from(step);
+        for (camera, offset_m, ids) in
+            [("a", 0.0, ["1", "2"]), ("b", 0.5, if step < 40 { ["8", "9"] } else { ["9", "8"] })]
+        {
+            let detections = [0.0, 1.1].into_iter().zip(ids).map(|(east_m, id)| {
+                let noise = [0; 2].map(|_| 0.1 * standard_normal(&mut random));
+                let position = at(east_m + offset_m + noise[0], 0.8 * seconds + noise[1]);
+                WorldDetection {
+                    offset_covariance_m2: PlaneCovariance::isotropic(0.1),
+                    covariance_m2: PlaneCovariance::isotropic(0.02),
+                    ..seen(position, Some(id))
+                }
+            });
+            let outcome = tracker.observe(&frame(camera, seconds, detections.collect()));
+            match step {
+                39 => tracks.clone_from(&outcome.tracks),
+                40.. => exchanged += usize::from(outcome.tracks != tracks),
+                _ => {}
+            }
+        }
+    }
+    exchanged
+}
+
+#[test]
+fn neighbours_are_told_apart_by_the_offset_of_each_camera() {
+    let settings = WorldTrackSettings::default();
+    let forgetful = WorldTrackSettings { offset_time_constant_s: 1e-6, ..settings.clone() };
+    let (with, without) = (exchanged_boxes(settings), exchanged_boxes(forgetful));
+    println!("{with} frames exchanged, {without} without a state per camera");
+    assert_eq!(with, 0);
+    assert!(without > 0);
+}
+
+/// However many frames are averaged, the error that lasts is stated.
+#[test]
+fn a_lasting_error_does_not_average_out() {
+    let mut tracker = tracker();
+    for step in 0..200 {
+        let seconds = 0.1 * f64::from(step);
+        tracker.observe(&frame("a", seconds, vec![seen(at(seconds, 0.0), Some("7"))]));
+    }
+    let state = tracker.tracks().next().expect("a track").state();
+    let lasting_m2 = 0.01 + 0.25;
+    assert!(state.covariance_m2.east_m2 > lasting_m2, "{state:?}");
+    assert!(state.covariance_m2.east_m2 < lasting_m2 + 0.04, "{state:?}");
 }

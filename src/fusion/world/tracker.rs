@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 
 use super::assignment::{Candidate, assign};
-use super::association_cost::{PredictedTrack, difference_m};
+use super::association_cost::PredictedTrack;
 use super::frame::{
     CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };
@@ -97,8 +97,8 @@ impl WorldTracker {
         }
         let processed = frame.detections.len().min(self.settings.max_detections);
         let detections = &frame.detections[..processed];
-        let unassigned_cost = -self.settings.birth_density_per_m2.ln();
-        let assigned = assign(processed, &self.candidates(frame, detections), unassigned_cost);
+        // A detection starts a track at the cost 0: the density of new targets is in the costs of its pairs.
+        let assigned = assign(processed, &self.candidates(frame, detections), 0.0);
         let mut indexes = Vec::with_capacity(processed);
         for (detection, track) in detections.iter().zip(assigned) {
             indexes.push(match track {
@@ -163,10 +163,12 @@ impl WorldTracker {
     /// The pairs of detection and track within the gates.
     fn candidates(&self, frame: &CameraFrame, detections: &[WorldDetection]) -> Vec<Candidate> {
         let mut candidates = Vec::new();
+        let births_per_m2: Vec<f64> =
+            detections.iter().map(|detection| self.settings.birth_density_per_m2(detection)).collect();
         for (column, track) in self.tracks.iter().enumerate() {
             let predicted = PredictedTrack::new(track, frame, &self.settings);
-            for (row, detection) in detections.iter().enumerate() {
-                if let Some(cost) = predicted.cost(detection, &self.settings) {
+            for (row, (detection, birth_per_m2)) in detections.iter().zip(&births_per_m2).enumerate() {
+                if let Some(cost) = predicted.cost(detection, *birth_per_m2, &self.settings) {
                     candidates.push(Candidate { row, column, cost });
                 }
             }
@@ -183,13 +185,14 @@ impl WorldTracker {
         detection: &WorldDetection,
         events: &mut Vec<TimedEvent>,
     ) {
+        let predicted = PredictedTrack::new(&self.tracks[index], frame, &self.settings);
+        let offset = predicted.offset(detection, &self.settings);
+        let (innovation, s) = predicted.innovation(detection, &self.settings);
         let track = &mut self.tracks[index];
-        let s = track.gating_covariance().plus(self.settings.measurement_covariance(detection));
-        let difference = difference_m(detection.position, track.filter.position());
-        if s.mahalanobis_squared(difference) > self.settings.own_id_gate {
-            track.filter.inflate_position(PlaneCovariance::outer(difference.east_m, difference.north_m));
+        if s.mahalanobis_squared(innovation) > self.settings.own_id_gate {
+            track.filter.inflate_position(PlaneCovariance::outer(innovation.east_m, innovation.north_m));
         }
-        if let Some(from) = track.observe(&frame.camera, frame.time, detection, &self.settings) {
+        if let Some(from) = track.observe(frame, detection, offset, &self.settings) {
             let event = WorldEvent::HandedOver { track: track.id, from, to: frame.camera.clone() };
             events.push(TimedEvent { time: frame.time, event });
         }

@@ -2,8 +2,9 @@
 
 use jiff::Timestamp;
 
+use super::camera_offset::CameraOffset;
 use super::constant_velocity::ConstantVelocityFilter;
-use super::frame::{WorldDetection, WorldTrackId};
+use super::frame::{CameraFrame, WorldDetection, WorldTrackId};
 use super::settings::WorldTrackSettings;
 use crate::domain::{CameraId, ReceiverId, TargetId};
 use crate::geo::{EastNorth, PlaneCovariance};
@@ -28,6 +29,8 @@ pub struct Sighting {
     pub tracker_id: Option<TargetId>,
     /// When it saw the target last.
     pub last_seen: Timestamp,
+    /// Its offset from the track then.
+    pub(super) offset: CameraOffset,
 }
 
 /// The estimated state of a target at one instant.
@@ -48,6 +51,8 @@ pub struct WorldTrack {
     pub(super) filter: ConstantVelocityFilter,
     /// Instant of the filter's state.
     pub(super) time: Timestamp,
+    /// Covariance of the lasting error of the camera that measured it last, m2.
+    pub(super) offset_covariance_m2: PlaneCovariance,
     /// Covariance of the error that the latest measurements have in common, m2.
     common_covariance_m2: PlaneCovariance,
     /// Whether the latest measurement was a fix.
@@ -72,9 +77,11 @@ impl WorldTrack {
         let covariance_m2 = settings.measurement_covariance(detection);
         let mut track = Self::at(id, time, detection.position, covariance_m2, settings);
         track.receiver.clone_from(&detection.receiver);
+        track.offset_covariance_m2 = detection.offset_covariance_m2;
         track.common_covariance_m2 = detection.common_covariance_m2;
         track.detections = 1;
-        track.record_sighting(camera, time, detection.tracker_id.as_ref());
+        // The track is where this camera sees the target: its offset is known to be 0.
+        track.record_sighting(camera, time, detection.tracker_id.as_ref(), CameraOffset::default());
         track
     }
 
@@ -107,6 +114,7 @@ impl WorldTrack {
             id,
             filter: ConstantVelocityFilter::new(position, covariance_m2, settings.birth_speed_sigma_m_s),
             time,
+            offset_covariance_m2: PlaneCovariance::default(),
             common_covariance_m2: PlaneCovariance::default(),
             measured_by_receiver: false,
             born: time,
@@ -187,10 +195,11 @@ impl WorldTrack {
     /// The state at [`Self::time`].
     #[must_use]
     pub fn state(&self) -> WorldState {
+        let lasting_m2 = self.offset_covariance_m2.plus(self.common_covariance_m2);
         WorldState {
             position: self.filter.position(),
             velocity_m_s: self.filter.velocity_m_s(),
-            covariance_m2: self.filter.position_covariance().plus(self.common_covariance_m2),
+            covariance_m2: self.filter.position_covariance().plus(lasting_m2),
         }
     }
 
@@ -221,26 +230,32 @@ impl WorldTrack {
         if self.measured_by_receiver { filtered.plus(self.common_covariance_m2) } else { filtered }
     }
 
-    /// Takes a detection in; the state is at the frame's time, or later than a late frame.
-    /// Returns the camera that saw the target last, if this is another one's first sight of it since.
+    /// Takes a detection in, which is expected to have that offset; the state is at the frame's time, or later than a
+    /// late frame. Returns the camera that saw the target last, if this is another one's first sight of it since.
     pub(super) fn observe(
         &mut self,
-        camera: &CameraId,
-        time: Timestamp,
+        frame: &CameraFrame,
         detection: &WorldDetection,
+        offset: CameraOffset,
         settings: &WorldTrackSettings,
     ) -> Option<CameraId> {
+        let CameraFrame { camera, time, .. } = frame;
+        let time = *time;
         if self.measured_by_receiver {
             self.filter.inflate_position(self.common_covariance_m2);
             self.measured_by_receiver = false;
         }
-        let position = self.moved_to_state_time(detection.position, time);
-        self.filter.update(position, settings.measurement_covariance(detection));
+        let position = offset.removed_from(self.moved_to_state_time(detection.position, time));
+        let r = settings.measurement_covariance(detection).plus(offset.covariance_m2);
+        let s = self.filter.position_covariance().plus(r);
+        let offset = offset.updated(position.minus(self.filter.position()), s);
+        self.filter.update(position, r);
+        self.offset_covariance_m2 = detection.offset_covariance_m2;
         self.common_covariance_m2 = detection.common_covariance_m2;
         self.detections += 1;
         let from = self.handed_over_from(camera, time, settings);
         self.last_seen = self.last_seen.max(time);
-        self.record_sighting(camera, time, detection.tracker_id.as_ref());
+        self.record_sighting(camera, time, detection.tracker_id.as_ref(), offset);
         from
     }
 
@@ -248,10 +263,7 @@ impl WorldTrack {
     pub(super) fn moved_to_state_time(&self, position: EastNorth, time: Timestamp) -> EastNorth {
         let late_s = seconds_from(time, self.time).max(0.0);
         let [east_m_s, north_m_s] = self.filter.velocity_m_s();
-        EastNorth {
-            east_m: position.east_m + late_s * east_m_s,
-            north_m: position.north_m + late_s * north_m_s,
-        }
+        position.plus(EastNorth { east_m: late_s * east_m_s, north_m: late_s * north_m_s })
     }
 
     /// Takes a fix in. While cameras see the target, they determine its position: a receiver's error lasts for
@@ -274,6 +286,7 @@ impl WorldTrack {
             // The first fix after a camera meets a state without the receiver's bias.
             let r = if self.measured_by_receiver { white } else { white.plus(coloured) };
             self.filter.update(position, r);
+            self.offset_covariance_m2 = PlaneCovariance::default();
             self.common_covariance_m2 = coloured;
             self.measured_by_receiver = true;
         }
@@ -300,13 +313,20 @@ impl WorldTrack {
     }
 
     /// Takes over what another track of the same target knows.
-    pub(super) fn absorb(&mut self, other: Self) {
+    pub(super) fn absorb(&mut self, mut other: Self) {
+        let apart = other.filter.position().minus(self.filter.position());
+        let apart_m2 = other.gating_covariance().plus(self.gating_covariance());
         if other.last_seen > self.last_seen {
+            let back = EastNorth::default().minus(apart);
+            self.sightings.iter_mut().for_each(|it| it.offset = it.offset.on_other_track(back, apart_m2));
             self.filter = other.filter;
             self.time = other.time;
+            self.offset_covariance_m2 = other.offset_covariance_m2;
             self.common_covariance_m2 = other.common_covariance_m2;
             self.measured_by_receiver = other.measured_by_receiver;
             self.last_seen = other.last_seen;
+        } else {
+            other.sightings.iter_mut().for_each(|it| it.offset = it.offset.on_other_track(apart, apart_m2));
         }
         self.born = self.born.min(other.born);
         self.detections += other.detections;
@@ -334,17 +354,23 @@ impl WorldTrack {
         (is_new && latest.camera != *camera).then(|| latest.camera.clone())
     }
 
-    fn record_sighting(&mut self, camera: &CameraId, time: Timestamp, tracker_id: Option<&TargetId>) {
+    fn record_sighting(
+        &mut self,
+        camera: &CameraId,
+        time: Timestamp,
+        tracker_id: Option<&TargetId>,
+        offset: CameraOffset,
+    ) {
         match self.sightings.iter_mut().find(|it| it.camera == *camera) {
             Some(own) => {
                 own.last_seen = own.last_seen.max(time);
                 own.tracker_id = tracker_id.cloned();
+                own.offset = offset;
             }
-            None => self.sightings.push(Sighting {
-                camera: camera.clone(),
-                tracker_id: tracker_id.cloned(),
-                last_seen: time,
-            }),
+            None => {
+                let (camera, tracker_id) = (camera.clone(), tracker_id.cloned());
+                self.sightings.push(Sighting { camera, tracker_id, last_seen: time, offset });
+            }
         }
     }
 }

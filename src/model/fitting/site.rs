@@ -28,7 +28,7 @@ use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
 use crate::model::regressor::Regressor;
 use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
 use crate::model::samples::target_groups::groups_of_targets;
-use crate::model::site::rows::{SiteRows, TargetPair};
+use crate::model::site::rows::SiteRows;
 use crate::model::site::{
     RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, fit_site_observed,
 };
@@ -245,8 +245,8 @@ impl SiteFit<'_> {
         Ok(())
     }
 
-    fn pairs(&self, keep: impl Fn(&TargetPair) -> bool) -> Vec<SitePair> {
-        self.site.pairs.iter().filter(|pair| keep(pair)).map(|pair| pair.pair).collect()
+    fn pairs(&self, keep: impl Fn(&SitePair) -> bool) -> Vec<SitePair> {
+        self.site.pairs.iter().filter(|pair| keep(pair)).copied().collect()
     }
 
     /// The form of the maps whose held-out residuals are the smaller, by their mean squares over all cameras with every
@@ -350,7 +350,7 @@ impl SiteFit<'_> {
             let is_kept = |receiver, time_s| self.groups.of(receiver, time_s) != group;
             let kept = self.site.fixes.iter().filter(|fix| is_kept(fix.receiver, fix.time_s));
             let fixes: Vec<SiteFix> = kept.cloned().collect();
-            let pairs = self.pairs(|pair| is_kept(pair.receiver, pair.time_s));
+            let pairs = self.pairs(|pair| is_kept(pair.target, pair.time_s));
             let together = self.fit(form, &fixes, &pairs, run)?;
             let apart = self.fit_apart(form, &fixes, run)?;
             for (camera, own) in validation.cameras.iter_mut().enumerate() {
@@ -360,8 +360,8 @@ impl SiteFit<'_> {
                     residuals
                 });
             }
-            let left_out = self.site.pairs.iter().filter(|pair| !is_kept(pair.receiver, pair.time_s));
-            for TargetPair { pair, .. } in left_out {
+            let left_out = self.site.pairs.iter().filter(|pair| !is_kept(pair.target, pair.time_s));
+            for pair in left_out {
                 let [one, other] =
                     [0, 1].map(|at| together.locate(pair.cameras[at], &pair.boxes[at]).position);
                 validation.disagreement[0].add(one.distance_m(other));

@@ -2,8 +2,10 @@
 
 use std::ops::ControlFlow;
 
+use nalgebra::Vector2;
+
 use super::ground_map::GroundMap;
-use super::input::{FEWEST_ROWS, SiteFitError, SiteFitInput, SiteFix, foot_and_size, is_foot_cut};
+use super::input::{FEWEST_ROWS, SiteFitError, SiteFitInput, SiteFix, SitePair, foot_and_size, is_foot_cut};
 use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
 use super::maps::SiteMaps;
 use crate::domain::GaussMarkovNoise;
@@ -27,6 +29,13 @@ const MAX_RECEIVER_ROWS: usize = 300;
 const LEAST_RECEIVER_ROWS: usize = 10;
 const MAX_TRANSFERS: usize = 60_000;
 const MAX_PAIR_TRANSFERS: usize = 4_000;
+/// Between two boxes of which the noise of a detector is independent, s, and the largest lag at which a target is near
+/// the place where it was.
+const LASTING_LAG_S: [f64; 2] = [2.0, 6.0];
+/// Largest difference of two feet that counts, in standard deviations.
+const LARGEST_DIFFERENCE: f64 = 4.0;
+/// Largest share of the feet's variance that lasts.
+const MOST_LASTING: f64 = 0.9;
 /// Median of a chi-square variable with 2 degrees of freedom: 2 ln 2.
 const MEDIAN_CHI_SQUARE: f64 = 1.386;
 
@@ -62,11 +71,13 @@ pub(crate) fn fit_site_observed(
         problem.foot_priors = foot_priors(&mut geometries, &maps);
         covariance = problem.solve(&mut maps, observer)?;
     }
+    let foot_lasting_share = lasting_share(input, &maps, problem.foot_sigma_px);
     let views_px = (0..maps.len()).map(|camera| view_px(&problem, camera)).collect();
     Ok(SiteMaps {
         maps,
         covariance,
         foot_sigma_px: problem.foot_sigma_px,
+        foot_lasting_share,
         noise: problem.noise(),
         image_sizes: input.image_sizes.to_vec(),
         views_px,
@@ -90,6 +101,41 @@ impl LeastSquaresProblem {
             self.foot_sigma_px = sigma_px.clamp(FOOT_SIGMA_RANGE_PX[0], FOOT_SIGMA_RANGE_PX[1]);
         }
     }
+}
+
+/// Share of the feet's variance that lasts: the autocovariance of the differences between two cameras over the lags of
+/// [`LASTING_LAG_S`], by their mean square, with every difference limited to [`LARGEST_DIFFERENCE`]. A homography that is
+/// not quite the camera's, and a box whose foot is not below its target, differ for as long as the target is
+/// near a place.
+fn lasting_share(input: &SiteFitInput<'_>, maps: &[GroundMap], foot_sigma_px: f64) -> f64 {
+    let mut pairs: Vec<&SitePair> = input.pairs.iter().collect();
+    pairs.sort_by(|one, other| {
+        let key = |pair: &SitePair| (pair.cameras, pair.target);
+        key(one).cmp(&key(other)).then(one.time_s.total_cmp(&other.time_s))
+    });
+    let (mut product, mut square, mut count) = (0.0, 0.0, 0);
+    for own in pairs.chunk_by(|one, next| (one.cameras, one.target) == (next.cameras, next.target)) {
+        let differences: Vec<(f64, Vector2<f64>)> = own
+            .iter()
+            .filter_map(|pair| {
+                let transfer =
+                    Transfer { cameras: pair.cameras, feet: pair.boxes.map(|it| foot_and_size(&it)) };
+                let difference = transfer.difference(maps)? / foot_sigma_px;
+                Some((pair.time_s, difference * (LARGEST_DIFFERENCE / difference.norm()).min(1.0)))
+            })
+            .collect();
+        for (at, (time_s, difference)) in differences.iter().enumerate() {
+            let [least_s, greatest_s] = LASTING_LAG_S;
+            let later = differences[at..].partition_point(|(later_s, _)| later_s - time_s < least_s);
+            let Some((later_s, later)) = differences.get(at + later) else { continue };
+            if later_s - time_s <= greatest_s {
+                product += difference.dot(later);
+                square += 0.5 * (difference.norm_squared() + later.norm_squared());
+                count += 1;
+            }
+        }
+    }
+    if count < FEWEST_ROWS { 0.0 } else { (product / square).clamp(0.0, MOST_LASTING) }
 }
 
 /// The fixes by receiver, without cut boxes.

@@ -33,6 +33,10 @@ impl SiteFix {
 /// One target in two cameras at one instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SitePair {
+    /// Number of the target: that of its receiver, where it has one.
+    pub target: u32,
+    /// Since any fixed instant, s.
+    pub time_s: f64,
     /// Indexes of the cameras.
     pub cameras: [usize; 2],
     /// The target's box in each.

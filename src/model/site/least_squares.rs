@@ -43,6 +43,15 @@ pub(super) struct Transfer {
     pub(super) feet: [Box4; 2],
 }
 
+impl Transfer {
+    /// The carried foot less the one in the second view, px, scaled to the noise of one foot; `None` where it cannot be
+    /// carried over.
+    pub(super) fn difference(&self, maps: &[GroundMap]) -> Option<Vector2<f64>> {
+        let carried = Carried::new(maps, self)?;
+        Some(carried.residual_px / carried.variance_factor.sqrt())
+    }
+}
+
 /// All rows with their noise.
 pub(super) struct LeastSquaresProblem {
     /// Fixes by receiver, in the order of time.
@@ -158,11 +167,8 @@ impl LeastSquaresProblem {
 
     /// Squared standardised distances of the transfers that can be made, with unit foot noise.
     pub(super) fn transfer_distances(&self, maps: &[GroundMap]) -> Vec<f64> {
-        let squared = |transfer: &Transfer| {
-            let carried = Carried::new(maps, transfer)?;
-            Some(carried.residual_px.norm_squared() / carried.variance_factor)
-        };
-        self.transfers.iter().filter_map(squared).collect()
+        let differences = self.transfers.iter().filter_map(|transfer| transfer.difference(maps));
+        differences.map(|difference| difference.norm_squared()).collect()
     }
 
     fn cost(&self, maps: &[GroundMap]) -> f64 {

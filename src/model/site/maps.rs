@@ -18,8 +18,10 @@ const VIEW_MARGIN: f64 = 0.1;
 pub struct SitePosition {
     /// In the site's plane, m.
     pub position: EastNorth,
-    /// Covariance of the box's noise, independent from box to box, m2.
+    /// Covariance of the box's noise that is independent from box to box, m2.
     pub box_noise_m2: PlaneCovariance,
+    /// Covariance of the box's noise that lasts while the target moves some metres, m2.
+    pub lasting_noise_m2: PlaneCovariance,
     /// Covariance of the part of the map's error that other cameras do not share (V_rel), m2.
     pub relative_m2: PlaneCovariance,
     /// Covariance of the part of the map's error that all cameras which see the place have in common (V_com), m2.
@@ -30,7 +32,7 @@ impl SitePosition {
     /// Covariance of the whole error, m2.
     #[must_use]
     pub fn covariance_m2(&self) -> PlaneCovariance {
-        self.box_noise_m2.plus(self.relative_m2).plus(self.common_m2)
+        self.box_noise_m2.plus(self.lasting_noise_m2).plus(self.relative_m2).plus(self.common_m2)
     }
 }
 
@@ -41,6 +43,8 @@ pub struct SiteMaps {
     /// Of all parameters, camera by camera.
     pub(super) covariance: DMatrix<f64>,
     pub(super) foot_sigma_px: f64,
+    /// Share of the feet's variance that lasts while a target moves some metres.
+    pub(super) foot_lasting_share: f64,
     pub(super) noise: GaussMarkovNoise,
     pub(super) image_sizes: Vec<Option<ImageSize>>,
     /// Extent of the feet of training per camera: least and greatest u and v, px.
@@ -52,6 +56,12 @@ impl SiteMaps {
     #[must_use]
     pub const fn foot_sigma_px(&self) -> f64 {
         self.foot_sigma_px
+    }
+
+    /// Share of a foot's variance that lasts while its target moves some metres, within 0 and 1.
+    #[must_use]
+    pub const fn foot_lasting_share(&self) -> f64 {
+        self.foot_lasting_share
     }
 
     /// Noise of the receivers' fixes per axis.
@@ -86,14 +96,16 @@ impl SiteMaps {
         let tangent = self.maps[camera].tangent(&foot);
         let is_cut = is_foot_cut(bounding_box, self.image_sizes[camera]);
         let cut_px = if is_cut { CUT_FOOT_SHARE * bounding_box.height_px() } else { 0.0 };
-        let variance_px2 = self.foot_sigma_px.powi(2) + cut_px.powi(2);
+        let foot_px2 = self.foot_sigma_px.powi(2);
+        let of_foot = |px2: f64| PlaneCovariance::from(tangent.by_foot * tangent.by_foot.transpose() * px2);
         let own = self.block(camera, &tangent.by_parameters, camera, &tangent.by_parameters);
         let common = self.common_part(camera, tangent.position, &tangent.by_parameters, own);
         SitePosition {
             position: EastNorth { east_m: tangent.position[0], north_m: tangent.position[1] },
-            box_noise_m2: plane_covariance(tangent.by_foot * tangent.by_foot.transpose() * variance_px2),
-            relative_m2: plane_covariance(own - common),
-            common_m2: plane_covariance(common),
+            box_noise_m2: of_foot((1.0 - self.foot_lasting_share) * foot_px2 + cut_px.powi(2)),
+            lasting_noise_m2: of_foot(self.foot_lasting_share * foot_px2),
+            relative_m2: PlaneCovariance::from(own - common),
+            common_m2: PlaneCovariance::from(common),
         }
     }
 
@@ -169,12 +181,4 @@ fn bounded(part: Matrix2<f64>, whole: Matrix2<f64>) -> Matrix2<f64> {
     let mut eigen = (inverse * part * inverse.transpose()).symmetric_eigen();
     eigen.eigenvalues.apply(|value| *value = value.clamp(0.0, 1.0));
     lower * eigen.recompose() * lower.transpose()
-}
-
-fn plane_covariance(matrix: Matrix2<f64>) -> PlaneCovariance {
-    PlaneCovariance {
-        east_m2: matrix[(0, 0)],
-        north_m2: matrix[(1, 1)],
-        east_north_m2: 0.5 * (matrix[(0, 1)] + matrix[(1, 0)]),
-    }
 }

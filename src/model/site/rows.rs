@@ -15,14 +15,6 @@ const LONGEST_BOX_GAP_S: f64 = 1.1;
 /// Boxes of one camera in the order of time, by receiver.
 type BoxesByReceiver = BTreeMap<u32, Vec<(Timestamp, BoundingBox)>>;
 
-/// A pair of boxes with its target.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct TargetPair {
-    pub(crate) receiver: u32,
-    pub(crate) time_s: f64,
-    pub(crate) pair: SitePair,
-}
-
 /// The samples of all cameras of a site.
 pub(crate) struct SiteRows<'a> {
     /// Number of each target: samples of one target in several cameras have one receiver.
@@ -30,7 +22,7 @@ pub(crate) struct SiteRows<'a> {
     /// By receiver and time.
     pub(crate) fixes: Vec<SiteFix>,
     /// In the same order.
-    pub(crate) pairs: Vec<TargetPair>,
+    pub(crate) pairs: Vec<SitePair>,
     /// Instant at which the time of fixes and pairs is 0.
     pub(crate) start: Timestamp,
 }
@@ -63,8 +55,8 @@ impl<'a> SiteRows<'a> {
             let time_s = rows.seconds(time);
             for (index, (camera, own)) in seen.iter().enumerate() {
                 for (other_camera, other) in &seen[index + 1..] {
-                    let pair = SitePair { cameras: [*camera, *other_camera], boxes: [*own, *other] };
-                    rows.pairs.push(TargetPair { receiver, time_s, pair });
+                    let (cameras, boxes) = ([*camera, *other_camera], [*own, *other]);
+                    rows.pairs.push(SitePair { target: receiver, time_s, cameras, boxes });
                 }
             }
             rows.fixes.push(SiteFix { receiver, time_s, position: plane.to_plane(position), boxes: seen });

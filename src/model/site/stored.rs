@@ -4,9 +4,8 @@
 use nalgebra::DMatrix;
 
 use super::ground_map::{GroundMap, PARAMETERS};
-use super::maps::SiteMaps;
+use super::maps::{SiteMaps, SitePosition};
 use crate::domain::{BoundingBox, Error, GaussMarkovNoise, ImageSize, Result, RunId};
-use crate::geo::PlaneCovariance;
 use crate::model::artifact::ModelParts;
 use crate::model::encoder::gaussian_process::projective_mean::{COEFFICIENTS, ProjectiveMean};
 use crate::model::site::input::RECEIVER_CORRELATION;
@@ -20,6 +19,7 @@ const VIEWS: &str = "site.views";
 const COVARIANCE: &str = "site.covariance";
 const CAMERA: &str = "site.camera";
 const FOOT_SIGMA: &str = "site.foot_sigma_px";
+const FOOT_LASTING_SHARE: &str = "site.foot_lasting_share";
 
 /// A camera's place among those that were trained together.
 #[derive(Debug, Clone)]
@@ -35,9 +35,9 @@ impl JointMap {
         self.run
     }
 
-    /// Covariance of the part of the map's error at a box that all cameras which see the place have in common, m2.
-    pub(crate) fn common_m2(&self, bounding_box: &BoundingBox) -> PlaneCovariance {
-        self.maps.locate(self.camera, bounding_box).common_m2
+    /// A box's position by the joint fit, with the parts of its error.
+    pub(crate) fn locate(&self, bounding_box: &BoundingBox) -> SitePosition {
+        self.maps.locate(self.camera, bounding_box)
     }
 
     /// Takes the maps out of a model's parts; `None` for a camera that was trained by itself.
@@ -63,6 +63,7 @@ impl SiteMaps {
     pub(crate) fn put(&self, camera: usize, parts: &mut ModelParts) {
         parts.set(CAMERA, camera as f64);
         parts.set(FOOT_SIGMA, self.foot_sigma_px);
+        parts.set(FOOT_LASTING_SHARE, self.foot_lasting_share);
         let numbers = |GroundMap(mean): &GroundMap| {
             let ProjectiveMean { scales_px, centre_m, spread_m, coefficients } = mean;
             let mut numbers = scales_px.concat();
@@ -87,6 +88,8 @@ impl SiteMaps {
 
     fn take(parts: &mut ModelParts, cameras: usize) -> Result<Self> {
         let foot_sigma_px = parts.positive_parameter(FOOT_SIGMA)?;
+        // Files of earlier versions do not tell which part of the noise lasts.
+        let foot_lasting_share = parts.parameter_or(FOOT_LASTING_SHARE, 0.0)?.clamp(0.0, 1.0);
         let tensors = &mut parts.tensors;
         let maps = tensors.take_f64(MAPS, &[cameras, MAP_NUMBERS])?;
         let maps: Vec<GroundMap> =
@@ -104,6 +107,7 @@ impl SiteMaps {
             maps,
             covariance,
             foot_sigma_px,
+            foot_lasting_share,
             noise: GaussMarkovNoise::new(1.0, RECEIVER_CORRELATION),
             image_sizes: views.iter().map(image_size).collect::<Result<_>>()?,
             views_px: views.iter().map(|view| [[view[2], view[3]], [view[4], view[5]]]).collect(),

@@ -29,12 +29,20 @@ struct World {
 
 /// Walkers with phones that cross the views of two cameras 10 m apart.
 fn world(seed: u64) -> World {
+    world_with(seed, 0.0)
+}
+
+/// The same with an error of each person's foot in each camera that does not change, of that standard deviation per axis.
+fn world_with(seed: u64, lasting_sigma_px: f64) -> World {
+    let mut lasting = stream(seed, 1);
     let mut random = stream(seed, 0);
     let mut world = World { fixes: Vec::new(), pairs: Vec::new(), boxes: Vec::new() };
     for receiver in 0..12 {
         let error = GaussMarkovNoise::new(2.6, CORRELATION);
         let mut phone = SimulatedReceiver::seeded(error, seed, 100 + u64::from(receiver));
         let north_m = 14.0 + 1.6 * f64::from(receiver);
+        let lasting_px: [[f64; 2]; 2] =
+            std::array::from_fn(|_| [0; 2].map(|_| lasting_sigma_px * standard_normal(&mut lasting)));
         for second in 0..30 {
             let truth = EastNorth { east_m: -12.0 + 1.3 * f64::from(second), north_m };
             let mut boxes = Vec::new();
@@ -44,13 +52,15 @@ fn world(seed: u64) -> World {
                     continue;
                 }
                 foot = foot.map(|side| side + FOOT_SIGMA_PX * standard_normal(&mut random));
+                foot = [0, 1].map(|axis| foot[axis] + lasting_px[camera][axis]);
                 let bounding_box =
                     BoundingBox::new(foot[0] - 10.0, foot[1] - 60.0, 20.0, 60.0).expect("valid");
                 boxes.push((camera, bounding_box));
                 world.boxes.push((camera, bounding_box, truth));
             }
             if let [one, other] = boxes[..] {
-                world.pairs.push(SitePair { cameras: [one.0, other.0], boxes: [one.1, other.1] });
+                let (cameras, boxes) = ([one.0, other.0], [one.1, other.1]);
+                world.pairs.push(SitePair { target: receiver, time_s: f64::from(second), cameras, boxes });
             }
             let position = phone.measure(truth, 1.0);
             if !boxes.is_empty() {
@@ -101,15 +111,15 @@ fn the_stated_parts_of_the_error_are_honest() {
         let maps = fitted(&world, &world.pairs);
         for (camera, bounding_box, truth) in &world.boxes {
             let located = maps.locate(*camera, bounding_box);
-            let error = minus(located.position, *truth);
+            let error = located.position.minus(*truth);
             inside[0] += f64::from(u8::from(located.covariance_m2().mahalanobis_squared(error) <= 5.99));
             inside[1] += 1.0;
         }
         for pair in &world.pairs {
             let [one, other] = [0, 1].map(|at| maps.locate(pair.cameras[at], &pair.boxes[at]));
-            let parts = |it: &SitePosition| it.box_noise_m2.plus(it.relative_m2);
+            let parts = |it: &SitePosition| it.box_noise_m2.plus(it.lasting_noise_m2).plus(it.relative_m2);
             let covariance = parts(&one).plus(parts(&other));
-            let squared = covariance.mahalanobis_squared(minus(one.position, other.position));
+            let squared = covariance.mahalanobis_squared(one.position.minus(other.position));
             relative_inside[0] += f64::from(u8::from(squared <= 5.99));
             relative_inside[1] += 1.0;
             assert!(one.common_m2.per_axis_m2() > 0.05, "{one:?}");
@@ -119,6 +129,22 @@ fn the_stated_parts_of_the_error_are_honest() {
     println!("coverage {coverage:.3}, of differences between cameras {relative:.3}");
     assert!((0.8..=1.0).contains(&coverage), "{coverage}");
     assert!((0.85..=1.0).contains(&relative), "{relative}");
+}
+
+#[test]
+fn the_lasting_part_of_the_feet_is_told_from_the_noise() {
+    let share_of = |lasting_px| {
+        let shares = (1..=6).map(|seed| {
+            let world = world_with(seed, lasting_px);
+            fitted(&world, &world.pairs).foot_lasting_share()
+        });
+        shares.sum::<f64>() / 6.0
+    };
+    let (of_noise, of_both) = (share_of(0.0), share_of(FOOT_SIGMA_PX));
+    println!("share {of_noise:.3} of white noise, {of_both:.3} where half of the variance lasts");
+    assert!(of_noise < 0.1, "{of_noise}");
+    // The maps follow a part of what lasts: twelve people cross the view.
+    assert!((0.25..0.6).contains(&of_both), "{of_both}");
 }
 
 #[test]
@@ -137,8 +163,4 @@ fn a_camera_without_fixes_is_fitted_by_its_neighbour() {
     let input =
         SiteFitInput { image_sizes: &size, fixes: &one_sided.fixes, pairs: &[], correlation: CORRELATION };
     assert_eq!(fit_site(&input).err(), Some(SiteFitError::TooFewRows { camera: 1 }));
-}
-
-fn minus(one: EastNorth, other: EastNorth) -> EastNorth {
-    EastNorth { east_m: one.east_m - other.east_m, north_m: one.north_m - other.north_m }
 }

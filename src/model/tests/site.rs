@@ -102,16 +102,12 @@ fn models_of_one_site_agree_on_people_they_have_not_seen() {
                 let position = plane.to_plane(regressor.plane().to_position(regression.regressed));
                 inside[0] += f64::from(u8::from(position.distance_m(truth[&key]) <= regression.r95_m()));
                 inside[1] += 1.0;
-                let (_, common) = regressor
+                let joint = regressor
                     .joint_error(&labelled.detection.bounding_box, &regression)
                     .expect("trained together");
-                let own = regression.covariance.minus(common);
+                let own = regression.covariance.minus(joint.common_m2);
                 if let Some((other, covariance)) = first.insert(key, (position, own)) {
-                    let difference = EastNorth {
-                        east_m: position.east_m - other.east_m,
-                        north_m: position.north_m - other.north_m,
-                    };
-                    let squared = own.plus(covariance).mahalanobis_squared(difference);
+                    let squared = own.plus(covariance).mahalanobis_squared(position.minus(other));
                     relative += f64::from(u8::from(squared <= 5.99));
                     pairs += 1.0;
                 }

@@ -60,10 +60,10 @@ fn items_of<'a>(
     let by_box = observed.usable_box().zip(observed.plane).map(|(observed_box, plane)| {
         let regression = &observed_box.independent;
         let (covariance, scale) = (regression.covariance, regression.normal_scale());
-        let joint = camera.model().zip(observation.bounding_box()).and_then(|((regressor, _), own)| {
-            let (run, common_m2) = regressor.joint_error(&own, regression)?;
-            Some((run, common_m2.scaled(scale)))
-        });
+        let joint = camera
+            .model()
+            .zip(observation.bounding_box())
+            .and_then(|((regressor, _), own)| Some(regressor.joint_error(&own, regression)?.scaled(scale)));
         let source = ItemSource::Box {
             covariance_m2: covariance.scaled(scale),
             map_covariance_m2: covariance.minus(regression.box_noise).scaled(scale),

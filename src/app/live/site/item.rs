@@ -2,8 +2,9 @@
 
 use jiff::Timestamp;
 
-use crate::domain::{CameraId, RunId, TargetId};
+use crate::domain::{CameraId, TargetId};
 use crate::geo::{PlaneCovariance, Position};
+use crate::model::JointError;
 
 /// One measured position of one target.
 #[derive(Debug)]
@@ -27,9 +28,8 @@ pub(super) enum ItemSource {
         /// Of it, the error of the map from pixels to the ground, which is the same from frame to frame at a
         /// place, m2.
         map_covariance_m2: PlaneCovariance,
-        /// Of it, what all cameras that were trained together have in common, m2, with the run that trained them; `None`
-        /// for a camera that was trained by itself.
-        joint: Option<(RunId, PlaneCovariance)>,
+        /// How it divides among cameras that were trained together; `None` for a camera that was trained by itself.
+        joint: Option<JointError>,
         /// Origin of the model's plane.
         model_origin: Position,
     },

@@ -19,7 +19,7 @@ use crate::fusion::world::{
     CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
     WorldTracker,
 };
-use crate::geo::LocalPlane;
+use crate::geo::{LocalPlane, PlaneCovariance};
 use crate::telemetry::{Metrics, SiteItemOutcome};
 
 /// Positions of a track are announced at least this far apart in time; readers follow people, not frames.
@@ -116,7 +116,7 @@ impl SiteTracker {
     pub(super) fn push(&mut self, item: SiteItem, now: Duration) {
         let (source, is_pacing) = match (&item.source, &item.target_id) {
             (ItemSource::Box { joint, .. }, _) => {
-                let seen = SeenModel { joint_run: joint.map(|(run, _)| run), noted_at: now };
+                let seen = SeenModel { joint_run: joint.map(|joint| joint.run), noted_at: now };
                 self.cameras.insert(item.camera.clone(), seen);
                 (Source::Camera(item.camera.clone()), true)
             }
@@ -439,32 +439,31 @@ fn detection_of(
     };
     let position = plane.to_plane_within_range(item.position).ok_or(SiteItemOutcome::OutOfRange)?;
     // Spread over more than the area of one new target, a box would start a track rather than join any.
-    if covariance_m2.determinant().sqrt() * settings.birth_density_per_m2 >= 1.0 {
+    if covariance_m2.determinant().sqrt() * settings.birth_density_per_m2[0] >= 1.0 {
         return Err(SiteItemOutcome::Uncertain);
     }
     let carrier = item.target_id.clone().filter(|target_id| carries(&item.camera, target_id));
-    let common_m2 = joint.filter(|(run, _)| Some(*run) == joint_run).map(|(_, common_m2)| common_m2);
-    let (covariance_m2, common_covariance_m2) = match common_m2 {
-        // What the cameras have in common is in every measurement alike: the filter has the rest.
-        Some(common_m2) => (covariance_m2.minus(common_m2), common_m2),
-        // The error of a map does not average out over frames. How much of it other cameras share is unknown where
-        // they were not trained together: all of it is stated, so averaging over cameras gains nothing in the
-        // stated error.
-        None => (*covariance_m2, *map_covariance_m2),
+    // The error of a map does not average out over frames, nor does a part of the noise. Without a joint run it is unknown
+    // how much of it other cameras share: all of it is the camera's own then, and all of it is stated.
+    let (common_m2, lasting_noise_m2) = match joint {
+        Some(joint) if Some(joint.run) == joint_run => (joint.common_m2, joint.lasting_noise_m2),
+        _ => (PlaneCovariance::default(), PlaneCovariance::default()),
     };
+    let noise_m2 = covariance_m2.minus(*map_covariance_m2).minus(lasting_noise_m2);
     Ok(WorldDetection {
         tracker_id: item.target_id.clone(),
         receiver: carrier.map(ReceiverId::from),
         position,
-        covariance_m2,
-        common_covariance_m2,
+        covariance_m2: noise_m2,
+        offset_covariance_m2: map_covariance_m2.minus(common_m2).plus(lasting_noise_m2),
+        common_covariance_m2: common_m2,
     })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geo::{PlaneCovariance, Position};
+    use crate::geo::Position;
 
     const START_S: i64 = 1_800_000_000;
 

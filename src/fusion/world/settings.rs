@@ -3,6 +3,10 @@
 use super::frame::WorldDetection;
 use crate::geo::PlaneCovariance;
 
+/// Added to the noise of every detection (1 cm per axis), so that one without any has an innovation covariance that can be
+/// inverted.
+const LEAST_NOISE: PlaneCovariance = PlaneCovariance::isotropic(1e-4);
+
 /// Noise, gates and bounds of a world tracker.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldTrackSettings {
@@ -61,7 +65,7 @@ pub struct WorldTrackSettings {
 impl WorldTrackSettings {
     /// The covariance of a detection's noise for the filter, m2.
     pub(super) fn measurement_covariance(&self, detection: &WorldDetection) -> PlaneCovariance {
-        detection.covariance_m2.scaled(self.correlated_noise_inflation)
+        detection.covariance_m2.scaled(self.correlated_noise_inflation).plus(LEAST_NOISE)
     }
 
     /// Density of targets without a track where a detection is, 1/m2.

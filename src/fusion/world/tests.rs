@@ -309,3 +309,24 @@ fn a_lasting_error_does_not_average_out() {
     assert!(state.covariance_m2.east_m2 > lasting_m2, "{state:?}");
     assert!(state.covariance_m2.east_m2 < lasting_m2 + 0.04, "{state:?}");
 }
+
+#[test]
+fn detections_without_any_error_are_tracked() {
+    let mut tracker = tracker();
+    let exact = |camera: &str, seconds: f64| {
+        let none = PlaneCovariance::default();
+        let detection = WorldDetection {
+            covariance_m2: none,
+            offset_covariance_m2: none,
+            common_covariance_m2: none,
+            ..seen(at(seconds, 0.0), Some("7"))
+        };
+        frame(camera, seconds, vec![detection])
+    };
+    // Twice at one instant, too.
+    let frames = [exact("a", 0.0), exact("a", 0.0), exact("b", 0.0), exact("a", 0.5), exact("b", 0.5)];
+    let tracks: Vec<WorldTrackId> = frames.iter().map(|own| only_track(&tracker.observe(own))).collect();
+    assert!(tracks.iter().all(|track| *track == tracks[0]), "{tracks:?}");
+    let state = tracker.tracks().next().expect("a track").state();
+    assert!(state.covariance_m2.is_finite() && state.position.distance_m(at(0.5, 0.0)) < 0.1, "{state:?}");
+}

@@ -3,6 +3,8 @@
 use crate::domain::{Error, ErrorKind};
 use crate::store::refusals::closed;
 
+const CONFLICT: &str = "another change came in between; try again";
+
 /// What a failed statement means to its caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Meaning {
@@ -17,7 +19,7 @@ enum Meaning {
 fn meaning(code: &str) -> Meaning {
     match code {
         "53100" => Meaning::Full,
-        "40001" | "40P01" | "23503" => Meaning::TryAgain("another change came in between; try again"),
+        "40001" | "40P01" | "23503" => Meaning::TryAgain(CONFLICT),
         "55P03" | "57014" => Meaning::TryAgain("the database is busy; try again"),
         "25P03" | "57P01" | "57P02" | "57P03" | "57P05" => {
             Meaning::TryAgain("the database has ended the connection; try again")
@@ -54,4 +56,9 @@ pub(super) fn failed(error: sqlx::Error) -> Error {
         ),
         Meaning::Fault => Error::fault(error),
     }
+}
+
+/// Whether the database has ended a transaction in favour of another one, by which nothing of it was done.
+pub(super) fn is_conflict(error: &Error) -> bool {
+    error.kind() == ErrorKind::Overloaded && error.to_string().contains(CONFLICT)
 }

@@ -144,6 +144,36 @@ async fn a_change_that_is_committed_after_a_later_one_is_not_missed() {
     assert!(listed(upto).await.0.len() <= ids.len());
 }
 
+/// Another transaction has the row of a camera's owner, which the deletion waits for, and then waits for the camera.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_deletion_that_the_database_ends_for_a_deadlock_is_made_again() {
+    let home = database().await;
+    let (store, node) = registered(&home, 1).await;
+    store.insert_camera(&NewCamera::named(id("a")), at(0)).await.expect("new");
+    acquire(&store, "a", node).await;
+    let mut other = connect(&url(&home)).await;
+    sqlx::raw_sql("BEGIN; UPDATE camera_owners SET fence = fence + 1")
+        .execute(&mut other)
+        .await
+        .expect("locked");
+    let deletion = tokio::spawn({
+        let store = store.clone();
+        async move { store.delete_camera(&id("a"), None, at(1)).await }
+    });
+    let waits = "SELECT count(*) FROM pg_stat_activity WHERE wait_event_type = 'Lock' AND datname = current_database()";
+    while sqlx::query_scalar::<_, i64>(waits).fetch_one(&mut other).await.expect("read") == 0 {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    // Whichever of the two the database ends, the deletion is made.
+    let change = "UPDATE cameras SET revision = revision + 1 WHERE id = 'a'";
+    let end = if sqlx::raw_sql(change).execute(&mut other).await.is_ok() { "COMMIT" } else { "ROLLBACK" };
+    sqlx::raw_sql(end).execute(&mut other).await.expect("ended");
+    deletion.await.expect("no panic").expect("deleted");
+    let error = store.camera(&id("a")).await.expect_err("deleted");
+    assert_eq!(error.kind(), ErrorKind::CameraNotFound);
+}
+
 /// Connections that the server ends, at any moment, cost an error at most; what was acknowledged stays.
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[ignore = "needs PostgreSQL: .ci/postgres"]

@@ -162,9 +162,10 @@ fn marks_of_ids_that_swap() {
     assert!(swapped >= steady - 0.05 && swapped_worlds > 0);
 }
 
+/// Ships that pass five times are found with their scale, which their boxes do not tell; those that pass once are not
+/// identifiable.
 #[test]
-#[ignore = "takes minutes: the marks of docs/association.md"]
-fn marks_of_ships_that_pass() {
+fn ships_are_found_by_several_passes() {
     let folder = data_folder();
     let (mut refused, mut identified, mut wrong) = (0, 0, 0);
     for seed in 1..=5 {
@@ -182,5 +183,5 @@ fn marks_of_ships_that_pass() {
         }
     }
     println!("one pass refused in {refused} of 5, five passes right in {identified} of 5, wrong {wrong}");
-    assert!(wrong == 0);
+    assert!(refused == 5 && identified >= 4 && wrong == 0);
 }

@@ -15,7 +15,7 @@ use super::evidence::EvidenceModel;
 use super::matching::{
     Located, MatchSettings, Matching, check_size, match_located, match_scene, receiver_noise,
 };
-use super::placement::{Placement, PlacementSearch};
+use super::placement::{Density, GroundPrior, Placement, PlacementSearch};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{
@@ -30,21 +30,25 @@ use crate::model::{Artifact, FitInput, FitOptions, GroundCamera, Regressor, fit}
 const SHIFTS: [f64; 6] = [0.21, 0.33, 0.45, 0.57, 0.69, 0.81];
 /// Shifts are at least this long, s: beyond the memory of walks and of receivers' errors.
 const LEAST_SHIFT_S: f64 = 25.0;
-/// The score of the best world exceeds that of all wrong ones by at least this.
+/// The score of the best world exceeds that of all wrong ones by at least this; where the scale is unknown, too, by more:
+/// a single straight way fits many worlds.
 const MIN_MARGIN: f64 = 8.0;
+const MIN_MARGIN_OF_UNKNOWN_SCALE: f64 = 25.0;
 /// The best world exceeds every other world of the same recording by at least this.
 const MIN_MODE_MARGIN: f64 = 3.0;
-/// Two placements closer than this are one world, m.
-const SAME_WORLD_M: f64 = 6.0;
+/// Two placements closer than this are one world, in the standard deviation of the ground.
+const SAME_WORLD: f64 = 6.0;
 /// Sure pieces at least: one or two straight walks fit more than one place and direction.
 const MIN_PIECES: usize = 3;
 /// The trained model departs from the placement by at most so many standard deviations of the latter in the
 /// mean.
 const MAX_DEPARTURE: f64 = 5.0;
 /// What is known about the ground of targets whose height is known: people and cars.
-const GROUND_OF_KNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06 };
-/// The same of all others, such as ships: the antenna stands somewhere on a large target.
-const GROUND_OF_UNKNOWN_HEIGHT: GroundPrior = GroundPrior { map_sigma_m: 8.0, scale_sigma: 1.5 };
+const GROUND_OF_KNOWN_HEIGHT: GroundPrior =
+    GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06, density: Density::Fixes };
+/// The same of all others, such as ships: the antenna stands somewhere on a large target, far away near the horizon.
+const GROUND_OF_UNKNOWN_HEIGHT: GroundPrior =
+    GroundPrior { map_sigma_m: 25.0, scale_sigma: 1.5, density: Density::GroundPoints };
 /// Rounds of training and matching at most.
 const ROUNDS: usize = 4;
 /// Rounds end when the model moves positions by less than this in the mean, in the standard deviation of the ground.
@@ -80,15 +84,6 @@ pub struct WorldScores {
     pub best_shifted: f64,
     /// Of the best other world, with true clocks; negative infinity if there is none.
     pub second: f64,
-}
-
-/// How well boxes alone determine the ground.
-#[derive(Debug, Clone, Copy)]
-struct GroundPrior {
-    /// Standard deviation per axis of a target's position, m.
-    map_sigma_m: f64,
-    /// Standard deviation of the logarithm of the scale.
-    scale_sigma: f64,
 }
 
 /// One candidate world.
@@ -177,7 +172,10 @@ impl<'a> JointSearch<'a> {
         for camera in cameras {
             let search = self.search(camera, fixes);
             worlds.extend(
-                search.search(MODES, SAME_WORLD_M).into_iter().map(|placement| World { camera, placement }),
+                search
+                    .search(MODES, self.same_world_m())
+                    .into_iter()
+                    .map(|placement| World { camera, placement }),
             );
         }
         worlds.sort_by(|one, other| other.placement.score.total_cmp(&one.placement.score));
@@ -186,8 +184,8 @@ impl<'a> JointSearch<'a> {
 
     fn search(&self, camera: usize, fixes: &[Vec<TimedFix>]) -> PlacementSearch {
         let tracklets = self.on_ground(camera);
-        let prior = (self.ground.scale_sigma, self.cameras[camera].log_prior());
-        PlacementSearch::new(&tracklets, fixes, &self.model, self.ground.map_sigma_m, prior)
+        let log_prior = self.cameras[camera].log_prior();
+        PlacementSearch::new(&tracklets, fixes, &self.model, &self.ground, log_prior)
     }
 
     /// The best world, if it is better than all that must be wrong and all others that may be right.
@@ -210,15 +208,27 @@ impl<'a> JointSearch<'a> {
             best_shifted: shifted.fold(f64::NEG_INFINITY, f64::max),
             second: self.second(&best, &worlds),
         };
-        check_scores(&scores)?;
+        check_scores(&scores, self.min_margin())?;
         Ok((best, scores))
+    }
+
+    /// Distance of placements that are one world, m.
+    fn same_world_m(&self) -> f64 {
+        SAME_WORLD * self.ground.map_sigma_m
+    }
+
+    fn min_margin(&self) -> f64 {
+        match self.ground.density {
+            Density::Fixes => MIN_MARGIN,
+            Density::GroundPoints => MIN_MARGIN_OF_UNKNOWN_SCALE,
+        }
     }
 
     /// Score of the best world that is another one than the best.
     fn second(&self, best: &World, worlds: &[World]) -> f64 {
         let other = worlds.iter().find(|world| {
             self.mean_distance_m(|own| Some(self.placed(world, own)?.distance_m(self.placed(best, own)?)))
-                > SAME_WORLD_M
+                > self.same_world_m()
         });
         other.map_or(f64::NEG_INFINITY, |world| world.placement.score)
     }
@@ -370,8 +380,8 @@ impl<'a> JointSearch<'a> {
 }
 
 /// Whether a world is better than those that must be wrong and all others.
-fn check_scores(scores: &WorldScores) -> Result<()> {
-    if scores.best < scores.best_shifted + MIN_MARGIN {
+fn check_scores(scores: &WorldScores, min_margin: f64) -> Result<()> {
+    if scores.best < scores.best_shifted + min_margin {
         return Err(not_identifiable(
             &format!(
                 "identities shifted in time explain it about as well (score {:.1} against {:.1}): too few \

@@ -6,7 +6,8 @@
 //! the log-likelihood is a quadratic form of (w, t) with seven coefficients, so a placement is scored in
 //! constant time per pair. Placements that single pairs suggest, and a grid of yaws, are refined by
 //! expectation-maximisation: soft assignment of receivers to tracklets, then the least-squares (w, t) in
-//! closed form. `docs/association.md` has the formulas.
+//! closed form. Where the scale is unknown, the likelihood is that of the ground points given the fixes: `|w|^2` for
+//! each point. `docs/association.md` has the formulas.
 
 use std::cmp::Ordering;
 
@@ -14,7 +15,8 @@ use nalgebra::{Complex, DMatrix};
 
 use super::disjoint;
 use super::evidence::{EvidenceModel, MAP_TIME_CONSTANT_S, free_log_likelihood};
-use super::tracklet::{TimedFix, Tracklet, concurrent};
+use super::tracklet::{Residual, SceneMotion, TimedFix, Tracklet, concurrent};
+use crate::geo::EastNorth;
 
 type C = Complex<f64>;
 
@@ -36,6 +38,27 @@ const REFINED: usize = 32;
 const ROUNDS: usize = 25;
 /// Log-likelihood ratios are multiplied by it: what the noise model leaves out makes them overstated.
 const TEMPERING: f64 = 0.6;
+
+/// What a likelihood ratio is the ratio of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Density {
+    /// Densities of the fixes, given the boxes.
+    Fixes,
+    /// Densities of the ground points of the boxes, given the fixes: a ground that has shrunk to the place of an emitter at
+    /// anchor explains every fix of that, but no box.
+    GroundPoints,
+}
+
+/// How well boxes alone determine the ground.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct GroundPrior {
+    /// Standard deviation per axis of a target's position, m.
+    pub(super) map_sigma_m: f64,
+    /// Standard deviation of the logarithm of the scale.
+    pub(super) scale_sigma: f64,
+    /// What the evidence is a density of.
+    pub(super) density: Density,
+}
 
 /// Scale, direction and place: `z = w g + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -77,6 +100,8 @@ struct Pair {
     zz: f64,
     gg: f64,
     gz: C,
+    /// Points whose density is taken on the ground.
+    ground_points: f64,
 }
 
 /// A placement's part of the quadratic forms, the same for all pairs.
@@ -84,6 +109,7 @@ struct Coefficients {
     turn: C,
     shift: C,
     turn_squared: f64,
+    log_turn_squared: f64,
     shift_squared: f64,
     mixed: C,
 }
@@ -91,7 +117,8 @@ struct Coefficients {
 impl Coefficients {
     fn new(turn: C, shift: C) -> Self {
         let (turn_squared, shift_squared) = (turn.norm_sqr(), shift.norm_sqr());
-        Self { turn, shift, turn_squared, shift_squared, mixed: shift.conj() * turn }
+        let log_turn_squared = turn_squared.ln();
+        Self { turn, shift, turn_squared, log_turn_squared, shift_squared, mixed: shift.conj() * turn }
     }
 }
 
@@ -103,7 +130,7 @@ impl Pair {
             - 2.0 * (at.turn.re * self.gz.re + at.turn.im * self.gz.im)
             - 2.0 * (at.shift.re * self.z.re + at.shift.im * self.z.im)
             + 2.0 * (at.mixed.re * self.g.re - at.mixed.im * self.g.im);
-        self.peak - 0.5 * squared
+        self.peak + self.ground_points * at.log_turn_squared - 0.5 * squared
     }
 
     /// The longest first, by the weight of its fixes.
@@ -126,9 +153,14 @@ struct ReceiverPairs {
 }
 
 impl ReceiverPairs {
-    fn new(tracklets: &[Tracklet], fixes: &[TimedFix], model: &EvidenceModel, map_sigma_m: f64) -> Self {
-        let mut pairs: Vec<Pair> =
-            tracklets.iter().filter_map(|own| pair(own, fixes, model, map_sigma_m)).collect();
+    fn new(
+        tracklets: &[Tracklet],
+        fixes: &[TimedFix],
+        (carried, other): (&EvidenceModel, &EvidenceModel),
+        ground: &GroundPrior,
+    ) -> Self {
+        let of_tracklet = |own| pair(own, fixes, (carried, other), ground);
+        let mut pairs: Vec<Pair> = tracklets.iter().filter_map(of_tracklet).collect();
         pairs.sort_by(|one, other| one.span_s[1].total_cmp(&other.span_s[1]));
         let spans_s: Vec<[f64; 2]> = pairs.iter().map(|own| own.span_s).collect();
         for own in &mut pairs {
@@ -177,18 +209,30 @@ impl PlacementSearch {
         tracklets: &[Tracklet],
         receivers: &[Vec<TimedFix>],
         model: &EvidenceModel,
-        map_sigma_m: f64,
-        (scale_sigma, log_prior): (f64, f64),
+        ground: &GroundPrior,
+        log_prior: f64,
     ) -> Self {
-        let pairs =
-            receivers.iter().map(|fixes| ReceiverPairs::new(tracklets, fixes, model, map_sigma_m)).collect();
+        // The other hypothesis is that of the side whose density is taken.
+        let motion = match ground.density {
+            Density::Fixes => model.motion,
+            Density::GroundPoints => SceneMotion::of(tracklets),
+        };
+        let other = EvidenceModel { motion, ..*model };
+        let of_receiver =
+            |fixes: &Vec<TimedFix>| ReceiverPairs::new(tracklets, fixes, (model, &other), ground);
+        let pairs = receivers.iter().map(of_receiver).collect();
         let all: Vec<C> = tracklets
             .iter()
             .flat_map(|own| &own.points)
             .map(|point| C::new(point.position.east_m, point.position.north_m))
             .collect();
         let stride = all.len().div_ceil(200).max(1);
-        Self { pairs, scale_sigma, log_prior, points: all.into_iter().step_by(stride).collect() }
+        Self {
+            pairs,
+            scale_sigma: ground.scale_sigma,
+            log_prior,
+            points: all.into_iter().step_by(stride).collect(),
+        }
     }
 
     /// Log-likelihood ratio of each pair where ground and plane are the same.
@@ -236,7 +280,7 @@ impl PlacementSearch {
                 let spread = pair.gg - pair.g.norm_sqr() / pair.ones;
                 // A target that stands still tells no direction.
                 (moved.norm() > 4.0 && spread > 4.0).then(|| {
-                    let turn = moved / moved.norm() * self.scale(moved.norm(), spread);
+                    let turn = moved / moved.norm() * self.scale(moved.norm(), spread, pair.ground_points);
                     self.placed(turn, (pair.z - turn * pair.g) / pair.ones)
                 })
             })
@@ -261,10 +305,12 @@ impl PlacementSearch {
         best
     }
 
-    /// The most probable scale, by the prior to first order about 1.
-    fn scale(&self, moved: f64, spread: f64) -> f64 {
+    /// The scale s of greatest `s moved - s^2 spread / 2 + 2 n ln s` with n ground points, by the prior to first order about 1.
+    fn scale(&self, moved: f64, spread: f64, ground_points: f64) -> f64 {
         let precision = self.scale_sigma.powi(-2);
-        ((moved + precision) / (spread + precision)).clamp(1.0 / MAX_SCALE, MAX_SCALE)
+        let (moved, spread) = (moved + precision, spread + precision);
+        let scale = (moved + (moved * moved + 8.0 * spread * ground_points).sqrt()) / (2.0 * spread);
+        scale.clamp(1.0 / MAX_SCALE, MAX_SCALE)
     }
 
     fn placed(&self, turn: C, shift: C) -> Placement {
@@ -289,7 +335,7 @@ impl PlacementSearch {
     }
 
     fn maximised(&self, turn: C, shift: C) -> Option<Placement> {
-        let (mut ones, mut gg) = (0.0, 0.0);
+        let (mut ones, mut gg, mut ground_points) = (0.0, 0.0, 0.0);
         let (mut z, mut g, mut gz) = (C::default(), C::default(), C::default());
         let at = Coefficients::new(turn, shift);
         for own in &self.pairs {
@@ -297,6 +343,7 @@ impl PlacementSearch {
                 let weight = TEMPERING * probability;
                 ones += weight * pair.ones;
                 gg += weight * pair.gg;
+                ground_points += weight * pair.ground_points;
                 z += pair.z * weight;
                 g += pair.g * weight;
                 gz += pair.gz * weight;
@@ -307,7 +354,7 @@ impl PlacementSearch {
             return None;
         }
         let moved = gz - g.conj() * z / ones;
-        let turn = moved / moved.norm().max(1e-12) * self.scale(moved.norm(), spread);
+        let turn = moved / moved.norm().max(1e-12) * self.scale(moved.norm(), spread, ground_points);
         Some(self.placed(turn, (z - turn * g) / ones))
     }
 }
@@ -326,7 +373,13 @@ fn distinct(sorted: &[Placement], points: &[C], most: usize, apart_m: f64) -> Ve
     kept
 }
 
-fn pair(tracklet: &Tracklet, fixes: &[TimedFix], model: &EvidenceModel, map_sigma_m: f64) -> Option<Pair> {
+fn pair(
+    tracklet: &Tracklet,
+    fixes: &[TimedFix],
+    (model, other): (&EvidenceModel, &EvidenceModel),
+    ground: &GroundPrior,
+) -> Option<Pair> {
+    let map_sigma_m = ground.map_sigma_m;
     let residuals = tracklet.residuals(fixes, 0.0, MAX_GAP_S);
     let stride = residuals.len().div_ceil(MAX_FIXES).max(1);
     let rows: Vec<_> = residuals.into_iter().step_by(stride).collect();
@@ -345,13 +398,22 @@ fn pair(tracklet: &Tracklet, fixes: &[TimedFix], model: &EvidenceModel, map_sigm
     let factor = covariance.cholesky()?;
     let log_determinant = 2.0 * factor.l_dirty().diagonal().iter().map(|own| own.ln()).sum::<f64>();
     let count = rows.len() as f64;
-    let fixed: Vec<TimedFix> = rows.iter().map(|row| row.fix).collect();
-    let peak = -log_determinant - count * std::f64::consts::TAU.ln() - free_log_likelihood(&fixed, model);
+    let on_ground = |row: &Residual| {
+        let [east_m, north_m] = row.difference_m;
+        row.fix.position.minus(EastNorth { east_m, north_m })
+    };
+    let observed: Vec<TimedFix> = match ground.density {
+        Density::Fixes => rows.iter().map(|row| row.fix).collect(),
+        Density::GroundPoints => {
+            rows.iter().map(|row| TimedFix { position: on_ground(row), ..row.fix }).collect()
+        }
+    };
+    let ground_points = if ground.density == Density::GroundPoints { count } else { 0.0 };
+    let peak = -log_determinant - count * std::f64::consts::TAU.ln() - free_log_likelihood(&observed, other);
     // Columns: one, z (east, north), g (right, forward), whitened.
     let mut columns = DMatrix::from_fn(rows.len(), 5, |i, column| {
-        let fix = rows[i].fix.position;
-        let [east_m, north_m] = rows[i].difference_m;
-        [1.0, fix.east_m, fix.north_m, fix.east_m - east_m, fix.north_m - north_m][column]
+        let (fix, point) = (rows[i].fix.position, on_ground(&rows[i]));
+        [1.0, fix.east_m, fix.north_m, point.east_m, point.north_m][column]
     });
     factor.l_dirty().solve_lower_triangular_mut(&mut columns);
     let dot = |a: usize, b: usize| columns.column(a).dot(&columns.column(b));
@@ -366,5 +428,6 @@ fn pair(tracklet: &Tracklet, fixes: &[TimedFix], model: &EvidenceModel, map_sigm
         gg: dot(3, 3) + dot(4, 4),
         // conj(g) z
         gz: C::new(dot(3, 1) + dot(4, 2), dot(3, 2) - dot(4, 1)),
+        ground_points,
     })
 }

@@ -108,7 +108,7 @@ impl LeastSquaresProblem {
 /// not quite the camera's, and a box whose foot is not below its target, differ for as long as the target is
 /// near a place.
 fn lasting_share(input: &SiteFitInput<'_>, maps: &[GroundMap], foot_sigma_px: f64) -> f64 {
-    let mut pairs: Vec<&SitePair> = input.pairs.iter().collect();
+    let mut pairs: Vec<&SitePair> = input.pairs.iter().filter(|pair| !is_cut(pair, input)).collect();
     pairs.sort_by(|one, other| {
         let key = |pair: &SitePair| (pair.cameras, pair.target);
         key(one).cmp(&key(other)).then(one.time_s.total_cmp(&other.time_s))
@@ -135,7 +135,7 @@ fn lasting_share(input: &SiteFitInput<'_>, maps: &[GroundMap], foot_sigma_px: f6
             }
         }
     }
-    if count < FEWEST_ROWS { 0.0 } else { (product / square).clamp(0.0, MOST_LASTING) }
+    if count < FEWEST_ROWS || square <= 0.0 { 0.0 } else { (product / square).clamp(0.0, MOST_LASTING) }
 }
 
 /// The fixes by receiver, without cut boxes.
@@ -162,13 +162,17 @@ fn receiver_rows(input: &SiteFitInput<'_>) -> Vec<Vec<FixRow>> {
     all.filter(|rows| !rows.is_empty()).collect()
 }
 
+/// Whether the border of an image hides the foot of either box.
+fn is_cut(pair: &SitePair, input: &SiteFitInput<'_>) -> bool {
+    [0, 1].into_iter().any(|at| is_foot_cut(&pair.boxes[at], input.image_sizes[pair.cameras[at]]))
+}
+
 /// Every pair in both directions, without cut boxes.
 fn transfers(input: &SiteFitInput<'_>) -> Vec<Transfer> {
     let mut both_ways = Vec::with_capacity(2 * input.pairs.len());
     for pair in input.pairs {
         let [from, to] = pair.cameras;
-        let is_cut = [0, 1].map(|at| is_foot_cut(&pair.boxes[at], input.image_sizes[pair.cameras[at]]));
-        if from == to || is_cut.contains(&true) {
+        if from == to || is_cut(pair, input) {
             continue;
         }
         let feet = pair.boxes.map(|it| foot_and_size(&it));

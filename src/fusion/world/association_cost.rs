@@ -29,7 +29,7 @@ pub(super) struct PredictedTrack<'a> {
     frame: &'a CameraFrame,
     /// The id that the camera's tracker gave the target last.
     tracker_id: Option<&'a TargetId>,
-    /// The camera's offset when it saw the target last, and the time since, s.
+    /// What is left of the camera's offset, and the share of the covariance of an unknown one that has come to it.
     offset: Option<(CameraOffset, f64)>,
     position: EastNorth,
     covariance_m2: PlaneCovariance,
@@ -48,26 +48,29 @@ impl<'a> PredictedTrack<'a> {
         };
         let (position, covariance_m2) = (track.filter.position(), track.gating_covariance());
         let tracker_id = sighting.and_then(|sighting| sighting.tracker_id.as_ref());
-        let offset = sighting.map(|sighting| (sighting.offset, since_s));
+        let offset =
+            sighting.map(|sighting| sighting.offset.decayed(since_s, settings.offset_time_constant_s));
         Self { track, frame, tracker_id, offset, position, covariance_m2, followed_within_m }
     }
 
     /// The offset that a detection is expected to have.
-    pub(super) fn offset(&self, detection: &WorldDetection, settings: &WorldTrackSettings) -> CameraOffset {
+    pub(super) fn offset(&self, detection: &WorldDetection) -> CameraOffset {
         let own_m2 = detection.offset_covariance_m2;
         match self.offset {
-            Some((offset, since_s)) => offset.after(since_s, settings.offset_time_constant_s, own_m2),
+            Some((kept, new_share)) => {
+                CameraOffset { covariance_m2: kept.covariance_m2.plus(own_m2.scaled(new_share)), ..kept }
+            }
             None => CameraOffset::unknown(own_m2, self.track.offset_covariance_m2),
         }
     }
 
-    /// The innovation of a detection, m, and its covariance, m2.
+    /// The innovation of a detection that is expected to have that offset, m, and its covariance, m2.
     pub(super) fn innovation(
         &self,
         detection: &WorldDetection,
+        offset: &CameraOffset,
         settings: &WorldTrackSettings,
     ) -> (EastNorth, PlaneCovariance) {
-        let offset = self.offset(detection, settings);
         let position = self.track.moved_to_state_time(detection.position, self.frame.time);
         let noise_m2 = settings.measurement_covariance(detection);
         let s = self.covariance_m2.plus(noise_m2).plus(offset.covariance_m2);
@@ -88,7 +91,7 @@ impl<'a> PredictedTrack<'a> {
             _ if self.track.is_measured_by_receiver() => return None,
             _ => false,
         };
-        let (difference, s) = self.innovation(detection, settings);
+        let (difference, s) = self.innovation(detection, &self.offset(detection), settings);
         let distance_m2 = difference.east_m.powi(2) + difference.north_m.powi(2);
         // d^2 is at least the squared distance divided by the trace of S.
         let least = distance_m2 / (s.east_m2 + s.north_m2);

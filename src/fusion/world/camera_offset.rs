@@ -30,14 +30,12 @@ impl CameraOffset {
         Self { mean: EastNorth::default(), covariance_m2: own_m2.plus(of_track_m2) }
     }
 
-    /// After some seconds; `stationary_m2` is the covariance of an offset of which nothing is known.
-    pub(super) fn after(self, seconds: f64, time_constant_s: f64, stationary_m2: PlaneCovariance) -> Self {
+    /// What is left of it after some seconds, and the share of the covariance of an unknown offset that has come to it.
+    pub(super) fn decayed(self, seconds: f64, time_constant_s: f64) -> (Self, f64) {
         let decay = (-seconds.max(0.0) / time_constant_s).exp();
         let kept = decay * decay;
-        Self {
-            mean: EastNorth { east_m: decay * self.mean.east_m, north_m: decay * self.mean.north_m },
-            covariance_m2: self.covariance_m2.scaled(kept).plus(stationary_m2.scaled(1.0 - kept)),
-        }
+        let mean = EastNorth { east_m: decay * self.mean.east_m, north_m: decay * self.mean.north_m };
+        (Self { mean, covariance_m2: self.covariance_m2.scaled(kept) }, 1.0 - kept)
     }
 
     /// A detection without the offset, m.

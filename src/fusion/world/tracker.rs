@@ -186,8 +186,8 @@ impl WorldTracker {
         events: &mut Vec<TimedEvent>,
     ) {
         let predicted = PredictedTrack::new(&self.tracks[index], frame, &self.settings);
-        let offset = predicted.offset(detection, &self.settings);
-        let (innovation, s) = predicted.innovation(detection, &self.settings);
+        let offset = predicted.offset(detection);
+        let (innovation, s) = predicted.innovation(detection, &offset, &self.settings);
         let track = &mut self.tracks[index];
         if s.mahalanobis_squared(innovation) > self.settings.own_id_gate {
             track.filter.inflate_position(PlaneCovariance::outer(innovation.east_m, innovation.north_m));

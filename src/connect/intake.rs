@@ -120,7 +120,7 @@ impl Intake {
     /// What failed is not the message's fault, so it must come again.
     pub(super) async fn take(&mut self, message: Message) -> Result<(), PeerError> {
         let now = self.app.clock.now();
-        let context = MessageContext { received_at: now, time_bounds: self.app.live_time_bounds() };
+        let context = MessageContext { received_at: now, time_bounds: self.app.live_time_bounds(now) };
         let read = if message.payload.len() > self.app.limits.connection_message_bytes {
             Err(format!("is larger than {} bytes", self.app.limits.connection_message_bytes))
         } else {
@@ -206,13 +206,14 @@ impl Intake {
 
     /// Gives an item to the camera's stream; its seq there.
     async fn follow(&mut self, camera: &CameraId, source: LiveSource) -> Result<u64> {
+        let now = self.app.clock.now();
         let known = self.stream(camera).await?;
         let active = known.stream.current_camera()?;
         let item = source.item(&active)?;
         let seq = known.last_seq + 1;
         known.stream.check_seq(seq)?;
         known.last_seq = seq;
-        match known.stream.take(&active, seq, item).await {
+        match known.stream.take(&active, seq, item, now).await {
             Ok(_) => Ok(seq),
             Err(error) => {
                 // One that was recorded before it was refused is settled by its recording.

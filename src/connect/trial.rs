@@ -86,7 +86,7 @@ async fn try_source(
     let mut source = open::source(app, connection, settings, secrets, &identity, &live).await?;
     let message = source.next().await?;
     let now = app.clock.now();
-    let context = MessageContext { received_at: now, time_bounds: app.live_time_bounds() };
+    let context = MessageContext { received_at: now, time_bounds: app.live_time_bounds(now) };
     let reading = match decoder(settings.format).decode(&message.payload, &context) {
         Ok(read) => {
             let skipped = read.skipped.iter().map(|reason| format!("skipped: {reason}"));

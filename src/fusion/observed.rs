@@ -109,11 +109,10 @@ impl ObservedBox {
             Some(recent) => regressor.regress_next(bounding_box, None, recent),
             None => regressor.regress(bounding_box, None),
         };
-        let one_step = match fix {
-            Some(_) if regressor.uses_fix() => regressor.regress(bounding_box, fix),
-            _ => independent,
-        };
-        let is_usable = is_usable(&independent) && is_usable(&one_step);
+        let with_fix = fix.filter(|_| regressor.uses_fix());
+        let one_step = with_fix.map(|fix| regressor.regress(bounding_box, Some(fix)));
+        let is_usable = is_usable(&independent) && one_step.as_ref().is_none_or(is_usable);
+        let one_step = one_step.unwrap_or(independent);
         Self {
             one_step: if is_usable { one_step } else { anywhere_in_range(&one_step) },
             independent: if is_usable { independent } else { anywhere_in_range(&independent) },

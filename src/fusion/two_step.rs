@@ -39,7 +39,7 @@ pub fn two_step(regression: &Regression, fix: EastNorth, e_gnss_m2: f64) -> (Eas
     };
     let regression_r95_m = weights.regression * regression.r95_m();
     let gnss_r95_m = weights.gnss * gnss_r95_m(e_gnss_m2);
-    (fused, weights, regression_r95_m.hypot(gnss_r95_m))
+    (fused, weights, (regression_r95_m * regression_r95_m + gnss_r95_m * gnss_r95_m).sqrt())
 }
 
 /// Answers one observation.

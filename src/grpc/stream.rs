@@ -255,9 +255,10 @@ impl StreamSession {
             return Ok(refused(seq, &error));
         }
         let camera = stream.current_camera()?;
+        let now = self.app.clock.now();
         // The receiver's clock offset is not applied yet, so only a wrong date is refused here.
-        let answered = match live_item(item, &camera.row_rules(self.app.clock.now())) {
-            Ok(item) => stream.take(&camera, seq, item).await,
+        let answered = match live_item(item, &camera.row_rules(now)) {
+            Ok(item) => stream.take(&camera, seq, item, now).await,
             Err(error) => Err(error),
         };
         match answered {

@@ -5,7 +5,6 @@ use super::encoder::Encoder;
 use super::encoder::features::{Encoded, reconstruction_error};
 use super::encoder::gaussian_process::RecentBoxes;
 use super::site::JointMap;
-use super::uncertainty::coverage::CoverageLookup;
 use super::uncertainty::error_model::{BoxError, ErrorModel};
 use crate::domain::{BoundingBox, ImageSize, Result, RunId};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
@@ -225,20 +224,18 @@ impl Regressor {
         fix: Option<EastNorth>,
         recent: Option<&mut RecentBoxes>,
     ) -> Regression {
-        let lookup = self.error_model.look_up(bounding_box);
         let mut r95_scale = self.r95_scale;
         let mut stated = None;
-        let (regressed, error) = match &self.encoder {
+        let (regressed, error, extrapolation_ratio) = match &self.encoder {
             Encoder::Paper(paper) => {
                 let estimate = paper.estimate(&self.plane, bounding_box, fix);
                 let (reconstruction_error, variance_m2) =
                     (estimate.reconstruction_error, estimate.variance_m2);
-                (estimate.position, BoxError { reconstruction_error, variance_m2 })
+                let error = BoxError { reconstruction_error, variance_m2 };
+                (estimate.position, error, self.error_model.extrapolation_ratio(bounding_box))
             }
-            Encoder::Hybrid(hybrid) => self.with_error(bounding_box, &lookup, hybrid.encode(bounding_box)),
-            Encoder::Projective(projective) => {
-                self.with_error(bounding_box, &lookup, projective.encode(bounding_box))
-            }
+            Encoder::Hybrid(hybrid) => self.with_error(bounding_box, hybrid.encode(bounding_box)),
+            Encoder::Projective(projective) => self.with_error(bounding_box, projective.encode(bounding_box)),
             Encoder::GaussianProcess(map) => {
                 // Its error comes with every answer, not from the error model.
                 let estimate = map.estimate(bounding_box, recent);
@@ -246,7 +243,8 @@ impl Regressor {
                 let reconstruction_error = reconstruction_error(bounding_box, &estimate.encoded);
                 stated = Some((estimate.covariance, estimate.box_noise));
                 let variance_m2 = estimate.covariance.per_axis_m2();
-                (estimate.encoded.position, BoxError { reconstruction_error, variance_m2 })
+                let error = BoxError { reconstruction_error, variance_m2 };
+                (estimate.encoded.position, error, self.error_model.extrapolation_ratio(bounding_box))
             }
         };
         let e_regression_m2 =
@@ -262,18 +260,18 @@ impl Regressor {
             e_regression_m2,
             covariance,
             box_noise,
-            outside_training: self.error_model.is_outside_training(&lookup, error.reconstruction_error),
+            outside_training: self
+                .error_model
+                .is_outside_training(extrapolation_ratio, error.reconstruction_error),
             r95_scale,
         }
     }
 
+    /// Position, its error by the error model, and the extrapolation ratio.
     #[inline]
-    fn with_error(
-        &self,
-        bounding_box: &BoundingBox,
-        lookup: &CoverageLookup,
-        encoded: Encoded,
-    ) -> (EastNorth, BoxError) {
-        (encoded.position, self.error_model.error_of(bounding_box, lookup, &encoded))
+    fn with_error(&self, bounding_box: &BoundingBox, encoded: Encoded) -> (EastNorth, BoxError, f64) {
+        let lookup = self.error_model.look_up(bounding_box);
+        let error = self.error_model.error_of(bounding_box, &lookup, &encoded);
+        (encoded.position, error, lookup.extrapolation_ratio)
     }
 }

@@ -120,10 +120,18 @@ impl Metrics {
 
     /// Observations were answered.
     pub fn fused(&self, fused: &[FusedFix]) {
-        let having = |flag| fused.iter().filter(|fix| fix.flags.contains(&flag)).count() as u64;
         self.fusions.answered.increment(fused.len() as u64);
-        self.fusions.denied.increment(having(Flag::GnssDenied));
-        self.fusions.outside_training.increment(having(Flag::OutsideTraining));
+        let flagged = [
+            (Flag::GnssDenied, &self.fusions.denied),
+            (Flag::OutsideTraining, &self.fusions.outside_training),
+        ];
+        for (flag, counter) in flagged {
+            let count = fused.iter().filter(|fix| fix.flags.contains(&flag)).count();
+            // An increment by 0 takes as long as any other.
+            if count > 0 {
+                counter.increment(count as u64);
+            }
+        }
     }
 
     /// An import was read: rows by outcome.

@@ -17,6 +17,8 @@ use crate::fusion::observed::ObservedPositions;
 
 /// Residuals that wait for their detector.
 const QUEUE: usize = 4_096;
+/// Residuals that are taken out at once.
+const BATCH: usize = 64;
 
 /// A residual of one camera.
 struct PairResidual {
@@ -53,15 +55,22 @@ pub(in crate::app) fn residual_queue() -> (ResidualQueue, WaitingResiduals) {
 impl WaitingResiduals {
     /// Feeds the detectors until the application is closed or dropped.
     pub(in crate::app) async fn run(mut self, app: Weak<Parts>) {
+        let mut batch = Vec::with_capacity(BATCH);
         loop {
-            let next = tokio::select! {
-                next = self.receiver.recv() => next,
-                () = self.closed.cancelled() => self.receiver.try_recv().ok(),
+            let is_closed = tokio::select! {
+                _ = self.receiver.recv_many(&mut batch, BATCH) => false,
+                () = self.closed.cancelled() => true,
             };
-            let (Some(PairResidual { camera, residual }), Some(parts)) = (next, app.upgrade()) else {
-                return;
-            };
-            App::of_program(parts, "drift detection").detect_drift(&camera, &residual).await;
+            if is_closed {
+                batch.extend(std::iter::from_fn(|| self.receiver.try_recv().ok()).take(QUEUE));
+            }
+            let Some(parts) = app.upgrade().filter(|_| !batch.is_empty()) else { return };
+            let app = App::of_program(parts, "drift detection");
+            for PairResidual { camera, residual } in batch.drain(..) {
+                app.detect_drift(&camera, &residual).await;
+            }
+            // Answers go first, and what they bring meanwhile is taken at once: waking this task for each costs more.
+            tokio::task::yield_now().await;
         }
     }
 }
@@ -81,7 +90,7 @@ impl App {
         camera: &Arc<ActiveCamera>,
         observations: &[(&Observation, ObservedPositions<'_>)],
     ) {
-        let bounds = self.live_time_bounds();
+        let bounds = self.live_time_bounds(self.clock.now());
         let residual = observations.iter().rev().find_map(|(observation, observed)| {
             let (regressed, fix) = (observed.usable_box()?.independent, observed.fix?);
             bounds.check(observation.time()).ok()?;

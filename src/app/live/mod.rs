@@ -109,14 +109,14 @@ impl CameraEvents {
 impl App {
     /// The bounds of times that may enter tracks and drift detection.
     #[must_use]
-    pub fn live_time_bounds(&self) -> TimeBounds {
-        TimeBounds::live_at(self.clock.now(), self.limits.live_ahead_s)
+    pub fn live_time_bounds(&self, now: Timestamp) -> TimeBounds {
+        TimeBounds::live_at(now, self.limits.live_ahead_s)
     }
 
     /// What live observations of a camera must satisfy.
     #[must_use]
     pub fn live_rules(&self, camera: &ActiveCamera) -> RowRules {
-        RowRules { time_bounds: self.live_time_bounds(), image_size: camera.image_size }
+        RowRules { time_bounds: self.live_time_bounds(self.clock.now()), image_size: camera.image_size }
     }
 
     /// Answers an observation, feeds its target's track and the tracker of the camera's site, and compares box
@@ -131,15 +131,17 @@ impl App {
         observation: Observation,
     ) -> Result<ItemResult> {
         // A time that no track takes must not move the matching either.
-        self.live_time_bounds().check(observation.time())?;
+        let now = self.clock.now();
+        self.live_time_bounds(now).check(observation.time())?;
         let identified = self.identify(camera, observation);
-        self.follow_identified((camera, lease), identified)
+        self.follow_identified((camera, lease), identified, now)
     }
 
     fn follow_identified(
         &self,
         (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
         identified: Identified,
+        observed_at: Timestamp,
     ) -> Result<ItemResult> {
         let now = self.clock.monotonic();
         lease.check(now)?;
@@ -163,7 +165,7 @@ impl App {
         };
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
-        camera.live.observed(self.clock.now());
+        camera.live.observed(observed_at);
         let world_track = self.feed_site(camera, observation, &observed);
         let (track, residual) = match (target, observation.target_id()) {
             (Some(mut target), Some(target_id)) => {

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tokio::sync::watch;
 
 use super::ItemResult;
@@ -149,7 +150,7 @@ impl App {
             let (receiver_id, class, score) = (None, None, None);
             let item = LiveItem { time, target_id, tracker_id, receiver_id, bounding_box, fix, class, score };
             stream.check_seq(seq)?;
-            followed.push(stream.take(camera, seq, item).await?);
+            followed.push(stream.take(camera, seq, item, self.clock.now()).await?);
         }
         // Deciding early would take other requests' and streams' items from each other.
         stream.settle_within(PAIRING_PATIENCE).await?;
@@ -247,12 +248,19 @@ impl LiveStream {
         }
     }
 
-    /// Takes an item: its own position, its target's track with it, and its part in a sample.
+    /// Takes an item: its own position, its target's track with it, and its part in a sample. `now` is a reading of the
+    /// wall clock after the item had come.
     ///
     /// # Errors
     /// `CameraBetweenNodes`, which ends the stream; `InvalidArgument` for neither box nor fix, or for a time ahead of the server's clock, naming the
     /// field; as [`App::follow`].
-    pub async fn take(&self, camera: &Arc<ActiveCamera>, seq: u64, item: LiveItem) -> Result<ItemResult> {
+    pub async fn take(
+        &self,
+        camera: &Arc<ActiveCamera>,
+        seq: u64,
+        item: LiveItem,
+        now: Timestamp,
+    ) -> Result<ItemResult> {
         let lease = self.lease()?;
         lease.check(self.app.clock.monotonic())?;
         let (target_id, time) = match (item.target_id, &item.receiver_id) {
@@ -266,14 +274,14 @@ impl LiveStream {
         let observation = Observation::new(time, target_id, item.bounding_box, item.fix)?
             .with_tracker_id(item.tracker_id)?;
         // A time that no track takes must not move the pairing either.
-        self.app.live_time_bounds().check(time)?;
+        self.app.live_time_bounds(now).check(time)?;
         let identified = self.app.identify(camera, observation);
         if identified.is_sure {
             self.record(seq, &identified.observation, item.class, item.score).await?;
         } else {
             self.ack_without_storing(seq, NotStoredReason::Unmatched);
         }
-        self.app.follow_identified((camera, lease), identified)
+        self.app.follow_identified((camera, lease), identified, now)
     }
 
     async fn record(

@@ -10,7 +10,8 @@ use super::camera_error::CameraError;
 use super::gate::{ACTIVE_S, GateOutcome, Reach, Reacquisition, SourceHistory};
 use super::measurement::{MeasuredPosition, Measurement, MeasurementSource, RejectionReason};
 use super::mode_filter::{
-    CAMERA_BIAS, GNSS_BIAS, ModeFilter, NoiseDecomposition, POSITION, PredictedMeasurement, VELOCITY,
+    CAMERA_BIAS, GNSS_BIAS, ModeFilter, NoiseDecomposition, POSITION, PredictedMeasurement, SESSION_BIAS,
+    Transition, VELOCITY, mix,
 };
 use super::settings::{MotionModel, TrackSettings};
 use super::state::{TrackState, Velocity};
@@ -54,13 +55,13 @@ impl ImmFilter {
         let motion = &settings.motion;
         let decomposition = NoiseDecomposition::new(settings, source, measured, 1.0);
         let moving = ModeFilter::new(&decomposition, measured.covariance, motion.initial_speed_sigma_m_s);
-        let mut stationary = moving.clone();
-        stationary.predict_stationary(0.0, motion.stationary_m2_s);
+        let mut stationary = moving;
+        stationary.propagate(&Transition::stationary(0.0, motion.stationary_m2_s));
         let mut histories = [SourceHistory::default(); 2];
         histories[source as usize] = SourceHistory::accepted(time);
         Self {
             time,
-            modes: [stationary, moving.clone(), moving],
+            modes: [stationary, moving, moving],
             mode_probabilities: initial_probabilities(motion),
             histories,
             last_regressed_at: (source == MeasurementSource::Regressed).then_some(time),
@@ -82,13 +83,28 @@ impl ImmFilter {
         self.camera.travel(self.mean_speed_m_s() * step_s);
         // Stationary variance of the agile velocity = speed envelope: density = 2 v^2 / tau.
         let agile_m2_s3 = 2.0 * self.speed_envelope_m2_s2 / motion.agile_time_constant_s;
-        for mode in &mut self.modes {
-            mode.propagate_biases(settings, step_s);
+        let transitions = [
+            Transition::stationary(step_s, motion.stationary_m2_s),
+            Transition::ornstein_uhlenbeck(step_s, motion.steady_m2_s3, motion.steady_time_constant_s),
+            Transition::ornstein_uhlenbeck(step_s, agile_m2_s3, motion.agile_time_constant_s),
+        ];
+        let regression = &settings.regression;
+        let [gnss, session, camera] = [
+            settings.gnss.time_constant_s,
+            settings.gnss_session.time_constant_s,
+            regression.correlation.time_constant_s,
+        ]
+        .map(|time_constant_s| step_s / time_constant_s);
+        let [gnss, session] = [gnss, session].map(|rate| (-rate).exp());
+        for (mode, transition) in self.modes.iter_mut().zip(transitions) {
+            // The camera's bias also decorrelates with the distance travelled.
+            let camera = camera + step_s * mode.speed_m_s() / regression.correlation_length_m;
+            let transition = transition
+                .with_bias(GNSS_BIAS, gnss)
+                .with_bias(SESSION_BIAS, session)
+                .with_bias(CAMERA_BIAS, (-camera).exp());
+            mode.propagate(&transition);
         }
-        let [stationary, steady, agile] = &mut self.modes;
-        stationary.predict_stationary(step_s, motion.stationary_m2_s);
-        steady.predict_ornstein_uhlenbeck(step_s, motion.steady_m2_s3, motion.steady_time_constant_s);
-        agile.predict_ornstein_uhlenbeck(step_s, agile_m2_s3, motion.agile_time_constant_s);
     }
 
     /// The interaction step of the IMM for a step of any length. The chance to stay in a mode is
@@ -98,17 +114,19 @@ impl ImmFilter {
         let transition_probability = |from: usize, to: usize| {
             if from == to { stay[from] } else { 0.5 * (1.0 - stay[from]) }
         };
-        let before = self.modes.clone();
         let mut probabilities = [0.0; MODES];
+        let mut weights = [[0.0; MODES]; MODES];
         for (to, predicted) in probabilities.iter_mut().enumerate() {
             let joint: [f64; MODES] =
                 std::array::from_fn(|from| self.mode_probabilities[from] * transition_probability(from, to));
-            let total: f64 = joint.iter().sum();
-            *predicted = total;
-            if total > MIN_PROBABILITY {
-                self.modes[to] = ModeFilter::moment_match(&before, joint.map(|share| share / total));
+            *predicted = joint.iter().sum();
+            if *predicted > MIN_PROBABILITY {
+                weights[to] = joint.map(|share| share / *predicted);
+            } else {
+                weights[to][to] = 1.0;
             }
         }
+        mix(&mut self.modes, &weights);
         let total: f64 = probabilities.iter().sum();
         self.mode_probabilities = probabilities.map(|probability| probability / total);
     }
@@ -120,7 +138,7 @@ impl ImmFilter {
         self.speed_envelope_m2_s2 = self.speed_envelope_m2_s2.max(motion.min_speed_m_s.powi(2));
         for (mode, probability) in self.modes.iter().zip(self.mode_probabilities).skip(1) {
             let speed_m2_s2: f64 = (VELOCITY..GNSS_BIAS)
-                .map(|state| mode.mean[state].powi(2) - mode.covariance[(state, state)])
+                .map(|state| mode.mean[state].powi(2) - mode.covariance[state][state])
                 .sum();
             if probability > SPEED_MODE_PROBABILITY && speed_m2_s2 > self.speed_envelope_m2_s2 {
                 self.speed_envelope_m2_s2 = speed_m2_s2;
@@ -144,78 +162,27 @@ impl ImmFilter {
         measurement: &Measurement,
     ) -> [Option<GateOutcome>; 2] {
         self.predict(settings, measurement.time);
-        let regressed = measurement.regressed.map(|it| self.camera.at_place(settings, it));
-        if let Some(regressed) = &regressed {
-            let correlation = self.camera.correlation(settings, regressed);
+        let regressed = measurement.regressed.map(|measured| {
+            let measured = self.camera.at_place(settings, measured);
+            let correlation = self.camera.correlation(settings, &measured);
             for mode in &mut self.modes {
                 mode.decorrelate(CAMERA_BIAS, correlation);
             }
-        }
-        let is_elsewhere = regressed
-            .zip(measurement.fix)
-            .is_some_and(|(regressed, fix)| self.is_elsewhere(settings, regressed, fix));
-        let regressed = regressed.map(|measured| {
-            if is_elsewhere {
-                return self.restart(settings, MeasurementSource::Regressed, measured);
-            }
-            self.gate_and_update(settings, MeasurementSource::Regressed, measured)
+            self.gate_and_update(settings, MeasurementSource::Regressed, measured, measurement.fix)
         });
-        let fix =
-            measurement.fix.map(|measured| self.gate_and_update(settings, MeasurementSource::Fix, measured));
+        let fix = measurement
+            .fix
+            .map(|measured| self.gate_and_update(settings, MeasurementSource::Fix, measured, None));
         [regressed, fix]
     }
 
-    /// Whether box and fix agree with each other, and neither with the track: its target id now names
-    /// another target.
-    fn is_elsewhere(
-        &self,
-        settings: &TrackSettings,
-        regressed: MeasuredPosition,
-        fix: MeasuredPosition,
-    ) -> bool {
-        if !(regressed.covariance.is_positive() && fix.covariance.is_positive()) {
-            return false;
-        }
-        let difference = EastNorth {
-            east_m: fix.position.east_m - regressed.position.east_m,
-            north_m: fix.position.north_m - regressed.position.north_m,
-        };
-        let pair_nis = fix
-            .covariance
-            .plus(regressed.covariance.scaled(regressed.stated_scale))
-            .mahalanobis_squared(difference);
-        let is_outside = |source, measured| {
-            let inflation = self.correlated_noise_inflation(settings, source);
-            let decomposition = NoiseDecomposition::new(settings, source, measured, inflation);
-            let predicted = self.predict_measurement(&decomposition);
-            !self.passes_gate(settings, &predicted, self.innovation(&predicted).1)
-        };
-        pair_nis <= settings.gate
-            && is_outside(MeasurementSource::Regressed, regressed)
-            && is_outside(MeasurementSource::Fix, fix)
-    }
-
-    fn restart(
-        &mut self,
-        settings: &TrackSettings,
-        source: MeasurementSource,
-        measured: MeasuredPosition,
-    ) -> GateOutcome {
-        *self = Self::new(settings, self.time, source, measured);
-        GateOutcome {
-            source,
-            innovation: EastNorth::default(),
-            nis: f64::NAN,
-            rejected: None,
-            reinitialized: true,
-        }
-    }
-
+    /// Updates with a position that passes the gate. `fix` is that of the same instant as a regressed position.
     fn gate_and_update(
         &mut self,
         settings: &TrackSettings,
         source: MeasurementSource,
         measured: MeasuredPosition,
+        fix: Option<MeasuredPosition>,
     ) -> GateOutcome {
         let mut outcome = GateOutcome {
             source,
@@ -227,12 +194,16 @@ impl ImmFilter {
         if !measured.covariance.is_positive() {
             return outcome;
         }
-        let inflation = self.correlated_noise_inflation(settings, source);
-        let decomposition = NoiseDecomposition::new(settings, source, measured, inflation);
+        let decomposition = self.decompose(settings, source, measured);
         let mut predicted = self.predict_measurement(&decomposition);
-        (outcome.innovation, outcome.nis) = self.innovation(&predicted);
+        let (innovation, nis) = self.innovation(&predicted);
         outcome.rejected = None;
-        if !self.passes_gate(settings, &predicted, outcome.nis) {
+        if !self.passes_gate(settings, &predicted, nis) {
+            if fix.is_some_and(|fix| self.is_elsewhere(settings, measured, fix)) {
+                *self = Self::new(settings, self.time, source, measured);
+                return GateOutcome { reinitialized: true, ..outcome };
+            }
+            (outcome.innovation, outcome.nis) = (innovation, nis);
             match self.reacquire(settings, source, measured, &decomposition) {
                 Reacquisition::Rejected => {
                     outcome.rejected = Some(RejectionReason::OutsideGate);
@@ -245,6 +216,7 @@ impl ImmFilter {
                 Reacquisition::BiasReset => predicted = self.predict_measurement(&decomposition),
             }
         }
+        (outcome.innovation, outcome.nis) = (innovation, nis);
         self.update(&predicted);
         self.histories[source as usize] = SourceHistory::accepted(self.time);
         if source == MeasurementSource::Regressed {
@@ -252,6 +224,42 @@ impl ImmFilter {
             self.camera = CameraError::new(settings, Some(&measured));
         }
         outcome
+    }
+
+    /// Whether a fix agrees with a regressed position that is outside the gate, and is outside itself: the track's
+    /// target id now names another target.
+    fn is_elsewhere(
+        &self,
+        settings: &TrackSettings,
+        regressed: MeasuredPosition,
+        fix: MeasuredPosition,
+    ) -> bool {
+        if !fix.covariance.is_positive() {
+            return false;
+        }
+        let difference = EastNorth {
+            east_m: fix.position.east_m - regressed.position.east_m,
+            north_m: fix.position.north_m - regressed.position.north_m,
+        };
+        let pair_nis = fix
+            .covariance
+            .plus(regressed.covariance.scaled(regressed.stated_scale))
+            .mahalanobis_squared(difference);
+        if pair_nis > settings.gate {
+            return false;
+        }
+        let predicted = self.predict_measurement(&self.decompose(settings, MeasurementSource::Fix, fix));
+        !self.passes_gate(settings, &predicted, self.innovation(&predicted).1)
+    }
+
+    fn decompose(
+        &self,
+        settings: &TrackSettings,
+        source: MeasurementSource,
+        measured: MeasuredPosition,
+    ) -> NoiseDecomposition {
+        let inflation = self.correlated_noise_inflation(settings, source);
+        NoiseDecomposition::new(settings, source, measured, inflation)
     }
 
     /// Factor, at least 1, on the white variance of a regressed position: boxes closer in time than
@@ -319,9 +327,9 @@ impl ImmFilter {
     }
 
     fn predict_measurement(&self, decomposition: &NoiseDecomposition) -> [PredictedMeasurement; MODES] {
-        std::array::from_fn(|mode| {
-            self.modes[mode].predict_measurement(decomposition, self.camera.stated_scale)
-        })
+        let of = |mode: &ModeFilter| mode.predict_measurement(decomposition, self.camera.stated_scale);
+        let [stationary, steady, agile] = &self.modes;
+        [of(stationary), of(steady), of(agile)]
     }
 
     /// The chi-square gate: `nis`, of the mixture, or the penalised NIS of the best mode is within
@@ -369,18 +377,23 @@ impl ImmFilter {
         penalised.fold(f64::INFINITY, f64::min)
     }
 
-    /// Kalman update of every mode, then Bayes' rule for the mode probabilities, by log-sum-exp so
-    /// that a distant measurement cannot turn all of them to 0.
+    /// Kalman update of every mode, then Bayes' rule for the mode probabilities, relative to the likeliest
+    /// mode so that a distant measurement cannot turn all of them to 0.
     fn update(&mut self, predicted: &[PredictedMeasurement; MODES]) {
-        let mut log_posterior = [0.0; MODES];
-        for (mode, log) in log_posterior.iter_mut().enumerate() {
-            *log = self.mode_probabilities[mode].max(MIN_PROBABILITY).ln()
-                + self.modes[mode].update(&predicted[mode]);
+        let mut squared_distances = [0.0; MODES];
+        for (mode, squared_distance) in squared_distances.iter_mut().enumerate() {
+            let [squared, root_determinant_m2] = self.modes[mode].update(&predicted[mode]);
+            *squared_distance = squared;
+            let prior = self.mode_probabilities[mode].max(MIN_PROBABILITY);
+            self.mode_probabilities[mode] = prior / root_determinant_m2;
         }
-        let highest = log_posterior.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let total: f64 = log_posterior.iter().map(|log| (log - highest).exp()).sum();
-        for (probability, log) in self.mode_probabilities.iter_mut().zip(log_posterior) {
-            *probability = (log - highest).exp() / total;
+        let least = squared_distances.iter().copied().fold(f64::INFINITY, f64::min);
+        for (probability, squared) in self.mode_probabilities.iter_mut().zip(squared_distances) {
+            *probability *= (0.5 * (least - squared)).exp();
+        }
+        let total: f64 = self.mode_probabilities.iter().sum();
+        for probability in &mut self.mode_probabilities {
+            *probability /= total;
         }
     }
 
@@ -396,12 +409,8 @@ impl ImmFilter {
         for (mode, probability) in self.modes.iter().zip(self.mode_probabilities) {
             let deviation =
                 PlaneCovariance::outer(mode.mean[POSITION] - mean[0], mode.mean[POSITION + 1] - mean[1]);
-            let position = PlaneCovariance {
-                east_m2: mode.covariance[(POSITION, POSITION)],
-                north_m2: mode.covariance[(POSITION + 1, POSITION + 1)],
-                east_north_m2: mode.covariance[(POSITION, POSITION + 1)],
-            };
-            let stated = position.plus(mode.camera_share().scaled(self.camera.stated_scale - 1.0));
+            let stated =
+                mode.position_covariance().plus(mode.camera_share().scaled(self.camera.stated_scale - 1.0));
             lasting = lasting.plus(mode.lasting_error().scaled(probability));
             covariance = covariance.plus(stated.plus(deviation).scaled(probability));
         }

@@ -11,15 +11,13 @@
 //! part for measurements closer in time than its own correlation
 //! (Bar-Shalom, Li and Kirubarajan 2001, 8.2: state augmentation for autocorrelated noise).
 
-use nalgebra::{SMatrix, SVector};
-
 use super::measurement::{MeasuredPosition, MeasurementSource};
 use super::settings::TrackSettings;
 use crate::geo::EastNorth;
 use crate::geo::PlaneCovariance;
 
 /// Components of the state.
-pub(super) const STATES: usize = 10;
+const STATES: usize = 10;
 /// Index of the first (east) component of each pair; north follows.
 pub(super) const POSITION: usize = 0;
 pub(super) const VELOCITY: usize = 2;
@@ -34,17 +32,33 @@ const RESET_BIAS_SIGMAS: f64 = 4.0;
 /// Mixing weights below this contribute nothing to a covariance.
 const NEGLIGIBLE_WEIGHT: f64 = 1e-9;
 
-pub(super) type State = SVector<f64, STATES>;
-pub(super) type StateCovariance = SMatrix<f64, STATES, STATES>;
+/// One number per state: arrays, of which loops of constant length are compiled to vector instructions.
+type Vector = [f64; STATES];
+/// By column; symmetric to the bit.
+type SymmetricMatrix = [Vector; STATES];
 
 /// Mean and covariance of the state under one motion mode.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 pub(super) struct ModeFilter {
-    pub(super) mean: State,
-    pub(super) covariance: StateCovariance,
-    /// `M`, the derivative of the mean by the camera's lasting error d, in its standard deviations: an error of all boxes
-    /// that is not estimated (a consider parameter; Bierman 1977, VIII). `z = p + L_d d`, so `M <- M + K (L_d - H M)`.
-    response: SMatrix<f64, STATES, 2>,
+    pub(super) mean: Vector,
+    pub(super) covariance: SymmetricMatrix,
+    /// `M`, the derivative of the mean by the camera's lasting error d (a column per axis), in its standard deviations: an
+    /// error of all boxes that is not estimated (a consider parameter; Bierman 1977, VIII). `z = p + L_d d`, so
+    /// `M <- M + K (L_d - H M)`.
+    response: [Vector; 2],
+}
+
+/// A propagation `x <- F x + w`: the velocity, integrated over time, adds to the position, and every state decays by a
+/// factor of its own.
+pub(super) struct Transition {
+    /// Integral of the velocity's decay over the step, s.
+    integrated_decay_s: f64,
+    /// Diagonal of F.
+    decay: Vector,
+    /// Variances of w, in squared units of each state.
+    noise: Vector,
+    /// Covariance of w between position and velocity of one axis, m2/s.
+    position_velocity_m2_s: f64,
 }
 
 /// A measured position with its error split into a bias and a white part.
@@ -75,8 +89,8 @@ pub(super) struct PredictedMeasurement {
     pub(super) innovation_covariance: PlaneCovariance,
     /// S with the camera's bias as uncertain as it is stated, m2: for the gate.
     pub(super) stated_covariance: PlaneCovariance,
-    /// Cross-covariance `P H'` of the state with the measured position.
-    cross_covariance: SMatrix<f64, STATES, 2>,
+    /// Cross-covariance `P H'` of the state with the measured position, by axis.
+    cross_covariance: [Vector; 2],
     /// `L_d - H M`, m: the derivatives of the innovation (east, north) by each component of the camera's lasting error.
     lasting: [[f64; 2]; 2],
 }
@@ -113,6 +127,112 @@ impl NoiseDecomposition {
     }
 }
 
+impl Transition {
+    /// Stationary mode: the velocity is zero and uncorrelated with everything; the position performs
+    /// a random walk of `density_m2_s`. With `step_s = 0` only the velocity is reset.
+    pub(super) fn stationary(step_s: f64, density_m2_s: f64) -> Self {
+        let mut own = Self {
+            integrated_decay_s: 0.0,
+            decay: [1.0; STATES],
+            noise: [0.0; STATES],
+            position_velocity_m2_s: 0.0,
+        };
+        for axis in 0..2 {
+            own.decay[VELOCITY + axis] = 0.0;
+            own.noise[VELOCITY + axis] = STATIONARY_SPEED_SIGMA_M_S * STATIONARY_SPEED_SIGMA_M_S;
+            own.noise[POSITION + axis] = density_m2_s * step_s;
+        }
+        own
+    }
+
+    /// Moving modes: the velocity is an Ornstein-Uhlenbeck process driven by white acceleration of
+    /// `density_m2_s3`, the position its integral, discretised exactly (Särkkä and Solin 2019, 6.2).
+    pub(super) fn ornstein_uhlenbeck(step_s: f64, density_m2_s3: f64, time_constant_s: f64) -> Self {
+        let rate = 1.0 / time_constant_s;
+        let exponent = rate * step_s;
+        let decay = (-exponent).exp();
+        let integrated_decay_s = (1.0 - decay) / rate;
+        let position_m2 = if exponent < 0.01 {
+            // Series to second order: the closed form loses all digits for short steps.
+            density_m2_s3 * step_s.powi(3) / 3.0 * (1.0 - 0.75 * exponent)
+        } else {
+            density_m2_s3 / rate.powi(3) * (exponent - 2.0 * (1.0 - decay) + 0.5 * (1.0 - decay * decay))
+        };
+        let mut own = Self {
+            integrated_decay_s,
+            decay: [1.0; STATES],
+            noise: [0.0; STATES],
+            position_velocity_m2_s: density_m2_s3 * 0.5 * integrated_decay_s * integrated_decay_s,
+        };
+        for axis in 0..2 {
+            own.decay[VELOCITY + axis] = decay;
+            own.noise[VELOCITY + axis] = density_m2_s3 * (1.0 - decay * decay) / (2.0 * rate);
+            own.noise[POSITION + axis] = position_m2;
+        }
+        own
+    }
+
+    /// With a bias that is a first-order Gauss-Markov process of unit variance, of which `correlation` is left.
+    pub(super) fn with_bias(mut self, bias: usize, correlation: f64) -> Self {
+        for state in [bias, bias + 1] {
+            self.decay[state] = correlation;
+            self.noise[state] = 1.0 - correlation * correlation;
+        }
+        self
+    }
+}
+
+/// The interaction step of the IMM: each mode becomes the mixture of all of them with its weights, `weights[to][from]`,
+/// by moment matching. The weights of a mode sum to 1.
+pub(super) fn mix<const N: usize>(modes: &mut [ModeFilter; N], weights: &[[f64; N]; N]) {
+    let before: [(Vector, [Vector; 2]); N] =
+        std::array::from_fn(|from| (modes[from].mean, modes[from].response));
+    // sqrt(w) (m_from - m_to): its outer products are the spread of the means, symmetric to the bit.
+    let mut spread = [[[0.0; STATES]; N]; N];
+    for (to, mode) in modes.iter_mut().enumerate() {
+        mode.mean = [0.0; STATES];
+        mode.response = [[0.0; STATES]; 2];
+        for ((mean, response), weight) in before.iter().zip(weights[to]) {
+            add_scaled(&mut mode.mean, weight, mean);
+            for (own, response) in mode.response.iter_mut().zip(response) {
+                add_scaled(own, weight, response);
+            }
+        }
+        for ((mean, _), (spread, weight)) in before.iter().zip(spread[to].iter_mut().zip(weights[to])) {
+            let root = of_covariance(weight).sqrt();
+            for state in 0..STATES {
+                spread[state] = root * (mean[state] - mode.mean[state]);
+            }
+        }
+    }
+    for column in 0..STATES {
+        let before: [Vector; N] = std::array::from_fn(|from| modes[from].covariance[column]);
+        for (to, mode) in modes.iter_mut().enumerate() {
+            let mut mixed = [0.0; STATES];
+            for from in 0..N {
+                let spread = &spread[to][from];
+                let (weight, own) = (of_covariance(weights[to][from]), spread[column]);
+                for state in 0..STATES {
+                    mixed[state] += weight * before[from][state] + own * spread[state];
+                }
+            }
+            mode.covariance[column] = mixed;
+        }
+    }
+}
+
+/// The weight of a component in the covariance of a mixture.
+fn of_covariance(weight: f64) -> f64 {
+    if weight > NEGLIGIBLE_WEIGHT { weight } else { 0.0 }
+}
+
+#[inline(always)]
+fn add_scaled(sum: &mut Vector, factor: f64, vector: &Vector) {
+    for (sum, value) in sum.iter_mut().zip(vector) {
+        *sum += factor * value;
+    }
+}
+
 impl ModeFilter {
     /// A filter that knows one measured position: `p = z - L b - e`, so position and bias are
     /// correlated from the start; the velocity has mean 0 and `initial_speed_sigma_m_s` per axis.
@@ -121,83 +241,70 @@ impl ModeFilter {
         covariance_m2: PlaneCovariance,
         initial_speed_sigma_m_s: f64,
     ) -> Self {
-        let mut mean = State::zeros();
+        let mut mean = [0.0; STATES];
         mean[POSITION] = decomposition.position.east_m;
         mean[POSITION + 1] = decomposition.position.north_m;
-        let mut covariance = StateCovariance::zeros();
-        for bias in GNSS_BIAS..STATES {
-            covariance[(bias, bias)] = 1.0;
+        let mut covariance = [[0.0; STATES]; STATES];
+        for (bias, column) in covariance.iter_mut().enumerate().skip(GNSS_BIAS) {
+            column[bias] = 1.0;
+        }
+        for state in [VELOCITY, VELOCITY + 1] {
+            covariance[state][state] = initial_speed_sigma_m_s.powi(2);
+        }
+        for ObservedBias { state, root_m } in decomposition.biases {
+            for (row, values) in rows(root_m).into_iter().enumerate() {
+                for (column, value) in values.into_iter().enumerate() {
+                    covariance[POSITION + row][state + column] = -value;
+                    covariance[state + column][POSITION + row] = -value;
+                }
+            }
+        }
+        for (row, values) in covariance_m2.rows_m2().into_iter().enumerate() {
+            covariance[POSITION + row][POSITION..VELOCITY].copy_from_slice(&values);
+        }
+        let response = rows(decomposition.lasting_root_m).map(|values| {
+            let mut column = [0.0; STATES];
+            column[POSITION..VELOCITY].copy_from_slice(&values);
+            column
+        });
+        Self { mean, covariance, response }
+    }
+
+    /// Speed of the mean velocity, m/s.
+    pub(super) fn speed_m_s(&self) -> f64 {
+        let [east_m_s, north_m_s] = [self.mean[VELOCITY], self.mean[VELOCITY + 1]];
+        (east_m_s * east_m_s + north_m_s * north_m_s).sqrt()
+    }
+
+    /// Propagates over a step: `m <- F m`, `M <- F M`, `P <- F P F' + Q`.
+    pub(super) fn propagate(&mut self, transition: &Transition) {
+        let Transition { integrated_decay_s, decay, noise, position_velocity_m2_s } = transition;
+        for axis in 0..2 {
+            let velocity = self.covariance[VELOCITY + axis];
+            add_scaled(&mut self.covariance[POSITION + axis], *integrated_decay_s, &velocity);
+        }
+        let [first, second] = &mut self.response;
+        for vector in self.covariance.iter_mut().chain([&mut self.mean, first, second]) {
+            for axis in 0..2 {
+                vector[POSITION + axis] += integrated_decay_s * vector[VELOCITY + axis];
+            }
+        }
+        // The two sums of this element were rounded in different orders.
+        self.covariance[POSITION + 1][POSITION] = self.covariance[POSITION][POSITION + 1];
+        for vector in [&mut self.mean, first, second] {
+            for (value, decay) in vector.iter_mut().zip(decay) {
+                *value *= decay;
+            }
+        }
+        for (state, column) in self.covariance.iter_mut().enumerate() {
+            for (value, other) in column.iter_mut().zip(decay) {
+                *value *= decay[state] * other;
+            }
+            column[state] += noise[state];
         }
         for axis in 0..2 {
-            covariance[(VELOCITY + axis, VELOCITY + axis)] = initial_speed_sigma_m_s.powi(2);
-        }
-        for ObservedBias { state, root_m: [east, north, east_north] } in decomposition.biases {
-            for (row, column, value) in [(0, 0, east), (1, 1, north), (0, 1, east_north), (1, 0, east_north)]
-            {
-                covariance[(POSITION + row, state + column)] = -value;
-                covariance[(state + column, POSITION + row)] = -value;
-            }
-        }
-        for (row, values) in covariance_m2.rows_m2().iter().enumerate() {
-            for (column, value) in values.iter().enumerate() {
-                covariance[(POSITION + row, POSITION + column)] = *value;
-            }
-        }
-        let mut response = SMatrix::zeros();
-        let [east, north, east_north] = decomposition.lasting_root_m;
-        for (row, values) in [[east, east_north], [east_north, north]].into_iter().enumerate() {
-            for (column, value) in values.into_iter().enumerate() {
-                response[(POSITION + row, column)] = value;
-            }
-        }
-        Self { mean, covariance, response }
-    }
-
-    /// Mean and covariance of a mixture with the given weights, which sum to 1 (moment matching).
-    pub(super) fn moment_match<const N: usize>(components: &[Self; N], weights: [f64; N]) -> Self {
-        let mut mean = State::zeros();
-        let mut response = SMatrix::zeros();
-        for (component, weight) in components.iter().zip(weights) {
-            mean += component.mean * weight;
-            response += component.response * weight;
-        }
-        let mut covariance = StateCovariance::zeros();
-        for (component, weight) in components.iter().zip(weights) {
-            if weight > NEGLIGIBLE_WEIGHT {
-                let deviation = component.mean - mean;
-                covariance += (component.covariance + deviation * deviation.transpose()) * weight;
-            }
-        }
-        Self { mean, covariance, response }
-    }
-
-    /// Multiplies one state component by a factor, its covariances with it.
-    fn scale(&mut self, state: usize, factor: f64) {
-        self.mean[state] *= factor;
-        self.response[(state, 0)] *= factor;
-        self.response[(state, 1)] *= factor;
-        for other in 0..STATES {
-            self.covariance[(state, other)] *= factor;
-            self.covariance[(other, state)] *= factor;
-        }
-    }
-
-    /// Propagates the biases as first-order Gauss-Markov processes of unit variance,
-    /// `phi = exp(-rate)`; the camera's also decorrelates with the distance travelled.
-    pub(super) fn propagate_biases(&mut self, settings: &TrackSettings, step_s: f64) {
-        let speed_m_s = self.mean[VELOCITY].hypot(self.mean[VELOCITY + 1]);
-        let regression = &settings.regression;
-        let rates = [
-            (GNSS_BIAS, step_s / settings.gnss.time_constant_s),
-            (SESSION_BIAS, step_s / settings.gnss_session.time_constant_s),
-            (
-                CAMERA_BIAS,
-                step_s / regression.correlation.time_constant_s
-                    + step_s * speed_m_s / regression.correlation_length_m,
-            ),
-        ];
-        for (bias, rate) in rates {
-            self.decorrelate(bias, (-rate).exp());
+            self.covariance[POSITION + axis][VELOCITY + axis] += position_velocity_m2_s;
+            self.covariance[VELOCITY + axis][POSITION + axis] += position_velocity_m2_s;
         }
     }
 
@@ -205,84 +312,51 @@ impl ModeFilter {
     pub(super) fn decorrelate(&mut self, bias: usize, correlation: f64) {
         for state in [bias, bias + 1] {
             self.scale(state, correlation);
-            self.covariance[(state, state)] += 1.0 - correlation * correlation;
+            self.covariance[state][state] += 1.0 - correlation * correlation;
         }
-    }
-
-    /// Stationary mode: the velocity is zero and uncorrelated with everything; the position performs
-    /// a random walk of `density_m2_s`. With `step_s = 0` only the velocity is reset.
-    pub(super) fn predict_stationary(&mut self, step_s: f64, density_m2_s: f64) {
-        for state in [VELOCITY, VELOCITY + 1] {
-            self.scale(state, 0.0);
-            self.covariance[(state, state)] = STATIONARY_SPEED_SIGMA_M_S * STATIONARY_SPEED_SIGMA_M_S;
-        }
-        for state in [POSITION, POSITION + 1] {
-            self.covariance[(state, state)] += density_m2_s * step_s;
-        }
-    }
-
-    /// Moving modes: the velocity is an Ornstein-Uhlenbeck process driven by white acceleration of
-    /// `density_m2_s3`, the position its integral, discretised exactly (Särkkä and Solin 2019, 6.2).
-    pub(super) fn predict_ornstein_uhlenbeck(
-        &mut self,
-        step_s: f64,
-        density_m2_s3: f64,
-        time_constant_s: f64,
-    ) {
-        let rate = 1.0 / time_constant_s;
-        let exponent = rate * step_s;
-        let decay = (-exponent).exp();
-        let integrated_decay_s = (1.0 - decay) / rate;
-        for axis in 0..2 {
-            let (position, velocity) = (POSITION + axis, VELOCITY + axis);
-            self.mean[position] += integrated_decay_s * self.mean[velocity];
-            for column in 0..2 {
-                self.response[(position, column)] += integrated_decay_s * self.response[(velocity, column)];
-            }
-            for other in 0..STATES {
-                self.covariance[(position, other)] += integrated_decay_s * self.covariance[(velocity, other)];
-            }
-            for other in 0..STATES {
-                self.covariance[(other, position)] += integrated_decay_s * self.covariance[(other, velocity)];
-            }
-            self.scale(velocity, decay);
-            let cross = density_m2_s3 * 0.5 * integrated_decay_s * integrated_decay_s;
-            let position_m2 = if exponent < 0.01 {
-                // Series to second order: the closed form loses all digits for short steps.
-                density_m2_s3 * step_s.powi(3) / 3.0 * (1.0 - 0.75 * exponent)
-            } else {
-                density_m2_s3 / rate.powi(3) * (exponent - 2.0 * (1.0 - decay) + 0.5 * (1.0 - decay * decay))
-            };
-            self.covariance[(position, position)] += position_m2;
-            self.covariance[(velocity, velocity)] += density_m2_s3 * (1.0 - decay * decay) / (2.0 * rate);
-            self.covariance[(position, velocity)] += cross;
-            self.covariance[(velocity, position)] += cross;
-        }
-    }
-
-    /// The part of the position's covariance that the camera's bias causes, m2, `P_pc P_pc'`: the error of an estimate
-    /// that is linear in the measurements has the covariance `P_pc` with a bias of variance 1.
-    pub(super) fn camera_share(&self) -> PlaneCovariance {
-        let of = |state| {
-            PlaneCovariance::outer(self.covariance[(POSITION, state)], self.covariance[(POSITION + 1, state)])
-        };
-        of(CAMERA_BIAS).plus(of(CAMERA_BIAS + 1))
-    }
-
-    /// Covariance of the position, m2, if all boxes shared one error: `M_p M_p'`.
-    pub(super) fn lasting_error(&self) -> PlaneCovariance {
-        let of = |column| {
-            PlaneCovariance::outer(self.response[(POSITION, column)], self.response[(POSITION + 1, column)])
-        };
-        of(0).plus(of(1))
     }
 
     /// Sets a bias to 0 with a wide variance, uncorrelated with everything else.
     pub(super) fn reset_bias(&mut self, bias: usize) {
         for state in [bias, bias + 1] {
             self.scale(state, 0.0);
-            self.covariance[(state, state)] = RESET_BIAS_SIGMAS * RESET_BIAS_SIGMAS;
+            self.covariance[state][state] = RESET_BIAS_SIGMAS * RESET_BIAS_SIGMAS;
         }
+    }
+
+    /// Multiplies one state component by a factor, its covariances with it.
+    fn scale(&mut self, state: usize, factor: f64) {
+        self.mean[state] *= factor;
+        for response in &mut self.response {
+            response[state] *= factor;
+        }
+        for column in &mut self.covariance {
+            column[state] *= factor;
+        }
+        for value in &mut self.covariance[state] {
+            *value *= factor;
+        }
+    }
+
+    /// Covariance of the position, m2.
+    pub(super) fn position_covariance(&self) -> PlaneCovariance {
+        PlaneCovariance {
+            east_m2: self.covariance[POSITION][POSITION],
+            north_m2: self.covariance[POSITION + 1][POSITION + 1],
+            east_north_m2: self.covariance[POSITION][POSITION + 1],
+        }
+    }
+
+    /// The part of the position's covariance that the camera's bias causes, m2, `P_pc P_pc'`: the error of an estimate
+    /// that is linear in the measurements has the covariance `P_pc` with a bias of variance 1.
+    pub(super) fn camera_share(&self) -> PlaneCovariance {
+        spanned_by([&self.covariance[CAMERA_BIAS], &self.covariance[CAMERA_BIAS + 1]])
+    }
+
+    /// Covariance of the position, m2, if all boxes shared one error: `M_p M_p'`.
+    pub(super) fn lasting_error(&self) -> PlaneCovariance {
+        let [first, second] = &self.response;
+        spanned_by([first, second])
     }
 
     /// Innovation, its covariance `S = H P H' + white` and `P H'`, with `H = [I 0 .. L ..]`.
@@ -291,73 +365,160 @@ impl ModeFilter {
         decomposition: &NoiseDecomposition,
         camera_scale: f64,
     ) -> PredictedMeasurement {
-        // H applied to a vector over the states.
-        let measured = |of: &dyn Fn(usize) -> f64| {
-            let mut sum = [of(POSITION), of(POSITION + 1)];
-            for ObservedBias { state, root_m: [east, north, east_north] } in decomposition.biases {
-                sum[0] += east * of(state) + east_north * of(state + 1);
-                sum[1] += east_north * of(state) + north * of(state + 1);
-            }
-            sum
+        let measured = |vector: &Vector| decomposition.measured(vector);
+        let predicted = measured(&self.mean);
+        let EastNorth { east_m, north_m } = decomposition.position;
+        let lasting = |column: usize| {
+            let root = rows(decomposition.lasting_root_m)[column];
+            let predicted = measured(&self.response[column]);
+            [root[0] - predicted[0], root[1] - predicted[1]]
         };
-        let [east_m, north_m] = measured(&|state| self.mean[state]);
-        let [root_east, root_north, root_east_north] = decomposition.lasting_root_m;
-        let of_east = measured(&|state| self.response[(state, 0)]);
-        let of_north = measured(&|state| self.response[(state, 1)]);
-        let lasting = [
-            [root_east - of_east[0], root_east_north - of_east[1]],
-            [root_east_north - of_north[0], root_north - of_north[1]],
-        ];
-        let innovation = [decomposition.position.east_m - east_m, decomposition.position.north_m - north_m];
-        let mut cross = SMatrix::<f64, STATES, 2>::zeros();
-        for state in 0..STATES {
-            let [east, north] = measured(&|column| self.covariance[(state, column)]);
-            cross[(state, 0)] = east;
-            cross[(state, 1)] = north;
+        let [mut east, mut north] = [self.covariance[POSITION], self.covariance[POSITION + 1]];
+        for ObservedBias { state, root_m } in decomposition.biases {
+            if root_m == [0.0; 3] {
+                continue;
+            }
+            let [by_east, by_north] = rows(root_m);
+            for (cross, [by_first, by_second]) in [(&mut east, by_east), (&mut north, by_north)] {
+                add_scaled(cross, by_first, &self.covariance[state]);
+                add_scaled(cross, by_second, &self.covariance[state + 1]);
+            }
         }
-        let [east_m2, _] = measured(&|state| cross[(state, 0)]);
-        let [east_north_m2, north_m2] = measured(&|state| cross[(state, 1)]);
-        let predicted = PlaneCovariance { east_m2, north_m2, east_north_m2 };
-        let innovation_covariance = predicted.plus(decomposition.white);
-        let camera = [CAMERA_BIAS, CAMERA_BIAS + 1]
-            .map(|state| PlaneCovariance::outer(cross[(state, 0)], cross[(state, 1)]));
+        let [[east_m2, east_north_m2], [_, north_m2]] = [measured(&east), measured(&north)];
+        let innovation_covariance =
+            PlaneCovariance { east_m2, north_m2, east_north_m2 }.plus(decomposition.white);
+        let by_camera = |state: usize| PlaneCovariance::outer(east[state], north[state]);
+        let by_camera = by_camera(CAMERA_BIAS).plus(by_camera(CAMERA_BIAS + 1));
         PredictedMeasurement {
-            innovation,
+            innovation: [east_m - predicted[0], north_m - predicted[1]],
             innovation_covariance,
-            stated_covariance: innovation_covariance
-                .plus(camera[0].plus(camera[1]).scaled(camera_scale - 1.0)),
-            cross_covariance: cross,
-            lasting,
+            stated_covariance: innovation_covariance.plus(by_camera.scaled(camera_scale - 1.0)),
+            cross_covariance: [east, north],
+            lasting: [lasting(0), lasting(1)],
         }
     }
 
-    /// The Kalman update `K = P H' S^-1`. Returns the log-likelihood of the measurement without its
-    /// constant, `-(d' S^-1 d + ln det S) / 2`.
-    pub(super) fn update(&mut self, predicted: &PredictedMeasurement) -> f64 {
-        let PredictedMeasurement {
-            innovation, innovation_covariance, cross_covariance: cross, lasting, ..
-        } = predicted;
-        let determinant = innovation_covariance.determinant();
-        let inverse = [
-            innovation_covariance.north_m2 / determinant,
-            innovation_covariance.east_m2 / determinant,
-            -innovation_covariance.east_north_m2 / determinant,
-        ];
+    /// The Kalman update `K = P H' S^-1`. Returns what the measurement's likelihood
+    /// `exp(-d' S^-1 d / 2) / (2 pi sqrt(det S))` depends on: `d' S^-1 d` and `sqrt(det S)`, m2.
+    ///
+    /// With the Cholesky factor `S = C C'` and `W = P H' C^-T`, `P <- P - W W'` stays symmetric to the bit, and
+    /// `m <- m + W C^-1 d`.
+    pub(super) fn update(&mut self, predicted: &PredictedMeasurement) -> [f64; 2] {
+        let PredictedMeasurement { innovation, innovation_covariance, cross_covariance, lasting, .. } =
+            predicted;
+        let root_determinant_m2 = innovation_covariance.determinant().sqrt();
+        // C^-1, by rows (first, 0) and (below, second).
+        let first = innovation_covariance.east_m2.sqrt().recip();
+        let second = (first * root_determinant_m2).recip();
+        let below = -innovation_covariance.east_north_m2 * first * first * second;
+        let whiten = |[east, north]: [f64; 2]| [first * east, below * east + second * north];
+        let [east, north] = cross_covariance;
+        let mut gains = [[0.0; STATES]; 2];
         for state in 0..STATES {
-            let (east, north) = (cross[(state, 0)], cross[(state, 1)]);
-            let gain = [east * inverse[0] + north * inverse[2], east * inverse[2] + north * inverse[1]];
-            self.mean[state] += gain[0] * innovation[0] + gain[1] * innovation[1];
-            for (column, [east, north]) in lasting.iter().enumerate() {
-                self.response[(state, column)] += gain[0] * east + gain[1] * north;
-            }
-            for other in 0..=state {
-                let reduction = gain[0] * cross[(other, 0)] + gain[1] * cross[(other, 1)];
-                let value = self.covariance[(state, other)] - reduction;
-                self.covariance[(state, other)] = value;
-                self.covariance[(other, state)] = value;
+            [gains[0][state], gains[1][state]] = whiten([east[state], north[state]]);
+        }
+        let by_innovation = whiten(*innovation);
+        let by_lasting = lasting.map(whiten);
+        let [response_east, response_north] = &mut self.response;
+        let vectors = [&mut self.mean, response_east, response_north];
+        for (vector, residual) in vectors.into_iter().zip([by_innovation, by_lasting[0], by_lasting[1]]) {
+            add_scaled(vector, residual[0], &gains[0]);
+            add_scaled(vector, residual[1], &gains[1]);
+        }
+        for (state, column) in self.covariance.iter_mut().enumerate() {
+            let (by_first, by_second) = (gains[0][state], gains[1][state]);
+            for other in 0..STATES {
+                column[other] -= by_first * gains[0][other] + by_second * gains[1][other];
             }
         }
-        let innovation = EastNorth { east_m: innovation[0], north_m: innovation[1] };
-        -0.5 * (innovation_covariance.mahalanobis_squared(innovation) + determinant.ln())
+        let [one, other] = by_innovation;
+        [one * one + other * other, root_determinant_m2]
+    }
+}
+
+impl NoiseDecomposition {
+    /// H applied to a vector over the states: `p + L b` per bias.
+    fn measured(&self, vector: &Vector) -> [f64; 2] {
+        let mut sum = [vector[POSITION], vector[POSITION + 1]];
+        for ObservedBias { state, root_m } in self.biases {
+            for (sum, [by_first, by_second]) in sum.iter_mut().zip(rows(root_m)) {
+                *sum += by_first * vector[state] + by_second * vector[state + 1];
+            }
+        }
+        sum
+    }
+}
+
+/// Rows of a symmetric 2 x 2 matrix that is given as (east, north, east-north).
+const fn rows([east, north, east_north]: [f64; 3]) -> [[f64; 2]; 2] {
+    [[east, east_north], [east_north, north]]
+}
+
+/// `A A'` of the positions of two vectors, the columns of A.
+fn spanned_by(vectors: [&Vector; 2]) -> PlaneCovariance {
+    let [first, second] =
+        vectors.map(|vector| PlaneCovariance::outer(vector[POSITION], vector[POSITION + 1]));
+    first.plus(second)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn decomposition(source: MeasurementSource, [east_m, north_m]: [f64; 2]) -> NoiseDecomposition {
+        let covariance = PlaneCovariance { east_m2: 4.0, north_m2: 2.5, east_north_m2: 0.7 };
+        let measured = MeasuredPosition {
+            position: EastNorth { east_m, north_m },
+            covariance,
+            white: Some(covariance.scaled(0.2)),
+            stated_scale: 1.4,
+        };
+        NoiseDecomposition::new(&TrackSettings::default(), source, measured, 1.5)
+    }
+
+    proptest! {
+        #[test]
+        fn covariances_stay_symmetric_to_the_bit_and_positive(
+            steps in proptest::collection::vec((0.01..2.0f64, -20.0..20.0f64, -20.0..20.0f64, any::<bool>()), 1..40),
+            stay in 0.4..0.98f64,
+        ) {
+            let first = ModeFilter::new(
+                &decomposition(MeasurementSource::Regressed, [0.0; 2]),
+                PlaneCovariance { east_m2: 4.0, north_m2: 2.5, east_north_m2: 0.7 },
+                10.0,
+            );
+            let mut modes = [first; 3];
+            let leave = 0.5 * (1.0 - stay);
+            let weights = [[stay, leave, leave], [leave, stay, leave], [leave, leave, stay]];
+            for (step_s, east_m, north_m, is_fix) in steps {
+                mix(&mut modes, &weights);
+                let source = if is_fix { MeasurementSource::Fix } else { MeasurementSource::Regressed };
+                let decomposition = decomposition(source, [east_m, north_m]);
+                let transitions = [
+                    Transition::stationary(step_s, 1e-4),
+                    Transition::ornstein_uhlenbeck(step_s, 0.05, 60.0),
+                    Transition::ornstein_uhlenbeck(step_s, 2.0, 5.0),
+                ];
+                for (mode, transition) in modes.iter_mut().zip(transitions) {
+                    mode.propagate(&transition.with_bias(CAMERA_BIAS, (-step_s).exp()));
+                    let predicted = mode.predict_measurement(&decomposition, 1.4);
+                    let [squared_distance, root_determinant_m2] = mode.update(&predicted);
+                    let innovation = EastNorth { east_m: predicted.innovation[0], north_m: predicted.innovation[1] };
+                    let expected = predicted.innovation_covariance.mahalanobis_squared(innovation);
+                    prop_assert!((squared_distance - expected).abs() <= 1e-9 * (1.0 + expected));
+                    prop_assert!(root_determinant_m2 > 0.0);
+                }
+                for mode in &modes {
+                    for (column, values) in mode.covariance.iter().enumerate() {
+                        prop_assert!(values[column] > 0.0, "{mode:?}");
+                        for (row, value) in values.iter().enumerate() {
+                            prop_assert_eq!(value.to_bits(), mode.covariance[row][column].to_bits());
+                        }
+                    }
+                }
+            }
+        }
     }
 }

@@ -35,13 +35,17 @@ pub(crate) const TANH_NUMERATOR: [f32; 7] = [
 /// Denominator of [`tanh`] in the square, highest power first.
 pub(crate) const TANH_DENOMINATOR: [f32; 4] = [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3];
 
-/// A network for inference: the weight matrices are transposed, so that the inner loop runs over outputs.
+/// Outputs that are summed at once: two SSE registers.
+const LANES: usize = 8;
+
+/// A network for inference: the weights lie in the order in which they are read, [`LANES`] outputs at a time, so that
+/// the sums stay in registers whatever the layer's width.
 #[derive(Debug, Clone)]
 pub struct Net {
     shape: NetShape,
     layers: Vec<Layer>,
-    /// Per layer: one row of `outputs` weights per input, then the biases.
-    transposed: Vec<f32>,
+    /// Per layer and block of outputs: their biases, then for each input their weights; 0 for missing outputs.
+    blocks: Vec<[f32; LANES]>,
 }
 
 impl Net {
@@ -51,16 +55,24 @@ impl Net {
     pub fn new(shape: NetShape, parameters: &[f32]) -> Self {
         assert_eq!(parameters.len(), shape.parameter_count(), "the parameters must match the shape");
         let layers: Vec<Layer> = shape.layers().collect();
-        let mut transposed = parameters.to_vec();
+        let mut blocks = Vec::new();
         for layer in &layers {
-            for output in 0..layer.outputs {
-                for input in 0..layer.inputs {
-                    transposed[layer.weights + input * layer.outputs + output] =
-                        parameters[layer.weights + output * layer.inputs + input];
-                }
+            let biases = &parameters[layer.biases..layer.biases + layer.outputs];
+            let rows = &parameters[layer.weights..layer.biases];
+            for first in (0..layer.outputs).step_by(LANES) {
+                let of_outputs = |value: &dyn Fn(usize) -> f32| {
+                    std::array::from_fn(|lane| {
+                        let output = first + lane;
+                        if output < layer.outputs { value(output) } else { 0.0 }
+                    })
+                };
+                blocks.push(of_outputs(&|output| biases[output]));
+                blocks.extend(
+                    (0..layer.inputs).map(|input| of_outputs(&|output| rows[output * layer.inputs + input])),
+                );
             }
         }
-        Self { shape, layers, transposed }
+        Self { shape, layers, blocks }
     }
 
     /// The network's shape.
@@ -71,9 +83,20 @@ impl Net {
 
     /// Weights of a layer as rows of one input each, and its biases.
     #[must_use]
-    pub(crate) fn matrix(&self, layer: &Layer) -> (&[f32], &[f32]) {
-        let biases = &self.transposed[layer.biases..layer.biases + layer.outputs];
-        (&self.transposed[layer.weights..layer.biases], biases)
+    pub(crate) fn matrix(&self, index: usize) -> (Vec<f32>, Vec<f32>) {
+        let layer = &self.layers[index];
+        let blocks = &self.blocks[self.first_block(index)..];
+        // Row 0 holds the biases.
+        let row = |row: usize| {
+            let of_output =
+                move |output: usize| blocks[(output / LANES) * (1 + layer.inputs) + row][output % LANES];
+            (0..layer.outputs).map(of_output)
+        };
+        ((1..=layer.inputs).flat_map(row).collect(), row(0).collect())
+    }
+
+    fn first_block(&self, index: usize) -> usize {
+        self.layers[..index].iter().map(|layer| layer.outputs.div_ceil(LANES) * (1 + layer.inputs)).sum()
     }
 
     /// The regressed position (the bottleneck) of one scaled input.
@@ -108,22 +131,26 @@ impl Net {
 
     #[inline]
     fn run(&self, layers: std::ops::Range<usize>, units: &mut [f32; WIDEST_LAYER]) {
+        let mut blocks = &self.blocks[self.first_block(layers.start)..];
         for layer in &self.layers[layers] {
-            let mut sums = [0.0; WIDEST_LAYER];
-            let sums = &mut sums[..layer.outputs];
-            sums.copy_from_slice(&self.transposed[layer.biases..layer.biases + layer.outputs]);
-            let rows = self.transposed[layer.weights..layer.biases].chunks_exact(layer.outputs);
-            for (row, unit) in rows.zip(units.iter()) {
-                for (sum, weight) in sums.iter_mut().zip(row) {
-                    *sum += weight * unit;
+            let mut outputs = [0.0; WIDEST_LAYER];
+            for outputs in outputs.as_chunks_mut::<LANES>().0.iter_mut().take(layer.outputs.div_ceil(LANES)) {
+                let (own, rest) = blocks.split_at(1 + layer.inputs);
+                blocks = rest;
+                let mut sums = own[0];
+                for (weights, unit) in own[1..].iter().zip(units.iter()) {
+                    for (sum, weight) in sums.iter_mut().zip(weights) {
+                        *sum += weight * unit;
+                    }
                 }
+                match (layer.linear, self.shape.activation()) {
+                    (true, _) => {}
+                    (false, Activation::Tanh) => sums.iter_mut().for_each(|sum| *sum = tanh(*sum)),
+                    (false, Activation::Relu) => sums.iter_mut().for_each(|sum| *sum = sum.max(0.0)),
+                }
+                *outputs = sums;
             }
-            match (layer.linear, self.shape.activation()) {
-                (true, _) => {}
-                (false, Activation::Tanh) => sums.iter_mut().for_each(|sum| *sum = tanh(*sum)),
-                (false, Activation::Relu) => sums.iter_mut().for_each(|sum| *sum = sum.max(0.0)),
-            }
-            units[..layer.outputs].copy_from_slice(sums);
+            *units = outputs;
         }
     }
 }

@@ -25,9 +25,9 @@ pub(super) fn first_hidden<'g>(net: &Net, inputs: Expr<'g>) -> Expr<'g> {
 fn run<'g>(net: &Net, layers: Range<usize>, inputs: Expr<'g>) -> Expr<'g> {
     layers.fold(inputs, |units, index| {
         let layer = net.shape().layer(index);
-        let (weights, biases) = net.matrix(&layer);
-        let sums = units.matrix_product(layer.inputs, layer.outputs, &f64s(weights))
-            + units.graph().row(&f64s(biases));
+        let (weights, biases) = net.matrix(index);
+        let sums = units.matrix_product(layer.inputs, layer.outputs, &f64s(&weights))
+            + units.graph().row(&f64s(&biases));
         match (layer.linear, net.shape().activation()) {
             (true, _) => sums,
             (false, Activation::Tanh) => sums.tanh(),

@@ -105,12 +105,18 @@ impl ErrorModel {
         self.coverage.look_up(bounding_box)
     }
 
+    /// Distance of a box from those of training: [`CoverageLookup::extrapolation_ratio`].
+    #[inline]
+    pub(crate) fn extrapolation_ratio(&self, bounding_box: &BoundingBox) -> f64 {
+        self.coverage.extrapolation_ratio(bounding_box)
+    }
+
     /// Whether a box is unlike those of training: far from all of them, or with edges that the decoder does
     /// not reconstruct. For `paper` the first alone, as its error is Es eX at any eX.
     #[inline]
-    pub(crate) fn is_outside_training(&self, lookup: &CoverageLookup, reconstruction_error: f64) -> bool {
+    pub(crate) fn is_outside_training(&self, extrapolation_ratio: f64, reconstruction_error: f64) -> bool {
         let limit = self.nominal_reconstruction_error;
-        lookup.extrapolation_ratio > NOMINAL_RATIO || (limit > 0.0 && reconstruction_error > limit)
+        extrapolation_ratio > NOMINAL_RATIO || (limit > 0.0 && reconstruction_error > limit)
     }
 
     /// Reconstruction error and error variance of a box.

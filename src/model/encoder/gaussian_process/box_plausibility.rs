@@ -74,7 +74,7 @@ pub struct RecentBoxes {
 
 impl RecentBoxes {
     /// Takes a box's deviation in: the plain mean of the first ten, then an exponential one.
-    pub(crate) fn push(&mut self, deviation: &Deviation) {
+    fn push(&mut self, deviation: &Deviation) {
         self.count = (self.count + 1).min(RECENT_BOXES as u32);
         for (mean, own) in self.mean.iter_mut().zip(deviation.normalized) {
             *mean += (own - *mean) / f64::from(self.count);
@@ -110,7 +110,7 @@ impl BoxPlausibility {
     }
 
     fn set_normal(&mut self, epochs: &[Epoch], boxes: &[Box4]) {
-        let deviations: Vec<Deviation> = boxes.iter().map(|sides| self.deviation(sides, None)).collect();
+        let deviations: Vec<Deviation> = boxes.iter().map(|sides| self.deviation(sides)).collect();
         let mut means: Vec<[f64; 2]> = Vec::new();
         let mut recent = RecentBoxes::default();
         for (row, deviation) in deviations.iter().enumerate() {
@@ -141,9 +141,9 @@ impl BoxPlausibility {
         [0, 1].map(|side| (sides[side] - self.scales_px[side][0]) / self.scales_px[side][1])
     }
 
-    /// How far a box, and the recent boxes of its target, deviate.
+    /// How far a box deviates.
     #[inline]
-    pub(crate) fn deviation(&self, sides: &Box4, recent: Option<&RecentBoxes>) -> Deviation {
+    pub(crate) fn deviation(&self, sides: &Box4) -> Deviation {
         let foot = self.foot(sides);
         let mut best = (f64::INFINITY, 0);
         for (at, cell) in self.cells.iter().enumerate() {
@@ -158,13 +158,20 @@ impl BoxPlausibility {
         let widen = 1.0 / (1.0 + cell.leverage(&foot)).sqrt();
         let normalized = whiten(&cell.whitening, &[log_width - predicted[0], log_height - predicted[1]])
             .map(|value| value * widen);
-        let beyond = |square: f64, normal: f64| if square > normal { 1.0 - normal / square } else { 0.0 };
-        let mut weight = beyond(square(&normalized), self.normal[0]);
-        if let Some(recent) = recent.filter(|recent| recent.count as usize == RECENT_BOXES) {
-            weight =
-                weight.max(beyond(square(&whiten(&self.recent_whitening, &recent.mean)), self.normal[1]));
-        }
+        let weight = share_beyond(square(&normalized), self.normal[0]);
         Deviation { cell: best.1, foot, normalized, weight }
+    }
+
+    /// How far a box, and the recent boxes of its target with it, deviate; `recent` takes the box in.
+    #[inline]
+    pub(crate) fn next_deviation(&self, sides: &Box4, recent: &mut RecentBoxes) -> Deviation {
+        let mut deviation = self.deviation(sides);
+        recent.push(&deviation);
+        if recent.count as usize == RECENT_BOXES {
+            let lasting = square(&whiten(&self.recent_whitening, &recent.mean));
+            deviation.weight = deviation.weight.max(share_beyond(lasting, self.normal[1]));
+        }
+        deviation
     }
 
     /// The box with the cell's sides whose edges are nearest to the given one's.
@@ -198,6 +205,12 @@ impl BoxPlausibility {
         let side = |at: usize| (predicted[at] + slopes[at][0] * moved[0] + slopes[at][1] * moved[1]).max(1.0);
         [sides[0] + moved[0], sides[1] + moved[1], side(0), side(1)]
     }
+}
+
+/// Share of a squared distance that is beyond what is normal.
+#[inline]
+fn share_beyond(square: f64, normal: f64) -> f64 {
+    if square > normal { 1.0 - normal / square } else { 0.0 }
 }
 
 impl Cell {

@@ -295,8 +295,8 @@ impl Predictor {
         }
     }
 
-    /// Position and error of a box; `recent` are the boxes of its target up to now.
-    pub(crate) fn predict(&self, sides: &Box4, recent: Option<&RecentBoxes>) -> MapPrediction {
+    /// Position and error of a box; `recent`, of its target, takes it in.
+    pub(crate) fn predict(&self, sides: &Box4, recent: Option<&mut RecentBoxes>) -> MapPrediction {
         let mixture = self.mix(sides, true);
         let mut position_m = mixture.position_m;
         let noise_m2 = quadratic(&mixture.by_edge, &self.edge_px2);
@@ -304,7 +304,10 @@ impl Predictor {
             std::array::from_fn(|at| self.widening * mixture.map_m2[at] + noise_m2[at]);
         covariance_m2[0] += self.shared_bias_m2;
         covariance_m2[2] += self.shared_bias_m2;
-        let deviation = self.plausibility.deviation(sides, recent);
+        let deviation = match recent {
+            Some(recent) => self.plausibility.next_deviation(sides, recent),
+            None => self.plausibility.deviation(sides),
+        };
         if deviation.weight > 0.0 {
             let plausible = self.plausibility.nearest_plausible(sides, &deviation);
             let other_m = self.mix(&plausible, false).position_m;

@@ -229,10 +229,6 @@ impl GaussianProcessEncoder {
         recent: Option<&mut RecentBoxes>,
     ) -> BoxEstimate {
         let sides = features_of(bounding_box);
-        let recent = recent.map(|recent| {
-            recent.push(&self.predictor.plausibility.deviation(&sides, None));
-            &*recent
-        });
         let prediction = self.predictor.predict(&sides, recent);
         let [east_m, north_m] = prediction.position_m;
         let reconstruction_px = match &self.auto_encoder {

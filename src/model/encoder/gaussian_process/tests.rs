@@ -256,10 +256,8 @@ fn a_deviation_too_small_for_one_box_is_noticed_when_it_lasts() {
         (0..200).map(|step| 1.0 + 0.002 * f64::from(step)).take_while(|factor| weight(*factor) <= 0.0);
     let tall = tall(factor.last().expect("the box itself"));
     let mut recent = RecentBoxes::default();
-    for _ in 0..10 {
-        recent.push(&predictor.predict(&tall, None).deviation);
-    }
-    let (single, lasting) = (predictor.predict(&tall, None), predictor.predict(&tall, Some(&recent)));
+    let single = predictor.predict(&tall, None);
+    let lasting = (0..10).map(|_| predictor.predict(&tall, Some(&mut recent))).last().expect("ten boxes");
     assert!(single.deviation.weight <= 0.0 && lasting.deviation.weight > 0.1, "{}", lasting.deviation.weight);
     assert!(lasting.variance_m2() > single.variance_m2());
 }

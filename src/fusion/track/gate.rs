@@ -8,9 +8,9 @@ use crate::geo::EastNorth;
 
 /// Consecutive rejections before a source may be reacquired.
 const MIN_REJECTIONS: u32 = 5;
-/// Rejections in a row that agree with each other, and their least duration, s, after which a track without another
-/// source restarts from them: track initiation by 3 of 3 (Bar-Shalom, Li and Kirubarajan 2001, 1.3). A detector that
-/// takes another target for a moment is not followed.
+/// Rejections in a row that agree with each other, and their least duration, s, after which a track whose other source
+/// is silent or agrees with them restarts from them: track initiation by 3 of 3 (Bar-Shalom, Li and Kirubarajan 2001,
+/// 1.3). A detector that takes another target for a moment is not followed.
 const MIN_AGREEING: u32 = 3;
 const AGREEING_S: f64 = 1.0;
 /// A source counts as active for this long after its last accepted measurement, s.

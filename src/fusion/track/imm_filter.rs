@@ -204,7 +204,8 @@ impl ImmFilter {
                 return GateOutcome { reinitialized: true, ..outcome };
             }
             (outcome.innovation, outcome.nis) = (innovation, nis);
-            match self.reacquire(settings, source, measured, &decomposition) {
+            let is_confirmed = fix.is_some_and(|fix| agree(settings, measured, fix));
+            match self.reacquire(settings, source, measured, &decomposition, is_confirmed) {
                 Reacquisition::Rejected => {
                     outcome.rejected = Some(RejectionReason::OutsideGate);
                     return outcome;
@@ -234,18 +235,7 @@ impl ImmFilter {
         regressed: MeasuredPosition,
         fix: MeasuredPosition,
     ) -> bool {
-        if !fix.covariance.is_positive() {
-            return false;
-        }
-        let difference = EastNorth {
-            east_m: fix.position.east_m - regressed.position.east_m,
-            north_m: fix.position.north_m - regressed.position.north_m,
-        };
-        let pair_nis = fix
-            .covariance
-            .plus(regressed.covariance.scaled(regressed.stated_scale))
-            .mahalanobis_squared(difference);
-        if pair_nis > settings.gate {
+        if !agree(settings, regressed, fix) {
             return false;
         }
         let predicted = self.predict_measurement(&self.decompose(settings, MeasurementSource::Fix, fix));
@@ -274,21 +264,26 @@ impl ImmFilter {
         }
     }
 
-    /// Deals with a measurement beyond the gate. Once its source was rejected often and for long
-    /// enough: resets the source's bias if the other source is active and the measurement then
-    /// passes the gate; reinitialises the filter if the other source is not active.
+    /// Deals with a measurement beyond the gate. Where those that were rejected agree with each other,
+    /// reinitialises the filter if the other source is not active or confirms this one
+    /// (`is_confirmed`). Once its source was rejected often and for long enough: resets the source's
+    /// bias if the other source is active and the measurement then passes the gate; reinitialises the
+    /// filter if the other source is not active.
     fn reacquire(
         &mut self,
         settings: &TrackSettings,
         source: MeasurementSource,
         measured: MeasuredPosition,
         decomposition: &NoiseDecomposition,
+        is_confirmed: bool,
     ) -> Reacquisition {
         let now = self.time;
         let other_is_active = self.histories[1 - source as usize].is_active(now);
         let reach = self.reach(settings, decomposition);
         let history = &mut self.histories[source as usize];
-        let is_another = history.agree_on(now, measured.position, reach) && !other_is_active;
+        // A fix of 30 m passes the gate of a track that has lost its target, too, and would keep it for long.
+        let is_another =
+            history.agree_on(now, measured.position, reach) && (!other_is_active || is_confirmed);
         let rejected_s = history.record_rejection(now, settings.reacquire_after_s);
         if is_another {
             *self = Self::new(settings, now, source, measured);
@@ -432,6 +427,13 @@ impl ImmFilter {
             reinitialized: false,
         }
     }
+}
+
+/// Whether a regressed position and a fix of one instant pass each other's gate.
+fn agree(settings: &TrackSettings, regressed: MeasuredPosition, fix: MeasuredPosition) -> bool {
+    let covariance = fix.covariance.plus(regressed.covariance.scaled(regressed.stated_scale));
+    fix.covariance.is_positive()
+        && covariance.mahalanobis_squared(fix.position.minus(regressed.position)) <= settings.gate
 }
 
 /// The share of time spent in each mode, proportional to its mean sojourn: the stationary

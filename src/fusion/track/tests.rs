@@ -355,6 +355,26 @@ fn an_id_that_names_another_target_takes_the_track_there_at_once() {
 }
 
 #[test]
+fn boxes_that_the_fixes_confirm_are_followed_and_others_are_not() {
+    // A fix of 30 m does not contradict a track that is 40 m off, nor the boxes there; one of 2 m contradicts the boxes.
+    for (fix_sigma_m, is_followed) in [(30.0, true), (2.0, false)] {
+        let at = |second: f64, box_east_m: f64| Measurement {
+            fix: fix_at(second, 0.0, fix_sigma_m * fix_sigma_m).fix,
+            ..box_at(second, box_east_m, 2.25)
+        };
+        let mut track = Track::start(TrackSettings::default(), &at(0.0, 0.0)).expect("has both");
+        for second in 1..60 {
+            track.update(&at(f64::from(second), 0.0));
+        }
+        let states: Vec<_> = (60..66).map(|second| track.update(&at(f64::from(second), 40.0))).collect();
+        let restarted: Vec<bool> = states.iter().map(|state| state.reinitialized).collect();
+        assert_eq!(restarted, [false, false, is_followed, false, false, false], "{fix_sigma_m} m");
+        let east_m = states[5].position.east_m;
+        assert!(if is_followed { (east_m - 40.0).abs() < 3.0 } else { east_m.abs() < 3.0 }, "{east_m}");
+    }
+}
+
+#[test]
 fn a_single_source_that_contradicts_the_track_reinitialises_it() {
     let mut track = Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 4.0)).expect("a fix");
     for second in 1..30 {

@@ -13,7 +13,7 @@ use crate::domain::{BoundingBox, GaussMarkovNoise};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::samples::rows::TrainingRow;
 use crate::model::samples::second_differences::{MEAN_SQUARE_PER_VARIANCE, second_differences, trimmed_mean};
-use crate::model::samples::whitening::{Whitener, fit_noise};
+use crate::model::samples::whitening::{Whitener, fit_noise, with_gross_errors};
 use crate::statistics::median;
 
 /// Most steps of Levenberg and Marquardt's method per round.
@@ -144,12 +144,7 @@ pub(crate) fn fit(
         let jitter_m2 = fitted.jitter_variance_m2(&problem);
         weighting = fitted.noise.with_white_at_least(WHITE_PER_JITTER_VARIANCE * jitter_m2);
         if round + 1 < ROUNDS {
-            let whitener = Whitener::new(rows, &fitted.noise, &inflation);
-            let whitened = residuals.map(|mut axis| {
-                whitener.apply(&mut axis);
-                axis
-            });
-            whitener.inflate(&fitted.noise, &whitened, &mut inflation);
+            inflation = Whitener::new(rows, &fitted.noise, &inflation).inflation(&fitted.noise, residuals);
         }
     }
     let (normal, _) = fitted.normal_equations(&problem, &Whitener::new(rows, &weighting, &inflation));
@@ -161,7 +156,7 @@ pub(crate) fn fit(
 }
 
 /// White noise with the variance of the median residual, and the variance inflation of rows whose residual
-/// exceeds four times the median.
+/// exceeds four times the median; beyond six times, or seven standard deviations, it is a gross error.
 fn initial_noise(residuals: &[Vec<f64>; 2]) -> (GaussMarkovNoise, Vec<f64>) {
     let distances: Vec<f64> =
         residuals[0].iter().zip(&residuals[1]).map(|(east, north)| east.hypot(*north)).collect();
@@ -173,6 +168,7 @@ fn initial_noise(residuals: &[Vec<f64>; 2]) -> (GaussMarkovNoise, Vec<f64>) {
             excess.max(0.0) * 8.0
         })
         .collect();
+    let inflation = with_gross_errors(inflation, |row| distances[row] > 6.0 * median_m);
     (GaussMarkovNoise::white(median_m * median_m / MEDIAN_SQUARE_PER_VARIANCE), inflation)
 }
 

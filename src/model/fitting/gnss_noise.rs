@@ -5,11 +5,14 @@
 //! white; a track needs to know which. The mean over a traverse is not subtracted, because a
 //! traverse is short compared with the bias.
 
+use std::f64::consts::LN_2;
+
 use jiff::Timestamp;
 
 use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 use crate::geo::EastNorth;
 use crate::model::artifact::LEAST_GNSS_WHITE_SHARE;
+use crate::statistics::median;
 
 /// Lags of the autocovariance, in units of the fixes' interval (at least one second).
 const LAGS: [u32; 11] = [1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 50];
@@ -18,6 +21,9 @@ const TIME_CONSTANTS: [f64; 14] =
     [2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 75.0, 100.0, 150.0, 240.0];
 /// A lag needs this many pairs of residuals.
 const MIN_PAIRS: u32 = 30;
+/// A residual of more than this many standard deviations per axis, by the median, is a gross error of the fix or of the
+/// box. A few of 1 km are most of a variance, and white, so that a track would average the fixes of a phone.
+const GROSS_SIGMAS: f64 = 7.0;
 /// The estimate is at least this share of the residuals' variance, however large the regression's
 /// own variance is stated.
 const MIN_VARIANCE_SHARE: f64 = 0.05;
@@ -44,8 +50,9 @@ pub fn estimate_gnss_noise(
     e_regression_m2: f64,
     regression: &NoiseCorrelation,
 ) -> Option<GaussMarkovNoise> {
-    let unit_s = median_interval_s(traverses)?.max(1.0);
-    let (variance, lags) = autocovariance(traverses, unit_s)?;
+    let traverses = without_gross_errors(traverses);
+    let unit_s = median_interval_s(&traverses)?.max(1.0);
+    let (variance, lags) = autocovariance(&traverses, unit_s)?;
     let (fitted_bias, time_constant) = fit_exponential(&lags);
     let residual_bias_m2 = fitted_bias.min(variance);
     let residual_white_m2 = variance - residual_bias_m2;
@@ -55,6 +62,15 @@ pub fn estimate_gnss_noise(
     let white_share = (white_m2 / variance_m2).clamp(LEAST_GNSS_WHITE_SHARE, 1.0);
     let correlation = NoiseCorrelation { white_share, time_constant_s: time_constant * unit_s };
     Some(GaussMarkovNoise { variance_m2, correlation })
+}
+
+/// Squared lengths of normal residuals are exponentially distributed with the median `2 ln 2` times the variance per axis.
+fn without_gross_errors(traverses: &[Vec<TimedResidual>]) -> Vec<Vec<TimedResidual>> {
+    let square_m2 = |it: &TimedResidual| it.difference.east_m.powi(2) + it.difference.north_m.powi(2);
+    let variance_m2 = median(traverses.iter().flatten().map(square_m2).collect()) / (2.0 * LN_2);
+    let limit_m2 = GROSS_SIGMAS * GROSS_SIGMAS * variance_m2;
+    let is_credible = |it: &&TimedResidual| square_m2(it) <= limit_m2;
+    traverses.iter().map(|traverse| traverse.iter().filter(is_credible).copied().collect()).collect()
 }
 
 /// Median interval between neighbouring residuals, s.

@@ -16,11 +16,17 @@ const TIME_CONSTANTS_S: [f64; 5] = [5.0, 15.0, 40.0, 100.0, 250.0];
 const WHITE_SHARES: [f64; 6] = [0.01, 0.03, 0.1, 0.25, 0.5, 0.75];
 /// Normalised innovation squared (2 degrees of freedom) above which a row is down-weighted.
 const NOMINAL_NIS: f64 = 8.0;
+/// The same above which a row is a gross error: seven standard deviations.
+const GROSS_NIS: f64 = 49.0;
+/// The inflation of a gross error: its row is taken as missing. A finite one, in units of the noise's variance, would be
+/// the likelier the larger that variance is, so that a few gross errors make the noise of all rows large.
+const GROSS_ERROR: f64 = f64::INFINITY;
 
 /// The noise of maximum likelihood for residuals.
 ///
 /// `residuals` are east and north (m) of rows sorted by target and time; `inflation` is added to each
-/// row's white variance in units of the noise's variance, and is not part of the result.
+/// row's white variance in units of the noise's variance, and is not part of the result. Rows of
+/// [`GROSS_ERROR`] say nothing of the noise.
 pub(crate) fn fit_noise(
     rows: &[TrainingRow],
     residuals: &[Vec<f64>; 2],
@@ -28,6 +34,7 @@ pub(crate) fn fit_noise(
 ) -> GaussMarkovNoise {
     let unit = GaussMarkovNoise::white(1.0);
     let mut best = (f64::INFINITY, unit);
+    let credible = inflation.iter().filter(|inflation| inflation.is_finite()).count();
     let coloured = TIME_CONSTANTS_S.iter().flat_map(|time_constant_s| {
         WHITE_SHARES.iter().map(|white_share| GaussMarkovNoise {
             variance_m2: 1.0,
@@ -45,7 +52,7 @@ pub(crate) fn fit_noise(
             })
             .sum();
         // The scale of the variance has a closed form; -2 times the profile likelihood remains.
-        let count = 2.0 * rows.len() as f64;
+        let count = 2.0 * credible.max(1) as f64;
         let variance_m2 = (sum / count).max(1e-8);
         let deviance = count * variance_m2.ln() + 2.0 * whitener.log_determinant;
         if deviance < best.0 {
@@ -53,6 +60,16 @@ pub(crate) fn fit_noise(
         }
     }
     best.1
+}
+
+/// Inflations with gross errors marked as such, unless a fifth of the rows departs so far: then that is what these rows
+/// are like.
+pub(crate) fn with_gross_errors(mut inflation: Vec<f64>, is_gross: impl Fn(usize) -> bool) -> Vec<f64> {
+    let gross: Vec<usize> = (0..inflation.len()).filter(|row| is_gross(*row)).collect();
+    if 5 * gross.len() < inflation.len() {
+        gross.into_iter().for_each(|row| inflation[row] = GROSS_ERROR);
+    }
+    inflation
 }
 
 /// The number of independent fixes per axis that has the same information about a constant as the rows.
@@ -75,7 +92,9 @@ struct Coefficients {
     /// Decay of the state since the previous row.
     decay: f64,
     gain: f64,
-    /// Inverse standard deviation of the innovation, 1/m.
+    /// Variance of the innovation without the row's inflation, m2.
+    nominal_m2: f64,
+    /// Inverse standard deviation of the innovation, 1/m; 0 for a gross error.
     inverse_sigma: f64,
 }
 
@@ -98,39 +117,47 @@ impl Whitener {
             let same = at > 0 && rows[at - 1].target == row.target;
             let decay = if same { noise.correlation.decay(row.time_s - rows[at - 1].time_s) } else { 0.0 };
             state_variance_m2 = decay * decay * state_variance_m2 + (1.0 - decay * decay) * coloured_m2;
-            let innovation_variance_m2 = state_variance_m2 + white_m2 + inflation[at] * noise.variance_m2;
+            let nominal_m2 = state_variance_m2 + white_m2;
+            let innovation_variance_m2 = nominal_m2 + inflation[at] * noise.variance_m2;
             let gain = state_variance_m2 / innovation_variance_m2;
             state_variance_m2 *= 1.0 - gain;
-            log_determinant += innovation_variance_m2.ln();
+            if innovation_variance_m2.is_finite() {
+                log_determinant += innovation_variance_m2.ln();
+            }
             let inverse_sigma = 1.0 / innovation_variance_m2.sqrt();
-            coefficients.push(Coefficients { decay, gain, inverse_sigma });
+            coefficients.push(Coefficients { decay, gain, nominal_m2, inverse_sigma });
         }
         Self { coefficients, log_determinant }
     }
 
     /// Replaces a column (one value per row) by its normalised innovations.
     pub(crate) fn apply(&self, column: &mut [f64]) {
-        let mut state = 0.0;
-        for (value, Coefficients { decay, gain, inverse_sigma }) in column.iter_mut().zip(&self.coefficients)
-        {
-            state *= decay;
-            let innovation = *value - state;
-            state += gain * innovation;
-            *value = innovation * inverse_sigma;
+        self.innovate(column);
+        for (innovation, Coefficients { inverse_sigma, .. }) in column.iter_mut().zip(&self.coefficients) {
+            *innovation *= inverse_sigma;
         }
     }
 
-    /// Sets the variance inflation of every row so that its normalised innovation squared is at most
-    /// [`NOMINAL_NIS`]; `whitened` are the residuals whitened with the present inflation.
-    pub(crate) fn inflate(&self, noise: &GaussMarkovNoise, whitened: &[Vec<f64>; 2], inflation: &mut [f64]) {
-        for (at, inflation) in inflation.iter_mut().enumerate() {
-            let nis = whitened[0][at] * whitened[0][at] + whitened[1][at] * whitened[1][at];
-            let Coefficients { inverse_sigma, .. } = self.coefficients[at];
-            let variance_m2 = 1.0 / (inverse_sigma * inverse_sigma);
-            let nominal_m2 = variance_m2 - *inflation * noise.variance_m2;
-            let nis = nis * variance_m2 / nominal_m2.max(1e-12);
-            *inflation = nominal_m2 * (nis / NOMINAL_NIS - 1.0).max(0.0) / noise.variance_m2;
+    /// Replaces a column by its innovations.
+    fn innovate(&self, column: &mut [f64]) {
+        let mut state = 0.0;
+        for (value, Coefficients { decay, gain, .. }) in column.iter_mut().zip(&self.coefficients) {
+            state *= decay;
+            *value -= state;
+            state += gain * *value;
         }
+    }
+
+    /// The variance inflation of every row with which its normalised innovation squared is at most
+    /// [`NOMINAL_NIS`], or [`GROSS_ERROR`].
+    pub(crate) fn inflation(&self, noise: &GaussMarkovNoise, mut residuals: [Vec<f64>; 2]) -> Vec<f64> {
+        residuals.iter_mut().for_each(|axis| self.innovate(axis));
+        let [east, north] = residuals;
+        let nominal_m2 = |row: usize| self.coefficients[row].nominal_m2;
+        let nis = |row: usize| (east[row] * east[row] + north[row] * north[row]) / nominal_m2(row);
+        let finite =
+            |row: usize| nominal_m2(row) * (nis(row) / NOMINAL_NIS - 1.0).max(0.0) / noise.variance_m2;
+        with_gross_errors((0..east.len()).map(finite).collect(), |row| nis(row) > GROSS_NIS)
     }
 }
 
@@ -156,6 +183,27 @@ mod tests {
             stated_variance_m2: None,
         };
         (0..count).map(row).collect()
+    }
+
+    #[test]
+    fn gross_errors_do_not_make_the_noise_of_all_rows_large() {
+        let rows = rows(2000);
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let mut residuals =
+            [0, 1].map(|_| (0..2000).map(|_| 30.0 * standard_normal(&mut rng)).collect::<Vec<_>>());
+        (0..2000).step_by(20).for_each(|row| residuals[row / 20 % 2][row] += 1_000.0);
+        let is_gross = |row: usize| residuals[0][row].hypot(residuals[1][row]) > 400.0;
+        let mut inflation = with_gross_errors(vec![0.0; 2000], is_gross);
+        for _ in 0..6 {
+            let noise = fit_noise(&rows, &residuals, &inflation);
+            assert!((noise.variance_m2.sqrt() - 30.0).abs() < 2.0, "{noise:?}");
+            assert!(noise.correlation.white_share > 0.7, "{noise:?}");
+            inflation = Whitener::new(&rows, &noise, &inflation).inflation(&noise, residuals.clone());
+            assert_eq!(inflation.iter().filter(|inflation| !inflation.is_finite()).count(), 100);
+        }
+        // Half the rows are no gross errors.
+        let half = with_gross_errors(vec![1.0; 4], |row| row < 2);
+        assert_eq!(half, [1.0; 4]);
     }
 
     #[test]

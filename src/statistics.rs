@@ -19,6 +19,9 @@ pub fn median(mut values: Vec<f64>) -> f64 {
     *values.select_nth_unstable_by(rank, f64::total_cmp).1
 }
 
+/// A residual beyond this many robust standard deviations per axis is a gross error of the fix or of the box.
+pub const GROSS_SIGMAS: f64 = 7.0;
+
 /// Radius that contains 95 % of an isotropic normal distribution in the plane, in standard deviations per
 /// axis: `sqrt(-2 ln 0.05)`.
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;

@@ -89,16 +89,12 @@ impl ImmFilter {
             Transition::ornstein_uhlenbeck(step_s, agile_m2_s3, motion.agile_time_constant_s),
         ];
         let regression = &settings.regression;
-        let [gnss, session, camera] = [
-            settings.gnss.time_constant_s,
-            settings.gnss_session.time_constant_s,
-            regression.correlation.time_constant_s,
-        ]
-        .map(|time_constant_s| step_s / time_constant_s);
-        let [gnss, session] = [gnss, session].map(|rate| (-rate).exp());
+        let gnss = settings.gnss.decay(step_s);
+        let session = (-step_s / settings.gnss_session.time_constant_s).exp();
         for (mode, transition) in self.modes.iter_mut().zip(transitions) {
             // The camera's bias also decorrelates with the distance travelled.
-            let camera = camera + step_s * mode.speed_m_s() / regression.correlation_length_m;
+            let camera = step_s / regression.correlation.time_constant_s
+                + step_s * mode.speed_m_s() / regression.correlation_length_m;
             let transition = transition
                 .with_bias(GNSS_BIAS, gnss)
                 .with_bias(SESSION_BIAS, session)
@@ -196,16 +192,17 @@ impl ImmFilter {
         }
         let decomposition = self.decompose(settings, source, measured);
         let mut predicted = self.predict_measurement(&decomposition);
-        let (innovation, nis) = self.innovation(&predicted);
+        (outcome.innovation, outcome.nis) = self.innovation(&predicted);
         outcome.rejected = None;
-        if !self.passes_gate(settings, &predicted, nis) {
-            if fix.is_some_and(|fix| self.is_elsewhere(settings, measured, fix)) {
+        if !self.passes_gate(settings, &predicted, outcome.nis) {
+            let confirming = fix.filter(|fix| agree(settings, measured, *fix));
+            if confirming.is_some_and(|fix| self.is_outside(settings, MeasurementSource::Fix, fix)) {
+                // The track's target id now names another target.
                 *self = Self::new(settings, self.time, source, measured);
-                return GateOutcome { reinitialized: true, ..outcome };
+                outcome.reinitialized = true;
+                return outcome;
             }
-            (outcome.innovation, outcome.nis) = (innovation, nis);
-            let is_confirmed = fix.is_some_and(|fix| agree(settings, measured, fix));
-            match self.reacquire(settings, source, measured, &decomposition, is_confirmed) {
+            match self.reacquire(settings, source, measured, &decomposition, confirming.is_some()) {
                 Reacquisition::Rejected => {
                     outcome.rejected = Some(RejectionReason::OutsideGate);
                     return outcome;
@@ -217,7 +214,6 @@ impl ImmFilter {
                 Reacquisition::BiasReset => predicted = self.predict_measurement(&decomposition),
             }
         }
-        (outcome.innovation, outcome.nis) = (innovation, nis);
         self.update(&predicted);
         self.histories[source as usize] = SourceHistory::accepted(self.time);
         if source == MeasurementSource::Regressed {
@@ -227,18 +223,13 @@ impl ImmFilter {
         outcome
     }
 
-    /// Whether a fix agrees with a regressed position that is outside the gate, and is outside itself: the track's
-    /// target id now names another target.
-    fn is_elsewhere(
+    fn is_outside(
         &self,
         settings: &TrackSettings,
-        regressed: MeasuredPosition,
-        fix: MeasuredPosition,
+        source: MeasurementSource,
+        measured: MeasuredPosition,
     ) -> bool {
-        if !agree(settings, regressed, fix) {
-            return false;
-        }
-        let predicted = self.predict_measurement(&self.decompose(settings, MeasurementSource::Fix, fix));
+        let predicted = self.predict_measurement(&self.decompose(settings, source, measured));
         !self.passes_gate(settings, &predicted, self.innovation(&predicted).1)
     }
 

@@ -128,15 +128,18 @@ impl NoiseDecomposition {
 }
 
 impl Transition {
+    /// Changes nothing.
+    const IDENTITY: Self = Self {
+        integrated_decay_s: 0.0,
+        decay: [1.0; STATES],
+        noise: [0.0; STATES],
+        position_velocity_m2_s: 0.0,
+    };
+
     /// Stationary mode: the velocity is zero and uncorrelated with everything; the position performs
     /// a random walk of `density_m2_s`. With `step_s = 0` only the velocity is reset.
     pub(super) fn stationary(step_s: f64, density_m2_s: f64) -> Self {
-        let mut own = Self {
-            integrated_decay_s: 0.0,
-            decay: [1.0; STATES],
-            noise: [0.0; STATES],
-            position_velocity_m2_s: 0.0,
-        };
+        let mut own = Self::IDENTITY;
         for axis in 0..2 {
             own.decay[VELOCITY + axis] = 0.0;
             own.noise[VELOCITY + axis] = STATIONARY_SPEED_SIGMA_M_S * STATIONARY_SPEED_SIGMA_M_S;
@@ -160,9 +163,8 @@ impl Transition {
         };
         let mut own = Self {
             integrated_decay_s,
-            decay: [1.0; STATES],
-            noise: [0.0; STATES],
             position_velocity_m2_s: density_m2_s3 * 0.5 * integrated_decay_s * integrated_decay_s,
+            ..Self::IDENTITY
         };
         for axis in 0..2 {
             own.decay[VELOCITY + axis] = decay;

@@ -5,14 +5,13 @@
 //! white; a track needs to know which. The mean over a traverse is not subtracted, because a
 //! traverse is short compared with the bias.
 
-use std::f64::consts::LN_2;
-
 use jiff::Timestamp;
 
 use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 use crate::geo::EastNorth;
 use crate::model::artifact::LEAST_GNSS_WHITE_SHARE;
-use crate::statistics::median;
+use crate::model::uncertainty::variance_components::robust_variance_m2;
+use crate::statistics::GROSS_SIGMAS;
 
 /// Lags of the autocovariance, in units of the fixes' interval (at least one second).
 const LAGS: [u32; 11] = [1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 50];
@@ -21,9 +20,6 @@ const TIME_CONSTANTS: [f64; 14] =
     [2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 75.0, 100.0, 150.0, 240.0];
 /// A lag needs this many pairs of residuals.
 const MIN_PAIRS: u32 = 30;
-/// A residual of more than this many standard deviations per axis, by the median, is a gross error of the fix or of the
-/// box. A few of 1 km are most of a variance, and white, so that a track would average the fixes of a phone.
-const GROSS_SIGMAS: f64 = 7.0;
 /// The estimate is at least this share of the residuals' variance, however large the regression's
 /// own variance is stated.
 const MIN_VARIANCE_SHARE: f64 = 0.05;
@@ -64,12 +60,12 @@ pub fn estimate_gnss_noise(
     Some(GaussMarkovNoise { variance_m2, correlation })
 }
 
-/// Squared lengths of normal residuals are exponentially distributed with the median `2 ln 2` times the variance per axis.
+/// A few errors of 1 km are most of a variance, and white, so that a track would average the fixes of a phone.
 fn without_gross_errors(traverses: &[Vec<TimedResidual>]) -> Vec<Vec<TimedResidual>> {
-    let square_m2 = |it: &TimedResidual| it.difference.east_m.powi(2) + it.difference.north_m.powi(2);
-    let variance_m2 = median(traverses.iter().flatten().map(square_m2).collect()) / (2.0 * LN_2);
-    let limit_m2 = GROSS_SIGMAS * GROSS_SIGMAS * variance_m2;
-    let is_credible = |it: &&TimedResidual| square_m2(it) <= limit_m2;
+    let residual = |it: &TimedResidual| [it.difference.east_m, it.difference.north_m];
+    let residuals: Vec<[f64; 2]> = traverses.iter().flatten().map(residual).collect();
+    let limit_m = GROSS_SIGMAS * robust_variance_m2(&residuals).sqrt();
+    let is_credible = |it: &&TimedResidual| it.difference.distance_m(EastNorth::default()) <= limit_m;
     traverses.iter().map(|traverse| traverse.iter().filter(is_credible).copied().collect()).collect()
 }
 

@@ -9,6 +9,7 @@
 
 use super::rows::{TrainingRow, traverses};
 use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
+use crate::statistics::GROSS_SIGMAS;
 
 /// Candidates of the time constant, s.
 const TIME_CONSTANTS_S: [f64; 5] = [5.0, 15.0, 40.0, 100.0, 250.0];
@@ -16,8 +17,8 @@ const TIME_CONSTANTS_S: [f64; 5] = [5.0, 15.0, 40.0, 100.0, 250.0];
 const WHITE_SHARES: [f64; 6] = [0.01, 0.03, 0.1, 0.25, 0.5, 0.75];
 /// Normalised innovation squared (2 degrees of freedom) above which a row is down-weighted.
 const NOMINAL_NIS: f64 = 8.0;
-/// The same above which a row is a gross error: seven standard deviations.
-const GROSS_NIS: f64 = 49.0;
+/// The same above which a row is a gross error.
+const GROSS_NIS: f64 = GROSS_SIGMAS * GROSS_SIGMAS;
 /// The inflation of a gross error: its row is taken as missing. A finite one, in units of the noise's variance, would be
 /// the likelier the larger that variance is, so that a few gross errors make the noise of all rows large.
 const GROSS_ERROR: f64 = f64::INFINITY;

@@ -7,4 +7,4 @@ pub(crate) mod error_model;
 mod excess_calibration;
 mod jacobian;
 pub(crate) mod local_boxes;
-mod variance_components;
+pub(crate) mod variance_components;

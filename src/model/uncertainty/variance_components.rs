@@ -32,7 +32,7 @@ const LEAST_SESSION_SIZE: f64 = 4.0;
 
 /// Variance per axis of residuals, m2, from the median of their squared lengths, which are exponentially
 /// distributed with the median `2 ln 2` times the variance.
-pub(super) fn robust_variance_m2(residuals: &[Residual]) -> f64 {
+pub(crate) fn robust_variance_m2(residuals: &[Residual]) -> f64 {
     let squares = residuals.iter().map(|[east, north]| 0.5 * (east * east + north * north));
     median(squares.collect()) / std::f64::consts::LN_2
 }

@@ -2,16 +2,12 @@
 
 use super::noise::Epoch;
 use super::projective_mean::{Box4, ProjectiveMean};
-use crate::statistics::median;
+use crate::statistics::{GROSS_SIGMAS, median};
 
 /// Neighbours in time on either side that a row's residual is compared with.
 const NEIGHBOURS: usize = 3;
 /// Neighbours are at most so far away in time, s.
 const MAX_GAP_S: f64 = 10.0;
-/// A residual that departs from its neighbours' median by more than so many standard deviations of such
-/// departures is a gross error of the fix or of the box: what a map misses, and a receiver's coloured
-/// error, change slowly.
-const GROSS_SIGMAS: f64 = 7.0;
 
 /// Rows in the order of target and time.
 #[derive(Debug, Clone, Default)]
@@ -45,7 +41,8 @@ impl MapRows {
         self.boxes.iter().zip(&self.labels_m).map(miss).collect()
     }
 
-    /// The rows without gross errors about a mean.
+    /// The rows without gross errors about a mean. What departs is a residual from the median of its neighbours': what a map
+    /// misses, and a receiver's coloured error, change slowly.
     pub(crate) fn without_gross_errors(&self, mean: &ProjectiveMean) -> Self {
         let misses_m = self.misses_m(mean);
         let departures_m: Vec<Option<f64>> =

@@ -1,6 +1,5 @@
 //! Recordings whose boxes have only a tracker's ids and whose fixes only receivers': matched, then paired.
-//!
-//! What never happens here: evidence and search (they are [`crate::fusion::association`]'s).
+//! Evidence and search are in [`crate::fusion::association`].
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,13 +8,20 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::recording::Recording;
+use crate::config::Limits;
 use crate::domain::{
     Association, ClockOffset, Error, ErrorKind, ImageSize, ReceiverId, Receivers, Result, TargetId, TrackerId,
 };
 use crate::fusion::association::{
-    MatchSettings, Matching, WorldScores, match_with_model, match_without_model,
+    MatchLimits, MatchSettings, Matching, WorldScores, match_with_model, match_without_model,
 };
 use crate::model::Regressor;
+
+impl From<&Limits> for MatchLimits {
+    fn from(limits: &Limits) -> Self {
+        Self { tracklets: limits.match_tracklets, receivers: limits.match_receivers }
+    }
+}
 
 /// What a recording is matched by.
 #[derive(Debug, Clone, Copy)]

@@ -21,7 +21,7 @@ use crate::domain::{
     CameraId, ClockOffset, ImageSize, Receiver, ReceiverId, Receivers, TargetId, TimeBounds,
 };
 use crate::exchange::{self, FixFormat, MatchedSampleWriter, RowRules};
-use crate::fusion::association::MatchSettings;
+use crate::fusion::association::{MatchLimits, MatchSettings};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
 use crate::model::{Artifact, Regressor};
@@ -114,8 +114,7 @@ struct MatchFlags {
 
 impl MatchFlags {
     fn settings(&self) -> crate::domain::Result<MatchSettings> {
-        let limits = Limits::default();
-        MatchSettings::new(self.min_probability, self.clock_window_s, &limits)
+        MatchSettings::new(self.min_probability, self.clock_window_s, MatchLimits::default())
     }
 
     fn regressor(&self, file: Option<&Path>) -> anyhow::Result<Option<Arc<Regressor>>> {

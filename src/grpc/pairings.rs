@@ -159,7 +159,7 @@ fn matching(options: proto::MatchOptions, limits: &Limits) -> Result<MatchSettin
     let settings = MatchSettings::new(
         options.min_probability.unwrap_or(default.min_probability),
         options.clock_window_s.unwrap_or(default.clock_window_s),
-        limits,
+        limits.into(),
     );
     settings.map_err(|error| error.under("match"))
 }

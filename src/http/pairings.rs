@@ -310,7 +310,7 @@ fn matching(params: &mut Params, app: &App) -> Result<Option<MatchSettings>> {
     let settings = MatchSettings::new(
         min_probability.unwrap_or(default.min_probability),
         clock_window_s.unwrap_or(default.clock_window_s),
-        &app.limits,
+        (&app.limits).into(),
     )?;
     Ok(Some(settings))
 }

@@ -22,9 +22,9 @@ use crate::domain::{
     BoundingBox, Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, ReceiverId, Receivers,
     Recipe, Result, Sample, TargetClass, TargetId,
 };
-use crate::fusion::pairing::{PairingRule, PairingSettings, pair};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::model::{Artifact, FitInput, FitOptions, GroundCamera, Regressor, fit};
+use crate::pairing::{PairingRule, PairingSettings, pair};
 
 /// Shifts of the receivers' clocks as shares of the recording, for identities that are certainly wrong.
 const SHIFTS: [f64; 6] = [0.21, 0.33, 0.45, 0.57, 0.69, 0.81];
@@ -107,7 +107,7 @@ pub fn match_without_model(
     random: &mut impl Rng,
 ) -> Result<JointMatch> {
     let scene = Scene::new(detections, fixes, receivers);
-    check_size(&scene, settings)?;
+    check_size(&scene, settings.limits)?;
     let search = JointSearch::new(&scene, image_size, settings)?;
     let (world, scores) = search.accepted_world()?;
     search.trained(&world, scores, random)

@@ -11,7 +11,6 @@ use super::cuts;
 use super::evidence::EvidenceModel;
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, Tracklet};
-use crate::config::Limits;
 use crate::domain::{
     ClockOffset, Detection, Error, ErrorKind, GaussMarkovNoise, NoiseCorrelation, ReceivedFix, Receiver,
     ReceiverId, Receivers, Result, TargetId,
@@ -39,24 +38,36 @@ pub struct MatchSettings {
     pub gnss: Option<GaussMarkovNoise>,
     /// Evidence and prior probabilities.
     pub chains: ChainSettings,
-    /// Tracklets of one recording at most.
-    pub max_tracklets: usize,
-    /// Receivers of one recording at most.
-    pub max_receivers: usize,
+    /// Size of a recording.
+    pub limits: MatchLimits,
+}
+
+/// The largest recording that is matched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MatchLimits {
+    /// Number of tracklets.
+    pub tracklets: usize,
+    /// Number of receivers.
+    pub receivers: usize,
+}
+
+impl Default for MatchLimits {
+    fn default() -> Self {
+        Self { tracklets: 20_000, receivers: 200 }
+    }
 }
 
 impl MatchSettings {
     /// # Errors
     /// Names `min_probability` unless it is from 0.5 to 1, and `clock_window_s` unless it is from 0 to 30 s.
-    pub fn new(min_probability: f64, clock_window_s: f64, limits: &Limits) -> Result<Self> {
+    pub fn new(min_probability: f64, clock_window_s: f64, limits: MatchLimits) -> Result<Self> {
         if !(0.5..=1.0).contains(&min_probability) {
             return Err(Error::invalid("min_probability", "must be a number from 0.5 to 1"));
         }
         if !(0.0..=30.0).contains(&clock_window_s) {
             return Err(Error::invalid("clock_window_s", "must be a number of seconds from 0 to 30"));
         }
-        let (max_tracklets, max_receivers) = (limits.match_tracklets, limits.match_receivers);
-        Ok(Self { min_probability, clock_window_s, max_tracklets, max_receivers, ..Self::default() })
+        Ok(Self { min_probability, clock_window_s, limits, ..Self::default() })
     }
 }
 
@@ -67,8 +78,7 @@ impl Default for MatchSettings {
             clock_window_s: 0.0,
             gnss: None,
             chains: ChainSettings::default(),
-            max_tracklets: 20_000,
-            max_receivers: 200,
+            limits: MatchLimits::default(),
         }
     }
 }
@@ -145,7 +155,7 @@ pub fn match_with_model(
     random: &mut impl Rng,
 ) -> Result<Matching> {
     let scene = Scene::new(detections, fixes, receivers);
-    check_size(&scene, settings)?;
+    check_size(&scene, settings.limits)?;
     let gnss = settings.gnss.unwrap_or_else(|| receiver_noise(Some(regressor)));
     Ok(match_scene(&scene, regressor, gnss, settings, random))
 }
@@ -175,7 +185,7 @@ pub(super) fn receiver_noise(regressor: Option<&Regressor>) -> GaussMarkovNoise 
         .with_white_at_least(LEAST_WHITE_SIGMA_M * LEAST_WHITE_SIGMA_M)
 }
 
-pub(super) fn check_size(scene: &Scene<'_>, settings: &MatchSettings) -> Result<()> {
+pub(super) fn check_size(scene: &Scene<'_>, limits: MatchLimits) -> Result<()> {
     let refuse = |what: &str, count: usize, most: usize| {
         let message = format!(
             "there are {count} {what}, at most {most} are matched at once; split the recording by time"
@@ -183,8 +193,8 @@ pub(super) fn check_size(scene: &Scene<'_>, settings: &MatchSettings) -> Result<
         Err(Error::refused(ErrorKind::TooLarge, message))
     };
     match (scene.tracklets.len(), scene.receiver_ids.len()) {
-        (count, _) if count > settings.max_tracklets => refuse("tracklets", count, settings.max_tracklets),
-        (_, count) if count > settings.max_receivers => refuse("receivers", count, settings.max_receivers),
+        (count, _) if count > limits.tracklets => refuse("tracklets", count, limits.tracklets),
+        (_, count) if count > limits.receivers => refuse("receivers", count, limits.receivers),
         _ => Ok(()),
     }
 }

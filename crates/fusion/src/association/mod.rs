@@ -22,7 +22,7 @@ mod tracklet;
 pub use self::chains::ChainSettings;
 pub use self::joint::{JointMatch, WorldScores, match_without_model};
 pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};
-pub use self::matching::{MatchSettings, MatchedPiece, Matching, match_with_model};
+pub use self::matching::{MatchLimits, MatchSettings, MatchedPiece, Matching, match_with_model};
 
 #[cfg(test)]
 mod tests;

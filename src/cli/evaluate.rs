@@ -16,7 +16,9 @@ use crate::clock::{Clock, process_cpu_s};
 use crate::domain::{
     Detection, GnssBiasSigma, ImageSize, Recipe, Sample, SigmaM, StoredSample, TargetId, TimeBounds,
 };
-use crate::evaluation::{EvaluateOptions, Evaluation, Method, TestRow, Truth, evaluate, plots};
+use crate::evaluation::{
+    EvaluateOptions, Evaluation, Method, TestRow, Truth, evaluate, plots, truth_from_geojson,
+};
 use crate::exchange::{self, ObservedRow, RowRules};
 use crate::geo::Position;
 use crate::model::FitInput;
@@ -201,11 +203,15 @@ impl paper_experiments::Runner for PaperRunner {
     fn begin(&mut self, experiment: &str) {
         print_note(format_args!("{experiment}"));
     }
+
+    fn cpu_s(&self) -> fn() -> f64 {
+        process_cpu_s
+    }
 }
 
 fn truth_line(path: &Path) -> anyhow::Result<Truth> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    Ok(Truth::from_geojson(&text)?)
+    Ok(truth_from_geojson(&text)?)
 }
 
 /// The recipe of tracks.

@@ -10,6 +10,7 @@ use super::predictors::{Prediction, Predictor, Predictors, TargetRows};
 use super::report::MethodReport;
 use super::traces::{Curve, Evaluation, Trace, TracePoint};
 use super::training::{RecipeModel, Timed, fit_recipe, recipes_of};
+use super::truth::error_m;
 use crate::domain::{Method, Result, Sample, Truth};
 use crate::geo::{LocalPlane, Position};
 use crate::model::FitInput;
@@ -158,7 +159,7 @@ impl Run<'_> {
             for (&row, prediction) in target.iter().zip(predictions) {
                 rows += 1;
                 let Some(Prediction { position, r95_m, covariance }) = prediction else { continue };
-                let error_m = self.truth.error_m(self.predictors.test[row].truth, position);
+                let error_m = error_m(self.truth, self.predictors.test[row].truth, position);
                 scored.extend(error_m.map(|error_m| ScoredPrediction { error_m, r95_m }));
                 points.push(TracePoint { row, position, error_m, r95_m, covariance });
             }

@@ -8,39 +8,36 @@ use geojson::{GeoJson, Geometry, GeometryValue};
 use crate::domain::{Error, Result, Truth};
 use crate::geo::{EastNorth, LocalPlane, Position, distance_m};
 
-impl Truth {
-    /// The lines of a GeoJSON document: every LineString in it, at any depth.
-    ///
-    /// # Errors
-    /// Names `truth_line` for text that is not GeoJSON or contains no line of two positions.
-    pub fn from_geojson(text: &str) -> Result<Self> {
-        let wrong = |message: String| Error::invalid("truth_line", message);
-        let document: GeoJson = text.parse().map_err(|error| wrong(format!("is not GeoJSON: {error}")))?;
-        let mut lines = Vec::new();
-        match &document {
-            GeoJson::Geometry(geometry) => collect_lines(geometry, &mut lines)?,
-            GeoJson::Feature(feature) => {
-                feature.geometry.iter().try_for_each(|one| collect_lines(one, &mut lines))?
-            }
-            GeoJson::FeatureCollection(all) => {
-                let geometries = all.features.iter().filter_map(|feature| feature.geometry.as_ref());
-                geometries.into_iter().try_for_each(|one| collect_lines(one, &mut lines))?;
-            }
+/// The lines of a GeoJSON document as the truth: every LineString in it, at any depth.
+///
+/// # Errors
+/// Names `truth_line` for text that is not GeoJSON or contains no line of two positions.
+pub fn truth_from_geojson(text: &str) -> Result<Truth> {
+    let wrong = |message: String| Error::invalid("truth_line", message);
+    let document: GeoJson = text.parse().map_err(|error| wrong(format!("is not GeoJSON: {error}")))?;
+    let mut lines = Vec::new();
+    match &document {
+        GeoJson::Geometry(geometry) => collect_lines(geometry, &mut lines)?,
+        GeoJson::Feature(feature) => {
+            feature.geometry.iter().try_for_each(|one| collect_lines(one, &mut lines))?
         }
-        if lines.is_empty() {
-            return Err(wrong("must hold a LineString of at least two positions".to_owned()));
+        GeoJson::FeatureCollection(all) => {
+            let geometries = all.features.iter().filter_map(|feature| feature.geometry.as_ref());
+            geometries.into_iter().try_for_each(|one| collect_lines(one, &mut lines))?;
         }
-        Ok(Self::Lines(lines))
     }
+    if lines.is_empty() {
+        return Err(wrong("must hold a LineString of at least two positions".to_owned()));
+    }
+    Ok(Truth::Lines(lines))
+}
 
-    /// Horizontal error of a position, m, if the truth is known; `row` is the truth that the row states.
-    #[must_use]
-    pub fn error_m(&self, row: Option<Position>, position: Position) -> Option<f64> {
-        match self {
-            Self::Columns => row.map(|truth| distance_m(truth, position)),
-            Self::Point(point) => Some(distance_m(*point, position)),
-            Self::Lines(lines) => Some(distance_to_lines_m(lines, position)),
-        }
+/// Horizontal error of a position, m, if the truth is known; `row` is the truth that the row states.
+pub(crate) fn error_m(truth: &Truth, row: Option<Position>, position: Position) -> Option<f64> {
+    match truth {
+        Truth::Columns => row.map(|truth| distance_m(truth, position)),
+        Truth::Point(point) => Some(distance_m(*point, position)),
+        Truth::Lines(lines) => Some(distance_to_lines_m(lines, position)),
     }
 }
 
@@ -101,16 +98,16 @@ mod tests {
 
     #[test]
     fn a_line_is_read_and_its_distance_is_geodesic() {
-        let truth = Truth::from_geojson(LINE).expect("a line");
+        let truth = truth_from_geojson(LINE).expect("a line");
         let at = |longitude, latitude| Position::new(longitude, latitude).expect("valid");
         let beside = at(8.0005, 47.0001);
         let expected_m = distance_m(beside, at(8.0005, 47.0));
-        let error_m = truth.error_m(None, beside).expect("known");
-        assert!((error_m - expected_m).abs() < 1e-3, "{error_m} {expected_m}");
+        let stated_m = error_m(&truth, None, beside).expect("known");
+        assert!((stated_m - expected_m).abs() < 1e-3, "{stated_m} {expected_m}");
         // Beyond the end it is the distance to the end.
         let beyond = at(7.999, 47.0);
-        let error_m = truth.error_m(None, beyond).expect("known");
-        assert!((error_m - distance_m(beyond, at(8.0, 47.0))).abs() < 1e-3, "{error_m}");
+        let stated_m = error_m(&truth, None, beyond).expect("known");
+        assert!((stated_m - distance_m(beyond, at(8.0, 47.0))).abs() < 1e-3, "{stated_m}");
     }
 
     #[test]
@@ -122,7 +119,7 @@ mod tests {
             r#"{"type": "LineString", "coordinates": [[8.0, 47.0]]}"#,
             r#"{"type": "LineString", "coordinates": [[8.0, 97.0], [8.0, 47.0]]}"#,
         ] {
-            assert!(Truth::from_geojson(text).is_err(), "{text}");
+            assert!(truth_from_geojson(text).is_err(), "{text}");
         }
     }
 
@@ -131,12 +128,12 @@ mod tests {
         fn the_line_is_never_farther_than_its_points(
             longitude in 7.99..8.01f64, latitude in 46.99..47.01f64,
         ) {
-            let Truth::Lines(lines) = Truth::from_geojson(LINE).expect("a line") else { unreachable!() };
+            let Truth::Lines(lines) = truth_from_geojson(LINE).expect("a line") else { unreachable!() };
             let position = Position::new(longitude, latitude).expect("valid");
             let to_points_m = lines[0].iter().map(|&point| distance_m(point, position))
                 .fold(f64::INFINITY, f64::min);
-            let error_m = Truth::Lines(lines).error_m(None, position).expect("known");
-            prop_assert!(error_m <= to_points_m + 1e-3, "{error_m} {to_points_m}");
+            let to_lines_m = error_m(&Truth::Lines(lines), None, position).expect("known");
+            prop_assert!(to_lines_m <= to_points_m + 1e-3, "{to_lines_m} {to_points_m}");
         }
     }
 }

@@ -6,7 +6,6 @@ use std::ops::ControlFlow;
 use super::Runner;
 use super::simulated::Worlds;
 use super::splits::{Split, TestSet};
-use crate::clock::process_cpu_s;
 use crate::domain::{GnssError, Recipe, SigmaM};
 use crate::geo::distance_m;
 use crate::model::network::LossWeights;
@@ -29,7 +28,7 @@ const ROWS: usize = 2_000;
 pub(super) fn tables(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> anyhow::Result<()> {
     loss_balance(page, worlds, runner)?;
     label_smoothing(page, worlds, runner)?;
-    cost(page, worlds)
+    cost(page, worlds, runner.cpu_s())
 }
 
 fn loss_balance(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -> anyhow::Result<()> {
@@ -98,7 +97,7 @@ fn label_smoothing(page: &mut String, worlds: Worlds, runner: &mut dyn Runner) -
     Ok(())
 }
 
-fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
+fn cost(page: &mut String, worlds: Worlds, cpu_s: fn() -> f64) -> anyhow::Result<()> {
     let _ = writeln!(
         page,
         "## What the default costs\n\n`auto` on 10,000 rows, all candidates and held-out blocks included; the \
@@ -108,9 +107,9 @@ fn cost(page: &mut String, worlds: Worlds) -> anyhow::Result<()> {
     for &scene in Scene::ALL {
         for base in (Worlds { count: 1, ..worlds }).of(&Options::new(scene)) {
             let split = Split::of_world(&base, &[])?;
-            let started_s = process_cpu_s();
+            let started_s = cpu_s();
             let artifact = train(&split, &base, Recipe::Auto, FitOverrides::default())?;
-            let trained_s = process_cpu_s() - started_s;
+            let trained_s = cpu_s() - started_s;
             let _ = writeln!(page, "| {scene} | {trained_s:.2} | {} |", artifact.weights.len());
         }
     }

@@ -2,7 +2,7 @@
 
 use super::splits::Split;
 use crate::domain::SigmaM;
-use crate::evaluation::{Method, Truth};
+use crate::{Method, Truth};
 
 /// The methods of the main table, and three more of the tables behind it.
 pub(super) const METHODS: &str = "gnss,imm_ukf,homography.denied,dnn.denied,paper.two_step,auto.one_step,\

@@ -7,7 +7,7 @@ use super::marks::{self, Mark, ONE_STEP, TRACK, TWO_STEP};
 use super::scores::CaseScore;
 use super::simulated::Worlds;
 use super::walks::{DEFAULT, WALKS, WalkCurves};
-use crate::evaluation::{Trace, Truth, plots};
+use crate::{Trace, Truth, plots};
 
 /// The methods of the main table and their titles.
 const COLUMNS: [(&str, &str); 8] = [
@@ -178,7 +178,7 @@ fn walk_table(page: &mut String, curve: &WalkCurves) {
         WALKS.iter().zip(rows).map(|(walks, rows)| format!(" {walks} ({rows} rows) |")).collect();
     let _ = writeln!(page, "| walks |{heads}\n|---|{}", "---|".repeat(WALKS.len()));
     for (name, figures) in &curve.methods {
-        let cell = |one: &Option<crate::evaluation::ErrorMetrics>| {
+        let cell = |one: &Option<crate::ErrorMetrics>| {
             let Some(one) = one else { return " - |".to_owned() };
             let coverage = one.coverage95.filter(|_| name == DEFAULT);
             let coverage = coverage.map_or_else(String::new, |share| format!(" ({:.0})", 100.0 * share));

@@ -4,7 +4,7 @@ use super::cases::{Case, Experiment, METHODS, key};
 use super::splits::{Split, leave_out, sessions};
 use super::{RealCamera, RealRecording};
 use crate::domain::SigmaM;
-use crate::evaluation::{Method, Truth};
+use crate::{Method, Truth};
 
 /// Standard deviation per axis of the square recording's receiver, m: 2.7 m mean error at a fixed point,
 /// divided by sqrt(pi / 2).

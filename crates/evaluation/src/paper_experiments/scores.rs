@@ -5,9 +5,8 @@ use std::collections::BTreeMap;
 use super::Runner;
 use super::cases::{Case, Experiment, key};
 use super::splits::Split;
-use crate::clock::process_cpu_s;
 use crate::domain::Recipe;
-use crate::evaluation::{
+use crate::{
     Curve, ErrorMetrics, EvaluateOptions, Evaluation, MethodReport, ScoredPrediction, TestRow, Trace,
     TracePoint,
 };
@@ -71,7 +70,7 @@ pub(super) fn evaluate(
     for split in &experiment.splits {
         let split = split()?;
         let (test, begins) = split.joined_tests()?;
-        let options = options(&experiment, &split);
+        let options = options(&experiment, &split, runner.cpu_s());
         let evaluation = runner.evaluate(split.input(), &test, &experiment.truth, &options)?;
         for (at, scores) in worlds.iter_mut().enumerate() {
             let end = begins.get(at + 1).copied().unwrap_or(test.len());
@@ -89,7 +88,7 @@ pub(super) fn evaluate(
     Ok(scores)
 }
 
-fn options(experiment: &Experiment, split: &Split) -> EvaluateOptions {
+fn options(experiment: &Experiment, split: &Split, cpu_s: fn() -> f64) -> EvaluateOptions {
     EvaluateOptions {
         methods: experiment.methods.clone(),
         default_recipe: DEFAULT_RECIPE,
@@ -99,7 +98,7 @@ fn options(experiment: &Experiment, split: &Split) -> EvaluateOptions {
         gnss_sigma: Some(experiment.gnss_sigma),
         gnss_bias_sigma: None,
         box_shift_px: 0.0,
-        cpu_s: process_cpu_s,
+        cpu_s,
     }
 }
 

@@ -3,8 +3,8 @@
 use super::cases::{Case, Experiment, METHODS, key};
 use super::splits::{Split, TestSet, forty_rows_of_four_traverses};
 use crate::domain::SigmaM;
-use crate::evaluation::{Method, Truth};
 use crate::simulation::{Options, Route, Scene, TargetShape};
+use crate::{Method, Truth};
 
 /// The methods whose figures may depend on the training seed.
 const SEEDED: &str = "auto.one_step,auto.two_step,track";

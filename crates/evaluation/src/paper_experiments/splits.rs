@@ -3,8 +3,8 @@
 use jiff::{SignedDuration, Timestamp};
 
 use super::RealRecording;
+use crate::TestRow;
 use crate::domain::{BoundingBox, Detection, ImageSize, Observation, Sample, TargetId};
-use crate::evaluation::TestRow;
 use crate::model::FitInput;
 use crate::simulation::{Options, Route, SimulatedRow, World, simulate};
 

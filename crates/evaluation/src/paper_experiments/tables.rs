@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::scores::CaseScore;
-use crate::evaluation::ErrorMetrics;
+use crate::ErrorMetrics;
 
 /// Epochs whose Es is listed.
 const SHOWN_EPOCHS: [u32; 8] = [1, 2, 5, 10, 20, 50, 100, 200];

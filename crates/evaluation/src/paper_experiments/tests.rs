@@ -7,8 +7,8 @@ use super::scores::{CaseScore, MethodScore};
 use super::simulated::Worlds;
 use super::tables;
 use super::walks::{WALKS, WalkCurves};
-use crate::evaluation::{ErrorMetrics, MethodReport, ScoredPrediction};
 use crate::simulation::Scene;
+use crate::{ErrorMetrics, MethodReport, ScoredPrediction};
 
 /// Figures of that mean (m), with that share of the true positions inside the stated radius.
 fn figures(mean_m: f64, coverage: Option<f64>) -> ErrorMetrics {

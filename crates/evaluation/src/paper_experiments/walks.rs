@@ -5,12 +5,11 @@ use std::collections::BTreeMap;
 use super::Runner;
 use super::simulated::{Worlds, walks_of};
 use super::splits::{Split, TestSet, traverses};
-use crate::clock::process_cpu_s;
+use crate::axis::{Axes, AxisSpec};
+use crate::chart::{Series, Shape, chart};
 use crate::domain::{Recipe, Sample, SigmaM};
-use crate::evaluation::axis::{Axes, AxisSpec};
-use crate::evaluation::chart::{Series, Shape, chart};
-use crate::evaluation::{ErrorMetrics, EvaluateOptions, Method, Truth};
 use crate::simulation::Scene;
+use crate::{ErrorMetrics, EvaluateOptions, Method, Truth};
 
 /// Numbers of walks.
 pub(super) const WALKS: [usize; 6] = [1, 2, 3, 5, 10, 20];
@@ -48,7 +47,7 @@ impl WalkCurves {
                 gnss_sigma: Some(SigmaM::new(world.gnss_sigma_m)?),
                 gnss_bias_sigma: None,
                 box_shift_px: 0.0,
-                cpu_s: process_cpu_s,
+                cpu_s: runner.cpu_s(),
             };
             for (at, &count) in WALKS.iter().enumerate() {
                 let train: Vec<Sample> = traverses(&split.train).take(count).flatten().cloned().collect();

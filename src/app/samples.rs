@@ -4,7 +4,6 @@ use std::io::Read;
 use std::sync::Arc;
 
 use futures_util::{Stream, StreamExt as _};
-use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
 
@@ -12,9 +11,9 @@ use super::access::Permission;
 use super::idempotency::record_of;
 use super::{App, Page, page_of};
 use crate::domain::{
-    CameraId, Durability, Error, IdempotentRequest, OnConflict, Result, SampleCount, StoredSample, TargetId,
+    CameraId, Durability, Error, IdempotentRequest, OnConflict, Result, SampleCount, StoredSample,
 };
-use crate::exchange::{self, CsvLayout, Cursor, Format, RowError, RowRules};
+use crate::exchange::{self, CsvLayout, Format, RowError, RowRules};
 use crate::store::{Completion, InsertOptions, Inserted, SampleFilter, SampleKey};
 
 /// Rows that go to the store at once.
@@ -296,23 +295,6 @@ impl<'a> Import<'a> {
     }
 }
 
-/// A sample's place in the list by time and target.
-impl Cursor for SampleKey {
-    const LIST: &'static str = "samples";
-
-    fn to_key(&self) -> String {
-        format!("{}:{}", self.time.as_microsecond(), self.target_id)
-    }
-
-    fn from_key(key: &str) -> Option<Self> {
-        let (time_us, target_id) = key.split_once(':')?;
-        Some(Self {
-            time: Timestamp::from_microsecond(time_us.parse().ok()?).ok()?,
-            target_id: TargetId::new(target_id).ok()?,
-        })
-    }
-}
-
 pub(super) type Batch = Vec<Result<StoredSample, RowError>>;
 
 fn read_batches(
@@ -353,29 +335,5 @@ fn with_stored_rows(error: Error, report: &ImportReport) -> Error {
             Error::Refused(refusal)
         }
         error => error,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-    use crate::exchange::{read_cursor, write_cursor};
-
-    proptest! {
-        #[test]
-        fn a_sample_is_found_again(time_us in -1_000_000_000_i64..4_000_000_000_000_000, name in "[a-z ./:é-]{0,20}[a-z]") {
-            let Ok(target_id) = TargetId::new(&name) else { return Ok(()) };
-            let key = SampleKey { time: Timestamp::from_microsecond(time_us).expect("in range"), target_id };
-            prop_assert_eq!(read_cursor::<SampleKey>("cursor", &write_cursor(&key)).expect("its own"), key);
-        }
-
-        #[test]
-        fn what_is_no_cursor_is_refused_or_read(text in ".{1,40}") {
-            if let Err(error) = read_cursor::<SampleKey>("cursor", &text) {
-                prop_assert!(error.to_string().starts_with("cursor"));
-            }
-        }
     }
 }

@@ -2,9 +2,11 @@
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+use jiff::Timestamp;
 
 use crate::domain::{
-    AuditNumber, CameraId, ConnectionId, Error, EvaluationId, KeyId, Result, RunId, SiteId, TargetId,
+    AuditNumber, CameraId, ConnectionId, Error, EvaluationId, KeyId, Result, RunId, SampleKey, SiteId,
+    TargetId,
 };
 
 /// Largest accepted cursor, bytes.
@@ -50,6 +52,23 @@ impl Cursor for CameraId {
 
     fn from_key(key: &str) -> Option<Self> {
         Self::new(key).ok()
+    }
+}
+
+/// A sample's place in the list by time and target.
+impl Cursor for SampleKey {
+    const LIST: &'static str = "samples";
+
+    fn to_key(&self) -> String {
+        format!("{}:{}", self.time.as_microsecond(), self.target_id)
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        let (time_us, target_id) = key.split_once(':')?;
+        Some(Self {
+            time: Timestamp::from_microsecond(time_us.parse().ok()?).ok()?,
+            target_id: TargetId::new(target_id).ok()?,
+        })
     }
 }
 
@@ -153,7 +172,25 @@ impl Cursor for u32 {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+
+    proptest! {
+        #[test]
+        fn a_sample_is_found_again(time_us in -1_000_000_000_i64..4_000_000_000_000_000, name in "[a-z ./:é-]{0,20}[a-z]") {
+            let Ok(target_id) = TargetId::new(&name) else { return Ok(()) };
+            let key = SampleKey { time: Timestamp::from_microsecond(time_us).expect("in range"), target_id };
+            prop_assert_eq!(read_cursor::<SampleKey>("cursor", &write_cursor(&key)).expect("its own"), key);
+        }
+
+        #[test]
+        fn what_is_no_cursor_is_refused_or_read(text in ".{1,40}") {
+            if let Err(error) = read_cursor::<SampleKey>("cursor", &text) {
+                prop_assert!(error.to_string().starts_with("cursor"));
+            }
+        }
+    }
 
     #[test]
     fn a_cursor_is_read_by_its_own_list_only() {

@@ -1,8 +1,7 @@
 //! Domain values, valid by construction.
 //!
 //! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
-//! it and do not check again. What never happens here: I/O, clocks,
-//! randomness, wire formats, status codes.
+//! it and do not check again.
 
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
@@ -30,6 +29,7 @@ mod on_conflict;
 mod receiver;
 mod recipe;
 mod sample;
+mod sample_filter;
 mod sample_overflow;
 mod score;
 mod site;
@@ -64,6 +64,7 @@ pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use sample::{Association, Sample, SampleCount, StoredSample};
+pub use sample_filter::{SampleFilter, SampleKey};
 pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};

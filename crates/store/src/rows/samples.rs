@@ -3,17 +3,15 @@
 use std::collections::HashSet;
 use std::fmt;
 
-use jiff::Timestamp;
-
 use crate::domain::{
-    BoundingBox, Fix, Result, Sample, Score, SigmaM, StoredSample, TargetClass, TargetId, TimeRange,
+    BoundingBox, Fix, Result, Sample, SampleFilter, Score, SigmaM, StoredSample, TargetClass, TargetId,
 };
 use crate::geo::Position;
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// A table of samples. A key is in one of them only.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::store) enum SampleTable {
+pub(crate) enum SampleTable {
     /// Samples with a fix.
     WithFix,
     /// Samples without one.
@@ -30,19 +28,19 @@ impl fmt::Display for SampleTable {
 }
 
 /// A row with the batch it came from and the key of its camera.
-pub(in crate::store) struct Row<'a> {
-    pub(in crate::store) batch: usize,
-    pub(in crate::store) camera_key: i64,
-    pub(in crate::store) sample: &'a StoredSample,
+pub(crate) struct Row<'a> {
+    pub(crate) batch: usize,
+    pub(crate) camera_key: i64,
+    pub(crate) sample: &'a StoredSample,
 }
 
 /// Time and target of a sample, as they are stored.
-pub(in crate::store) fn key(sample: &StoredSample) -> (i64, &str) {
+pub(crate) fn key(sample: &StoredSample) -> (i64, &str) {
     (sample.time.as_microsecond(), sample.target_id.as_str())
 }
 
 /// Keeps the last of samples that have the same key; returns how many others there were.
-pub(in crate::store) fn keep_last(samples: &mut Vec<StoredSample>) -> u64 {
+pub(crate) fn keep_last(samples: &mut Vec<StoredSample>) -> u64 {
     let before = samples.len();
     let mut seen = HashSet::with_capacity(before);
     let mut is_last: Vec<bool> = samples
@@ -56,15 +54,24 @@ pub(in crate::store) fn keep_last(samples: &mut Vec<StoredSample>) -> u64 {
 
 impl SampleTable {
     /// Both.
-    pub(in crate::store) const ALL: [Self; 2] = [Self::WithFix, Self::WithoutFix];
+    pub(crate) const ALL: [Self; 2] = [Self::WithFix, Self::WithoutFix];
 
     /// The table of a sample.
-    pub(in crate::store) const fn of(sample: &StoredSample) -> Self {
+    pub(crate) const fn of(sample: &StoredSample) -> Self {
         if sample.fix.is_some() { Self::WithFix } else { Self::WithoutFix }
     }
 
+    /// The tables of the samples that are asked for.
+    pub(crate) const fn asked_for(filter: &SampleFilter) -> &'static [Self] {
+        match filter.has_fix {
+            None => &Self::ALL,
+            Some(true) => &[Self::WithFix],
+            Some(false) => &[Self::WithoutFix],
+        }
+    }
+
     /// Columns to select, the same for both tables.
-    pub(in crate::store) const fn columns(self) -> &'static str {
+    pub(crate) const fn columns(self) -> &'static str {
         match self {
             Self::WithFix => {
                 "camera_key, time_us, target_id, left_px, top_px, width_px, height_px, longitude_deg, \
@@ -78,7 +85,7 @@ impl SampleTable {
     }
 
     /// Column of `sample_counts` that counts the rows of the table.
-    pub(in crate::store) const fn counter(self) -> &'static str {
+    pub(crate) const fn counter(self) -> &'static str {
         match self {
             Self::WithFix => "samples",
             Self::WithoutFix => "without_fix",
@@ -86,54 +93,8 @@ impl SampleTable {
     }
 }
 
-/// Which samples of a camera.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct SampleFilter {
-    /// From this instant on.
-    pub from: Option<Timestamp>,
-    /// Before this instant.
-    pub until: Option<Timestamp>,
-    /// Of this target alone.
-    pub target_id: Option<TargetId>,
-    /// Only samples that have a fix, or only those that have none.
-    pub has_fix: Option<bool>,
-}
-
-impl SampleFilter {
-    /// All samples of a stretch of time.
-    #[must_use]
-    pub fn within(range: TimeRange) -> Self {
-        Self { from: range.from(), until: range.until(), ..Self::default() }
-    }
-
-    pub(in crate::store) fn tables(&self) -> &'static [SampleTable] {
-        match self.has_fix {
-            None => &SampleTable::ALL,
-            Some(true) => &[SampleTable::WithFix],
-            Some(false) => &[SampleTable::WithoutFix],
-        }
-    }
-}
-
-/// The place of a sample in its camera's order: by time, then by target (bytes of its UTF-8).
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub struct SampleKey {
-    /// The sample's time.
-    pub time: Timestamp,
-    /// The sample's target.
-    pub target_id: TargetId,
-}
-
-impl SampleKey {
-    /// The key of a sample, to go on after it.
-    #[must_use]
-    pub fn of<F>(sample: &Sample<F>) -> Self {
-        Self { time: sample.time, target_id: sample.target_id.clone() }
-    }
-}
-
 /// A row of [`SampleTable::columns`].
-pub(in crate::store) fn read_sample<'r>(row: impl Into<StoredRow<'r>>) -> Result<StoredSample> {
+pub(crate) fn read_sample<'r>(row: impl Into<StoredRow<'r>>) -> Result<StoredSample> {
     let row = row.into();
     let table = if row.is_null(7) { "samples_without_fix" } else { "samples" };
     let mut fields = RowDecoder::new(table, row).skip(1);

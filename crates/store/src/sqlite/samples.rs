@@ -10,15 +10,17 @@ use super::Store;
 use super::cameras::camera_key;
 use super::errors::failed;
 use super::sample_table::subtract;
-use crate::domain::{AuditAction, CameraId, CameraKey, Detection, Result, StoredSample};
+use crate::domain::{
+    AuditAction, CameraId, CameraKey, Detection, Result, SampleFilter, SampleKey, StoredSample,
+};
 use crate::geo::Position;
-use crate::store::group_commit::{InsertOptions, Inserted};
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::audit::Change;
-use crate::store::rows::samples::{SampleFilter, SampleKey, SampleTable, read_sample};
+use crate::group_commit::{InsertOptions, Inserted};
+use crate::row_decoder::RowDecoder;
+use crate::rows::audit::Change;
+use crate::rows::samples::{SampleTable, read_sample};
 
 impl Store {
-    pub(in crate::store) async fn insert_samples(
+    pub(crate) async fn insert_samples(
         &self,
         id: &CameraId,
         key: Option<CameraKey>,
@@ -29,7 +31,7 @@ impl Store {
         self.inner.samples.insert((id.clone(), key), samples, options, actor).await
     }
 
-    pub(in crate::store) async fn samples(
+    pub(crate) async fn samples(
         &self,
         id: &CameraId,
         filter: &SampleFilter,
@@ -38,14 +40,14 @@ impl Store {
     ) -> Result<Vec<StoredSample>> {
         let range = Range::of(camera_key(self.readers(), id).await?, filter, after);
         let select = |table: &SampleTable| range.sql(&format!("SELECT {} FROM {table}", table.columns()));
-        let tables: Vec<String> = filter.tables().iter().map(select).collect();
+        let tables: Vec<String> = SampleTable::asked_for(filter).iter().map(select).collect();
         let sql = format!("{} ORDER BY time_us, target_id LIMIT ?", tables.join(" UNION ALL "));
-        let query = filter.tables().iter().fold(query(&sql), |query, _| range.bind(query));
+        let query = SampleTable::asked_for(filter).iter().fold(query(&sql), |query, _| range.bind(query));
         let rows = query.bind(limit).fetch_all(self.readers()).await.map_err(failed)?;
         rows.iter().map(read_sample).collect()
     }
 
-    pub(in crate::store) async fn thinned_detections(
+    pub(crate) async fn thinned_detections(
         &self,
         id: &CameraId,
         filter: &SampleFilter,
@@ -69,15 +71,15 @@ impl Store {
         rows.iter().map(|row| read_sample(row).map(Detection::from)).collect()
     }
 
-    pub(in crate::store) async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+    pub(crate) async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
         let mut count = 0;
-        for table in filter.tables() {
+        for table in SampleTable::asked_for(filter) {
             count += self.count(id, filter, &format!("SELECT count(*) FROM {table}")).await?;
         }
         Ok(count)
     }
 
-    pub(in crate::store) async fn count_truths(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+    pub(crate) async fn count_truths(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
         self.count(id, filter, "SELECT count(truth_longitude_deg) FROM samples").await
     }
 
@@ -88,11 +90,7 @@ impl Store {
         RowDecoder::new("samples", &row).parse(|stored: i64| u64::try_from(stored))
     }
 
-    pub(in crate::store) async fn sample_time(
-        &self,
-        id: &CameraId,
-        before: u64,
-    ) -> Result<Option<Timestamp>> {
+    pub(crate) async fn sample_time(&self, id: &CameraId, before: u64) -> Result<Option<Timestamp>> {
         let range = Range::of(camera_key(self.readers(), id).await?, &SampleFilter::default(), None);
         let sql = format!(
             "{} ORDER BY time_us, target_id LIMIT 1 OFFSET ?",
@@ -104,7 +102,7 @@ impl Store {
         row.map(|row| RowDecoder::new("samples", &row).timestamp()).transpose()
     }
 
-    pub(in crate::store) async fn sample_extent(
+    pub(crate) async fn sample_extent(
         &self,
         id: &CameraId,
         filter: &SampleFilter,
@@ -126,7 +124,7 @@ impl Store {
         Ok((count, Some([corner(west, south)?, corner(east, north)?])))
     }
 
-    pub(in crate::store) async fn delete_samples(
+    pub(crate) async fn delete_samples(
         &self,
         id: &CameraId,
         filter: &SampleFilter,
@@ -137,7 +135,7 @@ impl Store {
         let key = camera_key(&mut *transaction, id).await?;
         let range = Range::of(key, filter, None);
         let mut deleted = 0;
-        for table in filter.tables() {
+        for table in SampleTable::asked_for(filter) {
             let sql = range.sql(&format!("DELETE FROM {table}"));
             let rows =
                 range.bind(query(&sql)).execute(&mut *transaction).await.map_err(failed)?.rows_affected();

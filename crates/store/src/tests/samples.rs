@@ -1,6 +1,6 @@
 use super::*;
 use crate::domain::{Detection, SampleCount, Score, SigmaM, StoredSample, TargetClass};
-use crate::store::{Inserted, SampleFilter, SampleKey};
+use crate::{Inserted, SampleFilter, SampleKey};
 use proptest::prelude::*;
 
 #[tokio::test]

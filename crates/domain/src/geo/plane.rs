@@ -3,9 +3,9 @@
 use super::position::{Position, wrap_degrees};
 
 /// Semi-major axis of WGS 84 in metres.
-pub(crate) const EQUATORIAL_RADIUS_M: f64 = 6_378_137.0;
+pub const EQUATORIAL_RADIUS_M: f64 = 6_378_137.0;
 /// First eccentricity of WGS 84, squared.
-pub(crate) const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_141_316e-3;
+pub const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_141_316e-3;
 
 /// Largest distance from the origin, m, at which a [`LocalPlane`] is used. Up to here the plane is exact
 /// to 1 mm in both directions; beyond it nothing that a ground camera sees is measured.
@@ -63,14 +63,24 @@ impl EastNorth {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalPlane {
     origin: Position,
-    pub(crate) sin_latitude: f64,
-    pub(crate) cos_latitude: f64,
-    /// Distance of the origin from the polar axis and from the equatorial plane, m.
-    pub(crate) axis_m: f64,
-    pub(crate) equator_m: f64,
-    /// Radii of curvature at the origin, in the prime vertical and in the meridian, m.
-    pub(crate) prime_vertical_m: f64,
-    pub(crate) meridian_m: f64,
+    constants: PlaneConstants,
+}
+
+/// What a [`LocalPlane`] computes with, for those who write its conversions in another language.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlaneConstants {
+    /// Sine of the origin's latitude.
+    pub sin_latitude: f64,
+    /// Cosine of the origin's latitude.
+    pub cos_latitude: f64,
+    /// Distance of the origin from the polar axis, m.
+    pub axis_m: f64,
+    /// Distance of the origin from the equatorial plane, m, negative in the south.
+    pub equator_m: f64,
+    /// Radius of curvature in the prime vertical at the origin, m.
+    pub prime_vertical_m: f64,
+    /// Radius of curvature in the meridian at the origin, m.
+    pub meridian_m: f64,
 }
 
 impl LocalPlane {
@@ -80,21 +90,27 @@ impl LocalPlane {
         let (sin_latitude, cos_latitude) = origin.latitude_deg().to_radians().sin_cos();
         let w2 = 1.0 - ECCENTRICITY_SQUARED * sin_latitude * sin_latitude;
         let prime_vertical_m = EQUATORIAL_RADIUS_M / w2.sqrt();
-        Self {
-            origin,
+        let constants = PlaneConstants {
             sin_latitude,
             cos_latitude,
             axis_m: prime_vertical_m * cos_latitude,
             equator_m: prime_vertical_m * (1.0 - ECCENTRICITY_SQUARED) * sin_latitude,
             prime_vertical_m,
             meridian_m: prime_vertical_m * (1.0 - ECCENTRICITY_SQUARED) / w2,
-        }
+        };
+        Self { origin, constants }
     }
 
     /// The point of tangency.
     #[must_use]
     pub const fn origin(&self) -> Position {
         self.origin
+    }
+
+    /// What the conversions compute with.
+    #[must_use]
+    pub const fn constants(&self) -> &PlaneConstants {
+        &self.constants
     }
 
     /// Metres east and north of the origin.
@@ -120,16 +136,17 @@ impl LocalPlane {
             EQUATORIAL_RADIUS_M / (1.0 - ECCENTRICITY_SQUARED * sin_latitude * sin_latitude).sqrt();
         let axis_m = prime_vertical_m * cos_latitude;
         let equator_m = prime_vertical_m * (1.0 - ECCENTRICITY_SQUARED) * sin_latitude;
+        let origin = &self.constants;
         let longitude_rad = wrap_degrees(position.longitude_deg() - self.origin.longitude_deg()).to_radians();
         let (sin_longitude, cos_longitude) = longitude_rad.sin_cos();
         // Earth-centred difference, rotated about the polar axis to the origin's meridian, then by latitude.
-        let outward_m = axis_m * cos_longitude - self.axis_m;
-        let upward_m = equator_m - self.equator_m;
+        let outward_m = axis_m * cos_longitude - origin.axis_m;
+        let upward_m = equator_m - origin.equator_m;
         let point = EastNorth {
             east_m: axis_m * sin_longitude,
-            north_m: self.cos_latitude * upward_m - self.sin_latitude * outward_m,
+            north_m: origin.cos_latitude * upward_m - origin.sin_latitude * outward_m,
         };
-        (point, self.cos_latitude * outward_m + self.sin_latitude * upward_m)
+        (point, origin.cos_latitude * outward_m + origin.sin_latitude * upward_m)
     }
 
     /// The position on the ellipsoid vertically below a point of the plane.
@@ -138,26 +155,28 @@ impl LocalPlane {
         // The third coordinate is the distance of the ellipsoid from the plane: two Newton steps on the
         // ellipsoid's equation, starting from the osculating paraboloid.
         let EastNorth { east_m, north_m } = point;
-        let mut up_m = -0.5 * (east_m * east_m / self.prime_vertical_m + north_m * north_m / self.meridian_m);
+        let origin = &self.constants;
+        let mut up_m =
+            -0.5 * (east_m * east_m / origin.prime_vertical_m + north_m * north_m / origin.meridian_m);
         let polar_squared = 1.0 - ECCENTRICITY_SQUARED;
         let (mut outward_m, mut upward_m) = (0.0, 0.0);
         for _ in 0..2 {
-            outward_m = self.axis_m + self.cos_latitude * up_m - self.sin_latitude * north_m;
-            upward_m = self.equator_m + self.sin_latitude * up_m + self.cos_latitude * north_m;
+            outward_m = origin.axis_m + origin.cos_latitude * up_m - origin.sin_latitude * north_m;
+            upward_m = origin.equator_m + origin.sin_latitude * up_m + origin.cos_latitude * north_m;
             let excess = east_m * east_m + outward_m * outward_m + upward_m * upward_m / polar_squared
                 - EQUATORIAL_RADIUS_M * EQUATORIAL_RADIUS_M;
             let derivative =
-                2.0 * (outward_m * self.cos_latitude + upward_m * self.sin_latitude / polar_squared);
+                2.0 * (outward_m * origin.cos_latitude + upward_m * origin.sin_latitude / polar_squared);
             up_m -= excess / derivative;
-            outward_m = self.axis_m + self.cos_latitude * up_m - self.sin_latitude * north_m;
-            upward_m = self.equator_m + self.sin_latitude * up_m + self.cos_latitude * north_m;
+            outward_m = origin.axis_m + origin.cos_latitude * up_m - origin.sin_latitude * north_m;
+            upward_m = origin.equator_m + origin.sin_latitude * up_m + origin.cos_latitude * north_m;
         }
         let axis_m = (east_m * east_m + outward_m * outward_m).sqrt();
         // At height zero tan(latitude) = upward / (axis (1 - e2)), without iteration; turned by the origin's latitude, so that
         // the angle is small.
         let (sine, cosine) = (upward_m, axis_m * polar_squared);
-        let turned_sine = sine * self.cos_latitude - cosine * self.sin_latitude;
-        let turned_cosine = cosine * self.cos_latitude + sine * self.sin_latitude;
+        let turned_sine = sine * origin.cos_latitude - cosine * origin.sin_latitude;
+        let turned_cosine = cosine * origin.cos_latitude + sine * origin.sin_latitude;
         Position::wrapped(
             self.origin.longitude_deg() + small_angle(east_m, outward_m).to_degrees(),
             self.origin.latitude_deg() + small_angle(turned_sine, turned_cosine).to_degrees(),

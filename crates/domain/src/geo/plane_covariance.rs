@@ -1,6 +1,4 @@
 //! Covariances in the local east-north plane, and the 95 % radius of a normal distribution.
-//!
-//! What never happens here: degrees, time, anything beyond two axes.
 
 use nalgebra::Matrix2;
 
@@ -9,7 +7,7 @@ use super::EastNorth;
 /// 95 % radius of a bivariate normal distribution divided by its larger principal standard deviation,
 /// tabulated by the ratio of the smaller to the larger in steps of 0.1. Solved numerically from the
 /// integral over the disc. The function is convex, so linear interpolation never underestimates it.
-pub(crate) const R95_BY_RATIO: [f64; 11] = [
+pub const R95_BY_RATIO: [f64; 11] = [
     1.959_964, 1.962_530, 1.970_409, 1.984_197, 2.005_138, 2.035_859, 2.081_305, 2.145_982, 2.230_288,
     2.331_799, 2.447_747,
 ];
@@ -179,9 +177,11 @@ impl From<Matrix2<f64>> for PlaneCovariance {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::StandardNormal;
 
     use super::*;
-    use crate::simulation::{standard_normal, stream};
 
     proptest! {
         #[test]
@@ -199,7 +199,8 @@ mod tests {
 
     #[test]
     fn the_radius_contains_95_percent() {
-        let mut random = stream(1, 0);
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut normal = || random.sample::<f64, _>(StandardNormal);
         for ratio in [0.05, 0.37, 0.73, 1.0] {
             let covariance =
                 PlaneCovariance { east_m2: 4.0, north_m2: 4.0 * ratio * ratio, east_north_m2: 0.0 };
@@ -207,7 +208,7 @@ mod tests {
             let draws = 200_000;
             let inside = (0..draws)
                 .filter(|_| {
-                    let (east, north) = (standard_normal(&mut random), standard_normal(&mut random));
+                    let (east, north) = (normal(), normal());
                     (2.0 * east).hypot(2.0 * ratio * north) <= radius_m
                 })
                 .count();

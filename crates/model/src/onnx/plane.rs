@@ -9,16 +9,21 @@ const ARC_TANGENT_TERMS: i32 = 11;
 
 /// Longitude and latitude (degrees) of points east and north of the origin, m: `LocalPlane::to_position`.
 pub(super) fn to_position<'g>(plane: &LocalPlane, [east_m, north_m]: [Expr<'g>; 2]) -> [Expr<'g>; 2] {
+    let constants = plane.constants();
     let polar_squared = 1.0 - ECCENTRICITY_SQUARED;
-    let outward = |up_m: Expr<'g>| plane.axis_m + up_m * plane.cos_latitude - north_m * plane.sin_latitude;
-    let upward = |up_m: Expr<'g>| plane.equator_m + up_m * plane.sin_latitude + north_m * plane.cos_latitude;
-    let mut up_m = (east_m.square() / plane.prime_vertical_m + north_m.square() / plane.meridian_m) * -0.5;
+    let outward =
+        |up_m: Expr<'g>| constants.axis_m + up_m * constants.cos_latitude - north_m * constants.sin_latitude;
+    let upward = |up_m: Expr<'g>| {
+        constants.equator_m + up_m * constants.sin_latitude + north_m * constants.cos_latitude
+    };
+    let mut up_m =
+        (east_m.square() / constants.prime_vertical_m + north_m.square() / constants.meridian_m) * -0.5;
     for _ in 0..2 {
         let (outward_m, upward_m) = (outward(up_m), upward(up_m));
         let excess = east_m.square() + outward_m.square() + upward_m.square() / polar_squared
             - EQUATORIAL_RADIUS_M * EQUATORIAL_RADIUS_M;
         let derivative =
-            (outward_m * plane.cos_latitude + upward_m * (plane.sin_latitude / polar_squared)) * 2.0;
+            (outward_m * constants.cos_latitude + upward_m * (constants.sin_latitude / polar_squared)) * 2.0;
         up_m = up_m - excess / derivative;
     }
     let (outward_m, upward_m) = (outward(up_m), upward(up_m));
@@ -29,14 +34,15 @@ pub(super) fn to_position<'g>(plane: &LocalPlane, [east_m, north_m]: [Expr<'g>; 
 
 /// East and north of the origin, m, of longitudes given from the origin and latitudes, degrees: `LocalPlane::to_plane`.
 pub(super) fn to_plane<'g>(plane: &LocalPlane, east_deg: Expr<'g>, latitude_deg: Expr<'g>) -> [Expr<'g>; 2] {
+    let constants = plane.constants();
     let radians = |degrees: Expr<'g>| degrees * 1.0_f64.to_radians();
     let (sin_latitude, cos_latitude) = (radians(latitude_deg).sin(), radians(latitude_deg).cos());
     let prime_vertical_m = EQUATORIAL_RADIUS_M / (1.0 - sin_latitude.square() * ECCENTRICITY_SQUARED).sqrt();
     let axis_m = prime_vertical_m * cos_latitude;
     let equator_m = prime_vertical_m * sin_latitude * (1.0 - ECCENTRICITY_SQUARED);
-    let outward_m = axis_m * radians(east_deg).cos() - plane.axis_m;
-    let upward_m = equator_m - plane.equator_m;
-    [axis_m * radians(east_deg).sin(), upward_m * plane.cos_latitude - outward_m * plane.sin_latitude]
+    let outward_m = axis_m * radians(east_deg).cos() - constants.axis_m;
+    let upward_m = equator_m - constants.equator_m;
+    [axis_m * radians(east_deg).sin(), upward_m * constants.cos_latitude - outward_m * constants.sin_latitude]
 }
 
 /// Longitudes wrapped into -180 to 180 degrees.

@@ -1,8 +1,11 @@
 use std::ops::ControlFlow;
 
 use super::*;
-use crate::domain::{Recipe, SigmaM};
-use crate::simulation::{Options, Scene, World, simulate, simulate_split};
+use crate::baselines::homography;
+use crate::domain::{GnssError, Recipe, Sample, SigmaM};
+use crate::geo::LocalPlane;
+use crate::model::{FitOptions, fit};
+use crate::simulation::{Options, Scene, World, simulate, simulate_split, walk};
 
 fn options(methods: &str) -> EvaluateOptions {
     EvaluateOptions {
@@ -119,4 +122,35 @@ fn steps_are_counted_and_a_break_stops_at_the_next_one() {
     });
     let methods = interrupted.expect("valid boxes").report.methods;
     assert_eq!((methods.len(), calls), (1, 1), "nothing goes on after the break");
+}
+
+#[test]
+fn a_fit_to_few_passes_is_no_worse_than_the_homography() {
+    let tests = walk(8, 40, 2.0, 98);
+    let fit_options = FitOptions {
+        recipe: Recipe::Auto,
+        seed: 7,
+        epochs: Some(30),
+        image_size: None,
+        gnss_error: GnssError::Known(SigmaM::new(2.0).expect("valid")),
+        gnss_bias_sigma_m: None,
+    };
+    let (mut own_m, mut homography_m) = (0.0, 0.0);
+    for seed in 20..26 {
+        let samples = walk(4, 10, 2.0, seed);
+        let artifact = fit(&samples, &fit_options, &mut |_| ControlFlow::Continue(())).expect("fits");
+        let regressor = artifact.load().expect("loads");
+        let plane = LocalPlane::new(samples[0].fix.position);
+        let pairs: Vec<_> =
+            samples.iter().map(|sample| (sample.bounding_box, plane.to_plane(sample.fix.position))).collect();
+        let homography = homography::fit(&pairs, 1).expect("fits");
+        let truth = |plane: &LocalPlane, sample: &Sample| plane.to_plane(sample.truth.expect("truth"));
+        for sample in &tests {
+            let regressed = regressor.regress(&sample.bounding_box, None).regressed;
+            own_m += regressed.distance_m(truth(regressor.plane(), sample));
+            let projected = homography.project(&sample.bounding_box);
+            homography_m += projected.map_or(30.0, |point| point.distance_m(truth(&plane, sample)).min(30.0));
+        }
+    }
+    assert!(own_m < 1.2 * homography_m, "{own_m} {homography_m}");
 }

@@ -1,6 +1,4 @@
 //! Noise of detectors and receivers, each kind from its own seeded stream.
-//!
-//! What never happens here: any source of randomness that is not a parameter.
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -10,14 +8,15 @@ use crate::domain::GaussMarkovNoise;
 use crate::geo::EastNorth;
 
 /// An independent stream of a seed: enabling one kind of noise does not change the draws of another.
-pub(crate) fn stream(seed: u64, number: u64) -> ChaCha8Rng {
+#[must_use]
+pub fn stream(seed: u64, number: u64) -> ChaCha8Rng {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(number);
     random
 }
 
 /// A draw from the standard normal distribution.
-pub(crate) fn standard_normal(random: &mut impl Rng) -> f64 {
+pub fn standard_normal(random: &mut impl Rng) -> f64 {
     random.sample(StandardNormal)
 }
 

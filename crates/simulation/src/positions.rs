@@ -13,30 +13,38 @@ use crate::geo::EastNorth;
 
 /// True, received and regressed position of one instant.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct SimulatedPositions {
-    pub(crate) time: Timestamp,
-    pub(crate) truth: EastNorth,
-    pub(crate) fix: EastNorth,
-    pub(crate) regressed: EastNorth,
+pub struct SimulatedPositions {
+    /// The instant.
+    pub time: Timestamp,
+    /// Where the target is.
+    pub truth: EastNorth,
+    /// Where its receiver says that it is.
+    pub fix: EastNorth,
+    /// Where a model says that it is.
+    pub regressed: EastNorth,
 }
 
 /// One target that walks at constant speed and turns at random, a measurement per second.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Walk {
-    pub(crate) gnss: GaussMarkovNoise,
-    pub(crate) regression: GaussMarkovNoise,
+pub struct Walk {
+    /// Error of the receiver.
+    pub gnss: GaussMarkovNoise,
+    /// Error of the model.
+    pub regression: GaussMarkovNoise,
     /// Distance over which the regression's bias decorrelates to 1/e, m.
-    pub(crate) regression_length_m: f64,
-    pub(crate) speed_m_s: f64,
+    pub regression_length_m: f64,
+    /// Speed, m/s.
+    pub speed_m_s: f64,
     /// Interval between choices of a new heading, s.
-    pub(crate) turn_interval_s: u32,
+    pub turn_interval_s: u32,
     /// Largest lateral acceleration, m/s2.
-    pub(crate) max_lateral_m_s2: f64,
+    pub max_lateral_m_s2: f64,
 }
 
 impl Walk {
     /// A pedestrian with a phone.
-    pub(crate) fn pedestrian() -> Self {
+    #[must_use]
+    pub fn pedestrian() -> Self {
         Self {
             gnss: GaussMarkovNoise::new(2.2, NoiseCorrelation::PHONE),
             regression: GaussMarkovNoise::new(
@@ -51,7 +59,8 @@ impl Walk {
     }
 
     /// Positions at 0, 1, 2 ... s after [`at_s`]`(0.0)`.
-    pub(crate) fn simulate(&self, seed: u64, seconds: u32) -> Vec<SimulatedPositions> {
+    #[must_use]
+    pub fn simulate(&self, seed: u64, seconds: u32) -> Vec<SimulatedPositions> {
         let mut random = stream(seed, 0);
         let (mut place, mut heading_rad, mut wanted_rad) = ([0.0; 2], 0.0_f64, 0.0_f64);
         let max_turn_rad = self.max_lateral_m_s2 / self.speed_m_s.max(0.1);
@@ -89,14 +98,14 @@ fn measure(noise: &GaussMarkovNoise, place: [f64; 2], bias: [f64; 2], random: &m
 }
 
 /// Standard deviation per axis of the fixes of [`SiteVisits`], m.
-pub(crate) const VISIT_GNSS_SIGMA_M: f64 = 2.2;
-/// The same of the regressed positions.
-pub(crate) const VISIT_MODEL_SIGMA_M: f64 = 0.8;
+pub const VISIT_GNSS_SIGMA_M: f64 = 2.2;
+/// Standard deviation per axis of the regressed positions of [`SiteVisits`], m.
+pub const VISIT_MODEL_SIGMA_M: f64 = 0.8;
 
 /// Visits of several receivers to an area of 30 to 80 m before a camera at the origin that looks
 /// north. Beside the biases of tens of seconds there are errors that change every hour, one common to
 /// all receivers and one of each, and an error of the model that depends on the place.
-pub(crate) struct SiteVisits {
+pub struct SiteVisits {
     random: ChaCha8Rng,
     common_m: [f64; 2],
     receivers_m: Vec<[f64; 2]>,
@@ -105,19 +114,23 @@ pub(crate) struct SiteVisits {
 }
 
 impl SiteVisits {
-    pub(crate) fn new(seed: u64, receivers: usize) -> Self {
+    /// Visits by that number of receivers, drawn from a seed.
+    #[must_use]
+    pub fn new(seed: u64, receivers: usize) -> Self {
         let mut random = stream(seed, 0);
         let model_phases = std::array::from_fn(|_| standard_normal(&mut random));
         Self { random, common_m: [0.0; 2], receivers_m: vec![[0.0; 2]; receivers], hour: -1, model_phases }
     }
 
-    pub(crate) fn receivers(&self) -> usize {
+    /// Number of receivers.
+    #[must_use]
+    pub fn receivers(&self) -> usize {
         self.receivers_m.len()
     }
 
     /// One visit of five minutes, walking or stationary; `pan_rad` is the camera's rotation since its
     /// model was trained.
-    pub(crate) fn visit(
+    pub fn visit(
         &mut self,
         receiver: usize,
         begin_s: f64,
@@ -187,6 +200,7 @@ fn advance(bias: &mut [GaussMarkov; 2], random: &mut ChaCha8Rng) -> [f64; 2] {
 }
 
 /// The instant that many seconds into a simulation.
-pub(crate) fn at_s(seconds: f64) -> Timestamp {
+#[must_use]
+pub fn at_s(seconds: f64) -> Timestamp {
     Timestamp::UNIX_EPOCH + SignedDuration::from_secs(1_600_000_000) + SignedDuration::from_secs_f64(seconds)
 }

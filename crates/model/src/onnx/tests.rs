@@ -8,8 +8,9 @@ use prost::Message as _;
 use super::messages::{GraphProto, ModelProto};
 use super::{BOXES, OUTPUTS};
 use crate::domain::Recipe;
-use crate::model::fit;
-use crate::model::tests::{options, silent, walk};
+use crate::fit;
+use crate::simulation::walk;
+use crate::tests::{options, silent};
 
 #[test]
 fn every_recipe_exports_a_graph_in_order_with_all_outputs_and_its_origin() {

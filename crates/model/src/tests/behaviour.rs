@@ -2,12 +2,12 @@
 
 use jiff::Timestamp;
 
-use super::{options, silent, walk};
+use super::{options, silent};
 use crate::domain::{BoundingBox, GnssError, Recipe, Sample, TargetId};
-use crate::evaluation::baselines::homography;
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::network::LossWeights;
-use crate::model::{Artifact, FitOptions, FitOverrides, fit, fit_with};
+use crate::network::LossWeights;
+use crate::simulation::walk;
+use crate::{Artifact, FitOptions, FitOverrides, fit, fit_with};
 
 /// Mean distance to the truth of regressed and fused positions, and the share of truths inside the
 /// stated 95 % radius.
@@ -45,27 +45,6 @@ fn the_default_has_a_smaller_error_than_the_receiver_and_states_it() {
         assert!(inside > 0.85, "{inside}");
         assert_eq!(artifact.metadata.candidates.len(), 7);
     }
-}
-
-#[test]
-fn few_passes_are_no_worse_than_the_homography() {
-    let tests = walk(8, 40, 2.0, 98);
-    let (mut own_m, mut homography_m) = (0.0, 0.0);
-    for seed in 20..26 {
-        let samples = walk(4, 10, 2.0, seed);
-        let artifact = fit(&samples, &options(Recipe::Auto), &mut silent).expect("fits");
-        own_m += scores(&artifact, &tests)[0];
-        let plane = LocalPlane::new(samples[0].fix.position);
-        let pairs: Vec<_> =
-            samples.iter().map(|sample| (sample.bounding_box, plane.to_plane(sample.fix.position))).collect();
-        let homography = homography::fit(&pairs, 1).expect("fits");
-        let miss_m = |sample: &Sample| {
-            let truth = plane.to_plane(sample.truth.expect("truth"));
-            homography.project(&sample.bounding_box).map_or(30.0, |point| point.distance_m(truth).min(30.0))
-        };
-        homography_m += tests.iter().map(miss_m).sum::<f64>() / tests.len() as f64;
-    }
-    assert!(own_m < 1.2 * homography_m, "{own_m} {homography_m}");
 }
 
 #[test]
@@ -220,7 +199,7 @@ fn a_report_names_the_candidates_and_what_would_help() {
 
 #[test]
 fn thinning_keeps_neighbours_together_and_counts_all_traverses() {
-    use crate::model::samples::rows::TrainingRows;
+    use crate::samples::rows::TrainingRows;
     let rows = TrainingRows::new(&walk(10, 40, 2.0, 73)).expect("usable");
     let (all, traverses) = (rows.rows.len(), rows.traverses);
     let thinned = rows.thinned(all / 4);
@@ -232,7 +211,7 @@ fn thinning_keeps_neighbours_together_and_counts_all_traverses() {
 
 /// A candidate's model, and the squared bounded misses of its held-out rows by traverse.
 struct Fitted {
-    regressor: crate::model::Regressor,
+    regressor: crate::Regressor,
     misses_m2: Vec<f64>,
 }
 
@@ -245,7 +224,7 @@ fn fitted_candidate(
     let mut misses_m2 = Vec::new();
     let overrides = FitOverrides { candidate: Some(name), loss_weights: None };
     let artifact = fit_with(samples, fit_options, overrides, &mut |event| {
-        if let crate::model::FitEvent::HeldOut(errors) = event {
+        if let crate::FitEvent::HeldOut(errors) = event {
             // Spells of 20 neighbours: their errors are correlated.
             let of_spell = |spell: &[crate::domain::HeldOutSampleError]| {
                 spell.iter().map(|error| (0.5 * error.distance_m.powi(2)).min(bound_m2)).sum()
@@ -308,7 +287,7 @@ fn averaging_all_candidates_against_choosing_one() {
         for row in simulate(&simulated.test(300)).rows {
             let Some(bounding_box) = row.bounding_box else { continue };
             let truth = |plane: &LocalPlane| plane.to_plane(row.truth);
-            let miss_m = |regressor: &crate::model::Regressor| {
+            let miss_m = |regressor: &crate::Regressor| {
                 regressor.regress(&bounding_box, None).regressed.distance_m(truth(regressor.plane()))
             };
             let (mut east_m, mut north_m) = (0.0, 0.0);

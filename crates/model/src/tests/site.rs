@@ -5,8 +5,8 @@ use std::ops::ControlFlow;
 
 use crate::domain::{Fix, GnssError, JointTraining, ModelMetadata, Sample, TargetId};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
-use crate::model::{Artifact, FitError, Regressor, SiteCamera, SiteModels, fit_site_models};
 use crate::simulation::{LabelledDetection, SimulatedCamera, SimulatedSite, SiteOptions, simulate_site};
+use crate::{Artifact, FitError, Regressor, SiteCamera, SiteModels, fit_site_models};
 
 fn simulated(seed: u64) -> SimulatedSite {
     simulate_site(&SiteOptions {

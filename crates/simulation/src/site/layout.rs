@@ -3,10 +3,10 @@
 use rand::RngExt;
 
 use super::options::SiteOptions;
+use crate::camera::{PinholeCamera, Point};
 use crate::domain::ImageSize;
 use crate::geo::EastNorth;
-use crate::simulation::camera::{PinholeCamera, Point};
-use crate::simulation::noise::stream;
+use crate::noise::stream;
 
 /// Distance along the street between two cameras whose views overlap, and across a gap, m.
 const OVERLAP_M: f64 = 22.0;

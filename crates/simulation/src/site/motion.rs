@@ -6,11 +6,11 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::layout::{LANES_M, PAVEMENT_M, STREET_END_M};
+use crate::camera::Point;
 use crate::geo::EastNorth;
-use crate::simulation::camera::Point;
-use crate::simulation::noise::standard_normal;
-use crate::simulation::path::Pose;
-use crate::simulation::scene::Scene;
+use crate::noise::standard_normal;
+use crate::path::Pose;
+use crate::scene::Scene;
 
 /// Time constant of a target's deviations from its mean speed, s.
 const SPEED_TIME_S: f64 = 5.0;

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::geo::{EastNorth, distance_m};
-use crate::simulation::{Scene, TargetShape};
+use crate::{Scene, TargetShape};
 
 fn plane_of(scene: Scene, position: Position) -> EastNorth {
     LocalPlane::new(scene.origin()).to_plane(position)
@@ -189,7 +189,7 @@ fn the_foot_of_a_large_target_is_far_from_its_antenna_depending_on_the_aspect() 
         let offset = |row: &SimulatedRow| {
             let seen = row.bounding_box.filter(|seen| !seen.touches_border(Some(camera.image_size)))?;
             let ground = plane.to_plane(row.truth);
-            let antenna_px = camera.project(crate::simulation::camera::Point { ground, up_m: 0.0 })?;
+            let antenna_px = camera.project(crate::camera::Point { ground, up_m: 0.0 })?;
             Some(seen.foot_px()[0] - antenna_px[0])
         };
         let offsets: Vec<f64> = simulate(&options).rows.iter().filter_map(offset).collect();

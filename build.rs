@@ -28,8 +28,6 @@ const CONSOLE: &str = "console/dist";
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed={FOLDER}");
-    // `sqlx::migrate!` does not notice new files by itself.
-    println!("cargo::rerun-if-changed=migrations");
     let descriptors = protox::compile(FILES, [FOLDER])?;
     let folder = PathBuf::from(env::var("OUT_DIR")?);
     fs::write(folder.join("sightfix_descriptor.bin"), descriptors.encode_to_vec())?;

@@ -1,5 +1,8 @@
 //! sightfix estimates the positions of targets from the bounding boxes of an uncalibrated fixed camera
-//! and from GNSS fixes. `docs/architecture.md` describes the structure of this crate.
+//! and from GNSS fixes.
+//!
+//! This crate has the transports, the use cases, the connections and the command line; what they work with is in the
+//! crates below `crates/`, which are re-exported here as modules. `docs/architecture.md` describes both.
 
 // They panic where the output is closed or its device is full.
 #![warn(clippy::print_stdout, clippy::print_stderr)]
@@ -12,24 +15,21 @@ pub mod clock;
 pub mod config;
 pub mod connect;
 pub mod doctor;
-pub mod domain;
-pub mod evaluation;
-pub mod exchange;
-pub mod filters;
-pub mod fusion;
-pub mod geo;
 pub mod grpc;
 pub mod http;
-pub mod model;
 pub mod openid;
-pub mod paper_experiments;
 pub mod replay;
 pub mod server;
 pub mod shutdown;
-pub mod simulation;
-pub mod statistics;
 pub mod status;
-pub mod store;
 pub mod telemetry;
 pub mod tls_client;
 pub mod worker;
+
+pub use sightfix_domain::{domain, geo, statistics};
+pub use sightfix_evaluation::{self as evaluation, paper_experiments};
+pub use sightfix_exchange as exchange;
+pub use sightfix_fusion as fusion;
+pub use sightfix_model::{self as model, filters};
+pub use sightfix_simulation as simulation;
+pub use sightfix_store as store;

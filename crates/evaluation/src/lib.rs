@@ -2,12 +2,25 @@
 //!
 //! Whatever is fitted or tuned is fitted on the training samples alone; no choice depends on a test
 //! row.
+//!
+//! | module | contents |
+//! |---|---|
+//! | [`evaluate`], [`Report`] | all methods on the same rows, and their figures |
+//! | [`baselines`] | what a method is compared with: a homography, a linear regression |
+//! | [`plots()`] | charts of a report as SVG |
+//! | [`site`] | the figures of world tracks |
+//! | [`paper_experiments`] | the cases of docs/accuracy.md, their marks, tables and pictures; imports from all others |
+//!
+//! Nothing here does input or output. The CPU time of a fit is measured by a function that is handed in.
+
+#![warn(missing_docs)]
 
 pub(crate) mod axis;
 pub mod baselines;
 pub(crate) mod chart;
 mod metrics;
 mod options;
+pub mod paper_experiments;
 pub(crate) mod plots;
 mod positions;
 mod predictors;
@@ -28,3 +41,9 @@ pub use positions::{EvaluatedPosition, ReportWithPositions};
 pub use report::{MethodReport, Report};
 pub use runner::evaluate;
 pub use traces::{Curve, Evaluation, Trace, TracePoint};
+pub use truth::truth_from_geojson;
+
+use sightfix_domain::{domain, geo, statistics};
+use sightfix_fusion as fusion;
+use sightfix_model::{self as model, filters};
+use sightfix_simulation as simulation;

@@ -5,8 +5,17 @@
 //! meaning everywhere. They stream: memory is bounded by one line or element of at most 64 KiB,
 //! regardless of the length of the file. An invalid row does not affect the others: an error with its
 //! line, field and reason takes its place. Numbers are checked by the constructors of
-//! [`crate::domain`] only. What never happens here: transports, storage, clocks.
+//! [`sightfix_domain`] only. Transports and storage are elsewhere; no clock is read here.
+//!
+//! | part | contents |
+//! |---|---|
+//! | [`read_samples`] and its like, [`FusedWriter`] and its like | whole files, row by row |
+//! | [`decoder`], [`MessageItem`] | single messages of a source, in the formats of receivers, detectors and brokers |
+//! | [`wire`] | the JSON objects that files, messages and REST have in common |
+//! | [`ConnectionSettings`], [`Address`] | where messages come from and go to, as it is configured |
+//! | [`Cursor`] | the key after which the next page of a list begins, as text |
 
+#![warn(missing_docs)]
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
@@ -59,6 +68,8 @@ pub use rows::{
 };
 pub use track_files::{TrackFile, TrackFileFormat};
 pub use write::{FusedWriter, MatchedSampleWriter, SampleWriter, write_fused, write_samples};
+
+use sightfix_domain::{domain, geo};
 
 /// Largest line of a CSV, NDJSON or NMEA file and largest element of a JSON array, bytes.
 pub const MAX_ROW_BYTES: usize = 64 * 1024;

@@ -385,7 +385,7 @@ fn fused_positions_are_written_in_every_format() {
 }
 
 fn shared_file(name: &str) -> File {
-    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/square").join(name);
     File::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 

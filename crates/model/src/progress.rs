@@ -8,7 +8,7 @@ use std::sync::Arc;
 use rand_chacha::ChaCha8Rng;
 
 use crate::domain::{EpochReport, Error, HeldOutSampleError, RunProgress};
-use crate::model::network::{LossSums, LossWeights, NetShape, Schedule, TrainError, TrainingSet, train};
+use crate::network::{LossSums, LossWeights, NetShape, Schedule, TrainError, TrainingSet, train};
 
 /// What the observer of a fit receives.
 #[derive(Debug)]

@@ -1,14 +1,18 @@
-//! Persistent storage behind one type, [`Store`]; the only module with SQL.
+//! Persistent storage behind one type, [`Store`]; the only crate with SQL.
 //!
 //! Two backends, written by hand: a file in a data folder (`sqlite`) and a database of a server (`postgres`). The
 //! methods of [`Store`] are listed once, in `contract`, with what they promise; the suite in `tests` holds both
 //! backends to it. What is in a row (`rows`), the rules of jobs (`jobs`), limits and the queue of samples that are
 //! committed in groups (`group_commit`) are the same for both.
 //!
-//! What never happens here: clocks are read, numbers are checked (they are valid by construction),
-//! a transaction is held across anything but statements, a type of the database library becomes public.
-//! Rows that the constructors of `domain` refuse are faults that name table, column and row.
+//! The crate reads no clock, and checks no numbers, since they are valid by construction. It holds a transaction across
+//! statements alone, and makes no type of the database library public. Rows that the constructors of `domain` refuse
+//! are faults that name table, column and row.
+//!
+//! The schema is in `migrations/` at the top of the repository, a folder per backend. `.ci/postgres` runs the suite
+//! against a server.
 
+#![warn(missing_docs)]
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
@@ -30,8 +34,11 @@ mod tests;
 use std::path::Path;
 use std::sync::Arc;
 
+use sightfix_domain::{domain, geo};
+
 use crate::domain::{Actor, CameraId, CameraKey, Durability, Result, StoredSample};
 
+pub use crate::domain::{SampleFilter, SampleKey};
 pub use copy::CopiedTable;
 pub use folder_fault::{FolderFault, FolderFaultKind};
 pub use group_commit::{Completion, InsertOptions, Inserted};
@@ -44,7 +51,6 @@ pub use rows::idempotency::{IdempotencyRecord, StoredAnswer};
 pub use rows::keys::KeysVersion;
 pub use rows::models::{NewModel, StoredHeldOutError};
 pub use rows::runs::{RunEnd, RunOutput};
-pub use rows::samples::{SampleFilter, SampleKey};
 pub use rows::site_runs::{SiteCameraOutput, SiteRunEnd, SiteRunOutput};
 pub use sqlite::{
     DatabaseReport, ExistingFile, Occupant, Restored, back_up, disk_available_bytes, has_database, inspect,
@@ -97,8 +103,8 @@ impl Default for StoreOptions {
 macro_rules! on_backend {
     ($store:expr, $backend:ident => $call:expr) => {
         match &$store.0 {
-            $crate::store::Backend::Sqlite($backend) => $call,
-            $crate::store::Backend::Postgres($backend) => $call,
+            $crate::Backend::Sqlite($backend) => $call,
+            $crate::Backend::Postgres($backend) => $call,
         }
     };
 }

@@ -10,7 +10,7 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::MessageContext;
 use crate::domain::{ReceivedFix, ReceiverId, Result};
-use crate::exchange::wire;
+use crate::wire;
 
 /// Messages of which not all sentences have come; beyond, the oldest is dropped.
 const MAX_PARTIAL: usize = 64;

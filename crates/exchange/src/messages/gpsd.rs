@@ -1,8 +1,8 @@
 //! Reports of gpsd, one JSON object per line.
 
 use super::{MessageContext, MessageDecoder, MessageItem, Reading};
-use crate::exchange::format::FixFormat;
-use crate::exchange::gpsd;
+use crate::format::FixFormat;
+use crate::gpsd;
 
 pub(super) struct Gpsd;
 

@@ -5,7 +5,7 @@ use jiff::Timestamp;
 use super::ais::Ais;
 use super::{MessageContext, MessageDecoder, MessageItem, Reading};
 use crate::domain::ReceivedFix;
-use crate::exchange::nmea_fixes::{SentenceContent, content_of, nearest_instant};
+use crate::nmea_fixes::{SentenceContent, content_of, nearest_instant};
 
 /// Reads sentences of one line each.
 #[derive(Default)]

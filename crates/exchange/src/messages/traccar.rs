@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 use super::{MessageContext, MessageDecoder, MessageItem, Reading, parse};
 use crate::domain::{ReceivedFix, ReceiverId, parse_time};
-use crate::exchange::wire;
+use crate::wire;
 
 pub(super) struct Traccar;
 

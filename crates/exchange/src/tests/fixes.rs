@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::domain::{Detection, ReceivedFix, TargetId};
-use crate::exchange::{read_detections, read_received_fixes};
+use crate::{read_detections, read_received_fixes};
 
 fn received(text: &str, format: FixFormat) -> Vec<std::result::Result<ReceivedFix, RowError>> {
     let rows = read_received_fixes(text.as_bytes(), format, rules().time_bounds).expect("a file");

@@ -9,8 +9,8 @@ use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::clock_offset::{OffsetSearch, estimate_clock_offset};
 use crate::domain::{BoundingBox, ClockOffset, Fix, Receiver, ReceiverId, TargetId, parse_time};
-use crate::fusion::clock_offset::{OffsetSearch, estimate_clock_offset};
 use crate::geo::{LocalPlane, Position};
 use crate::simulation::{Walk, at_s, standard_normal, stream};
 
@@ -38,7 +38,7 @@ fn received(name: Option<&str>, seconds: f64, longitude_deg: f64) -> ReceivedFix
 }
 
 fn columns(name: &str) -> Vec<Vec<String>> {
-    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data/square").join(name);
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/square").join(name);
     let mut reader = csv::Reader::from_path(path).expect("readable");
     reader.records().map(|row| row.expect("a row").iter().map(str::to_owned).collect()).collect()
 }

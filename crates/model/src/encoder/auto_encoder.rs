@@ -4,12 +4,12 @@
 use std::sync::Arc;
 
 use super::features::{Encoded, FEATURE_COUNT, features_of};
+use crate::artifact::Scale;
 use crate::domain::BoundingBox;
 use crate::geo::EastNorth;
-use crate::model::artifact::Scale;
-use crate::model::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet};
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::TrainingRows;
+use crate::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet};
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::TrainingRows;
 use crate::statistics::std_dev;
 
 /// wX and wZ of (1), on standardised inputs.

@@ -5,10 +5,10 @@ use super::FittedEncoder;
 use super::auto_encoder::{self, AutoEncoder, OutputScale, Trained};
 use super::features::{Encoded, FEATURES};
 use super::stored_network::{put_network, take_network};
+use crate::artifact::{ModelParts, Scale};
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
-use crate::model::artifact::{ModelParts, Scale};
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::TrainingRows;
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::TrainingRows;
 
 const HIDDEN: [usize; 2] = [24, 24];
 /// Default number of epochs.

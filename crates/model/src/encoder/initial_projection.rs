@@ -5,7 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::projection::Projection;
-use crate::model::samples::rows::TrainingRow;
+use crate::samples::rows::TrainingRow;
 use crate::statistics::median;
 
 /// Random subsets that are tried.

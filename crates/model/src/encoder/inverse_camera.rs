@@ -7,8 +7,8 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::features::FEATURE_COUNT;
+use crate::artifact::tensors::Tensors;
 use crate::domain::Result;
-use crate::model::artifact::tensors::Tensors;
 
 /// Three coefficients per feature and two of the common denominator.
 pub(crate) const COEFFICIENTS: usize = 3 * FEATURE_COUNT + 2;

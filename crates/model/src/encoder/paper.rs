@@ -9,12 +9,12 @@ use std::sync::Arc;
 
 use super::FittedEncoder;
 use super::stored_network::{put_network, take_network};
+use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::artifact::ModelParts;
-use crate::model::network::{Activation, LossSums, LossWeights, Net, NetShape, Schedule, TrainingSet};
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::TrainingRows;
+use crate::network::{Activation, LossSums, LossWeights, Net, NetShape, Schedule, TrainingSet};
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::TrainingRows;
 use crate::statistics::R95_PER_SIGMA;
 
 /// Units per degree.

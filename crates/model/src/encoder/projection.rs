@@ -16,7 +16,7 @@
 use super::features::{FEATURE_COUNT, features_of};
 use crate::domain::BoundingBox;
 use crate::geo::EastNorth;
-use crate::model::samples::rows::TrainingRow;
+use crate::samples::rows::TrainingRow;
 use crate::statistics::std_dev;
 
 /// Terms of a numerator: 1, foot x, foot y, width, height.

@@ -11,9 +11,9 @@ use super::initial_projection::initial_projection;
 use super::projection::{COEFFICIENTS, Projected, Projection};
 use crate::domain::{BoundingBox, GaussMarkovNoise};
 use crate::geo::{EastNorth, LocalPlane, Position};
-use crate::model::samples::rows::TrainingRow;
-use crate::model::samples::second_differences::{MEAN_SQUARE_PER_VARIANCE, second_differences, trimmed_mean};
-use crate::model::samples::whitening::{Whitener, fit_noise, with_gross_errors};
+use crate::samples::rows::TrainingRow;
+use crate::samples::second_differences::{MEAN_SQUARE_PER_VARIANCE, second_differences, trimmed_mean};
+use crate::samples::whitening::{Whitener, fit_noise, with_gross_errors};
 use crate::statistics::median;
 
 /// Most steps of Levenberg and Marquardt's method per round.

@@ -15,13 +15,13 @@ use super::initial_projection::subset_rng;
 use super::inverse_camera::InverseCamera;
 use super::projection::{COEFFICIENTS, Projection};
 use super::projection_fit::{self, Form, ParameterCovariance, ProjectionFit};
+use crate::artifact::ModelParts;
+use crate::artifact::tensors::Tensors;
 use crate::domain::{BoundingBox, Error, FeatureScale, Recipe, Result};
 use crate::geo::EastNorth;
-use crate::model::artifact::ModelParts;
-use crate::model::artifact::tensors::Tensors;
-use crate::model::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet};
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::{TrainingRow, TrainingRows};
+use crate::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet};
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::{TrainingRow, TrainingRows};
 
 /// Hidden units of the residual network.
 const HIDDEN: usize = 16;

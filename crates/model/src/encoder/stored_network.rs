@@ -1,9 +1,9 @@
 //! Networks as named tensors: `{prefix}encoder.0.weight`, `{prefix}encoder.0.bias` and so on, each a layer
 //! of candle's `Linear`.
 
+use crate::artifact::tensors::Tensors;
 use crate::domain::Result;
-use crate::model::artifact::tensors::Tensors;
-use crate::model::network::{Net, NetShape};
+use crate::network::{Net, NetShape};
 
 /// Adds the layers of a network to a model's tensors.
 pub(crate) fn put_network(tensors: &mut Tensors, prefix: &str, shape: &NetShape, parameters: &[f32]) {

@@ -1,7 +1,7 @@
 //! Filters and smoothers over fixes alone: the IMM-UKF baseline, and the fixed-interval smoother that
 //! prepares training labels.
 //!
-//! What never happens here: boxes, models, degrees. All positions are in metres of a local plane.
+//! All positions are in metres of a local plane.
 
 mod imm_ukf;
 mod smoother;

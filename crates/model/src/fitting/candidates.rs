@@ -1,14 +1,14 @@
 //! The candidates of each recipe.
 
 use crate::domain::{GaussMarkovNoise, ImageSize, Recipe};
-use crate::model::encoder::projective::Variant;
-use crate::model::encoder::{FittedEncoder, gaussian_process, hybrid, paper, projective};
-use crate::model::network::LossWeights;
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::TrainingRows;
-use crate::model::samples::unpaired::TargetBox;
-use crate::model::uncertainty::coverage::Coverage;
-use crate::model::uncertainty::error_model::set_uncalibrated;
+use crate::encoder::projective::Variant;
+use crate::encoder::{FittedEncoder, gaussian_process, hybrid, paper, projective};
+use crate::network::LossWeights;
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::TrainingRows;
+use crate::samples::unpaired::TargetBox;
+use crate::uncertainty::coverage::Coverage;
+use crate::uncertainty::error_model::set_uncalibrated;
 
 /// One way to fit a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

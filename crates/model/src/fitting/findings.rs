@@ -2,9 +2,9 @@
 //! make the model surer.
 
 use super::candidates::Candidate;
+use crate::artifact::ModelParts;
 use crate::domain::{CandidateFinding, CandidateReport, HeldOutError, ImageSize, TrainingReport};
-use crate::model::artifact::ModelParts;
-use crate::model::samples::rows::TrainingRows;
+use crate::samples::rows::TrainingRows;
 
 /// Below this share of held-out fixes inside the stated radius the report says so.
 const LEAST_COVERAGE: f64 = 0.9;

@@ -7,11 +7,11 @@
 
 use jiff::Timestamp;
 
+use crate::artifact::LEAST_GNSS_WHITE_SHARE;
 use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 use crate::geo::EastNorth;
-use crate::model::artifact::LEAST_GNSS_WHITE_SHARE;
-use crate::model::uncertainty::variance_components::robust_variance_m2;
 use crate::statistics::GROSS_SIGMAS;
+use crate::uncertainty::variance_components::robust_variance_m2;
 
 /// Lags of the autocovariance, in units of the fixes' interval (at least one second).
 const LAGS: [u32; 11] = [1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 50];

@@ -9,9 +9,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::candidates::{Candidate, FitContext};
-use crate::model::progress::{FitError, FitRun, Phase};
-use crate::model::regressor::Regressor;
-use crate::model::samples::rows::{TrainingRows, traverses};
+use crate::progress::{FitError, FitRun, Phase};
+use crate::regressor::Regressor;
+use crate::samples::rows::{TrainingRows, traverses};
 use crate::statistics::median;
 
 /// A squared residual counts at most this many times the median of the simplest candidate's.

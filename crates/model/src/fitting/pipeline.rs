@@ -15,21 +15,21 @@ use super::report::{
 };
 use super::track_noise::estimate_track_noise;
 use super::widening::widen_radius;
+use crate::artifact::{Artifact, FORMAT, ModelParts};
 use crate::domain::{
     CandidateReport, Detection, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError,
     HeldOutSampleError, ImageSize, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample, TrainingReport,
 };
-use crate::model::artifact::{Artifact, FORMAT, ModelParts};
-use crate::model::encoder::gaussian_process::target_height_m;
-use crate::model::encoder::projection_fit::ParameterCovariance;
-use crate::model::encoder::projective::{GeometricCovariance, fit_geometry};
-use crate::model::network::LossWeights;
-use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
-use crate::model::regressor::Regressor;
-use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
-use crate::model::samples::unpaired::unpaired_boxes;
-use crate::model::uncertainty::calibration::{HeldOut, calibrate, calibrate_reconstruction};
-use crate::model::uncertainty::error_model::set_image_size;
+use crate::encoder::gaussian_process::target_height_m;
+use crate::encoder::projection_fit::ParameterCovariance;
+use crate::encoder::projective::{GeometricCovariance, fit_geometry};
+use crate::network::LossWeights;
+use crate::progress::{FitError, FitEvent, FitRun, Phase};
+use crate::regressor::Regressor;
+use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
+use crate::samples::unpaired::unpaired_boxes;
+use crate::uncertainty::calibration::{HeldOut, calibrate, calibrate_reconstruction};
+use crate::uncertainty::error_model::set_image_size;
 
 /// Rows that a fit uses at most: neighbours repeat each other, and time and memory stay bounded.
 pub(super) const MAX_ROWS: usize = 20_000;

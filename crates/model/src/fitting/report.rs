@@ -2,12 +2,12 @@
 
 use super::candidates::{Candidate, FitContext};
 use super::held_out::HeldOutResiduals;
+use crate::artifact::ModelParts;
 use crate::domain::{GaussMarkovNoise, HeldOutError, NoiseCorrelation};
-use crate::model::artifact::ModelParts;
-use crate::model::progress::{FitError, FitRun};
-use crate::model::regressor::Regressor;
-use crate::model::samples::rows::TrainingRows;
-use crate::model::samples::whitening::effective_sample_size;
+use crate::progress::{FitError, FitRun};
+use crate::regressor::Regressor;
+use crate::samples::rows::TrainingRows;
+use crate::samples::whitening::effective_sample_size;
 use crate::statistics::R95_PER_SIGMA;
 
 /// Logs the samples and the noise of their fixes.

@@ -13,29 +13,29 @@ use super::pipeline::{MAX_ROWS, receiver_variance};
 use super::report::{coverage_of_fixes, held_out_error};
 use super::track_noise::estimate_track_noise;
 use super::widening::held_out_widening;
+use crate::artifact::{Artifact, FORMAT, ModelParts};
 use crate::domain::{
     CandidateFinding, CandidateReport, Error, ErrorKind, FeatureScale, GaussMarkovNoise, GnssError,
     GnssErrorSource, HeldOutError, HeldOutSampleError, ImageSize, JointTraining, ModelMetadata, OriginDeg,
     Recipe, RunProgress, Sample, TrainingReport,
 };
-use crate::geo::{EastNorth, LocalPlane};
-use crate::model::artifact::{Artifact, FORMAT, ModelParts};
-use crate::model::encoder::features::features_of;
-use crate::model::encoder::gaussian_process::{
+use crate::encoder::features::features_of;
+use crate::encoder::gaussian_process::{
     EPOCHS, SHARED_BIAS_SHARE, UprightStarts, target_height_m, widen_map,
 };
-use crate::model::progress::{FitError, FitEvent, FitRun, Phase};
-use crate::model::regressor::Regressor;
-use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
-use crate::model::samples::target_groups::groups_of_targets;
-use crate::model::site::rows::SiteRows;
-use crate::model::site::{
+use crate::geo::{EastNorth, LocalPlane};
+use crate::progress::{FitError, FitEvent, FitRun, Phase};
+use crate::regressor::Regressor;
+use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
+use crate::samples::target_groups::groups_of_targets;
+use crate::site::rows::SiteRows;
+use crate::site::{
     RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, fit_site_observed,
 };
-use crate::model::uncertainty::calibration::calibrate_reconstruction;
-use crate::model::uncertainty::coverage::Coverage;
-use crate::model::uncertainty::error_model::{set_image_size, set_uncalibrated};
 use crate::statistics::median;
+use crate::uncertainty::calibration::calibrate_reconstruction;
+use crate::uncertainty::coverage::Coverage;
+use crate::uncertainty::error_model::{set_image_size, set_uncalibrated};
 
 /// Names of the candidates in a model's report.
 const TOGETHER: &str = "site/together";

@@ -2,13 +2,13 @@
 //! fitted to them, for the tracks that use the model.
 
 use super::gnss_noise::{TimedResidual, estimate_gnss_noise};
+use crate::artifact::{ModelParts, TrackNoiseModel};
 use crate::domain::{NoiseCorrelation, Sample};
+use crate::encoder::gaussian_process;
 use crate::filters::noise_of_fixes;
 use crate::geo::EastNorth;
-use crate::model::artifact::{ModelParts, TrackNoiseModel};
-use crate::model::encoder::gaussian_process;
-use crate::model::regressor::Regressor;
-use crate::model::samples::sequences::{fix_sequences, sequences};
+use crate::regressor::Regressor;
+use crate::samples::sequences::{fix_sequences, sequences};
 
 /// Time constant of the model's own error at one place, s: the error of a map does not change while
 /// a target is stationary.

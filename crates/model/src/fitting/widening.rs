@@ -1,11 +1,11 @@
 //! Whether the error that a recipe states holds on the targets that its fits had not seen.
 
+use crate::artifact::ModelParts;
 use crate::domain::GaussMarkovNoise;
-use crate::model::artifact::ModelParts;
-use crate::model::encoder::gaussian_process::{Epoch, ReceiverNoise, SequenceMean, weighted_mean, widening};
-use crate::model::progress::FitError;
-use crate::model::regressor::Regressor;
-use crate::model::samples::rows::{TrainingRow, TrainingRows};
+use crate::encoder::gaussian_process::{Epoch, ReceiverNoise, SequenceMean, weighted_mean, widening};
+use crate::progress::FitError;
+use crate::regressor::Regressor;
+use crate::samples::rows::{TrainingRow, TrainingRows};
 
 /// Widens the stated radius of a calibrated model by its [`held_out_widening`].
 ///

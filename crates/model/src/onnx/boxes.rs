@@ -1,8 +1,8 @@
 //! The columns of the input: boxes.
 
 use super::expression::{Expr, Graph};
+use crate::artifact::Scale;
 use crate::domain::ImageSize;
-use crate::model::artifact::Scale;
 
 /// Name of the input.
 pub(super) const BOXES: &str = "boxes";

@@ -2,9 +2,9 @@
 
 use super::boxes::{Boxes, reconstruction_error};
 use super::expression::{Condition, Expr};
-use crate::model::uncertainty::coverage::{CoverageTable, SOFTENING};
-use crate::model::uncertainty::error_model::{ErrorModel, NOMINAL_RATIO};
-use crate::model::uncertainty::local_boxes::{ISOTROPIC_SHARE, LocalBoxModel, Region};
+use crate::uncertainty::coverage::{CoverageTable, SOFTENING};
+use crate::uncertainty::error_model::{ErrorModel, NOMINAL_RATIO};
+use crate::uncertainty::local_boxes::{ISOTROPIC_SHARE, LocalBoxModel, Region};
 
 /// Numbers of a region in a table: mean 4, precision 16, noise gain 8, isotropic variance 1, limit 1.
 const REGION_NUMBERS: usize = 30;

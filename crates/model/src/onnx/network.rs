@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use super::boxes::{Boxes, scaled};
 use super::expression::Expr;
-use crate::model::encoder::auto_encoder::AutoEncoder;
-use crate::model::network::{Activation, Net};
+use crate::encoder::auto_encoder::AutoEncoder;
+use crate::network::{Activation, Net};
 
 /// The bottleneck's two units.
 pub(super) fn encode<'g>(net: &Net, inputs: Expr<'g>) -> Expr<'g> {

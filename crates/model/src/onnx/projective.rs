@@ -3,9 +3,9 @@
 use super::boxes::Boxes;
 use super::expression::Expr;
 use super::network::first_hidden;
-use crate::model::encoder::inverse_camera::{self, InverseCamera};
-use crate::model::encoder::projection::{self, Projection, TERMS};
-use crate::model::encoder::projective::ProjectiveEncoder;
+use crate::encoder::inverse_camera::{self, InverseCamera};
+use crate::encoder::projection::{self, Projection, TERMS};
+use crate::encoder::projective::ProjectiveEncoder;
 
 /// Position (east and north, m) and reconstructed features, px.
 pub(super) fn encode<'g>(encoder: &ProjectiveEncoder, boxes: Boxes<'g>) -> (Expr<'g>, Expr<'g>) {

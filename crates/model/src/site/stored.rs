@@ -5,10 +5,10 @@ use nalgebra::DMatrix;
 
 use super::ground_map::{GroundMap, PARAMETERS};
 use super::maps::{SiteMaps, SitePosition};
+use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, Error, GaussMarkovNoise, ImageSize, Result, RunId};
-use crate::model::artifact::ModelParts;
-use crate::model::encoder::gaussian_process::projective_mean::{COEFFICIENTS, ProjectiveMean};
-use crate::model::site::input::RECEIVER_CORRELATION;
+use crate::encoder::gaussian_process::projective_mean::{COEFFICIENTS, ProjectiveMean};
+use crate::site::input::RECEIVER_CORRELATION;
 
 /// Scales 8, centre 2, spread, coefficients 8.
 const MAP_NUMBERS: usize = 11 + PARAMETERS;

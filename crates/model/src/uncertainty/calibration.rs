@@ -8,16 +8,16 @@ use super::local_boxes::LocalBoxModel;
 use super::variance_components::{
     between_block_m2, between_session_m2, between_traverse_m2, robust_variance_m2,
 };
+use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, GaussMarkovNoise, ImageSize};
+use crate::encoder::features::{Encoded, reconstruction_error};
+use crate::encoder::projective::GeometricCovariance;
+use crate::encoder::{Encoder, FittedEncoder};
 use crate::geo::EastNorth;
-use crate::model::artifact::ModelParts;
-use crate::model::encoder::features::{Encoded, reconstruction_error};
-use crate::model::encoder::projective::GeometricCovariance;
-use crate::model::encoder::{Encoder, FittedEncoder};
-use crate::model::progress::FitError;
-use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow};
-use crate::model::samples::second_differences::{MEAN_SQUARE_PER_VARIANCE, second_differences, trimmed_mean};
-use crate::model::samples::whitening::effective_sample_size;
+use crate::progress::FitError;
+use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow};
+use crate::samples::second_differences::{MEAN_SQUARE_PER_VARIANCE, second_differences, trimmed_mean};
+use crate::samples::whitening::effective_sample_size;
 use crate::statistics::R95_PER_SIGMA;
 
 /// Largest ratio of the receiver's stated variance to that of the residuals that is taken into account.

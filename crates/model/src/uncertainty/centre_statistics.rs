@@ -2,8 +2,8 @@
 
 use super::coverage::Coverage;
 use super::jacobian::{Encode, edge_variance_m2, foot_variance_m2, jacobian_at};
-use crate::model::encoder::projective::GeometricCovariance;
-use crate::model::samples::rows::TrainingRow;
+use crate::encoder::projective::GeometricCovariance;
+use crate::samples::rows::TrainingRow;
 
 /// One value per centre, except for `of_row`.
 pub(super) struct CentreStatistics {

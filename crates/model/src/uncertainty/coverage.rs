@@ -7,8 +7,8 @@
 //! box extrapolates. The error variance at a box is interpolated between the centres by inverse distance
 //! weighting (Shepard 1968) with the exponent 4.
 
+use crate::artifact::tensors::Tensors;
 use crate::domain::{BoundingBox, Error, Result};
-use crate::model::artifact::tensors::Tensors;
 use crate::statistics::std_dev;
 
 /// Most centres; each adds some nanoseconds to every answer.

@@ -12,9 +12,9 @@
 
 use super::coverage::{Coverage, CoverageLookup, CoverageTable};
 use super::local_boxes::LocalBoxModel;
+use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, ImageSize, Recipe, Result};
-use crate::model::artifact::ModelParts;
-use crate::model::encoder::features::{Encoded, reconstruction_error};
+use crate::encoder::features::{Encoded, reconstruction_error};
 use crate::statistics::R95_PER_SIGMA;
 
 /// Distance to the nearest centre, in covering radii, up to which the nominal error holds; a box beyond it

@@ -3,9 +3,9 @@
 use super::error_model::{EXCESS_PARAMETERS, ErrorModel, TruncationClass};
 use super::jacobian::Encode;
 use super::variance_components::robust_variance_m2;
+use crate::artifact::ModelParts;
 use crate::domain::Result;
-use crate::model::artifact::ModelParts;
-use crate::model::samples::rows::TrainingRow;
+use crate::samples::rows::TrainingRow;
 
 /// A squared residual counts at most this many times its expected value.
 const LARGEST_SQUARE_RATIO: f64 = 6.0;

@@ -3,8 +3,8 @@
 use nalgebra::{Matrix4, Vector4};
 
 use crate::domain::BoundingBox;
+use crate::encoder::features::Encoded;
 use crate::geo::EastNorth;
-use crate::model::encoder::features::Encoded;
 
 /// An encoder as a function of the box.
 pub(crate) type Encode<'a> = dyn Fn(&BoundingBox) -> Encoded + 'a;

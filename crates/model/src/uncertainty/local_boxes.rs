@@ -21,9 +21,9 @@ use nalgebra::{Matrix4, Vector4};
 
 use super::coverage::Coverage;
 use super::jacobian::{Encode, edge_variance_m2, edges_of, jacobian_at};
+use crate::artifact::tensors::Tensors;
 use crate::domain::{BoundingBox, Error, Result};
-use crate::model::artifact::tensors::Tensors;
-use crate::model::samples::rows::TrainingRow;
+use crate::samples::rows::TrainingRow;
 use crate::statistics::median;
 
 /// Fewest training boxes per region.

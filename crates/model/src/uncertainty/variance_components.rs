@@ -7,8 +7,8 @@
 
 use super::coverage::Coverage;
 use crate::domain::GaussMarkovNoise;
-use crate::model::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, traverses};
-use crate::model::samples::whitening::effective_sample_size;
+use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, traverses};
+use crate::samples::whitening::effective_sample_size;
 use crate::statistics::median;
 
 /// East and north, m.

@@ -8,14 +8,11 @@ use sqlx::postgres::PgRow;
 use super::Store;
 use super::errors::failed;
 use crate::domain::{CameraId, CameraKey, Error, Result};
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::cameras::{CameraVersion, CameraVersions, ChangeMark, read_version};
+use crate::row_decoder::RowDecoder;
+use crate::rows::cameras::{CameraVersion, CameraVersions, ChangeMark, read_version};
 
 impl Store {
-    pub(in crate::store) async fn camera_versions(
-        &self,
-        since: Option<ChangeMark>,
-    ) -> Result<CameraVersions> {
+    pub(crate) async fn camera_versions(&self, since: Option<ChangeMark>) -> Result<CameraVersions> {
         let mut reader = self.reader().await?;
         let upto: String = sqlx::query_scalar("SELECT pg_snapshot_xmin(pg_current_snapshot())::TEXT")
             .fetch_one(&mut *reader)

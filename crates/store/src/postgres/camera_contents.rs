@@ -7,18 +7,15 @@ use sqlx::Row as _;
 use super::Store;
 use super::errors::failed;
 use crate::domain::{CameraId, Error, Result};
-use crate::store::refusals::no_camera;
-use crate::store::rows::cameras::{CameraContent, camera_columns as columns, read_camera};
-use crate::store::rows::models::{read_content, read_move};
+use crate::refusals::no_camera;
+use crate::rows::cameras::{CameraContent, camera_columns as columns, read_camera};
+use crate::rows::models::{read_content, read_move};
 
 /// Id of the camera, metadata document, weights and checksum.
 type StoredModel = (String, Vec<u8>, Vec<u8>, Option<String>);
 
 impl Store {
-    pub(in crate::store) async fn camera_contents(
-        &self,
-        ids: &[CameraId],
-    ) -> Result<Vec<Result<CameraContent>>> {
+    pub(crate) async fn camera_contents(&self, ids: &[CameraId]) -> Result<Vec<Result<CameraContent>>> {
         let names: Vec<&str> = ids.iter().map(CameraId::as_str).collect();
         // One snapshot: an active version is among the models.
         let mut reader = self.reader().await?;

@@ -4,11 +4,11 @@ use super::Store;
 use super::cameras::lock_camera;
 use super::errors::failed;
 use crate::domain::{CameraId, CameraMoved, Error, JobState, Result, RunId};
-use crate::store::jobs::read_state;
-use crate::store::rows::models::read_move;
+use crate::jobs::read_state;
+use crate::rows::models::read_move;
 
 impl Store {
-    pub(in crate::store) async fn insert_move(&self, camera: &CameraId, moved: &CameraMoved) -> Result<bool> {
+    pub(crate) async fn insert_move(&self, camera: &CameraId, moved: &CameraMoved) -> Result<bool> {
         let mut transaction = self.writer().await?;
         let key = lock_camera(&mut transaction, camera).await?;
         let stored = sqlx::query(
@@ -31,7 +31,7 @@ impl Store {
         Ok(stored.rows_affected() > 0)
     }
 
-    pub(in crate::store) async fn camera_move(
+    pub(crate) async fn camera_move(
         &self,
         camera: &CameraId,
         model_version: u32,
@@ -50,7 +50,7 @@ impl Store {
         row.as_ref().map(read_move).transpose()
     }
 
-    pub(in crate::store) async fn retraining_state(
+    pub(crate) async fn retraining_state(
         &self,
         camera: &CameraId,
         model_version: u32,
@@ -69,7 +69,7 @@ impl Store {
         state.as_deref().map(read_state).transpose().map_err(Error::fault)
     }
 
-    pub(in crate::store) async fn note_retraining(
+    pub(crate) async fn note_retraining(
         &self,
         camera: &CameraId,
         model_version: u32,

@@ -11,9 +11,9 @@ use crate::domain::{
     AuditAction, Camera, CameraId, Error, ExpectedVersion, GnssBiasSigma, GnssError, NewCamera, Result,
     SiteId, TargetClass,
 };
-use crate::store::refusals::no_camera;
-use crate::store::rows::audit::Change;
-use crate::store::rows::cameras::{
+use crate::refusals::no_camera;
+use crate::rows::audit::Change;
+use crate::rows::cameras::{
     camera_columns as columns, camera_exists, check_limit, check_site, check_version, has_live_run,
     read_camera, write_receivers,
 };
@@ -24,11 +24,7 @@ type Query = sqlx::query::Query<'static, Postgres, PgArguments>;
 const DELETION_ATTEMPTS: u32 = 4;
 
 impl Store {
-    pub(in crate::store) async fn insert_camera(
-        &self,
-        profile: &NewCamera,
-        now: Timestamp,
-    ) -> Result<Camera> {
+    pub(crate) async fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera> {
         let mut transaction = self.writer().await?;
         lock_limit(&mut transaction, Limit::Cameras).await?;
         let insert = sqlx::query(concat!(
@@ -53,12 +49,12 @@ impl Store {
         Ok(camera)
     }
 
-    pub(in crate::store) async fn camera(&self, id: &CameraId) -> Result<Camera> {
+    pub(crate) async fn camera(&self, id: &CameraId) -> Result<Camera> {
         let mut reader = self.reader().await?;
         find_camera(&mut reader, id).await
     }
 
-    pub(in crate::store) async fn cameras(
+    pub(crate) async fn cameras(
         &self,
         site: Option<&SiteId>,
         after: Option<&CameraId>,
@@ -88,7 +84,7 @@ impl Store {
         rows.iter().map(read_camera).collect()
     }
 
-    pub(in crate::store) async fn replace_camera(
+    pub(crate) async fn replace_camera(
         &self,
         profile: &NewCamera,
         expected: Option<ExpectedVersion>,
@@ -120,7 +116,7 @@ impl Store {
 
     /// A deletion locks rows of many tables, and meets writers that hold some of them and wait for the camera. The database
     /// ends one of the two; if that is the deletion, it is made again behind the other one.
-    pub(in crate::store) async fn delete_camera(
+    pub(crate) async fn delete_camera(
         &self,
         id: &CameraId,
         expected: Option<ExpectedVersion>,

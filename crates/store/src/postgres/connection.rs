@@ -16,8 +16,8 @@ use tokio::time::Instant;
 use super::errors::failed;
 use super::locks::{Limit, try_lock_limit};
 use crate::domain::{Durability, Error, Result};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
-use crate::store::location::DatabaseUrl;
+use crate::folder_fault::{FolderFault, FolderFaultKind};
+use crate::location::DatabaseUrl;
 
 /// Connections of one process.
 const CONNECTIONS: u32 = 12;
@@ -41,7 +41,7 @@ const BEGIN_SCHEMA: &str =
 
 /// The lock of the library lasts for a session, which a pooler does not keep.
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| {
-    let mut migrations = sqlx::migrate!("migrations/postgres");
+    let mut migrations = sqlx::migrate!("../../migrations/postgres");
     migrations.set_locking(false);
     migrations
 });

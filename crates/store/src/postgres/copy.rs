@@ -8,8 +8,8 @@ use tokio::sync::mpsc;
 
 use super::Store;
 use super::errors::failed;
+use crate::copy::{Column, CopyTransaction, Kind, ROWS_AT_A_TIME, Rows, Table, Value, names_of};
 use crate::domain::{Error, Result};
-use crate::store::copy::{Column, CopyTransaction, Kind, ROWS_AT_A_TIME, Rows, Table, Value, names_of};
 
 /// A copy may take long, and there is nobody whom it could keep waiting.
 const NO_TIMEOUTS: &str =
@@ -17,7 +17,7 @@ const NO_TIMEOUTS: &str =
 
 impl Store {
     /// A transaction that keeps everybody else from changing the tables.
-    pub(in crate::store) async fn begin_copy(&self) -> Result<Box<dyn CopyTransaction>> {
+    pub(crate) async fn begin_copy(&self) -> Result<Box<dyn CopyTransaction>> {
         let mut transaction = self.writer().await?;
         sqlx::raw_sql(NO_TIMEOUTS).execute(&mut *transaction).await.map_err(failed)?;
         let mut copying = Copying(transaction);

@@ -1,7 +1,7 @@
 //! Conversion of database errors into errors of the domain.
 
 use crate::domain::{Error, ErrorKind};
-use crate::store::refusals::closed;
+use crate::refusals::closed;
 
 const CONFLICT: &str = "another change came in between; try again";
 

@@ -15,13 +15,13 @@ use super::idempotency::insert_answer;
 use super::sample_retention::delete_oldest;
 use super::sample_table::{delete_replaced, delete_stored, insert};
 use crate::domain::{AuditAction, Durability, Error, Result, SampleOverflow};
-use crate::store::group_commit::{
+use crate::group_commit::{
     Committing, Completion, Counting, Failure, Inserted, Known, SampleBatch, SampleWriter, WriteSession,
     admit, as_count, changed_counts, count, must_roll_back, note, outcomes_before, rows_of,
 };
-use crate::store::limits::Usage;
-use crate::store::rows::audit::Change;
-use crate::store::rows::samples::{Row, SampleTable};
+use crate::limits::Usage;
+use crate::rows::audit::Change;
+use crate::rows::samples::{Row, SampleTable};
 
 /// Stores samples through the pool.
 pub(super) struct GroupWriter {

@@ -7,12 +7,12 @@ use super::Store;
 use super::errors::failed;
 use super::locks::{Limit, lock_limit};
 use crate::domain::{ApiKey, AuditAction, CameraId, Error, KeyId, NewKey, Result, SecretDigest};
-use crate::store::refusals::no_key;
-use crate::store::rows::audit::Change;
-use crate::store::rows::keys::{KeysVersion, check_limit, read_key, select_keys as select};
+use crate::refusals::no_key;
+use crate::rows::audit::Change;
+use crate::rows::keys::{KeysVersion, check_limit, read_key, select_keys as select};
 
 impl Store {
-    pub(in crate::store) async fn insert_key(
+    pub(crate) async fn insert_key(
         &self,
         id: KeyId,
         key: &NewKey,
@@ -43,7 +43,7 @@ impl Store {
         self.key(id).await
     }
 
-    pub(in crate::store) async fn key(&self, id: KeyId) -> Result<ApiKey> {
+    pub(crate) async fn key(&self, id: KeyId) -> Result<ApiKey> {
         let mut reader = self.reader().await?;
         let row = sqlx::query(select!("WHERE id = $1"))
             .bind(id.to_string())
@@ -53,7 +53,7 @@ impl Store {
         Ok(read_key(&row.ok_or_else(|| no_key(id))?)?.0)
     }
 
-    pub(in crate::store) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
+    pub(crate) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
         let mut reader = self.reader().await?;
         let rows = sqlx::query(select!("WHERE id < $1 ORDER BY id DESC LIMIT $2"))
             // "~" sorts behind all UUIDs.
@@ -65,7 +65,7 @@ impl Store {
         rows.iter().map(|row| Ok(read_key(row)?.0)).collect()
     }
 
-    pub(in crate::store) async fn unrevoked_keys(&self) -> Result<Vec<(ApiKey, SecretDigest)>> {
+    pub(crate) async fn unrevoked_keys(&self) -> Result<Vec<(ApiKey, SecretDigest)>> {
         let mut reader = self.reader().await?;
         let rows = sqlx::query(select!("WHERE revoked_at_us IS NULL"))
             .fetch_all(&mut *reader)
@@ -74,7 +74,7 @@ impl Store {
         rows.iter().map(read_key).collect()
     }
 
-    pub(in crate::store) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
+    pub(crate) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
         let mut reader = self.reader().await?;
         let row = sqlx::query(select!("WHERE sha256 = $1"))
             .bind(digest.as_bytes().as_slice())
@@ -84,7 +84,7 @@ impl Store {
         row.map(|row| Ok(read_key(&row)?.0)).transpose()
     }
 
-    pub(in crate::store) async fn keys_version(&self) -> Result<KeysVersion> {
+    pub(crate) async fn keys_version(&self) -> Result<KeysVersion> {
         let mut reader = self.reader().await?;
         let (rows, revoked, latest) =
             sqlx::query_as("SELECT count(*), count(revoked_at_us), max(id) FROM api_keys")
@@ -94,7 +94,7 @@ impl Store {
         Ok(KeysVersion { rows, revoked, latest })
     }
 
-    pub(in crate::store) async fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey> {
+    pub(crate) async fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey> {
         let mut transaction = self.writer().await?;
         let revoked: Option<String> = sqlx::query_scalar(
             "UPDATE api_keys SET revoked_at_us = $1 WHERE id = $2 AND revoked_at_us IS NULL RETURNING name",
@@ -112,7 +112,7 @@ impl Store {
         self.key(id).await
     }
 
-    pub(in crate::store) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
+    pub(crate) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
         let mut transaction = self.relaxed_writer().await?;
         // In one order everywhere, or two nodes could wait for each other.
         let mut uses = uses.to_vec();

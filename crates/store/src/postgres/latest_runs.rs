@@ -5,11 +5,11 @@ use std::collections::HashMap;
 use super::Store;
 use super::errors::failed;
 use crate::domain::{Camera, CameraId, JobState, Result, RunId};
-use crate::store::jobs::{job_state, read_state};
-use crate::store::row_decoder::RowDecoder;
+use crate::jobs::{job_state, read_state};
+use crate::row_decoder::RowDecoder;
 
 impl Store {
-    pub(in crate::store) async fn cameras_with_latest_run(
+    pub(crate) async fn cameras_with_latest_run(
         &self,
         after: Option<&CameraId>,
         limit: u32,

@@ -11,7 +11,7 @@ use super::errors::failed;
 use super::locks::{Limit, try_lock_limit};
 use super::sample_retention::delete_batch;
 use crate::domain::{Error, Result};
-use crate::store::rows::samples::SampleTable;
+use crate::rows::samples::SampleTable;
 
 const WEEK_US: i64 = 7 * 86_400 * 1_000_000;
 /// Weeks behind the present one that have a partition already.
@@ -22,11 +22,7 @@ const DAY_LENGTH: usize = 8;
 const NO_TIMEOUT: &str = "SET LOCAL statement_timeout = 0";
 
 impl Store {
-    pub(in crate::store) async fn retain_samples(
-        &self,
-        since: Option<Timestamp>,
-        now: Timestamp,
-    ) -> Result<u64> {
+    pub(crate) async fn retain_samples(&self, since: Option<Timestamp>, now: Timestamp) -> Result<u64> {
         let mut deleted = 0;
         for table in SampleTable::ALL {
             self.add_partitions(table, now).await?;

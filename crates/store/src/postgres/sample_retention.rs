@@ -5,7 +5,7 @@ use sqlx::{AssertSqlSafe, PgConnection};
 use super::errors::failed;
 use super::sample_table::subtract;
 use crate::domain::Result;
-use crate::store::rows::samples::SampleTable;
+use crate::rows::samples::SampleTable;
 
 /// Beyond its limit a camera is cut to this share of it, so that not every import deletes.
 const KEPT_PER_MILLE: u64 = 990;

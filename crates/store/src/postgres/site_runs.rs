@@ -15,17 +15,17 @@ use crate::domain::{
     AuditAction, Error, Result, RunId, RunProgress, SiteId, SiteTrainingOptions, SiteTrainingReport,
     SiteTrainingRun,
 };
-use crate::store::jobs::{Claim, Heartbeat, JobEnd};
-use crate::store::refusals::{no_run, no_site};
-use crate::store::rows::audit::{Change, version};
-use crate::store::rows::idempotency::IdempotencyRecord;
-use crate::store::rows::site_runs::{
+use crate::jobs::{Claim, Heartbeat, JobEnd};
+use crate::refusals::{no_run, no_site};
+use crate::rows::audit::{Change, version};
+use crate::rows::idempotency::IdempotencyRecord;
+use crate::rows::site_runs::{
     SiteCameraOutput, SiteRunEnd, SiteRunOutput, check_no_live_site_run, check_site_run_not_ended,
     conflict_of, read_site_run, select_site_runs as select, site_run_of,
 };
 
 impl Store {
-    pub(in crate::store) async fn insert_site_run(
+    pub(crate) async fn insert_site_run(
         &self,
         run: RunId,
         site: &SiteId,
@@ -68,13 +68,13 @@ impl Store {
         stored.ok_or_else(|| no_run(run))
     }
 
-    pub(in crate::store) async fn site_run(&self, site: &SiteId, run: RunId) -> Result<SiteTrainingRun> {
+    pub(crate) async fn site_run(&self, site: &SiteId, run: RunId) -> Result<SiteTrainingRun> {
         let mut reader = self.reader().await?;
         site_key(&mut reader, site).await?;
         site_run_of(find_run(&mut reader, run).await?, site, run)
     }
 
-    pub(in crate::store) async fn site_runs(
+    pub(crate) async fn site_runs(
         &self,
         site: &SiteId,
         before: Option<RunId>,
@@ -95,7 +95,7 @@ impl Store {
         rows.iter().map(read_site_run).collect()
     }
 
-    pub(in crate::store) async fn claim_site_run(
+    pub(crate) async fn claim_site_run(
         &self,
         lease: Duration,
         now: Timestamp,
@@ -108,7 +108,7 @@ impl Store {
         Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
     }
 
-    pub(in crate::store) async fn heartbeat_site_run(
+    pub(crate) async fn heartbeat_site_run(
         &self,
         run: RunId,
         fence: i64,
@@ -126,7 +126,7 @@ impl Store {
         Ok(heartbeat)
     }
 
-    pub(in crate::store) async fn cancel_site_run(
+    pub(crate) async fn cancel_site_run(
         &self,
         site: &SiteId,
         run: RunId,
@@ -144,7 +144,7 @@ impl Store {
         stored.ok_or_else(|| no_run(run))
     }
 
-    pub(in crate::store) async fn finish_site_run(
+    pub(crate) async fn finish_site_run(
         &self,
         run: RunId,
         fence: i64,

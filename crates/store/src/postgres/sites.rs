@@ -8,10 +8,10 @@ use super::Store;
 use super::errors::failed;
 use super::locks::{Limit, lock_limit};
 use crate::domain::{AuditAction, Error, ExpectedVersion, NewSite, Result, Revision, Site, SiteId, SiteKey};
-use crate::store::refusals::no_site;
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::audit::Change;
-use crate::store::rows::sites::{
+use crate::refusals::no_site;
+use crate::row_decoder::RowDecoder;
+use crate::rows::audit::Change;
+use crate::rows::sites::{
     check_limit, check_unused, check_version, read_site, site_columns as columns, site_exists,
 };
 
@@ -20,7 +20,7 @@ type Query = sqlx::query::Query<'static, Postgres, PgArguments>;
 type Expected = Option<ExpectedVersion<SiteKey>>;
 
 impl Store {
-    pub(in crate::store) async fn insert_site(&self, profile: &NewSite, now: Timestamp) -> Result<Site> {
+    pub(crate) async fn insert_site(&self, profile: &NewSite, now: Timestamp) -> Result<Site> {
         let mut transaction = self.writer().await?;
         lock_limit(&mut transaction, Limit::Sites).await?;
         let insert = sqlx::query(concat!(
@@ -42,12 +42,12 @@ impl Store {
         Ok(site)
     }
 
-    pub(in crate::store) async fn site(&self, id: &SiteId) -> Result<Site> {
+    pub(crate) async fn site(&self, id: &SiteId) -> Result<Site> {
         let mut reader = self.reader().await?;
         find_site(&mut reader, id).await
     }
 
-    pub(in crate::store) async fn sites(&self, after: Option<&SiteId>, limit: u32) -> Result<Vec<Site>> {
+    pub(crate) async fn sites(&self, after: Option<&SiteId>, limit: u32) -> Result<Vec<Site>> {
         let mut reader = self.reader().await?;
         let page = concat!("SELECT ", columns!(), " FROM sites WHERE id > $1 ORDER BY id LIMIT $2");
         let rows = sqlx::query(page)
@@ -59,7 +59,7 @@ impl Store {
         rows.iter().map(read_site).collect()
     }
 
-    pub(in crate::store) async fn site_versions(&self) -> Result<Vec<(SiteId, SiteKey, Revision)>> {
+    pub(crate) async fn site_versions(&self) -> Result<Vec<(SiteId, SiteKey, Revision)>> {
         let mut reader = self.reader().await?;
         let rows = sqlx::query("SELECT id, key, revision FROM sites")
             .fetch_all(&mut *reader)
@@ -74,7 +74,7 @@ impl Store {
         rows.iter().map(read).collect()
     }
 
-    pub(in crate::store) async fn replace_site(
+    pub(crate) async fn replace_site(
         &self,
         profile: &NewSite,
         expected: Expected,
@@ -99,12 +99,7 @@ impl Store {
         Ok(site)
     }
 
-    pub(in crate::store) async fn delete_site(
-        &self,
-        id: &SiteId,
-        expected: Expected,
-        now: Timestamp,
-    ) -> Result<()> {
+    pub(crate) async fn delete_site(&self, id: &SiteId, expected: Expected, now: Timestamp) -> Result<()> {
         let mut transaction = self.writer().await?;
         lock_site(&mut transaction, id).await?;
         let site = find_site(&mut transaction, id).await?;

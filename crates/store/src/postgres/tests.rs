@@ -12,9 +12,9 @@ use crate::domain::{
     CameraId, ConnectionId, Durability, ErrorKind, NewCamera, NewConnection, NewSite, NodeId, NodeProfile,
     RunId, SiteId,
 };
-use crate::store::tests::copy::copy_and_compare;
-use crate::store::tests::{Fixture, Home, at, connect, id, new_database, options, sample};
-use crate::store::{Acquired, DatabaseUrl, Location, SampleFilter, Store, StoreOptions};
+use crate::tests::copy::copy_and_compare;
+use crate::tests::{Fixture, Home, at, connect, id, new_database, options, sample};
+use crate::{Acquired, DatabaseUrl, Location, SampleFilter, Store, StoreOptions};
 
 const LEASE: Duration = Duration::from_secs(30);
 
@@ -230,7 +230,7 @@ async fn terminated_connections_lose_and_duplicate_nothing_that_was_acknowledged
 async fn what_cannot_be_opened_says_why() {
     let home = database().await;
     let store = home.open().await;
-    crate::store::on_backend!(store, store => store.tamper(
+    crate::on_backend!(store, store => store.tamper(
         "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
          VALUES (9000, 'later', TRUE, '', 0)"
     ).await);

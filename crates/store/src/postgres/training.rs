@@ -8,17 +8,12 @@ use super::errors::failed;
 use super::finite;
 use super::jobs::RUNS;
 use crate::domain::{EpochReport, Result, RunId};
-use crate::store::refusals::no_run;
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::runs::{LINE_BYTES, LOG_LINES};
+use crate::refusals::no_run;
+use crate::row_decoder::RowDecoder;
+use crate::rows::runs::{LINE_BYTES, LOG_LINES};
 
 impl Store {
-    pub(in crate::store) async fn append_epochs(
-        &self,
-        run: RunId,
-        fence: i64,
-        epochs: &[EpochReport],
-    ) -> Result<()> {
+    pub(crate) async fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()> {
         let mut transaction = self.relaxed_writer().await?;
         if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
@@ -44,13 +39,7 @@ impl Store {
         transaction.commit().await.map_err(failed)
     }
 
-    pub(in crate::store) async fn append_log(
-        &self,
-        run: RunId,
-        fence: i64,
-        now: Timestamp,
-        line: &str,
-    ) -> Result<()> {
+    pub(crate) async fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()> {
         let mut transaction = self.relaxed_writer().await?;
         if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
@@ -76,7 +65,7 @@ impl Store {
         transaction.commit().await.map_err(failed)
     }
 
-    pub(in crate::store) async fn epochs(&self, run: RunId) -> Result<Vec<EpochReport>> {
+    pub(crate) async fn epochs(&self, run: RunId) -> Result<Vec<EpochReport>> {
         let mut reader = self.reader().await?;
         check_run(&mut reader, run).await?;
         let rows = sqlx::query(
@@ -100,7 +89,7 @@ impl Store {
         rows.iter().map(read).collect()
     }
 
-    pub(in crate::store) async fn log(&self, run: RunId) -> Result<Vec<(Timestamp, String)>> {
+    pub(crate) async fn log(&self, run: RunId) -> Result<Vec<(Timestamp, String)>> {
         let mut reader = self.reader().await?;
         check_run(&mut reader, run).await?;
         let rows = sqlx::query(

@@ -3,37 +3,33 @@
 use std::net::IpAddr;
 
 use crate::domain::{Actor, AuditAction, AuditEntry, AuditNumber, CameraId, KeyId, Result};
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// A change, for the audit log.
-pub(in crate::store) struct Change<'a> {
-    pub(in crate::store) action: AuditAction,
-    pub(in crate::store) camera: Option<&'a CameraId>,
-    pub(in crate::store) subject: Option<String>,
+pub(crate) struct Change<'a> {
+    pub(crate) action: AuditAction,
+    pub(crate) camera: Option<&'a CameraId>,
+    pub(crate) subject: Option<String>,
 }
 
 impl<'a> Change<'a> {
     /// A change of a camera, or of something that belongs to it.
-    pub(in crate::store) fn of_camera(
-        action: AuditAction,
-        camera: &'a CameraId,
-        subject: Option<String>,
-    ) -> Self {
+    pub(crate) fn of_camera(action: AuditAction, camera: &'a CameraId, subject: Option<String>) -> Self {
         Self { action, camera: Some(camera), subject }
     }
 
     /// Any other change.
-    pub(in crate::store) const fn of(action: AuditAction, subject: String) -> Self {
+    pub(crate) const fn of(action: AuditAction, subject: String) -> Self {
         Self { action, camera: None, subject: Some(subject) }
     }
 }
 
 /// A model version as the subject of a change.
-pub(in crate::store) fn version(number: impl std::fmt::Display) -> String {
+pub(crate) fn version(number: impl std::fmt::Display) -> String {
     format!("version {number}")
 }
 
-pub(in crate::store) fn read_entry<'r>(row: impl Into<StoredRow<'r>>) -> Result<AuditEntry> {
+pub(crate) fn read_entry<'r>(row: impl Into<StoredRow<'r>>) -> Result<AuditEntry> {
     let mut fields = RowDecoder::new("audit_log", row);
     Ok(AuditEntry {
         number: AuditNumber(fields.parse(|number: i64| u64::try_from(number))?),

@@ -9,8 +9,8 @@ use crate::domain::{
     GnssError, ImageSize, ModelMetadata, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision,
     SampleCount, SigmaM, SiteId, TargetClass, TargetId,
 };
-use crate::store::refusals::unknown_site;
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::refusals::unknown_site;
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// Which camera there is, and in which state.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -27,7 +27,7 @@ pub struct CameraVersion {
 
 /// Until where changes of cameras have been read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ChangeMark(pub(in crate::store) u64);
+pub struct ChangeMark(pub(crate) u64);
 
 /// Which cameras there are, or what has changed among them.
 #[derive(Debug)]
@@ -51,7 +51,7 @@ pub struct CameraContent {
 }
 
 /// Columns: id, key, revision, active model.
-pub(in crate::store) fn read_version<'r>(row: impl Into<StoredRow<'r>>) -> Result<CameraVersion> {
+pub(crate) fn read_version<'r>(row: impl Into<StoredRow<'r>>) -> Result<CameraVersion> {
     let mut fields = RowDecoder::new("cameras", row);
     Ok(CameraVersion {
         id: fields.parse(CameraId::new)?,
@@ -72,19 +72,19 @@ macro_rules! camera_columns {
     };
 }
 
-pub(in crate::store) fn check_version(camera: &Camera, expected: Option<ExpectedVersion>) -> Result<()> {
+pub(crate) fn check_version(camera: &Camera, expected: Option<ExpectedVersion>) -> Result<()> {
     expected.map_or(Ok(()), |expected| expected.check("camera", camera.key, camera.revision))
 }
 
 /// Refuses a stored camera whose site was looked up and not found.
-pub(in crate::store) fn check_site(stored: &Camera, wanted: &NewCamera) -> Result<()> {
+pub(crate) fn check_site(stored: &Camera, wanted: &NewCamera) -> Result<()> {
     match &wanted.site {
         Some(site) if stored.profile.site.is_none() => Err(unknown_site(site)),
         _ => Ok(()),
     }
 }
 
-pub(in crate::store) fn read_camera<'r>(row: impl Into<StoredRow<'r>>) -> Result<Camera> {
+pub(crate) fn read_camera<'r>(row: impl Into<StoredRow<'r>>) -> Result<Camera> {
     let mut fields = RowDecoder::new("cameras", row);
     let key = CameraKey(fields.get()?);
     let id = fields.parse(CameraId::new)?;
@@ -136,7 +136,7 @@ struct StoredReceiver {
     clock_offset_us: i64,
 }
 
-pub(in crate::store) fn write_receivers(receivers: &Receivers) -> Result<String> {
+pub(crate) fn write_receivers(receivers: &Receivers) -> Result<String> {
     let stored = receivers.iter().map(|receiver| StoredReceiver {
         receiver_id: receiver.receiver_id.as_str().to_owned(),
         target_id: receiver.target_id.as_str().to_owned(),
@@ -157,20 +157,20 @@ fn read_receivers(json: &str) -> Result<Receivers> {
     Receivers::new(stored.iter().map(receiver).collect::<Result<Vec<_>>>()?)
 }
 
-pub(in crate::store) use camera_columns;
+pub(crate) use camera_columns;
 
 /// The refusal of a camera whose id is taken.
-pub(in crate::store) fn camera_exists(id: &CameraId) -> Error {
+pub(crate) fn camera_exists(id: &CameraId) -> Error {
     Error::field(ErrorKind::CameraExists, "id", format!("a camera of the id {id} exists already"))
 }
 
 /// The refusal of a deletion while a training run has not ended.
-pub(in crate::store) fn has_live_run() -> Error {
+pub(crate) fn has_live_run() -> Error {
     Error::refused(ErrorKind::RunLive, "the camera has a training run that has not ended; cancel it first")
 }
 
 /// Refuses the camera that was just inserted if it is one too many.
-pub(in crate::store) fn check_limit(cameras: i64, limit: u32) -> Result<()> {
+pub(crate) fn check_limit(cameras: i64, limit: u32) -> Result<()> {
     if cameras <= i64::from(limit) {
         return Ok(());
     }

@@ -4,7 +4,7 @@ use crate::domain::{
     Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
     OutboxMessage, Result, SourceOffset,
 };
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// Columns to select, in the order of [`read_connection`].
 macro_rules! connection_columns {
@@ -12,15 +12,15 @@ macro_rules! connection_columns {
         "key, id, display_name, paused, settings, secrets, revision, created_at_us, updated_at_us"
     };
 }
-pub(in crate::store) use connection_columns;
+pub(crate) use connection_columns;
 
 /// The refusal of a connection whose id is taken.
-pub(in crate::store) fn connection_exists(id: &ConnectionId) -> Error {
+pub(crate) fn connection_exists(id: &ConnectionId) -> Error {
     Error::field(ErrorKind::ConnectionExists, "id", format!("a connection of the id {id} exists already"))
 }
 
 /// Refuses the connection that was just inserted if it is one too many.
-pub(in crate::store) fn check_limit(connections: i64, limit: u32) -> Result<()> {
+pub(crate) fn check_limit(connections: i64, limit: u32) -> Result<()> {
     if connections <= i64::from(limit) {
         return Ok(());
     }
@@ -30,14 +30,14 @@ pub(in crate::store) fn check_limit(connections: i64, limit: u32) -> Result<()> 
     Err(Error::refused(ErrorKind::InsufficientStorage, message))
 }
 
-pub(in crate::store) fn check_version(
+pub(crate) fn check_version(
     connection: &Connection,
     expected: Option<ExpectedVersion<ConnectionKey>>,
 ) -> Result<()> {
     expected.map_or(Ok(()), |expected| expected.check("connection", connection.key, connection.revision))
 }
 
-pub(in crate::store) fn read_connection<'r>(row: impl Into<StoredRow<'r>>) -> Result<Connection> {
+pub(crate) fn read_connection<'r>(row: impl Into<StoredRow<'r>>) -> Result<Connection> {
     let mut fields = RowDecoder::new("connections", row);
     let key = ConnectionKey(fields.get()?);
     let profile = NewConnection {
@@ -56,7 +56,7 @@ pub(in crate::store) fn read_connection<'r>(row: impl Into<StoredRow<'r>>) -> Re
     })
 }
 
-pub(in crate::store) fn read_message(fields: &mut RowDecoder<'_>) -> Result<OutboxMessage> {
+pub(crate) fn read_message(fields: &mut RowDecoder<'_>) -> Result<OutboxMessage> {
     Ok(OutboxMessage {
         number: fields.get()?,
         message_id: fields.get()?,
@@ -66,12 +66,12 @@ pub(in crate::store) fn read_message(fields: &mut RowDecoder<'_>) -> Result<Outb
     })
 }
 
-pub(in crate::store) fn read_dead_letter<'r>(row: impl Into<StoredRow<'r>>) -> Result<DeadLetter> {
+pub(crate) fn read_dead_letter<'r>(row: impl Into<StoredRow<'r>>) -> Result<DeadLetter> {
     let mut fields = RowDecoder::new("outbox", row);
     Ok(DeadLetter { message: read_message(&mut fields)?, reason: fields.get()? })
 }
 
-pub(in crate::store) fn read_source_offset<'r>(row: impl Into<StoredRow<'r>>) -> Result<SourceOffset> {
+pub(crate) fn read_source_offset<'r>(row: impl Into<StoredRow<'r>>) -> Result<SourceOffset> {
     let mut fields = RowDecoder::new("source_offsets", row);
     Ok(SourceOffset {
         topic: fields.get()?,

@@ -7,15 +7,15 @@ use crate::domain::{
     Result, SigmaM, TimeRange, Truth,
 };
 use crate::geo::Position;
-use crate::store::jobs::read_state;
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::jobs::read_state;
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 macro_rules! select_evaluations {
     ($rest:literal) => {
         concat!(
             "SELECT jobs.id, cameras.id, jobs.train_from_us, jobs.train_until_us, jobs.test_from_us, \
              jobs.test_until_us, jobs.truth_longitude_deg, jobs.truth_latitude_deg, jobs.truth_lines, \
-             jobs.methods, jobs.recipe, jobs.seeds, jobs.box_shift_px, jobs.gnss_sigma_m, ", $crate::store::jobs::job_state!("jobs"), ", \
+             jobs.methods, jobs.recipe, jobs.seeds, jobs.box_shift_px, jobs.gnss_sigma_m, ", $crate::jobs::job_state!("jobs"), ", \
              jobs.attempt, jobs.phase, jobs.steps_done, jobs.steps_planned, jobs.remaining_s, jobs.outcome, \
              jobs.created_at_us, jobs.started_at_us, jobs.ended_at_us \
              FROM evaluations AS jobs JOIN cameras ON cameras.key = jobs.camera_key ",
@@ -24,7 +24,7 @@ macro_rules! select_evaluations {
     };
 }
 
-pub(in crate::store) fn read_evaluation<'r>(row: impl Into<StoredRow<'r>>) -> Result<EvaluationJob> {
+pub(crate) fn read_evaluation<'r>(row: impl Into<StoredRow<'r>>) -> Result<EvaluationJob> {
     let mut fields = RowDecoder::new("evaluations", row);
     Ok(EvaluationJob {
         id: EvaluationId(fields.parse(Uuid::parse_str)?),
@@ -65,7 +65,7 @@ fn read_methods(json: &str) -> Result<Vec<Method>> {
 }
 
 /// A truth as its columns: a point, or lines as JSON.
-pub(in crate::store) fn written_truth(truth: &Truth) -> Result<(Option<Position>, Option<String>)> {
+pub(crate) fn written_truth(truth: &Truth) -> Result<(Option<Position>, Option<String>)> {
     match truth {
         Truth::Columns => Ok((None, None)),
         Truth::Point(point) => Ok((Some(*point), None)),
@@ -103,10 +103,10 @@ fn read_lines(json: &str) -> Result<Vec<Vec<Position>>> {
     lines.into_iter().map(read).collect()
 }
 
-pub(in crate::store) use select_evaluations;
+pub(crate) use select_evaluations;
 
 /// Refuses to cancel an evaluation that has ended.
-pub(in crate::store) fn check_not_ended(job: &EvaluationJob) -> Result<()> {
+pub(crate) fn check_not_ended(job: &EvaluationJob) -> Result<()> {
     if !job.state.has_ended() {
         return Ok(());
     }

@@ -3,7 +3,7 @@
 use jiff::{SignedDuration, Timestamp};
 
 use crate::domain::{Actor, Error, ErrorKind, IdempotencyKey, RequestDigest, Result};
-use crate::store::limits::StoreLimits;
+use crate::limits::StoreLimits;
 
 /// A request that its client may repeat.
 #[derive(Debug, Clone)]
@@ -17,8 +17,8 @@ pub struct IdempotencyRecord {
 /// An answer that was stored under a key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StoredAnswer {
-    pub(in crate::store) digest: Vec<u8>,
-    pub(in crate::store) answer: String,
+    pub(crate) digest: Vec<u8>,
+    pub(crate) answer: String,
 }
 
 impl StoredAnswer {
@@ -38,12 +38,12 @@ impl StoredAnswer {
     }
 }
 
-pub(in crate::store) fn owner(actor: &Actor) -> String {
+pub(crate) fn owner(actor: &Actor) -> String {
     actor.key_id.map(|id| id.to_string()).unwrap_or_default()
 }
 
 /// Keys of this time and before have expired.
-pub(in crate::store) fn expired_until_us(limits: &StoreLimits, now: Timestamp) -> i64 {
+pub(crate) fn expired_until_us(limits: &StoreLimits, now: Timestamp) -> i64 {
     let life = SignedDuration::from_secs(limits.idempotency_key_s.into());
     now.saturating_sub(life).map_or(i64::MIN, Timestamp::as_microsecond)
 }

@@ -1,7 +1,7 @@
 //! Rows of keys.
 
 use crate::domain::{ApiKey, CameraId, Error, ErrorKind, Result, Role, Scope, SecretDigest};
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 macro_rules! select_keys {
     ($rest:literal) => {
@@ -16,9 +16,9 @@ macro_rules! select_keys {
 /// Changes whenever a key is created, revoked or deleted.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeysVersion {
-    pub(in crate::store) rows: i64,
-    pub(in crate::store) revoked: i64,
-    pub(in crate::store) latest: Option<String>,
+    pub(crate) rows: i64,
+    pub(crate) revoked: i64,
+    pub(crate) latest: Option<String>,
 }
 
 impl KeysVersion {
@@ -29,7 +29,7 @@ impl KeysVersion {
     }
 }
 
-pub(in crate::store) fn read_key<'r>(row: impl Into<StoredRow<'r>>) -> Result<(ApiKey, SecretDigest)> {
+pub(crate) fn read_key<'r>(row: impl Into<StoredRow<'r>>) -> Result<(ApiKey, SecretDigest)> {
     let mut fields = RowDecoder::new("api_keys", row);
     let id = fields.parse(|id: &str| id.parse())?;
     let name = fields.get()?;
@@ -51,10 +51,10 @@ pub(in crate::store) fn read_key<'r>(row: impl Into<StoredRow<'r>>) -> Result<(A
     Ok((key, SecretDigest::from_bytes(digest)))
 }
 
-pub(in crate::store) use select_keys;
+pub(crate) use select_keys;
 
 /// Refuses a key where so many are stored already.
-pub(in crate::store) fn check_limit(keys: i64, limit: u32) -> Result<()> {
+pub(crate) fn check_limit(keys: i64, limit: u32) -> Result<()> {
     if keys < i64::from(limit) {
         return Ok(());
     }

@@ -7,8 +7,8 @@ use crate::domain::{
     Result, RunId, TargetId, model_sha256,
 };
 use crate::geo::Position;
-use crate::store::refusals::no_model;
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::refusals::no_model;
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 macro_rules! select_models {
     ($rest:literal) => {
@@ -32,7 +32,7 @@ pub struct NewModel<'a> {
     pub held_out: &'a [HeldOutSampleError],
 }
 
-pub(in crate::store) fn no_earlier_model(camera: &CameraId, active: i64) -> Error {
+pub(crate) fn no_earlier_model(camera: &CameraId, active: i64) -> Error {
     let message = format!(
         "version {active} of camera {camera} stays active: no other version was active before it; activate one by \
          its number"
@@ -40,7 +40,7 @@ pub(in crate::store) fn no_earlier_model(camera: &CameraId, active: i64) -> Erro
     Error::refused(ErrorKind::NoEarlierModel, message)
 }
 
-pub(in crate::store) fn unusable(camera: &CameraId, number: u32, reason: &str) -> Error {
+pub(crate) fn unusable(camera: &CameraId, number: u32, reason: &str) -> Error {
     Error::refused(
         ErrorKind::ModelUnusable,
         format!(
@@ -59,7 +59,7 @@ pub struct StoredHeldOutError {
     pub sample: Option<(BoundingBox, Position)>,
 }
 
-pub(in crate::store) fn read_held_out_error<'r>(row: impl Into<StoredRow<'r>>) -> Result<StoredHeldOutError> {
+pub(crate) fn read_held_out_error<'r>(row: impl Into<StoredRow<'r>>) -> Result<StoredHeldOutError> {
     let mut fields = RowDecoder::new("held_out_errors", row).skip(1);
     let time = fields.timestamp()?;
     let target_id = fields.parse(TargetId::new)?;
@@ -84,7 +84,7 @@ pub(in crate::store) fn read_held_out_error<'r>(row: impl Into<StoredRow<'r>>) -
     Ok(StoredHeldOutError { error, sample: Some((bounding_box, position)) })
 }
 
-pub(in crate::store) fn read_model<'r>(row: impl Into<StoredRow<'r>>) -> Result<ModelVersion> {
+pub(crate) fn read_model<'r>(row: impl Into<StoredRow<'r>>) -> Result<ModelVersion> {
     let mut fields = RowDecoder::new("models", row);
     Ok(ModelVersion {
         camera_id: fields.parse(CameraId::new)?,
@@ -96,9 +96,9 @@ pub(in crate::store) fn read_model<'r>(row: impl Into<StoredRow<'r>>) -> Result<
     })
 }
 
-pub(in crate::store) use select_models;
+pub(crate) use select_models;
 
-pub(in crate::store) fn read_move<'r>(row: impl Into<StoredRow<'r>>) -> Result<CameraMoved> {
+pub(crate) fn read_move<'r>(row: impl Into<StoredRow<'r>>) -> Result<CameraMoved> {
     let mut fields = RowDecoder::new("camera_moves", row).skip(1);
     Ok(CameraMoved {
         model_version: fields.count()?,
@@ -112,7 +112,7 @@ pub(in crate::store) fn read_move<'r>(row: impl Into<StoredRow<'r>>) -> Result<C
 }
 
 /// The metadata of a model as they are stored.
-pub(in crate::store) fn write_metadata(metadata: &ModelMetadata) -> Result<String> {
+pub(crate) fn write_metadata(metadata: &ModelMetadata) -> Result<String> {
     let document = serde_json::to_string(metadata).map_err(Error::fault)?;
     // JSON has no NaN: it would be written as null and could never be read again.
     serde_json::from_str::<ModelMetadata>(&document)
@@ -121,10 +121,10 @@ pub(in crate::store) fn write_metadata(metadata: &ModelMetadata) -> Result<Strin
 }
 
 /// Metadata document, weights and checksum of a version, if it was found.
-pub(in crate::store) type StoredContent = Option<(Vec<u8>, Vec<u8>, Option<String>)>;
+pub(crate) type StoredContent = Option<(Vec<u8>, Vec<u8>, Option<String>)>;
 
 /// Metadata and weights of a version as they were stored, with the checksum verified.
-pub(in crate::store) fn read_content(
+pub(crate) fn read_content(
     camera: &CameraId,
     number: u32,
     content: StoredContent,
@@ -140,7 +140,7 @@ pub(in crate::store) fn read_content(
 
 /// Of the latest two activations that were not rolled back (position and number, the latest first): the position
 /// to be rolled back and the version that becomes active.
-pub(in crate::store) fn roll_back_target(camera: &CameraId, latest: &[(i64, i64)]) -> Result<(i64, i64)> {
+pub(crate) fn roll_back_target(camera: &CameraId, latest: &[(i64, i64)]) -> Result<(i64, i64)> {
     match *latest {
         [(position, _), (_, number)] => Ok((position, number)),
         [(_, active), ..] => Err(no_earlier_model(camera, active)),
@@ -152,7 +152,7 @@ pub(in crate::store) fn roll_back_target(camera: &CameraId, latest: &[(i64, i64)
 }
 
 /// The refusal to delete the active version.
-pub(in crate::store) fn is_active(number: u32) -> Error {
+pub(crate) fn is_active(number: u32) -> Error {
     Error::refused(
         ErrorKind::ModelActive,
         format!("version {number} is active; activate another version first"),

@@ -6,15 +6,15 @@ use super::models::NewModel;
 use crate::domain::{
     CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
 };
-use crate::store::jobs::{JobEnd, read_state};
-use crate::store::refusals::no_run;
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::jobs::{JobEnd, read_state};
+use crate::refusals::no_run;
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// Lines kept in a run's log; older ones are deleted.
-pub(in crate::store) const LOG_LINES: i64 = 1_000;
+pub(crate) const LOG_LINES: i64 = 1_000;
 
 /// Bytes kept of one line; the rest is cut off.
-pub(in crate::store) const LINE_BYTES: usize = 4_000;
+pub(crate) const LINE_BYTES: usize = 4_000;
 
 /// The output of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -32,7 +32,7 @@ macro_rules! select_runs {
     ($report:literal, $rest:literal) => {
         concat!(
             "SELECT runs.id, cameras.id, runs.recipe, runs.seed, runs.epochs, runs.from_us, runs.until_us, \
-             ", $crate::store::jobs::job_state!("runs"), ", runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
+             ", $crate::jobs::job_state!("runs"), ", runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
              runs.reconstruction_error, runs.regression_error, runs.error_scale, runs.remaining_s, \
              runs.model_version, (SELECT ", $report, " FROM models \
              WHERE models.camera_key = runs.camera_key AND models.number = runs.model_version), runs.outcome, runs.created_at_us, runs.started_at_us, runs.ended_at_us \
@@ -43,15 +43,11 @@ macro_rules! select_runs {
 }
 
 /// The run, if it is one of that camera.
-pub(in crate::store) fn run_of(
-    found: Option<TrainingRun>,
-    camera: &CameraId,
-    run: RunId,
-) -> Result<TrainingRun> {
+pub(crate) fn run_of(found: Option<TrainingRun>, camera: &CameraId, run: RunId) -> Result<TrainingRun> {
     found.filter(|found| found.camera_id == *camera).ok_or_else(|| no_run(run))
 }
 
-pub(in crate::store) fn read_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<TrainingRun> {
+pub(crate) fn read_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<TrainingRun> {
     let mut fields = RowDecoder::new("training_runs", row);
     Ok(TrainingRun {
         id: RunId(fields.parse(Uuid::parse_str)?),
@@ -84,10 +80,10 @@ pub(in crate::store) fn read_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<Tr
     })
 }
 
-pub(in crate::store) use select_runs;
+pub(crate) use select_runs;
 
 /// A camera has one live run at most.
-pub(in crate::store) fn check_no_live_run(live: Option<String>) -> Result<()> {
+pub(crate) fn check_no_live_run(live: Option<String>) -> Result<()> {
     let Some(live) = live else { return Ok(()) };
     let message =
         format!("the camera has training run {live}, which has not ended; wait for it or cancel it");
@@ -95,7 +91,7 @@ pub(in crate::store) fn check_no_live_run(live: Option<String>) -> Result<()> {
 }
 
 /// Refuses to cancel a run that has ended.
-pub(in crate::store) fn check_not_ended(run: &TrainingRun) -> Result<()> {
+pub(crate) fn check_not_ended(run: &TrainingRun) -> Result<()> {
     if !run.state.has_ended() {
         return Ok(());
     }

@@ -7,9 +7,9 @@ use crate::domain::{
     CameraId, CameraKey, Error, ErrorKind, Result, RunId, RunProgress, SiteId, SiteTrainingOptions,
     SiteTrainingReport, SiteTrainingRun,
 };
-use crate::store::jobs::{JobEnd, read_state};
-use crate::store::refusals::no_run;
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::jobs::{JobEnd, read_state};
+use crate::refusals::no_run;
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// The output of a run: a model for each camera, which are activated together or not at all.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,7 +41,7 @@ macro_rules! select_site_runs {
     ($rest:literal) => {
         concat!(
             "SELECT runs.id, sites.id, runs.seed, runs.from_us, runs.until_us, ",
-            $crate::store::jobs::job_state!("runs"),
+            $crate::jobs::job_state!("runs"),
             ", runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, runs.reconstruction_error, \
              runs.regression_error, runs.error_scale, runs.remaining_s, runs.outcome, runs.created_at_us, \
              runs.started_at_us, runs.ended_at_us, runs.report \
@@ -51,9 +51,9 @@ macro_rules! select_site_runs {
     };
 }
 
-pub(in crate::store) use select_site_runs;
+pub(crate) use select_site_runs;
 
-pub(in crate::store) fn read_site_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<SiteTrainingRun> {
+pub(crate) fn read_site_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<SiteTrainingRun> {
     let mut fields = RowDecoder::new("site_training_runs", row);
     Ok(SiteTrainingRun {
         id: RunId(fields.parse(Uuid::parse_str)?),
@@ -83,7 +83,7 @@ pub(in crate::store) fn read_site_run<'r>(row: impl Into<StoredRow<'r>>) -> Resu
 }
 
 /// The run, if it is one of that site.
-pub(in crate::store) fn site_run_of(
+pub(crate) fn site_run_of(
     found: Option<SiteTrainingRun>,
     site: &SiteId,
     run: RunId,
@@ -92,14 +92,14 @@ pub(in crate::store) fn site_run_of(
 }
 
 /// A site has one live run at most.
-pub(in crate::store) fn check_no_live_site_run(live: Option<String>) -> Result<()> {
+pub(crate) fn check_no_live_site_run(live: Option<String>) -> Result<()> {
     let Some(live) = live else { return Ok(()) };
     let message = format!("the site has training run {live}, which has not ended; wait for it or cancel it");
     Err(Error::conflict(ErrorKind::RunLive, live, message))
 }
 
 /// Refuses to cancel a run that has ended.
-pub(in crate::store) fn check_site_run_not_ended(run: &SiteTrainingRun) -> Result<()> {
+pub(crate) fn check_site_run_not_ended(run: &SiteTrainingRun) -> Result<()> {
     if !run.state.has_ended() {
         return Ok(());
     }
@@ -109,7 +109,7 @@ pub(in crate::store) fn check_site_run_not_ended(run: &SiteTrainingRun) -> Resul
 
 /// Why a camera's model cannot be stored with those of the others, if it cannot. `stored` are the keys of the camera's
 /// site and the number of its active version; `None` if the camera was deleted.
-pub(in crate::store) fn conflict_of(
+pub(crate) fn conflict_of(
     output: &SiteCameraOutput<'_>,
     stored: Option<(Option<i64>, Option<i64>)>,
     site_key: i64,

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::domain::{Error, ErrorKind, ExpectedVersion, NewSite, Result, Site, SiteId, SiteKey};
 use crate::geo::Position;
-use crate::store::row_decoder::{RowDecoder, StoredRow};
+use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// Columns to select, in the order of [`read_site`].
 macro_rules! site_columns {
@@ -14,11 +14,11 @@ macro_rules! site_columns {
     };
 }
 
-pub(in crate::store) fn check_version(site: &Site, expected: Option<ExpectedVersion<SiteKey>>) -> Result<()> {
+pub(crate) fn check_version(site: &Site, expected: Option<ExpectedVersion<SiteKey>>) -> Result<()> {
     expected.map_or(Ok(()), |expected| expected.check("site", site.key, site.revision))
 }
 
-pub(in crate::store) fn read_site<'r>(row: impl Into<StoredRow<'r>>) -> Result<Site> {
+pub(crate) fn read_site<'r>(row: impl Into<StoredRow<'r>>) -> Result<Site> {
     let mut fields = RowDecoder::new("sites", row);
     let key = SiteKey(fields.get()?);
     let id = fields.parse(SiteId::new)?;
@@ -40,15 +40,15 @@ pub(in crate::store) fn read_site<'r>(row: impl Into<StoredRow<'r>>) -> Result<S
     })
 }
 
-pub(in crate::store) use site_columns;
+pub(crate) use site_columns;
 
 /// The refusal of a site whose id is taken.
-pub(in crate::store) fn site_exists(id: &SiteId) -> Error {
+pub(crate) fn site_exists(id: &SiteId) -> Error {
     Error::field(ErrorKind::SiteExists, "id", format!("a site of the id {id} exists already"))
 }
 
 /// Refuses the deletion of a site that cameras belong to.
-pub(in crate::store) fn check_unused(site: &Site) -> Result<()> {
+pub(crate) fn check_unused(site: &Site) -> Result<()> {
     if site.cameras == 0 {
         return Ok(());
     }
@@ -57,7 +57,7 @@ pub(in crate::store) fn check_unused(site: &Site) -> Result<()> {
 }
 
 /// Refuses the site that was just inserted if it is one too many.
-pub(in crate::store) fn check_limit(sites: i64, limit: u32) -> Result<()> {
+pub(crate) fn check_limit(sites: i64, limit: u32) -> Result<()> {
     if sites <= i64::from(limit) {
         return Ok(());
     }

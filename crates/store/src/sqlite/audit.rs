@@ -6,8 +6,8 @@ use sqlx::SqliteConnection;
 use super::Store;
 use super::errors::failed;
 use crate::domain::{Actor, AuditEntry, AuditNumber, CameraId, Result};
-use crate::store::limits::StoreLimits;
-use crate::store::rows::audit::{Change, read_entry};
+use crate::limits::StoreLimits;
+use crate::rows::audit::{Change, read_entry};
 
 impl Store {
     /// Records a change of the transaction that is open on the connection. The oldest entries beyond the
@@ -21,7 +21,7 @@ impl Store {
         record(connection, (&self.actor, self.limits()), change, now).await
     }
 
-    pub(in crate::store) async fn audit_log(
+    pub(crate) async fn audit_log(
         &self,
         camera: Option<&CameraId>,
         before: Option<AuditNumber>,

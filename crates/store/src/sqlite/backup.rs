@@ -11,7 +11,7 @@ use super::connection::cannot_open;
 use super::file_check::{DatabaseReport, FileUse, check_file, missing};
 use super::folder::{DATABASE, flush_entries, parent_of};
 use crate::domain::{Error, ErrorKind, Result};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
+use crate::folder_fault::{FolderFault, FolderFaultKind};
 
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 

@@ -10,9 +10,9 @@ use crate::domain::{
     AuditAction, Camera, CameraId, Error, ExpectedVersion, GnssBiasSigma, GnssError, ImageSize, NewCamera,
     Result, SiteId, TargetClass,
 };
-use crate::store::refusals::no_camera;
-use crate::store::rows::audit::Change;
-use crate::store::rows::cameras::{
+use crate::refusals::no_camera;
+use crate::rows::audit::Change;
+use crate::rows::cameras::{
     CameraContent, CameraVersions, ChangeMark, camera_columns as columns, camera_exists, check_limit,
     check_site, check_version, has_live_run, read_camera, read_version, write_receivers,
 };
@@ -20,11 +20,7 @@ use crate::store::rows::cameras::{
 type Query = sqlx::query::Query<'static, Sqlite, SqliteArguments>;
 
 impl Store {
-    pub(in crate::store) async fn insert_camera(
-        &self,
-        profile: &NewCamera,
-        now: Timestamp,
-    ) -> Result<Camera> {
+    pub(crate) async fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera> {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
         let insert = sqlx::query(concat!(
@@ -49,11 +45,11 @@ impl Store {
         Ok(camera)
     }
 
-    pub(in crate::store) async fn camera(&self, id: &CameraId) -> Result<Camera> {
+    pub(crate) async fn camera(&self, id: &CameraId) -> Result<Camera> {
         find_camera(self.readers(), id).await
     }
 
-    pub(in crate::store) async fn cameras(
+    pub(crate) async fn cameras(
         &self,
         site: Option<&SiteId>,
         after: Option<&CameraId>,
@@ -81,10 +77,7 @@ impl Store {
     }
 
     /// One process changes most of what is in a folder: all cameras are read each time.
-    pub(in crate::store) async fn camera_versions(
-        &self,
-        _since: Option<ChangeMark>,
-    ) -> Result<CameraVersions> {
+    pub(crate) async fn camera_versions(&self, _since: Option<ChangeMark>) -> Result<CameraVersions> {
         let rows = sqlx::query("SELECT id, key, revision, active_model FROM cameras")
             .fetch_all(self.readers())
             .await
@@ -93,10 +86,7 @@ impl Store {
         Ok(CameraVersions { versions, deleted: None, upto: None })
     }
 
-    pub(in crate::store) async fn camera_contents(
-        &self,
-        ids: &[CameraId],
-    ) -> Result<Vec<Result<CameraContent>>> {
+    pub(crate) async fn camera_contents(&self, ids: &[CameraId]) -> Result<Vec<Result<CameraContent>>> {
         let mut contents = Vec::with_capacity(ids.len());
         for id in ids {
             contents.push(self.camera_content(id).await);
@@ -113,7 +103,7 @@ impl Store {
         Ok(CameraContent { camera, moved, model: Some(self.model_content(id, active).await) })
     }
 
-    pub(in crate::store) async fn replace_camera(
+    pub(crate) async fn replace_camera(
         &self,
         profile: &NewCamera,
         expected: Option<ExpectedVersion>,
@@ -143,7 +133,7 @@ impl Store {
         Ok(camera)
     }
 
-    pub(in crate::store) async fn delete_camera(
+    pub(crate) async fn delete_camera(
         &self,
         id: &CameraId,
         expected: Option<ExpectedVersion>,

@@ -13,7 +13,7 @@ use tokio::time::Instant;
 use super::errors::{is_busy, primary_code};
 use super::writer::Writer;
 use crate::domain::{Error, Result};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
+use crate::folder_fault::{FolderFault, FolderFaultKind};
 
 /// How long to wait for another process that writes.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
@@ -27,7 +27,7 @@ const OPEN_PAUSE: Duration = Duration::from_millis(50);
 const READERS: u32 = 4;
 const READER_WAIT: Duration = Duration::from_secs(10);
 
-static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
+static MIGRATIONS: Migrator = sqlx::migrate!("../../migrations/sqlite");
 
 /// Opens a database with its schema brought up to date. `max_pages` limits its size.
 pub(super) async fn open(path: &Path, max_pages: Option<u32>) -> Result<(Writer, SqlitePool)> {

@@ -8,9 +8,9 @@ use super::errors::failed;
 use crate::domain::{
     AuditAction, Connection, ConnectionId, ConnectionKey, ExpectedVersion, NewConnection, Result,
 };
-use crate::store::refusals::no_connection;
-use crate::store::rows::audit::Change;
-use crate::store::rows::connections::{
+use crate::refusals::no_connection;
+use crate::rows::audit::Change;
+use crate::rows::connections::{
     check_limit, check_version, connection_columns as columns, connection_exists, read_connection,
 };
 
@@ -18,7 +18,7 @@ use crate::store::rows::connections::{
 type Expected = Option<ExpectedVersion<ConnectionKey>>;
 
 impl Store {
-    pub(in crate::store) async fn insert_connection(
+    pub(crate) async fn insert_connection(
         &self,
         profile: &NewConnection,
         now: Timestamp,
@@ -46,11 +46,11 @@ impl Store {
         Ok(connection)
     }
 
-    pub(in crate::store) async fn connection(&self, id: &ConnectionId) -> Result<Connection> {
+    pub(crate) async fn connection(&self, id: &ConnectionId) -> Result<Connection> {
         find_connection(self.readers(), id).await
     }
 
-    pub(in crate::store) async fn connections(
+    pub(crate) async fn connections(
         &self,
         after: Option<&ConnectionId>,
         limit: u32,
@@ -65,7 +65,7 @@ impl Store {
         rows.iter().map(read_connection).collect()
     }
 
-    pub(in crate::store) async fn replace_connection(
+    pub(crate) async fn replace_connection(
         &self,
         profile: &NewConnection,
         expected: Expected,
@@ -94,7 +94,7 @@ impl Store {
         Ok(connection)
     }
 
-    pub(in crate::store) async fn delete_connection(
+    pub(crate) async fn delete_connection(
         &self,
         id: &ConnectionId,
         expected: Expected,

@@ -8,12 +8,12 @@ use tokio::sync::mpsc;
 
 use super::Store;
 use super::errors::failed;
+use crate::copy::{Column, CopyTransaction, Kind, ROWS_AT_A_TIME, Rows, Table, Value, names_of};
 use crate::domain::{Error, Result};
-use crate::store::copy::{Column, CopyTransaction, Kind, ROWS_AT_A_TIME, Rows, Table, Value, names_of};
 
 impl Store {
     /// A transaction that keeps everybody else from changing the file.
-    pub(in crate::store) async fn begin_copy(&self) -> Result<Box<dyn CopyTransaction>> {
+    pub(crate) async fn begin_copy(&self) -> Result<Box<dyn CopyTransaction>> {
         let options = self.inner.writer.options();
         let pool = SqlitePoolOptions::new().max_connections(1).connect_lazy_with(options);
         let mut transaction = pool.begin_with("BEGIN IMMEDIATE").await.map_err(failed)?;

@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use sqlx::error::DatabaseError;
 
 use crate::domain::{Error, ErrorKind};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
-use crate::store::refusals::closed;
+use crate::folder_fault::{FolderFault, FolderFaultKind};
+use crate::refusals::closed;
 
 /// SQLite's primary result code, if the error is SQLite's own.
 pub(super) fn primary_code(error: &sqlx::Error) -> Option<u32> {

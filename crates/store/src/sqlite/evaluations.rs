@@ -15,15 +15,15 @@ use crate::domain::{
     Result, SigmaM,
 };
 use crate::geo::Position;
-use crate::store::jobs::{Claim, Heartbeat, JobEnd};
-use crate::store::refusals::no_evaluation;
-use crate::store::rows::audit::Change;
-use crate::store::rows::evaluations::{
+use crate::jobs::{Claim, Heartbeat, JobEnd};
+use crate::refusals::no_evaluation;
+use crate::rows::audit::Change;
+use crate::rows::evaluations::{
     check_not_ended, read_evaluation, select_evaluations as select, written_truth,
 };
 
 impl Store {
-    pub(in crate::store) async fn insert_evaluation(
+    pub(crate) async fn insert_evaluation(
         &self,
         id: EvaluationId,
         camera: &CameraId,
@@ -69,11 +69,11 @@ impl Store {
         Ok(stored)
     }
 
-    pub(in crate::store) async fn evaluation(&self, id: EvaluationId) -> Result<EvaluationJob> {
+    pub(crate) async fn evaluation(&self, id: EvaluationId) -> Result<EvaluationJob> {
         find_evaluation(self.readers(), id).await
     }
 
-    pub(in crate::store) async fn evaluation_report(&self, id: EvaluationId) -> Result<Option<String>> {
+    pub(crate) async fn evaluation_report(&self, id: EvaluationId) -> Result<Option<String>> {
         let report: Option<Option<String>> =
             sqlx::query_scalar("SELECT report FROM evaluations WHERE id = ?")
                 .bind(id.to_string())
@@ -83,7 +83,7 @@ impl Store {
         report.ok_or_else(|| no_evaluation(id))
     }
 
-    pub(in crate::store) async fn evaluations(
+    pub(crate) async fn evaluations(
         &self,
         camera: Option<&CameraId>,
         before: Option<EvaluationId>,
@@ -105,7 +105,7 @@ impl Store {
         rows.iter().map(read_evaluation).collect()
     }
 
-    pub(in crate::store) async fn claim_evaluation(
+    pub(crate) async fn claim_evaluation(
         &self,
         lease: Duration,
         now: Timestamp,
@@ -118,7 +118,7 @@ impl Store {
         Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
     }
 
-    pub(in crate::store) async fn heartbeat_evaluation(
+    pub(crate) async fn heartbeat_evaluation(
         &self,
         id: EvaluationId,
         fence: i64,
@@ -147,11 +147,7 @@ impl Store {
         Ok(heartbeat)
     }
 
-    pub(in crate::store) async fn cancel_evaluation(
-        &self,
-        id: EvaluationId,
-        now: Timestamp,
-    ) -> Result<EvaluationJob> {
+    pub(crate) async fn cancel_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<EvaluationJob> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
         let stored = find_evaluation(&mut *transaction, id).await?;
@@ -165,7 +161,7 @@ impl Store {
         Ok(stored)
     }
 
-    pub(in crate::store) async fn finish_evaluation(
+    pub(crate) async fn finish_evaluation(
         &self,
         id: EvaluationId,
         fence: i64,
@@ -190,7 +186,7 @@ impl Store {
         Ok(Some(stored))
     }
 
-    pub(in crate::store) async fn delete_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<()> {
+    pub(crate) async fn delete_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         let stored = find_evaluation(&mut *transaction, id).await?;

@@ -10,7 +10,7 @@ use sqlx::{ConnectOptions, Connection, SqliteConnection};
 use super::connection::{cannot_open, newer, newest_step};
 use super::folder::DATABASE;
 use crate::domain::{Error, Result, model_sha256};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
+use crate::folder_fault::{FolderFault, FolderFaultKind};
 
 /// Steps of the schema that brought what is read here.
 const CHECKSUMS_STEP: i64 = 5;

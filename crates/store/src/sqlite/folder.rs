@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use crate::domain::{Error, Result};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
+use crate::folder_fault::{FolderFault, FolderFaultKind};
 
 /// Name of the database in its folder.
 pub(super) const DATABASE: &str = "sightfix.db";

@@ -15,12 +15,12 @@ use super::sample_table::{Insert, delete_replaced, delete_stored, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
 use crate::domain::{AuditAction, Durability, Error, Result, SampleOverflow};
-use crate::store::group_commit::{
+use crate::group_commit::{
     Committing, Completion, Counting, Failure, Inserted, Known, SampleBatch, SampleWriter, WriteSession,
     admit, as_count, changed_counts, count, must_roll_back, note, outcomes_before, rows_of,
 };
-use crate::store::rows::audit::Change;
-use crate::store::rows::samples::{Row, SampleTable};
+use crate::rows::audit::Change;
+use crate::rows::samples::{Row, SampleTable};
 
 /// Stores samples through the one writing connection.
 pub(super) struct GroupWriter {

@@ -6,11 +6,11 @@ use sqlx::{SqliteConnection, SqliteExecutor};
 use super::Store;
 use super::errors::failed;
 use crate::domain::{Actor, IdempotencyKey, Result};
-use crate::store::limits::StoreLimits;
-use crate::store::rows::idempotency::{IdempotencyRecord, StoredAnswer, expired_until_us, owner};
+use crate::limits::StoreLimits;
+use crate::rows::idempotency::{IdempotencyRecord, StoredAnswer, expired_until_us, owner};
 
 impl Store {
-    pub(in crate::store) async fn stored_answer(
+    pub(crate) async fn stored_answer(
         &self,
         key: &IdempotencyKey,
         now: Timestamp,

@@ -9,7 +9,7 @@ use uuid::Uuid;
 use super::Store;
 use super::errors::failed;
 use crate::domain::{Error, JobState, Result, RunProgress};
-use crate::store::jobs::{
+use crate::jobs::{
     self, COUNT_JOBS, Claim, Finished, Heartbeat, JobCounts, JobEnd, JobTable, Settled, lease_expired,
     lease_us,
 };
@@ -21,7 +21,7 @@ pub(super) const SITE_RUNS: Jobs = Jobs(&jobs::SITE_RUNS);
 pub(super) const EVALUATIONS: Jobs = Jobs(&jobs::EVALUATIONS);
 
 impl Store {
-    pub(in crate::store) async fn job_counts(&self) -> Result<JobCounts> {
+    pub(crate) async fn job_counts(&self) -> Result<JobCounts> {
         let rows: Vec<(String, String, i64)> =
             sqlx::query_as(COUNT_JOBS).fetch_all(self.readers()).await.map_err(failed)?;
         Ok(JobCounts::of(&rows))

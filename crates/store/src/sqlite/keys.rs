@@ -6,12 +6,12 @@ use sqlx::SqliteConnection;
 use super::Store;
 use super::errors::failed;
 use crate::domain::{ApiKey, AuditAction, CameraId, Error, KeyId, NewKey, Result, SecretDigest};
-use crate::store::refusals::no_key;
-use crate::store::rows::audit::Change;
-use crate::store::rows::keys::{KeysVersion, check_limit, read_key, select_keys as select};
+use crate::refusals::no_key;
+use crate::rows::audit::Change;
+use crate::rows::keys::{KeysVersion, check_limit, read_key, select_keys as select};
 
 impl Store {
-    pub(in crate::store) async fn insert_key(
+    pub(crate) async fn insert_key(
         &self,
         id: KeyId,
         key: &NewKey,
@@ -42,7 +42,7 @@ impl Store {
         self.key(id).await
     }
 
-    pub(in crate::store) async fn key(&self, id: KeyId) -> Result<ApiKey> {
+    pub(crate) async fn key(&self, id: KeyId) -> Result<ApiKey> {
         let row = sqlx::query(select!("WHERE id = ?"))
             .bind(id.to_string())
             .fetch_optional(self.readers())
@@ -51,7 +51,7 @@ impl Store {
         Ok(read_key(&row.ok_or_else(|| no_key(id))?)?.0)
     }
 
-    pub(in crate::store) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
+    pub(crate) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
         let rows = sqlx::query(select!("WHERE id < ? ORDER BY id DESC LIMIT ?"))
             // "~" sorts behind all UUIDs.
             .bind(before.map_or_else(|| "~".to_owned(), |id| id.to_string()))
@@ -62,7 +62,7 @@ impl Store {
         rows.iter().map(|row| Ok(read_key(row)?.0)).collect()
     }
 
-    pub(in crate::store) async fn unrevoked_keys(&self) -> Result<Vec<(ApiKey, SecretDigest)>> {
+    pub(crate) async fn unrevoked_keys(&self) -> Result<Vec<(ApiKey, SecretDigest)>> {
         let rows = sqlx::query(select!("WHERE revoked_at_us IS NULL"))
             .fetch_all(self.readers())
             .await
@@ -70,7 +70,7 @@ impl Store {
         rows.iter().map(read_key).collect()
     }
 
-    pub(in crate::store) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
+    pub(crate) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
         let row = sqlx::query(select!("WHERE sha256 = ?"))
             .bind(digest.as_bytes().as_slice())
             .fetch_optional(self.readers())
@@ -79,7 +79,7 @@ impl Store {
         row.map(|row| Ok(read_key(&row)?.0)).transpose()
     }
 
-    pub(in crate::store) async fn keys_version(&self) -> Result<KeysVersion> {
+    pub(crate) async fn keys_version(&self) -> Result<KeysVersion> {
         let (rows, revoked, latest) =
             sqlx::query_as("SELECT count(*), count(revoked_at_us), max(id) FROM api_keys")
                 .fetch_one(self.readers())
@@ -88,7 +88,7 @@ impl Store {
         Ok(KeysVersion { rows, revoked, latest })
     }
 
-    pub(in crate::store) async fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey> {
+    pub(crate) async fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
         let revoked: Option<String> = sqlx::query_scalar(
@@ -107,7 +107,7 @@ impl Store {
         self.key(id).await
     }
 
-    pub(in crate::store) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
+    pub(crate) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
         let mut writer = self.relaxed().await?;
         let mut transaction = writer.begin().await?;
         for (id, used_at) in uses {

@@ -11,16 +11,16 @@ use crate::domain::{
     AuditAction, Camera, CameraId, Error, HeldOutSampleError, ModelMetadata, ModelVersion, Result, RunId,
     model_sha256,
 };
-use crate::store::refusals::no_model;
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::audit::{Change, version};
-use crate::store::rows::models::{
+use crate::refusals::no_model;
+use crate::row_decoder::RowDecoder;
+use crate::rows::audit::{Change, version};
+use crate::rows::models::{
     NewModel, StoredContent, StoredHeldOutError, read_content, read_held_out_error, read_model,
     roll_back_target, select_models as select, write_metadata,
 };
 
 impl Store {
-    pub(in crate::store) async fn insert_model(
+    pub(crate) async fn insert_model(
         &self,
         camera: &CameraId,
         metadata: &ModelMetadata,
@@ -40,13 +40,13 @@ impl Store {
         version.ok_or_else(|| no_model(camera, number))
     }
 
-    pub(in crate::store) async fn model(&self, camera: &CameraId, number: u32) -> Result<ModelVersion> {
+    pub(crate) async fn model(&self, camera: &CameraId, number: u32) -> Result<ModelVersion> {
         camera_key(self.readers(), camera).await?;
         let mut reader = self.readers().acquire().await.map_err(failed)?;
         find_model(&mut reader, camera, number).await?.ok_or_else(|| no_model(camera, number))
     }
 
-    pub(in crate::store) async fn model_content(
+    pub(crate) async fn model_content(
         &self,
         camera: &CameraId,
         number: u32,
@@ -63,7 +63,7 @@ impl Store {
         read_content(camera, number, content)
     }
 
-    pub(in crate::store) async fn fill_in_model_checksums(&self) -> Result<u64> {
+    pub(crate) async fn fill_in_model_checksums(&self) -> Result<u64> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
         let missing: Vec<(i64, i64)> =
@@ -92,7 +92,7 @@ impl Store {
         Ok(missing.len() as u64)
     }
 
-    pub(in crate::store) async fn held_out_errors(
+    pub(crate) async fn held_out_errors(
         &self,
         camera: &CameraId,
         number: u32,
@@ -112,7 +112,7 @@ impl Store {
         rows.iter().map(read_held_out_error).collect()
     }
 
-    pub(in crate::store) async fn models(
+    pub(crate) async fn models(
         &self,
         camera: &CameraId,
         before: Option<u32>,
@@ -131,7 +131,7 @@ impl Store {
         rows.iter().map(read_model).collect()
     }
 
-    pub(in crate::store) async fn activate_model(
+    pub(crate) async fn activate_model(
         &self,
         camera: &CameraId,
         number: u32,
@@ -151,7 +151,7 @@ impl Store {
         Ok(camera)
     }
 
-    pub(in crate::store) async fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera> {
+    pub(crate) async fn roll_back(&self, camera: &CameraId, now: Timestamp) -> Result<Camera> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;
@@ -179,7 +179,7 @@ impl Store {
         Ok(camera)
     }
 
-    pub(in crate::store) async fn active_models(&self) -> Result<Vec<(CameraId, u32)>> {
+    pub(crate) async fn active_models(&self) -> Result<Vec<(CameraId, u32)>> {
         let rows =
             sqlx::query("SELECT id, active_model FROM cameras WHERE active_model IS NOT NULL ORDER BY id")
                 .fetch_all(self.readers())

@@ -9,11 +9,11 @@ use sqlx::SqliteConnection;
 use super::Store;
 use super::errors::failed;
 use crate::domain::{ConnectionKey, DeadLetter, OutboxCounts, OutboxMessage, Result};
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::connections::{read_dead_letter, read_message};
+use crate::row_decoder::RowDecoder;
+use crate::rows::connections::{read_dead_letter, read_message};
 
 impl Store {
-    pub(in crate::store) async fn append_to_outbox(
+    pub(crate) async fn append_to_outbox(
         &self,
         key: ConnectionKey,
         messages: &[OutboxMessage],
@@ -39,11 +39,7 @@ impl Store {
         Ok(dropped)
     }
 
-    pub(in crate::store) async fn outbox(
-        &self,
-        key: ConnectionKey,
-        limit: u32,
-    ) -> Result<Vec<OutboxMessage>> {
+    pub(crate) async fn outbox(&self, key: ConnectionKey, limit: u32) -> Result<Vec<OutboxMessage>> {
         let rows = sqlx::query(
             "SELECT number, message_id, subject, payload, created_at_us FROM outbox \
              WHERE connection_key = ? AND dead_reason IS NULL ORDER BY number LIMIT ?",
@@ -56,7 +52,7 @@ impl Store {
         rows.iter().map(|row| read_message(&mut RowDecoder::new("outbox", row))).collect()
     }
 
-    pub(in crate::store) async fn settle_outbox(
+    pub(crate) async fn settle_outbox(
         &self,
         key: ConnectionKey,
         outcomes: &[(i64, Result<(), String>)],
@@ -79,7 +75,7 @@ impl Store {
         transaction.commit().await.map_err(failed)
     }
 
-    pub(in crate::store) async fn dead_letters(
+    pub(crate) async fn dead_letters(
         &self,
         key: ConnectionKey,
         after: i64,
@@ -98,11 +94,11 @@ impl Store {
         rows.iter().map(read_dead_letter).collect()
     }
 
-    pub(in crate::store) async fn retry_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
+    pub(crate) async fn retry_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
         self.change_dead_letters(key, "UPDATE outbox SET dead_reason = NULL").await
     }
 
-    pub(in crate::store) async fn delete_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
+    pub(crate) async fn delete_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
         self.change_dead_letters(key, "DELETE FROM outbox").await
     }
 
@@ -120,7 +116,7 @@ impl Store {
         Ok(changed)
     }
 
-    pub(in crate::store) async fn outbox_counts(&self, key: ConnectionKey) -> Result<OutboxCounts> {
+    pub(crate) async fn outbox_counts(&self, key: ConnectionKey) -> Result<OutboxCounts> {
         let (queued, dead, oldest_us): (i64, i64, Option<i64>) = sqlx::query_as(
             "SELECT count(*) FILTER (WHERE dead_reason IS NULL), count(dead_reason), \
              min(created_at_us) FILTER (WHERE dead_reason IS NULL) FROM outbox WHERE connection_key = ?",

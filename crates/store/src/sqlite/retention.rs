@@ -7,17 +7,12 @@ use super::Store;
 use super::cameras::{camera_key, find_camera};
 use super::errors::failed;
 use crate::domain::{AuditAction, CameraId, Error, ErrorKind, Result, RunId};
-use crate::store::refusals::{no_model, no_run};
-use crate::store::rows::audit::{Change, version};
-use crate::store::rows::models::is_active;
+use crate::refusals::{no_model, no_run};
+use crate::rows::audit::{Change, version};
+use crate::rows::models::is_active;
 
 impl Store {
-    pub(in crate::store) async fn delete_model(
-        &self,
-        camera: &CameraId,
-        number: u32,
-        now: Timestamp,
-    ) -> Result<()> {
+    pub(crate) async fn delete_model(&self, camera: &CameraId, number: u32, now: Timestamp) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         if find_camera(&mut *transaction, camera).await?.active_model == Some(number) {
@@ -34,12 +29,7 @@ impl Store {
         Ok(())
     }
 
-    pub(in crate::store) async fn delete_run(
-        &self,
-        camera: &CameraId,
-        run: RunId,
-        now: Timestamp,
-    ) -> Result<()> {
+    pub(crate) async fn delete_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         let key = camera_key(&mut *transaction, camera).await?;

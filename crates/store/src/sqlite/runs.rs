@@ -13,11 +13,11 @@ use super::jobs::RUNS;
 use super::models::{activate, add_model};
 use super::retention::prune_models;
 use crate::domain::{AuditAction, CameraId, Result, RunId, RunProgress, TrainingOptions, TrainingRun};
-use crate::store::jobs::{Claim, Heartbeat, run_priority};
-use crate::store::refusals::no_run;
-use crate::store::rows::audit::{Change, version};
-use crate::store::rows::idempotency::IdempotencyRecord;
-use crate::store::rows::runs::{
+use crate::jobs::{Claim, Heartbeat, run_priority};
+use crate::refusals::no_run;
+use crate::rows::audit::{Change, version};
+use crate::rows::idempotency::IdempotencyRecord;
+use crate::rows::runs::{
     RunEnd, RunOutput, check_no_live_run, check_not_ended, read_run, run_of, select_runs,
 };
 
@@ -37,7 +37,7 @@ impl Store {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunLive`] if the camera has a run that has not ended,
     /// [`ErrorKind::Overloaded`] if all cameras together have `max_live` of them.
-    pub(in crate::store) async fn insert_run(
+    pub(crate) async fn insert_run(
         &self,
         run: RunId,
         camera: &CameraId,
@@ -48,7 +48,7 @@ impl Store {
         self.insert_run_once(run, camera, options, max_live, None, now).await
     }
 
-    pub(in crate::store) async fn insert_run_once(
+    pub(crate) async fn insert_run_once(
         &self,
         run: RunId,
         camera: &CameraId,
@@ -95,12 +95,12 @@ impl Store {
         stored.ok_or_else(|| no_run(run))
     }
 
-    pub(in crate::store) async fn run(&self, camera: &CameraId, run: RunId) -> Result<TrainingRun> {
+    pub(crate) async fn run(&self, camera: &CameraId, run: RunId) -> Result<TrainingRun> {
         camera_key(self.readers(), camera).await?;
         run_of(find_run(self.readers(), run).await?, camera, run)
     }
 
-    pub(in crate::store) async fn runs(
+    pub(crate) async fn runs(
         &self,
         camera: &CameraId,
         before: Option<RunId>,
@@ -120,7 +120,7 @@ impl Store {
         rows.iter().map(read_run).collect()
     }
 
-    pub(in crate::store) async fn claim_run(
+    pub(crate) async fn claim_run(
         &self,
         lease: Duration,
         now: Timestamp,
@@ -139,7 +139,7 @@ impl Store {
         Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
     }
 
-    pub(in crate::store) async fn heartbeat_run(
+    pub(crate) async fn heartbeat_run(
         &self,
         run: RunId,
         fence: i64,
@@ -158,7 +158,7 @@ impl Store {
         Ok(heartbeat)
     }
 
-    pub(in crate::store) async fn cancel_run(
+    pub(crate) async fn cancel_run(
         &self,
         camera: &CameraId,
         run: RunId,
@@ -177,7 +177,7 @@ impl Store {
         stored.ok_or_else(|| no_run(run))
     }
 
-    pub(in crate::store) async fn finish_run(
+    pub(crate) async fn finish_run(
         &self,
         run: RunId,
         fence: i64,

@@ -7,7 +7,7 @@ use super::Store;
 use super::errors::failed;
 use super::sample_table::subtract;
 use crate::domain::Result;
-use crate::store::rows::samples::SampleTable;
+use crate::rows::samples::SampleTable;
 
 /// Beyond its limit a camera is cut to this share of it, so that not every import deletes.
 const KEPT_PER_MILLE: u64 = 990;
@@ -15,11 +15,7 @@ const KEPT_PER_MILLE: u64 = 990;
 const BATCH: i64 = 10_000;
 
 impl Store {
-    pub(in crate::store) async fn retain_samples(
-        &self,
-        since: Option<Timestamp>,
-        _now: Timestamp,
-    ) -> Result<u64> {
+    pub(crate) async fn retain_samples(&self, since: Option<Timestamp>, _now: Timestamp) -> Result<u64> {
         let Some(before_us) = since.map(Timestamp::as_microsecond) else { return Ok(0) };
         let cameras: Vec<i64> = sqlx::query_scalar(
             "SELECT camera_key FROM sample_counts AS counts WHERE EXISTS (SELECT 1 FROM samples \

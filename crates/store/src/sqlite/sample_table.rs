@@ -10,7 +10,7 @@ use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 use super::errors::failed;
 use crate::domain::{Error, Result, Score, SigmaM, StoredSample, TargetClass};
 use crate::geo::Position;
-use crate::store::rows::samples::{Row, SampleTable, key};
+use crate::rows::samples::{Row, SampleTable, key};
 
 /// Columns bound per row.
 const fn width(table: SampleTable) -> usize {

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use super::occupants::Occupant;
 use crate::domain::{Error, Result};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
+use crate::folder_fault::{FolderFault, FolderFaultKind};
 
 const NAME: &str = "server.lock";
 

@@ -7,10 +7,10 @@ use sqlx::{Sqlite, SqliteConnection, SqliteExecutor};
 use super::Store;
 use super::errors::failed;
 use crate::domain::{AuditAction, Error, ExpectedVersion, NewSite, Result, Revision, Site, SiteId, SiteKey};
-use crate::store::refusals::no_site;
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::audit::Change;
-use crate::store::rows::sites::{
+use crate::refusals::no_site;
+use crate::row_decoder::RowDecoder;
+use crate::rows::audit::Change;
+use crate::rows::sites::{
     check_limit, check_unused, check_version, read_site, site_columns as columns, site_exists,
 };
 
@@ -19,7 +19,7 @@ type Query = sqlx::query::Query<'static, Sqlite, SqliteArguments>;
 type Expected = Option<ExpectedVersion<SiteKey>>;
 
 impl Store {
-    pub(in crate::store) async fn insert_site(&self, profile: &NewSite, now: Timestamp) -> Result<Site> {
+    pub(crate) async fn insert_site(&self, profile: &NewSite, now: Timestamp) -> Result<Site> {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
         let insert = sqlx::query(concat!(
@@ -41,11 +41,11 @@ impl Store {
         Ok(site)
     }
 
-    pub(in crate::store) async fn site(&self, id: &SiteId) -> Result<Site> {
+    pub(crate) async fn site(&self, id: &SiteId) -> Result<Site> {
         find_site(self.readers(), id).await
     }
 
-    pub(in crate::store) async fn sites(&self, after: Option<&SiteId>, limit: u32) -> Result<Vec<Site>> {
+    pub(crate) async fn sites(&self, after: Option<&SiteId>, limit: u32) -> Result<Vec<Site>> {
         let page = concat!("SELECT ", columns!(), " FROM sites WHERE id > ? ORDER BY id LIMIT ?");
         let rows = sqlx::query(page)
             .bind(after.map_or("", SiteId::as_str).to_owned())
@@ -56,7 +56,7 @@ impl Store {
         rows.iter().map(read_site).collect()
     }
 
-    pub(in crate::store) async fn site_versions(&self) -> Result<Vec<(SiteId, SiteKey, Revision)>> {
+    pub(crate) async fn site_versions(&self) -> Result<Vec<(SiteId, SiteKey, Revision)>> {
         let rows = sqlx::query("SELECT id, key, revision FROM sites")
             .fetch_all(self.readers())
             .await
@@ -70,7 +70,7 @@ impl Store {
         rows.iter().map(read).collect()
     }
 
-    pub(in crate::store) async fn replace_site(
+    pub(crate) async fn replace_site(
         &self,
         profile: &NewSite,
         expected: Expected,
@@ -95,12 +95,7 @@ impl Store {
         Ok(site)
     }
 
-    pub(in crate::store) async fn delete_site(
-        &self,
-        id: &SiteId,
-        expected: Expected,
-        now: Timestamp,
-    ) -> Result<()> {
+    pub(crate) async fn delete_site(&self, id: &SiteId, expected: Expected, now: Timestamp) -> Result<()> {
         let mut deletion = self.deletion().await?;
         let mut transaction = deletion.begin().await?;
         let site = find_site(&mut *transaction, id).await?;

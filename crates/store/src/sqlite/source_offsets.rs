@@ -3,10 +3,10 @@
 use super::Store;
 use super::errors::failed;
 use crate::domain::{ConnectionKey, Durability, Result, SourceOffset};
-use crate::store::rows::connections::read_source_offset;
+use crate::rows::connections::read_source_offset;
 
 impl Store {
-    pub(in crate::store) async fn source_offsets(&self, key: ConnectionKey) -> Result<Vec<SourceOffset>> {
+    pub(crate) async fn source_offsets(&self, key: ConnectionKey) -> Result<Vec<SourceOffset>> {
         let rows = sqlx::query(
             "SELECT topic, partition_number, next_offset FROM source_offsets WHERE connection_key = ? \
              ORDER BY topic, partition_number",
@@ -18,7 +18,7 @@ impl Store {
         rows.iter().map(read_source_offset).collect()
     }
 
-    pub(in crate::store) async fn store_source_offsets(
+    pub(crate) async fn store_source_offsets(
         &self,
         key: ConnectionKey,
         offsets: &[SourceOffset],

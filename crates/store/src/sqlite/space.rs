@@ -10,7 +10,7 @@ use super::errors::failed;
 use super::reserve::Reserve;
 use super::writer::{Growth, WriterGuard};
 use crate::domain::{Durability, Error, Result};
-use crate::store::limits::{StorageStatus, StoreLimits, Usage};
+use crate::limits::{StorageStatus, StoreLimits, Usage};
 
 /// SQLite's own; the files of this store have never had another.
 const PAGE_BYTES: u64 = 4_096;
@@ -93,11 +93,11 @@ impl Store {
 
     /// Whether imports are refused for want of space, as far as is known without looking.
     #[must_use]
-    pub(in crate::store) fn is_full(&self) -> bool {
+    pub(crate) fn is_full(&self) -> bool {
         self.inner.space.usage.is_full()
     }
 
-    pub(in crate::store) async fn maintain(&self) -> Result<StorageStatus> {
+    pub(crate) async fn maintain(&self) -> Result<StorageStatus> {
         let space = &self.inner.space;
         self.log_newcomers();
         let is_reserved = space.reserve.ensure().await?;

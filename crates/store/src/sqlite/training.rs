@@ -6,17 +6,12 @@ use super::Store;
 use super::errors::failed;
 use super::jobs::RUNS;
 use crate::domain::{EpochReport, Result, RunId};
-use crate::store::refusals::no_run;
-use crate::store::row_decoder::RowDecoder;
-use crate::store::rows::runs::{LINE_BYTES, LOG_LINES};
+use crate::refusals::no_run;
+use crate::row_decoder::RowDecoder;
+use crate::rows::runs::{LINE_BYTES, LOG_LINES};
 
 impl Store {
-    pub(in crate::store) async fn append_epochs(
-        &self,
-        run: RunId,
-        fence: i64,
-        epochs: &[EpochReport],
-    ) -> Result<()> {
+    pub(crate) async fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()> {
         let mut writer = self.relaxed().await?;
         let mut transaction = writer.begin().await?;
         if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
@@ -43,13 +38,7 @@ impl Store {
         transaction.commit().await.map_err(failed)
     }
 
-    pub(in crate::store) async fn append_log(
-        &self,
-        run: RunId,
-        fence: i64,
-        now: Timestamp,
-        line: &str,
-    ) -> Result<()> {
+    pub(crate) async fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()> {
         let mut writer = self.relaxed().await?;
         let mut transaction = writer.begin().await?;
         if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
@@ -76,7 +65,7 @@ impl Store {
         transaction.commit().await.map_err(failed)
     }
 
-    pub(in crate::store) async fn epochs(&self, run: RunId) -> Result<Vec<EpochReport>> {
+    pub(crate) async fn epochs(&self, run: RunId) -> Result<Vec<EpochReport>> {
         self.check_run(run).await?;
         let rows = sqlx::query(
             "SELECT run_id, epoch, loss, reconstruction_error, regression_error, error_scale \
@@ -99,7 +88,7 @@ impl Store {
         rows.iter().map(read).collect()
     }
 
-    pub(in crate::store) async fn log(&self, run: RunId) -> Result<Vec<(Timestamp, String)>> {
+    pub(crate) async fn log(&self, run: RunId) -> Result<Vec<(Timestamp, String)>> {
         self.check_run(run).await?;
         let rows = sqlx::query(
             "SELECT run_id, line_number, at_us, line FROM training_log WHERE run_id = ? ORDER BY line_number",

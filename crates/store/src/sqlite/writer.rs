@@ -6,7 +6,7 @@ use tokio::sync::{Mutex, MutexGuard};
 
 use super::errors::{failed, is_busy};
 use crate::domain::{Durability, Result};
-use crate::store::refusals::closed;
+use crate::refusals::closed;
 
 /// Pages above the database's limit that are left to transactions other than growing ones.
 const HEADROOM_PAGES: u32 = 256;

@@ -5,7 +5,7 @@ use crate::domain::{
     Camera, ClockOffset, GnssBiasSigma, GnssError, ImageSize, Receiver, ReceiverId, Receivers, Revision,
     SampleCount, SigmaM, TargetClass,
 };
-use crate::store::{CameraVersion, ChangeMark, SampleFilter};
+use crate::{CameraVersion, ChangeMark, SampleFilter};
 
 /// A profile in which every field says something.
 fn full(name: &str) -> NewCamera {

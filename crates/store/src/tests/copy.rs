@@ -1,5 +1,5 @@
 use super::*;
-use crate::store::{CopiedTable, NewModel, RunEnd, RunOutput, SampleFilter};
+use crate::{CopiedTable, NewModel, RunEnd, RunOutput, SampleFilter};
 
 /// Fills a store with rows of most tables, some of them with extreme values.
 async fn fill(Fixture { store, camera, .. }: &Fixture) {
@@ -23,7 +23,7 @@ fn rows_of(copied: &[CopiedTable], name: &str) -> u64 {
 }
 
 /// The copy is read back through the methods of a store, and copied on into a folder.
-pub(in crate::store) async fn copy_and_compare(fixture: &Fixture, target: &Home) {
+pub(crate) async fn copy_and_compare(fixture: &Fixture, target: &Home) {
     fill(fixture).await;
     let Fixture { store, camera, .. } = fixture;
     let copy = target.open().await;

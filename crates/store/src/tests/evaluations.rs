@@ -5,7 +5,7 @@ use crate::domain::{
     EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, JobState, Method, SigmaM, TimeRange,
     Truth,
 };
-use crate::store::{Claim, Heartbeat, JobEnd, SampleFilter};
+use crate::{Claim, Heartbeat, JobEnd, SampleFilter};
 
 const LEASE: Duration = Duration::from_secs(30);
 

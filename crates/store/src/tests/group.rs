@@ -3,18 +3,18 @@ use std::collections::HashSet;
 use proptest::prelude::*;
 
 use super::*;
-use crate::store::{Inserted, SampleFilter};
+use crate::{Inserted, SampleFilter};
 use tokio::task::JoinHandle;
 
-pub(in crate::store) type Call = JoinHandle<Result<Inserted>>;
+pub(crate) type Call = JoinHandle<Result<Inserted>>;
 
-pub(in crate::store) fn call(store: &Store, camera: &CameraId, samples: Vec<Sample>) -> Call {
+pub(crate) fn call(store: &Store, camera: &CameraId, samples: Vec<Sample>) -> Call {
     let (store, camera) = (store.clone(), camera.clone());
     tokio::spawn(async move { store.insert_samples(&camera, samples, Durability::Synced).await })
 }
 
 /// Keeps groups of samples from being stored until it is dropped.
-pub(in crate::store) async fn hold(store: &Store) -> Box<dyn Send + '_> {
+pub(crate) async fn hold(store: &Store) -> Box<dyn Send + '_> {
     on_backend!(store, store => store.hold().await)
 }
 
@@ -26,12 +26,12 @@ async fn queued(store: &Store, calls: usize) {
 }
 
 /// Lets groups be stored once so many calls are queued.
-pub(in crate::store) async fn release(store: &Store, held: Box<dyn Send + '_>, calls: usize) {
+pub(crate) async fn release(store: &Store, held: Box<dyn Send + '_>, calls: usize) {
     queued(store, calls).await;
     drop(held);
 }
 
-pub(in crate::store) async fn count(store: &Store, camera: &CameraId) -> u64 {
+pub(crate) async fn count(store: &Store, camera: &CameraId) -> u64 {
     store.count_samples(camera, &SampleFilter::default()).await.expect("counted")
 }
 

@@ -1,6 +1,6 @@
 use super::*;
 use crate::domain::{Durability, HeldOutSampleError, ModelVersion};
-use crate::store::{NewModel, RunEnd, RunOutput};
+use crate::{NewModel, RunEnd, RunOutput};
 
 async fn active(store: &Store, camera: &CameraId) -> Option<u32> {
     store.camera(camera).await.expect("known").active_model

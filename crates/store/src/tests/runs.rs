@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use super::*;
 use crate::domain::{Actor, EpochReport, JobState, RunProgress, TrainingRun};
-use crate::store::{Claim, Heartbeat, NewModel, RunEnd, RunOutput};
+use crate::{Claim, Heartbeat, NewModel, RunEnd, RunOutput};
 
 const LEASE: Duration = Duration::from_secs(30);
 

@@ -5,9 +5,7 @@ use crate::domain::{
     Actor, AuditAction, Camera, CameraChange, IdempotencyKey, JobState, NewSite, RequestHasher, RunProgress,
     SiteCameraFinding, SiteId, SiteTrainingOptions, SiteTrainingReport, SiteTrainingRun,
 };
-use crate::store::{
-    Claim, Heartbeat, IdempotencyRecord, NewModel, SiteCameraOutput, SiteRunEnd, SiteRunOutput,
-};
+use crate::{Claim, Heartbeat, IdempotencyRecord, NewModel, SiteCameraOutput, SiteRunEnd, SiteRunOutput};
 
 const LEASE: Duration = Duration::from_secs(30);
 

@@ -2,15 +2,15 @@
 //! paper whatever the position comes from. Its reconstruction error eX (2) tells boxes that no training box
 //! resembles; Es (4) scales it to an error.
 
+use crate::artifact::tensors::is_usable;
+use crate::artifact::{ModelParts, Scale};
 use crate::domain::{Error, Result};
+use crate::encoder::auto_encoder::{AutoEncoder, OutputScale, Trained, shape, train};
+use crate::encoder::features::{FEATURE_COUNT, reconstruction_error};
+use crate::encoder::stored_network::{put_network, take_network};
 use crate::geo::EastNorth;
-use crate::model::artifact::tensors::is_usable;
-use crate::model::artifact::{ModelParts, Scale};
-use crate::model::encoder::auto_encoder::{AutoEncoder, OutputScale, Trained, shape, train};
-use crate::model::encoder::features::{FEATURE_COUNT, reconstruction_error};
-use crate::model::encoder::stored_network::{put_network, take_network};
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::TrainingRows;
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::TrainingRows;
 
 /// Five layers of nodes as in the paper: 4-16-2-16-4.
 const HIDDEN: [usize; 1] = [16];

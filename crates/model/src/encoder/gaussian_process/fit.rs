@@ -13,7 +13,7 @@ use super::predictor::{PositionMap, Predictor, Stated};
 use super::projective_mean::ProjectiveMean;
 use super::sessions::SessionBiases;
 use super::upright_camera::UprightCamera;
-use crate::model::samples::rows::SESSION_GAP_S;
+use crate::samples::rows::SESSION_GAP_S;
 use crate::statistics::median;
 
 /// Rows that a fit uses at most; more are thinned evenly.

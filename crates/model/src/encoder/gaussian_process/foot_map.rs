@@ -9,11 +9,11 @@ use super::map_rows::MapRows;
 use super::predictor::{PositionMap, Predictor, Stated};
 use super::projective_mean::{COEFFICIENTS, FOOT_COEFFICIENTS, ProjectiveMean};
 use super::recipe::{map_rows, white_share};
+use crate::artifact::ModelParts;
 use crate::domain::{Error, Recipe};
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::artifact::ModelParts;
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::TrainingRows;
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::TrainingRows;
 
 /// Step at which a plane's axes are compared with those of another, m.
 const AXIS_STEP_M: f64 = 100.0;

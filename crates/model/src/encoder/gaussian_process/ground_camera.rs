@@ -3,7 +3,7 @@
 
 use super::upright_camera::{Parameters, UprightCamera};
 use crate::domain::{BoundingBox, ImageSize, TargetClass};
-use crate::model::encoder::features::features_of;
+use crate::encoder::features::features_of;
 
 /// Standard deviation of the foot of a box, px.
 const FOOT_NOISE_PX: f64 = 3.0;

@@ -2,8 +2,8 @@
 //! else spells.
 
 use super::noise::Epoch;
-use crate::model::samples::rows::SESSION_GAP_S;
-use crate::model::samples::target_groups::groups_of_targets;
+use crate::samples::rows::SESSION_GAP_S;
+use crate::samples::target_groups::groups_of_targets;
 
 /// Groups at most.
 pub(crate) const GROUPS: usize = 8;

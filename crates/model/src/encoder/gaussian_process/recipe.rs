@@ -7,15 +7,15 @@ use super::map_rows::MapRows;
 use super::noise::Epoch;
 use super::predictor::Predictor;
 use super::upright_camera::UprightCamera;
+use crate::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
 use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, TargetClass};
+use crate::encoder::FittedEncoder;
+use crate::encoder::auto_encoder::AutoEncoder;
+use crate::encoder::features::{Encoded, features_of};
 use crate::geo::{EastNorth, PlaneCovariance};
-use crate::model::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
-use crate::model::encoder::FittedEncoder;
-use crate::model::encoder::auto_encoder::AutoEncoder;
-use crate::model::encoder::features::{Encoded, features_of};
-use crate::model::progress::{FitError, Phase};
-use crate::model::samples::rows::TrainingRows;
-use crate::model::samples::unpaired::TargetBox;
+use crate::progress::{FitError, Phase};
+use crate::samples::rows::TrainingRows;
+use crate::samples::unpaired::TargetBox;
 
 /// Median height of a target in m, and the standard deviation of its logarithm, by class; the last is for
 /// all other classes, whose heights only have to agree with each other.

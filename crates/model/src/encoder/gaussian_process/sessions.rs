@@ -4,7 +4,7 @@
 //! from the map; between them, the means of their residuals about one map scatter by it.
 
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
-use crate::model::samples::rows::SESSION_GAP_S;
+use crate::samples::rows::SESSION_GAP_S;
 
 /// Sessions with fewer rows say nothing.
 const MIN_ROWS: usize = 20;

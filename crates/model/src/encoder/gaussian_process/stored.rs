@@ -6,9 +6,9 @@ use super::groups::GROUPS;
 use super::kernel::{InputScales, LengthScales};
 use super::predictor::{CoefficientDeviation, MAX_RANK, PositionMap, Predictor, QUANTILES};
 use super::projective_mean::{COEFFICIENTS, ProjectiveMean};
+use crate::artifact::ModelParts;
 use crate::domain::{Error, FeatureScale, Result};
-use crate::model::artifact::ModelParts;
-use crate::model::encoder::features::FEATURES;
+use crate::encoder::features::FEATURES;
 
 /// Maps of a mixture at most.
 const MAX_MAPS: usize = 4;

@@ -12,11 +12,11 @@ use super::posterior::{Gram, Posterior, TangentPrior};
 use super::predictor::Predictor;
 use super::projective_mean::{Box4, COEFFICIENTS};
 use super::upright_camera::UprightCamera;
+use crate::artifact::ModelParts;
+use crate::artifact::tensors::{LARGEST_WEIGHTS_BYTES, Tensors};
 use crate::domain::Recipe;
+use crate::encoder::features::features_of;
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::artifact::ModelParts;
-use crate::model::artifact::tensors::{LARGEST_WEIGHTS_BYTES, Tensors};
-use crate::model::encoder::features::features_of;
 use crate::simulation::{Options, Scene, simulate, standard_normal};
 
 const IMAGE_PX: (f64, f64) = (1280.0, 720.0);

@@ -4,8 +4,8 @@ use tempfile::TempDir;
 
 use super::{file_store, in_folder};
 use crate::domain::{Durability, NewCamera};
-use crate::store::tests::{Fixture, at, id, metadata, options, run_id, sample};
-use crate::store::{SampleFilter, Store};
+use crate::tests::{Fixture, at, id, metadata, options, run_id, sample};
+use crate::{SampleFilter, Store};
 
 /// What a process killed now would leave on the disk.
 fn crashed_copy(folder: &Path) -> TempDir {

@@ -8,8 +8,8 @@ use std::sync::Arc;
 use tempfile::TempDir;
 
 use super::Store as FileStore;
-use crate::store::tests::{Fixture, Home};
-use crate::store::{Backend, Store};
+use crate::tests::{Fixture, Home};
+use crate::{Backend, Store};
 
 /// A store in a folder, whatever the cases of both backends run on.
 async fn in_folder() -> (Fixture, Arc<TempDir>) {

@@ -1,7 +1,7 @@
 use super::{file_store, in_folder};
 use crate::domain::{Durability, ErrorKind, NewCamera, Sample};
-use crate::store::tests::group::{call, count, hold, release};
-use crate::store::tests::{Fixture, at, kind, sample};
+use crate::tests::group::{call, count, hold, release};
+use crate::tests::{Fixture, at, kind, sample};
 
 #[tokio::test]
 async fn a_dropped_transaction_is_rolled_back_and_releases_the_writer() {

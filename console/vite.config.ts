@@ -21,6 +21,6 @@ export default defineConfig({
     rollupOptions: { input: { index: resolve('index.html'), walk: resolve('walk.html') } },
   },
   // The names of columns are those of the importer.
-  server: { proxy, fs: { allow: ['.', '../src/exchange'] } },
+  server: { proxy, fs: { allow: ['.', '../crates/exchange/src'] } },
   preview: { proxy, headers: { 'content-security-policy': policy } },
 });

@@ -1,33 +1,23 @@
-//! Checks the layers and library boundaries of docs/architecture.md on the source text.
+//! Checks on the source text what the compiler does not: the layers of the modules in `src` and their libraries, and
+//! that no files of a crate import each other in a circle. The order of the crates is in their manifests.
 
 mod imports;
 
 use std::collections::BTreeMap;
 
-use self::imports::{SourceFile, circle, imports_within_modules, source_files};
+use self::imports::{circle, files_of_all_crates, files_of_src, imports_within_crates};
 
-/// The layer of each module. A module imports only from modules of lower layers.
+/// The layer of each module in `src`, above all crates. A module imports only from modules of lower layers.
 const LAYERS: &[(&str, u32)] = &[
-    ("geo", 0),
-    ("statistics", 0),
-    ("domain", 1),
     ("backoff", 2),
     ("clock", 2),
     ("config", 2),
     ("shutdown", 2),
     ("tls_client", 2),
-    ("exchange", 2),
-    ("store", 2),
-    ("filters", 2),
-    ("model", 3),
     ("admission", 3),
     ("openid", 3),
     ("telemetry", 5),
-    ("fusion", 4),
-    ("simulation", 4),
-    ("evaluation", 5),
     ("app", 6),
-    ("paper_experiments", 6),
     ("worker", 7),
     ("connect", 7),
     ("status", 7),
@@ -39,11 +29,8 @@ const LAYERS: &[(&str, u32)] = &[
     ("cli", 10),
 ];
 
-/// The modules that may use a library.
+/// The modules in `src` that may use a library.
 const LIBRARIES: &[(&str, &[&str])] = &[
-    ("candle_core", &["model"]),
-    ("candle_nn", &["model"]),
-    ("sqlx", &["store"]),
     ("axum", &["http", "server"]),
     ("utoipa_axum", &["http"]),
     ("utoipa_swagger_ui", &["http"]),
@@ -51,10 +38,7 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("tonic_types", &["grpc"]),
     ("tonic_health", &["grpc"]),
     ("tonic_reflection", &["grpc"]),
-    ("prost", &["grpc", "model"]),
-    ("geographiclib_rs", &["geo"]),
-    ("nmea", &["exchange"]),
-    ("quick_xml", &["exchange"]),
+    ("prost", &["grpc"]),
     ("rustls", &["connect", "openid", "server", "tls_client"]),
     ("tokio_rustls", &["connect", "openid", "server"]),
     ("rustls_native_certs", &["tls_client"]),
@@ -92,12 +76,11 @@ fn imported_modules(text: &str) -> impl Iterator<Item = (usize, &str)> {
 fn every_module_has_a_layer_and_imports_only_from_lower_ones() {
     let layers: BTreeMap<_, _> = LAYERS.iter().copied().collect();
     let mut wrong = Vec::new();
-    for SourceFile { path, text, module } in &source_files() {
-        let module = module.first().map_or("", String::as_str);
-        if matches!(module, "lib" | "main") {
+    for file in &files_of_src() {
+        let (text, module, path) = (&file.text, file.top_level(), file.path.display());
+        if matches!(module, "" | "main") {
             continue;
         }
-        let path = path.display();
         let Some(layer) = layers.get(module) else {
             wrong.push(format!("{path}: the module has no layer"));
             continue;
@@ -116,9 +99,9 @@ fn every_module_has_a_layer_and_imports_only_from_lower_ones() {
 }
 
 #[test]
-fn the_files_of_a_module_import_each_other_without_circles() {
-    let files = source_files();
-    let imports = imports_within_modules(&files);
+fn the_files_of_a_crate_import_each_other_without_circles() {
+    let files = files_of_all_crates();
+    let imports = imports_within_crates(&files);
     // The parser is of use only if it finds imports at all.
     let count: usize = imports.iter().map(|imports| imports.len()).sum();
     assert!(count > files.len(), "{count} imports of {} files", files.len());
@@ -133,7 +116,7 @@ fn the_files_of_a_module_import_each_other_without_circles() {
 #[test]
 fn each_library_is_used_only_by_its_modules() {
     let mut wrong = Vec::new();
-    for file in source_files() {
+    for file in files_of_src() {
         for (library, modules) in LIBRARIES {
             if uses(&file.text, library) && !modules.contains(&file.top_level()) {
                 wrong.push(format!("{}: uses {library}", file.path.display()));
@@ -152,7 +135,7 @@ fn statuses_are_defined_in_one_place() {
         "Status::invalid_argument(",
         "Status::not_found(",
     ];
-    for file in source_files() {
+    for file in files_of_src() {
         let names_status = STATUSES.iter().any(|status| file.text.contains(status));
         assert!(!names_status || file.top_level() == "status", "{}", file.path.display());
     }

@@ -1,6 +1,6 @@
 // Files of rows as people have them: any separator, any column names, any convention of boxes. Mapped here to the
 // columns that the importer documents.
-import columnNames from '../../../src/exchange/column_names.json' with { type: 'json' };
+import columnNames from '../../../crates/exchange/src/column_names.json' with { type: 'json' };
 import type { ImageSize, RejectedRow } from './types';
 
 export type FileKind = 'samples' | 'detections' | 'fixes';

@@ -1,24 +1,31 @@
-//! The files of the crate, and the files that each of them imports from.
+//! The files of the crates, and the files that each of them imports from.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Segments of a module's path below the crate: `["model", "encoder"]`.
+/// Segments of a module's path from its crate on: `["sightfix", "http", "samples"]`, `["model", "encoder"]`.
 type ModulePath = Vec<String>;
 
 /// One source file without comments and unit tests.
 pub(super) struct SourceFile {
-    /// Path below `src`.
+    /// Path below the `src` of its crate.
     pub(super) path: PathBuf,
-    pub(super) module: ModulePath,
+    module: ModulePath,
     pub(super) text: String,
 }
 
 impl SourceFile {
-    /// The module at the top of the crate that the file belongs to.
+    fn new(package: &str, path: PathBuf, text: String) -> Self {
+        let segments = path.with_extension("");
+        let segments = segments.components().map(|part| part.as_os_str().to_string_lossy().into_owned());
+        let segments = segments.filter(|segment| segment != "mod" && segment != "lib");
+        Self { module: std::iter::once(package.to_owned()).chain(segments).collect(), path, text }
+    }
+
+    /// The module at the top of the crate that the file belongs to; empty for the crate's own file.
     pub(super) fn top_level(&self) -> &str {
-        self.module.first().map_or("", String::as_str)
+        self.module.get(1).map_or("", String::as_str)
     }
 
     /// All paths in the file that begin with `crate`, `super` or `self`, or, in a `use`, with a submodule.
@@ -49,9 +56,9 @@ impl SourceFile {
         absolute
     }
 
-    /// The path from the crate's root, without `crate`; `None` for a path that leaves the crate.
+    /// The path from the crate on; `None` for a path that leaves it.
     fn absolute(&self, path: ModulePath) -> Option<ModulePath> {
-        let mut absolute = if path[0] == "crate" { Vec::new() } else { self.module.clone() };
+        let mut absolute = if path[0] == "crate" { self.module[..1].to_vec() } else { self.module.clone() };
         for segment in path {
             match segment.as_str() {
                 "crate" | "self" => {}
@@ -93,9 +100,24 @@ fn use_tree(text: &str) -> (Vec<ModulePath>, &str) {
     }
 }
 
-/// All files below `src`.
-pub(super) fn source_files() -> Vec<SourceFile> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+/// All files of the crate at the top.
+pub(super) fn files_of_src() -> Vec<SourceFile> {
+    files_of("sightfix", Path::new(env!("CARGO_MANIFEST_DIR")))
+}
+
+/// All files of the workspace.
+pub(super) fn files_of_all_crates() -> Vec<SourceFile> {
+    let crates = Path::new(env!("CARGO_MANIFEST_DIR")).join("crates");
+    let mut files = files_of_src();
+    for entry in fs::read_dir(crates).expect("the crates can be read") {
+        let entry = entry.expect("an entry can be read");
+        files.extend(files_of(&entry.file_name().to_string_lossy(), &entry.path()));
+    }
+    files
+}
+
+fn files_of(package: &str, folder: &Path) -> Vec<SourceFile> {
+    let root = folder.join("src");
     let mut folders = vec![root.clone()];
     let mut files = Vec::new();
     while let Some(folder) = folders.pop() {
@@ -107,17 +129,11 @@ pub(super) fn source_files() -> Vec<SourceFile> {
                 let text = fs::read_to_string(&path).expect("source can be read");
                 let path = path.strip_prefix(&root).expect("below src").to_owned();
                 let text = without_comments(&without_tests(&path, text));
-                files.push(SourceFile { module: module_of(&path), path, text });
+                files.push(SourceFile::new(package, path, text));
             }
         }
     }
     files
-}
-
-fn module_of(path: &Path) -> ModulePath {
-    let segments = path.with_extension("");
-    let segments = segments.components().map(|part| part.as_os_str().to_string_lossy().into_owned());
-    segments.filter(|segment| segment != "mod").collect()
 }
 
 /// Unit tests may import from higher layers: a filter is tested on a simulation.
@@ -137,11 +153,11 @@ fn without_comments(text: &str) -> String {
     text.lines().map(line).collect()
 }
 
-/// The files that each file imports from, within the same top-level module, by index.
+/// The files that each file imports from, within the same crate, by index.
 ///
 /// A name that a module re-exports from a submodule counts as imported from the submodule. What a file
 /// imports from a module that contains it is not counted: a submodule may use the types of its parent.
-pub(super) fn imports_within_modules(files: &[SourceFile]) -> Vec<BTreeSet<usize>> {
+pub(super) fn imports_within_crates(files: &[SourceFile]) -> Vec<BTreeSet<usize>> {
     let modules: BTreeSet<&ModulePath> = files.iter().map(|file| &file.module).collect();
     let by_module: BTreeMap<&ModulePath, usize> =
         files.iter().enumerate().map(|(index, file)| (&file.module, index)).collect();
@@ -157,9 +173,7 @@ pub(super) fn imports_within_modules(files: &[SourceFile]) -> Vec<BTreeSet<usize
         let targets = file.paths(&modules).into_iter().filter_map(resolve);
         let counted = |target: &usize| {
             let module = &files[*target].module;
-            *target != index
-                && files[*target].top_level() == file.top_level()
-                && !file.module.starts_with(module)
+            *target != index && module[0] == file.module[0] && !file.module.starts_with(module)
         };
         targets.filter(counted).collect()
     };
@@ -229,17 +243,14 @@ fn a_use_tree_is_expanded_to_its_paths() {
 
 #[test]
 fn a_circle_is_found_through_a_re_export() {
-    let file = |path: &str, text: &str| {
-        let path = PathBuf::from(path);
-        SourceFile { module: module_of(&path), path, text: text.to_owned() }
-    };
+    let file = |path: &str, text: &str| SourceFile::new("house", PathBuf::from(path), text.to_owned());
     let files = [
         file("rooms/mod.rs", "mod low;\nmod high;\npub use high::Roof;\n"),
         file("rooms/low.rs", "use super::Roof;\n"),
         file("rooms/high.rs", "use super::low::Floor;\n"),
     ];
-    let imports = imports_within_modules(&files);
+    let imports = imports_within_crates(&files);
     assert_eq!(circle(&imports).map(|circle| circle.len()), Some(2), "{imports:?}");
     let without = [file("rooms/low.rs", ""), file("rooms/high.rs", "use super::low::Floor;\n")];
-    assert_eq!(circle(&imports_within_modules(&without)), None);
+    assert_eq!(circle(&imports_within_crates(&without)), None);
 }

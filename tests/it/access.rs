@@ -2,6 +2,8 @@
 
 use std::collections::BTreeSet;
 use std::process::Stdio;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::Duration;
 
 use http_body_util::{BodyExt as _, Full};
@@ -12,11 +14,14 @@ use hyper_util::rt::TokioExecutor;
 use prost::Message as _;
 use serde_json::{Value, json};
 use sightfix::app::access::{OPERATIONS, Operation, Permission};
-use sightfix::domain::Role;
+use sightfix::clock::{Clock, Randomness};
+use sightfix::config::Config;
+use sightfix::domain::{NewKey, Role, Scope};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::key_service_client::KeyServiceClient;
+use sightfix::server::Server;
 use tempfile::TempDir;
 use tokio::sync::mpsc;
 use tonic::metadata::AsciiMetadataValue;
@@ -547,4 +552,43 @@ async fn a_replay_presents_its_key() {
     std::fs::write(&file, format!("{key}\n")).expect("a file");
     let accepted = replay().arg("--key-file").arg(&file).output().expect("the binary runs");
     assert!(accepted.status.success(), "{accepted:?}");
+}
+
+/// A server whose clock jumps past the expiry of a key and is set back answers the key again, without a restart.
+#[tokio::test]
+async fn a_key_works_again_when_a_wrong_clock_is_set_back() {
+    let folder = data_folder();
+    let wall_s = Arc::new(AtomicI64::new(1_800_000_000));
+    let clock = {
+        let wall_s = wall_s.clone();
+        Clock::from_fn(move || jiff::Timestamp::from_second(wall_s.load(Ordering::SeqCst)).expect("in range"))
+    };
+    let mut config = Config { data: folder.path().to_owned(), ..Config::default() };
+    config.listen.set_port(0);
+    let server = Server::bind(config, clock, Randomness::seeded(1)).await.expect("a free port");
+    let (app, address, shutdown) =
+        (server.app().clone(), server.address().expect("a port"), server.shutdown());
+    let expires_at = app.clock.now() + jiff::SignedDuration::from_hours(1);
+    let scope = Scope::new(Role::Viewer, Vec::new()).expect("a scope");
+    let key = NewKey::new("report", scope, Some(expires_at), app.clock.now()).expect("a key");
+    let (_, secret) = app.create_key(&key).await.expect("stored");
+    let running = tokio::spawn(server.run());
+    let client: HttpClient<_, Full<Bytes>> = HttpClient::builder(TokioExecutor::new()).build_http();
+    let status = async || {
+        let request = Request::get(format!("http://{address}/v1/cameras"))
+            .header("authorization", format!("Bearer {}", secret.reveal()))
+            .body(Full::default())
+            .expect("a request");
+        client.request(request).await.expect("an answer").status().as_u16()
+    };
+    assert_eq!(status().await, 200);
+    wall_s.fetch_add(86_400, Ordering::SeqCst);
+    // What the server does every two seconds: it ends what is open for the key.
+    app.access.refresh(&app.store, app.clock.now()).await.expect("read");
+    assert_eq!(status().await, 401);
+    wall_s.fetch_sub(86_400, Ordering::SeqCst);
+    app.access.refresh(&app.store, app.clock.now()).await.expect("read");
+    assert_eq!(status().await, 200);
+    shutdown.drain();
+    running.await.expect("no panic").expect("ends well");
 }

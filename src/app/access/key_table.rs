@@ -126,7 +126,9 @@ impl KeyTable {
         let _change = self.change.lock().await;
         let known = self.keys.load_full();
         let version = store.keys_version().await?;
-        if known.version.as_ref() != Some(&version) {
+        // What was open for a key that has expired has ended; if the clock was wrong, the key works again.
+        let has_returned = known.iter().any(|key| key.has_ended() && key.key.is_valid_at(now));
+        if has_returned || known.version.as_ref() != Some(&version) {
             let is_first = known.version.as_ref().is_some_and(KeysVersion::is_empty);
             self.replace(&known, store.unrevoked_keys().await?, version);
             if is_first {
@@ -145,7 +147,8 @@ impl KeyTable {
         for (key, digest) in stored {
             kept.insert(key.id);
             // What is open for a key holds the same value, and ends with it.
-            let active = by_id.get(&key.id).map_or_else(|| ActiveKey::new(key, digest), |&it| it.clone());
+            let known = by_id.get(&key.id).filter(|known| !known.has_ended());
+            let active = known.map_or_else(|| ActiveKey::new(key, digest), |&it| it.clone());
             by_bucket.entry(digest.bucket()).or_default().push(active);
         }
         self.keys.store(Arc::new(Keys { by_bucket, version: Some(version) }));

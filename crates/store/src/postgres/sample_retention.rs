@@ -25,16 +25,9 @@ pub(super) async fn delete_oldest(connection: &mut PgConnection, camera_key: i64
         return Ok(());
     }
     let kept = limit - limit * (1_000 - KEPT_PER_MILLE) / 1_000;
-    // Both tables are read in the order of their primary keys, and no further than needed.
-    let newest_deleted_us: Option<i64> = sqlx::query_scalar(
-        "SELECT time_us FROM (SELECT time_us FROM samples WHERE camera_key = $1 \
-         UNION ALL SELECT time_us FROM samples_without_fix WHERE camera_key = $1) AS times ORDER BY time_us LIMIT 1 OFFSET $2",
-    )
-    .bind(camera_key)
-    .bind(i64::try_from(stored - kept - 1).unwrap_or(i64::MAX))
-    .fetch_optional(&mut *connection)
-    .await
-    .map_err(failed)?;
+    let newest_deleted_us =
+        oldest_time(connection, camera_key, i64::MAX, i64::try_from(stored - kept).unwrap_or(i64::MAX))
+            .await?;
     let Some(newest_deleted_us) = newest_deleted_us else { return Ok(()) };
     delete_upto(connection, camera_key, newest_deleted_us).await?;
     Ok(())
@@ -46,18 +39,31 @@ pub(super) async fn delete_batch(
     camera_key: i64,
     before_us: i64,
 ) -> Result<u64> {
-    let newest_of_batch_us: Option<i64> = sqlx::query_scalar(
-        "SELECT time_us FROM (SELECT time_us FROM samples WHERE camera_key = $1 AND time_us < $2 \
-         UNION ALL SELECT time_us FROM samples_without_fix WHERE camera_key = $1 AND time_us < $2) AS times \
-         ORDER BY time_us LIMIT 1 OFFSET $3",
-    )
-    .bind(camera_key)
-    .bind(before_us)
-    .bind(BATCH - 1)
-    .fetch_optional(&mut *connection)
-    .await
-    .map_err(failed)?;
+    let newest_of_batch_us = oldest_time(connection, camera_key, before_us, BATCH).await?;
     delete_upto(connection, camera_key, newest_of_batch_us.unwrap_or(before_us - 1)).await
+}
+
+/// Time of the sample of a camera that has one less than `count` before it, of those before an instant. Each table is read
+/// in the order of its primary key, and no further than needed.
+async fn oldest_time(
+    connection: &mut PgConnection,
+    camera_key: i64,
+    before_us: i64,
+    count: i64,
+) -> Result<Option<i64>> {
+    let oldest = SampleTable::ALL.map(|table| {
+        format!(
+            "(SELECT time_us FROM {table} WHERE camera_key = $1 AND time_us < $2 ORDER BY time_us LIMIT $3)"
+        )
+    });
+    let sql = format!("{} ORDER BY time_us LIMIT 1 OFFSET $3 - 1", oldest.join(" UNION ALL "));
+    sqlx::query_scalar(AssertSqlSafe(sql))
+        .bind(camera_key)
+        .bind(before_us)
+        .bind(count)
+        .fetch_optional(connection)
+        .await
+        .map_err(failed)
 }
 
 /// Deletes the samples of a camera up to an instant, and counts them no more; returns how many.

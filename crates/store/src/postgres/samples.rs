@@ -40,13 +40,13 @@ impl Store {
     ) -> Result<Vec<StoredSample>> {
         let mut reader = self.reader().await?;
         let range = Range::of(camera_key(&mut reader, id).await?, filter, after);
-        let select = |table: &SampleTable| range.sql(&format!("SELECT {} FROM {table}", table.columns()));
+        let order = format!("ORDER BY time_us, target_id LIMIT ${}", range.next_parameter());
+        // Each table is read in the order of its primary key, and no further than the page.
+        let select = |table: &SampleTable| {
+            format!("({} {order})", range.sql(&format!("SELECT {} FROM {table}", table.columns())))
+        };
         let tables: Vec<String> = SampleTable::asked_for(filter).iter().map(select).collect();
-        let sql = format!(
-            "{} ORDER BY time_us, target_id LIMIT ${}",
-            tables.join(" UNION ALL "),
-            range.next_parameter()
-        );
+        let sql = format!("{} {order}", tables.join(" UNION ALL "));
         let rows =
             range.bind(query(&sql)).bind(i64::from(limit)).fetch_all(&mut *reader).await.map_err(failed)?;
         rows.iter().map(read_sample).collect()

@@ -27,10 +27,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use jiff::SignedDuration;
 use tokio::net::TcpListener;
 
-use crate::app::{App, NodeSettings, store_limits, store_location};
+use crate::app::access::Caller;
+use crate::app::{App, NodeSettings, Retention, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, NodeRole, OtherNode};
 use crate::connect;
@@ -319,17 +319,17 @@ const RETENTION_RETRY: Duration = Duration::from_secs(60);
 
 /// Deletes samples that are older than `limits.sample_days`, and prepares the tables of the weeks to come.
 async fn retention_loop(app: App, shutdown: Shutdown) {
+    let app = app.on_behalf_of(Caller::program("retention"));
     let work = async {
         loop {
-            let now = app.clock.now();
-            let since = match app.limits.sample_days {
-                0 => None,
-                days => now.checked_sub(SignedDuration::from_hours(24 * i64::from(days))).ok(),
-            };
-            let pause = match app.store.retain_samples(since, now).await {
-                Ok(0) => RETENTION_EVERY,
-                Ok(deleted) => {
+            let pause = match app.retain_samples().await {
+                Ok(Retention::Deleted(0)) => RETENTION_EVERY,
+                Ok(Retention::Deleted(deleted)) => {
                     tracing::info!(deleted, "samples older than limits.sample_days were deleted");
+                    RETENTION_EVERY
+                }
+                Ok(Retention::Refused(doubt)) => {
+                    tracing::error!("no samples are deleted by limits.sample_days: {doubt}; set the clock");
                     RETENTION_EVERY
                 }
                 Err(error) => {

@@ -1,7 +1,7 @@
 //! The database and the models in it.
 
 use super::{Check, in_units};
-use crate::app::{App, store_limits, store_location};
+use crate::app::{App, ClockDoubt, retention_doubt, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
 use crate::domain::Result;
@@ -13,7 +13,7 @@ const MODELS: &str = "models";
 
 pub(super) async fn check(config: &Config, clock: &Clock) -> (Vec<Check>, Option<DatabaseReport>) {
     if config.database.is_some() {
-        return (vec![server(config, clock).await], None);
+        return (vec![server(config, clock).await, retention(config, clock).await], None);
     }
     if !store::has_database(&config.data) {
         let check = Check::warning(DATABASE, "there is none yet", "`sightfix serve` makes it; check --data");
@@ -30,6 +30,9 @@ pub(super) async fn check(config: &Config, clock: &Clock) -> (Vec<Check>, Option
     let mut checks = vec![of_file];
     if report.problems.is_empty() {
         checks.push(models(config, clock, &report).await);
+        if report.schema_step == report.newest_step {
+            checks.push(retention(config, clock).await);
+        }
     }
     (checks, Some(report))
 }
@@ -98,14 +101,39 @@ async fn models(config: &Config, clock: &Clock, report: &DatabaseReport) -> Chec
     }
 }
 
-/// Loads every active model, with its checks, as a server does at its start.
-async fn faults(config: &Config, clock: &Clock) -> Result<Vec<String>> {
+/// Whether old samples are deleted as the settings say.
+async fn retention(config: &Config, clock: &Clock) -> Check {
+    const NAME: &str = "retention";
+    let days = config.limits.sample_days;
+    let remedy = "synchronise the clock (timedatectl set-ntp true); samples of a camera that has ended are deleted with \
+                  `DELETE /v1/cameras/{camera}/samples?until=...`";
+    match doubt(config, clock).await {
+        Err(error) => Check::warning(NAME, format!("the newest sample cannot be read: {error}"), remedy),
+        Ok(Some(doubt)) => Check::warning(NAME, format!("no sample is deleted for its age: {doubt}"), remedy),
+        Ok(None) if days == 0 => Check::ok(NAME, "samples are kept without end (limits.sample_days)"),
+        Ok(None) => Check::ok(NAME, format!("samples are deleted after {days} days (limits.sample_days)")),
+    }
+}
+
+async fn doubt(config: &Config, clock: &Clock) -> Result<Option<ClockDoubt>> {
+    let store = opened(config).await?;
+    let doubt = retention_doubt(&store, clock, config.limits.sample_days).await;
+    store.close().await;
+    doubt
+}
+
+async fn opened(config: &Config) -> Result<Store> {
     let options = StoreOptions {
         limits: store_limits(&config.limits),
         role: "sightfix doctor".to_owned(),
         sharing: Sharing::Command,
     };
-    let store = Store::open_at(&store_location(config)?, options).await?;
+    Store::open_at(&store_location(config)?, options).await
+}
+
+/// Loads every active model, with its checks, as a server does at its start.
+async fn faults(config: &Config, clock: &Clock) -> Result<Vec<String>> {
+    let store = opened(config).await?;
     let app =
         App::new(store, clock.clone(), Randomness::system(), config.limits.clone(), Metrics::new()).await?;
     app.registry.refresh(&app.store).await?;

@@ -52,6 +52,7 @@ pub struct Metrics {
     queues: QueueMetrics,
     models_unusable: Gauge,
     maintenance_errors: Counter,
+    retention_refused: Gauge,
 }
 
 impl Default for Metrics {
@@ -100,6 +101,11 @@ impl Metrics {
             maintenance_errors: registry.counter(
                 "sightfix_maintenance_errors_total",
                 "Rounds of the store's maintenance that failed",
+                &[],
+            ),
+            retention_refused: registry.gauge(
+                "sightfix_sample_retention_refused",
+                "1 while no sample is deleted for its age since the clock is far from the newest sample",
                 &[],
             ),
             handle: registry.handle(),
@@ -239,6 +245,11 @@ impl Metrics {
     /// A round of the store's maintenance failed.
     pub fn maintenance_failed(&self) {
         self.maintenance_errors.increment(1);
+    }
+
+    /// Whether samples are not deleted for their age, since the clock is not believed.
+    pub fn retention_refused(&self, is_refused: bool) {
+        self.retention_refused.set(f64::from(u8::from(is_refused)));
     }
 
     /// How much of the quotas is held.

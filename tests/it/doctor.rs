@@ -35,7 +35,18 @@ async fn a_sound_server_passes_every_check() {
     }
     assert_eq!(code, Some(0));
     let names: Vec<_> = checks.iter().filter_map(|check| check["name"].as_str()).collect();
-    let all = ["folder", "space", "lock", "database", "models", "clock", "port", "open files", "memory"];
+    let all = [
+        "folder",
+        "space",
+        "lock",
+        "database",
+        "models",
+        "retention",
+        "clock",
+        "port",
+        "open files",
+        "memory",
+    ];
     assert_eq!(names, all);
     let lock = check(&checks, "lock")["finding"].as_str().expect("text").to_owned();
     assert!(lock.contains(&format!("process id {}", server.pid())), "{lock}");

@@ -1,11 +1,16 @@
 //! Several processes with one PostgreSQL database. `.ci/postgres` starts the server.
 
+use std::fmt::Write as _;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
+use sightfix::app::Retention;
+use sightfix::clock::{Clock, Randomness};
+use sightfix::config::Config;
+use sightfix::server::Server;
 
-use crate::harness::{TestServer, data_folder, run, sightfix, simulated_csv, store_arguments};
+use crate::harness::{TestServer, data_folder, now, run, sightfix, simulated_csv, store_arguments};
 
 const RUNS: &str = "/v1/cameras/c/training-runs";
 
@@ -19,6 +24,87 @@ async fn with_samples(server: &TestServer) {
     server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
     let headers = [("content-type", "text/csv")];
     server.send("POST", "/v1/cameras/c/samples", &headers, simulated_csv()).await.expect(200);
+}
+
+/// Samples a second apart, of which the last is so many days old.
+fn csv(count: i64, days: i64) -> String {
+    let mut csv = "time,target_id,left,top,width,height,longitude,latitude\n".to_owned();
+    for second in 0..count {
+        let time = now() - jiff::SignedDuration::from_secs(days * 86_400 + count - second);
+        writeln!(csv, "{time},van,10,20,30,60,103.9,30.6").expect("memory");
+    }
+    csv
+}
+
+async fn import(server: &TestServer, csv: String) {
+    let headers = [("content-type", "text/csv")];
+    server.send("POST", "/v1/cameras/c/samples", &headers, csv).await.expect(200);
+}
+
+/// What a statement gives in the database of a folder.
+fn sql(folder: &Path, statement: &str) -> String {
+    let [_, url] = store_arguments(folder);
+    let output = std::process::Command::new("psql").args([&url, "-Atqc", statement]).output();
+    let output = output.expect("psql runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8_lossy(&output.stdout).trim().to_owned()
+}
+
+/// Of two processes the clock of one is 400 days ahead. Samples are deleted by the clock of the database.
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn the_wrong_clock_of_one_node_deletes_no_samples() {
+    let folder = data_folder();
+    let right = node(folder.path(), "serve");
+    right.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
+    import(&right, csv(500, 0)).await;
+    import(&right, csv(40, 60)).await;
+    let ahead = Clock::from_fn(|| now() + jiff::SignedDuration::from_hours(400 * 24));
+    let [_, url] = store_arguments(folder.path());
+    let mut config = Config { database: Some(url.into()), ..Config::default() };
+    config.listen.set_port(0);
+    config.limits.sample_days = 30;
+    let wrong = Server::bind(config, ahead, Randomness::seeded(1)).await.expect("a free port");
+    let deleted = wrong.app().retain_samples().await.expect("deleted");
+    assert_eq!(deleted, Retention::Deleted(40), "those that are older by the right clock");
+    let count = right.get("/v1/cameras/c/samples/count").await.expect(200).json();
+    assert_eq!(count["count"], 500);
+    let audited = right.get("/v1/audit?limit=1").await.expect(200).json();
+    assert_eq!(audited["items"][0]["action"], "samples-deleted", "{audited}");
+}
+
+/// Every page reads what it shows, not what is left: 20 pages of 20,000 samples read 20,000 rows, not 210,000.
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_page_of_samples_reads_no_more_than_the_page() {
+    const ROWS: i64 = 20_000;
+    let folder = data_folder();
+    let server = node(folder.path(), "serve");
+    server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
+    import(&server, csv(ROWS, 0)).await;
+    // Figures are published by each connection a second after it has used them.
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    let read = || {
+        let sum = "SELECT sum(coalesce(seq_tup_read, 0) + coalesce(idx_tup_fetch, 0)) FROM pg_stat_user_tables \
+                   WHERE relname LIKE 'samples%'";
+        sql(folder.path(), sum).parse::<i64>().expect("a number")
+    };
+    sql(folder.path(), "ANALYZE");
+    let before = read();
+    let mut cursor = String::new();
+    let (mut pages, mut shown) = (0, 0);
+    loop {
+        let path = format!("/v1/cameras/c/samples?limit=1000{cursor}");
+        let page = server.get(&path).await.expect(200).json();
+        (pages, shown) = (pages + 1, shown + page["items"].as_array().expect("items").len());
+        let Some(next) = page["next_cursor"].as_str() else { break };
+        cursor = format!("&cursor={next}");
+    }
+    assert_eq!((pages, shown as i64), (20, ROWS));
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    let rows = read() - before;
+    println!("{pages} pages of {ROWS} samples read {rows} rows");
+    assert!((ROWS..2 * ROWS).contains(&rows), "{rows} rows were read");
 }
 
 async fn start_run(server: &TestServer, request: &Value) -> String {

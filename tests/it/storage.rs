@@ -426,4 +426,38 @@ async fn samples_older_than_the_days_of_the_setting_are_deleted() {
     assert_eq!(stored["items"][0]["target_id"], "young");
     let line = server.logged(|line| line["deleted"] == 90).await;
     assert!(line.to_string().contains("limits.sample_days"), "{line}");
+    let audited = server.get("/v1/audit?limit=1").await.expect(200).json();
+    let entry = &audited["items"][0];
+    assert_eq!(
+        (&entry["action"], &entry["actor"]),
+        (&json!("samples-deleted"), &json!("retention")),
+        "{entry}"
+    );
+    assert!(entry["subject"].as_str().expect("text").starts_with("samples from before "), "{entry}");
+}
+
+/// Rows of [`csv`] are years old: what a clock that is years ahead makes of samples of today.
+#[tokio::test]
+async fn a_clock_far_from_the_newest_sample_deletes_nothing() {
+    let folder = data_folder();
+    let days = ("SIGHTFIX_LIMITS__SAMPLE_DAYS", "30");
+    {
+        let server = TestServer::start(folder.path());
+        create_camera(&server, "c").await.expect(201);
+        import(&server, SAMPLES, csv(0..90)).await.expect(200);
+    }
+    let server = TestServer::start_with(folder.path(), &[days]);
+    let line = server.logged(|line| line.to_string().contains("no samples are deleted")).await.to_string();
+    assert!(line.contains("days ahead of the newest sample (2020-09-13T12:28:09Z)"), "{line}");
+    assert_eq!(server.get("/v1/cameras/c").await.expect(200).json()["samples"], 90);
+    let metrics = server.get("/metrics").await.expect(200).text();
+    assert!(metrics.contains("sightfix_sample_retention_refused 1"), "{metrics}");
+
+    let mut doctor = sightfix();
+    doctor.args(["doctor", "--json", "--listen", &server.address.to_string(), "--data"]).arg(folder.path());
+    let output = doctor.env(days.0, days.1).output().expect("the binary runs");
+    let checks: Vec<Value> = serde_json::from_slice(&output.stdout).expect("JSON");
+    let check = checks.iter().find(|check| check["name"] == "retention").expect("a check");
+    assert_eq!(check["status"], "warning", "{check}");
+    assert!(check["finding"].as_str().expect("text").contains("ahead of the newest sample"), "{check}");
 }

@@ -17,9 +17,9 @@ use crate::domain::{
     ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraMoved, Connection, ConnectionId, ConnectionKey,
     DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
     EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
-    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision, RunId,
-    RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun, SourceOffset,
-    StoredSample, TrainingOptions, TrainingRun,
+    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision,
+    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
+    SourceOffset, StoredSample, TrainingOptions, TrainingRun,
 };
 use crate::geo::Position;
 
@@ -531,8 +531,21 @@ contract! {
     /// Faults only.
     fn maintain(&self) -> Result<StorageStatus>;
 
+    /// What time it is for everything that is stored: by the clock of a database's server, which all processes share; a data
+    /// folder has that of its process, which is handed in.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn time(&self, now: Timestamp) -> Result<Timestamp>;
+
+    /// Time of the newest sample of all cameras; `None` if there is none.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn newest_sample(&self) -> Result<Option<Timestamp>>;
+
     /// Makes room for the samples of the weeks to come, where they are stored by week, and deletes those of before an
-    /// instant; there, weeks that are over at that instant. Returns how many.
+    /// instant; there, weeks that are over at that instant. The audit log says so. Returns how many.
     ///
     /// # Errors
     /// [`ErrorKind::Overloaded`] while others use what is to be dropped. The next call goes on.

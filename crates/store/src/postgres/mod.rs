@@ -187,6 +187,14 @@ impl Store {
     }
 }
 
+/// The time of the database, in microseconds.
+macro_rules! database_now_us {
+    () => {
+        "(extract(epoch FROM clock_timestamp()) * 1000000)::BIGINT"
+    };
+}
+use database_now_us;
+
 /// A number that is not NaN; NaN is stored as NULL in both backends.
 fn finite(number: f64) -> Option<f64> {
     (!number.is_nan()).then_some(number)

@@ -13,6 +13,7 @@ use sqlx::{PgConnection, PgPool, Postgres, Transaction};
 use uuid::Uuid;
 
 use super::connection::{begin_read, begin_write};
+use super::database_now_us;
 use super::errors::failed;
 use crate::domain::{CameraKey, Durability, Error, ErrorKind, Node, NodeId, NodeProfile, Result, SiteKey};
 
@@ -43,13 +44,6 @@ pub enum Acquired {
 /// The columns of a node, read by [`read_node`].
 const COLUMNS: &str = "id, url, role, version, lease_ms, renewal, is_draining, started_at_us, renewed_at_us";
 type NodeRow = (String, Option<String>, String, String, i64, i64, bool, i64, i64);
-
-/// The time of the database, in microseconds.
-macro_rules! database_now_us {
-    () => {
-        "(extract(epoch FROM clock_timestamp()) * 1000000)::BIGINT"
-    };
-}
 
 impl NodeLeases {
     /// Registers a node under an id that was never used before.

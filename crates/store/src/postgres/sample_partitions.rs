@@ -10,8 +10,9 @@ use super::Store;
 use super::errors::failed;
 use super::locks::{Limit, try_lock_limit};
 use super::sample_retention::delete_batch;
-use crate::domain::{Error, Result};
-use crate::rows::samples::SampleTable;
+use crate::domain::{AuditAction, Error, Result};
+use crate::rows::audit::Change;
+use crate::rows::samples::{SampleTable, expired};
 
 const WEEK_US: i64 = 7 * 86_400 * 1_000_000;
 /// Weeks behind the present one that have a partition already.
@@ -30,11 +31,11 @@ impl Store {
                 self.detach_before(table, since).await?;
             }
             for partition in self.detached(table).await? {
-                deleted += self.drop_detached(table, &partition).await?;
+                deleted += self.drop_detached(table, &partition, now).await?;
             }
         }
         match since {
-            Some(since) => Ok(deleted + self.delete_before(week_of(since)).await?),
+            Some(since) => Ok(deleted + self.delete_before(week_of(since), now).await?),
             None => Ok(deleted),
         }
     }
@@ -94,7 +95,7 @@ impl Store {
     }
 
     /// Counts the samples of a detached week no more, and drops it; returns how many there were.
-    async fn drop_detached(&self, table: SampleTable, name: &str) -> Result<u64> {
+    async fn drop_detached(&self, table: SampleTable, name: &str, now: Timestamp) -> Result<u64> {
         let mut transaction = self.writer().await?;
         if !try_lock_limit(&mut transaction, Limit::SamplePartitions).await.map_err(failed)? {
             return Ok(0);
@@ -111,12 +112,15 @@ impl Store {
             sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(&mut *transaction).await.map_err(failed)?;
         let sql = format!("DROP TABLE {name}");
         sqlx::raw_sql(AssertSqlSafe(sql)).execute(&mut *transaction).await.map_err(failed)?;
+        let subject = format!("{rows} samples of the week of {}, by limits.sample_days", day_of(name));
+        self.record(&mut transaction, Change::of(AuditAction::SamplesDeleted, subject), now).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(rows.unsigned_abs())
     }
 
     /// Deletes what no partition of a week holds, camera by camera and in short transactions.
-    async fn delete_before(&self, before_us: i64) -> Result<u64> {
+    async fn delete_before(&self, before_us: i64, now: Timestamp) -> Result<u64> {
+        let before = Timestamp::from_microsecond(before_us).map_err(Error::fault)?;
         let mut reader = self.reader().await?;
         let cameras: Vec<i64> = sqlx::query_scalar(
             "SELECT camera_key FROM sample_counts AS counts WHERE EXISTS (SELECT 1 FROM samples \
@@ -134,6 +138,9 @@ impl Store {
             loop {
                 let mut transaction = self.writer().await?;
                 let rows = delete_batch(&mut transaction, camera_key, before_us).await?;
+                if deleted == 0 && rows > 0 {
+                    self.record(&mut transaction, expired(before), now).await?;
+                }
                 transaction.commit().await.map_err(failed)?;
                 if rows == 0 {
                     break;

@@ -1,16 +1,37 @@
 //! The oldest samples are deleted, where the operator has chosen so: beyond a number for each camera, or an age.
 
+use jiff::Timestamp;
 use sqlx::{AssertSqlSafe, PgConnection};
 
 use super::errors::failed;
 use super::sample_table::subtract;
-use crate::domain::Result;
-use crate::rows::samples::SampleTable;
+use super::{Store, database_now_us};
+use crate::domain::{Error, Result};
+use crate::rows::samples::{NEWEST_TIME, SampleTable};
 
 /// Beyond its limit a camera is cut to this share of it, so that not every import deletes.
 const KEPT_PER_MILLE: u64 = 990;
 /// Rows of one camera that a transaction deletes by age.
 const BATCH: i64 = 10_000;
+
+impl Store {
+    pub(crate) async fn newest_sample(&self) -> Result<Option<Timestamp>> {
+        let mut reader = self.reader().await?;
+        let newest_us: Option<i64> =
+            sqlx::query_scalar(NEWEST_TIME).fetch_one(&mut *reader).await.map_err(failed)?;
+        newest_us.map(Timestamp::from_microsecond).transpose().map_err(Error::fault)
+    }
+
+    /// The processes of a database agree on its server's clock, not on their own.
+    pub(crate) async fn time(&self, _now: Timestamp) -> Result<Timestamp> {
+        let mut reader = self.reader().await?;
+        let now_us: i64 = sqlx::query_scalar(concat!("SELECT ", database_now_us!()))
+            .fetch_one(&mut *reader)
+            .await
+            .map_err(failed)?;
+        Timestamp::from_microsecond(now_us).map_err(Error::fault)
+    }
+}
 
 /// Deletes the oldest samples of a camera that has more than `limit`. Samples of one instant stay or go together.
 pub(super) async fn delete_oldest(connection: &mut PgConnection, camera_key: i64, limit: u64) -> Result<()> {

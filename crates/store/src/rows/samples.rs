@@ -3,11 +3,15 @@
 use std::collections::HashSet;
 use std::fmt;
 
+use jiff::Timestamp;
+
 use crate::domain::{
-    BoundingBox, Fix, Result, Sample, SampleFilter, Score, SigmaM, StoredSample, TargetClass, TargetId,
+    AuditAction, BoundingBox, Fix, Result, Sample, SampleFilter, Score, SigmaM, StoredSample, TargetClass,
+    TargetId,
 };
 use crate::geo::Position;
 use crate::row_decoder::{RowDecoder, StoredRow};
+use crate::rows::audit::Change;
 
 /// A table of samples. A key is in one of them only.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,6 +54,18 @@ pub(crate) fn keep_last(samples: &mut Vec<StoredSample>) -> u64 {
         .collect();
     samples.retain(|_| is_last.pop().unwrap_or(true));
     (before - samples.len()) as u64
+}
+
+/// Time of the newest sample: a look at the end of each camera's primary keys.
+pub(crate) const NEWEST_TIME: &str = "SELECT max(time_us) FROM (\
+     SELECT (SELECT max(time_us) FROM samples WHERE camera_key = counts.camera_key) AS time_us \
+     FROM sample_counts AS counts UNION ALL \
+     SELECT (SELECT max(time_us) FROM samples_without_fix WHERE camera_key = counts.camera_key) \
+     FROM sample_counts AS counts) AS newest";
+
+/// What the audit log says of samples that are deleted for their age.
+pub(crate) fn expired(before: Timestamp) -> Change<'static> {
+    Change::of(AuditAction::SamplesDeleted, format!("samples from before {before}, by limits.sample_days"))
 }
 
 impl SampleTable {

@@ -6,8 +6,8 @@ use sqlx::{AssertSqlSafe, SqliteConnection};
 use super::Store;
 use super::errors::failed;
 use super::sample_table::subtract;
-use crate::domain::Result;
-use crate::rows::samples::SampleTable;
+use crate::domain::{Error, Result};
+use crate::rows::samples::{NEWEST_TIME, SampleTable, expired};
 
 /// Beyond its limit a camera is cut to this share of it, so that not every import deletes.
 const KEPT_PER_MILLE: u64 = 990;
@@ -15,8 +15,24 @@ const KEPT_PER_MILLE: u64 = 990;
 const BATCH: i64 = 10_000;
 
 impl Store {
-    pub(crate) async fn retain_samples(&self, since: Option<Timestamp>, _now: Timestamp) -> Result<u64> {
-        let Some(before_us) = since.map(Timestamp::as_microsecond) else { return Ok(0) };
+    pub(crate) async fn newest_sample(&self) -> Result<Option<Timestamp>> {
+        let newest_us: Option<i64> =
+            sqlx::query_scalar(NEWEST_TIME).fetch_one(self.readers()).await.map_err(failed)?;
+        newest_us.map(Timestamp::from_microsecond).transpose().map_err(Error::fault)
+    }
+
+    /// A data folder has no clock but that of its process.
+    pub(crate) async fn time(&self, now: Timestamp) -> Result<Timestamp> {
+        Ok(now)
+    }
+
+    pub(crate) async fn retain_samples(
+        &self,
+        since: Option<Timestamp>,
+        now: Timestamp,
+    ) -> Result<u64> {
+        let Some(since) = since else { return Ok(0) };
+        let before_us = since.as_microsecond();
         let cameras: Vec<i64> = sqlx::query_scalar(
             "SELECT camera_key FROM sample_counts AS counts WHERE EXISTS (SELECT 1 FROM samples \
              WHERE samples.camera_key = counts.camera_key AND time_us < ?1) \
@@ -33,6 +49,9 @@ impl Store {
                 let mut deletion = self.deletion().await?;
                 let mut transaction = deletion.begin().await?;
                 let rows = delete_batch(&mut transaction, camera_key, before_us).await?;
+                if deleted == 0 && rows > 0 {
+                    self.record(&mut transaction, expired(since), now).await?;
+                }
                 transaction.commit().await.map_err(failed)?;
                 deletion.reclaim().await;
                 if rows == 0 {

@@ -185,7 +185,7 @@ impl Server {
             shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         }
         if config.role.answers_clients() {
-            shutdown.spawn(connect::run(app.clone(), shutdown.clone()));
+            shutdown.spawn(connect::Supervisor::start(app.clone()).await.run(shutdown.clone()));
         }
         shutdown.spawn(maintenance_loop(reloader, config.role, shutdown.clone()));
         shutdown.spawn(retention_loop(app.clone(), shutdown.clone()));

@@ -54,8 +54,9 @@ pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
-    LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SiteEvent, SiteEventKind,
-    SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate, TrackPoint, WorldSighting, WorldTrackPoint,
+    LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SinkFeed, SinkFeeds,
+    SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
+    TrackPoint, WantedPositions, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;
@@ -87,6 +88,8 @@ pub struct Parts {
     pub site_registry: SiteRegistry,
     /// What connections with other systems do.
     pub connection_board: ConnectionBoard,
+    /// What waits for the outboxes of their sinks.
+    pub sink_feeds: SinkFeeds,
     /// Where their sinks write files, if they may: set by the server at its start.
     pub export_folder: OnceLock<PathBuf>,
     /// Serial devices that their sources may read: set by the server at its start.
@@ -158,6 +161,7 @@ impl App {
             registry,
             site_registry,
             connection_board: ConnectionBoard::default(),
+            sink_feeds: SinkFeeds::new(randomness.uuid_v7(clock.now())),
             export_folder: OnceLock::new(),
             serial_devices: OnceLock::new(),
             access,
@@ -212,6 +216,7 @@ impl App {
         if tokio::time::timeout(CLOSE_TIME, self.tasks.wait()).await.is_err() {
             tracing::warn!("samples or residuals of live streams were still under way at the end");
         }
+        self.close_outbox_logs().await;
         self.store.close().await;
     }
 }

@@ -33,5 +33,5 @@ mod trial;
 mod udp;
 mod webhook;
 
-pub use supervisor::run;
+pub use supervisor::Supervisor;
 pub use trial::{Trial, try_connection};

@@ -1,14 +1,13 @@
-//! From the tracks of cameras to the outbox of a sink.
+//! From the positions of cameras to the outbox of a sink.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::mpsc;
-use tokio_util::task::AbortOnDropHandle;
+use sha2::{Digest as _, Sha256};
+use uuid::Builder;
 
-use crate::app::{App, CameraEvent, CameraEvents, LiveConnection, TrackPoint};
-use crate::domain::{CameraId, ConnectionKey, OutboxMessage, Result, TargetId};
+use crate::app::{App, LiveConnection, SinkFeed, SinkPosition};
+use crate::domain::{ConnectionKey, Observation, OutboxMessage};
 use crate::exchange::{
     OutgoingFormat, OutgoingPosition, SinkSettings, cot_event, onvif_frame, position_json,
 };
@@ -17,15 +16,12 @@ use crate::exchange::{
 const GATHERING: Duration = Duration::from_millis(100);
 /// Messages of one transaction.
 const MAX_BATCH: usize = 256;
-/// Time until a camera that does not exist is looked for again.
-const RETRY_CAMERA: Duration = Duration::from_secs(2);
-/// Targets whose last position is remembered; beyond, those that are silent are forgotten.
-const MAX_TARGETS: usize = 4_096;
-const DEFAULT_INTERVAL_S: f64 = 1.0;
+/// Time until what the outbox did not take is offered again.
+const RETRY: Duration = Duration::from_millis(200);
 const DEFAULT_STALE_S: f64 = 30.0;
 const DEFAULT_COT_TYPE: &str = "a-u-G";
 
-/// Writes the positions of a sink's cameras into its outbox, for as long as it is polled.
+/// Writes the positions of a sink's cameras into its outbox, until the server ends.
 pub(super) struct Publisher<'a> {
     pub(super) app: &'a App,
     pub(super) key: ConnectionKey,
@@ -34,94 +30,60 @@ pub(super) struct Publisher<'a> {
 }
 
 impl Publisher<'_> {
-    pub(super) async fn run(self) -> Result<std::convert::Infallible> {
-        let (points, mut incoming) = mpsc::channel(self.app.limits.connection_queue);
-        let cameras = self.settings.cameras()?;
-        let mut readers = Vec::with_capacity(cameras.len());
-        for camera in cameras {
-            let events = self.app.own_camera_events(&camera).await.ok();
-            let reader = read_camera(self.app.clone(), camera, events, points.clone(), self.live.clone());
-            readers.push(AbortOnDropHandle::new(tokio::spawn(reader)));
-        }
+    pub(super) async fn run(self) {
+        let Some(feed) = self.app.sink_feeds.of(self.key) else { return };
+        // Before anything else the database is told of the log, so that it will be known if this process ends too soon.
+        self.store(&[]).await;
         // Set before, where the settings have changed since.
         let _ = self.live.publishing.set(());
-        let mut last_sent = HashMap::new();
-        let mut batch = Vec::new();
         loop {
-            // The sender above keeps the channel open.
-            let Some(first) = incoming.recv().await else { return std::future::pending().await };
-            let mut next = Some(first);
-            let gathered = tokio::time::sleep(GATHERING);
-            tokio::pin!(gathered);
-            while let Some((camera, point)) = next {
-                if self.is_due(&mut last_sent, &camera, &point) {
-                    batch.push(self.message(&camera, &point));
+            tokio::select! {
+                () = self.app.sink_feeds.closed() => return,
+                waiting = feed.waiting() => if waiting < MAX_BATCH {
+                    tokio::time::sleep(GATHERING).await;
                 }
-                if batch.len() >= MAX_BATCH {
-                    break;
-                }
-                next = tokio::select! {
-                    () = &mut gathered => None,
-                    point = incoming.recv() => point,
-                };
             }
-            self.store(&mut batch).await;
+            self.publish(&feed).await;
         }
     }
 
-    async fn store(&self, batch: &mut Vec<OutboxMessage>) {
-        if batch.is_empty() {
-            return;
-        }
-        let count = batch.len() as u64;
-        match self.app.store.append_to_outbox(self.key, batch).await {
-            Ok(dropped) => self.live.update(|status| {
-                status.items += count;
-                status.dropped += dropped;
-            }),
-            Err(error) => {
-                let now = self.app.clock.now();
-                self.live.update(|status| {
-                    status.dropped += count;
-                    status.last_error = Some((now, format!("positions could not be queued: {error}")));
-                });
-            }
-        }
-        batch.clear();
+    /// Brings the oldest positions into the outbox. Where that is interrupted, they are still the oldest.
+    async fn publish(&self, feed: &SinkFeed) {
+        let positions = feed.oldest(MAX_BATCH);
+        let messages: Vec<_> = positions.iter().map(|position| self.message(position)).collect();
+        self.store(&messages).await;
+        let lost = feed.take_lost();
+        self.live.update(|status| {
+            status.items += messages.len() as u64;
+            status.dropped += lost;
+        });
+        feed.settle(positions.last().map_or(0, |last| last.number));
         self.live.queued.notify_one();
     }
 
-    /// Whether a target's last position was sent long enough ago.
-    fn is_due(
-        &self,
-        last_sent: &mut HashMap<(CameraId, TargetId), f64>,
-        camera: &CameraId,
-        point: &TrackPoint,
-    ) -> bool {
-        let interval_s = self.settings.min_interval_s.unwrap_or(DEFAULT_INTERVAL_S);
-        let time_s = point.state.time.as_microsecond() as f64 * 1e-6;
-        if last_sent.len() >= MAX_TARGETS {
-            last_sent.retain(|_, sent_s| time_s - *sent_s < 60.0_f64.max(interval_s));
-        }
-        let key = (camera.clone(), point.target_id.clone());
-        match last_sent.get_mut(&key) {
-            // A time that steps back is another run of the same target.
-            Some(sent_s) if (0.0..interval_s).contains(&(time_s - *sent_s)) => false,
-            Some(sent_s) => {
-                *sent_s = time_s;
-                true
+    /// Appends messages, again and again until the outbox has them.
+    async fn store(&self, messages: &[OutboxMessage]) {
+        let mut is_first = true;
+        loop {
+            match self.app.append_to_outbox(self.key, messages).await {
+                Ok(dropped) => return self.live.update(|status| status.dropped += dropped),
+                Err(error) => {
+                    if std::mem::take(&mut is_first) {
+                        tracing::warn!(%error, "positions wait for the outbox of a sink; it is tried again");
+                    }
+                    let error = format!("positions wait for the outbox: {error}");
+                    let now = self.app.clock.now();
+                    self.live.update(|status| status.last_error = Some((now, error)));
+                }
             }
-            None => {
-                last_sent.insert(key, time_s);
-                true
-            }
+            tokio::time::sleep(RETRY).await;
         }
     }
 
-    fn message(&self, camera: &CameraId, point: &TrackPoint) -> OutboxMessage {
-        let now = self.app.clock.now();
-        let message_id = self.app.randomness.uuid_v7(now).to_string();
-        let position = OutgoingPosition {
+    fn message(&self, position: &SinkPosition) -> OutboxMessage {
+        let SinkPosition { number, camera, point, .. } = position;
+        let message_id = message_id(self.key, position);
+        let outgoing = OutgoingPosition {
             message_id: &message_id,
             camera_id: camera,
             target_id: &point.target_id,
@@ -132,12 +94,44 @@ impl Publisher<'_> {
             velocity_m_s: [point.state.velocity.east_m_s, point.state.velocity.north_m_s],
         };
         OutboxMessage {
-            number: 0,
+            number: number.cast_signed(),
             subject: self.settings.topic_of(camera, &point.target_id),
-            payload: payload(self.settings, &position),
-            created_at: now,
+            payload: payload(self.settings, &outgoing),
+            created_at: self.app.clock.now(),
             message_id,
         }
+    }
+}
+
+/// The id of a position for a sink: a UUID of version 7 of the observation's time, whose other bits are a hash of what was
+/// observed. A client that sends an observation again, to whichever node, makes no other message of it.
+fn message_id(key: ConnectionKey, position: &SinkPosition) -> String {
+    let SinkPosition { camera, observation, point, .. } = position;
+    let mut hash = Sha256::new();
+    hash.update(key.0.to_le_bytes());
+    for name in [camera.as_str(), point.target_id.as_str()] {
+        hash.update((name.len() as u64).to_le_bytes());
+        hash.update(name);
+    }
+    hash.update(observation.time().as_microsecond().to_le_bytes());
+    hash_measurements(&mut hash, observation);
+    let mut random = [0; 10];
+    random.copy_from_slice(&hash.finalize()[..10]);
+    let millis = u64::try_from(observation.time().as_millisecond()).unwrap_or_default();
+    Builder::from_unix_timestamp_millis(millis, &random).into_uuid().to_string()
+}
+
+fn hash_measurements(hash: &mut Sha256, observation: &Observation) {
+    let mut add = |mark: u8, numbers: &[f64]| {
+        hash.update([mark]);
+        numbers.iter().for_each(|number| hash.update(number.to_le_bytes()));
+    };
+    if let Some(bounding_box) = observation.bounding_box() {
+        add(1, &bounding_box.sides_px());
+    }
+    if let Some(fix) = observation.fix() {
+        let sigma_m = fix.sigma_m.map_or(f64::NAN, |sigma_m| sigma_m.metres());
+        add(2, &[fix.position.longitude_deg(), fix.position.latitude_deg(), sigma_m]);
     }
 }
 
@@ -151,34 +145,5 @@ pub(super) fn payload(settings: &SinkSettings, position: &OutgoingPosition<'_>) 
             let cot_type = settings.cot_type.as_deref().unwrap_or(DEFAULT_COT_TYPE);
             cot_event(position, cot_type, settings.stale_s.unwrap_or(DEFAULT_STALE_S))
         }
-    }
-}
-
-/// Hands on the points of a camera's tracks, also of one that is created later, or again.
-async fn read_camera(
-    app: App,
-    camera: CameraId,
-    mut opened: Option<CameraEvents>,
-    points: mpsc::Sender<(CameraId, Arc<TrackPoint>)>,
-    live: Arc<LiveConnection>,
-) {
-    loop {
-        if opened.is_none() {
-            opened = app.own_camera_events(&camera).await.ok();
-        }
-        if let Some(mut events) = opened.take() {
-            while let Some(event) = events.next().await {
-                match event {
-                    Ok((_, event)) => {
-                        let CameraEvent::Track(update) = &*event else { continue };
-                        if points.send((camera.clone(), update.point.clone())).await.is_err() {
-                            return;
-                        }
-                    }
-                    Err(lost) => live.update(|status| status.dropped += lost.count.unwrap_or(1)),
-                }
-            }
-        }
-        tokio::time::sleep(RETRY_CAMERA).await;
     }
 }

@@ -23,18 +23,20 @@ use super::open;
 use super::publish::Publisher;
 use super::source::SourceIdentity;
 use crate::app::{
-    App, ConnectionLease, ConnectionState, LiveConnection, ReportedStatuses, connection_groups,
-    connection_settings,
+    App, ConnectionLease, ConnectionState, LiveConnection, ReportedStatuses, WantedPositions,
+    connection_groups, connection_settings,
 };
 use crate::backoff::Backoff;
 use crate::domain::{CameraId, Connection, ConnectionId, ConnectionKey, Result, Revision};
-use crate::exchange::{ConnectionSettings, Secrets, SinkSettings, SourceSettings};
+use crate::exchange::{ConnectionSettings, Secrets, SourceSettings};
 use crate::shutdown::Shutdown;
 
 /// How often connections are looked for that another process has changed, or has ceased to run.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// How often unsettled messages are looked at.
 const SETTLE_EVERY: Duration = Duration::from_millis(20);
+/// Least time between two positions of a target where a sink does not say, s.
+const DEFAULT_INTERVAL_S: f64 = 1.0;
 /// Connections read at a time.
 const PAGE: u32 = 256;
 
@@ -77,54 +79,107 @@ struct WantedTask {
     lease: ConnectionLease,
 }
 
-/// Runs the parts of all connections that this node has to run, until the server shuts down.
-pub async fn run(app: App, shutdown: Shutdown) {
-    let mut supervisor = Supervisor {
-        app,
-        running: HashMap::new(),
-        tasks: TaskTracker::new(),
-        unreadable: HashSet::new(),
-        reported: ReportedStatuses::default(),
-    };
-    while !shutdown.is_draining() {
-        if let Err(error) = supervisor.look().await {
-            tracing::error!(%error, "cannot look for changed connections");
-        }
-        tokio::select! {
-            () = shutdown.draining() => {}
-            () = supervisor.app.connection_board.changed() => {}
-            () = tokio::time::sleep(LOOK_EVERY) => {}
-        }
-    }
-    supervisor.running.values().for_each(|task| task.cancel.cancel());
-    supervisor.tasks.close();
-    supervisor.tasks.wait().await;
-}
-
-struct Supervisor {
+/// Runs the parts of all connections that a node has to run.
+pub struct Supervisor {
     app: App,
     running: HashMap<(ConnectionId, Part), RunningTask>,
+    /// Those that end when the server begins to shut down.
     tasks: TaskTracker,
+    /// The connections as they were when the sinks among them were last told apart by cameras.
+    fed: Vec<(ConnectionKey, Revision)>,
     /// Connections whose settings could not be read, which is logged once.
     unreadable: HashSet<(ConnectionKey, Revision)>,
     reported: ReportedStatuses,
 }
 
 impl Supervisor {
+    /// Starts the connections; no position of a camera that is measured afterwards is missing in its sinks.
+    pub async fn start(app: App) -> Self {
+        let mut supervisor = Self {
+            app,
+            running: HashMap::new(),
+            tasks: TaskTracker::new(),
+            fed: Vec::new(),
+            unreadable: HashSet::new(),
+            reported: ReportedStatuses::default(),
+        };
+        supervisor.try_look().await;
+        supervisor
+    }
+
+    /// Goes on until the server shuts down. Publishers go on after it, for as long as positions are made.
+    pub async fn run(mut self, shutdown: Shutdown) {
+        while !shutdown.is_draining() {
+            tokio::select! {
+                () = shutdown.draining() => break,
+                () = self.app.connection_board.changed() => {}
+                () = tokio::time::sleep(LOOK_EVERY) => {}
+            }
+            self.try_look().await;
+        }
+        let ends_now = |((_, part), _): &(&(ConnectionId, Part), &RunningTask)| *part != Part::Publisher;
+        self.running.iter().filter(ends_now).for_each(|(_, task)| task.cancel.cancel());
+        self.tasks.close();
+        self.tasks.wait().await;
+    }
+
+    async fn try_look(&mut self) {
+        if let Err(error) = self.look().await {
+            tracing::error!(%error, "cannot look for changed connections");
+        }
+    }
+
     /// Starts and ends tasks, so that they are those of the stored connections, and tells other nodes what they do.
     async fn look(&mut self) -> Result<()> {
         let connections = all_connections(&self.app).await?;
+        self.count_lost(&connections).await?;
+        let all: Vec<_> =
+            connections.iter().map(|connection| (connection.key, connection.revision)).collect();
         let active: Vec<_> = connections
             .into_iter()
             .filter(|connection| !connection.profile.paused)
             .filter_map(|connection| self.read(connection).map(Arc::new))
             .collect();
+        self.feed(all, &active);
         let site_of = |camera: &CameraId| self.app.registry.get(camera).and_then(|known| known.site.clone());
         let keyed = active.iter().map(|active| (active.connection.key, &active.settings));
         let groups = connection_groups(keyed, site_of);
         let leases = self.app.own_connections(&groups).await?;
         self.adjust(active.into_iter().flat_map(|active| wanted_tasks(active, &leases)).collect());
         self.app.report_connections(&mut self.reported).await
+    }
+
+    /// Counts what processes may have lost that ended before their positions were in the outboxes.
+    async fn count_lost(&self, connections: &[Connection]) -> Result<()> {
+        for key in self.app.lost_outbox_logs().await? {
+            let Some(connection) = connections.iter().find(|connection| connection.key == key) else {
+                continue;
+            };
+            let message = "a server ended before its last positions were queued; some may be missing";
+            tracing::warn!(connection = %connection.id(), message);
+            let error = Some((self.app.clock.now(), message.to_owned()));
+            self.app.live_connection(connection).update(|status| {
+                // How many is not known.
+                status.dropped += 1;
+                status.last_error = error;
+            });
+        }
+        Ok(())
+    }
+
+    /// Lets the sinks get the positions of their cameras, after anything has changed.
+    fn feed(&mut self, all: Vec<(ConnectionKey, Revision)>, active: &[Arc<ActiveConnection>]) {
+        if self.fed == all {
+            return;
+        }
+        let wanted = active.iter().filter_map(|active| {
+            let (key, sink) = (active.connection.key, active.settings.sink.as_ref()?);
+            let min_interval_s = sink.min_interval_s.unwrap_or(DEFAULT_INTERVAL_S);
+            Some(WantedPositions { key, cameras: sink.cameras().ok()?, min_interval_s })
+        });
+        let wanted: Vec<_> = wanted.collect();
+        self.app.sink_feeds.feed(&all.iter().map(|(key, _)| *key).collect(), &wanted);
+        self.fed = all;
     }
 
     fn read(&mut self, connection: Connection) -> Option<ActiveConnection> {
@@ -154,7 +209,11 @@ impl Supervisor {
             let (version, cancel) = (task.version(), CancellationToken::new());
             // A port or a session that the one before holds must be free.
             let before = ending.remove(&id).map(|task| task.handle);
-            let handle = self.tasks.spawn(run_task(self.app.clone(), task, before, cancel.clone()));
+            let running = run_task(self.app.clone(), task, before, cancel.clone());
+            let handle = match id.1 {
+                Part::Publisher => tokio::spawn(running),
+                Part::Intake | Part::Delivery => self.tasks.spawn(running),
+            };
             self.running.insert(id, RunningTask { version, cancel, handle });
         }
     }
@@ -216,7 +275,9 @@ async fn run_part(app: &App, task: &WantedTask, live: &Arc<LiveConnection>) {
         (Part::Intake, Some(settings), _) => {
             retried(app, connection, live, Work::Source { settings, secrets }).await;
         }
-        (Part::Publisher, _, Some(settings)) => publish(app, connection, settings, live).await,
+        (Part::Publisher, _, Some(settings)) => {
+            Publisher { app, key: connection.key, settings, live }.run().await;
+        }
         (Part::Delivery, _, Some(settings)) => {
             let client_id = client_id(connection);
             let delivery = Delivery {
@@ -307,11 +368,4 @@ async fn run_source(
         source.settle(settled).await?;
         live.update(|status| status.acknowledged += count);
     }
-}
-
-async fn publish(app: &App, connection: &Connection, settings: &SinkSettings, live: &Arc<LiveConnection>) {
-    let Err(error) = Publisher { app, key: connection.key, settings, live }.run().await;
-    tracing::error!(connection = %connection.id(), %error, "positions cannot be queued");
-    // Its settings name no cameras that it could read.
-    std::future::pending().await
 }

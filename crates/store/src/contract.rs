@@ -17,7 +17,7 @@ use crate::domain::{
     ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraMoved, Connection, ConnectionId, ConnectionKey,
     DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
     EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
-    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxMessage, Result, Revision,
+    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Result, Revision,
     RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
     SourceOffset, StoredSample, TrainingOptions, TrainingRun,
 };
@@ -582,11 +582,26 @@ contract! {
     /// [`ErrorKind::ConnectionNotFound`], [`ErrorKind::RevisionMismatch`].
     fn delete_connection(&self, id: &ConnectionId, expected: Option<ExpectedVersion<ConnectionKey>>, now: Timestamp) -> Result<()>;
 
-    /// Appends messages; how many of the oldest were dropped for the limit. A connection that was deleted takes none.
+    /// Appends messages of a process's log, in the order of their numbers, but for those that were appended before; how
+    /// many of the oldest were dropped for the limit. Without messages only the log is noted. A connection that was deleted
+    /// takes none.
     ///
     /// # Errors
     /// [`ErrorKind::InsufficientStorage`]; then none is stored.
-    fn append_to_outbox(&self, key: ConnectionKey, messages: &[OutboxMessage]) -> Result<u64>;
+    fn append_to_outbox(&self, key: ConnectionKey, log: &OutboxLog, messages: &[OutboxMessage]) -> Result<u64>;
+
+    /// Connections whose logs were left open by processes that have ended: messages of theirs may be lost. Each is returned
+    /// once. Where several processes share the database, one has ended when it has not been registered for ten seconds.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn lost_outbox_logs(&self, own: &OutboxLog) -> Result<Vec<ConnectionKey>>;
+
+    /// Notes that all messages of a process's log are in the outboxes of these connections, and that none will come.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn close_outbox_logs(&self, own: &OutboxLog, connections: &[ConnectionKey]) -> Result<()>;
 
     /// The oldest waiting messages.
     ///

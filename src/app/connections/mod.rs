@@ -3,6 +3,7 @@
 //! Here they are created, changed and watched; `connect` runs them.
 
 mod groups;
+mod outbox;
 mod reports;
 mod status;
 

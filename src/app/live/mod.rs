@@ -17,6 +17,7 @@ mod matching;
 mod retraining;
 mod sample_committer;
 mod sample_recorder;
+mod sink_feeds;
 pub(super) mod site;
 mod stream;
 pub(super) mod sync;
@@ -48,6 +49,7 @@ pub use camera::{CameraEvent, TargetUpdate};
 pub use camera_events::{EventId, LostEvents};
 pub(super) use identification::MatchingSlot;
 pub(super) use retraining::RetrainSchedule;
+pub use sink_feeds::{SinkFeed, SinkFeeds, SinkPosition, WantedPositions};
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
     WorldSighting, WorldTrackPoint,
@@ -175,6 +177,7 @@ impl App {
         };
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
+            self.sink_feeds.push(&camera.id, observation, point);
             camera.live.announce_track(now, || TargetUpdate {
                 point: point.clone(),
                 bounding_box: observation.bounding_box(),
@@ -245,15 +248,6 @@ impl App {
         let camera = self.readable_camera(id).await?;
         let watch = self.watch_camera_owner(&camera);
         Ok(CameraEvents { reader: camera.live.events.reader(last_seen), live: camera.live.clone(), watch })
-    }
-
-    /// What happens in a camera's view on this node alone, from now on.
-    ///
-    /// # Errors
-    /// `CameraNotFound`.
-    pub async fn own_camera_events(&self, id: &CameraId) -> Result<CameraEvents> {
-        let live = self.active_camera(id).await?.live.clone();
-        Ok(CameraEvents { reader: live.events.reader(None), live, watch: Watch::default() })
     }
 
     /// Whether a camera's active model no longer fits what the camera sees.

@@ -242,4 +242,70 @@ async fn a_sink_of_cameras_on_two_nodes_is_delivered_once() {
     taken.dedup();
     assert_eq!((taken.len(), receiver.taken().len()), (45, 45), "each once");
     assert_eq!(runner(&other, "hook").await, url(&other));
+    // What the other node had not queued cannot be known.
+    connection_when(&other, "hook", |status| status["dropped"] == 1).await;
+}
+
+/// Has a node give a camera up for another.
+fn hand_over(folder: &Path, camera: &str, to: &TestServer) {
+    let wanted = format!(
+        "UPDATE camera_owners SET wanted_by = (SELECT id FROM nodes WHERE url = '{}') \
+         WHERE camera_key = (SELECT key FROM cameras WHERE id = '{camera}')",
+        url(to)
+    );
+    sql(folder, &wanted);
+}
+
+/// Sends a fix to a node until it has the camera.
+async fn fix_when_owner(server: &TestServer, camera: &str, fix: &Value) {
+    let path = format!("/v1/cameras/{camera}/tracks?store_samples=false");
+    for _ in 0..1_500 {
+        if server.post(&path, &json!({"observations": [fix]})).await.status == 200 {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    panic!("{} never owns {camera}", url(server))
+}
+
+/// A camera that goes to another node and comes back, six times: each position is delivered, and what is sent again to
+/// the next owner has the id that it had.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_camera_that_changes_nodes_loses_no_position_and_doubles_none() {
+    let folder = data_folder();
+    let nodes = [node(folder.path()), node(folder.path())];
+    create(&nodes[0], &json!({"id": "yard"})).await;
+    let (receiver, address) = Receiver::start().await;
+    let sink = json!({"address": address, "camera_ids": ["yard"], "min_interval_s": 0});
+    nodes[0].post("/v1/connections", &json!({"id": "hook", "sink": sink})).await.expect(201);
+    runner(&nodes[1], "hook").await;
+    // Both nodes publish from here on; a node looks for connections once a second.
+    tokio::time::sleep(Duration::from_millis(1_500)).await;
+    let fix = |target: String| {
+        json!({"time": now().to_string(), "target_id": target,
+            "fix": {"longitude_deg": 103.98678, "latitude_deg": 30.628, "sigma_m": 1.5}})
+    };
+    let mut last = fix("first".to_owned());
+    fix_when_owner(&nodes[0], "yard", &last).await;
+    for turn in 1..=6 {
+        let owner = &nodes[turn % 2];
+        hand_over(folder.path(), "yard", owner);
+        // The answer to it was lost, as far as its sender knows.
+        fix_when_owner(owner, "yard", &last).await;
+        for item in 0..10 {
+            last = fix(format!("van-{turn}-{item}"));
+            fix_when_owner(owner, "yard", &last).await;
+        }
+    }
+    let mut ids = until_taken(&receiver, 67).await;
+    let shown = |status: &Value| status["items"] == 67 && status["queued"] == 0 && status["dropped"] == 0;
+    connection_when(&nodes[0], "hook", shown).await;
+    ids.sort_unstable();
+    ids.dedup();
+    assert_eq!(
+        (ids.len(), receiver.taken().len()),
+        (61, 67),
+        "61 observations, 6 of them sent to both nodes"
+    );
 }

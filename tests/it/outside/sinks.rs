@@ -336,3 +336,72 @@ async fn a_sink_with_nothing_to_deliver_notices_that_its_peer_has_gone() {
         assert_eq!(status["status"]["connects"], 1, "{status}");
     }
 }
+
+/// Ids of the messages that come to a webhook until the outbox is empty, each answered with 200.
+async fn delivered(listener: &TcpListener, count: usize) -> Vec<String> {
+    let mut ids = Vec::new();
+    let mut stream = accept(listener).await;
+    while ids.len() < count {
+        ids.push(Hook::answered(&mut stream, 200).await.header("webhook-id").to_owned());
+    }
+    ids
+}
+
+/// A sink of all positions at an address where nobody listens.
+async fn idle_sink(server: &TestServer, address: std::net::SocketAddr) {
+    create_gate(server).await;
+    let sink = json!({"address": format!("http://{address}/hook?site=1"), "camera_ids": ["gate"], "min_interval_s": 0});
+    server.post("/v1/connections", &json!({"id": "hook", "sink": sink})).await.expect(201);
+    connection_when(server, "hook", |status| status["state"] == "waiting").await;
+}
+
+/// While the outbox cannot be written, positions wait, and each comes once when it can be.
+#[tokio::test]
+async fn outages_of_the_outbox_lose_no_position() {
+    let address = own_address();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    idle_sink(&server, address).await;
+    let database = rusqlite::Connection::open(folder.path().join("sightfix.db")).expect("the database");
+    for outage in 0..3 {
+        database.execute_batch("ALTER TABLE outbox RENAME TO away").expect("renamed");
+        for item in 0..10 {
+            send_fix(&server, &format!("van-{outage}-{item}"), &now().to_string(), 103.98678, false).await;
+        }
+        let waits =
+            |status: &Value| status["last_error"]["message"].as_str().is_some_and(|it| it.contains("outbox"));
+        server.logged(|line| line.to_string().contains("positions wait for the outbox")).await;
+        tokio::time::sleep(std::time::Duration::from_millis(500)).await;
+        database.execute_batch("ALTER TABLE away RENAME TO outbox").expect("renamed");
+        let shown = connection_when(&server, "hook", |status| status["items"] == 10 * (outage + 1)).await;
+        assert_eq!(shown["status"]["dropped"], 0, "{shown}");
+        assert!(waits(&shown["status"]) || shown["status"]["state"] == "waiting", "{shown}");
+    }
+    let listener = TcpListener::bind(address).await.expect("the address is free");
+    let mut ids = delivered(&listener, 30).await;
+    ids.sort_unstable();
+    ids.dedup();
+    assert_eq!(ids.len(), 30, "each once");
+    connection_when(&server, "hook", |status| status["queued"] == 0 && status["dropped"] == 0).await;
+}
+
+/// A server that ends in order leaves every position in the outbox. One that is killed may lose the latest, which the next
+/// one counts.
+#[tokio::test]
+async fn no_position_is_lost_silently_at_the_end_of_a_server() {
+    let address = own_address();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    idle_sink(&server, address).await;
+    send_fixes(&server, "van", 20).await;
+    assert!(server.terminate(), "ends well");
+    let server = TestServer::start(folder.path());
+    let shown = connection_when(&server, "hook", |status| status["state"] == "waiting").await;
+    assert_eq!((&shown["status"]["queued"], &shown["status"]["dropped"]), (&json!(20), &json!(0)), "{shown}");
+    send_fixes(&server, "car", 20).await;
+    server.kill();
+    let server = TestServer::start(folder.path());
+    let shown = connection_when(&server, "hook", |status| status["dropped"] == 1).await;
+    println!("killed: {} of 20 were queued", shown["status"]["queued"].as_u64().expect("a number") - 20);
+    server.logged(|line| line.to_string().contains("before its last positions were queued")).await;
+}

@@ -3,9 +3,11 @@
 use std::fmt;
 
 use jiff::Timestamp;
+use uuid::Uuid;
 
 use super::camera::{ExpectedVersion, Revision};
 use super::names::ConnectionId;
+use super::node::NodeId;
 
 /// A connection as the operator defines it. Settings and secrets are JSON that has been checked where it was read.
 #[derive(Clone, PartialEq, Eq)]
@@ -80,7 +82,8 @@ impl Connection {
 /// A message that is to be delivered at least once.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OutboxMessage {
-    /// Its place in the outbox; messages are delivered in this order. 0 before it is stored.
+    /// Its place in the outbox; messages are delivered in this order. Before it is stored, its place in the log that it
+    /// comes from, from 1.
     pub number: i64,
     /// The same at every attempt, so that the receiver can recognise a repetition.
     pub message_id: String,
@@ -90,6 +93,15 @@ pub struct OutboxMessage {
     pub payload: Vec<u8>,
     /// When it was made.
     pub created_at: Timestamp,
+}
+
+/// The log of positions that a process keeps for each sink until they are in its outbox.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OutboxLog {
+    /// Another one for every run of a process.
+    pub id: Uuid,
+    /// The process, where several share the database.
+    pub node: Option<NodeId>,
 }
 
 /// How far a source has read a partition of a topic.

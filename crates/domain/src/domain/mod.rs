@@ -43,7 +43,8 @@ pub use bounding_box::{BoundingBox, ImageSize};
 pub use camera::{Camera, CameraChange, CameraKey, CameraMoved, ExpectedVersion, NewCamera, Revision};
 pub use checksum::model_sha256;
 pub use connection::{
-    Connection, ConnectionKey, DeadLetter, NewConnection, OutboxCounts, OutboxMessage, SourceOffset,
+    Connection, ConnectionKey, DeadLetter, NewConnection, OutboxCounts, OutboxLog, OutboxMessage,
+    SourceOffset,
 };
 pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Violation, convert_all};

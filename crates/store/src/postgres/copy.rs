@@ -37,7 +37,7 @@ impl CopyTransaction for Copying {
                 "SELECT relname::TEXT FROM pg_class WHERE relnamespace = current_schema()::REGNAMESPACE \
                  AND (relkind = 'p' OR relkind = 'r' AND NOT relispartition AND relname !~ '^samples_.*[0-9]{8}$') \
                  AND relname NOT IN ('_sqlx_migrations', 'nodes', 'camera_owners', 'connection_owners', \
-                 'connection_statuses', 'camera_changes') ORDER BY relname::TEXT COLLATE \"C\"",
+                 'connection_statuses', 'camera_changes', 'outbox_logs') ORDER BY relname::TEXT COLLATE \"C\"",
             )
             .fetch_all(&mut *self.0)
             .await

@@ -24,6 +24,7 @@ mod locks;
 mod models;
 mod nodes;
 mod outbox;
+mod outbox_logs;
 mod retention;
 mod runs;
 mod sample_partitions;

@@ -8,7 +8,8 @@ use sqlx::PgConnection;
 
 use super::Store;
 use super::errors::failed;
-use crate::domain::{ConnectionKey, DeadLetter, OutboxCounts, OutboxMessage, Result};
+use super::outbox_logs::{lock_log, note_position};
+use crate::domain::{ConnectionKey, DeadLetter, OutboxCounts, OutboxLog, OutboxMessage, Result};
 use crate::row_decoder::RowDecoder;
 use crate::rows::connections::{read_dead_letter, read_message};
 
@@ -16,10 +17,12 @@ impl Store {
     pub(crate) async fn append_to_outbox(
         &self,
         key: ConnectionKey,
+        log: &OutboxLog,
         messages: &[OutboxMessage],
     ) -> Result<u64> {
         let mut transaction = self.writer().await?;
-        for message in messages {
+        let Some(position) = lock_log(&mut transaction, key, log).await? else { return Ok(0) };
+        for message in messages.iter().filter(|message| message.number > position) {
             sqlx::query(
                 "INSERT INTO outbox (connection_key, message_id, subject, payload, created_at_us) \
                  SELECT key, $1, $2, $3, $4 FROM connections WHERE key = $5",
@@ -32,6 +35,9 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+        }
+        if let Some(last) = messages.last().filter(|last| last.number > position) {
+            note_position(&mut transaction, key, log, last.number).await?;
         }
         let dropped = trim(&mut transaction, key, "IS NULL", self.limits().outbox_messages).await?;
         transaction.commit().await.map_err(failed)?;

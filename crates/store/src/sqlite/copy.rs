@@ -29,7 +29,7 @@ impl CopyTransaction for Copying {
         async move {
             sqlx::query_scalar(
                 "SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite%' \
-                 AND name <> '_sqlx_migrations'",
+                 AND name NOT IN ('_sqlx_migrations', 'outbox_logs')",
             )
             .fetch_all(&mut *self.0)
             .await

@@ -23,6 +23,7 @@ mod latest_runs;
 mod models;
 mod occupants;
 mod outbox;
+mod outbox_logs;
 mod reserve;
 mod restore;
 mod retention;

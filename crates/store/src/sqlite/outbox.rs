@@ -8,7 +8,8 @@ use sqlx::SqliteConnection;
 
 use super::Store;
 use super::errors::failed;
-use crate::domain::{ConnectionKey, DeadLetter, OutboxCounts, OutboxMessage, Result};
+use super::outbox_logs::{note_position, open_log};
+use crate::domain::{ConnectionKey, DeadLetter, OutboxCounts, OutboxLog, OutboxMessage, Result};
 use crate::row_decoder::RowDecoder;
 use crate::rows::connections::{read_dead_letter, read_message};
 
@@ -16,11 +17,13 @@ impl Store {
     pub(crate) async fn append_to_outbox(
         &self,
         key: ConnectionKey,
+        log: &OutboxLog,
         messages: &[OutboxMessage],
     ) -> Result<u64> {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
-        for message in messages {
+        let Some(position) = open_log(&mut transaction, key, log).await? else { return Ok(0) };
+        for message in messages.iter().filter(|message| message.number > position) {
             sqlx::query(
                 "INSERT INTO outbox (connection_key, message_id, subject, payload, created_at_us) \
                  SELECT key, ?, ?, ?, ? FROM connections WHERE key = ?",
@@ -33,6 +36,9 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
+        }
+        if let Some(last) = messages.last().filter(|last| last.number > position) {
+            note_position(&mut transaction, key, log, last.number).await?;
         }
         let dropped = trim(&mut transaction, key, "IS NULL", self.limits().outbox_messages).await?;
         transaction.commit().await.map_err(failed)?;

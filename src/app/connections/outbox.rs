@@ -1,0 +1,39 @@
+//! The outboxes of sinks, and the logs of positions that this process keeps for them.
+
+use crate::app::App;
+use crate::domain::{ConnectionKey, OutboxLog, OutboxMessage, Result};
+
+impl App {
+    /// Appends messages of this process's log to the outbox of a sink; how many of the oldest were dropped for the limit.
+    /// What the outbox has from an attempt whose outcome was not heard is left out.
+    ///
+    /// # Errors
+    /// The store cannot be written; then none is appended, or all are and the next attempt finds them.
+    pub async fn append_to_outbox(&self, sink: ConnectionKey, messages: &[OutboxMessage]) -> Result<u64> {
+        self.store.append_to_outbox(sink, &self.outbox_log(), messages).await
+    }
+
+    /// Sinks whose latest positions a process may have lost, since it ended before it had appended them; each loss is
+    /// returned once, by one process.
+    ///
+    /// # Errors
+    /// The store cannot be read or written.
+    pub async fn lost_outbox_logs(&self) -> Result<Vec<ConnectionKey>> {
+        self.store.lost_outbox_logs(&self.outbox_log()).await
+    }
+
+    /// At the end of the server: waits for the outboxes, and tells the database which of them have everything.
+    pub(in crate::app) async fn close_outbox_logs(&self) {
+        let complete = self.sink_feeds.close().await;
+        if complete.is_empty() {
+            return;
+        }
+        if let Err(error) = self.store.close_outbox_logs(&self.outbox_log(), &complete).await {
+            tracing::warn!(%error, "the next start will count positions of sinks as lost");
+        }
+    }
+
+    fn outbox_log(&self) -> OutboxLog {
+        OutboxLog { id: self.sink_feeds.log(), node: self.reporting_node() }
+    }
+}

@@ -204,28 +204,76 @@ async fn a_full_database_refuses_imports_fuses_on_and_recovers_by_deleting() {
     assert!(server.terminate());
 }
 
+/// A file system of its own for a data folder; unmounted when the test ends, however it ends.
+struct Mounted<'f>(&'f Path);
+
+impl<'f> Mounted<'f> {
+    fn new(folder: &'f Path) -> Self {
+        let mut mount = Command::new("mount");
+        mount.args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder);
+        assert!(mount.status().expect("mount runs").success(), "needs the superuser");
+        Self(folder)
+    }
+
+    /// Another program takes all that is left, in pieces of this size.
+    fn occupy(&self, name: &str, piece_bytes: usize) {
+        let mut file = std::fs::File::create(self.0.join(name)).expect("a file");
+        let piece = vec![b'x'; piece_bytes];
+        while file.write_all(&piece).is_ok() {}
+    }
+}
+
+impl Drop for Mounted<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(self.0).status();
+    }
+}
+
+const RESERVED: [(&str, &str); 1] = [("SIGHTFIX_LIMITS__RESERVE_BYTES", "20971520")];
+
 /// Needs the rights to mount; `.ci/run` runs it.
 #[tokio::test]
 #[ignore = "mounts a file system, which needs the superuser"]
 async fn a_full_disk_refuses_imports_fuses_on_and_recovers_by_deleting() {
-    /// Unmounts when the test ends, however it ends.
-    struct Mounted<'f>(&'f Path);
-
-    impl Drop for Mounted<'_> {
-        fn drop(&mut self) {
-            let _ = Command::new("umount").arg(self.0).status();
-        }
-    }
-
     let folder = data_folder();
-    let mut mount = Command::new("mount");
-    mount.args(["-t", "tmpfs", "-o", "size=48m", "tmpfs"]).arg(folder.path());
-    assert!(mount.status().expect("mount runs").success(), "needs the superuser");
-    let _mounted = Mounted(folder.path());
-    let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__RESERVE_BYTES", "20971520")]);
+    let _mounted = Mounted::new(folder.path());
+    let server = TestServer::start_with(folder.path(), &RESERVED);
     create_camera(&server, "c").await.expect(201);
     import_model(&server).await;
     activate(&server, 1).await;
+    let refused = fill(&server).await;
+    check_full_storage(&server, &refused).await;
+}
+
+/// Needs the rights to mount; `.ci/run` runs it.
+#[tokio::test]
+#[ignore = "mounts a file system, which needs the superuser"]
+async fn a_server_that_was_killed_on_a_full_disk_starts_and_answers_however_often() {
+    let folder = data_folder();
+    let mounted = Mounted::new(folder.path());
+    let mut server = TestServer::start_with(folder.path(), &RESERVED);
+    create_camera(&server, "c").await.expect(201);
+    import_model(&server).await;
+    activate(&server, 1).await;
+    fill(&server).await;
+    for round in 0..6 {
+        server.kill();
+        mounted.occupy(&format!("other-{round}"), 1 << (2 * round));
+        server = TestServer::start_with(folder.path(), &RESERVED);
+        let ready = server.get("/readyz").await.expect(200).text();
+        assert!(ready.contains("degraded: insufficient-storage"), "round {round}: {ready}");
+        let observation = json!({"observations": [{
+            "time": "2026-01-01T00:00:00Z",
+            "bounding_box": {"left_px": 900.0, "top_px": 500.0, "width_px": 40.0, "height_px": 90.0},
+        }]});
+        server.post("/v1/cameras/c/fusions", &observation).await.expect(200);
+        let reserve = std::fs::metadata(folder.path().join("sightfix.reserve")).expect("set aside again");
+        assert!(reserve.len() >= 16 << 20, "round {round}: {} bytes are left of the reserve", reserve.len());
+        problem(&fill(&server).await, 507, "insufficient-storage");
+    }
+    for round in 0..6 {
+        std::fs::remove_file(folder.path().join(format!("other-{round}"))).expect("removed");
+    }
     let refused = fill(&server).await;
     check_full_storage(&server, &refused).await;
 }

@@ -169,7 +169,14 @@ impl Usage {
 
     /// Samples could not be committed.
     pub(super) fn failed(&self, error: &Error) {
-        if error.kind() == ErrorKind::InsufficientStorage && !self.is_full.swap(true, Ordering::Relaxed) {
+        if error.kind() == ErrorKind::InsufficientStorage {
+            self.found_full();
+        }
+    }
+
+    /// No space is left.
+    pub(super) fn found_full(&self) {
+        if !self.is_full.swap(true, Ordering::Relaxed) {
             tracing::error!("there is no space for more samples; imports are refused until some is freed");
         }
     }

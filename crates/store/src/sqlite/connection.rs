@@ -32,7 +32,12 @@ static MIGRATIONS: Migrator = sqlx::migrate!("../../migrations/sqlite");
 /// Opens a database with its schema brought up to date. `max_pages` limits its size.
 pub(super) async fn open(path: &Path, max_pages: Option<u32>) -> Result<(Writer, SqlitePool)> {
     let options = options(path);
-    let writer = writer_options(options.clone());
+    let mut writer = writer_options(options.clone());
+    // Free pages can be given back to the disk in new files only: the setting is part of the file's format. In an
+    // existing one it is no change, and yet a commit, which makes a full disk copy the log back.
+    if std::fs::metadata(path).is_ok_and(|metadata| metadata.len() == 0) {
+        writer = writer.auto_vacuum(SqliteAutoVacuum::Incremental);
+    }
     let connection = open_writer(&writer).await.map_err(|cause| unusable(path, &cause))?;
     let readers = SqlitePoolOptions::new()
         .max_connections(READERS)
@@ -55,11 +60,9 @@ fn options(path: &Path) -> SqliteConnectOptions {
         .disable_statement_logging()
 }
 
-/// The log is copied back every 16 MB, and is cut to that size after a large change. Free pages can
-/// be given back to the disk in new files only: the setting is part of the file's format.
+/// The log is copied back every 16 MB, and is cut to that size after a large change.
 fn writer_options(options: SqliteConnectOptions) -> SqliteConnectOptions {
     options
-        .auto_vacuum(SqliteAutoVacuum::Incremental)
         .journal_mode(SqliteJournalMode::Wal)
         .pragma("cache_size", "-16000")
         .pragma("wal_autocheckpoint", "4000")

@@ -100,13 +100,19 @@ impl Store {
         let actor = Arc::new(Actor::program(&role));
         let path = folder::prepare(folder).await?;
         // Before the schema is touched: a server of another version may be using it.
+        let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
         let server_lock = match sharing {
-            Sharing::OneServer => Some(ServerLock::acquire(folder, &role)?),
+            Sharing::OneServer => {
+                let mut lock = ServerLock::acquire(folder)?;
+                space.make_room_to_start().await?;
+                lock.announce(&role)?;
+                Some(lock)
+            }
             Sharing::Command => None,
         };
         let (writer, readers) = connection::open(&path, Space::max_pages(&limits)).await?;
         let writer = Arc::new(writer);
-        let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
+        space.set_aside_at_start().await;
         let group_writer = GroupWriter { writer: Arc::clone(&writer), space: Arc::clone(&space) };
         let samples = GroupCommit::start(Arc::new(group_writer));
         let presence = Presence::announce(folder, &role)
@@ -121,7 +127,6 @@ impl Store {
         let server_lock = Mutex::new(server_lock);
         let inner = Inner { writer, readers, probe, samples, space, presence, server_lock };
         let store = Self { inner: Arc::new(inner), actor };
-        store.reserve_space().await;
         store.count_all_samples().await?;
         Ok(store)
     }

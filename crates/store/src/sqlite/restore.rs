@@ -38,7 +38,8 @@ pub async fn restore(folder: &Path, backup: &Path, now: Timestamp) -> Result<Res
     let report = check_file(backup, FileUse::Unused).await?;
     report.ensure_sound(backup)?;
     prepare_folder(folder).await?;
-    let _lock = ServerLock::acquire(folder, ROLE)?;
+    let mut lock = ServerLock::acquire(folder)?;
+    lock.announce(ROLE)?;
     let mut presence = Presence::announce(folder, ROLE).map_err(|error| not_written(folder, &error))?;
     let others = presence.newcomers().map_err(|error| not_written(folder, &error))?;
     if let Some(other) = others.first() {

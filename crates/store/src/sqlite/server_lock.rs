@@ -6,7 +6,7 @@
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Write as _};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::occupants::Occupant;
 use crate::domain::{Error, Result};
@@ -16,28 +16,18 @@ const NAME: &str = "server.lock";
 
 /// The lock, held until the value is dropped.
 pub(super) struct ServerLock {
-    _file: File,
+    file: File,
+    path: PathBuf,
 }
 
 impl ServerLock {
-    /// Takes the lock of a folder for this process.
+    /// Takes the lock of a folder for this process. Nothing is written, so that it works on a full disk.
     ///
     /// # Errors
-    /// A [`FolderFault`]: another process holds the lock, or the file cannot be written.
-    pub(super) fn acquire(folder: &Path, role: &str) -> Result<Self> {
+    /// A [`FolderFault`]: another process holds the lock, or the file cannot be opened for writing.
+    pub(super) fn acquire(folder: &Path) -> Result<Self> {
         let path = folder.join(NAME);
-        let unusable = |error: io::Error| {
-            let kind = match error.kind() {
-                io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => FolderFaultKind::NoSpace,
-                _ => FolderFaultKind::NotWritable,
-            };
-            let path = path.display();
-            FolderFault::error(
-                kind,
-                format!("{path} cannot be opened for writing ({error}); check owner, permissions and disk"),
-            )
-        };
-        let mut file = open(&path).map_err(unusable)?;
+        let file = open(&path).map_err(|error| unusable(&path, &error))?;
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => return Err(in_use(folder, read_holder(&path).as_ref())),
@@ -46,10 +36,30 @@ impl ServerLock {
                 tracing::warn!(%error, "the file system has no locks: make sure that only one server uses it");
             }
         }
-        let name = serde_json::to_vec(&Occupant::this_process(role)).map_err(Error::fault)?;
-        file.set_len(0).and_then(|()| file.write_all(&name)).map_err(unusable)?;
-        Ok(Self { _file: file })
+        Ok(Self { file, path })
     }
+
+    /// Writes the name of this process into the lock's file, for others that find the folder in use.
+    ///
+    /// # Errors
+    /// A [`FolderFault`]: the file cannot be written.
+    pub(super) fn announce(&mut self, role: &str) -> Result<()> {
+        let name = serde_json::to_vec(&Occupant::this_process(role)).map_err(Error::fault)?;
+        let written = self.file.set_len(0).and_then(|()| self.file.write_all(&name));
+        written.map_err(|error| unusable(&self.path, &error))
+    }
+}
+
+fn unusable(path: &Path, error: &io::Error) -> Error {
+    let kind = match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => FolderFaultKind::NoSpace,
+        _ => FolderFaultKind::NotWritable,
+    };
+    let path = path.display();
+    FolderFault::error(
+        kind,
+        format!("{path} cannot be opened for writing ({error}); check owner, permissions and disk"),
+    )
 }
 
 /// The process that holds the lock of a folder, if one does and has written its name.

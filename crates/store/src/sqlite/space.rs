@@ -13,7 +13,7 @@ use crate::domain::{Durability, Error, Result};
 use crate::limits::{StorageStatus, StoreLimits, Usage};
 
 /// SQLite's own; the files of this store have never had another.
-const PAGE_BYTES: u64 = 4_096;
+pub(super) const PAGE_BYTES: u64 = 4_096;
 
 /// Free pages that are left in the file for the next imports.
 const FREE_PAGES_KEPT: u64 = 1_024;
@@ -30,6 +30,35 @@ pub(super) struct Space {
 impl Space {
     pub(super) fn new(limits: StoreLimits, reserve: Reserve) -> Arc<Self> {
         Arc::new(Self { usage: Usage::new(limits), reserve })
+    }
+
+    /// On a full disk, releases the reserve, so that a server can open its database there: to be called with the
+    /// server's lock, before anything is written.
+    pub(super) async fn make_room_to_start(&self) -> Result<()> {
+        let available_bytes = self.reserve.available_bytes().await?;
+        if available_bytes.is_some_and(|bytes| bytes < ROOM_BYTES) {
+            self.usage.found_full();
+        }
+        if self.reserve.is_disk_scarce().await? {
+            let released_bytes = self.reserve.release().await?;
+            tracing::warn!(
+                available_bytes,
+                released_bytes,
+                "the disk is scarce: the reserve is released to start"
+            );
+        }
+        Ok(())
+    }
+
+    /// Sets space aside when the database is open, before anything is stored.
+    pub(super) async fn set_aside_at_start(&self) {
+        match self.reserve.ensure().await {
+            Ok(true) => {}
+            Ok(false) => {
+                tracing::warn!("the disk has no space for the reserve that deletions need when it is full")
+            }
+            Err(error) => tracing::warn!(%error, "no space is reserved for deletions on a full disk"),
+        }
     }
 
     /// The size limit as SQLite counts it.
@@ -152,16 +181,5 @@ impl Store {
                 .map_err(failed)?;
         self.inner.space.usage.counted(samples);
         Ok(())
-    }
-
-    /// Sets space aside when the store is opened.
-    pub(super) async fn reserve_space(&self) {
-        match self.inner.space.reserve.ensure().await {
-            Ok(true) => {}
-            Ok(false) => {
-                tracing::warn!("the disk has no space for the reserve that deletions need when it is full")
-            }
-            Err(error) => tracing::warn!(%error, "no space is reserved for deletions on a full disk"),
-        }
     }
 }

@@ -7,6 +7,8 @@ mod folder;
 mod port;
 mod system;
 
+use std::path::Path;
+
 use serde::Serialize;
 
 use crate::clock::Clock;
@@ -66,8 +68,9 @@ impl Check {
     }
 }
 
-/// Makes all checks of a server with these settings. Reads the whole database, which takes seconds per gigabyte.
-pub async fn examine(config: &Config, clock: &Clock) -> Vec<Check> {
+/// Makes all checks of a server with these settings, and those of a backup if one is named. Reads the whole database,
+/// which takes seconds per gigabyte.
+pub async fn examine(config: &Config, backup: Option<&Path>, clock: &Clock) -> Vec<Check> {
     let mut checks = match config.database {
         None => vec![folder::writable(config), folder::space(config), folder::lock(config)],
         Some(_) => Vec::new(),
@@ -78,6 +81,9 @@ pub async fn examine(config: &Config, clock: &Clock) -> Vec<Check> {
     checks.push(port::check(config).await);
     checks.push(system::open_files(config));
     checks.push(system::memory(config));
+    if let Some(file) = backup {
+        checks.push(database::backup(file).await);
+    }
     checks
 }
 

@@ -1,7 +1,7 @@
 //! `sightfix doctor`
 
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
@@ -17,6 +17,9 @@ pub(super) struct Doctor {
     /// Address of the server
     #[arg(long, value_name = "ADDR")]
     listen: Option<SocketAddr>,
+    /// Check a file of `sightfix backup`, too: its structure, its models and its digest
+    #[arg(long, value_name = "FILE")]
+    backup: Option<PathBuf>,
     /// Print the checks as JSON
     #[arg(long)]
     json: bool,
@@ -28,7 +31,7 @@ impl Doctor {
     pub(super) fn run(self, settings_file: Option<&Path>) -> anyhow::Result<()> {
         let overrides = Overrides { listen: self.listen, ..self.folder.overrides() };
         let settings = Config::load(settings_file, overrides)?;
-        let checks = runtime()?.block_on(examine(&settings, &Clock::system()));
+        let checks = runtime()?.block_on(examine(&settings, self.backup.as_deref(), &Clock::system()));
         if self.json {
             print_line(&serde_json::to_string_pretty(&checks)?)?;
         } else {

@@ -1,11 +1,13 @@
 //! The database and the models in it.
 
+use std::path::Path;
+
 use super::{Check, in_units};
 use crate::app::{App, ClockDoubt, retention_doubt, store_limits, store_location};
 use crate::clock::{Clock, Randomness};
 use crate::config::Config;
 use crate::domain::Result;
-use crate::store::{self, DatabaseReport, Sharing, Store, StoreOptions};
+use crate::store::{self, BackupReport, DatabaseReport, Sharing, Store, StoreOptions};
 use crate::telemetry::Metrics;
 
 const DATABASE: &str = "database";
@@ -35,6 +37,23 @@ pub(super) async fn check(config: &Config, clock: &Clock) -> (Vec<Check>, Option
         }
     }
     (checks, Some(report))
+}
+
+/// A backup: complete, sound, and as it was written.
+pub(super) async fn backup(file: &Path) -> Check {
+    const NAME: &str = "backup";
+    match store::inspect_backup(file).await {
+        Err(error) => Check::failed(NAME, error.to_string(), "make another: sightfix backup FILE"),
+        Ok(BackupReport { report, has_digest: true }) => Check::ok(
+            NAME,
+            format!("matches its digest, {} cameras, {} samples", report.cameras, report.samples),
+        ),
+        Ok(_) => Check::warning(
+            NAME,
+            "sound, without a digest: a changed value in it would not be seen",
+            "make another: sightfix backup FILE",
+        ),
+    }
 }
 
 /// The database of a server: reachable, its schema up to date, every active model usable.

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use serde_json::json;
+use tempfile::TempDir;
 
 use crate::data_folder::damage_samples;
 use crate::harness::{TestServer, data_folder, sightfix};
@@ -116,6 +117,78 @@ fn kept_databases(data: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(data).expect("listed").filter_map(Result::ok);
     let paths = entries.map(|entry| entry.path());
     paths.filter(|path| path.to_string_lossy().contains("before-restore")).collect()
+}
+
+/// A folder with samples, and a backup of it.
+async fn folder_and_backup() -> (TempDir, PathBuf) {
+    let folder = data_folder();
+    let data = folder.path().join("data");
+    let server = TestServer::start(&data);
+    server.post("/v1/cameras", &json!({"id": "c"})).await.expect(201);
+    for import in 0..8 {
+        let headers = [("content-type", "text/csv")];
+        server.send("POST", "/v1/cameras/c/samples", &headers, csv(import)).await.expect(200);
+    }
+    let file = folder.path().join("backup.db");
+    let (code, text) = command("backup", &file, &data, &[]);
+    assert_eq!(code, Some(0), "{text}");
+    assert!(server.terminate());
+    (folder, file)
+}
+
+#[tokio::test]
+async fn a_backup_with_one_flipped_bit_is_not_restored() {
+    let (folder, file) = folder_and_backup().await;
+    let sound = std::fs::read(&file).expect("the backup");
+    let target = folder.path().join("restored");
+    let last = sound.len() - 1;
+    let bytes = (0..40).map(|n| n * last / 39).chain((0..116).step_by(9).map(|n| last - n));
+    for (at, byte) in bytes.enumerate() {
+        let mut flipped = sound.clone();
+        flipped[byte] ^= 1 << (at % 8);
+        std::fs::write(&file, &flipped).expect("written");
+        let (code, text) = command("restore", &file, &target, &["--without-digest"]);
+        assert!(
+            code == Some(4) && !target.join("sightfix.db").exists(),
+            "bit of byte {byte}: {code:?} {text}"
+        );
+    }
+    // Cut off where the pages end, it is a database as any other.
+    std::fs::write(&file, &sound[..sound.len() - 116]).expect("written");
+    let (code, text) = command("restore", &file, &target, &[]);
+    assert!(code == Some(1) && text.contains("has no digest"), "{code:?} {text}");
+    std::fs::write(&file, &sound).expect("written");
+    let (code, text) = command("restore", &file, &target, &[]);
+    assert_eq!(code, Some(0), "{text}");
+    assert_eq!(count(&target.join("sightfix.db")), 8 * ROWS);
+}
+
+#[tokio::test]
+async fn a_backup_without_a_digest_is_restored_only_on_request_and_doctor_tells() {
+    let (folder, file) = folder_and_backup().await;
+    let examined = |file: &Path| {
+        let mut doctor = sightfix();
+        doctor.args(["doctor", "--json", "--listen", "127.0.0.1:0", "--backup"]).arg(file);
+        let output = doctor.arg("--data").arg(folder.path().join("data")).output().expect("the binary runs");
+        let checks: Vec<serde_json::Value> = serde_json::from_slice(&output.stdout).expect("JSON");
+        checks.into_iter().find(|check| check["name"] == "backup").expect("the check")["status"].clone()
+    };
+    assert_eq!(examined(&file), "ok");
+    // It can be opened and read as any database, and stays as it is.
+    assert_eq!(count(&file), 8 * ROWS);
+    assert_eq!(examined(&file), "ok");
+    let plain = folder.path().join("plain.db");
+    let source = rusqlite::Connection::open(folder.path().join("data/sightfix.db")).expect("a database");
+    source.execute("VACUUM INTO ?", [plain.to_str().expect("UTF-8")]).expect("copied");
+    assert_eq!(examined(&plain), "warning");
+    let target = folder.path().join("restored");
+    let (code, text) = command("restore", &plain, &target, &[]);
+    assert!(code == Some(1) && text.contains("--without-digest") && !target.exists(), "{code:?} {text}");
+    let (code, text) = command("restore", &plain, &target, &["--without-digest"]);
+    assert_eq!(code, Some(0), "{text}");
+    assert_eq!(count(&target.join("sightfix.db")), 8 * ROWS);
+    std::fs::write(&plain, [std::fs::read(&file).expect("read"), vec![0]].concat()).expect("written");
+    assert_eq!(examined(&plain), "failed");
 }
 
 #[tokio::test]

@@ -53,8 +53,8 @@ pub use rows::models::{NewModel, StoredHeldOutError};
 pub use rows::runs::{RunEnd, RunOutput};
 pub use rows::site_runs::{SiteCameraOutput, SiteRunEnd, SiteRunOutput};
 pub use sqlite::{
-    DatabaseReport, ExistingFile, Occupant, Restored, back_up, disk_available_bytes, has_database, inspect,
-    restore, server_of,
+    BackupReport, DatabaseReport, ExistingFile, MissingDigest, Occupant, Restored, back_up,
+    disk_available_bytes, has_database, inspect, inspect_backup, restore, server_of,
 };
 
 /// The storage of one data folder, or of one PostgreSQL database. Clones share one store; it lives until the last

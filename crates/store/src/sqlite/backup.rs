@@ -7,6 +7,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection};
 use tempfile::NamedTempFile;
 
+use super::backup_digest::{self, BackupContent};
 use super::connection::cannot_open;
 use super::file_check::{DatabaseReport, FileUse, check_file, missing};
 use super::folder::{DATABASE, flush_entries, parent_of};
@@ -28,7 +29,7 @@ pub enum ExistingFile {
 /// consistent state. A server that uses the folder goes on reading and writing.
 ///
 /// The copy has a temporary name beside `target` until it is written, found sound (SQLite's integrity check, the
-/// checksums of the models) and flushed to the disk.
+/// checksums of the models), given its digest and flushed to the disk.
 ///
 /// # Errors
 /// [`ErrorKind::InvalidArgument`] for a target that exists; a [`FolderFault`] for a database that cannot be read, or
@@ -68,14 +69,43 @@ async fn copy_database(source: &Path, copy: &Path) -> Result<()> {
     copied.map(drop).map_err(|error| cannot_open(source, &error))
 }
 
-fn publish(copy: NamedTempFile, target: PathBuf, existing: ExistingFile) -> Result<()> {
-    copy.as_file().sync_all().map_err(|error| not_written(&target, &error))?;
+fn publish(mut copy: NamedTempFile, target: PathBuf, existing: ExistingFile) -> Result<()> {
+    backup_digest::append(copy.as_file_mut())
+        .and_then(|()| copy.as_file().sync_all())
+        .map_err(|error| not_written(&target, &error))?;
     let published = match existing {
         ExistingFile::Replace => copy.persist(&target),
         ExistingFile::Keep => copy.persist_noclobber(&target),
     };
     published.map_err(|error| not_written(&target, &error.error))?;
     flush_entries(parent_of(&target)).map_err(|error| not_written(&target, &error))
+}
+
+/// What a backup holds, and whether its digest proves that it is what was written.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BackupReport {
+    /// What the database in it holds.
+    pub report: DatabaseReport,
+    /// Whether it has a digest, as all backups have but those of earlier versions and of other programs.
+    pub has_digest: bool,
+}
+
+/// Reads and checks a whole backup: its structure, the checksums of the models, and its digest.
+///
+/// # Errors
+/// A [`FolderFault`] if it cannot be read, is damaged, or was written by a newer version.
+pub async fn inspect_backup(path: &Path) -> Result<BackupReport> {
+    let (report, content) = check_backup(path).await?;
+    Ok(BackupReport { report, has_digest: content.is_proven })
+}
+
+/// As [`inspect_backup`], with the part of the file that is the database.
+pub(super) async fn check_backup(path: &Path) -> Result<(DatabaseReport, BackupContent)> {
+    let report = check_file(path, FileUse::Unused).await?;
+    report.ensure_sound(path)?;
+    let path = path.to_owned();
+    let read = tokio::task::spawn_blocking(move || backup_digest::read(&path));
+    Ok((report, read.await.map_err(Error::fault)??))
 }
 
 fn exists(target: &Path) -> Error {

@@ -6,6 +6,7 @@
 
 mod audit;
 mod backup;
+mod backup_digest;
 mod camera_moves;
 mod cameras;
 mod connection;
@@ -52,11 +53,11 @@ use super::limits::StoreLimits;
 use super::{Sharing, StoreOptions};
 use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 
-pub use backup::{ExistingFile, back_up};
+pub use backup::{BackupReport, ExistingFile, back_up, inspect_backup};
 pub use file_check::{DatabaseReport, has_database, inspect};
 pub use occupants::Occupant;
 pub use reserve::available_bytes as disk_available_bytes;
-pub use restore::{Restored, restore};
+pub use restore::{MissingDigest, Restored, restore};
 pub use server_lock::holder as server_of;
 
 use errors::failed;
@@ -99,8 +100,8 @@ impl Store {
         let StoreOptions { limits, role, sharing } = options;
         let actor = Arc::new(Actor::program(&role));
         let path = folder::prepare(folder).await?;
-        // Before the schema is touched: a server of another version may be using it.
         let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
+        // Before the schema is touched: a server of another version may be using it.
         let server_lock = match sharing {
             Sharing::OneServer => {
                 let mut lock = ServerLock::acquire(folder)?;
@@ -111,8 +112,8 @@ impl Store {
             Sharing::Command => None,
         };
         let (writer, readers) = connection::open(&path, Space::max_pages(&limits)).await?;
-        let writer = Arc::new(writer);
         space.set_aside_at_start().await;
+        let writer = Arc::new(writer);
         let group_writer = GroupWriter { writer: Arc::clone(&writer), space: Arc::clone(&space) };
         let samples = GroupCommit::start(Arc::new(group_writer));
         let presence = Presence::announce(folder, &role)

@@ -9,8 +9,9 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection};
 use tempfile::NamedTempFile;
 
-use super::backup::not_written;
-use super::file_check::{DatabaseReport, FileUse, check_file};
+use super::backup::{check_backup, not_written};
+use super::backup_digest::BackupContent;
+use super::file_check::DatabaseReport;
 use super::folder::{DATABASE, flush_entries, prepare_folder};
 use super::occupants::Presence;
 use super::server_lock::{ServerLock, in_use};
@@ -18,6 +19,15 @@ use crate::domain::{Error, ErrorKind, Result};
 
 /// What this process is to others while it restores.
 const ROLE: &str = "sightfix restore";
+
+/// What to do with a backup that has no digest, so that nothing shows whether a value in it was changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MissingDigest {
+    /// It is refused.
+    Refuse,
+    /// It is restored.
+    Accept,
+}
 
 /// What a restore has done.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -32,11 +42,19 @@ pub struct Restored {
 /// there is none. Whenever the process is killed, the folder has either database, complete.
 ///
 /// # Errors
-/// A [`FolderFault`](super::FolderFault): the backup is damaged or of a newer version, the folder is in use by
+/// [`ErrorKind::InvalidArgument`] for a backup without a digest, unless that is accepted; a
+/// [`FolderFault`](super::FolderFault): the backup is damaged or of a newer version, the folder is in use by
 /// another process, or cannot be written. Nothing has changed then.
-pub async fn restore(folder: &Path, backup: &Path, now: Timestamp) -> Result<Restored> {
-    let report = check_file(backup, FileUse::Unused).await?;
-    report.ensure_sound(backup)?;
+pub async fn restore(
+    folder: &Path,
+    backup: &Path,
+    missing: MissingDigest,
+    now: Timestamp,
+) -> Result<Restored> {
+    let (report, content) = check_backup(backup).await?;
+    if !content.is_proven && missing == MissingDigest::Refuse {
+        return Err(no_digest(backup));
+    }
     prepare_folder(folder).await?;
     let mut lock = ServerLock::acquire(folder)?;
     lock.announce(ROLE)?;
@@ -51,9 +69,18 @@ pub async fn restore(folder: &Path, backup: &Path, now: Timestamp) -> Result<Res
     }
     let kept = database.with_extension(format!("db.before-restore-{}", now.strftime("%Y%m%dT%H%M%SZ")));
     let backup = backup.to_owned();
-    let replaced = tokio::task::spawn_blocking(move || replace(&database, &backup, &kept));
+    let replaced = tokio::task::spawn_blocking(move || replace(&database, (&backup, &content), &kept));
     let kept = replaced.await.map_err(Error::fault)??;
     Ok(Restored { report, kept })
+}
+
+fn no_digest(backup: &Path) -> Error {
+    let message = format!(
+        "{} has no digest, so a changed value in it would not be seen: it was made by an earlier version or another \
+         program, or its end is cut off; take another backup, or restore it as it is with --without-digest",
+        backup.display()
+    );
+    Error::refused(ErrorKind::InvalidArgument, message)
 }
 
 /// Copies the write-ahead log into the database and removes it. If that fails, because the database is damaged, the
@@ -72,13 +99,15 @@ async fn fold_log(database: &Path) {
 }
 
 /// The old database has both names until the new one takes its place, so that a power cut leaves either.
-fn replace(database: &Path, backup: &Path, kept: &Path) -> Result<Option<PathBuf>> {
+fn replace(
+    database: &Path,
+    (backup, content): (&Path, &BackupContent),
+    kept: &Path,
+) -> Result<Option<PathBuf>> {
     let folder = database.parent().unwrap_or_else(|| Path::new("."));
     let failed = |error: io::Error| not_written(database, &error);
     let mut copy = NamedTempFile::with_prefix_in("restore.", folder).map_err(failed)?;
-    io::copy(&mut fs::File::open(backup).map_err(|error| not_written(backup, &error))?, &mut copy)
-        .and_then(|_| copy.as_file().sync_all())
-        .map_err(failed)?;
+    content.copy(backup, &mut copy).and_then(|()| copy.as_file().sync_all()).map_err(failed)?;
     let had_database = database.exists();
     if had_database {
         if kept.exists() {

@@ -80,6 +80,8 @@ impl SignInSecret {
 pub struct Identity {
     /// As the audit log names them: the provider's id, and the name that they have there.
     pub name: String,
+    /// The provider's address and its id of the person, who keeps it when names change.
+    pub subject: String,
     /// What they may do.
     pub scope: Scope,
 }
@@ -200,7 +202,9 @@ impl Provider {
             let message = format!("the claim {claim} of the person has no value that gives a role here");
             return Err(Error::refused(ErrorKind::PermissionDenied, message));
         };
-        Ok(Identity { name, scope: Scope::new(role, Vec::new())? })
+        let id = claims.get("sub").and_then(Value::as_str).unwrap_or_default();
+        let subject = format!("{} {id}", self.issuer);
+        Ok(Identity { name, subject, scope: Scope::new(role, Vec::new())? })
     }
 
     fn turn(&self) -> Result<tokio::sync::SemaphorePermit<'_>> {

@@ -206,6 +206,40 @@ async fn a_person_signs_in_and_has_the_role_of_their_group_until_they_sign_out()
 }
 
 #[tokio::test]
+async fn people_have_idempotency_keys_of_their_own_in_all_their_sessions() {
+    let (_folder, server, provider) = start().await;
+    let origin = format!("http://{}", server.address);
+    let import = async |subject: &str, name: &str, left_px: u32| {
+        let answer = sign_in(&server, &provider, |sign_in| {
+            sign_in.claims["sub"] = json!(subject);
+            sign_in.claims["preferred_username"] = json!(name);
+        })
+        .await
+        .expect(303);
+        let cookie = cookie_of(&answer, "sightfix_session");
+        let headers = [("cookie", &*cookie), ("origin", &*origin), ("content-type", "application/json")];
+        server.send("POST", "/v1/cameras", &headers, r#"{"id":"c"}"#).await;
+        let headers = [
+            ("cookie", &*cookie),
+            ("origin", &*origin),
+            ("content-type", "text/csv"),
+            ("idempotency-key", "import-1"),
+        ];
+        let csv = format!(
+            "time,target_id,left,top,width,height,longitude,latitude\n\
+             2020-12-14T06:41:0{subject}Z,a,{left_px},11,28,77,103.98678,30.6280135\n"
+        );
+        server.send("POST", "/v1/cameras/c/samples", &headers, csv).await
+    };
+    assert_eq!(import("1", "ada", 10).await.expect(200).json()["accepted"], 1);
+    let other = import("2", "ada", 20).await.expect(200).json();
+    assert_eq!(other["accepted"], 1, "the key of another person is another key");
+    let again = import("1", "ada lovelace", 10).await.expect(200).json();
+    assert_eq!(again["accepted"], 1, "the answer of the first, although it is another session: {again}");
+    import("1", "ada", 30).await.expect(422);
+}
+
+#[tokio::test]
 async fn what_does_not_hold_signs_nobody_in() {
     let (_folder, server, provider) = start().await;
     type Change = fn(&mut SignIn);

@@ -6,8 +6,9 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
-use http_body_util::{BodyExt as _, Empty};
+use http_body_util::{BodyExt as _, Full};
 use hyper::body::Bytes;
+use hyper::header::HeaderValue;
 use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use rcgen::{BasicConstraints, Certificate, CertificateParams, DnType, IsCa, Issuer, KeyPair};
@@ -110,12 +111,16 @@ async fn connect(
 
 /// Asks for a path over HTTP/1.1 or, where it was agreed, HTTP/2.
 async fn get(stream: TlsStream<TcpStream>, path: &str, key: Option<&str>) -> (StatusCode, String) {
-    let is_h2 = stream.get_ref().1.alpn_protocol() == Some(b"h2");
-    let mut request = Request::get(format!("https://localhost{path}")).header("host", "localhost");
+    let mut request = Request::get(format!("https://localhost{path}"));
     if let Some(key) = key {
         request = request.header("authorization", format!("Bearer {key}"));
     }
-    let request = request.body(Empty::<Bytes>::new()).expect("a request");
+    answer(stream, request.body(Full::default()).expect("a request")).await
+}
+
+async fn answer(stream: TlsStream<TcpStream>, mut request: Request<Full<Bytes>>) -> (StatusCode, String) {
+    let is_h2 = stream.get_ref().1.alpn_protocol() == Some(b"h2");
+    request.headers_mut().insert("host", HeaderValue::from_static("localhost"));
     let stream = TokioIo::new(stream);
     let answer = if is_h2 {
         let (mut sender, connection) =
@@ -202,6 +207,44 @@ async fn client_certificates_have_the_role_of_their_authority() {
         Ok(mut stream) => stream.read(&mut [0; 64]).await.map_or(true, |bytes| bytes == 0),
     };
     assert!(is_refused, "a certificate of somebody else");
+}
+
+#[tokio::test]
+async fn holders_of_certificates_have_idempotency_keys_of_their_own() {
+    let (authority, data) = (Authority::new(), data_folder());
+    let files = Files::new(&authority);
+    let mut command = files.serve(&data);
+    command.arg("--tls-client-ca").arg(&files.client_ca).env("SIGHTFIX_TLS__CLIENT_ROLE", "operator");
+    let server = TestServer::run(command);
+    let [ada, bob] = [(); 2].map(|()| {
+        let (certificate, key) = authority.issue();
+        move || (certificate.clone(), KeyPair::from_pem(&key.serialize_pem()).expect("its own"))
+    });
+    let post = async |own: (Certificate, KeyPair), path: &str, media_type: &str, body: String| {
+        let stream = connect(server.address, &authority, &["h2"], Some(own)).await.expect("open");
+        let request = Request::post(format!("https://localhost{path}"))
+            .header("content-type", media_type)
+            .header("idempotency-key", "import-1");
+        answer(stream, request.body(body.into()).expect("a request")).await
+    };
+    let (status, text) = post(ada(), "/v1/cameras", "application/json", r#"{"id":"c"}"#.to_owned()).await;
+    assert_eq!(status, StatusCode::CREATED, "{text}");
+    let row = |second: u32| {
+        format!(
+            "time,target_id,left,top,width,height,longitude,latitude\n\
+             2020-12-14T06:41:0{second}Z,a,10,11,28,77,103.98678,30.6280135\n"
+        )
+    };
+    for (own, second, expected) in [
+        (ada(), 1, StatusCode::OK),
+        (bob(), 2, StatusCode::OK),
+        (ada(), 1, StatusCode::OK),
+        (bob(), 1, StatusCode::UNPROCESSABLE_ENTITY),
+    ] {
+        let (status, text) = post(own, "/v1/cameras/c/samples", "text/csv", row(second)).await;
+        assert_eq!(status, expected, "{text}");
+        assert!(!status.is_success() || text.contains("\"accepted\":1"), "{text}");
+    }
 }
 
 /// Whether the server presents a certificate of the authority.

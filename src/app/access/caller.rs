@@ -73,11 +73,13 @@ impl Caller {
     /// The sender of a request.
     #[must_use]
     pub fn new(principal: Principal, address: Option<IpAddr>, request_id: Option<Arc<str>>) -> Self {
-        let key_id = match &principal {
-            Principal::Key(key) => Some(key.key().id),
-            _ => None,
+        let (key_id, identity) = match &principal {
+            Principal::Key(key) => (Some(key.key().id), None),
+            Principal::User(user) => (None, Some(user.subject())),
+            Principal::Certificate(_) => (None, Some(principal.name())),
+            Principal::Anonymous | Principal::Everyone | Principal::Program => (None, None),
         };
-        let actor = Arc::new(Actor { name: principal.name(), key_id, address, request_id });
+        let actor = Arc::new(Actor { name: principal.name(), key_id, identity, address, request_id });
         Self { principal, actor }
     }
 

@@ -10,6 +10,7 @@ use crate::openid::Identity;
 /// A person who has signed in, until the session ends.
 pub struct SignedInUser {
     name: Arc<str>,
+    subject: Arc<str>,
     scope: Scope,
     ended: CancellationToken,
 }
@@ -17,13 +18,24 @@ pub struct SignedInUser {
 impl SignedInUser {
     pub(super) fn new(identity: Identity) -> Self {
         let name = format!("user {}", identity.name).into();
-        Self { name, scope: identity.scope, ended: CancellationToken::new() }
+        Self {
+            name,
+            subject: identity.subject.into(),
+            scope: identity.scope,
+            ended: CancellationToken::new(),
+        }
     }
 
     /// As the audit log names them.
     #[must_use]
     pub fn name(&self) -> Arc<str> {
         self.name.clone()
+    }
+
+    /// The same person in every session.
+    #[must_use]
+    pub fn subject(&self) -> Arc<str> {
+        self.subject.clone()
     }
 
     /// What they may do.

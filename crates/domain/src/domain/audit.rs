@@ -17,6 +17,8 @@ pub struct Actor {
     pub name: Arc<str>,
     /// The key, if one was presented.
     pub key_id: Option<KeyId>,
+    /// The certificate or the person of a request without a key, for what belongs to one caller alone. Not recorded.
+    pub identity: Option<Arc<str>>,
     /// The client's network address; `None` for a process on the data folder itself.
     pub address: Option<IpAddr>,
     /// Id of the request, as in the log.
@@ -27,7 +29,7 @@ impl Actor {
     /// A part of the program that acts by itself.
     #[must_use]
     pub fn program(name: &str) -> Self {
-        Self { name: name.into(), key_id: None, address: None, request_id: None }
+        Self { name: name.into(), key_id: None, identity: None, address: None, request_id: None }
     }
 
     /// Whether a client asked, rather than the program by itself.

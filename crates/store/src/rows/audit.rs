@@ -37,6 +37,7 @@ pub(crate) fn read_entry<'r>(row: impl Into<StoredRow<'r>>) -> Result<AuditEntry
         actor: Actor {
             name: fields.get::<String>()?.into(),
             key_id: fields.parse_optional(|id: &str| id.parse::<KeyId>())?,
+            identity: None,
             address: fields.parse_optional(|address: &str| address.parse::<IpAddr>())?,
             request_id: fields.get::<Option<String>>()?.map(Into::into),
         },

@@ -38,8 +38,11 @@ impl StoredAnswer {
     }
 }
 
+/// Whose a key is: that of an API key, a certificate or a person who has signed in. Callers without any of them, while
+/// no credential is needed, share their keys.
 pub(crate) fn owner(actor: &Actor) -> String {
-    actor.key_id.map(|id| id.to_string()).unwrap_or_default()
+    let key = actor.key_id.map(|id| id.to_string());
+    key.or_else(|| actor.identity.as_deref().map(str::to_owned)).unwrap_or_default()
 }
 
 /// Keys of this time and before have expired.

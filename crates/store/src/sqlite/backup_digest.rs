@@ -13,7 +13,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::space::PAGE_BYTES;
 use crate::domain::{Error, Result};
-use crate::store::folder_fault::{FolderFault, FolderFaultKind};
+use crate::folder_fault::{FolderFault, FolderFaultKind};
 
 const MARK: &str = "\nsightfix backup, SHA-256 of all before this line: ";
 const HEX_BYTES: usize = 64;

@@ -626,13 +626,13 @@ contract! {
     ///
     /// # Errors
     /// Faults only.
-    fn retry_dead_letters(&self, key: ConnectionKey) -> Result<u64>;
+    fn retry_dead_letters(&self, connection: &Connection, now: Timestamp) -> Result<u64>;
 
     /// Deletes all dead letters of a connection; how many.
     ///
     /// # Errors
     /// Faults only.
-    fn delete_dead_letters(&self, key: ConnectionKey) -> Result<u64>;
+    fn delete_dead_letters(&self, connection: &Connection, now: Timestamp) -> Result<u64>;
 
     /// What is in the outbox of a connection.
     ///

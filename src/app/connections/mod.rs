@@ -216,7 +216,7 @@ impl App {
     /// `ConnectionNotFound`.
     pub async fn retry_dead_letters(&self, id: &ConnectionId) -> Result<u64> {
         let connection = self.store.connection(id).await?;
-        self.store.retry_dead_letters(connection.key).await
+        self.store.retry_dead_letters(&connection, self.clock.now()).await
     }
 
     /// Deletes all dead letters of a connection; how many.
@@ -225,7 +225,7 @@ impl App {
     /// `ConnectionNotFound`.
     pub async fn delete_dead_letters(&self, id: &ConnectionId) -> Result<u64> {
         let connection = self.store.connection(id).await?;
-        self.store.delete_dead_letters(connection.key).await
+        self.store.delete_dead_letters(&connection, self.clock.now()).await
     }
 
     /// Hands a message to a source that takes them by HTTP; returns when what was to be stored is stored.

@@ -135,6 +135,9 @@ async fn what_a_receiver_refuses_for_good_is_a_dead_letter() {
 
     let retried = server.post("/v1/connections/hook/dead-letters/retry", &json!({})).await.expect(200).json();
     assert_eq!(retried["dead_letters"], 1);
+    let audit = server.get("/v1/audit?limit=1").await.expect(200).json();
+    assert_eq!(audit["items"][0]["action"], "dead-letters-retried", "{audit}");
+    assert_eq!(audit["items"][0]["subject"], "1 dead letters of connection hook", "{audit}");
     assert_eq!(
         Hook::answered(&mut stream, 200).await.header("webhook-id"),
         letter["id"].as_str().expect("an id")
@@ -142,6 +145,12 @@ async fn what_a_receiver_refuses_for_good_is_a_dead_letter() {
     connection_when(&server, "hook", |status| status["dead_letters"] == 0 && status["queued"] == 0).await;
 
     // A receiver that takes nothing fills the outbox up to its limit; the oldest messages give way.
+    send_fixes(&server, "bus", 1).await;
+    Hook::answered(&mut stream, 422).await;
+    connection_when(&server, "hook", |status| status["dead_letters"] == 1).await;
+    server.send("DELETE", "/v1/connections/hook/dead-letters", &[], "").await.expect(200);
+    let audit = server.get("/v1/audit?limit=1").await.expect(200).json();
+    assert_eq!(audit["items"][0]["action"], "dead-letters-deleted", "{audit}");
     drop((stream, listener));
     send_fixes(&server, "car", 8).await;
     let status = connection_when(&server, "hook", |status| status["dropped"].as_u64() >= Some(4)).await;

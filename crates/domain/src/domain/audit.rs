@@ -61,6 +61,10 @@ pub enum AuditAction {
     ConnectionChanged,
     /// A connection was deleted with its outbox.
     ConnectionDeleted,
+    /// The dead letters of a connection were put back among its waiting messages.
+    DeadLettersRetried,
+    /// The dead letters of a connection were deleted.
+    DeadLettersDeleted,
     /// Samples were deleted.
     SamplesDeleted,
     /// Stored samples were replaced by those of an import.

@@ -9,8 +9,11 @@ use sqlx::PgConnection;
 use super::Store;
 use super::errors::failed;
 use super::outbox_logs::{lock_log, note_position};
-use crate::domain::{ConnectionKey, DeadLetter, OutboxCounts, OutboxLog, OutboxMessage, Result};
+use crate::domain::{
+    AuditAction, Connection, ConnectionKey, DeadLetter, OutboxCounts, OutboxLog, OutboxMessage, Result,
+};
 use crate::row_decoder::RowDecoder;
+use crate::rows::audit::Change;
 use crate::rows::connections::{read_dead_letter, read_message};
 
 impl Store {
@@ -100,23 +103,43 @@ impl Store {
         rows.iter().map(read_dead_letter).collect()
     }
 
-    pub(crate) async fn retry_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
-        self.change_dead_letters(key, "UPDATE outbox SET dead_reason = NULL").await
+    pub(crate) async fn retry_dead_letters(
+        &self,
+        connection: &Connection,
+        now: Timestamp,
+    ) -> Result<u64> {
+        let change = (AuditAction::DeadLettersRetried, "UPDATE outbox SET dead_reason = NULL");
+        self.change_dead_letters(connection, change, now).await
     }
 
-    pub(crate) async fn delete_dead_letters(&self, key: ConnectionKey) -> Result<u64> {
-        self.change_dead_letters(key, "DELETE FROM outbox").await
+    pub(crate) async fn delete_dead_letters(
+        &self,
+        connection: &Connection,
+        now: Timestamp,
+    ) -> Result<u64> {
+        let change = (AuditAction::DeadLettersDeleted, "DELETE FROM outbox");
+        self.change_dead_letters(connection, change, now).await
     }
 
-    async fn change_dead_letters(&self, key: ConnectionKey, change: &str) -> Result<u64> {
+    /// Where there are none, nothing is recorded.
+    async fn change_dead_letters(
+        &self,
+        connection: &Connection,
+        (action, change): (AuditAction, &str),
+        now: Timestamp,
+    ) -> Result<u64> {
         let mut transaction = self.writer().await?;
         let sql = format!("{change} WHERE connection_key = $1 AND dead_reason IS NOT NULL");
         let changed = sqlx::query(sqlx::AssertSqlSafe(sql))
-            .bind(key.0)
+            .bind(connection.key.0)
             .execute(&mut *transaction)
             .await
             .map_err(failed)?
             .rows_affected();
+        if changed > 0 {
+            let subject = format!("{changed} dead letters of connection {}", connection.id());
+            self.record(&mut transaction, Change::of(action, subject), now).await?;
+        }
         transaction.commit().await.map_err(failed)?;
         Ok(changed)
     }

@@ -15,9 +15,9 @@ use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use rumqttc::v5::mqttbytes::QoS;
 use rumqttc::v5::mqttbytes::v5::{
-    Filter, Packet, PubAckReason, Publish, PublishProperties, SubscribeReasonCode,
+    ConnectReturnCode, Filter, Packet, PubAckReason, Publish, PublishProperties, SubscribeReasonCode,
 };
-use rumqttc::v5::{AsyncClient, Event, EventLoop, MqttOptions};
+use rumqttc::v5::{AsyncClient, ConnectionError, Event, EventLoop, MqttOptions};
 use rumqttc::{Outgoing, Transport};
 use tempfile::TempDir;
 use tokio::net::UnixListener;
@@ -39,6 +39,9 @@ const SESSION_EXPIRY_S: u32 = 86_400;
 const PACKET_OVERHEAD_BYTES: usize = 66_000;
 /// Messages that a sink may have under way; fewer where the broker states so.
 const PUBLISH_QUEUE: usize = 128;
+
+const NEEDS_MQTT_5: &str = "connections need MQTT 5: a broker that speaks MQTT 3.1.1 alone has to be updated, or \
+                            bridged by one that speaks both";
 
 /// What the task of a connection reports.
 enum Report {
@@ -106,12 +109,28 @@ async fn prepare(
     Ok((options, bridge))
 }
 
+/// Whether a broker may have failed to answer because it does not know MQTT 5: it says so, ends the connection, or
+/// sends the answer of MQTT 3.1.1, which is two bytes shorter than a packet of MQTT 5 can be.
+const fn may_lack_mqtt_5(error: &ConnectionError) -> bool {
+    use ConnectReturnCode::{RefusedProtocolVersion, UnsupportedProtocolVersion};
+    matches!(
+        error,
+        ConnectionError::MqttState(_)
+            | ConnectionError::Timeout(_)
+            | ConnectionError::ConnectionRefused(RefusedProtocolVersion | UnsupportedProtocolVersion)
+    )
+}
+
 /// Drives a connection until it fails; reports that nobody takes in time fail it, too.
 async fn drive(mut connection: EventLoop, reports: mpsc::Sender<Report>) {
+    let mut is_connected = false;
     loop {
         let report = match connection.poll().await {
             Ok(Event::Incoming(Packet::Publish(publish))) => Report::Message(publish),
-            Ok(Event::Incoming(Packet::ConnAck(_))) => Report::Connected,
+            Ok(Event::Incoming(Packet::ConnAck(_))) => {
+                is_connected = true;
+                Report::Connected
+            }
             Ok(Event::Incoming(Packet::PubAck(ack))) => {
                 let is_taken =
                     matches!(ack.reason, PubAckReason::Success | PubAckReason::NoMatchingSubscribers);
@@ -131,6 +150,9 @@ async fn drive(mut connection: EventLoop, reports: mpsc::Sender<Report>) {
                 Report::Failed(format!("the broker ends the connection: {:?}", reason.reason_code))
             }
             Ok(_) => continue,
+            Err(error) if !is_connected && may_lack_mqtt_5(&error) => {
+                Report::Failed(format!("{error}; {NEEDS_MQTT_5}"))
+            }
             Err(error) => Report::Failed(error.to_string()),
         };
         let has_failed = matches!(report, Report::Failed(_));

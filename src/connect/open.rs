@@ -9,7 +9,7 @@ use super::source::{Source, SourceIdentity};
 use super::{kafka, lines, mqtt, nats, push, stream, udp, webhook};
 use crate::app::{App, LiveConnection};
 use crate::domain::{Connection, ConnectionId};
-use crate::exchange::{Address, OutgoingFormat, Scheme, Secrets, SerialLine, SinkSettings, SourceSettings};
+use crate::exchange::{OutgoingFormat, Scheme, Secrets, SinkSettings, SourceSettings};
 
 /// Time after which a new file begins, s.
 const DEFAULT_ROTATE_S: f64 = 3_600.0;
@@ -43,7 +43,7 @@ pub(super) async fn source(
             Box::new(reader.open(brokers, settings.topics.iter().cloned().collect()).await?)
         }
         Scheme::Serial => {
-            Box::new(lines::LineSource::open_serial(&serial_line(app, &address)?, message_bytes)?)
+            Box::new(lines::LineSource::open_serial(&app.serial_line(&address)?, message_bytes)?)
         }
         Scheme::Tcp | Scheme::Tls | Scheme::Gpsd => {
             Box::new(lines::LineSource::connect(&address, &credentials, message_bytes).await?)
@@ -94,16 +94,6 @@ pub(super) async fn sink(
             return Err("a sink cannot have this address".into());
         }
     })
-}
-
-/// The serial device of an address, if the operator of the machine lets it be read.
-fn serial_line(app: &App, address: &Address) -> Result<SerialLine, PeerError> {
-    let line = address.serial_line()?;
-    if app.serial_devices.get().is_some_and(|devices| devices.contains(&line.path)) {
-        return Ok(line);
-    }
-    let path = line.path.display();
-    Err(PeerError(format!("{path} may not be read; name it in the setting serial_devices of the server")))
 }
 
 async fn file_sink(

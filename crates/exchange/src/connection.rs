@@ -256,12 +256,24 @@ impl Secrets {
                         "must be text of 1 to 32,768 bytes",
                     ));
                 }
+                Some(secret) if name == "authorization" && !is_header(&secret) => {
+                    return Err(Error::invalid(
+                        "secrets.authorization",
+                        "must be the value of a header in ASCII, such as `Bearer abc`, without line breaks, and \
+                         without spaces at its ends",
+                    ));
+                }
                 Some(secret) => drop(self.0.insert(name, secret)),
                 None => drop(self.0.remove(&name)),
             }
         }
         Ok(self)
     }
+}
+
+/// Whether a text can be sent as the value of a header as it is (RFC 9110, 5.5).
+fn is_header(text: &str) -> bool {
+    text.trim() == text && text.bytes().all(|byte| matches!(byte, b' '..=b'~'))
 }
 
 impl ConnectionSettings {

@@ -19,7 +19,7 @@ use crate::domain::{
     Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
     OutboxCounts, Result, check_text,
 };
-use crate::exchange::{ConnectionDraft, ConnectionSettings, Scheme, Secrets};
+use crate::exchange::{Address, ConnectionDraft, ConnectionSettings, Scheme, Secrets, SerialLine};
 
 pub use groups::connection_groups;
 pub use reports::{ConnectionNode, ReportedStatuses};
@@ -95,6 +95,7 @@ impl App {
     /// # Errors
     /// `ConnectionExists`; `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
     pub async fn create_connection(&self, request: ConnectionRequest) -> Result<Connection> {
+        self.check_device(&request)?;
         let profile = request.into_profile(Secrets::default())?;
         let connection = self.store.insert_connection(&profile, self.clock.now()).await?;
         self.connection_board.notify();
@@ -106,6 +107,7 @@ impl App {
     /// # Errors
     /// `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
     pub async fn declare_connection(&self, request: ConnectionRequest) -> Result<()> {
+        self.check_device(&request)?;
         let profile = request.into_profile(Secrets::default())?;
         let now = self.clock.now();
         match self.store.connection(&profile.id).await {
@@ -118,6 +120,31 @@ impl App {
             }
             Err(error) => Err(error),
         }
+    }
+
+    /// Checks that a connection that is not paused may read its serial device, if it has one.
+    fn check_device(&self, request: &ConnectionRequest) -> Result<()> {
+        let source = request.settings.source.as_ref().filter(|_| !request.paused);
+        let Some(source) = source else { return Ok(()) };
+        let checked = source.address().and_then(|address| match address.scheme {
+            Scheme::Serial => self.serial_line(&address).map(drop),
+            _ => Ok(()),
+        });
+        checked.map_err(|error| error.under("source"))
+    }
+
+    /// The serial device of an address, if the operator of the machine lets it be read.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `address`.
+    pub fn serial_line(&self, address: &Address) -> Result<SerialLine> {
+        let line = address.serial_line()?;
+        if self.serial_devices.get().is_some_and(|devices| devices.contains(&line.path)) {
+            return Ok(line);
+        }
+        let path = line.path.display();
+        let message = format!("{path} may not be read; name it in the setting serial_devices of the server");
+        Err(Error::invalid("address", message))
     }
 
     /// One connection.
@@ -152,6 +179,7 @@ impl App {
     ) -> Result<Connection> {
         let stored = self.store.connection(&request.id).await?;
         let (_, secrets) = connection_settings(&stored)?;
+        self.check_device(&request)?;
         let profile = request.into_profile(secrets)?;
         let connection = self.store.replace_connection(&profile, Some(expected), self.clock.now()).await?;
         self.connection_board.notify();

@@ -217,8 +217,12 @@ async fn only_serial_devices_that_the_operator_of_the_machine_names_are_read() {
         let refused = server.post("/v1/connections", &draft("wrong", address)).await.expect(422);
         assert!(refused.text().contains("source.address"), "{address}: {}", refused.text());
     }
+    let unnamed = draft("unnamed", &line.device("receiver"));
+    let refused = server.post("/v1/connections", &unnamed).await.expect(422).json();
+    assert_eq!(refused["violations"][0]["field"], "source.address", "{refused}");
+    assert!(refused.to_string().contains("serial_devices"), "{refused}");
+    server.get("/v1/connections/unnamed").await.expect(404);
     for (id, device, reason) in [
-        ("unnamed", line.device("receiver"), "serial_devices"),
         ("file", line.device("file"), "is no serial device"),
         ("null", "/dev/null".to_owned(), "is no serial device"),
     ] {

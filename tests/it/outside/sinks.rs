@@ -158,6 +158,53 @@ async fn what_a_receiver_refuses_for_good_is_a_dead_letter() {
     let deleted =
         server.send("DELETE", "/v1/connections/hook/dead-letters", &[], "").await.expect(200).json();
     assert_eq!(deleted["dead_letters"], 0);
+    let unchanged = server.get("/v1/audit?limit=1").await.expect(200).json();
+    assert_eq!(unchanged, audit, "what changes nothing is not recorded");
+}
+
+#[tokio::test]
+async fn an_authorization_that_is_no_header_is_refused_when_it_is_set() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let draft = |authorization: &str| {
+        let sink = json!({"address": "http://127.0.0.1:9/hook", "camera_ids": ["gate"]});
+        json!({"id": "hook", "paused": true, "sink": sink, "secrets": {"authorization": authorization}})
+    };
+    for broken in
+        ["Bearer s3\ncret", "Bearer s3cret\n", " Bearer s3cret", "Bearer s3cr\u{e9}t", "Bearer s3\u{0}cret"]
+    {
+        let refused = server.post("/v1/connections", &draft(broken)).await.expect(422).json();
+        assert_eq!(refused["violations"][0]["field"], "secrets.authorization", "{broken:?}: {refused}");
+        assert!(!refused.to_string().contains("s3"), "a secret is not repeated: {refused}");
+    }
+    server.post("/v1/connections", &draft("Bearer s3cret")).await.expect(201);
+    let change = json!({"secrets": {"authorization": "Bearer\r\nx: y"}});
+    patch(&server, "hook", &change).await.expect(422);
+}
+
+/// Answers CONNECT as a broker of MQTT 3.1.1 does that knows no other version: return code 1, then the end.
+async fn answer_as_mqtt_3(listener: TcpListener) {
+    while let Ok((mut stream, _)) = listener.accept().await {
+        let mut begin = [0; 64];
+        let _ = stream.read(&mut begin).await;
+        let _ = stream.write_all(&[0x20, 2, 0, 1]).await;
+    }
+}
+
+#[tokio::test]
+async fn a_broker_of_mqtt_3_is_named_as_the_reason() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    tokio::spawn(answer_as_mqtt_3(listener));
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let sink = json!({"address": format!("mqtt://{address}"), "camera_ids": ["gate"]});
+    server.post("/v1/connections", &json!({"id": "old", "sink": sink})).await.expect(201);
+    let status = connection_when(&server, "old", |status| !status["last_error"].is_null()).await;
+    let error = status["status"]["last_error"]["message"].as_str().expect("an error");
+    assert!(error.contains("need MQTT 5") && error.contains("3.1.1"), "{error}");
 }
 
 /// The value of an attribute of an event.

@@ -25,6 +25,28 @@ test.describe('the server goes and comes back', () => {
   });
 });
 
+test('an address whose percent signs are no escapes shows a page', async ({ console: page, server }) => {
+  await page.goto(`${server.url}/#/%`);
+  await expect(page.getByRole('navigation').first()).toBeVisible();
+  // A page that is open follows the changed address.
+  await page.goto(`${server.url}/#/settings/connections`);
+  await page.evaluate(() => (location.hash = '#/cameras/%zz'));
+  await expect(page.getByRole('navigation').first()).toBeVisible();
+  await page.evaluate(() => (location.hash = '#/settings/connections'));
+  await expect(page.getByRole('heading', { name: 'Connections' })).toBeVisible();
+});
+
+test('swapped columns are told with the remedy', async ({ console: page, server }) => {
+  // The simulated camera is in Europe, where both orders are positions.
+  const rows = simulate(1).csv.trim().split(/\r?\n/);
+  const swapped = [rows[0]!.replace(/(longitude|latitude)/g, (name) => (name === 'longitude' ? 'latitude' : 'longitude')), ...rows.slice(1)].join('\n');
+  await server.request('POST', '/v1/cameras', { id: 'gate' });
+  await page.goto(`${server.url}/#/cameras/gate/data`);
+  await page.locator('input[type=file]').setInputFiles({ name: 'swapped.csv', mimeType: 'text/csv', buffer: Buffer.from(swapped) });
+  await page.getByRole('button', { name: 'Import', exact: true }).click();
+  await expect(page.getByText(/swap the two columns/)).toBeVisible();
+});
+
 test('bad rows are named with their lines, and can be downloaded', async ({ console: page, server }) => {
   await server.request('POST', '/v1/cameras', { id: 'gate' });
   await page.goto(`${server.url}/#/cameras/gate/data`);

@@ -1,7 +1,16 @@
 // Routes live in the fragment (`#/cameras/north-gate/live`), so the server has one page and no fallback.
 
+/** A segment whose percent signs are no escapes is taken as it is. */
+function decoded(segment: string): string {
+  try {
+    return decodeURIComponent(segment);
+  } catch {
+    return segment;
+  }
+}
+
 function segmentsOf(hash: string): string[] {
-  return hash.replace(/^#\/?/, '').split('?')[0]!.split('/').filter(Boolean).map(decodeURIComponent);
+  return hash.replace(/^#\/?/, '').split('?')[0]!.split('/').filter(Boolean).map(decoded);
 }
 
 /** The view that a sign-in at a provider leads away from. */

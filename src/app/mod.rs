@@ -28,6 +28,7 @@ mod site_registry;
 mod site_training;
 mod sites;
 mod spool;
+mod swapped_columns;
 mod training;
 
 use std::path::PathBuf;

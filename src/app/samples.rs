@@ -9,6 +9,7 @@ use tokio::sync::mpsc;
 
 use super::access::Permission;
 use super::idempotency::record_of;
+use super::swapped_columns::PlaceCheck;
 use super::{App, Page, page_of};
 use crate::domain::{
     CameraId, Durability, Error, IdempotentRequest, OnConflict, Result, SampleCount, StoredSample,
@@ -47,6 +48,9 @@ pub struct ImportReport {
     pub rejected: u64,
     /// The first of them, with their reasons.
     pub rejected_rows: Vec<RejectedRow>,
+    /// What seems to be wrong with the rows as a whole, with its remedy.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// A row that was not stored, and why.
@@ -225,6 +229,7 @@ pub(super) struct Import<'a> {
     id: &'a CameraId,
     options: ImportOptions,
     waiting: Option<Batch>,
+    places: PlaceCheck,
     report: ImportReport,
 }
 
@@ -236,7 +241,14 @@ impl<'a> Import<'a> {
             // Replacing loses the stored samples, as deleting does.
             app.caller().authorize(Permission::Operate)?;
         }
-        Ok(Self { app, id, options, waiting: None, report: ImportReport::default() })
+        Ok(Self {
+            app,
+            id,
+            options,
+            waiting: None,
+            places: PlaceCheck::default(),
+            report: ImportReport::default(),
+        })
     }
 
     /// Stores the batch, or the one before it if this one may be the last that the answer goes with.
@@ -273,6 +285,10 @@ impl<'a> Import<'a> {
                 Ok(sample) => samples.push(sample),
                 Err(row) => self.reject(row),
             }
+        }
+        self.places.see(self.app, self.id, &samples).await?;
+        if is_last {
+            self.report.warnings = self.places.warnings();
         }
         let completion = self.options.idempotent.as_ref().filter(|_| is_last).map(|request| {
             let before = self.report.clone();

@@ -132,7 +132,8 @@ impl Import {
 }
 
 fn print(report: &ImportReport, summary: &Summary) -> anyhow::Result<()> {
-    let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows } = report;
+    let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows, warnings } =
+        report;
     summary.document(&serde_json::to_value(report)?)?;
     summary.line(&format_args!(
         "accepted {accepted} (without a fix {without_fix}), duplicate {duplicate}, rejected {rejected}"
@@ -145,6 +146,9 @@ fn print(report: &ImportReport, summary: &Summary) -> anyhow::Result<()> {
     }
     if *rejected > rejected_rows.len() as u64 {
         summary.line(&format_args!("... and {} more", rejected - rejected_rows.len() as u64))?;
+    }
+    for warning in warnings {
+        summary.line(&format_args!("warning: {warning}"))?;
     }
     Ok(())
 }

@@ -178,6 +178,7 @@ fn response(report: PairedReport, durability: Durability) -> proto::PairSamplesR
         durability: proto::Durability::from(durability).into(),
         accepted_without_fix: samples.without_fix,
         replaced: samples.replaced,
+        warnings: samples.warnings,
     };
     let (of_detections, of_fixes): (Vec<_>, Vec<_>) =
         rejected.rows.into_iter().partition(|(part, _)| *part == Part::Detections);

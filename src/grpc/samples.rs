@@ -199,5 +199,6 @@ fn imported(report: ImportReport, durability: Durability) -> proto::ImportSample
         rejected: report.rejected,
         rejected_rows: report.rejected_rows.into_iter().map(Into::into).collect(),
         durability: proto::Durability::from(durability).into(),
+        warnings: report.warnings,
     }
 }

@@ -67,6 +67,8 @@ struct PairedSamples {
     rejected_rows: Vec<RejectedPartRow>,
     /// What the accepted samples are safe from.
     durability: Durability,
+    /// What seems to be wrong with the samples as a whole, with its remedy; they are stored all the same.
+    warnings: Vec<String>,
     /// What became of the other rows.
     pairing: Pairing,
     /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
@@ -336,6 +338,7 @@ fn paired_samples(report: PairedReport, durability: domain::Durability, with_off
         rejected: rejected.count,
         rejected_rows: rejected.rows.into_iter().map(|(part, row)| rejected_row(part, row)).collect(),
         durability: durability.into(),
+        warnings: samples.warnings,
         pairing: counts.into(),
         unnamed_fixes_of: unnamed_fixes_of.as_ref().map(Receiver::from),
         matching: matching.map(Matching::from),

@@ -51,6 +51,9 @@ pub(super) struct Imported {
     rejected_rows: Vec<RejectedRow>,
     /// What the accepted rows are safe from.
     durability: Durability,
+    /// What seems to be wrong with the rows as a whole, with its remedy, such as latitude and longitude swapped. The rows
+    /// are stored all the same.
+    warnings: Vec<String>,
 }
 
 /// A row that was not taken, and why.
@@ -73,7 +76,8 @@ impl From<crate::app::RejectedRow> for RejectedRow {
 
 impl Imported {
     fn new(report: ImportReport, durability: domain::Durability) -> Self {
-        let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows } = report;
+        let ImportReport { accepted, without_fix, duplicate, replaced, rejected, rejected_rows, warnings } =
+            report;
         let rejected_rows = rejected_rows.into_iter().map(RejectedRow::from).collect();
         let durability = durability.into();
         Self {
@@ -84,6 +88,7 @@ impl Imported {
             rejected,
             rejected_rows,
             durability,
+            warnings,
         }
     }
 }

@@ -55,6 +55,7 @@ mod sites;
 mod storage;
 mod story;
 mod stream;
+mod swapped_columns;
 mod tls;
 mod usage;
 mod walk;

@@ -18,6 +18,7 @@ export interface ImportOutcome {
   duplicate: number;
   rejected: number;
   rejectedRows: RejectedRow[];
+  warnings: string[];
   pairing?: PairedSamples['pairing'];
 }
 
@@ -46,7 +47,7 @@ export async function importSamples(
   signal: AbortSignal,
 ): Promise<ImportOutcome> {
   const { rows, rejected } = mapAll(source, image);
-  const outcome: ImportOutcome = { accepted: 0, withoutFix: 0, duplicate: 0, rejected: rejected.length, rejectedRows: rejected };
+  const outcome: ImportOutcome = { accepted: 0, withoutFix: 0, duplicate: 0, rejected: rejected.length, rejectedRows: rejected, warnings: [] };
   const columns = outputColumns(source.mapping);
   for (let from = 0; from < rows.length; from += ROWS_PER_PART) {
     const part = rows.slice(from, from + ROWS_PER_PART);
@@ -59,6 +60,8 @@ export async function importSamples(
     outcome.duplicate += report.duplicate;
     outcome.rejected += report.rejected;
     outcome.rejectedRows.push(...atOriginalLines(report.rejected_rows, part));
+    // Parts of one file have the same fault.
+    if (outcome.warnings.length === 0) outcome.warnings = report.warnings;
     progress(Math.min(1, (from + part.length) / rows.length));
   }
   outcome.rejectedRows.sort((a, b) => a.line - b.line);
@@ -96,6 +99,7 @@ export async function importPair(
     duplicate: report.duplicate,
     rejected: report.rejected + rejected.length,
     rejectedRows: [...rejected, ...reported],
+    warnings: report.warnings,
     pairing: report.pairing,
   };
 }

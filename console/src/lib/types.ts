@@ -95,6 +95,7 @@ export interface Imported {
   duplicate: number;
   rejected: number;
   rejected_rows: RejectedRow[];
+  warnings: string[];
 }
 export interface PairedSamples extends Imported {
   pairing: {

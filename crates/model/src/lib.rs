@@ -52,6 +52,7 @@ pub use fitting::{
 };
 pub use progress::{FitError, FitEvent};
 pub use regressor::{JointError, Regression, Regressor};
+pub use samples::mirroring::{FootPosition, is_mirrored, median_position};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use samples::sequences::fix_sequences;
 pub use site::{

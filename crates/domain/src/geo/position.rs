@@ -55,6 +55,24 @@ impl Position {
     pub const fn latitude_deg(self) -> f64 {
         self.latitude_deg
     }
+
+    /// The position with longitude and latitude swapped; `None` where that is none.
+    #[must_use]
+    pub fn swapped(self) -> Option<Self> {
+        Self::new(self.latitude_deg, self.longitude_deg).ok()
+    }
+
+    /// Whether the position is near a place only when it is swapped; near is within half a degree of both, which is
+    /// farther than a camera sees.
+    #[must_use]
+    pub fn is_swapped_at(self, place: Self) -> bool {
+        const NEAR_DEG: f64 = 0.5;
+        let is_near = |position: Self| {
+            (position.latitude_deg - place.latitude_deg).abs() <= NEAR_DEG
+                && wrap_degrees(position.longitude_deg - place.longitude_deg).abs() <= NEAR_DEG
+        };
+        !is_near(self) && self.swapped().is_some_and(is_near)
+    }
 }
 
 /// Wraps degrees into -180..=180, so that differences are correct across the antimeridian.

@@ -4,6 +4,7 @@
 use super::candidates::Candidate;
 use crate::artifact::ModelParts;
 use crate::domain::{CandidateFinding, CandidateReport, HeldOutError, ImageSize, TrainingReport};
+use crate::samples::mirroring::{FootPosition, is_mirrored};
 use crate::samples::rows::TrainingRows;
 
 /// Below this share of held-out fixes inside the stated radius the report says so.
@@ -12,6 +13,9 @@ const LEAST_COVERAGE: f64 = 0.9;
 const FEW_TRAVERSES: u32 = 8;
 /// Sessions disagree if their bias per axis exceeds this share of the receiver's standard deviation.
 const DISAGREEMENT: f64 = 0.5;
+
+/// Rows that are compared with a mirror image.
+const MIRROR_ROWS: usize = 512;
 
 /// The outcome of a selection.
 pub(super) struct Selection<'a> {
@@ -84,13 +88,41 @@ fn reason_to_drop(selection: &Selection<'_>, at: usize) -> String {
     }
 }
 
+/// Rows whose latitude and longitude seem to be swapped; `sigma_m` is that of the receiver per axis.
+fn swapped_columns(rows: &TrainingRows, sigma_m: f64) -> Option<String> {
+    const REMEDY: &str = "swap the two columns, import these samples again with on_conflict=replace (--replace), and train again";
+    let centre = rows.plane.origin();
+    let swapped = rows.rows.iter().filter(|row| row.position.is_swapped_at(centre)).count();
+    if swapped > 0 {
+        return Some(format!(
+            "latitude and longitude are swapped in {swapped} of {} samples, which lie near the others only with both \
+             swapped: {REMEDY}",
+            rows.rows.len()
+        ));
+    }
+    let stride = rows.rows.len().div_ceil(MIRROR_ROWS);
+    let points: Vec<FootPosition> = rows
+        .rows
+        .iter()
+        .step_by(stride)
+        .filter(|row| row.position.swapped().is_some())
+        .map(|row| (row.bounding_box.foot_px(), row.position))
+        .collect();
+    is_mirrored(&points, sigma_m).then(|| {
+        format!(
+            "latitude and longitude seem to be swapped: the boxes show the positions as a mirror would, and no camera \
+             does unless its picture is mirrored: {REMEDY}"
+        )
+    })
+}
+
 fn advice(
     held_out: &HeldOutError,
     rows: &TrainingRows,
     parts: &ModelParts,
     image_size: Option<ImageSize>,
 ) -> Vec<String> {
-    let mut advice = Vec::new();
+    let mut advice: Vec<String> = swapped_columns(rows, parts.e_gnss_m2.sqrt()).into_iter().collect();
     if rows.targets == 1 {
         advice.push(
             "let a second receiver walk: all fixes are of one receiver, and its lasting bias cannot be seen; \

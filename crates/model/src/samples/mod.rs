@@ -1,5 +1,6 @@
 //! Training samples as rows in a local plane, and the noise of their fixes over time.
 
+pub(crate) mod mirroring;
 pub(crate) mod rows;
 pub(crate) mod second_differences;
 pub(crate) mod sequences;

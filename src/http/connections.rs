@@ -55,7 +55,8 @@ struct ConnectionChange {
     source: Option<SourceSettings>,
     /// Changes to the sink.
     sink: Option<SinkSettings>,
-    /// Secrets to be set; one that is null is removed, others stay.
+    /// Secrets to be set; one that is null is removed. Others stay, unless the address gets another scheme, host or port:
+    /// then they are removed.
     secrets: Option<BTreeMap<String, Option<String>>>,
 }
 
@@ -361,7 +362,8 @@ async fn get_connection(
 
 /// Change, pause or resume a connection
 ///
-/// A merge patch (RFC 7396): what is left out stays. The connection is closed and opened again. The change is based on
+/// A merge patch (RFC 7396): what is left out stays. The connection is closed and opened again. An address with another
+/// scheme, host or port removes all secrets that the same patch does not set; `secret_names` shows what is left. The change is based on
 /// a revision, named by the header `if-match` with the `etag` that was read; `if-match: *` changes whatever is there.
 #[utoipa::path(
     patch, path = "/v1/connections/{connection}", tag = "connections",

@@ -295,6 +295,20 @@ impl ConnectionSettings {
         }
         Ok(())
     }
+
+    /// Whether the peer is the same as by other settings: direction, scheme, host and port.
+    #[must_use]
+    pub fn has_peer_of(&self, other: &Self) -> bool {
+        self.peer().is_some_and(|peer| other.peer() == Some(peer))
+    }
+
+    fn peer(&self) -> Option<(bool, Scheme, String, u16)> {
+        let address = match (&self.source, &self.sink) {
+            (Some(source), _) => source.address(),
+            (None, sink) => sink.as_ref()?.address(),
+        };
+        address.ok().map(|it| (self.source.is_some(), it.scheme, it.host, it.port))
+    }
 }
 
 impl SourceSettings {

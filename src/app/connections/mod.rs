@@ -168,7 +168,8 @@ impl App {
         Ok(page_of(connections, limit, |connection| connection.id().clone()))
     }
 
-    /// Puts a description in the place of the stored one; secrets that it does not name stay. It starts again.
+    /// Replaces the stored description. Secrets that it does not name stay while scheme, host and port of the address do;
+    /// else they are removed, for who may change an address need not know them. It starts again.
     ///
     /// # Errors
     /// `ConnectionNotFound`, `RevisionMismatch`, `InvalidArgument` naming the field.
@@ -178,9 +179,10 @@ impl App {
         expected: ExpectedVersion<ConnectionKey>,
     ) -> Result<Connection> {
         let stored = self.store.connection(&request.id).await?;
-        let (_, secrets) = connection_settings(&stored)?;
+        let (settings, secrets) = connection_settings(&stored)?;
         self.check_device(&request)?;
-        let profile = request.into_profile(secrets)?;
+        let kept = if settings.has_peer_of(&request.settings) { secrets } else { Secrets::default() };
+        let profile = request.into_profile(kept)?;
         let connection = self.store.replace_connection(&profile, Some(expected), self.clock.now()).await?;
         self.connection_board.notify();
         Ok(connection)

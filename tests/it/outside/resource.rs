@@ -35,6 +35,8 @@ async fn a_connection_is_created_read_changed_and_deleted_and_its_secrets_are_ne
     let changed =
         patch(&server, "hook", &json!({"secrets": {"signing_key": null, "authorization": SECRET}})).await;
     assert_eq!(changed.expect(200).json()["secret_names"], json!(["authorization"]));
+    let changed = patch(&server, "hook", &json!({"sink": {"address": "http://127.0.0.1:9/other"}})).await;
+    assert_eq!(changed.expect(200).json()["secret_names"], json!(["authorization"]), "the same peer");
 
     server.post("/v1/connections", &webhook("hook")).await.expect(409);
     server.post("/v1/connections", &webhook("other")).await.expect(201);

@@ -77,6 +77,45 @@ async fn send_fixes(server: &TestServer, target: &str, count: i64) {
     }
 }
 
+/// The first request that a webhook sends when it is tried.
+async fn tried_request(server: &TestServer, listener: &TcpListener) -> Hook {
+    let empty = json!({});
+    let request = async { Hook::answered(&mut accept(listener).await, 200).await };
+    let (answer, hook) = tokio::join!(server.post("/v1/connections/hook/test", &empty), request);
+    answer.expect(200);
+    hook
+}
+
+#[tokio::test]
+async fn a_webhook_that_is_moved_to_another_peer_takes_no_secrets_with_it() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let listen = || async { TcpListener::bind("127.0.0.1:0").await.expect("a port") };
+    let url =
+        |listener: &TcpListener| format!("http://{}/hook?site=1", listener.local_addr().expect("an address"));
+    let (first, second) = (listen().await, listen().await);
+    let draft = json!({
+        "id": "hook", "secrets": {"signing_key": "a key", "authorization": "Bearer abc"},
+        "sink": {"address": url(&first), "camera_ids": ["gate"]},
+    });
+    server.post("/v1/connections", &draft).await.expect(201);
+    assert_eq!(tried_request(&server, &first).await.header("authorization"), "Bearer abc");
+
+    let moved = patch(&server, "hook", &json!({"sink": {"address": url(&second)}})).await.expect(200);
+    assert_eq!(moved.json()["secret_names"], json!([]));
+    let hook = tried_request(&server, &second).await;
+    let is_secret =
+        |(name, _): &&(String, String)| matches!(&name[..], "authorization" | "webhook-signature");
+    assert_eq!(hook.headers.iter().find(is_secret), None);
+
+    // Who moves it back does not get them back, and who knows them sets them in the same change.
+    let change = json!({"sink": {"address": url(&first)}, "secrets": {"authorization": "Bearer new"}});
+    let back = patch(&server, "hook", &change).await.expect(200);
+    assert_eq!(back.json()["secret_names"], json!(["authorization"]));
+    assert_eq!(tried_request(&server, &first).await.header("authorization"), "Bearer new");
+}
+
 #[tokio::test]
 async fn a_webhook_is_signed_and_comes_again_until_it_is_taken_also_after_a_kill() {
     let address = own_address();

@@ -420,11 +420,13 @@ pub(super) fn describe(item: &MessageItem) -> String {
         MessageItem::Fix(fix) => {
             let position = fix.fix.position;
             let receiver = fix.receiver_id.as_ref().map_or("the connection", ReceiverId::as_str);
+            let sigma = fix.fix.sigma_m.map(|sigma| format!(", sigma {:.3} m per axis", sigma.metres()));
             format!(
-                "fix of {receiver} at {}: longitude {}, latitude {} degrees",
+                "fix of {receiver} at {}: longitude {}, latitude {} degrees{}",
                 fix.time,
                 position.longitude_deg(),
-                position.latitude_deg()
+                position.latitude_deg(),
+                sigma.unwrap_or_default()
             )
         }
     }

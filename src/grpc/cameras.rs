@@ -142,6 +142,7 @@ fn receiver(given: &proto::Receiver) -> Result<Receiver> {
     Ok(Receiver {
         target_id: target_id.map_or(Ok(named.target_id), TargetId::new)?,
         clock_offset: ClockOffset::from_seconds(given.clock_offset_s)?,
+        sigma: given.sigma_m.map(SigmaM::new).transpose()?,
         receiver_id: named.receiver_id,
     })
 }
@@ -234,6 +235,7 @@ impl From<&Receiver> for proto::Receiver {
             receiver_id: receiver.receiver_id.as_str().to_owned(),
             target_id: receiver.target_id.as_str().to_owned(),
             clock_offset_s: receiver.clock_offset.seconds(),
+            sigma_m: receiver.sigma.map(SigmaM::metres),
         }
     }
 }

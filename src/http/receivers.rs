@@ -3,9 +3,9 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::domain::{self, ClockOffset, ReceiverId, Receivers, Result, TargetId};
+use crate::domain::{self, ClockOffset, ReceiverId, Receivers, Result, SigmaM, TargetId};
 
-/// A GNSS receiver: whose it is, and how far its clock is off.
+/// A GNSS receiver: whose it is, how far its clock is off, and its error.
 #[derive(Clone, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Receiver {
@@ -20,6 +20,11 @@ pub(super) struct Receiver {
     #[serde(default)]
     #[schema(minimum = -86_400.0, maximum = 86_400.0, example = -0.35)]
     clock_offset_s: f64,
+    /// Standard deviation per horizontal axis, m, of its fixes that state none; that of the camera's `gnss_error` if left
+    /// out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.001, maximum = 10_000.0, example = 0.02)]
+    sigma_m: Option<f64>,
 }
 
 impl Receiver {
@@ -28,6 +33,7 @@ impl Receiver {
         Ok(domain::Receiver {
             target_id: self.target_id.as_deref().map_or(Ok(named.target_id), TargetId::new)?,
             clock_offset: ClockOffset::from_seconds(self.clock_offset_s)?,
+            sigma: self.sigma_m.map(SigmaM::new).transpose()?,
             receiver_id: named.receiver_id,
         })
     }
@@ -52,6 +58,7 @@ impl From<&domain::Receiver> for Receiver {
             receiver_id: receiver.receiver_id.as_str().to_owned(),
             target_id: Some(receiver.target_id.as_str().to_owned()),
             clock_offset_s: receiver.clock_offset.seconds(),
+            sigma_m: receiver.sigma.map(SigmaM::metres),
         }
     }
 }

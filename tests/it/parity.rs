@@ -567,6 +567,7 @@ async fn receivers_are_the_same_and_refused_alike() {
         receiver_id: id.to_owned(),
         target_id: "walker".to_owned(),
         clock_offset_s,
+        sigma_m: Some(0.02),
     };
     let stored = update(vec![receiver("phone", -0.35)]).await.expect("good").camera.expect("a camera");
     let rest = both.server.get("/v1/cameras/c").await.expect(200).json();
@@ -574,6 +575,7 @@ async fn receivers_are_the_same_and_refused_alike() {
     assert_eq!(rest["receivers"][0]["receiver_id"], profile.receivers[0].receiver_id);
     assert_eq!(rest["receivers"][0]["target_id"], "walker");
     assert_eq!(rest["receivers"][0]["clock_offset_s"], -0.35);
+    assert_eq!((&rest["receivers"][0]["sigma_m"], profile.receivers[0].sigma_m), (&json!(0.02), Some(0.02)));
     for (id, offset_s) in [("phone", 1e9), ("", 0.0)] {
         let given = json!({"receiver_id": id, "target_id": "walker", "clock_offset_s": offset_s});
         let rest = patch(&both.server, &json!({"receivers": [given]})).await;

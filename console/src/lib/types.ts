@@ -30,6 +30,7 @@ export interface Receiver {
   receiver_id: string;
   target_id?: string | null;
   clock_offset_s?: number;
+  sigma_m?: number | null;
 }
 export interface CameraMoved {
   model_version: number;

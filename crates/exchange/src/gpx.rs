@@ -10,14 +10,15 @@ use quick_xml::events::{BytesStart, Event};
 
 use super::MAX_ROW_BYTES;
 use super::file_row::RowError;
+use super::fix_quality::Solution;
 use super::fix_row::FixRow;
 use super::wire;
-use crate::domain::{Error, ErrorKind, Fix, Result, TimeBounds, parse_time};
+use crate::domain::{Error, ErrorKind, Fix, Result, SigmaM, TimeBounds, parse_time};
 
 /// Largest nesting depth of elements.
 const MAX_DEPTH: usize = 64;
-/// Largest text of a time, bytes.
-const MAX_TIME_BYTES: usize = 64;
+/// Largest text of a child of a point, bytes.
+const MAX_TEXT_BYTES: usize = 64;
 
 /// Reads a GPX file's points.
 pub(super) struct GpxFixes<R> {
@@ -37,14 +38,37 @@ struct OpenPoint {
     /// Depth of its parent.
     depth: usize,
     fix: std::result::Result<Fix, RowError>,
-    /// Text of its `time`, if it has one.
-    time: Option<String>,
-    in_time: bool,
+    /// Texts of its children.
+    texts: [Option<String>; Child::COUNT],
+    /// The child that is open.
+    child: Option<Child>,
+}
+
+/// A child of a point that is read.
+#[derive(Clone, Copy)]
+enum Child {
+    Time,
+    /// Kind of solution.
+    Fix,
+    Hdop,
+}
+
+impl Child {
+    const COUNT: usize = 3;
+
+    fn named(name: &str) -> Option<Self> {
+        Some(match name {
+            "time" => Self::Time,
+            "fix" => Self::Fix,
+            "hdop" => Self::Hdop,
+            _ => return None,
+        })
+    }
 }
 
 /// An XML event as far as it concerns points.
 enum PointEvent {
-    Open { point: Option<OpenPoint>, is_time: bool, is_gpx: bool, is_empty: bool },
+    Open { point: Option<OpenPoint>, child: Option<Child>, is_gpx: bool, is_empty: bool },
     Close,
     Text(String),
     Other,
@@ -82,13 +106,13 @@ impl<R: Read> GpxFixes<R> {
     fn next_event(&mut self) -> Result<PointEvent> {
         self.buffer.clear();
         self.reader.get_mut().event_bytes = 0;
-        let in_time = self.point.as_ref().is_some_and(|point| point.in_time);
+        let in_child = self.point.as_ref().is_some_and(|point| point.child.is_some());
         let event = self.reader.read_event_into(&mut self.buffer);
         Ok(match event {
             Ok(Event::Start(tag)) => opened(&tag, self.reader.get_ref().line, self.depth, false),
             Ok(Event::Empty(tag)) => opened(&tag, self.reader.get_ref().line, self.depth, true),
             Ok(Event::End(_)) => PointEvent::Close,
-            Ok(Event::Text(text)) if in_time => PointEvent::Text(text.to_string()),
+            Ok(Event::Text(text)) if in_child => PointEvent::Text(text.to_string()),
             Ok(Event::Eof) => PointEvent::End,
             Ok(_) => PointEvent::Other,
             Err(quick_xml::Error::Io(error)) if error.kind() != io::ErrorKind::InvalidInput => {
@@ -100,16 +124,18 @@ impl<R: Read> GpxFixes<R> {
 
     fn handle(&mut self, event: PointEvent) -> Result<Option<std::result::Result<FixRow, RowError>>> {
         match event {
-            PointEvent::Open { point, is_time, is_gpx, is_empty } => {
+            PointEvent::Open { point, child, is_gpx, is_empty } => {
                 if !self.has_root && !is_gpx {
                     return Err(self.malformed("not GPX: the first element must be `gpx`"));
                 }
                 self.has_root = true;
                 if let Some(open) = &mut self.point {
-                    // The time of the point itself, not of one of its extensions.
-                    if is_time && self.depth == open.depth + 1 && !is_empty {
-                        open.in_time = true;
-                        open.time.get_or_insert_default();
+                    // The child of the point itself, not of one of its extensions.
+                    if self.depth == open.depth + 1 && !is_empty {
+                        open.child = child;
+                        if let Some(child) = child {
+                            open.texts[child as usize].get_or_insert_default();
+                        }
                     }
                 } else {
                     self.point = point;
@@ -124,10 +150,10 @@ impl<R: Read> GpxFixes<R> {
             }
             PointEvent::Close => return Ok(self.close()),
             PointEvent::Text(text) => {
-                if let Some(time) = self.point.as_mut().and_then(|point| point.time.as_mut())
-                    && time.len() + text.len() <= MAX_TIME_BYTES
+                if let Some(known) = self.point.as_mut().and_then(OpenPoint::open_text)
+                    && known.len() + text.len() <= MAX_TEXT_BYTES
                 {
-                    time.push_str(&text);
+                    known.push_str(&text);
                 }
             }
             PointEvent::Other => {}
@@ -143,7 +169,7 @@ impl<R: Read> GpxFixes<R> {
         self.depth = self.depth.saturating_sub(1);
         let depth = self.depth;
         if let Some(open) = &mut self.point {
-            open.in_time = false;
+            open.child = None;
         }
         let point = self.point.take_if(|point| point.depth == depth)?;
         Some(point.row(&self.time_bounds))
@@ -156,9 +182,30 @@ impl<R: Read> GpxFixes<R> {
 }
 
 impl OpenPoint {
+    fn open_text(&mut self) -> Option<&mut String> {
+        self.texts[self.child? as usize].as_mut()
+    }
+
+    fn text(&self, child: Child) -> Option<&str> {
+        self.texts[child as usize].as_deref().map(str::trim)
+    }
+
+    /// By the kind of solution and the dilution of precision; `None` where the point has neither.
+    fn sigma(&self) -> Option<SigmaM> {
+        let hdop = self.text(Child::Hdop).and_then(|text| text.parse().ok());
+        let solution = match self.text(Child::Fix) {
+            Some("dgps") => Solution::Differential,
+            Some("pps") => Solution::Precise,
+            Some("2d" | "3d") => Solution::Autonomous,
+            _ => hdop.map(|_| Solution::Autonomous)?,
+        };
+        solution.sigma(hdop)
+    }
+
     fn row(self, time_bounds: &TimeBounds) -> std::result::Result<FixRow, RowError> {
-        let fix = self.fix?;
-        let time = self.time.as_deref().map(|text| parse_time(text.trim())).transpose();
+        let time = self.text(Child::Time).map(parse_time).transpose();
+        let sigma_m = self.sigma();
+        let fix = Fix { sigma_m, ..self.fix? };
         let invalid = |_| RowError {
             line: self.line,
             field: "time".to_owned(),
@@ -171,9 +218,14 @@ impl OpenPoint {
 fn opened(tag: &BytesStart<'_>, line: u64, depth: usize, is_empty: bool) -> PointEvent {
     let name = tag.local_name().into_inner();
     let is_point = matches!(name, "trkpt" | "rtept" | "wpt");
-    let point =
-        is_point.then(|| OpenPoint { line, depth, fix: fix_of(tag, line), time: None, in_time: false });
-    PointEvent::Open { point, is_time: name == "time", is_gpx: name == "gpx", is_empty }
+    let point = is_point.then(|| OpenPoint {
+        line,
+        depth,
+        fix: fix_of(tag, line),
+        texts: [const { None }; 3],
+        child: None,
+    });
+    PointEvent::Open { point, child: Child::named(name), is_gpx: name == "gpx", is_empty }
 }
 
 fn fix_of(tag: &BytesStart<'_>, line: u64) -> std::result::Result<Fix, RowError> {

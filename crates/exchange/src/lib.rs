@@ -29,6 +29,7 @@ mod cursor;
 mod elements;
 mod feature;
 mod file_row;
+mod fix_quality;
 mod fix_row;
 mod fixes;
 mod format;

@@ -1,7 +1,7 @@
 //! Fixes of an NMEA 0183 log.
 //!
 //! Positions are those of GGA, which has their quality but only the time of day; the date is that of
-//! RMC and ZDA. Other sentences are skipped.
+//! RMC and ZDA, and standard deviations are those of GST. Other sentences are skipped.
 
 use std::collections::VecDeque;
 use std::io::Read;
@@ -10,14 +10,15 @@ use jiff::civil::{Date, DateTime, Time};
 use jiff::tz::TimeZone;
 use jiff::{SignedDuration, Timestamp};
 use nmea::sentences::rmc::RmcStatusOfFix;
-use nmea::sentences::{FixType, GgaData, RmcData, ZdaData};
+use nmea::sentences::{FixType, GgaData, GstData, RmcData, ZdaData};
 use nmea::{ParseResult, SentenceType};
 
 use super::file_row::RowError;
+use super::fix_quality::{Solution, StatedDeviations, sigma_of_deviations};
 use super::fix_row::FixRow;
 use super::lines::{Line, Lines};
 use super::wire;
-use crate::domain::{Error, Fix, Result, TimeBounds};
+use crate::domain::{Error, Fix, Result, SigmaM, TimeBounds};
 
 /// Rows buffered until the first date. Receivers send RMC or ZDA at least every few seconds; the fixes
 /// of a file without a date have no time.
@@ -26,6 +27,7 @@ const MAX_PENDING: usize = 256;
 /// Reads an NMEA log's fixes.
 pub(super) struct NmeaFixes<R> {
     lines: Lines<R>,
+    sentences: Sentences,
     time_bounds: TimeBounds,
     /// The latest instant with a date.
     dated_instant: Option<Timestamp>,
@@ -47,7 +49,13 @@ pub(super) enum SentenceContent {
 
 impl<R: Read> NmeaFixes<R> {
     pub(super) fn new(reader: R, time_bounds: TimeBounds) -> Self {
-        Self { lines: Lines::new(reader), time_bounds, dated_instant: None, pending: VecDeque::new() }
+        Self {
+            lines: Lines::new(reader),
+            sentences: Sentences::default(),
+            time_bounds,
+            dated_instant: None,
+            pending: VecDeque::new(),
+        }
     }
 
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
@@ -71,7 +79,7 @@ impl<R: Read> NmeaFixes<R> {
     fn read_line(&mut self) -> Result<bool> {
         let Some((line, text)) = self.lines.next_line().map_err(Error::fault)? else { return Ok(false) };
         let content = match text {
-            Line::Text(text) => content_of(text.trim()),
+            Line::Text(text) => self.sentences.content_of(text.trim()),
             Line::NotUtf8 => Err("is not UTF-8".to_owned()),
             Line::TooLong => Err("is longer than 64 KiB".to_owned()),
         };
@@ -113,22 +121,54 @@ fn instant(date: Date, time: Time) -> Option<Timestamp> {
     TimeZone::UTC.to_timestamp(DateTime::from_parts(date, time)).ok()
 }
 
-/// Parses a line; blank lines and other sentences have no content.
-pub(super) fn content_of(text: &str) -> Result<SentenceContent, String> {
-    let Some(sentence) = sentence_of(text) else { return Ok(SentenceContent::None) };
-    match nmea::parse_str(text) {
-        Ok(ParseResult::GGA(gga)) => Ok(SentenceContent::Fix(time_of(gga.fix_time), fix_of(&gga)?)),
-        Ok(ParseResult::RMC(rmc)) => {
-            Ok(date_of_rmc(&rmc).map_or(SentenceContent::None, SentenceContent::Date))
+/// The sentences of one receiver, in the order in which it sends them.
+#[derive(Default)]
+pub(super) struct Sentences {
+    deviations: StatedDeviations<Solution>,
+}
+
+impl Sentences {
+    /// Parses a line; blank lines and other sentences have no content.
+    pub(super) fn content_of(&mut self, text: &str) -> Result<SentenceContent, String> {
+        let Some(sentence) = sentence_of(text) else { return Ok(SentenceContent::None) };
+        match nmea::parse_str(text) {
+            Ok(ParseResult::GGA(gga)) => Ok(SentenceContent::Fix(time_of(gga.fix_time), self.fix_of(&gga)?)),
+            Ok(ParseResult::GST(gst)) => {
+                self.take_deviations(&gst);
+                Ok(SentenceContent::None)
+            }
+            Ok(ParseResult::RMC(rmc)) => {
+                Ok(date_of_rmc(&rmc).map_or(SentenceContent::None, SentenceContent::Date))
+            }
+            Ok(ParseResult::ZDA(zda)) => {
+                Ok(date_of_zda(&zda).map_or(SentenceContent::None, SentenceContent::Date))
+            }
+            Ok(_) => Ok(SentenceContent::None),
+            // An invalid sentence without a position loses no fix.
+            Err(_) if sentence == Sentence::Supplement => Ok(SentenceContent::None),
+            Err(nmea::Error::ChecksumMismatch { .. }) => Err("the sentence's checksum is wrong".to_owned()),
+            Err(_) => Err("is not an NMEA 0183 sentence".to_owned()),
         }
-        Ok(ParseResult::ZDA(zda)) => {
-            Ok(date_of_zda(&zda).map_or(SentenceContent::None, SentenceContent::Date))
-        }
-        Ok(_) => Ok(SentenceContent::None),
-        // An invalid sentence without a position loses no fix.
-        Err(_) if sentence == Sentence::Date => Ok(SentenceContent::None),
-        Err(nmea::Error::ChecksumMismatch { .. }) => Err("the sentence's checksum is wrong".to_owned()),
-        Err(_) => Err("is not an NMEA 0183 sentence".to_owned()),
+    }
+
+    fn take_deviations(&mut self, gst: &GstData) {
+        let Some(time_of_day) = time_of(gst.time) else { return };
+        let axes = gst.long_sd.zip(gst.lat_sd).or(gst.ellipse_semi_major_sd.zip(gst.ellipse_semi_minor_sd));
+        let sigma = axes.and_then(|(one_m, other_m)| sigma_of_deviations(one_m.into(), other_m.into()));
+        self.deviations.state(second_of_day(time_of_day), sigma);
+    }
+
+    fn fix_of(&mut self, gga: &GgaData) -> Result<Fix, String> {
+        let solution = solution_of(gga)?;
+        let (Some(longitude_deg), Some(latitude_deg)) = (gga.longitude, gga.latitude) else {
+            return Err("the sentence has no position".to_owned());
+        };
+        let time_of_day = time_of(gga.fix_time).map(second_of_day);
+        let stated = time_of_day.and_then(|at_s| self.deviations.of_fix(at_s, solution));
+        let sigma = stated.or_else(|| solution.sigma(gga.hdop.map(f64::from)));
+        wire::Fix { longitude_deg, latitude_deg, sigma_m: sigma.map(SigmaM::metres) }
+            .to_domain()
+            .map_err(|error| error.to_string())
     }
 }
 
@@ -136,8 +176,8 @@ pub(super) fn content_of(text: &str) -> Result<SentenceContent, String> {
 enum Sentence {
     /// GGA, or text that is not a sentence.
     Position,
-    /// RMC or ZDA.
-    Date,
+    /// RMC or ZDA, which have the date, or GST.
+    Supplement,
 }
 
 /// Kind of a sentence by its address: `$` or `!`, two letters of the talker, three of the sentence;
@@ -154,10 +194,10 @@ fn sentence_of(text: &str) -> Option<Sentence> {
     if name == SentenceType::GGA.as_str() {
         return Some(Sentence::Position);
     }
-    [SentenceType::RMC, SentenceType::ZDA]
+    [SentenceType::RMC, SentenceType::ZDA, SentenceType::GST]
         .iter()
-        .any(|dated| name == dated.as_str())
-        .then_some(Sentence::Date)
+        .any(|supplement| name == supplement.as_str())
+        .then_some(Sentence::Supplement)
 }
 
 /// Converts the parser's times, which are of another calendar library, by their ISO 8601 text.
@@ -175,19 +215,23 @@ fn date_of_zda(zda: &ZdaData) -> Option<Timestamp> {
     instant(zda.utc_date()?.to_string().parse().ok()?, time_of(zda.utc_time)?)
 }
 
-fn fix_of(gga: &GgaData) -> Result<Fix, String> {
-    match gga.fix_type {
-        Some(quality) if quality.is_valid() => {}
+fn second_of_day(time: Time) -> f64 {
+    time.duration_since(Time::midnight()).as_secs_f64()
+}
+
+fn solution_of(gga: &GgaData) -> Result<Solution, String> {
+    Ok(match gga.fix_type {
+        Some(FixType::Gps) => Solution::Autonomous,
+        Some(FixType::DGps) => Solution::Differential,
+        Some(FixType::Pps) => Solution::Precise,
+        Some(FixType::Rtk) => Solution::RtkFixed,
+        Some(FixType::FloatRtk) => Solution::RtkFloat,
         None | Some(FixType::Invalid) => return Err("the receiver had no fix (quality 0)".to_owned()),
-        Some(_) => {
+        Some(FixType::Estimated | FixType::Manual | FixType::Simulation) => {
             return Err(
                 "the position is estimated, entered manually or simulated (quality 6 to 8), not measured"
                     .to_owned(),
             );
         }
-    }
-    let (Some(longitude_deg), Some(latitude_deg)) = (gga.longitude, gga.latitude) else {
-        return Err("the sentence has no position".to_owned());
-    };
-    wire::Fix { longitude_deg, latitude_deg, sigma_m: None }.to_domain().map_err(|error| error.to_string())
+    })
 }

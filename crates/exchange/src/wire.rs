@@ -255,20 +255,18 @@ impl Observation<'_> {
         let target_id = self.target_id.as_ref().map(|id| domain::TargetId::new(id.as_str())).transpose()?;
         let receiver_id =
             self.receiver_id.as_ref().map(|id| domain::ReceiverId::new(id.as_str())).transpose()?;
-        let (target_id, time) = match (target_id, receiver_id) {
+        let bounding_box = self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?;
+        let fix = self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?;
+        let (target_id, time, fix) = match (target_id, receiver_id) {
             (None, Some(receiver_id)) => {
                 let (target_id, time) = receivers.resolve(&receiver_id, time);
-                (Some(target_id), time)
+                (Some(target_id), time, fix.map(|fix| receivers.with_sigma(&receiver_id, fix)))
             }
-            (target_id, _) => (target_id, time),
+            (target_id, _) => (target_id, time, fix),
         };
-        domain::Observation::new(
-            time,
-            target_id,
-            self.bounding_box.map(|sides| box_within(sides, image_size)).transpose()?,
-            self.fix.map(|fix| fix.to_domain().map_err(|error| error.under("fix"))).transpose()?,
-        )?
-        .with_tracker_id(self.tracker_id.as_ref().map(|id| domain::TrackerId::new(id.as_str())).transpose()?)
+        domain::Observation::new(time, target_id, bounding_box, fix)?.with_tracker_id(
+            self.tracker_id.as_ref().map(|id| domain::TrackerId::new(id.as_str())).transpose()?,
+        )
     }
 }
 

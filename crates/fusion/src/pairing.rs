@@ -176,7 +176,7 @@ pub fn pair(
             continue;
         };
         let (target_id, time) = receivers.resolve(receiver_id, received.time);
-        pairer.insert_fix(&target_id, time, received.fix, ());
+        pairer.insert_fix(&target_id, time, receivers.with_sigma(receiver_id, received.fix), ());
     }
     let (detections, fixes) = pairer.items_of_lone_sources();
     let PairedItems { samples, unpaired_detections, .. } = pairer.finish();

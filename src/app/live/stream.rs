@@ -263,16 +263,16 @@ impl LiveStream {
     ) -> Result<ItemResult> {
         let lease = self.lease()?;
         lease.check(self.app.clock.monotonic())?;
-        let (target_id, time) = match (item.target_id, &item.receiver_id) {
-            (Some(target_id), _) => (Some(target_id), item.time),
+        let (target_id, time, fix) = match (item.target_id, &item.receiver_id) {
             (None, Some(receiver_id)) => {
                 let (target_id, time) = camera.receivers.resolve(receiver_id, item.time);
-                (Some(target_id), time)
+                let fix = item.fix.map(|fix| camera.receivers.with_sigma(receiver_id, fix));
+                (Some(target_id), time, fix)
             }
-            (None, None) => (None, item.time),
+            (target_id, _) => (target_id, item.time, item.fix),
         };
-        let observation = Observation::new(time, target_id, item.bounding_box, item.fix)?
-            .with_tracker_id(item.tracker_id)?;
+        let observation =
+            Observation::new(time, target_id, item.bounding_box, fix)?.with_tracker_id(item.tracker_id)?;
         // A time that no track takes must not move the pairing either.
         self.app.live_time_bounds(now).check(time)?;
         let identified = self.app.identify(camera, observation);

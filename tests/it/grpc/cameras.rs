@@ -21,7 +21,12 @@ fn yard() -> proto::CameraProfile {
 }
 
 fn receiver(receiver_id: &str, target_id: &str, clock_offset_s: f64) -> proto::Receiver {
-    proto::Receiver { receiver_id: receiver_id.to_owned(), target_id: target_id.to_owned(), clock_offset_s }
+    proto::Receiver {
+        receiver_id: receiver_id.to_owned(),
+        target_id: target_id.to_owned(),
+        clock_offset_s,
+        sigma_m: None,
+    }
 }
 
 fn get(id: &str) -> proto::GetCameraRequest {

@@ -3,7 +3,8 @@
 use jiff::{SignedDuration, Timestamp};
 use sightfix::domain::{ReceivedFix, ReceiverId, Score, TargetClass, TimeBounds};
 use sightfix::exchange::{
-    DetectedBox, MessageContext, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
+    DetectedBox, FixFormat, MessageContext, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
+    read_received_fixes,
 };
 
 fn context() -> MessageContext {
@@ -283,4 +284,107 @@ fn a_time_ahead_of_the_servers_clock_is_refused() {
     let message = FRIGATE.replace("1607123962.082975", &format!("{}", ahead.as_second()));
     let refused = decoder(MessageFormat::Frigate).decode(message.as_bytes(), &context()).expect_err("ahead");
     assert!(refused.contains("ahead of the server's clock"), "{refused}");
+}
+
+/// Standard deviation of each fix, mm, as messages state it.
+fn live_sigmas_mm(format: MessageFormat, text: &str) -> Vec<Option<i64>> {
+    let reading = read(format, text);
+    let sigma_mm = |item: &MessageItem| match item {
+        MessageItem::Fix(it) => it.fix.sigma_m.map(|sigma| (sigma.metres() * 1e3).round() as i64),
+        MessageItem::Detection(it) => panic!("{it:?}"),
+    };
+    reading.items.iter().map(sigma_mm).collect()
+}
+
+/// The same as a file states it.
+fn filed_sigmas_mm(format: FixFormat, text: &str) -> Vec<Option<i64>> {
+    let rows = read_received_fixes(text.as_bytes(), format, context().time_bounds).expect("a file");
+    let sigma_mm = |row: ReceivedFix| row.fix.sigma_m.map(|sigma| (sigma.metres() * 1e3).round() as i64);
+    rows.map(|row| sigma_mm(row.expect("it goes on").expect("a fix"))).collect()
+}
+
+fn sentence(body: &str) -> String {
+    let checksum = body.bytes().fold(0, |sum, byte| sum ^ byte);
+    let start = if body.starts_with("AI") { '!' } else { '$' };
+    format!("{start}{body}*{checksum:02X}\r\n")
+}
+
+#[test]
+fn nmea_messages_and_files_state_the_same_quality() {
+    let rmc = sentence("GPRMC,115950.00,A,3037.6808,N,10359.2068,E,0.5,054.7,010626,020.3,E");
+    let gga = |second: u32, quality: u32, hdop: &str| {
+        sentence(&format!(
+            "GPGGA,1159{second}.00,3037.6808,N,10359.2068,E,{quality},08,{hdop},545.4,M,46.9,M,,"
+        ))
+    };
+    let gst = |second: u32, axes: &str| sentence(&format!("GPGST,1159{second}.00,0.01,,,,{axes},0.03"));
+    let log = [
+        rmc,
+        gga(51, 1, "0.9"),
+        gga(52, 2, "1.0"),
+        gga(53, 1, ""),
+        gga(54, 4, "0.9"),
+        gst(54, "0.014,0.010"),
+        gga(55, 4, "0.9"),
+        // The ambiguities are lost: what was stated for them holds no longer.
+        gga(56, 1, "0.9"),
+        gst(57, "2.0,1.0"),
+        gga(57, 1, "0.9"),
+        gst(57, ","),
+        gga(58, 1, "0.9"),
+    ]
+    .concat();
+    let expected = [3_182, 1_414, 5_303, 19, 12, 3_182, 1_581, 3_182].map(Some);
+    assert_eq!(live_sigmas_mm(MessageFormat::Nmea, &log), expected);
+    assert_eq!(filed_sigmas_mm(FixFormat::Nmea, &log), expected);
+}
+
+#[test]
+fn gpsd_messages_and_files_state_the_same_quality() {
+    let report = |second: u32, rest: &str| {
+        format!(
+            r#"{{"class":"TPV","device":"a","mode":3,"time":"2026-06-01T11:59:{second}Z","lat":30.6,"lon":103.9{rest}}}"#
+        )
+    };
+    let log = [
+        report(10, ""),
+        report(11, r#","epx":1.96,"epy":1.96"#),
+        report(12, r#","epx":1.96,"epy":1.96,"eph":10"#),
+        report(13, r#","status":3,"epx":15,"epy":15,"eph":0.02"#),
+        report(14, r#","status":1"#),
+        r#"{"class":"GST","device":"a","time":"2026-06-01T11:59:14Z","lat":0.3,"lon":0.4}"#.to_owned(),
+        report(15, r#","status":1,"eph":10"#),
+        r#"{"class":"GST","device":"b","time":"2026-06-01T11:59:16Z","lat":0.01,"lon":0.01}"#.to_owned(),
+        report(16, r#","status":1,"eph":10"#),
+    ]
+    .join("\n");
+    let expected = [None, Some(1_000), Some(4_085), Some(13), Some(5_303), Some(354), Some(4_085)];
+    assert_eq!(live_sigmas_mm(MessageFormat::Gpsd, &log), expected);
+    assert_eq!(filed_sigmas_mm(FixFormat::Gpsd, &log), expected);
+}
+
+#[test]
+fn traccar_ais_and_gpx_state_their_quality() {
+    let forwarded = |quality: &str| {
+        format!(
+            r#"{{"position": {{"deviceId": 3, "fixTime": "2026-06-01T12:00:18.000+00:00", "valid": true,
+            "latitude": 59.4371, "longitude": 24.7453, {quality}}}}}"#
+        )
+    };
+    let of_traccar = |quality: &str| live_sigmas_mm(MessageFormat::Traccar, &forwarded(quality));
+    assert_eq!(of_traccar(r#""accuracy": 4.0, "attributes": {"hdop": 9}"#), [Some(2_650)]);
+    assert_eq!(of_traccar(r#""accuracy": 0.0, "attributes": {"hdop": 0.9}"#), [Some(3_182)]);
+    assert_eq!(of_traccar(r#""accuracy": 0.0, "attributes": {}"#), [None]);
+
+    let of_ais =
+        |payload: &str| live_sigmas_mm(MessageFormat::Nmea, &sentence(&format!("AIVDM,1,1,,B,{payload},0")));
+    assert_eq!(of_ais("177KQJ5000G?tO`K>RA1wUbN0TKH"), [Some(10_214)], "more than 10 m");
+    assert_eq!(of_ais("177KQJ5000g?tO`K>RA1wUbN0TKH"), [Some(4_085)], "10 m or less");
+
+    let point = |rest: &str| {
+        format!(r#"<trkpt lat="30.6" lon="103.9"><time>2026-06-01T11:59:50Z</time>{rest}</trkpt>"#)
+    };
+    let points = ["", "<hdop>0.9</hdop>", "<fix>dgps</fix><hdop>1</hdop>", "<fix>3d</fix>"].map(point);
+    let gpx = format!("<gpx><trk><trkseg>{}</trkseg></trk></gpx>", points.concat());
+    assert_eq!(filed_sigmas_mm(FixFormat::Gpx, &gpx), [None, Some(3_182), Some(1_414), Some(5_303)]);
 }

@@ -71,6 +71,49 @@ async fn nmea_over_tcp_feeds_the_track_of_the_connections_receiver() {
     assert!(tried["message"]["reading"][0].as_str().expect("text").contains("latitude 30.628"), "{tried}");
 }
 
+/// The radius of the track of a target, m.
+async fn r95_m(server: &TestServer, target: &str) -> f64 {
+    let tracks = server.get("/v1/cameras/gate/tracks").await.expect(200).json();
+    let features = tracks["features"].as_array().expect("features");
+    let track = features.iter().find(|it| it["properties"]["target_id"] == target);
+    track.unwrap_or_else(|| panic!("{tracks}"))["properties"]["r95_m"].as_f64().expect("a number")
+}
+
+#[tokio::test]
+async fn what_a_fix_states_wins_over_its_receiver_and_that_over_the_camera() {
+    let address = own_address();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    let camera = json!({
+        "id": "gate", "gnss_error": {"sigma_m": 0.02}, "receivers": [{"receiver_id": "rover", "sigma_m": 4.0}],
+    });
+    server.post("/v1/cameras", &camera).await.expect(201);
+    let source = json!({
+        "address": format!("udp://{address}"), "format": "nmea", "camera_ids": ["gate"], "receiver_id": "boat",
+    });
+    server.post("/v1/connections", &json!({"id": "receiver", "source": source})).await.expect(201);
+    connection_when(&server, "receiver", |status| status["state"] == "running").await;
+    let socket = UdpSocket::bind("127.0.0.1:0").await.expect("a port");
+    socket.send_to(sentences().as_bytes(), address).await.expect("sent");
+    let connection = connection_when(&server, "receiver", |status| status["items"] == 1).await;
+    // Quality 1 with an HDOP of 0.9, whatever the camera's receivers usually reach: 3.18 m per axis.
+    let stated_m = r95_m(&server, "boat").await;
+    assert!((7.5..8.1).contains(&stated_m), "{stated_m} m");
+    let reading = connection["status"]["last_message"]["reading"][0].as_str().expect("text");
+    assert!(reading.contains("sigma 3.182 m per axis"), "{reading}");
+
+    for receiver in ["rover", "other"] {
+        let fix = json!({"observations": [{
+            "time": now().to_string(), "receiver_id": receiver, "fix": {"longitude_deg": 103.98678, "latitude_deg": 30.628},
+        }]});
+        server.post("/v1/cameras/gate/tracks", &fix).await.expect(200);
+    }
+    let of_receiver_m = r95_m(&server, "rover").await;
+    assert!((9.5..10.1).contains(&of_receiver_m), "{of_receiver_m} m");
+    let of_camera_m = r95_m(&server, "other").await;
+    assert!(of_camera_m < 0.1, "{of_camera_m} m");
+}
+
 #[tokio::test]
 async fn a_datagram_may_have_several_sentences() {
     let address = own_address();

@@ -7,10 +7,15 @@ use super::error::{Error, Result};
 pub struct SigmaM(f64);
 
 impl SigmaM {
+    /// Least standard deviation, m.
+    pub const LEAST_M: f64 = 0.001;
+    /// Largest standard deviation, m.
+    pub const LARGEST_M: f64 = 10_000.0;
+
     /// # Errors
     /// Refuses what is not a finite number from 0.001 to 10,000 m; the field is named `sigma_m`.
     pub fn new(sigma_m: f64) -> Result<Self> {
-        if (0.001..=10_000.0).contains(&sigma_m) {
+        if (Self::LEAST_M..=Self::LARGEST_M).contains(&sigma_m) {
             Ok(Self(sigma_m))
         } else {
             Err(Error::invalid("sigma_m", "must be a standard deviation from 0.001 to 10000 metres per axis"))

@@ -15,7 +15,8 @@ use crate::geo::{PlaneCovariance, Position};
 pub struct Fix {
     /// Measured position.
     pub position: Position,
-    /// Standard deviation per axis as reported by the receiver, if any.
+    /// Standard deviation per axis as the receiver states it with the fix, else as the camera's profile states it for the
+    /// receiver; `None` where neither does.
     pub sigma_m: Option<SigmaM>,
 }
 

@@ -1,10 +1,11 @@
-//! GNSS receivers: the targets that carry them, and their clock offsets.
+//! GNSS receivers: the targets that carry them, their clock offsets and their errors.
 
 use std::collections::BTreeMap;
 
 use jiff::{SignedDuration, Timestamp};
 
 use super::error::{Error, Result};
+use super::gnss_error::SigmaM;
 use super::names::{ReceiverId, TargetId};
 use super::observation::Fix;
 
@@ -73,7 +74,7 @@ pub struct ReceivedFix {
 }
 
 /// A receiver and the target that carries it.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Receiver {
     /// Id of the receiver.
     pub receiver_id: ReceiverId,
@@ -81,18 +82,25 @@ pub struct Receiver {
     pub target_id: TargetId,
     /// Offset of its clock.
     pub clock_offset: ClockOffset,
+    /// Standard deviation per axis of its fixes that state none; that of the camera's profile if `None`.
+    pub sigma: Option<SigmaM>,
 }
 
 impl Receiver {
-    /// A receiver with defaults: its id is also the target id, and its clock has no offset.
+    /// A receiver with defaults: its id is also the target id, its clock has no offset, and its error is the camera's.
     #[must_use]
     pub fn named(receiver_id: ReceiverId) -> Self {
-        Self { target_id: TargetId::from(receiver_id.clone()), receiver_id, clock_offset: ClockOffset::ZERO }
+        Self {
+            target_id: TargetId::from(receiver_id.clone()),
+            receiver_id,
+            clock_offset: ClockOffset::ZERO,
+            sigma: None,
+        }
     }
 }
 
 /// The receivers of a camera, each once, ordered by id.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Receivers(BTreeMap<ReceiverId, Receiver>);
 
 impl Receivers {
@@ -148,6 +156,13 @@ impl Receivers {
             None => (TargetId::from(receiver_id.clone()), time),
         }
     }
+
+    /// A receiver's fix with the error that is taken for it: what the fix states, else what is known of the receiver.
+    #[must_use]
+    pub fn with_sigma(&self, receiver_id: &ReceiverId, fix: Fix) -> Fix {
+        let of_receiver = || self.0.get(receiver_id).and_then(|receiver| receiver.sigma);
+        Fix { sigma_m: fix.sigma_m.or_else(of_receiver), ..fix }
+    }
 }
 
 #[cfg(test)]
@@ -201,5 +216,18 @@ mod tests {
         assert_eq!((target_id.as_str(), at), ("other", time));
         let early = ClockOffset::from_seconds(-60.0).expect("small").applied_to(Timestamp::MIN);
         assert_eq!(early, Timestamp::MIN, "saturates at the end of the calendar");
+    }
+
+    #[test]
+    fn what_a_fix_states_wins_over_what_is_known_of_its_receiver() {
+        let sigma = |metres: f64| Some(SigmaM::new(metres).expect("a sigma"));
+        let receivers = Receivers::new([Receiver { sigma: sigma(0.5), ..receiver("rover") }]).expect("good");
+        let position = crate::geo::Position::new(11.0, 48.0).expect("a position");
+        let taken = |name: &str, sigma_m| {
+            receivers.with_sigma(&ReceiverId::new(name).expect("a name"), Fix { position, sigma_m }).sigma_m
+        };
+        assert_eq!(taken("rover", sigma(3.0)), sigma(3.0));
+        assert_eq!(taken("rover", None), sigma(0.5));
+        assert_eq!(taken("other", None), None);
     }
 }

@@ -2,16 +2,17 @@
 
 use super::{MessageContext, MessageDecoder, MessageItem, Reading};
 use crate::format::FixFormat;
-use crate::gpsd;
+use crate::gpsd::Reports;
 
-pub(super) struct Gpsd;
+#[derive(Default)]
+pub(super) struct Gpsd(Reports);
 
 impl MessageDecoder for Gpsd {
     fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
         let text = std::str::from_utf8(payload).map_err(|_| "is not UTF-8".to_owned())?;
         let mut reading = Reading::default();
         for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
-            match gpsd::report(1, line, &context.time_bounds) {
+            match self.0.fix(1, line, &context.time_bounds) {
                 Ok(None) => reading.skip("a report without a position"),
                 Ok(Some(row)) => match row.and_then(|row| row.received(FixFormat::Gpsd)) {
                     Ok(fix) => reading.items.push(MessageItem::Fix(fix)),

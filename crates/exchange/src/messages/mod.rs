@@ -122,7 +122,7 @@ pub fn decoder(format: MessageFormat) -> Box<dyn MessageDecoder> {
         MessageFormat::Deepstream => Box::new(deepstream::DeepStream),
         MessageFormat::Onvif => Box::new(onvif::Onvif),
         MessageFormat::Nmea => Box::new(nmea::Nmea::default()),
-        MessageFormat::Gpsd => Box::new(gpsd::Gpsd),
+        MessageFormat::Gpsd => Box::new(gpsd::Gpsd::default()),
         MessageFormat::Traccar => Box::new(traccar::Traccar),
     }
 }

@@ -1,17 +1,19 @@
-//! NMEA 0183 sentences as they come: GGA of a receiver, dated by its RMC and ZDA, and AIS.
+//! NMEA 0183 sentences as they come: GGA of a receiver, dated by its RMC and ZDA, with the standard deviations of its
+//! GST, and AIS.
 
 use jiff::Timestamp;
 
 use super::ais::Ais;
 use super::{MessageContext, MessageDecoder, MessageItem, Reading};
 use crate::domain::ReceivedFix;
-use crate::nmea_fixes::{SentenceContent, content_of, nearest_instant};
+use crate::nmea_fixes::{SentenceContent, Sentences, nearest_instant};
 
 /// Reads sentences of one line each.
 #[derive(Default)]
 pub(super) struct Nmea {
     /// The latest instant with a date.
     dated_instant: Option<Timestamp>,
+    sentences: Sentences,
     ais: Ais,
 }
 
@@ -39,7 +41,7 @@ impl Nmea {
             reading.items.push(MessageItem::Fix(fix));
             return Ok(());
         }
-        match content_of(line)? {
+        match self.sentences.content_of(line)? {
             SentenceContent::None => {}
             SentenceContent::Date(instant) => self.dated_instant = Some(instant),
             SentenceContent::Fix(time_of_day, fix) => {

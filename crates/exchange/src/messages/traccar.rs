@@ -1,11 +1,13 @@
 //! Positions as Traccar forwards them (`forward.type = json`): `{"position": {...}, "device": {...}}`.
 //!
-//! The field `accuracy` is not used: its confidence level is not defined.
+//! `accuracy` is what devices state: of phones, the radius that contains them in 68 of 100 cases, m. 0 means that there
+//! is none; then the attribute `hdop` counts, if the device sends it.
 
 use serde::Deserialize;
 
 use super::{MessageContext, MessageDecoder, MessageItem, Reading, parse};
-use crate::domain::{ReceivedFix, ReceiverId, parse_time};
+use crate::domain::{ReceivedFix, ReceiverId, SigmaM, parse_time};
+use crate::fix_quality::{Solution, sigma_of_radius_68};
 use crate::wire;
 
 pub(super) struct Traccar;
@@ -28,6 +30,21 @@ struct Position {
     outdated: bool,
     latitude: f64,
     longitude: f64,
+    accuracy: Option<f64>,
+    attributes: Option<Attributes>,
+}
+
+#[derive(Deserialize)]
+struct Attributes {
+    hdop: Option<f64>,
+}
+
+impl Position {
+    fn sigma(&self) -> Option<SigmaM> {
+        let hdop = || self.attributes.as_ref().and_then(|attributes| attributes.hdop);
+        let by_hdop = || hdop().and_then(|hdop| Solution::Autonomous.sigma(Some(hdop)));
+        self.accuracy.and_then(sigma_of_radius_68).or_else(by_hdop)
+    }
 }
 
 #[derive(Deserialize)]
@@ -48,6 +65,7 @@ impl MessageDecoder for Traccar {
             reading.skip("the position is not valid, or an old one");
             return Ok(reading);
         }
+        let sigma = position.sigma();
         let named = device.and_then(|device| device.unique_id);
         let named = named.or_else(|| position.device_id.map(|id| id.to_string()));
         let time = position.fix_time.ok_or("position.fixTime is missing")?;
@@ -55,7 +73,7 @@ impl MessageDecoder for Traccar {
             let fix = wire::Fix {
                 longitude_deg: position.longitude,
                 latitude_deg: position.latitude,
-                sigma_m: None,
+                sigma_m: sigma.map(SigmaM::metres),
             };
             Ok(ReceivedFix {
                 time: context.time_bounds.check(parse_time(&time)?)?,

@@ -117,11 +117,13 @@ impl Matching {
     pub fn receivers_of(&self, fixes: &[ReceivedFix], given: &Receivers) -> Receivers {
         let ids: BTreeSet<&ReceiverId> = fixes.iter().filter_map(|fix| fix.receiver_id.as_ref()).collect();
         let receivers = ids.into_iter().map(|id| {
-            let given_s = given.get(id).map_or(0.0, |own| own.clock_offset.seconds());
+            let known = given.get(id);
+            let given_s = known.map_or(0.0, |own| own.clock_offset.seconds());
             let found = self.clock_offsets.iter().find(|(own, _)| own == id);
             let found_s = found.map_or(0.0, |(_, own)| own.seconds());
             let clock_offset = ClockOffset::from_seconds(given_s + found_s).unwrap_or(ClockOffset::ZERO);
-            Receiver { clock_offset, ..Receiver::named(id.clone()) }
+            let sigma = known.and_then(|own| own.sigma);
+            Receiver { clock_offset, sigma, ..Receiver::named(id.clone()) }
         });
         // The bound on receivers is smaller than that of a list of receivers.
         Receivers::new(receivers).unwrap_or_default()

@@ -125,10 +125,11 @@ impl<'a> Scene<'a> {
             own.iter()
                 .filter_map(|received| {
                     let (_, time) = self.receivers.resolve(receiver_id, received.time);
+                    let fix = self.receivers.with_sigma(receiver_id, received.fix);
                     Some(TimedFix {
                         time_s: self.seconds(time),
-                        position: plane.to_plane_within_range(received.fix.position)?,
-                        stated_variance_m2: received.fix.sigma_m.map(|sigma| sigma.variance_m2()),
+                        position: plane.to_plane_within_range(fix.position)?,
+                        stated_variance_m2: fix.sigma_m.map(|sigma| sigma.variance_m2()),
                     })
                 })
                 .collect()

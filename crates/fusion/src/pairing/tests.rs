@@ -79,7 +79,7 @@ fn square() -> (Vec<Detection>, Vec<ReceivedFix>) {
 
 fn carried_by(name: &str, phone: &str, offset_s: f64) -> Receivers {
     let clock_offset = ClockOffset::from_seconds(offset_s).expect("within a day");
-    Receivers::new([Receiver { receiver_id: receiver(phone), target_id: target(name), clock_offset }])
+    Receivers::new([Receiver { target_id: target(name), clock_offset, ..Receiver::named(receiver(phone)) }])
         .expect("one receiver")
 }
 

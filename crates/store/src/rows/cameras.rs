@@ -134,6 +134,9 @@ struct StoredReceiver {
     receiver_id: String,
     target_id: String,
     clock_offset_us: i64,
+    /// Missing in rows of earlier releases.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sigma_m: Option<f64>,
 }
 
 pub(crate) fn write_receivers(receivers: &Receivers) -> Result<String> {
@@ -141,6 +144,7 @@ pub(crate) fn write_receivers(receivers: &Receivers) -> Result<String> {
         receiver_id: receiver.receiver_id.as_str().to_owned(),
         target_id: receiver.target_id.as_str().to_owned(),
         clock_offset_us: receiver.clock_offset.microseconds(),
+        sigma_m: receiver.sigma.map(SigmaM::metres),
     });
     serde_json::to_string(&stored.collect::<Vec<_>>()).map_err(Error::fault)
 }
@@ -152,6 +156,7 @@ fn read_receivers(json: &str) -> Result<Receivers> {
             receiver_id: ReceiverId::new(&stored.receiver_id)?,
             target_id: TargetId::new(&stored.target_id)?,
             clock_offset: ClockOffset::from_microseconds(stored.clock_offset_us)?,
+            sigma: stored.sigma_m.map(SigmaM::new).transpose()?,
         })
     };
     Receivers::new(stored.iter().map(receiver).collect::<Result<Vec<_>>>()?)

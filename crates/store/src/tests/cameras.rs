@@ -27,6 +27,7 @@ fn full(name: &str) -> NewCamera {
                 receiver_id: ReceiverId::new("phone-7").expect("a name"),
                 target_id: target("person-1"),
                 clock_offset: ClockOffset::from_seconds(-18.000_001).expect("within a day"),
+                sigma: Some(SigmaM::new(0.02).expect("a sigma")),
             },
         ])
         .expect("two receivers"),

@@ -1,5 +1,5 @@
 //! Which rows are left out together: whole targets; where one target has nearly all rows whole sessions,
-//! else spells.
+//! else intervals of time.
 
 use super::noise::Epoch;
 use crate::samples::rows::SESSION_GAP_S;
@@ -7,8 +7,6 @@ use crate::samples::target_groups::groups_of_targets;
 
 /// Groups at most.
 pub(crate) const GROUPS: usize = 8;
-/// Share of the rows that a session of its own has at least.
-const MIN_SESSION_SHARE: f64 = 0.1;
 
 /// Group of each row, and their number.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,15 +31,16 @@ impl Grouping {
 pub(crate) fn groups(epochs: &[Epoch]) -> Grouping {
     let targets: Vec<usize> =
         epochs.chunk_by(|one, next| one.sequence == next.sequence).map(<[Epoch]>::len).collect();
-    whole_targets(&targets).or_else(|| sessions(epochs)).unwrap_or_else(|| spells(epochs, &targets))
+    whole_targets(&targets).or_else(|| sessions(epochs)).unwrap_or_else(|| intervals(epochs, &targets))
 }
 
-/// Whole sessions, where there are at least two: what they contradict each other by is in no spell's
-/// difference from its neighbours.
+/// Whole sessions, where there are at least two. An interval shares the bias of its session with its neighbours, so
+/// leaving out an interval does not show how much sessions differ.
 fn sessions(epochs: &[Epoch]) -> Option<Grouping> {
     let mut order: Vec<usize> = (0..epochs.len()).collect();
     order.sort_by(|one, other| epochs[*one].time_s.total_cmp(&epochs[*other].time_s));
-    let least = (epochs.len() as f64 * MIN_SESSION_SHARE) as usize;
+    // So there are at most as many groups as may be.
+    let least = epochs.len().div_ceil(GROUPS);
     let mut of_row = vec![0; epochs.len()];
     let (mut count, mut in_last) = (0, 0_usize);
     for session in order.chunk_by(|one, next| epochs[*next].time_s - epochs[*one].time_s <= SESSION_GAP_S) {
@@ -62,30 +61,67 @@ fn whole_targets(targets: &[usize]) -> Option<Grouping> {
     Some(Grouping { of_row, count })
 }
 
-/// Spells of each target, cut at the largest gaps near equal shares.
-fn spells(epochs: &[Epoch], targets: &[usize]) -> Grouping {
-    let pieces = GROUPS.div_ceil(targets.len().max(1));
+/// Intervals of the target that has nearly all rows, cut at the largest gaps near equal shares; the rows of all others
+/// together are one more group.
+fn intervals(epochs: &[Epoch], targets: &[usize]) -> Grouping {
+    let others = usize::from(targets.len() > 1);
+    let pieces = GROUPS - others;
+    let largest = (0..targets.len()).max_by_key(|target| targets[*target]).unwrap_or(0);
     let mut of_row = Vec::with_capacity(epochs.len());
-    let (mut from, mut group) = (0, 0);
-    for rows in targets {
-        let own = &epochs[from..from + rows];
-        let share = rows / pieces;
-        let cuts: Vec<usize> = (1..pieces)
-            .map(|cut| {
-                let (low, high) = (cut * share - share / 3, cut * share + share / 3);
-                let gap_s = |at: usize| own[at].time_s - own[at - 1].time_s;
-                (low.max(1)..=high.min(rows.saturating_sub(1)))
-                    .max_by(|one, other| {
-                        gap_s(*one)
-                            .total_cmp(&gap_s(*other))
-                            .then_with(|| other.abs_diff(cut * share).cmp(&one.abs_diff(cut * share)))
-                    })
-                    .unwrap_or(cut * share)
-            })
-            .collect();
-        of_row.extend((0..*rows).map(|row| group + cuts.iter().filter(|cut| row >= **cut).count()));
-        group += pieces;
-        from += rows;
+    for (target, rows) in targets.iter().enumerate() {
+        if target == largest {
+            let from = of_row.len();
+            of_row.extend(interval_of_row(&epochs[from..from + rows], pieces));
+        } else {
+            of_row.extend(std::iter::repeat_n(pieces, *rows));
+        }
     }
-    Grouping { of_row, count: group }
+    Grouping { of_row, count: pieces + others }
+}
+
+/// The interval of each row of one target.
+fn interval_of_row(own: &[Epoch], pieces: usize) -> impl Iterator<Item = usize> {
+    let share = own.len() / pieces;
+    let gap_s = |at: usize| own[at].time_s - own[at - 1].time_s;
+    let cut_near = |middle: usize| {
+        let (low, high) = (middle - share / 3, middle + share / 3);
+        (low.max(1)..=high.min(own.len().saturating_sub(1)))
+            .max_by(|one, other| {
+                gap_s(*one)
+                    .total_cmp(&gap_s(*other))
+                    .then_with(|| other.abs_diff(middle).cmp(&one.abs_diff(middle)))
+            })
+            .unwrap_or(middle)
+    };
+    let cuts: Vec<usize> = (1..pieces).map(|cut| cut_near(cut * share)).collect();
+    (0..own.len()).map(move |row| cuts.iter().filter(|cut| row >= **cut).count())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Rows of each target, one per second from each of these instants on.
+    fn epochs(targets: &[&[(f64, usize)]]) -> Vec<Epoch> {
+        let of_target = |(sequence, sessions): (usize, &&[(f64, usize)])| {
+            let row = move |time_s| Epoch { time_s, sequence: sequence as u32 };
+            let of_session = |&(from_s, rows): &(f64, usize)| (0..rows).map(move |at| from_s + at as f64);
+            sessions.iter().flat_map(of_session).map(row).collect::<Vec<_>>()
+        };
+        targets.iter().enumerate().flat_map(of_target).collect()
+    }
+
+    #[test]
+    fn there_are_at_most_as_many_groups_as_a_model_may_hold() {
+        let (long, short): (&[(f64, usize)], &[(f64, usize)]) = (&[(0.0, 900)], &[(0.0, 5)]);
+        let few = [long, short, short, short, short];
+        let many: Vec<_> = std::iter::once(long).chain(std::iter::repeat_n(short, 30)).collect();
+        let days: Vec<(f64, usize)> = (0..12).map(|day| (86_400.0 * f64::from(day), 30)).collect();
+        for (targets, expected) in [(few.as_slice(), 8), (&many, 8), (&[days.as_slice()], 8)] {
+            let epochs = epochs(targets);
+            let members = groups(&epochs).members();
+            assert_eq!(members.len(), expected);
+            assert_eq!(members.iter().map(Vec::len).sum::<usize>(), epochs.len());
+        }
+    }
 }

@@ -116,8 +116,10 @@ struct MapTerms<'g> {
 
 fn terms<'g>(map: &PositionMap, predictor: &Predictor, sides: Sides<'g>) -> MapTerms<'g> {
     let mean = MeanTerms::of(&map.mean, sides);
-    let mut jacobian = mean.jacobian(&map.mean);
-    let mut position_m = [0, 1].map(|axis| mean.offset_m[axis] + map.mean.centre_m[axis]);
+    let tangent = mean.tangent();
+    let moved_m = tangent.map(|tangent| tangent.matrix_product(COEFFICIENTS, 1, &map.step));
+    let mut jacobian = mean.jacobian(map, &moved_m);
+    let mut position_m = [0, 1].map(|axis| mean.offset_m[axis] + moved_m[axis] + map.mean.centre_m[axis]);
     let q = (!map.inducing.is_empty()).then(|| {
         let scales = &predictor.input_scales.0;
         let [width_px, height_px] = [sides[2].max(1.0), sides[3].max(1.0)];
@@ -141,7 +143,7 @@ fn terms<'g>(map: &PositionMap, predictor: &Predictor, sides: Sides<'g>) -> MapT
         position_m = [0, 1].map(|axis| position_m[axis] + residual_m.column(axis));
         kernel.correlation.matrix_product(map.inducing.len(), map.rank, &map.basis)
     });
-    MapTerms { tangent: mean.tangent(), q, position_m, jacobian }
+    MapTerms { tangent, q, position_m, jacobian }
 }
 
 /// East and north weight of each inducing point.
@@ -243,13 +245,11 @@ impl<'g> MeanTerms<'g> {
             let scaled = (sides[side] - centre_px) / unit_px;
             if side < 2 { scaled } else { scaled.clamp(-MAX_SIDE, MAX_SIDE) }
         });
-        let linear =
-            |constant: f64, slopes: [f64; 4]| graph.columns(&scaled).matrix_product(4, 1, &slopes) + constant;
-        let denominator = linear(1.0, [c[6], c[7], c[12], c[13]]).max(MIN_DENOMINATOR);
-        let offset_m = [
-            linear(c[0], [c[1], c[2], c[8], c[9]]) / denominator,
-            linear(c[3], [c[4], c[5], c[10], c[11]]) / denominator,
-        ];
+        let linear = |constant: f64, part: Part| {
+            graph.columns(&scaled).matrix_product(4, 1, &by_side(c, part)) + constant
+        };
+        let denominator = linear(1.0, Part::Denominator).max(MIN_DENOMINATOR);
+        let offset_m = [0, 1].map(|axis| linear(c[3 * axis], Part::Numerator(axis)) / denominator);
         Self { scaled, denominator, offset_m }
     }
 
@@ -272,17 +272,43 @@ impl<'g> MeanTerms<'g> {
         })
     }
 
-    /// Derivatives of east and north by foot u, foot v, width and height, m per px.
-    fn jacobian(&self, mean: &ProjectiveMean) -> [Sides<'g>; 2] {
-        let c = &mean.coefficients;
-        let slopes_d = [c[6], c[7], c[12], c[13]];
-        let slopes_n = [[c[1], c[2], c[8], c[9]], [c[4], c[5], c[10], c[11]]];
+    /// Derivatives of east and north, with the map's step along the tangent, by foot u, foot v, width and height, m per px.
+    fn jacobian(&self, map: &PositionMap, moved_m: &[Expr<'g>; 2]) -> [Sides<'g>; 2] {
+        let slopes_d = by_side(&map.mean.coefficients, Part::Denominator);
+        let steps_d = by_side(&map.step, Part::Denominator);
+        let moved_d = self.graph_sum(&steps_d) / self.denominator;
         std::array::from_fn(|axis| {
+            let slopes_n = by_side(&map.mean.coefficients, Part::Numerator(axis));
+            let steps_n = by_side(&map.step, Part::Numerator(axis));
             std::array::from_fn(|side| {
-                (slopes_n[axis][side] - self.offset_m[axis] * slopes_d[side])
-                    / (self.denominator * mean.scales_px[side][1])
+                let offset_m = self.offset_m[axis];
+                let scale = self.denominator * map.mean.scales_px[side][1];
+                let of_ratio = (slopes_n[side] - offset_m * slopes_d[side]) / scale;
+                let of_move =
+                    (steps_n[side] - offset_m * steps_d[side] - moved_m[axis] * slopes_d[side]) / scale;
+                of_ratio * (1.0 - moved_d) + of_move
             })
         })
+    }
+
+    /// A linear function of the standardised foot and sides.
+    fn graph_sum(&self, slopes: &[f64; 4]) -> Expr<'g> {
+        self.denominator.graph().columns(&self.scaled).matrix_product(4, 1, slopes)
+    }
+}
+
+/// A numerator by axis, or the denominator.
+#[derive(Clone, Copy)]
+enum Part {
+    Numerator(usize),
+    Denominator,
+}
+
+/// The coefficients of foot u, foot v, width and height.
+fn by_side(c: &[f64; COEFFICIENTS], part: Part) -> [f64; 4] {
+    match part {
+        Part::Numerator(axis) => [c[3 * axis + 1], c[3 * axis + 2], c[8 + 2 * axis], c[9 + 2 * axis]],
+        Part::Denominator => [c[6], c[7], c[12], c[13]],
     }
 }
 

@@ -44,7 +44,11 @@ pub(crate) struct CoefficientDeviation {
 pub(crate) struct PositionMap {
     /// Weights of all maps sum to 1.
     pub(crate) weight: f64,
+    /// The ratio about which the map was linearised.
     pub(crate) mean: ProjectiveMean,
+    /// The solution less the coefficients of `mean`. The map answers by the tangent of `mean`, for its kernel weights, its
+    /// covariance and its calibration belong to that tangent.
+    pub(crate) step: [f64; COEFFICIENTS],
     pub(crate) lengths: LengthScales,
     /// Prior variance of the residual, m2.
     pub(crate) residual_m2: f64,
@@ -141,11 +145,11 @@ impl PositionMap {
             kernel: std::array::from_fn(|axis| project(&kernel[axis])),
         });
         let tangent_factor = posterior.tangent_covariance.clone().cholesky()?.unpack();
-        let mut mean = candidate.mean.clone();
-        // The coefficients of the last solution stand in for those about which it was linearised.
-        mean.coefficients.copy_from_slice(posterior.tangent.as_slice());
+        let mean = candidate.mean.clone();
+        let step = std::array::from_fn(|at| posterior.tangent[at] - mean.coefficients[at]);
         let tangent_factor = tangent_factor.transpose().as_slice().to_vec();
         let mut map = Self {
+            step,
             lengths: parameters.lengths,
             residual_m2: residual_m * residual_m,
             inducing: inducing.clone(),
@@ -168,6 +172,7 @@ impl PositionMap {
         Self {
             weight,
             mean,
+            step: [0.0; COEFFICIENTS],
             lengths: LengthScales { place: 1.0, size: 1.0 },
             residual_m2: 0.0,
             inducing: Vec::new(),
@@ -212,15 +217,19 @@ impl PositionMap {
             }
         }
         let evaluation = self.mean.evaluate(sides);
+        let moved_m = evaluation.moved_m(&self.step);
         let mut jacobian = self.mean.jacobian(&evaluation);
+        let of_move = self.mean.jacobian_of_move(&evaluation, &self.step, &jacobian);
         let squares = [self.lengths.place.powi(-2), self.lengths.size.powi(-2)];
         for axis in 0..2 {
             for side in 0..4 {
-                jacobian[axis][side] += gradient[axis][side] * squares[side / 2] * by_px[side];
+                jacobian[axis][side] +=
+                    of_move[axis][side] + gradient[axis][side] * squares[side / 2] * by_px[side];
             }
         }
-        let position_m =
-            [0, 1].map(|axis| self.mean.centre_m[axis] + evaluation.offset_m[axis] + residual_m[axis]);
+        let position_m = [0, 1].map(|axis| {
+            self.mean.centre_m[axis] + evaluation.offset_m[axis] + moved_m[axis] + residual_m[axis]
+        });
         MapTerms { evaluation, q, position_m, jacobian }
     }
 

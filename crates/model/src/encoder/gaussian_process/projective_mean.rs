@@ -114,6 +114,31 @@ impl ProjectiveMean {
         })
     }
 
+    /// Derivatives of [`EvaluatedMean::moved_m`] by foot u, foot v, width and height, m per px; `slopes` are those of
+    /// [`Self::jacobian`].
+    #[inline]
+    pub(crate) fn jacobian_of_move(
+        &self,
+        at: &EvaluatedMean,
+        step: &[f64; COEFFICIENTS],
+        slopes: &[[f64; 4]; 2],
+    ) -> [[f64; 4]; 2] {
+        let moved_m = at.moved_m(step);
+        let c = &self.coefficients;
+        let slopes_d = [c[6], c[7], c[12], c[13]];
+        let steps_d = [step[6], step[7], step[12], step[13]];
+        let steps_n = [[step[1], step[2], step[8], step[9]], [step[4], step[5], step[10], step[11]]];
+        let moved_d = at.moved_denominator(step) / at.denominator;
+        std::array::from_fn(|axis| {
+            std::array::from_fn(|side| {
+                let own = steps_n[axis][side]
+                    - at.offset_m[axis] * steps_d[side]
+                    - moved_m[axis] * slopes_d[side];
+                own / (at.denominator * self.scales_px[side][1]) - slopes[axis][side] * moved_d
+            })
+        })
+    }
+
     /// Variances of the prior: wide for the foot, `side_scale` in units of the foot's spread for the sides.
     pub(crate) fn prior_variances(&self, side_scale: f64) -> [f64; COEFFICIENTS] {
         let numerator = (NUMERATOR_PRIOR * self.spread_m).powi(2);
@@ -223,6 +248,28 @@ impl ProjectiveMean {
 }
 
 impl EvaluatedMean {
+    /// How far a step of the coefficients moves east and north along the tangent, m.
+    #[inline]
+    pub(crate) fn moved_m(&self, step: &[f64; COEFFICIENTS]) -> [f64; 2] {
+        let [one, u, v, width, height] = self.terms;
+        let moved_d = self.moved_denominator(step);
+        std::array::from_fn(|axis| {
+            let (foot, side) = (3 * axis, 8 + 2 * axis);
+            let moved_n = step[foot] * one
+                + step[foot + 1] * u
+                + step[foot + 2] * v
+                + step[side] * width
+                + step[side + 1] * height;
+            (moved_n - self.offset_m[axis] * moved_d) / self.denominator
+        })
+    }
+
+    #[inline]
+    fn moved_denominator(&self, step: &[f64; COEFFICIENTS]) -> f64 {
+        let [_, u, v, width, height] = self.terms;
+        step[6] * u + step[7] * v + step[12] * width + step[13] * height
+    }
+
     /// Derivatives of east and north by the coefficients.
     #[inline]
     pub(crate) fn tangent(&self) -> [[f64; COEFFICIENTS]; 2] {

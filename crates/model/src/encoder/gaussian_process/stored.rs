@@ -94,6 +94,9 @@ impl PositionMap {
         let mut mean = vec![self.weight, centre_m[0], centre_m[1], *spread_m, self.residual_m2, place, size];
         mean.extend(coefficients);
         tensors.put_f64(name("mean"), &[mean.len()], mean);
+        if self.step != [0.0; COEFFICIENTS] {
+            tensors.put_f64(name("step"), &[COEFFICIENTS], self.step.to_vec());
+        }
         tensors.put_f32(name("tangent_factor"), &[COEFFICIENTS, COEFFICIENTS], f32s(&self.tangent_factor));
         if !self.deviations.is_empty() {
             let width = COEFFICIENTS + 2 * rank;
@@ -134,6 +137,10 @@ impl PositionMap {
             return Err(invalid(&format!("{prefix} has too many inducing points or directions")));
         }
         let mut map = Self::without_kernel(weight, projective, tangent_factor);
+        if tensors.rows(&name("step")).is_some() {
+            let step = tensors.take_f64(&name("step"), &[COEFFICIENTS])?;
+            map.step = std::array::from_fn(|at| step[at]);
+        }
         map.residual_m2 = mean[4].max(0.0);
         map.lengths = LengthScales { place: mean[5], size: mean[6] };
         if rank > 0 {

@@ -274,16 +274,9 @@ impl<'a> Draft<'a> {
 
 impl Columns {
     /// Gram matrix of some rows, in their order.
-    fn gram(
-        &self,
-        rows: &[usize],
-        epochs: &[Epoch],
-        parameters: &Hyperparameters,
-        white_m2: &[f64],
-    ) -> Gram {
+    fn gram(&self, rows: &[usize], epochs: &[Epoch], parameters: &Hyperparameters, white_m2: &[f64]) -> Gram {
         let own: Vec<Epoch> = rows.iter().map(|row| epochs[*row]).collect();
-        let variances: Vec<f64> =
-            rows.iter().map(|row| self.left_out_m2[*row] + white_m2[*row]).collect();
+        let variances: Vec<f64> = rows.iter().map(|row| self.left_out_m2[*row] + white_m2[*row]).collect();
         let columns = join(&[&self.tangent, &self.phi, &self.labels_m]);
         let columns = if rows.len() == epochs.len() { columns } else { columns.select_rows(rows) };
         Gram::new(columns, &ReceiverWhitener::new(&own, &parameters.noise, &variances))

@@ -6,11 +6,11 @@ use super::edge_noise::edge_covariance_px2;
 use super::groups::{Grouping, groups};
 use super::hyperparameters::{Hyperparameters, Priors};
 use super::kernel::InputScales;
-use super::leave_out::{calibrate, weigh};
+use super::leave_out::{bounded_m2, calibrate, weigh};
 use super::map_rows::{MapRows, scatter_m2};
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::predictor::{PositionMap, Predictor, Stated};
-use super::projective_mean::ProjectiveMean;
+use super::projective_mean::{Box4, ProjectiveMean};
 use super::sessions::SessionBiases;
 use super::upright_camera::UprightCamera;
 use crate::samples::rows::SESSION_GAP_S;
@@ -28,6 +28,8 @@ pub(crate) const SHARED_BIAS_SHARE: f64 = 0.1;
 const PRIOR_FREEDOM: f64 = 4.0;
 /// Of the normal distribution.
 const MIN_INVERSE_FREEDOM: f64 = 1e-6;
+/// Share by which the miss to the own rows may exceed that to left-out ones: what few rows differ by.
+const OWN_MISS_TOLERANCE: f64 = 0.05;
 /// Least variance of the fixes about the homography, m2.
 const MIN_SCATTER_M2: f64 = 1e-6;
 
@@ -51,6 +53,8 @@ pub(crate) struct FitReport {
     pub(crate) jackknife_shares: Vec<f64>,
     /// Degrees of freedom of the radius.
     pub(crate) freedom: f64,
+    /// Mean squared miss per axis of the solution to the fixes that it was fitted to, bounded as those to left-out ones, m2.
+    pub(crate) own_m2: f64,
     /// Of the mixture: mean squared miss per axis to left-out fixes, m2, and the share of these inside
     /// the radius that map and receiver state together.
     pub(crate) held_out_m2: f64,
@@ -109,6 +113,10 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     predictor.widening = calibration.widening;
     let residuals_m: Vec<[f64; 2]> =
         (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
+    let receiver_m2 = parameters.noise.variance_m2();
+    // Rows that a fit has seen are missed by less than those that it has not: else it is no solution.
+    let own_m2 = own_miss_m2(&predictor, &rows, receiver_m2);
+    (own_m2 <= (1.0 + OWN_MISS_TOLERANCE) * calibration.miss_m2).then_some(())?;
     let of_candidate = |((candidate, weight), miss_m2): ((&MapCandidate, &f64), &f64)| {
         (candidate.form.as_str(), *weight, *miss_m2)
     };
@@ -122,6 +130,8 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
         sessions: SessionBiases::new(&rows.epochs, &residuals_m, &parameters.noise),
         jackknife_shares: jackknives.iter().map(|(share, _)| *share).collect(),
         freedom,
+        own_m2: residuals_m.iter().map(|own_m| bounded_m2(*own_m, receiver_m2)).sum::<f64>()
+            / residuals_m.len() as f64,
         held_out_m2: calibration.miss_m2,
         held_out_coverage: calibration.coverage,
     };
@@ -174,6 +184,16 @@ fn without_negligible(weights: &[f64]) -> Vec<f64> {
     let kept = weights.iter().map(|weight| if *weight < MIN_WEIGHT { 0.0 } else { *weight });
     let sum: f64 = kept.clone().sum();
     kept.map(|weight| weight / sum).collect()
+}
+
+/// Mean squared miss per axis of a model's answers to the fixes of some rows, bounded, m2.
+pub(super) fn own_miss_m2(predictor: &Predictor, rows: &MapRows, receiver_m2: f64) -> f64 {
+    let square_m2 = |(sides, label_m): (&Box4, &[f64; 2])| {
+        let [east_m, north_m] = predictor.mix(sides, false).position_m;
+        bounded_m2([label_m[0] - east_m, label_m[1] - north_m], receiver_m2)
+    };
+    let sum_m2: f64 = rows.boxes.iter().zip(&rows.labels_m).map(square_m2).sum();
+    sum_m2 / rows.boxes.len() as f64
 }
 
 fn mixed_residual(candidates: &[MapCandidate], weights: &[f64], row: usize) -> [f64; 2] {

@@ -38,6 +38,11 @@ pub(crate) struct LeftOutCalibration {
     pub(crate) coverage: f64,
 }
 
+/// Squared miss per axis, bounded, m2.
+pub(crate) fn bounded_m2([east_m, north_m]: [f64; 2], receiver_m2: f64) -> f64 {
+    (0.5 * (east_m * east_m + north_m * north_m)).min(BOUND * receiver_m2)
+}
+
 /// Left-out sequences of rows: those of one target within one group.
 fn sequences(grouping: &Grouping, epochs: &[Epoch]) -> Vec<(usize, Vec<usize>)> {
     let members = grouping.members();
@@ -58,15 +63,14 @@ pub(crate) fn weigh(
     noise: &ReceiverNoise,
     seed: u64,
 ) -> (Vec<f64>, Vec<f64>) {
-    let bound_m2 = BOUND * noise.variance_m2();
+    let receiver_m2 = noise.variance_m2();
     let sequences = sequences(grouping, &rows.epochs);
     let misses: Vec<Vec<f64>> = candidates
         .iter()
         .map(|candidate| {
             let sum = |(group, rows): &(usize, Vec<usize>)| {
                 let square = |row: &usize| {
-                    let [east, north] = candidate.residual(&candidate.without[*group], *row).0;
-                    (0.5 * (east * east + north * north)).min(bound_m2)
+                    bounded_m2(candidate.residual(&candidate.without[*group], *row).0, receiver_m2)
                 };
                 rows.iter().map(square).sum::<f64>()
             };
@@ -109,7 +113,7 @@ pub(crate) fn calibrate(
         for left_out in &own {
             let stated_m2 = left_out.map_m2 + extra_m2(left_out.row);
             let square_m2 = 0.5 * (left_out.residual_m[0].powi(2) + left_out.residual_m[1].powi(2));
-            miss_m2 += square_m2.min(BOUND * receiver_m2);
+            miss_m2 += bounded_m2(left_out.residual_m, receiver_m2);
             inside += f64::from(u8::from(2.0 * square_m2 <= CHI_SQUARE_95 * (stated_m2 + receiver_m2)));
             map_m2 += stated_m2 / own.len() as f64;
             count += 1.0;

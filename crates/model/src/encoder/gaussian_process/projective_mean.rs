@@ -131,9 +131,8 @@ impl ProjectiveMean {
         let moved_d = at.moved_denominator(step) / at.denominator;
         std::array::from_fn(|axis| {
             std::array::from_fn(|side| {
-                let own = steps_n[axis][side]
-                    - at.offset_m[axis] * steps_d[side]
-                    - moved_m[axis] * slopes_d[side];
+                let own =
+                    steps_n[axis][side] - at.offset_m[axis] * steps_d[side] - moved_m[axis] * slopes_d[side];
                 own / (at.denominator * self.scales_px[side][1]) - slopes[axis][side] * moved_d
             })
         })

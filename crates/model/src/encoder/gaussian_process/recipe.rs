@@ -152,6 +152,7 @@ fn put_report(report: &FitReport, parts: &mut ModelParts) {
         ("gross_errors", report.gross_errors as f64),
         ("held_out_groups", report.groups as f64),
         ("held_out_coverage", report.held_out_coverage),
+        ("own_m2", report.own_m2),
         ("held_out_m2", report.held_out_m2),
         ("radius_degrees_of_freedom", report.freedom),
     ] {

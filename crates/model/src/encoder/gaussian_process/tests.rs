@@ -5,7 +5,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::box_plausibility::RecentBoxes;
-use super::fit::{FitReport, FitSettings, fit};
+use super::fit::{FitReport, FitSettings, fit, own_miss_m2};
 use super::map_rows::MapRows;
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
@@ -163,31 +163,57 @@ fn derivatives_by_the_edges_are_those_of_the_position() {
     }
 }
 
+fn stored(predictor: &Predictor) -> ModelParts {
+    let plane = LocalPlane::new(crate::geo::Position::new(11.0, 48.0).expect("within range"));
+    let mut parts = ModelParts::new(Recipe::GaussianProcess, plane, predictor.features(), 1.0);
+    predictor.put(&mut parts);
+    parts
+}
+
+/// A predictor from the bytes of its file.
+fn loaded(predictor: &Predictor) -> Predictor {
+    let mut parts = stored(predictor);
+    let bytes = parts.tensors.to_bytes().expect("safetensors");
+    parts.tensors = Tensors::from_bytes(&bytes).expect("its own file");
+    let loaded = Predictor::take(&mut parts).expect("its own tensors");
+    parts.tensors.finish().expect("every tensor is taken");
+    loaded
+}
+
 #[test]
 fn a_stored_model_answers_as_the_fitted_one_and_is_the_same_for_the_same_rows() {
     let (rows, tests) = walkers(4001, 8, 90, 1.0);
     let (predictor, _) = fitted(&rows);
-    let stored = |predictor: &Predictor| {
-        let plane = LocalPlane::new(crate::geo::Position::new(11.0, 48.0).expect("within range"));
-        let mut parts = ModelParts::new(Recipe::GaussianProcess, plane, predictor.features(), 1.0);
-        predictor.put(&mut parts);
-        parts
-    };
-    let mut parts = stored(&predictor);
+    let parts = stored(&predictor);
     let bytes = parts.tensors.to_bytes().expect("safetensors");
     println!("{} bytes of {LARGEST_WEIGHTS_BYTES}", bytes.len());
     assert!(bytes.len() < LARGEST_WEIGHTS_BYTES);
     let again = stored(&fitted(&rows).0);
     assert_eq!(bytes, again.tensors.to_bytes().expect("safetensors"), "another fit, other bits");
     assert_eq!(parts.parameters, again.parameters);
-    parts.tensors = Tensors::from_bytes(&bytes).expect("its own file");
-    let loaded = Predictor::take(&mut parts).expect("its own tensors");
-    parts.tensors.finish().expect("every tensor is taken");
+    let loaded = loaded(&predictor);
     for (sides, _) in &tests {
         let (one, other) = (predictor.predict(sides, None), loaded.predict(sides, None));
         let [east_m, north_m] = [0, 1].map(|axis| one.position_m[axis] - other.position_m[axis]);
         assert!(east_m.hypot(north_m) < 1e-3, "{east_m} {north_m}");
         assert!((one.variance_m2() / other.variance_m2() - 1.0).abs() < 1e-2);
+    }
+}
+
+#[test]
+fn a_loaded_model_misses_its_own_rows_as_the_fit_has_reported() {
+    for (seed, targets) in [(4002, 1), (4003, 2), (4004, 8)] {
+        let (rows, _) = walkers(seed, targets, 90, 1.0);
+        let (predictor, report) = fitted(&rows);
+        assert_eq!(report.gross_errors, 0);
+        let receiver_m2 = report.parameters.noise.variance_m2();
+        let own_m2 = own_miss_m2(&loaded(&predictor), &rows, receiver_m2);
+        println!(
+            "{targets} targets: {own_m2:.4} of {:.4} m2; left out {:.4}",
+            report.own_m2, report.held_out_m2
+        );
+        assert!((own_m2 / report.own_m2 - 1.0).abs() < 1e-3);
+        assert!(report.own_m2 <= report.held_out_m2);
     }
 }
 

@@ -184,12 +184,12 @@ impl Server {
             shutdown.spawn(worker::train_sites(app.clone(), config.training.clone(), shutdown.clone()));
             shutdown.spawn(worker::evaluate(app.clone(), config.evaluation.clone(), shutdown.clone()));
         }
-        if config.role.answers_clients() {
-            shutdown.spawn(connect::Supervisor::start(app.clone()).await.run(shutdown.clone()));
-        }
         shutdown.spawn(maintenance_loop(reloader, config.role, shutdown.clone()));
         shutdown.spawn(retention_loop(app.clone(), shutdown.clone()));
         shutdown.spawn(app.clone().keep_registered(shutdown.clone()));
+        if config.role.answers_clients() {
+            shutdown.spawn(connect::Supervisor::start(app.clone()).await.run(shutdown.clone()));
+        }
         let mut allowed_hosts = config.allowed_hosts.clone();
         // Clients are redirected to this name.
         let advertised = config.advertised_url.as_deref().and_then(|url| url.split_once("://"));

@@ -152,7 +152,7 @@ struct ConnectionStatus {
     skipped: u64,
     /// Messages that could not be read, or that the receiver refused.
     rejected: u64,
-    /// Positions that were dropped since the outbox was full.
+    /// Positions that were dropped since the outbox was full; one for each server that was killed and may have lost some.
     dropped: u64,
     /// Messages that were acknowledged to the peer.
     acknowledged: u64,

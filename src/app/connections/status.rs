@@ -73,7 +73,7 @@ pub struct ConnectionStatus {
     pub skipped: u64,
     /// Messages that could not be read, or that the receiver refused.
     pub rejected: u64,
-    /// Positions that were dropped since the outbox was full.
+    /// Positions that were dropped since the outbox was full; one for each server that was killed and may have lost some.
     pub dropped: u64,
     /// Messages that were acknowledged to the peer.
     pub acknowledged: u64,

@@ -73,7 +73,7 @@ impl Store {
     }
 }
 
-/// Locks a log; how far the outbox has come in it. `None` for a connection that was deleted.
+/// Locks a log, after its connection as a deletion does; how far the outbox has come in it. `None` for a connection that was deleted.
 pub(super) async fn lock_log(
     connection: &mut PgConnection,
     key: ConnectionKey,
@@ -81,7 +81,7 @@ pub(super) async fn lock_log(
 ) -> Result<Option<i64>> {
     sqlx::query_scalar(
         "INSERT INTO outbox_logs (connection_key, log, node_id, position) \
-         SELECT key, $2, $3, 0 FROM connections WHERE key = $1 \
+         SELECT key, $2, $3, 0 FROM connections WHERE key = $1 FOR KEY SHARE \
          ON CONFLICT (connection_key, log) DO UPDATE SET node_id = excluded.node_id, ended_at_us = NULL \
          RETURNING position",
     )

@@ -14,15 +14,12 @@ use crate::store::SampleFilter;
 const STORED_SAMPLES: u32 = 50;
 /// Rows of an import that are kept for the comparison with a mirror image.
 const KEPT_ROWS: usize = 512;
-/// Standard deviation per axis of fixes whose receiver is not known, m.
-const USUAL_SIGMA_M: f64 = 3.0;
 
 /// The fixes of an import, as far as they are looked at.
 #[derive(Default)]
 pub(super) struct PlaceCheck {
     /// Where the camera's positions are.
     reference: Option<Position>,
-    sigma_m: Option<f64>,
     fixes: u64,
     /// Fixes that are near the reference only when they are swapped, and the first of them.
     swapped: u64,
@@ -45,7 +42,6 @@ impl PlaceCheck {
             })
         };
         if self.reference.is_none() && fixes().next().is_some() {
-            self.sigma_m = app.active_camera(id).await?.e_gnss_m2.map(f64::sqrt);
             self.reference = match known_place(app, id).await? {
                 Some(place) => Some(place),
                 None => median_position(fixes().map(|(_, position)| position)),
@@ -91,7 +87,7 @@ impl PlaceCheck {
                 distance_m(wrong, reference) / 1_000.0
             )];
         }
-        if is_mirrored(&self.kept, self.sigma_m.unwrap_or(USUAL_SIGMA_M)) {
+        if is_mirrored(&self.kept) {
             return vec![format!(
                 "latitude and longitude seem to be swapped: the boxes show the positions as a mirror would, and no \
                  camera does unless its picture is mirrored; {REMEDY}"

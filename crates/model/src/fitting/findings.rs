@@ -88,8 +88,8 @@ fn reason_to_drop(selection: &Selection<'_>, at: usize) -> String {
     }
 }
 
-/// Rows whose latitude and longitude seem to be swapped; `sigma_m` is that of the receiver per axis.
-fn swapped_columns(rows: &TrainingRows, sigma_m: f64) -> Option<String> {
+/// What to do if the latitude and longitude of rows seem to be swapped.
+fn swapped_columns(rows: &TrainingRows) -> Option<String> {
     const REMEDY: &str = "swap the two columns, import these samples again with on_conflict=replace (--replace), and train again";
     let centre = rows.plane.origin();
     let swapped = rows.rows.iter().filter(|row| row.position.is_swapped_at(centre)).count();
@@ -108,7 +108,7 @@ fn swapped_columns(rows: &TrainingRows, sigma_m: f64) -> Option<String> {
         .filter(|row| row.position.swapped().is_some())
         .map(|row| (row.bounding_box.foot_px(), row.position))
         .collect();
-    is_mirrored(&points, sigma_m).then(|| {
+    is_mirrored(&points).then(|| {
         format!(
             "latitude and longitude seem to be swapped: the boxes show the positions as a mirror would, and no camera \
              does unless its picture is mirrored: {REMEDY}"
@@ -122,7 +122,7 @@ fn advice(
     parts: &ModelParts,
     image_size: Option<ImageSize>,
 ) -> Vec<String> {
-    let mut advice: Vec<String> = swapped_columns(rows, parts.e_gnss_m2.sqrt()).into_iter().collect();
+    let mut advice: Vec<String> = swapped_columns(rows).into_iter().collect();
     if rows.targets == 1 {
         advice.push(
             "let a second receiver walk: all fixes are of one receiver, and its lasting bias cannot be seen; \

@@ -185,6 +185,9 @@ pub struct Limits {
     pub match_tracklets: usize,
     /// Receivers of an import whose boxes and fixes are matched.
     pub match_receivers: usize,
+    /// Comparisons of an import whose boxes and fixes are matched: pairs of a tracklet and a fix during it, for each clock
+    /// offset that is tried.
+    pub match_comparisons: u64,
     /// Rejected rows of an import that are reported one by one.
     pub rejected_rows: usize,
     /// Bytes of a request's headers.
@@ -273,6 +276,10 @@ pub struct Limits {
     pub connection_message_bytes: usize,
     /// Messages of one source that are not settled yet; beyond, no more are read.
     pub connection_queue: usize,
+    /// Bytes that one source holds of messages that were read and not taken yet; beyond, no more are read.
+    pub connection_queue_bytes: usize,
+    /// Clients that may be connected to one listening source.
+    pub connection_clients: usize,
     /// Messages of one sink that wait for their receiver; beyond, the oldest is dropped.
     pub outbox_messages: u32,
     /// Files of one sink; beyond, the oldest is deleted.
@@ -378,6 +385,7 @@ impl Default for Limits {
             pairings: 1,
             match_tracklets: 20_000,
             match_receivers: 200,
+            match_comparisons: 2_000_000,
             rejected_rows: 100,
             header_bytes: 32 << 10,
             header_s: 10,
@@ -420,6 +428,8 @@ impl Default for Limits {
             outside_connections: 256,
             connection_message_bytes: 1 << 20,
             connection_queue: 1_024,
+            connection_queue_bytes: 8 << 20,
+            connection_clients: 64,
             outbox_messages: 100_000,
             export_files: 256,
             dead_letters: 1_000,

@@ -157,6 +157,8 @@ impl Config {
         for (name, limit) in [
             ("connection_message_bytes", limits.connection_message_bytes),
             ("connection_queue", limits.connection_queue),
+            ("connection_queue_bytes", limits.connection_queue_bytes),
+            ("connection_clients", limits.connection_clients),
             ("export_files", limits.export_files),
             ("site_queue", limits.site_queue),
             ("site_frames", limits.site_frames),

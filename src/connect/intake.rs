@@ -121,7 +121,7 @@ impl Intake {
     pub(super) async fn take(&mut self, message: Message) -> Result<(), PeerError> {
         let now = self.app.clock.now();
         let context = MessageContext { received_at: now, time_bounds: self.app.live_time_bounds(now) };
-        let read = if message.payload.len() > self.app.limits.connection_message_bytes {
+        let read = if message.size_bytes > self.app.limits.connection_message_bytes {
             Err(format!("is larger than {} bytes", self.app.limits.connection_message_bytes))
         } else {
             self.decoder.decode(&message.payload, &context)

@@ -14,9 +14,12 @@
 mod credentials;
 mod deliver;
 mod file;
+mod inbox;
 mod intake;
 mod kafka;
+mod line_reader;
 mod lines;
+mod listener;
 mod mqtt;
 mod nats;
 mod open;

@@ -8,7 +8,8 @@
 //! The library's own encryption needs an outdated verifier of certificates, so an encrypted connection is opened here
 //! as any other, and the library reaches it by a Unix socket that only this process can open.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -21,13 +22,15 @@ use rumqttc::v5::{AsyncClient, ConnectionError, Event, EventLoop, MqttOptions};
 use rumqttc::{Outgoing, Transport};
 use tempfile::TempDir;
 use tokio::net::UnixListener;
-use tokio::sync::mpsc;
+use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::credentials::{Credentials, PeerError};
+use super::inbox::{HeldBytes, Inlet, Outlet, inbox};
 use super::peer::{OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
 use super::source::{Message, Settled, Source, SourceIdentity};
+use crate::app::LiveConnection;
 use crate::config::Limits;
 use crate::domain::OutboxMessage;
 use crate::exchange::{Address, Scheme};
@@ -39,6 +42,11 @@ const SESSION_EXPIRY_S: u32 = 86_400;
 const PACKET_OVERHEAD_BYTES: usize = 66_000;
 /// Messages that a sink may have under way; fewer where the broker states so.
 const PUBLISH_QUEUE: usize = 128;
+/// What a broker may send to a sink, which subscribes to nothing, bytes.
+const SINK_BYTES: usize = 64 << 10;
+
+/// Of a broker that never answers a subscription.
+const UNCONFIRMED: &str = "the broker has not confirmed the subscription within 10 s";
 
 const NEEDS_MQTT_5: &str = "connections need MQTT 5: a broker that speaks MQTT 3.1.1 alone has to be updated, or \
                             bridged by one that speaks both";
@@ -121,12 +129,26 @@ const fn may_lack_mqtt_5(error: &ConnectionError) -> bool {
     )
 }
 
-/// Drives a connection until it fails; reports that nobody takes in time fail it, too.
-async fn drive(mut connection: EventLoop, reports: mpsc::Sender<Report>) {
+impl Report {
+    /// Bytes that it takes up.
+    fn bytes(&self) -> usize {
+        match self {
+            Self::Message(publish) => publish.payload.len() + publish.topic.len(),
+            _ => 0,
+        }
+    }
+}
+
+/// Drives a connection until it fails or nobody takes its reports any more. It waits while these have too many bytes, so
+/// that the broker waits, too.
+async fn drive(mut connection: EventLoop, reports: Inlet<Report>, live: Option<Arc<LiveConnection>>) {
     let mut is_connected = false;
     loop {
         let report = match connection.poll().await {
-            Ok(Event::Incoming(Packet::Publish(publish))) => Report::Message(publish),
+            Ok(Event::Incoming(Packet::Publish(publish))) => {
+                // Nothing of them is used, and they may be as large as the packet.
+                Report::Message(Publish { properties: None, ..publish })
+            }
             Ok(Event::Incoming(Packet::ConnAck(_))) => {
                 is_connected = true;
                 Report::Connected
@@ -156,10 +178,16 @@ async fn drive(mut connection: EventLoop, reports: mpsc::Sender<Report>) {
             Err(error) => Report::Failed(error.to_string()),
         };
         let has_failed = matches!(report, Report::Failed(_));
-        // Messages of QoS 0 are not bounded by the receive maximum: those beyond the queue are lost, as QoS 0 allows.
+        // Messages of QoS 0 are bounded by nothing: those beyond the queue are lost, as QoS 0 allows.
         let may_be_lost = matches!(&report, Report::Message(publish) if publish.qos == QoS::AtMostOnce);
-        let sent = if may_be_lost && reports.capacity() == 0 { Ok(()) } else { reports.try_send(report) };
-        if has_failed || sent.is_err() {
+        let bytes = report.bytes();
+        if may_be_lost {
+            if !reports.try_put(report, bytes)
+                && let Some(live) = &live
+            {
+                live.update(|status| status.lost += 1);
+            }
+        } else if !reports.put(report, bytes).await || has_failed {
             return;
         }
     }
@@ -168,28 +196,33 @@ async fn drive(mut connection: EventLoop, reports: mpsc::Sender<Report>) {
 /// An open connection to a broker.
 struct Link {
     client: AsyncClient,
-    reports: mpsc::Receiver<Report>,
+    reports: Outlet<Report>,
     _driving: AbortOnDropHandle<()>,
     _bridge: Option<Bridge>,
 }
 
 impl Link {
-    async fn open((options, bridge): (MqttOptions, Option<Bridge>), queue: usize) -> Result<Self, PeerError> {
+    /// With at most `queue` messages and `bytes` of them that nobody has taken yet.
+    async fn open(
+        (options, bridge): (MqttOptions, Option<Bridge>),
+        (queue, bytes): (usize, usize),
+        live: Option<Arc<LiveConnection>>,
+    ) -> Result<Self, PeerError> {
         let (client, connection) = AsyncClient::new(options, queue);
         // Acknowledgements of subscriptions and of the connection come besides the messages.
-        let (reports_in, reports) = mpsc::channel(2 * queue + 16);
-        let driving = AbortOnDropHandle::new(tokio::spawn(drive(connection, reports_in)));
+        let (reports_in, reports) = inbox(2 * queue + 16, bytes);
+        let driving = AbortOnDropHandle::new(tokio::spawn(drive(connection, reports_in, live)));
         let mut link = Self { client, reports, _driving: driving, _bridge: bridge };
         loop {
-            if let Report::Connected = link.report().await? {
+            if let (Report::Connected, _) = link.report().await? {
                 return Ok(link);
             }
         }
     }
 
-    async fn report(&mut self) -> Result<Report, PeerError> {
+    async fn report(&mut self) -> Result<(Report, HeldBytes), PeerError> {
         match self.reports.recv().await {
-            Some(Report::Failed(reason)) => Err(PeerError(reason)),
+            Some((Report::Failed(reason), _)) => Err(PeerError(reason)),
             Some(report) => Ok(report),
             None => Err("the connection to the broker has ended".into()),
         }
@@ -200,7 +233,9 @@ impl Link {
 pub(super) struct MqttSource {
     link: Link,
     /// Messages that came before the subscription was confirmed, from the session that the broker has kept.
-    early: Vec<Publish>,
+    early: VecDeque<(Publish, HeldBytes)>,
+    /// Until when the subscription must be confirmed; `None` once it is.
+    confirmed_by: Option<Instant>,
     unsettled: HashMap<u64, Publish>,
     last_receipt: u64,
 }
@@ -211,7 +246,7 @@ impl MqttSource {
         topics: &[String],
         credentials: &Credentials<'_>,
         identity: &SourceIdentity,
-        limits: &Limits,
+        (limits, live): (&Limits, &Arc<LiveConnection>),
     ) -> Result<Self, PeerError> {
         let (mut options, bridge) = prepare(address, &identity.client_id, credentials).await?;
         let queue = limits.connection_queue.min(usize::from(u16::MAX));
@@ -225,42 +260,87 @@ impl MqttSource {
         let filters: Vec<Filter> =
             topics.iter().map(|topic| Filter::new(topic.as_str(), QoS::AtLeastOnce)).collect();
         let open = async {
-            let mut link = Link::open((options, bridge), queue).await?;
+            let bytes = limits.connection_queue_bytes;
+            let link = Link::open((options, bridge), (queue, bytes), Some(live.clone())).await?;
             link.client.subscribe_many(filters).await.map_err(|error| PeerError(error.to_string()))?;
-            let mut early = Vec::new();
-            loop {
-                match link.report().await? {
-                    Report::Subscribed(Ok(())) => break,
-                    Report::Subscribed(Err(reason)) => return Err(PeerError(reason)),
-                    Report::Message(publish) => early.push(publish),
-                    _ => {}
-                }
-            }
-            early.reverse();
-            Ok(Self { link, early, unsettled: HashMap::new(), last_receipt: 0 })
+            let mut source = Self {
+                link,
+                early: VecDeque::new(),
+                confirmed_by: Some(Instant::now() + OPEN_TIME),
+                unsettled: HashMap::new(),
+                last_receipt: 0,
+            };
+            source.gather_early(bytes / 2).await?;
+            Ok(source)
         };
         within(OPEN_TIME, open).await
+    }
+}
+
+impl MqttSource {
+    /// Reads until the subscription is confirmed, or as many messages have come first as may be held: those of a session
+    /// that was kept must be taken before the broker goes on.
+    async fn gather_early(&mut self, most_bytes: usize) -> Result<(), PeerError> {
+        let mut bytes = 0;
+        while self.confirmed_by.is_some() && bytes < most_bytes {
+            if let Some(message) = self.message().await? {
+                bytes += message.1.num_permits();
+                self.early.push_back(message);
+            }
+        }
+        Ok(())
+    }
+
+    /// What the broker sends next, if it is a message.
+    async fn message(&mut self) -> Result<Option<(Publish, HeldBytes)>, PeerError> {
+        match self.link.report().await? {
+            (Report::Message(publish), held) => return Ok(Some((publish, held))),
+            (Report::Subscribed(confirmed), _) => {
+                confirmed.map_err(PeerError)?;
+                self.confirmed_by = None;
+            }
+            _ => {}
+        }
+        Ok(None)
+    }
+
+    async fn next_message(&mut self) -> Result<(Publish, HeldBytes), PeerError> {
+        if let Some(early) = self.early.pop_front() {
+            return Ok(early);
+        }
+        loop {
+            let until = self.confirmed_by;
+            let confirmation = async {
+                match until {
+                    Some(until) => tokio::time::sleep_until(until).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let message = tokio::select! {
+                // First: messages that come without end must not put it off.
+                biased;
+                () = confirmation => return Err(UNCONFIRMED.into()),
+                message = self.message() => message?,
+            };
+            if let Some(message) = message {
+                return Ok(message);
+            }
+        }
     }
 }
 
 impl Source for MqttSource {
     fn next(&mut self) -> BoxFuture<'_, Result<Message, PeerError>> {
         Box::pin(async {
-            let mut publish = match self.early.pop() {
-                Some(publish) => publish,
-                None => loop {
-                    if let Report::Message(publish) = self.link.report().await? {
-                        break publish;
-                    }
-                },
-            };
+            let (mut publish, _held) = self.next_message().await?;
             self.last_receipt += 1;
-            let payload = std::mem::take(&mut publish.payload);
-            let subject = String::from_utf8_lossy(&publish.topic).into_owned();
+            let (payload, topic) = (std::mem::take(&mut publish.payload), std::mem::take(&mut publish.topic));
+            let subject = String::from_utf8_lossy(&topic).into_owned();
             if publish.qos != QoS::AtMostOnce {
+                // Its number alone is acknowledged.
                 self.unsettled.insert(self.last_receipt, publish);
             }
-            Ok(Message { receipt: self.last_receipt, subject, payload })
+            Ok(Message::new(self.last_receipt, subject, payload))
         })
     }
 
@@ -291,7 +371,8 @@ impl MqttSink {
     ) -> Result<Self, PeerError> {
         let (mut options, bridge) = prepare(address, client_id, credentials).await?;
         options.set_clean_start(true);
-        let link = within(OPEN_TIME, Link::open((options, bridge), PUBLISH_QUEUE)).await?;
+        let link =
+            within(OPEN_TIME, Link::open((options, bridge), (PUBLISH_QUEUE, SINK_BYTES), None)).await?;
         Ok(Self { link, media_type })
     }
 
@@ -326,7 +407,7 @@ impl Sink for MqttSink {
                     let (mut unsent, mut sent) = (window.iter(), HashMap::new());
                     let mut missing = window.len();
                     while missing > 0 {
-                        match self.link.report().await? {
+                        match self.link.report().await?.0 {
                             Report::Sent(id) => {
                                 sent.extend(unsent.next().map(|message| (id, message.number)));
                             }

@@ -6,7 +6,7 @@ use super::credentials::{Credentials, PeerError};
 use super::file::{FileSettings, FileSink};
 use super::sink::Sink;
 use super::source::{Source, SourceIdentity};
-use super::{kafka, lines, mqtt, nats, push, stream, udp, webhook};
+use super::{kafka, lines, listener, mqtt, nats, push, stream, udp, webhook};
 use crate::app::{App, LiveConnection};
 use crate::domain::{Connection, ConnectionId};
 use crate::exchange::{OutgoingFormat, Scheme, Secrets, SinkSettings, SourceSettings};
@@ -34,21 +34,22 @@ pub(super) async fn source(
     let (queue, message_bytes) = (limits.connection_queue, limits.connection_message_bytes);
     Ok(match address.scheme {
         Scheme::Mqtt | Scheme::Mqtts => Box::new(
-            mqtt::MqttSource::open(&address, &settings.topics, &credentials, identity, limits).await?,
+            mqtt::MqttSource::open(&address, &settings.topics, &credentials, identity, (limits, live))
+                .await?,
         ),
         Scheme::Kafka | Scheme::Kafkas => {
             let brokers = kafka::Brokers::open(&address, &credentials, &identity.client_id).await?;
             let offsets = identity.is_lasting.then(|| (app.store.clone(), connection.key));
-            let reader = kafka::SourceReader { offsets, queue };
+            let reader = kafka::SourceReader { offsets, limits: limits.clone() };
             Box::new(reader.open(brokers, settings.topics.iter().cloned().collect()).await?)
         }
         Scheme::Serial => {
-            Box::new(lines::LineSource::open_serial(&app.serial_line(&address)?, message_bytes)?)
+            Box::new(lines::LineSource::open_serial(&app.serial_line(&address)?, message_bytes, live)?)
         }
         Scheme::Tcp | Scheme::Tls | Scheme::Gpsd => {
-            Box::new(lines::LineSource::connect(&address, &credentials, message_bytes).await?)
+            Box::new(lines::LineSource::connect(&address, &credentials, message_bytes, live).await?)
         }
-        Scheme::TcpListen => Box::new(lines::LineListener::bind(&address, queue, message_bytes).await?),
+        Scheme::TcpListen => Box::new(listener::LineListener::bind(&address, app, live).await?),
         Scheme::Udp => Box::new(udp::UdpSource::bind(&address).await?),
         Scheme::Push => Box::new(push::PushSource::open(live.clone(), queue)),
         Scheme::Http | Scheme::Https | Scheme::Nats | Scheme::File => {

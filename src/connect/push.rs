@@ -39,7 +39,7 @@ impl Source for PushSource {
                 self.messages.recv().await.ok_or_else(|| PeerError::from("the connection is closed"))?;
             self.last_receipt += 1;
             self.unsettled.insert(self.last_receipt, settled);
-            Ok(Message { receipt: self.last_receipt, subject: sender, payload })
+            Ok(Message::new(self.last_receipt, sender, payload))
         })
     }
 

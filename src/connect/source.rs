@@ -11,7 +11,18 @@ pub(super) struct Message {
     pub(super) receipt: u64,
     /// Its topic, or the address of its sender.
     pub(super) subject: String,
+    /// Its content, or the beginning of it where it is larger than is taken.
     pub(super) payload: Bytes,
+    /// Bytes of the whole content.
+    pub(super) size_bytes: usize,
+}
+
+impl Message {
+    /// A message with its whole content.
+    pub(super) const fn new(receipt: u64, subject: String, payload: Bytes) -> Self {
+        let size_bytes = payload.len();
+        Self { receipt, subject, payload, size_bytes }
+    }
 }
 
 /// An open connection to a system that sends messages.

@@ -41,7 +41,7 @@ impl Source for UdpSource {
         Box::pin(async {
             let (bytes, peer) = self.socket.recv_from(&mut self.buffer).await?;
             let payload = Bytes::copy_from_slice(&self.buffer[..bytes]);
-            Ok(Message { receipt: 0, subject: peer.to_string(), payload })
+            Ok(Message::new(0, peer.to_string(), payload))
         })
     }
 }

@@ -158,6 +158,13 @@ struct ConnectionStatus {
     acknowledged: u64,
     /// Times that the peer was reached.
     connects: u64,
+    /// Messages of a source that were dropped unread: too long, or sent without a promise (MQTT's QoS 0) faster than they
+    /// are taken.
+    lost: u64,
+    /// Clients that are connected to a source `tcp-listen:` now.
+    clients: u64,
+    /// Clients that were refused or closed because there were too many; `last_error` says which.
+    refused_clients: u64,
     /// Messages of a sink that wait.
     queued: u64,
     /// Messages of a sink that are not tried any more.
@@ -232,6 +239,9 @@ impl Connection {
             dropped: status.dropped,
             acknowledged: status.acknowledged,
             connects: status.connects,
+            lost: status.lost,
+            clients: status.clients,
+            refused_clients: status.refused_clients,
             queued: outbox.queued,
             dead_letters: outbox.dead,
             lag_s: status.lag_s,

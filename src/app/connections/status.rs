@@ -79,6 +79,12 @@ pub struct ConnectionStatus {
     pub acknowledged: u64,
     /// Connections to the peer that were opened.
     pub connects: u64,
+    /// Messages of a source that were dropped unread: too long, or sent without a promise faster than they are taken.
+    pub lost: u64,
+    /// Clients that are connected to a listening source now.
+    pub clients: u64,
+    /// Clients that were refused or closed because there were too many.
+    pub refused_clients: u64,
     /// Age of the last item when it came, s; of the oldest waiting message of a sink.
     pub lag_s: Option<f64>,
 }
@@ -94,6 +100,9 @@ impl ConnectionStatus {
         self.dropped = sum(|it| it.dropped);
         self.acknowledged = sum(|it| it.acknowledged);
         self.connects = sum(|it| it.connects);
+        self.lost = sum(|it| it.lost);
+        self.clients = sum(|it| it.clients);
+        self.refused_clients = sum(|it| it.refused_clients);
     }
 }
 

@@ -7,18 +7,22 @@ use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use rskafka::client::error::ProtocolError;
 use rskafka::client::partition::{OffsetAt, PartitionClient};
-use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use super::{Brokers, MAX_PARTITIONS, Topics, answer_of};
+use crate::config::Limits;
 use crate::connect::credentials::PeerError;
+use crate::connect::inbox::{Inlet, Outlet, inbox};
 use crate::connect::peer::{OPEN_TIME, within};
 use crate::connect::source::{Message, Settled, Source};
 use crate::domain::{ConnectionKey, Durability, SourceOffset};
 use crate::store::Store;
 
-/// Records that a broker sends at a time, bytes; a larger batch comes whole.
-const FETCH_BYTES: i32 = 256 << 10;
+/// Records that a broker sends at a time, bytes, over all partitions at most what a source may hold; a larger batch comes
+/// whole.
+const FETCH_BYTES: std::ops::RangeInclusive<usize> = 16 << 10..=256 << 10;
+/// What is kept of a message that is too large, for the status.
+const KEPT_BYTES: usize = 4 << 10;
 /// How long a broker waits for records.
 const FETCH_WAIT: Duration = Duration::from_millis(500);
 
@@ -27,15 +31,28 @@ struct PartitionRecord {
     /// Index into [`KafkaSource::partitions`].
     partition: usize,
     offset: i64,
+    /// Its beginning alone where it is larger than is taken.
     value: Vec<u8>,
+    size_bytes: usize,
+}
+
+impl PartitionRecord {
+    fn new(partition: usize, offset: i64, mut value: Vec<u8>, most_bytes: usize) -> Self {
+        let size_bytes = value.len();
+        if size_bytes > most_bytes {
+            value.truncate(KEPT_BYTES);
+            value.shrink_to_fit();
+        }
+        Self { partition, offset, value, size_bytes }
+    }
 }
 
 /// Opens sources of topics.
 pub(in crate::connect) struct SourceReader {
     /// Where the offsets of a lasting source are; one that is only tried has none.
     pub(in crate::connect) offsets: Option<(Store, ConnectionKey)>,
-    /// Messages that may be read ahead.
-    pub(in crate::connect) queue: usize,
+    /// How much may be read ahead.
+    pub(in crate::connect) limits: Limits,
 }
 
 impl SourceReader {
@@ -48,7 +65,8 @@ impl SourceReader {
             Some((store, key)) => store.source_offsets(*key).await?,
             None => Vec::new(),
         };
-        let (records_in, records) = mpsc::channel(self.queue);
+        let Limits { connection_queue, connection_queue_bytes, .. } = self.limits;
+        let (records_in, records) = inbox(connection_queue, connection_queue_bytes);
         let (mut known, mut partitions, mut readers) = (Topics::new(), Vec::new(), Vec::new());
         for topic in topics {
             let numbers = brokers.partitions(&topic).await?;
@@ -71,9 +89,14 @@ impl SourceReader {
         if let Some((store, key)) = &self.offsets {
             store.store_source_offsets(*key, &partitions, Durability::Synced).await?;
         }
+        let share = connection_queue_bytes / partitions.len().max(1);
+        let size = FetchSize {
+            fetch_bytes: share.clamp(*FETCH_BYTES.start(), *FETCH_BYTES.end()) as i32,
+            message_bytes: self.limits.connection_message_bytes,
+        };
         let mut reading = JoinSet::new();
         for (index, (client, from)) in readers.into_iter().zip(&partitions).enumerate() {
-            reading.spawn(read(client, index, from.next_offset, records_in.clone()));
+            reading.spawn(read(client, index, from.next_offset, size, records_in.clone()));
         }
         reading.spawn(async move { brokers.watch(&known).await });
         Ok(KafkaSource {
@@ -98,16 +121,26 @@ fn first_offset(stored: &[SourceOffset], topic: &str, partition: i32) -> Result<
     }
 }
 
+/// How much is read at a time.
+#[derive(Clone, Copy)]
+struct FetchSize {
+    /// Bytes of one answer of a broker.
+    fetch_bytes: i32,
+    /// Bytes of a message that is taken.
+    message_bytes: usize,
+}
+
 /// Hands on the records of a partition; ends with the reason.
 async fn read(
     client: PartitionClient,
     partition: usize,
     mut offset: i64,
-    records: mpsc::Sender<PartitionRecord>,
+    size: FetchSize,
+    records: Inlet<PartitionRecord>,
 ) -> PeerError {
     let wait_ms = i32::try_from(FETCH_WAIT.as_millis()).unwrap_or(i32::MAX);
     loop {
-        let fetching = client.fetch_records(offset, 1..FETCH_BYTES, wait_ms);
+        let fetching = client.fetch_records(offset, 1..size.fetch_bytes, wait_ms);
         let fetched = match tokio::time::timeout(FETCH_WAIT + OPEN_TIME, fetching).await {
             Ok(fetched) => fetched,
             Err(_) => return "the broker does not answer".into(),
@@ -130,7 +163,9 @@ async fn read(
         for it in read {
             offset = it.offset + 1;
             let value = it.record.value.unwrap_or_default();
-            if records.send(PartitionRecord { partition, offset: it.offset, value }).await.is_err() {
+            let record = PartitionRecord::new(partition, it.offset, value, size.message_bytes);
+            let bytes = record.value.len();
+            if !records.put(record, bytes).await {
                 return "the source is closed".into();
             }
         }
@@ -156,7 +191,7 @@ async fn oldest_offset(client: &PartitionClient, missing: i64) -> Result<i64, Pe
 
 /// Messages of topics.
 pub(in crate::connect) struct KafkaSource {
-    records: mpsc::Receiver<PartitionRecord>,
+    records: Outlet<PartitionRecord>,
     /// A task for each partition, and one that watches the topics; each ends only when it fails.
     reading: JoinSet<PeerError>,
     /// How far each partition was read when it was opened; its index identifies it.
@@ -171,7 +206,7 @@ impl Source for KafkaSource {
     fn next(&mut self) -> BoxFuture<'_, Result<Message, PeerError>> {
         Box::pin(async {
             let record = tokio::select! {
-                Some(record) = self.records.recv() => record,
+                Some((record, _held)) = self.records.recv() => record,
                 Some(ended) = self.reading.join_next() => {
                     return Err(ended.unwrap_or_else(|panic| PeerError(panic.to_string())));
                 }
@@ -180,7 +215,8 @@ impl Source for KafkaSource {
             self.last_receipt += 1;
             self.unsettled.insert(self.last_receipt, (record.partition, record.offset));
             let subject = self.partitions[record.partition].topic.clone();
-            Ok(Message { receipt: self.last_receipt, subject, payload: Bytes::from(record.value) })
+            let (payload, size_bytes) = (Bytes::from(record.value), record.size_bytes);
+            Ok(Message { receipt: self.last_receipt, subject, payload, size_bytes })
         })
     }
 

@@ -3,7 +3,7 @@
 use rustix::pty::OpenptFlags;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-use tokio::net::{TcpListener, UdpSocket};
+use tokio::net::{TcpListener, TcpSocket, TcpStream, UdpSocket};
 
 use super::peers::{connection_when, create_gate};
 use crate::harness::{TestServer, data_folder, now, own_address};
@@ -274,4 +274,110 @@ async fn only_serial_devices_that_the_operator_of_the_machine_names_are_read() {
         let error = status["status"]["last_error"]["message"].as_str().expect("an error");
         assert!(error.contains(reason) && !error.contains("secret"), "{id}: {error}");
     }
+}
+
+/// A client of a listening source, from an address of this machine.
+async fn client_from(ip: &str, address: std::net::SocketAddr) -> TcpStream {
+    let socket = TcpSocket::new_v4().expect("a socket");
+    socket.bind(format!("{ip}:0").parse().expect("an address")).expect("an address of the loopback");
+    socket.connect(address).await.expect("the source listens")
+}
+
+/// A source that listens, with some limits.
+async fn listening(settings: &[(&str, &str)]) -> (TestServer, std::net::SocketAddr, tempfile::TempDir) {
+    let (address, folder) = (own_address(), data_folder());
+    let server = TestServer::start_with(folder.path(), settings);
+    create_gate(&server).await;
+    let source = json!({
+        "address": format!("tcp-listen://{address}"), "format": "nmea", "camera_ids": ["gate"], "receiver_id": "boat",
+    });
+    server.post("/v1/connections", &json!({"id": "receiver", "source": source})).await.expect(201);
+    connection_when(&server, "receiver", |status| status["state"] == "running").await;
+    (server, address, folder)
+}
+
+#[tokio::test]
+async fn silent_clients_of_a_listener_do_not_keep_a_receiver_out() {
+    let (server, address, _folder) = listening(&[("SIGHTFIX_LIMITS__CONNECTION_CLIENTS", "4")]).await;
+    // One address gets half of the places, so another one still finds some.
+    let mut silent = Vec::new();
+    for _ in 0..3 {
+        silent.push(client_from("127.0.0.1", address).await);
+    }
+    let status = connection_when(&server, "receiver", |status| status["refused_clients"] == 1).await;
+    let status = &status["status"];
+    assert_eq!(status["clients"], 2, "{status}");
+    let error = status["last_error"]["message"].as_str().expect("text");
+    assert!(error.contains("127.0.0.1 has 2 connections"), "{error}");
+    for ip in ["127.0.0.3", "127.0.0.4"] {
+        silent.push(client_from(ip, address).await);
+    }
+    connection_when(&server, "receiver", |status| status["clients"] == 4).await;
+    // All places are taken; once a client has been silent for some time, it gives way.
+    let mut receivers = Vec::new();
+    for _ in 0..60 {
+        let mut receiver = client_from("127.0.0.2", address).await;
+        // A client that is refused may be reset while it sends.
+        let _ = receiver.write_all(sentences().as_bytes()).await;
+        receivers.push(receiver);
+        tokio::time::sleep(std::time::Duration::from_millis(500)).await;
+        let status = server.get("/v1/connections/receiver").await.expect(200).json()["status"].clone();
+        if status["items"].as_u64() > Some(0) {
+            let error = status["last_error"]["message"].as_str().expect("text");
+            assert!(error.contains("which was silent, was closed"), "{error}");
+            return assert_tracked(&server, "boat").await;
+        }
+    }
+    panic!("the receiver never got a place");
+}
+
+#[tokio::test]
+async fn a_line_of_a_listeners_client_takes_no_more_than_the_bytes_of_its_source() {
+    let (server, address, _folder) = listening(&[("SIGHTFIX_LIMITS__CONNECTION_QUEUE_BYTES", "65536")]).await;
+    let mut client = client_from("127.0.0.1", address).await;
+    // Less than a message may have, and more than the source may hold.
+    client.write_all(&vec![b'x'; 500_000]).await.expect("written");
+    let status = connection_when(&server, "receiver", |status| status["lost"] == 1).await;
+    assert_eq!(status["status"]["messages"], 0, "{status}");
+    client.write_all(b"\r\n").await.expect("written");
+    client.write_all(sentences().as_bytes()).await.expect("written");
+    connection_when(&server, "receiver", |status| status["items"] == 1).await;
+    assert_tracked(&server, "boat").await;
+}
+
+/// A broker of MQTT 5 that accepts everybody, never confirms a subscription and publishes without end (QoS 0).
+async fn flooding_broker(listener: TcpListener) {
+    let (mut stream, _) = listener.accept().await.expect("the server connects");
+    let mut connect = [0; 1_024];
+    assert!(stream.read(&mut connect).await.expect("a CONNECT") > 0);
+    stream.write_all(&[0x20, 3, 0, 0, 0]).await.expect("a CONNACK");
+    let payload = vec![b'x'; 16_000];
+    // Topic `t`, no properties.
+    let length = payload.len() + 4;
+    let mut publish = vec![0x30, (length % 128) as u8 | 0x80, (length / 128) as u8, 0, 1, b't', 0];
+    publish.extend_from_slice(&payload);
+    while stream.write_all(&publish).await.is_ok() {}
+}
+
+#[tokio::test]
+async fn a_subscription_that_is_never_confirmed_ends_whatever_the_broker_sends() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let flooding = tokio::spawn(flooding_broker(listener));
+    let folder = data_folder();
+    let server =
+        TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__CONNECTION_QUEUE_BYTES", "262144")]);
+    create_gate(&server).await;
+    let source = json!({
+        "address": format!("mqtt://{address}"), "topics": ["t"], "format": "nmea", "camera_ids": ["gate"],
+        "receiver_id": "boat",
+    });
+    server.post("/v1/connections", &json!({"id": "receiver", "source": source})).await.expect(201);
+    let is_refused = |status: &Value| {
+        let message = status["last_error"]["message"].as_str();
+        message.is_some_and(|message| message.contains("has not confirmed the subscription"))
+    };
+    let connection = connection_when(&server, "receiver", is_refused).await;
+    assert!(connection["status"]["messages"].as_u64() > Some(0), "some were taken meanwhile: {connection}");
+    flooding.abort();
 }

@@ -13,13 +13,17 @@ use crate::domain::{
     Association, ClockOffset, Error, ErrorKind, ImageSize, ReceiverId, Receivers, Result, TargetId, TrackerId,
 };
 use crate::fusion::association::{
-    MatchLimits, MatchSettings, Matching, WorldScores, match_with_model, match_without_model,
+    Cancellation, MatchLimits, MatchSettings, Matching, WorldScores, match_with_model, match_without_model,
 };
 use crate::model::Regressor;
 
 impl From<&Limits> for MatchLimits {
     fn from(limits: &Limits) -> Self {
-        Self { tracklets: limits.match_tracklets, receivers: limits.match_receivers }
+        Self {
+            tracklets: limits.match_tracklets,
+            receivers: limits.match_receivers,
+            comparisons: limits.match_comparisons,
+        }
     }
 }
 
@@ -34,6 +38,8 @@ pub struct MatchRequest<'a> {
     pub settings: MatchSettings,
     /// Seed of everything random.
     pub seed: u64,
+    /// Ends it early.
+    pub cancellation: Cancellation<'a>,
 }
 
 /// A recording whose sure boxes have the ids of their receivers.
@@ -99,7 +105,7 @@ impl Recording {
     /// Finds out whose boxes show whose receivers, and gives sure boxes the ids of their receivers.
     ///
     /// # Errors
-    /// `NotIdentifiable` with the reason and a remedy; `TooLarge` beyond the settings' bounds;
+    /// `NotIdentifiable` with the reason and a remedy; `TooLarge` beyond the settings' bounds; `Cancelled`;
     /// `InvalidArgument` where neither model nor image size is given.
     pub fn matched(mut self, receivers: &Receivers, request: &MatchRequest<'_>) -> Result<MatchedRecording> {
         let mut random = ChaCha8Rng::seed_from_u64(request.seed);
@@ -113,6 +119,7 @@ impl Recording {
                     regressor,
                     settings,
                     &mut random,
+                    request.cancellation,
                 )?;
                 (matching, None)
             }
@@ -124,6 +131,7 @@ impl Recording {
                     image_size,
                     settings,
                     &mut random,
+                    request.cancellation,
                 )?;
                 (joint.matching, Some(joint.scores))
             }

@@ -108,7 +108,7 @@ pub struct Parts {
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
-    pub pairings: Semaphore,
+    pub pairings: Arc<Semaphore>,
     /// Notifies workers of queued training runs.
     pub training_queue: JobQueue,
     /// Notifies workers of queued training runs of sites.
@@ -154,7 +154,7 @@ impl App {
         let site_registry = SiteRegistry::new(randomness.clone(), limits.site_events);
         let access = Access::default();
         access.refresh(&store, clock.now()).await?;
-        let pairings = Semaphore::new(limits.pairings);
+        let pairings = Arc::new(Semaphore::new(limits.pairings));
         let (residuals, waiting) = live::residual_queue();
         let quotas = Quotas::new(&limits);
         let parts = Parts {

@@ -3,6 +3,8 @@
 use std::io::Read;
 use std::sync::Arc;
 
+use tokio_util::sync::CancellationToken;
+
 use super::matching::{MatchReport, MatchRequest};
 use super::recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 use super::samples::{BATCH_ROWS, Import, ImportOptions};
@@ -11,7 +13,7 @@ use crate::domain::{
     CameraId, Error, ImageSize, Receiver, ReceiverId, Receivers, Result, StoredSample, TargetId,
 };
 use crate::exchange::{self, CsvLayout, FixFormat, Format, RowRules};
-use crate::fusion::association::MatchSettings;
+use crate::fusion::association::{Cancellation, MatchSettings};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::PairingSettings;
 use crate::model::Regressor;
@@ -102,8 +104,14 @@ impl App {
         let limits =
             RecordingLimits { rows: self.limits.pairing_rows, rejected_rows: self.limits.rejected_rows };
         let options = import.options.clone();
-        let _place = self.pairings.acquire().await.map_err(Error::fault)?;
-        let pairing = tokio::task::spawn_blocking(move || import.paired(&rules, &camera, limits));
+        let place = self.pairings.clone().acquire_owned().await.map_err(Error::fault)?;
+        // Dropped with this future when the client leaves; the work then ends, and until it has its place is taken.
+        let cancel = CancellationToken::new();
+        let _guard = cancel.clone().drop_guard();
+        let pairing = tokio::task::spawn_blocking(move || {
+            let _place = place;
+            import.paired(&rules, &camera, limits, &|| cancel.is_cancelled())
+        });
         let Work { samples, mut report } = pairing.await.map_err(Error::fault)??;
         // The same files pair alike, so of a repeated import only what became of the samples is stored.
         report.samples = match self.repeated_import(&options).await? {
@@ -131,7 +139,13 @@ impl App {
 }
 
 impl<D: Read, F: Read> PairedImport<D, F> {
-    fn paired(self, rules: &RowRules, camera: &CameraContext, limits: RecordingLimits) -> Result<Work> {
+    fn paired(
+        self,
+        rules: &RowRules,
+        camera: &CameraContext,
+        limits: RecordingLimits,
+        is_cancelled: &dyn Fn() -> bool,
+    ) -> Result<Work> {
         let receivers = &camera.receivers;
         let boxes = exchange::read_detections(
             self.detections,
@@ -151,8 +165,13 @@ impl<D: Read, F: Read> PairedImport<D, F> {
             None => (recording, receivers.clone(), None),
             Some(settings) => {
                 let regressor = camera.regressor.as_deref();
-                let request =
-                    MatchRequest { regressor, image_size: camera.image_size, settings, seed: MATCH_SEED };
+                let request = MatchRequest {
+                    regressor,
+                    image_size: camera.image_size,
+                    settings,
+                    seed: MATCH_SEED,
+                    cancellation: Cancellation::new(is_cancelled),
+                };
                 let matched = recording.matched(receivers, &request)?;
                 (matched.recording, matched.receivers, Some(matched.report))
             }

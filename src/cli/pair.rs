@@ -21,7 +21,7 @@ use crate::domain::{
     CameraId, ClockOffset, ImageSize, Receiver, ReceiverId, Receivers, TargetId, TimeBounds,
 };
 use crate::exchange::{self, FixFormat, MatchedSampleWriter, RowRules};
-use crate::fusion::association::{MatchLimits, MatchSettings};
+use crate::fusion::association::{Cancellation, MatchLimits, MatchSettings};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
 use crate::model::{Artifact, Regressor};
@@ -189,6 +189,7 @@ impl Pair {
             image_size: self.matching.image_size,
             settings: self.matching.settings()?,
             seed: self.matching.match_seed,
+            cancellation: Cancellation::NEVER,
         };
         let matched = recording.matched(receivers, &request)?;
         print_match(summary, &matched.report)?;

@@ -123,15 +123,28 @@ async fn matching_takes_so_many_tracklets_and_receivers() {
         csv
     };
     let folder = data_folder();
-    let settings = [("SIGHTFIX_LIMITS__MATCH_TRACKLETS", "2"), ("SIGHTFIX_LIMITS__MATCH_RECEIVERS", "2")];
+    // Two tracklets and two receivers of 30 fixes, which stand still but for the first: 120 comparisons.
+    let settings = [
+        ("SIGHTFIX_LIMITS__MATCH_TRACKLETS", "2"),
+        ("SIGHTFIX_LIMITS__MATCH_RECEIVERS", "2"),
+        ("SIGHTFIX_LIMITS__MATCH_COMPARISONS", "120"),
+    ];
     let server = TestServer::start_with(folder.path(), &settings);
     let camera = json!({"id": "c", "image_size": {"width_px": 1920, "height_px": 1080}});
     server.post("/v1/cameras", &camera).await.expect(201);
-    for (trackers, receivers, is_refused) in [(2, 2, false), (3, 2, true), (2, 3, true)] {
+    let offsets = "?match=true&clock_window_s=1";
+    for (query, trackers, receivers, is_refused) in [
+        ("?match=true", 2, 2, false),
+        ("?match=true", 3, 2, true),
+        ("?match=true", 2, 3, true),
+        (offsets, 2, 2, true),
+        (offsets, 1, 1, true),
+    ] {
         let stream = TcpStream::connect(server.address).await.expect("the server listens");
-        let request = two_parts("?match=true", &detections(trackers), &fixes(receivers));
+        let request = two_parts(query, &detections(trackers), &fixes(receivers));
         let answer = exchange(stream, request).await;
         assert_eq!(answer.contains("problem:too-large"), is_refused, "{trackers}, {receivers}: {answer}");
+        assert_eq!(answer.contains("smaller clock_window_s"), query == offsets, "{answer}");
     }
 }
 

@@ -185,3 +185,54 @@ fn ships_are_found_by_several_passes() {
     println!("one pass refused in {refused} of 5, five passes right in {identified} of 5, wrong {wrong}");
     assert!(refused == 5 && identified >= 4 && wrong == 0);
 }
+
+/// CPU time of a process, in ticks.
+fn cpu_ticks(pid: u32) -> u64 {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).expect("it runs");
+    let fields = stat.rsplit_once(") ").expect("a name").1.split(' ').skip(11).take(2);
+    fields.map(|ticks| ticks.parse::<u64>().expect("a number")).sum()
+}
+
+#[tokio::test]
+async fn a_match_ends_when_its_client_leaves() {
+    let crowd = Crowd { seed: 1, walkers: 60, phones: 60, seconds: 600, lifetime_s: 120.0, swap_s: 1e9 };
+    let recorded = crowd.recorded();
+    let folder = data_folder();
+    let settings = [("SIGHTFIX_LIMITS__MATCH_COMPARISONS", "1000000000")];
+    let server = crate::harness::TestServer::start_with(folder.path(), &settings);
+    let camera = serde_json::json!({"id": "c", "image_size": {"width_px": 1920, "height_px": 1080}});
+    server.post("/v1/cameras", &camera).await.expect(201);
+    let part = |name: &str, content: &str| {
+        format!(
+            "--b\r\ncontent-disposition: form-data; name=\"{name}\"\r\ncontent-type: text/csv\r\n\r\n{content}\r\n"
+        )
+    };
+    let body = part("detections", &recorded.detections) + &part("fixes", &recorded.fixes) + "--b--\r\n";
+    let headers = [("content-type", "multipart/form-data; boundary=b")];
+    let before = cpu_ticks(server.pid());
+    let matching = server.send(
+        "POST",
+        "/v1/cameras/c/samples/pairings?match=true",
+        &headers,
+        hyper::body::Bytes::from(body),
+    );
+    let at_work = async {
+        // Reading the files takes less; from then on it is matched.
+        while cpu_ticks(server.pid()) < before + 500 {
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        }
+    };
+    tokio::select! {
+        answer = matching => panic!("it must not be done yet: {}", answer.text()),
+        () = at_work => {}
+    }
+    // The client has left; the process comes to rest, which without that takes minutes.
+    for _ in 0..60 {
+        let ticks = cpu_ticks(server.pid());
+        tokio::time::sleep(std::time::Duration::from_secs(1)).await;
+        if cpu_ticks(server.pid()) < ticks + 20 {
+            return;
+        }
+    }
+    panic!("the match goes on without its client");
+}

@@ -15,7 +15,7 @@ use crate::domain::{
     Detection, Observation, ReceivedFix, ReceiverId, ReceiverMatch, Receivers, Result, TargetId,
 };
 use crate::fusion::association::{
-    LiveMatchSettings, LiveMatches, LiveWindow, MatchSettings, match_with_model,
+    Cancellation, LiveMatchSettings, LiveMatches, LiveWindow, MatchSettings, match_with_model,
 };
 use crate::model::Regressor;
 
@@ -95,7 +95,9 @@ impl LiveMatching {
         let mut random = ChaCha8Rng::seed_from_u64(SEED);
         // Fixes have the camera's time already.
         let (receivers, settings) = (Receivers::default(), MatchSettings::default());
-        let matching = match_with_model(&detections, &fixes, &receivers, regressor, &settings, &mut random)?;
+        let never = Cancellation::NEVER;
+        let matching =
+            match_with_model(&detections, &fixes, &receivers, regressor, &settings, &mut random, never)?;
         let mut state = lock(&self.state);
         state.matches = state.matches.updated(&matching, &detections, &self.settings);
         Ok(())

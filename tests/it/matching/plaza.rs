@@ -14,7 +14,9 @@ use sightfix::domain::{
     TimeBounds,
 };
 use sightfix::exchange::{FixFormat, Format, RowRules, read_detections, read_received_fixes};
-use sightfix::fusion::association::{MatchSettings, Matching, match_with_model, match_without_model};
+use sightfix::fusion::association::{
+    Cancellation, MatchSettings, Matching, match_with_model, match_without_model,
+};
 use sightfix::fusion::pairing::{PairingRule, PairingSettings, pair};
 use sightfix::geo::{Position, distance_m};
 use sightfix::model::{FitInput, FitOptions, Regressor, fit};
@@ -302,8 +304,16 @@ fn shared_plaza_pairs_with_a_known_model() {
             let matched = |boxes: &[Detection]| {
                 let mut random = ChaCha8Rng::seed_from_u64(draw);
                 let settings = MatchSettings::default();
-                match_with_model(boxes, &fixes, &Receivers::default(), &model, &settings, &mut random)
-                    .expect("within bounds")
+                match_with_model(
+                    boxes,
+                    &fixes,
+                    &Receivers::default(),
+                    &model,
+                    &settings,
+                    &mut random,
+                    Cancellation::NEVER,
+                )
+                .expect("within bounds")
             };
             let boxes = &plaza.detections[camera];
             let matching = matched(boxes);
@@ -342,6 +352,7 @@ fn shared_plaza_without_a_model() {
                 image_size(),
                 &settings,
                 &mut random,
+                Cancellation::NEVER,
             );
             match found {
                 Err(reason) => println!("{camera}, draw {draw}: {reason}; with identities {known_m:.2} m"),

@@ -9,7 +9,9 @@ use pathfinding::kuhn_munkres::kuhn_munkres;
 use pathfinding::matrix::Matrix;
 use rand::{Rng, RngExt};
 
+use super::cancellation::Cancellation;
 use super::chains::Chain;
+use crate::domain::Result;
 
 /// Sweeps over all receivers, and those before probabilities are counted.
 const SWEEPS: usize = 300;
@@ -29,12 +31,21 @@ struct Sampler<'a> {
 
 /// Posterior probabilities by receiver, then piece, of receivers with these chains, of which the first is
 /// empty.
-pub(super) fn posterior(chains: &[Vec<Chain>], pieces: usize, random: &mut impl Rng) -> Vec<Vec<f64>> {
+///
+/// # Errors
+/// `Cancelled`.
+pub(super) fn posterior(
+    chains: &[Vec<Chain>],
+    pieces: usize,
+    random: &mut impl Rng,
+    cancellation: Cancellation<'_>,
+) -> Result<Vec<Vec<f64>>> {
     let mut sampler = Sampler { chains, chosen: vec![0; chains.len()], owner: vec![None; pieces] };
     sampler.start();
     let rivals = rivals(chains, pieces);
     let mut probability = vec![vec![0.0; pieces]; chains.len()];
     for sweep in 0..SWEEPS {
+        cancellation.check()?;
         for (one, other) in &rivals {
             sampler.draw_two(*one, *other, random);
         }
@@ -49,7 +60,7 @@ pub(super) fn posterior(chains: &[Vec<Chain>], pieces: usize, random: &mut impl 
             }
         }
     }
-    probability
+    Ok(probability)
 }
 
 impl Sampler<'_> {

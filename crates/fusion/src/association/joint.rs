@@ -11,6 +11,7 @@ use std::ops::ControlFlow;
 use jiff::SignedDuration;
 use rand::Rng;
 
+use super::cancellation::Cancellation;
 use super::evidence::EvidenceModel;
 use super::matching::{
     Located, MatchSettings, Matching, check_size, match_located, match_scene, receiver_noise,
@@ -23,7 +24,7 @@ use crate::domain::{
     Recipe, Result, Sample, TargetClass, TargetId,
 };
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::{Artifact, FitInput, FitOptions, GroundCamera, Regressor, fit};
+use crate::model::{Artifact, FitEvent, FitInput, FitOptions, GroundCamera, Regressor, fit};
 use crate::pairing::{PairingRule, PairingSettings, pair};
 
 /// Shifts of the receivers' clocks as shares of the recording, for identities that are certainly wrong.
@@ -97,7 +98,7 @@ struct World {
 ///
 /// # Errors
 /// `NotIdentifiable`, with the reason and what to record, where another assignment explains the recording
-/// as well; `TooLarge` beyond the settings' bounds.
+/// as well; `TooLarge` beyond the settings' bounds; `Cancelled`.
 pub fn match_without_model(
     detections: &[Detection],
     fixes: &[ReceivedFix],
@@ -105,9 +106,10 @@ pub fn match_without_model(
     image_size: ImageSize,
     settings: &MatchSettings,
     random: &mut impl Rng,
+    cancellation: Cancellation<'_>,
 ) -> Result<JointMatch> {
-    let scene = Scene::new(detections, fixes, receivers);
-    check_size(&scene, settings.limits)?;
+    let scene = Scene::new(detections, fixes, receivers, cancellation);
+    check_size(&scene, settings)?;
     let search = JointSearch::new(&scene, image_size, settings)?;
     let (world, scores) = search.accepted_world()?;
     search.trained(&world, scores, random)
@@ -173,7 +175,7 @@ impl<'a> JointSearch<'a> {
             let search = self.search(camera, fixes);
             worlds.extend(
                 search
-                    .search(MODES, self.same_world_m())
+                    .search(MODES, self.same_world_m(), self.scene.cancellation)
                     .into_iter()
                     .map(|placement| World { camera, placement }),
             );
@@ -191,6 +193,8 @@ impl<'a> JointSearch<'a> {
     /// The best world, if it is better than all that must be wrong and all others that may be right.
     fn accepted_world(&self) -> Result<(World, WorldScores)> {
         let worlds = self.worlds(0..self.cameras.len(), &self.fixes);
+        // What was cancelled has found nothing.
+        self.scene.cancellation.check()?;
         let Some(best) = worlds.first().copied() else {
             return Err(not_identifiable(
                 "no receiver has three fixes while a tracklet is seen",
@@ -208,6 +212,7 @@ impl<'a> JointSearch<'a> {
             best_shifted: shifted.fold(f64::NEG_INFINITY, f64::max),
             second: self.second(&best, &worlds),
         };
+        self.scene.cancellation.check()?;
         check_scores(&scores, self.min_margin())?;
         Ok((best, scores))
     }
@@ -268,7 +273,7 @@ impl<'a> JointSearch<'a> {
         self.fixes.iter().map(shifted).collect()
     }
 
-    fn matched(&self, world: &World, random: &mut impl Rng) -> Matching {
+    fn matched(&self, world: &World, random: &mut impl Rng) -> Result<Matching> {
         let (tracklets, points) = self.scene.located(|bounding_box| {
             let box_variance_m2 = self.cameras[world.camera].ground_point(bounding_box)?.box_variance_m2;
             Some((self.placed(world, bounding_box)?, box_variance_m2, self.ground.map_sigma_m.powi(2)))
@@ -280,11 +285,11 @@ impl<'a> JointSearch<'a> {
 
     /// Trains on the sure pieces and matches by the model, in turn.
     fn trained(&self, world: &World, scores: WorldScores, random: &mut impl Rng) -> Result<JointMatch> {
-        let mut matching = self.matched(world, random);
+        let mut matching = self.matched(world, random)?;
         let mut model = self.fit(&matching, |_| true)?;
         let mut regressor = model.load()?;
         for _ in 1..ROUNDS {
-            matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random);
+            matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random)?;
             let next = self.fit(&matching, |_| true)?;
             let next_regressor = next.load()?;
             let moved_m = self.distance_m(&regressor, &next_regressor);
@@ -293,7 +298,7 @@ impl<'a> JointSearch<'a> {
                 break;
             }
         }
-        matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random);
+        matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random)?;
         let halves_m = self.halves_distance_m(&matching)?;
         if let Some(halves_m) =
             halves_m.filter(|halves_m| *halves_m > MAX_HALVES_DISTANCE * self.ground.map_sigma_m)
@@ -369,7 +374,13 @@ impl<'a> JointSearch<'a> {
             gnss_bias_sigma_m: None,
         };
         let input = FitInput { samples: &samples, unpaired: &unpaired };
-        fit(input, &options, &mut |_| ControlFlow::Continue(())).map_err(|error| {
+        let cancellation = self.scene.cancellation;
+        let mut observer = |_: FitEvent<'_>| {
+            if cancellation.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        };
+        let fitted = fit(input, &options, &mut observer);
+        cancellation.check()?;
+        fitted.map_err(|error| {
             // Boxes of wrong carriers may have no fit at all, which is no fault of the program.
             not_identifiable(
                 &format!("the matched boxes cannot train a model: {error}"),

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use rand::Rng;
 
 use super::assignment::posterior;
+use super::cancellation::Cancellation;
 use super::chains::{Chain, ChainSettings, Piece, PieceTable};
 use super::companions::View;
 use super::cuts;
@@ -49,11 +50,13 @@ pub struct MatchLimits {
     pub tracklets: usize,
     /// Number of receivers.
     pub receivers: usize,
+    /// Pairs of a tracklet and a fix during it, for each clock offset that is tried.
+    pub comparisons: u64,
 }
 
 impl Default for MatchLimits {
     fn default() -> Self {
-        Self { tracklets: 20_000, receivers: 200 }
+        Self { tracklets: 20_000, receivers: 200, comparisons: u64::MAX }
     }
 }
 
@@ -147,7 +150,7 @@ pub(super) struct Located<'a> {
 /// Matches detections with fixes by the positions that a model regresses.
 ///
 /// # Errors
-/// `TooLarge` for more tracklets or receivers than the settings allow.
+/// `TooLarge` for more tracklets, receivers or comparisons than the settings allow; `Cancelled`.
 pub fn match_with_model(
     detections: &[Detection],
     fixes: &[ReceivedFix],
@@ -155,11 +158,12 @@ pub fn match_with_model(
     regressor: &Regressor,
     settings: &MatchSettings,
     random: &mut impl Rng,
+    cancellation: Cancellation<'_>,
 ) -> Result<Matching> {
-    let scene = Scene::new(detections, fixes, receivers);
-    check_size(&scene, settings.limits)?;
+    let scene = Scene::new(detections, fixes, receivers, cancellation);
+    check_size(&scene, settings)?;
     let gnss = settings.gnss.unwrap_or_else(|| receiver_noise(Some(regressor)));
-    Ok(match_scene(&scene, regressor, gnss, settings, random))
+    match_scene(&scene, regressor, gnss, settings, random)
 }
 
 pub(super) fn match_scene(
@@ -168,7 +172,7 @@ pub(super) fn match_scene(
     gnss: GaussMarkovNoise,
     settings: &MatchSettings,
     random: &mut impl Rng,
-) -> Matching {
+) -> Result<Matching> {
     let (tracklets, points) = scene.regressed(regressor);
     let located =
         Located { tracklets: &tracklets, detections: &points, fixes: &scene.fixes(regressor.plane()), gnss };
@@ -187,7 +191,8 @@ pub(super) fn receiver_noise(regressor: Option<&Regressor>) -> GaussMarkovNoise 
         .with_white_at_least(LEAST_WHITE_SIGMA_M * LEAST_WHITE_SIGMA_M)
 }
 
-pub(super) fn check_size(scene: &Scene<'_>, limits: MatchLimits) -> Result<()> {
+pub(super) fn check_size(scene: &Scene<'_>, settings: &MatchSettings) -> Result<()> {
+    let limits = settings.limits;
     let refuse = |what: &str, count: usize, most: usize| {
         let message = format!(
             "there are {count} {what}, at most {most} are matched at once; split the recording by time"
@@ -197,8 +202,21 @@ pub(super) fn check_size(scene: &Scene<'_>, limits: MatchLimits) -> Result<()> {
     match (scene.tracklets.len(), scene.receiver_ids.len()) {
         (count, _) if count > limits.tracklets => refuse("tracklets", count, limits.tracklets),
         (_, count) if count > limits.receivers => refuse("receivers", count, limits.receivers),
-        _ => Ok(()),
+        _ => check_comparisons(scene, settings),
     }
+}
+
+fn check_comparisons(scene: &Scene<'_>, settings: &MatchSettings) -> Result<()> {
+    let comparisons = scene.comparisons().saturating_mul(clock_offsets(settings) as u64);
+    if comparisons > settings.limits.comparisons {
+        let message = format!(
+            "there are {comparisons} comparisons of fixes with tracklets, at most {} are made at once \
+             (limits.match_comparisons); split the recording by time, or give a smaller clock_window_s",
+            settings.limits.comparisons
+        );
+        return Err(Error::refused(ErrorKind::TooLarge, message));
+    }
+    Ok(())
 }
 
 pub(super) fn match_located(
@@ -206,18 +224,22 @@ pub(super) fn match_located(
     located: &Located<'_>,
     settings: &MatchSettings,
     random: &mut impl Rng,
-) -> Matching {
+) -> Result<Matching> {
+    let cancellation = scene.cancellation;
     let model = EvidenceModel { gnss: located.gnss, motion: SceneMotion::of(located.tracklets) };
-    let offsets_s = clock_offsets_s(located, &model, settings);
+    let offsets_s = clock_offsets_s(located, &model, settings, cancellation)?;
     let timed: Vec<(&[TimedFix], f64)> =
         located.fixes.iter().map(Vec::as_slice).zip(offsets_s.iter().copied()).collect();
     let pieces = cuts::pieces(located.tracklets, &timed, &model, &settings.chains);
     let table = PieceTable::new(located.tracklets, pieces, model.motion, &settings.chains);
     let chains: Vec<Vec<Chain>> = timed
         .iter()
-        .map(|(fixes, offset_s)| table.chains(fixes, *offset_s, &model, &settings.chains))
-        .collect();
-    let probabilities = posterior(&chains, table.pieces.len(), random);
+        .map(|(fixes, offset_s)| {
+            cancellation.check()?;
+            Ok(table.chains(fixes, *offset_s, &model, &settings.chains))
+        })
+        .collect::<Result<_>>()?;
+    let probabilities = posterior(&chains, table.pieces.len(), random, cancellation)?;
     let most_probable = |at: usize| {
         let all = probabilities.iter().map(|own| own[at]).enumerate();
         all.max_by(|one, other| one.1.total_cmp(&other.1))
@@ -247,15 +269,20 @@ pub(super) fn match_located(
     matching.clock_offsets = found
         .filter_map(|(id, offset_s)| Some((id.clone(), ClockOffset::from_seconds(offset_s).ok()?)))
         .collect();
-    matching
+    Ok(matching)
 }
 
 /// The clock offset of each receiver with the largest evidence, over all chains, under a normal prior.
-fn clock_offsets_s(located: &Located<'_>, model: &EvidenceModel, settings: &MatchSettings) -> Vec<f64> {
+fn clock_offsets_s(
+    located: &Located<'_>,
+    model: &EvidenceModel,
+    settings: &MatchSettings,
+    cancellation: Cancellation<'_>,
+) -> Result<Vec<f64>> {
     let window_s = settings.clock_window_s;
-    let steps = (window_s / OFFSET_STEP_S).floor() as i32;
+    let steps = clock_steps(settings);
     if steps < 1 {
-        return vec![0.0; located.fixes.len()];
+        return Ok(vec![0.0; located.fixes.len()]);
     }
     let whole = |(tracklet, own): (usize, &Tracklet)| Piece { tracklet, first: 0, end: own.points.len() };
     let pieces = located.tracklets.iter().enumerate().map(whole).collect();
@@ -267,10 +294,29 @@ fn clock_offsets_s(located: &Located<'_>, model: &EvidenceModel, settings: &Matc
         most + sum.ln() - 0.5 * (2.0 * offset_s / window_s).powi(2)
     };
     let best = |fixes: &Vec<TimedFix>| {
-        let grid = (-steps..=steps).map(|step| f64::from(step) * OFFSET_STEP_S);
-        grid.map(|offset_s| (offset_s, evidence(fixes, offset_s)))
-            .max_by(|one, other| one.1.total_cmp(&other.1))
-            .map_or(0.0, |(offset_s, _)| offset_s)
+        let mut best = (0.0, f64::NEG_INFINITY);
+        for offset_s in (-steps..=steps).map(|step| f64::from(step) * OFFSET_STEP_S) {
+            cancellation.check()?;
+            let evidence = evidence(fixes, offset_s);
+            // Of equals the last.
+            if evidence.total_cmp(&best.1).is_ge() {
+                best = (offset_s, evidence);
+            }
+        }
+        Ok(best.0)
     };
     located.fixes.iter().map(best).collect()
+}
+
+/// Steps of the search for a clock offset to either side.
+fn clock_steps(settings: &MatchSettings) -> i32 {
+    (settings.clock_window_s / OFFSET_STEP_S).floor() as i32
+}
+
+/// Passes over all comparisons: one for each clock offset that is tried, and that with the best.
+fn clock_offsets(settings: &MatchSettings) -> i32 {
+    match clock_steps(settings) {
+        ..1 => 1,
+        steps => 2 * steps + 2,
+    }
 }

@@ -2,10 +2,11 @@
 //!
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/association.md` has the formulas and figures. The files in the order of their imports:
-//! `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`.
+//! `cancellation`, `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`.
 //! What never happens here: I/O, clocks, randomness that is not handed in.
 
 mod assignment;
+mod cancellation;
 mod chains;
 mod companions;
 mod cuts;
@@ -19,6 +20,7 @@ mod placement;
 mod recording;
 mod tracklet;
 
+pub use self::cancellation::Cancellation;
 pub use self::chains::ChainSettings;
 pub use self::joint::{JointMatch, WorldScores, match_without_model};
 pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};

@@ -13,6 +13,7 @@ use std::cmp::Ordering;
 
 use nalgebra::{Complex, DMatrix};
 
+use super::cancellation::Cancellation;
 use super::disjoint;
 use super::evidence::{EvidenceModel, MAP_TIME_CONSTANT_S, free_log_likelihood};
 use super::tracklet::{Residual, SceneMotion, TimedFix, Tracklet, concurrent};
@@ -33,6 +34,8 @@ const MAX_SCALE: f64 = 100.0;
 const YAWS: usize = 48;
 /// Longest pairs whose position suggests a translation for each yaw.
 const GRID_PAIRS: usize = 80;
+/// Longest pairs that suggest a placement each.
+const SUGGESTING_PAIRS: usize = 2_000;
 /// Placements refined, and rounds of refinement.
 const REFINED: usize = 32;
 const ROUNDS: usize = 25;
@@ -247,6 +250,16 @@ impl PlacementSearch {
         self.pairs.iter().flat_map(|own| &own.pairs)
     }
 
+    /// The longest pairs, those of all receivers among them: pairs of a few only would all be wrong where these are out of
+    /// view.
+    fn longest(&self, most: usize) -> Vec<&Pair> {
+        let per_receiver = (most / self.pairs.len().max(1)).max(4);
+        let mut longest: Vec<&Pair> = self.pairs.iter().flat_map(|own| own.longest(per_receiver)).collect();
+        longest.sort_by(Pair::by_length);
+        longest.truncate(most);
+        longest
+    }
+
     fn score(&self, turn: C, shift: C) -> f64 {
         let scale = turn.norm().ln() / self.scale_sigma;
         let at = Coefficients::new(turn, shift);
@@ -256,25 +269,32 @@ impl PlacementSearch {
 
     /// The best placements that differ from each other, the best first. The best starts lie mostly about the best
     /// placement, so others are also searched for farther away than `apart_m` from it.
-    pub(super) fn search(&self, most: usize, apart_m: f64) -> Vec<Placement> {
-        let mut starts = self.suggested();
-        starts.extend(self.grid());
+    /// None once it is cancelled.
+    pub(super) fn search(&self, most: usize, apart_m: f64, cancellation: Cancellation<'_>) -> Vec<Placement> {
+        let mut starts = self.suggested(cancellation);
+        starts.extend(self.grid(cancellation));
         starts.sort_by(|one, other| other.score.total_cmp(&one.score));
         let near = distinct(&starts, &self.points, REFINED, 1.0);
-        let mut modes: Vec<Placement> = near.into_iter().map(|start| self.refined(start)).collect();
+        let refined = |starts: Vec<Placement>| {
+            let going_on = starts.into_iter().take_while(|_| !cancellation.is_cancelled());
+            going_on.map(|start| self.refined(start)).collect::<Vec<_>>()
+        };
+        let mut modes = refined(near);
         modes.sort_by(|one, other| other.score.total_cmp(&one.score));
         if let Some(best) = modes.first().copied() {
             starts.retain(|start| start.distance_m(&best, &self.points) > apart_m);
             let far = distinct(&starts, &self.points, REFINED, 0.5 * apart_m);
-            modes.extend(far.into_iter().map(|start| self.refined(start)));
+            modes.extend(refined(far));
         }
         modes.sort_by(|one, other| other.score.total_cmp(&one.score));
-        distinct(&modes, &self.points, most, 1.0)
+        if cancellation.is_cancelled() { Vec::new() } else { distinct(&modes, &self.points, most, 1.0) }
     }
 
-    /// The placement that each pair alone suggests.
-    fn suggested(&self) -> Vec<Placement> {
-        self.all_pairs()
+    /// The placement that each of the longest pairs alone suggests: scoring one takes all pairs.
+    fn suggested(&self, cancellation: Cancellation<'_>) -> Vec<Placement> {
+        self.longest(SUGGESTING_PAIRS)
+            .into_iter()
+            .take_while(|_| !cancellation.is_cancelled())
             .filter_map(|pair| {
                 let moved = pair.gz - pair.g.conj() * pair.z / pair.ones;
                 let spread = pair.gg - pair.g.norm_sqr() / pair.ones;
@@ -288,14 +308,10 @@ impl PlacementSearch {
     }
 
     /// For each yaw the translations that the longest pairs suggest.
-    fn grid(&self) -> Vec<Placement> {
-        // Pairs of a few receivers only would all be wrong where these are out of view.
-        let per_receiver = (GRID_PAIRS / self.pairs.len().max(1)).max(4);
-        let mut longest: Vec<&Pair> = self.pairs.iter().flat_map(|own| own.longest(per_receiver)).collect();
-        longest.sort_by(Pair::by_length);
-        longest.truncate(GRID_PAIRS);
+    fn grid(&self, cancellation: Cancellation<'_>) -> Vec<Placement> {
+        let longest = self.longest(GRID_PAIRS);
         let mut best = Vec::with_capacity(YAWS * 3);
-        for step in 0..YAWS {
+        for step in (0..YAWS).take_while(|_| !cancellation.is_cancelled()) {
             let turn = C::from_polar(1.0, step as f64 / YAWS as f64 * std::f64::consts::TAU);
             let mut own: Vec<Placement> =
                 longest.iter().map(|pair| self.placed(turn, (pair.z - turn * pair.g) / pair.ones)).collect();

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use jiff::Timestamp;
 
+use super::cancellation::Cancellation;
 use super::tracklet::{TimedFix, TrackPoint, Tracklet};
 use crate::domain::{BoundingBox, Detection, ReceivedFix, ReceiverId, Receivers, TargetId};
 use crate::geo::{EastNorth, LocalPlane};
@@ -30,6 +31,7 @@ pub(super) struct Scene<'a> {
     pub(super) receivers: &'a Receivers,
     pub(super) received: &'a [ReceivedFix],
     origin: Timestamp,
+    pub(super) cancellation: Cancellation<'a>,
 }
 
 impl<'a> Scene<'a> {
@@ -39,6 +41,7 @@ impl<'a> Scene<'a> {
         detections: &'a [Detection],
         fixes: &'a [ReceivedFix],
         receivers: &'a Receivers,
+        cancellation: Cancellation<'a>,
     ) -> Self {
         let origin = detections.iter().map(|own| own.time).min().unwrap_or(Timestamp::UNIX_EPOCH);
         let mut by_target: BTreeMap<&TargetId, Vec<usize>> = BTreeMap::new();
@@ -77,7 +80,27 @@ impl<'a> Scene<'a> {
             receivers,
             received: fixes,
             origin,
+            cancellation,
         }
+    }
+
+    /// Pairs of a tracklet and a fix of a receiver during it: what the evidence is made of.
+    pub(super) fn comparisons(&self) -> u64 {
+        let spans = self.tracklets.iter().filter_map(|own| {
+            let (first, last) = (own.detections.first()?, own.detections.last()?);
+            Some((self.detections[*first].time, self.detections[*last].time))
+        });
+        let camera_time = |(own, id): (&Vec<&ReceivedFix>, &ReceiverId)| -> Vec<Timestamp> {
+            own.iter().map(|fix| self.receivers.resolve(id, fix.time).1).collect()
+        };
+        let times: Vec<Vec<Timestamp>> = self.fixes.iter().zip(&self.receiver_ids).map(camera_time).collect();
+        let during = |(first, last): (Timestamp, Timestamp)| -> usize {
+            let of_receiver = |own: &Vec<Timestamp>| {
+                own.partition_point(|time| *time <= last) - own.partition_point(|time| *time < first)
+            };
+            times.iter().map(of_receiver).sum()
+        };
+        spans.map(|span| during(span) as u64).sum()
     }
 
     /// Time from the first to the last box, s.

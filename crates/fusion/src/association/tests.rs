@@ -2,6 +2,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::assignment::posterior;
+use super::cancellation::Cancellation;
 use super::chains::{Chain, ChainSettings};
 use super::cuts;
 use super::evidence::{EvidenceModel, LikelihoodRatio};
@@ -126,7 +127,8 @@ fn sampled_probabilities_are_those_of_the_enumeration() {
             }
         }
     }
-    let sampled = posterior(&chains, 2, &mut ChaCha8Rng::seed_from_u64(3));
+    let sampled = posterior(&chains, 2, &mut ChaCha8Rng::seed_from_u64(3), Cancellation::NEVER)
+        .expect("never cancelled");
     for (own, wanted) in sampled.iter().flatten().zip(expected.iter().flatten()) {
         assert!((own - wanted / total).abs() < 0.06, "{sampled:?} {expected:?} {total}");
     }
@@ -155,7 +157,7 @@ fn largest_error_m(prior: &GroundPrior, scale: f64, anchored: u8) -> f64 {
     let mut receivers: Vec<Vec<TimedFix>> = (0..3).map(|at| carried(&tracks[at], 20 + at as u64)).collect();
     receivers.extend((0..anchored).map(at_anchor));
     let search = PlacementSearch::new(&ground, &receivers, &MODEL, prior, 0.0);
-    let best = search.search(1, 50.0)[0];
+    let best = search.search(1, 50.0, Cancellation::NEVER)[0];
     let error_m = |(track, ground): (&Tracklet, &Tracklet)| {
         let (truth, point) = (track.points[60].position, ground.points[60].position);
         let [east_m, north_m] = best.apply(point.east_m, point.north_m);

@@ -225,7 +225,8 @@ contract! {
     fn runs(&self, camera: &CameraId, before: Option<RunId>, limit: u32) -> Result<Vec<TrainingRun>>;
 
     /// Claims the oldest run that is queued or whose lease has expired. Its attempt and fence go up by
-    /// one; its curve and progress are reset.
+    /// one; its curve and progress are reset. Leases of all jobs are measured by the clock of the database's server, or
+    /// by `now` in a data folder.
     ///
     /// # Errors
     /// Faults only.

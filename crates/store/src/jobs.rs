@@ -5,9 +5,11 @@
 //! the fence, and whatever the earlier worker still writes is ignored. So a job ends exactly once, whatever
 //! crashes.
 //!
-//! Leases are instants of the wall clock, which may step. A lease that ends further ahead than its own
-//! length was taken under a clock that has been set back since; it counts as expired. A worker that is
-//! alive writes a sound lease again with its next heartbeat.
+//! Leases are instants of one clock: that of the database's server in PostgreSQL, and in a data folder, which one
+//! machine has, that of the caller. The caller may have read its clock before it waited for the file, so a lease that
+//! another worker has taken meanwhile ends somewhat further ahead than its own length. One that ends more than
+//! [`CLOCK_ERROR_US`] further ahead was taken under a clock that has been set back since; it counts as expired. A worker
+//! that is alive writes a sound lease again with its next heartbeat.
 
 use std::time::Duration;
 
@@ -133,20 +135,18 @@ pub(super) fn lease_us(lease: Duration) -> i64 {
     i64::try_from(lease.as_micros()).map_or(CENTURY_US, |lease_us| lease_us.min(CENTURY_US))
 }
 
-/// Condition under which no worker holds a live lease on a job; the literal is the parameter of the time now in
+/// How much further ahead than its own length a lease may end. A clock that is set back by less keeps the job of a dead
+/// worker waiting for as long as it was set back.
+pub(super) const CLOCK_ERROR_US: i64 = 60_000_000;
+
+/// Condition under which no worker holds a live lease on a job, where `now` is an expression for the time now in
 /// microseconds. Rows of earlier releases do not have the length of their lease; an hour is longer than any was.
-macro_rules! lease_expired {
-    ($now:literal) => {
-        concat!(
-            "(lease_until_us IS NULL OR lease_until_us <= ",
-            $now,
-            " OR lease_until_us > ",
-            $now,
-            " + coalesce(lease_us, 3600000000))"
-        )
-    };
+pub(super) fn lease_expired(now: &str) -> String {
+    format!(
+        "(lease_until_us IS NULL OR lease_until_us <= {now} \
+         OR lease_until_us > {now} + coalesce(lease_us, 3600000000) + {CLOCK_ERROR_US})"
+    )
 }
-pub(super) use lease_expired;
 
 /// A table of jobs. Only its fixed text goes into statements; values are bound.
 pub(super) struct JobTable {

@@ -39,6 +39,9 @@ const BEGIN_RELAXED: &str = "BEGIN; DEALLOCATE ALL; SET LOCAL statement_timeout 
 const BEGIN_SCHEMA: &str =
     "BEGIN; DEALLOCATE ALL; SET LOCAL lock_timeout = '30s'; SET LOCAL synchronous_commit = on";
 
+/// The time of the database, in microseconds, as an expression.
+pub(super) const DATABASE_NOW_US: &str = "(extract(epoch FROM clock_timestamp()) * 1000000)::BIGINT";
+
 /// The lock of the library lasts for a session, which a pooler does not keep.
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| {
     let mut migrations = sqlx::migrate!("../../migrations/postgres");

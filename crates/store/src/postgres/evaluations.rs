@@ -125,10 +125,10 @@ impl Store {
         fence: i64,
         progress: &EvaluationProgress,
         lease: Duration,
-        now: Timestamp,
+        _now: Timestamp,
     ) -> Result<Heartbeat> {
         let mut transaction = self.relaxed_writer().await?;
-        let heartbeat = EVALUATIONS.heartbeat(&mut transaction, (id.0, fence), lease, now).await?;
+        let heartbeat = EVALUATIONS.heartbeat(&mut transaction, (id.0, fence), lease).await?;
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }

@@ -7,6 +7,7 @@ use sqlx::{AssertSqlSafe, PgConnection};
 use uuid::Uuid;
 
 use super::Store;
+use super::connection::DATABASE_NOW_US;
 use super::errors::failed;
 use super::finite;
 use super::locks::{Limit, lock_limit};
@@ -15,8 +16,6 @@ use crate::jobs::{
     self, COUNT_JOBS, Claim, Finished, Heartbeat, JobCounts, JobEnd, JobTable, Settled, lease_expired,
     lease_us,
 };
-
-const LEASE_EXPIRED: &str = lease_expired!("$1");
 
 pub(super) const RUNS: Jobs = Jobs(&jobs::RUNS);
 pub(super) const SITE_RUNS: Jobs = Jobs(&jobs::SITE_RUNS);
@@ -117,7 +116,8 @@ impl Jobs {
     }
 
     /// Claims the job that comes first of those that are queued or whose lease has expired. Attempt and fence go up by one;
-    /// the progress is reset. Jobs that another transaction is claiming are passed over.
+    /// the progress is reset. Jobs that another transaction is claiming are passed over. The lease is counted by the
+    /// database's clock, `now` is when the job began for those who look at it.
     pub(super) async fn claim(
         &self,
         connection: &mut PgConnection,
@@ -125,11 +125,12 @@ impl Jobs {
         now: Timestamp,
     ) -> Result<Option<Claim<Uuid>>> {
         let JobTable { table, reset_progress, order, .. } = self.0;
+        let expired = lease_expired(DATABASE_NOW_US);
         let sql = format!(
             "UPDATE {table} SET state = 'running', attempt = attempt + 1, fence = fence + 1, \
-             lease_until_us = $1 + $2, lease_us = $2, started_at_us = $1, phase = '', remaining_s = NULL, \
+             lease_until_us = {DATABASE_NOW_US} + $2, lease_us = $2, started_at_us = $1, phase = '', remaining_s = NULL, \
              {reset_progress} \
-             WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') AND {LEASE_EXPIRED} \
+             WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') AND {expired} \
              ORDER BY {order} LIMIT 1 FOR UPDATE SKIP LOCKED) \
              RETURNING id, fence, cancel_requested"
         );
@@ -150,15 +151,13 @@ impl Jobs {
         connection: &mut PgConnection,
         (id, fence): (Uuid, i64),
         lease: Duration,
-        now: Timestamp,
     ) -> Result<Heartbeat> {
         let sql = format!(
-            "UPDATE {} SET lease_until_us = $1 + $2, lease_us = $2 \
-             WHERE id = $3 AND fence = $4 AND state = 'running' RETURNING cancel_requested",
+            "UPDATE {} SET lease_until_us = {DATABASE_NOW_US} + $1, lease_us = $1 \
+             WHERE id = $2 AND fence = $3 AND state = 'running' RETURNING cancel_requested",
             self.0.table
         );
         let cancel_requested: Option<i64> = sqlx::query_scalar(AssertSqlSafe(sql))
-            .bind(now.as_microsecond())
             .bind(lease_us(lease))
             .bind(id.to_string())
             .bind(fence)
@@ -196,13 +195,12 @@ impl Jobs {
     /// Cancels a job that has not ended: at once where no worker holds a live lease on it, otherwise at
     /// its worker's next heartbeat.
     pub(super) async fn cancel(&self, connection: &mut PgConnection, id: Uuid, now: Timestamp) -> Result<()> {
-        let table = self.0.table;
+        let (table, expired) = (self.0.table, lease_expired(DATABASE_NOW_US));
         let sql = format!(
-            "SELECT 1::BIGINT FROM {table} WHERE id = $2 AND (state = 'queued' OR (state = 'running' AND {LEASE_EXPIRED})) \
+            "SELECT 1::BIGINT FROM {table} WHERE id = $1 AND (state = 'queued' OR (state = 'running' AND {expired})) \
              FOR UPDATE"
         );
         let unclaimed: Option<i64> = sqlx::query_scalar(AssertSqlSafe(sql))
-            .bind(now.as_microsecond())
             .bind(id.to_string())
             .fetch_optional(&mut *connection)
             .await

@@ -114,10 +114,10 @@ impl Store {
         fence: i64,
         progress: &RunProgress,
         lease: Duration,
-        now: Timestamp,
+        _now: Timestamp,
     ) -> Result<Heartbeat> {
         let mut transaction = self.relaxed_writer().await?;
-        let heartbeat = SITE_RUNS.heartbeat(&mut transaction, (run.0, fence), lease, now).await?;
+        let heartbeat = SITE_RUNS.heartbeat(&mut transaction, (run.0, fence), lease).await?;
         if heartbeat == Heartbeat::Lost {
             return Ok(heartbeat);
         }

@@ -14,8 +14,6 @@ use crate::jobs::{
     lease_us,
 };
 
-const LEASE_EXPIRED: &str = lease_expired!("?1");
-
 pub(super) const RUNS: Jobs = Jobs(&jobs::RUNS);
 pub(super) const SITE_RUNS: Jobs = Jobs(&jobs::SITE_RUNS);
 pub(super) const EVALUATIONS: Jobs = Jobs(&jobs::EVALUATIONS);
@@ -116,12 +114,12 @@ impl Jobs {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Option<Claim<Uuid>>> {
-        let JobTable { table, reset_progress, order, .. } = self.0;
+        let (JobTable { table, reset_progress, order, .. }, expired) = (self.0, lease_expired("?1"));
         let sql = format!(
             "UPDATE {table} SET state = 'running', attempt = attempt + 1, fence = fence + 1, \
              lease_until_us = ?1 + ?2, lease_us = ?2, started_at_us = ?1, phase = '', remaining_s = NULL, \
              {reset_progress} \
-             WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') AND {LEASE_EXPIRED} \
+             WHERE id = (SELECT id FROM {table} WHERE state IN ('queued', 'running') AND {expired} \
              ORDER BY {order} LIMIT 1) \
              RETURNING id, fence, cancel_requested"
         );
@@ -192,9 +190,9 @@ impl Jobs {
         id: Uuid,
         now: Timestamp,
     ) -> Result<()> {
-        let table = self.0.table;
+        let (table, expired) = (self.0.table, lease_expired("?1"));
         let sql = format!(
-            "SELECT 1 FROM {table} WHERE id = ?2 AND (state = 'queued' OR (state = 'running' AND {LEASE_EXPIRED}))"
+            "SELECT 1 FROM {table} WHERE id = ?2 AND (state = 'queued' OR (state = 'running' AND {expired}))"
         );
         let unclaimed: Option<i64> = sqlx::query_scalar(AssertSqlSafe(sql))
             .bind(now.as_microsecond())

@@ -107,6 +107,7 @@ async fn a_worker_without_a_lease_cannot_store_a_report() {
     let old = fixture.claim_evaluation(2).await;
     assert_eq!(fixture.heartbeat_evaluation(old.fence, 3).await, Heartbeat::Continue);
     assert!(fixture.store.claim_evaluation(LEASE, at(32)).await.expect("works").is_none(), "the lease holds");
+    fixture.let_leases_expire().await;
     let new = fixture.claim_evaluation(33).await;
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert_eq!(new.job.progress, EvaluationProgress::default(), "its progress is reset");

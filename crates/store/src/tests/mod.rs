@@ -99,6 +99,21 @@ impl Fixture {
     }
 
     /// As [`Fixture::tamper`], in the words of each backend.
+    /// Lets the leases of all jobs expire, by whichever clock they are measured.
+    async fn let_leases_expire(&self) {
+        self.tamper(
+            "UPDATE training_runs SET lease_until_us = 1 WHERE state = 'running'; \
+             UPDATE site_training_runs SET lease_until_us = 1 WHERE state = 'running'; \
+             UPDATE evaluations SET lease_until_us = 1 WHERE state = 'running'",
+        )
+        .await;
+    }
+
+    /// Sets the clock back by 400 days, as the leases of training runs see it.
+    async fn set_clock_back(&self) {
+        self.tamper("UPDATE training_runs SET lease_until_us = lease_until_us + 34560000000000").await;
+    }
+
     async fn tamper_each(&self, sqlite: &'static str, postgres: &'static str) {
         match &self.store.0 {
             Backend::Sqlite(store) => store.tamper(sqlite).await,

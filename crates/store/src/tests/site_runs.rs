@@ -138,6 +138,7 @@ async fn a_worker_that_lost_its_lease_or_was_cancelled_activates_nothing() {
     let (fixture, cameras) = with_site().await;
     fixture.queue_site(1).await;
     let old = fixture.claim_site(2).await;
+    fixture.let_leases_expire().await;
     let new = fixture.claim_site(33).await;
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert!(fixture.finish_site(old.fence, success(&cameras, &metadata, true)).await.is_none());

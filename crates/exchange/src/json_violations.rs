@@ -28,7 +28,14 @@ pub(super) fn all_violations<'de, T: Deserialize<'de>>(json: &[u8], first: Error
         count => format!("{count} fields cannot be used"),
     };
     let kind = ErrorKind::InvalidArgument;
-    Error::Refused(Refusal { kind, message, violations, conflicting_id: None, other_node: None })
+    Error::Refused(Refusal {
+        kind,
+        message,
+        violations,
+        conflicting_id: None,
+        other_node: None,
+        may_repeat: false,
+    })
 }
 
 fn collect<'de, T: Deserialize<'de>>(document: &mut Value, violations: &mut Vec<Violation>) {

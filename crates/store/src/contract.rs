@@ -1,15 +1,18 @@
 //! The methods of [`Store`] that both backends have, each with what it promises.
 //!
-//! A new method is added here and to `sqlite` and `postgres` under the same signature, with cases in `tests`.
+//! A new method is added here and to `sqlite` and `postgres` under the same signature, with cases in `tests`. PostgreSQL
+//! may end a transaction in favour of another one; then the method is called again, so what it commits before its last
+//! transaction must bear repetition.
 
 use std::time::Duration;
 
 use jiff::Timestamp;
 
+use super::postgres::repeated;
 use super::{
-    CameraContent, CameraVersions, ChangeMark, Claim, Heartbeat, IdempotencyRecord, JobCounts, JobEnd,
-    KeysVersion, RunEnd, SampleFilter, SampleKey, SiteRunEnd, StorageStatus, Store, StoredAnswer,
-    StoredHeldOutError, on_backend,
+    Backend, CameraContent, CameraVersions, ChangeMark, Claim, Heartbeat, IdempotencyRecord, JobCounts,
+    JobEnd, KeysVersion, RunEnd, SampleFilter, SampleKey, SiteRunEnd, StorageStatus, Store, StoredAnswer,
+    StoredHeldOutError,
 };
 #[cfg(doc)]
 use crate::domain::ErrorKind;
@@ -29,7 +32,10 @@ macro_rules! contract {
             $(
                 $(#[$attribute])*
                 pub async fn $name(&self $(, $argument: $type)*) -> $output {
-                    on_backend!(self, store => store.$name($($argument),*).await)
+                    match &self.0 {
+                        Backend::Sqlite(store) => store.$name($($argument),*).await,
+                        Backend::Postgres(store) => repeated!(store.$name($(Clone::clone(&$argument)),*)),
+                    }
                 }
             )*
         }

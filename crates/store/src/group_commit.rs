@@ -278,6 +278,14 @@ pub(super) enum Failure {
     Transaction(Error),
 }
 
+impl Failure {
+    pub(super) const fn error(&self) -> &Error {
+        match self {
+            Self::Statement(error) | Self::Transaction(error) => error,
+        }
+    }
+}
+
 /// How statements and batches go together.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Counting {
@@ -412,6 +420,6 @@ pub(super) fn note(usage: &Usage, committed: &Result<Vec<Result<Inserted>>, Fail
     match committed {
         Ok(outcomes) => usage
             .stored(outcomes.iter().flatten().map(|inserted| inserted.accepted - inserted.replaced).sum()),
-        Err(Failure::Statement(error) | Failure::Transaction(error)) => usage.failed(error),
+        Err(failure) => usage.failed(failure.error()),
     }
 }

@@ -61,6 +61,18 @@ impl DatabaseUrl {
         if !["postgres://", "postgresql://"].iter().any(|scheme| url.starts_with(scheme)) {
             return Err(refused("it begins otherwise"));
         }
+        // The library connects to one host, and would look for one of that name.
+        let authority = url.split("://").nth(1).and_then(|rest| rest.split('/').next()).unwrap_or_default();
+        let host = authority.rsplit('@').next().unwrap_or_default();
+        let query = url.split_once('?').map_or("", |(_, query)| query);
+        let of_query = query.split('&').filter_map(|pair| pair.strip_prefix("host="));
+        if of_query.chain([host]).any(|host| host.contains(',') || host.to_ascii_lowercase().contains("%2c"))
+        {
+            return Err(refused(
+                "it names several hosts; give one address that always leads to the primary, such as that of HAProxy or \
+                 PgBouncer, a virtual address, or a name that a fail-over changes",
+            ));
+        }
         let options: PgConnectOptions = url.parse().map_err(|_| refused("it cannot be read"))?;
         let database = options.get_database().unwrap_or_else(|| options.get_username());
         let shown = format!("postgres://{}:{}/{database}", options.get_host(), options.get_port());

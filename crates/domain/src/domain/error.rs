@@ -160,7 +160,14 @@ pub fn convert_all<T, R>(
     }
     let message = format!("nothing was done, for the {list} at fault");
     let kind = ErrorKind::InvalidArgument;
-    Err(Error::Refused(Refusal { kind, message, violations, conflicting_id: None, other_node: None }))
+    Err(Error::Refused(Refusal {
+        kind,
+        message,
+        violations,
+        conflicting_id: None,
+        other_node: None,
+        may_repeat: false,
+    }))
 }
 
 /// One invalid field.
@@ -195,6 +202,9 @@ pub struct Refusal {
     pub conflicting_id: Option<String>,
     /// Address of the node that would answer, such as `https://node-1.example.org:8443`.
     pub other_node: Option<String>,
+    /// Nothing was done, and the same call may be made again at once: the database ended its transaction in favour of
+    /// another one. Transports do not show this.
+    pub may_repeat: bool,
 }
 
 impl fmt::Display for Refusal {
@@ -253,6 +263,7 @@ impl Error {
             violations: Vec::new(),
             conflicting_id: None,
             other_node: Some(url.into()),
+            may_repeat: false,
         })
     }
 
@@ -264,6 +275,7 @@ impl Error {
             violations: Vec::new(),
             conflicting_id: None,
             other_node: None,
+            may_repeat: false,
         })
     }
 
@@ -281,6 +293,7 @@ impl Error {
             violations: vec![violation],
             conflicting_id: None,
             other_node: None,
+            may_repeat: false,
         })
     }
 
@@ -292,6 +305,19 @@ impl Error {
             violations: Vec::new(),
             conflicting_id: Some(id.into()),
             other_node: None,
+            may_repeat: false,
+        })
+    }
+
+    /// A refusal of a transaction that the database ended in favour of another one; the same call may be made again.
+    pub fn repeatable(kind: ErrorKind, message: impl Into<String>) -> Self {
+        Self::Refused(Refusal {
+            kind,
+            message: message.into(),
+            violations: Vec::new(),
+            conflicting_id: None,
+            other_node: None,
+            may_repeat: true,
         })
     }
 
@@ -311,7 +337,14 @@ impl Error {
             return Ok(());
         }
         let (kind, message) = (ErrorKind::InvalidArgument, message.to_owned());
-        Err(Self::Refused(Refusal { kind, message, violations, conflicting_id: None, other_node: None }))
+        Err(Self::Refused(Refusal {
+            kind,
+            message,
+            violations,
+            conflicting_id: None,
+            other_node: None,
+            may_repeat: false,
+        }))
     }
 
     /// The kind that `status.rs` maps.

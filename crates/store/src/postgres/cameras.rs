@@ -5,7 +5,7 @@ use sqlx::postgres::PgArguments;
 use sqlx::{PgConnection, Postgres};
 
 use super::Store;
-use super::errors::{failed, is_conflict};
+use super::errors::failed;
 use super::locks::{Limit, lock_limit};
 use crate::domain::{
     AuditAction, Camera, CameraId, Error, ExpectedVersion, GnssBiasSigma, GnssError, NewCamera, Result,
@@ -19,9 +19,6 @@ use crate::rows::cameras::{
 };
 
 type Query = sqlx::query::Query<'static, Postgres, PgArguments>;
-
-/// Transactions of one deletion at most.
-const DELETION_ATTEMPTS: u32 = 4;
 
 impl Store {
     pub(crate) async fn insert_camera(&self, profile: &NewCamera, now: Timestamp) -> Result<Camera> {
@@ -115,23 +112,8 @@ impl Store {
     }
 
     /// A deletion locks rows of many tables, and meets writers that hold some of them and wait for the camera. The database
-    /// ends one of the two; if that is the deletion, it is made again behind the other one.
+    /// ends one of the two.
     pub(crate) async fn delete_camera(
-        &self,
-        id: &CameraId,
-        expected: Option<ExpectedVersion>,
-        now: Timestamp,
-    ) -> Result<()> {
-        for _ in 1..DELETION_ATTEMPTS {
-            match self.try_delete_camera(id, expected, now).await {
-                Err(error) if is_conflict(&error) => {}
-                done => return done,
-            }
-        }
-        self.try_delete_camera(id, expected, now).await
-    }
-
-    async fn try_delete_camera(
         &self,
         id: &CameraId,
         expected: Option<ExpectedVersion>,

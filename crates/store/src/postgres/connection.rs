@@ -13,7 +13,7 @@ use sqlx::postgres::{PgConnectOptions, PgPoolOptions};
 use sqlx::{ConnectOptions, PgPool, Postgres, Transaction};
 use tokio::time::Instant;
 
-use super::errors::failed;
+use super::errors::{Meaning, failed, meaning};
 use super::locks::{Limit, try_lock_limit};
 use crate::domain::{Durability, Error, Result};
 use crate::folder_fault::{FolderFault, FolderFaultKind};
@@ -123,7 +123,7 @@ async fn migrate(pool: &PgPool) -> Result<(), MigrateError> {
 
 /// Why there is no connection, for the person who started the program.
 fn unreachable(url: &DatabaseUrl, error: &sqlx::Error) -> Error {
-    FolderFault::error(FolderFaultKind::Unreachable, format!("cannot connect to the database {url}: {error}"))
+    FolderFault::error(FolderFaultKind::Unreachable, format!("cannot use the database {url} now: {error}"))
 }
 
 fn unusable(url: &DatabaseUrl, cause: &MigrateError) -> Error {
@@ -146,6 +146,12 @@ fn unusable(url: &DatabaseUrl, cause: &MigrateError) -> Error {
             FolderFaultKind::InUse,
             format!("another process has been changing the schema of the database {url} for minutes"),
         ),
+        // A standby that is not yet the primary, or a connection that was lost: another start may find it otherwise.
+        MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _)
+            if matches!(meaning(error), Meaning::TryAgain(_) | Meaning::Conflict) =>
+        {
+            return unreachable(url, error);
+        }
         cause => (
             FolderFaultKind::Other,
             format!("the schema of the database {url} cannot be brought up to date: {cause}"),

@@ -5,7 +5,7 @@
 use std::collections::HashMap;
 
 use super::connection::{begin_read, begin_write};
-use super::errors::failed;
+use super::errors::{failed, repeated};
 use super::locks::{Limit, lock_limit};
 use super::nodes::{NodeLeases, node_id};
 use crate::domain::{ConnectionKey, Durability, NodeId, Result};
@@ -41,6 +41,15 @@ impl NodeLeases {
     /// # Errors
     /// As [`NodeLeases::register`].
     pub async fn acquire_connections(
+        &self,
+        id: NodeId,
+        group: &[ConnectionKey],
+        wanted: &[ConnectionKey],
+    ) -> Result<Vec<(ConnectionKey, i64)>> {
+        repeated!(self.try_acquire_connections(id, group, wanted))
+    }
+
+    async fn try_acquire_connections(
         &self,
         id: NodeId,
         group: &[ConnectionKey],
@@ -86,6 +95,10 @@ impl NodeLeases {
     /// # Errors
     /// As [`NodeLeases::register`].
     pub async fn release_connections(&self, id: NodeId, connections: &[(ConnectionKey, i64)]) -> Result<()> {
+        repeated!(self.try_release_connections(id, connections))
+    }
+
+    async fn try_release_connections(&self, id: NodeId, connections: &[(ConnectionKey, i64)]) -> Result<()> {
         let (keys, fences): (Vec<i64>, Vec<i64>) =
             connections.iter().map(|(key, fence)| (key.0, *fence)).unzip();
         let mut transaction = begin_write(&self.pool, Durability::Synced).await?;
@@ -108,6 +121,14 @@ impl NodeLeases {
     /// # Errors
     /// As [`NodeLeases::register`].
     pub async fn store_connection_statuses(
+        &self,
+        id: NodeId,
+        statuses: &[(ConnectionKey, String)],
+    ) -> Result<()> {
+        repeated!(self.try_store_connection_statuses(id, statuses))
+    }
+
+    async fn try_store_connection_statuses(
         &self,
         id: NodeId,
         statuses: &[(ConnectionKey, String)],

@@ -7,23 +7,41 @@ use sqlx::{AssertSqlSafe, Postgres, Row as _, Transaction};
 use tokio::sync::mpsc;
 
 use super::Store;
+use super::connection::DATABASE_NOW_US;
 use super::errors::failed;
+use crate::domain::{Error, ErrorKind, Result};
 use crate::copy::{Column, CopyTransaction, Kind, ROWS_AT_A_TIME, Rows, Table, Value, names_of};
-use crate::domain::{Error, Result};
 
 /// A copy may take long, and there is nobody whom it could keep waiting.
 const NO_TIMEOUTS: &str =
     "SET LOCAL statement_timeout = 0; SET LOCAL idle_in_transaction_session_timeout = 0";
 
 impl Store {
-    /// A transaction that keeps everybody else from changing the tables.
+    /// A transaction that keeps everybody else from changing the tables, and nodes from registering.
+    ///
+    /// # Errors
+    /// `Overloaded` where a node has renewed its registration within its lease.
     pub(crate) async fn begin_copy(&self) -> Result<Box<dyn CopyTransaction>> {
         let mut transaction = self.writer().await?;
         sqlx::raw_sql(NO_TIMEOUTS).execute(&mut *transaction).await.map_err(failed)?;
         let mut copying = Copying(transaction);
         let tables = copying.tables().await?.join(", ");
-        let lock = format!("LOCK TABLE {tables} IN EXCLUSIVE MODE");
+        let lock = format!("LOCK TABLE {tables}, nodes IN EXCLUSIVE MODE");
         sqlx::raw_sql(AssertSqlSafe(lock)).execute(&mut *copying.0).await.map_err(failed)?;
+        let running = format!(
+            "SELECT coalesce(url, id) FROM nodes WHERE renewed_at_us + 1000 * lease_ms > {DATABASE_NOW_US}"
+        );
+        let running: Vec<String> =
+            sqlx::query_scalar(AssertSqlSafe(running)).fetch_all(&mut *copying.0).await.map_err(failed)?;
+        if !running.is_empty() {
+            let nodes = running.join(", ");
+            return Err(Error::refused(
+                ErrorKind::Overloaded,
+                format!(
+                    "servers use the database: {nodes}; stop all of them, and wait until their leases are over"
+                ),
+            ));
+        }
         Ok(Box::new(copying))
     }
 }

@@ -10,7 +10,7 @@ use sqlx::{Connection as _, PgConnection, PgPool, Postgres};
 
 use super::audit::record;
 use super::connection::begin_write_statement;
-use super::errors::failed;
+use super::errors::{Attempts, failed};
 use super::idempotency::insert_answer;
 use super::sample_retention::delete_oldest;
 use super::sample_table::{delete_replaced, delete_stored, insert};
@@ -47,7 +47,13 @@ struct Session<'w> {
 impl WriteSession for Session<'_> {
     fn commit<'a>(&'a mut self, durability: Durability, group: &'a [SampleBatch]) -> Committing<'a> {
         async move {
-            let committed = try_commit(&mut self.connection, self.usage, durability, group).await;
+            let mut attempts = Attempts::default();
+            let committed = loop {
+                let committed = try_commit(&mut self.connection, self.usage, durability, group).await;
+                if !attempts.again(committed.as_ref().err().map(Failure::error)).await {
+                    break committed;
+                }
+            };
             note(self.usage, &committed);
             committed
         }

@@ -50,6 +50,7 @@ use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 
 use errors::failed;
 use group_commit::GroupWriter;
+pub(super) use errors::{Attempts, repeated};
 
 pub use connection_owners::ConnectionReports;
 pub use nodes::{Acquired, NodeLeases};
@@ -101,11 +102,18 @@ impl Store {
             return Err(Error::refused(ErrorKind::ShuttingDown, "the store is closed"));
         }
         let mut reader = self.reader().await?;
-        sqlx::query_scalar::<_, i64>("SELECT count(*) FROM cameras WHERE key = 0")
-            .fetch_one(&mut *reader)
-            .await
-            .map_err(failed)?;
-        Ok(())
+        let (_, takes_changes): (i64, bool) = sqlx::query_as(
+            "SELECT count(*), NOT (pg_is_in_recovery() OR current_setting('default_transaction_read_only')::BOOLEAN) \
+             FROM cameras WHERE key = 0",
+        )
+        .fetch_one(&mut *reader)
+        .await
+        .map_err(failed)?;
+        if takes_changes {
+            return Ok(());
+        }
+        let message = "the database takes no changes: it is a standby, or read-only";
+        Err(Error::refused(ErrorKind::Overloaded, message))
     }
 
     pub(super) fn is_full(&self) -> bool {

@@ -10,11 +10,11 @@ use uuid::Uuid;
 
 use crate::domain::{
     CameraId, ConnectionId, Durability, ErrorKind, NewCamera, NewConnection, NewSite, NodeId, NodeProfile,
-    RunId, SiteId,
+    RunId, RunProgress, SiteId,
 };
 use crate::tests::copy::copy_and_compare;
 use crate::tests::{Fixture, Home, at, connect, id, new_database, options, sample};
-use crate::{Acquired, DatabaseUrl, Location, SampleFilter, Store, StoreOptions};
+use crate::{Acquired, DatabaseUrl, Heartbeat, Location, SampleFilter, Store, StoreOptions};
 
 const LEASE: Duration = Duration::from_secs(30);
 
@@ -39,6 +39,17 @@ fn a_url_is_shown_without_its_secrets() {
     let refused = DatabaseUrl::new("mysql://someone:pass-word@db").expect_err("another database");
     assert_eq!(refused.kind(), ErrorKind::InvalidArgument);
     assert!(!refused.to_string().contains("pass-word"), "{refused}");
+    let several = [
+        "someone:pass-word@one:5432,two:5432/fixes",
+        "someone:pass-word@one,two/fixes",
+        "one/fixes?host=one,two",
+    ];
+    for several in several {
+        let refused =
+            DatabaseUrl::new(&format!("postgres://{several}")).expect_err("several hosts").to_string();
+        assert!(refused.contains("several hosts") && !refused.contains("pass-word"), "{refused}");
+    }
+    DatabaseUrl::new("postgres://someone:pass,word@one/fixes").expect("a comma in the password");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
@@ -112,6 +123,77 @@ async fn workers_of_several_processes_claim_each_run_once() {
         runs.extend(claimed);
     }
     assert_eq!((claims, runs.len()), (60, 60));
+}
+
+/// Leases are measured by the clock of the database, so those of workers may be wrong by any time.
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn the_clocks_of_workers_decide_no_lease() {
+    let fixture = Fixture::at(database().await).await;
+    let store = &fixture.store;
+    let run = RunId(Uuid::from_u128(1));
+    store.insert_run(run, &fixture.camera, &options(), 9, at(0)).await.expect("queued");
+    let fence = store.claim_run(LEASE, at(0)).await.expect("works").expect("a run").fence;
+    for second in [-86_400, -60, -1, 1, 60, 86_400] {
+        assert_eq!(store.claim_run(LEASE, at(second)).await.expect("works"), None, "at {second} s");
+        let beat = store.heartbeat_run(run, fence, &RunProgress::default(), LEASE, at(-second)).await;
+        assert_eq!(beat.expect("works"), Heartbeat::Continue);
+    }
+    // One that was taken a moment ago by the database's clock.
+    fixture.tamper("UPDATE training_runs SET lease_until_us = lease_until_us - 30000000").await;
+    assert_eq!(store.claim_run(LEASE, at(0)).await.expect("works").map(|claim| claim.fence), Some(fence + 1));
+}
+
+/// The database ends a transaction for a deadlock, or because it cannot be serialised, at whatever statement and call.
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_transaction_that_the_database_ends_is_made_again() {
+    let home = database().await;
+    let (store, node) = registered(&home, 1).await;
+    store.insert_camera(&NewCamera::named(id("a")), at(0)).await.expect("new");
+    crate::on_backend!(store, store => store.tamper(
+        "CREATE SEQUENCE statements; \
+         CREATE FUNCTION refuse_two_of_three() RETURNS TRIGGER LANGUAGE plpgsql AS $$ DECLARE n BIGINT; BEGIN \
+         n := nextval('statements'); \
+         IF n % 3 = 1 THEN RAISE EXCEPTION 'deadlock' USING ERRCODE = '40P01'; END IF; \
+         IF n % 3 = 2 THEN RAISE EXCEPTION 'serialization' USING ERRCODE = '40001'; END IF; \
+         RETURN NULL; END $$; \
+         CREATE TRIGGER refuse AFTER INSERT ON sample_counts FOR EACH STATEMENT EXECUTE FUNCTION refuse_two_of_three(); \
+         CREATE TRIGGER refuse AFTER UPDATE ON cameras FOR EACH STATEMENT EXECUTE FUNCTION refuse_two_of_three(); \
+         CREATE TRIGGER refuse AFTER UPDATE ON camera_owners FOR EACH STATEMENT EXECUTE FUNCTION refuse_two_of_three(); \
+         CREATE TRIGGER refuse AFTER INSERT ON training_runs FOR EACH STATEMENT EXECUTE FUNCTION refuse_two_of_three()"
+    ).await);
+    let inserted = store.insert_samples(&id("a"), vec![sample(1, "x")], Durability::Synced).await;
+    assert_eq!(inserted.expect("the shared writer tries again").accepted, 1);
+    let changed = store.replace_camera(&NewCamera::named(id("a")), None, at(1)).await.expect("changed");
+    assert_eq!(changed.revision.0, 2, "once");
+    assert_eq!(acquire(&store, "a", node).await, Acquired::Owned { fence: 1, is_takeover: false });
+    store.insert_run(RunId(Uuid::from_u128(1)), &id("a"), &options(), 9, at(1)).await.expect("queued");
+
+    crate::on_backend!(store, store => store.tamper(
+        "CREATE OR REPLACE FUNCTION refuse_two_of_three() RETURNS TRIGGER LANGUAGE plpgsql AS $$ BEGIN \
+         RAISE EXCEPTION 'always' USING ERRCODE = '40001'; END $$"
+    ).await);
+    let refused = store.insert_samples(&id("a"), vec![sample(2, "x")], Durability::Synced).await;
+    assert_eq!(refused.expect_err("not without end").kind(), ErrorKind::Overloaded);
+    let refused = store.replace_camera(&NewCamera::named(id("a")), None, at(2)).await;
+    assert_eq!(refused.expect_err("not without end").kind(), ErrorKind::Overloaded);
+}
+
+/// A copy beside servers would miss what they change after it.
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_copy_is_refused_as_long_as_a_node_is_registered() {
+    let home = database().await;
+    let (store, node) = registered(&home, 1).await;
+    let folder = TempDir::new().expect("a folder");
+    let target = Store::open(folder.path()).await.expect("opens");
+    for (from, to) in [(&store, &target), (&target, &store)] {
+        let refused = from.copy_to(to).await.expect_err("a server runs");
+        assert!(refused.to_string().contains("http://node-1"), "{refused}");
+    }
+    store.node_leases().expect("a database").end(node).await.expect("works");
+    store.copy_to(&target).await.expect("copied");
 }
 
 #[tokio::test]

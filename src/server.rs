@@ -77,7 +77,7 @@ impl Reloader {
     /// Loads the certificate and the keys again, whether they have changed or not.
     pub async fn reload(&self) {
         self.reload_certificate(true).await;
-        if let Err(error) = self.app.access.refresh(&self.app.store, self.app.clock.now()).await {
+        if let Err(error) = self.app.access.refresh(&self.app.store, &self.app.clock).await {
             tracing::error!(%error, "cannot look for changed keys");
         }
     }
@@ -293,7 +293,7 @@ async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown
         {
             tracing::error!(%error, "cannot look for changed sites and cameras");
         }
-        if let Err(error) = app.access.refresh(&app.store, app.clock.now()).await {
+        if let Err(error) = app.access.refresh(&app.store, &app.clock).await {
             tracing::error!(%error, "cannot look for changed keys");
         }
         round = (round + 1) % STORE_USES_EVERY;

@@ -12,43 +12,53 @@ impl App {
     /// Creates a key. Its secret is not stored, so this is the only time that it is known.
     ///
     /// # Errors
-    /// `InsufficientStorage` beyond the limit of keys.
+    /// `InsufficientStorage` beyond the limit of keys; `Unauthenticated` for everybody once a key exists.
     pub async fn create_key(&self, key: &NewKey) -> Result<(ApiKey, KeySecret)> {
+        if let Principal::Everyone = self.caller.principal() {
+            // Another process may have created the first key a moment ago.
+            self.access.refresh(&self.store, &self.clock).await?;
+            if !self.access.is_open() {
+                let message = "a key was created a moment ago: from now on every request needs one";
+                return Err(Error::refused(ErrorKind::Unauthenticated, message));
+            }
+        }
         let secret = KeySecret::generate(|bytes| self.randomness.fill(bytes));
-        Ok((self.store_key(key, &secret).await?, secret))
+        let stored = self.store_key(key, &secret).await?;
+        self.access.refresh(&self.store, &self.clock).await?;
+        Ok((stored, secret))
     }
 
     async fn store_key(&self, key: &NewKey, secret: &KeySecret) -> Result<ApiKey> {
         let now = self.clock.now();
         let id = KeyId(self.randomness.uuid_v7(now));
-        let stored = self.store.insert_key(id, key, &secret.digest(), now).await?;
-        self.access.refresh(&self.store, now).await?;
-        Ok(stored)
+        self.store.insert_key(id, key, &secret.digest(), now).await
     }
 
-    /// Makes sure that a secret from the settings is the key of an administrator.
+    /// Makes sure that a secret from the settings is the key of an administrator, which works here when this returns,
+    /// also where another process has stored it meanwhile.
     ///
     /// # Errors
     /// `PermissionDenied` if that key was revoked, has expired or has another role.
     pub async fn ensure_admin_key(&self, secret: &KeySecret) -> Result<()> {
-        match self.store.key_by_digest(&secret.digest()).await? {
+        let key = match self.store.key_by_digest(&secret.digest()).await? {
+            Some(key) => key,
             None => {
                 let scope = Scope::new(Role::Admin, Vec::new())?;
                 let key = NewKey { name: ADMIN_KEY_NAME.to_owned(), scope, expires_at: None };
                 let stored = self.store_key(&key, secret).await?;
                 tracing::info!(key.id = %stored.id, "stored the admin key of the settings");
-                Ok(())
+                stored
             }
-            Some(key) if key.is_valid_at(self.clock.now()) && key.scope.role() == Role::Admin => Ok(()),
-            Some(key) => Err(Error::refused(
-                ErrorKind::PermissionDenied,
-                format!(
-                    "the admin key of the settings is key {}, which was revoked, has expired or has another \
-                     role; give another one",
-                    key.id
-                ),
-            )),
+        };
+        self.access.refresh(&self.store, &self.clock).await?;
+        if key.is_valid_at(self.clock.now()) && key.scope.role() == Role::Admin {
+            return Ok(());
         }
+        let message = format!(
+            "the admin key of the settings is key {}, which was revoked, has expired or has another role; give another one",
+            key.id
+        );
+        Err(Error::refused(ErrorKind::PermissionDenied, message))
     }
 
     /// One key.
@@ -79,7 +89,7 @@ impl App {
         // Its last use is known in memory, which forgets the key now.
         self.access.store_last_uses(&self.store).await?;
         let key = self.store.revoke_key(id, now).await?;
-        self.access.refresh(&self.store, now).await?;
+        self.access.refresh(&self.store, &self.clock).await?;
         Ok(key)
     }
 
@@ -131,4 +141,45 @@ impl App {
 fn with_last_use(access: &Access, key: ApiKey) -> ApiKey {
     let last_used_at = access.last_use(key.id).max(key.last_used_at);
     ApiKey { last_used_at, ..key }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::app::access::Caller;
+    use crate::clock::{Clock, Randomness};
+    use crate::config::Limits;
+    use crate::store::Store;
+    use crate::telemetry::Metrics;
+
+    async fn app(folder: &std::path::Path) -> App {
+        let store = Store::open(folder).await.expect("opens");
+        let (clock, randomness) = (Clock::system(), Randomness::system());
+        App::new(store, clock, randomness, Limits::default(), Metrics::new()).await.expect("an application")
+    }
+
+    /// Of two nodes that start at once with one admin key, the second has looked for keys before the first stored it.
+    #[tokio::test]
+    async fn an_admin_key_that_another_process_has_stored_closes_access_here_too() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (first, second) = (app(folder.path()).await, app(folder.path()).await);
+        let secret = KeySecret::generate(|bytes| bytes.fill(7));
+        first.ensure_admin_key(&secret).await.expect("stored");
+        assert!(second.access.is_open(), "as far as it has looked");
+        second.ensure_admin_key(&secret).await.expect("it is an admin's");
+        assert!(!second.access.is_open());
+    }
+
+    /// Everybody may create the first key, and no other one.
+    #[tokio::test]
+    async fn nobody_without_a_key_creates_one_after_another_process_has_created_the_first() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (first, second) = (app(folder.path()).await, app(folder.path()).await);
+        let scope = Scope::new(Role::Admin, Vec::new()).expect("all cameras");
+        let key = NewKey { name: "mine".to_owned(), scope, expires_at: None };
+        let everyone = |app: &App| app.on_behalf_of(Caller::new(Principal::Everyone, None, None));
+        everyone(&first).create_key(&key).await.expect("the first");
+        let refused = everyone(&second).create_key(&key).await.expect_err("no longer open");
+        assert_eq!(refused.kind(), ErrorKind::Unauthenticated);
+    }
 }

@@ -153,7 +153,7 @@ impl App {
         }
         let site_registry = SiteRegistry::new(randomness.clone(), limits.site_events);
         let access = Access::default();
-        access.refresh(&store, clock.now()).await?;
+        access.refresh(&store, &clock).await?;
         let pairings = Arc::new(Semaphore::new(limits.pairings));
         let (residuals, waiting) = live::residual_queue();
         let quotas = Quotas::new(&limits);

@@ -401,7 +401,8 @@ impl RequestPipeline {
         if let Credential::Session(_) = credential {
             self.hosts.check_same_origin(request)?;
         }
-        let principal = match self.app.access.authenticate(credential, self.app.clock.now()) {
+        let clock = &self.app.clock;
+        let principal = match self.app.access.authenticate(credential, clock.now(), clock.monotonic()) {
             // What watches the server learns that it is alive, whatever has become of its key.
             Err(_) if class == RequestClass::Probe => Principal::Anonymous,
             principal => principal?,

@@ -471,7 +471,8 @@ contract! {
     /// Faults only.
     fn job_counts(&self) -> Result<JobCounts>;
 
-    /// Stores a key. The oldest keys that no longer work make room for it.
+    /// Stores a key. The oldest keys that no longer work make room for it. Where a key with the same secret is stored
+    /// already, also by another process at the same time, nothing is changed and that key is returned.
     ///
     /// # Errors
     /// [`ErrorKind::InsufficientStorage`] if as many keys as allowed are in use.

@@ -1,8 +1,9 @@
 //! The keys that work, looked up without a lock and without the database.
 
 use std::collections::{HashMap, HashSet};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
 
 use arc_swap::ArcSwap;
 use jiff::Timestamp;
@@ -97,10 +98,16 @@ impl Keys {
     }
 }
 
-/// The keys of the store, replaced as a whole when one changes.
+/// The keys of the store, replaced as a whole when one changes. Instants are readings of the monotonic clock.
 #[derive(Default)]
 pub(super) struct KeyTable {
     keys: ArcSwap<Keys>,
+    /// How long they count after they were last known to be those of the store; without end if it is not set.
+    lease: OnceLock<Duration>,
+    /// When that was.
+    confirmed_at_ns: AtomicU64,
+    /// How often what was read had to be forgotten.
+    distrusted: AtomicU64,
     /// Held from reading the store to replacing the table.
     change: Mutex<()>,
 }
@@ -109,6 +116,36 @@ impl KeyTable {
     /// Whether no key was ever created; `false` before the store was read.
     pub(super) fn is_empty(&self) -> bool {
         self.keys.load().version.as_ref().is_some_and(KeysVersion::is_empty)
+    }
+
+    /// Lets the keys count for that time only after each time that they were known to be those of the store.
+    pub(super) fn set_lease(&self, lease: Duration) {
+        self.lease.get_or_init(|| lease);
+    }
+
+    /// Notes that a look at the store which began at that instant found this version; `false` if it is another one than
+    /// that of these keys, and then nothing is noted.
+    pub(super) fn confirm(&self, version: &KeysVersion, began_at: Duration) -> bool {
+        let is_known = self.keys.load().version.as_ref() == Some(version);
+        if is_known {
+            self.confirmed_at_ns.fetch_max(as_ns(began_at), Ordering::AcqRel);
+        }
+        is_known
+    }
+
+    /// Checks that another process can have revoked no key, nor created the first, for longer than the lease.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub(super) fn check_confirmed(&self, at: Duration) -> Result<()> {
+        let age = as_ns(at).saturating_sub(self.confirmed_at_ns.load(Ordering::Acquire));
+        let is_recent = self.lease.get().is_none_or(|lease| age < as_ns(*lease));
+        if is_recent && self.keys.load().version.is_some() {
+            return Ok(());
+        }
+        let message =
+            "the database cannot be reached, so it is not known which keys work; try again, or another node";
+        Err(Error::refused(ErrorKind::Overloaded, message))
     }
 
     /// The key with a digest, which is used now.
@@ -122,19 +159,36 @@ impl KeyTable {
         key.cloned().ok_or_else(does_not_work)
     }
 
-    pub(super) async fn refresh(&self, store: &Store, now: Timestamp) -> Result<()> {
+    /// Lets nobody in until the keys were read again, whatever version they have.
+    pub(super) fn distrust(&self) {
+        self.distrusted.fetch_add(1, Ordering::AcqRel);
+        self.forget_version();
+    }
+
+    fn forget_version(&self) {
+        self.keys.rcu(|keys| Keys { by_bucket: keys.by_bucket.clone(), version: None });
+    }
+
+    /// Reads the keys if they have changed; `began_at` is an instant before the call.
+    pub(super) async fn refresh(&self, store: &Store, now: Timestamp, began_at: Duration) -> Result<()> {
         let _change = self.change.lock().await;
+        let distrusted = self.distrusted.load(Ordering::Acquire);
         let known = self.keys.load_full();
         let version = store.keys_version().await?;
         // What was open for a key that has expired has ended; if the clock was wrong, the key works again.
         let has_returned = known.iter().any(|key| key.has_ended() && key.key.is_valid_at(now));
         if has_returned || known.version.as_ref() != Some(&version) {
-            let is_first = known.version.as_ref().is_some_and(KeysVersion::is_empty);
-            self.replace(&known, store.unrevoked_keys().await?, version);
+            let is_first = known.version.as_ref().is_some_and(KeysVersion::is_empty) && !version.is_empty();
+            self.replace(&known, store.unrevoked_keys().await?, version.clone());
             if is_first {
                 tracing::info!("a key was created: from now on every request needs one");
             }
         }
+        if self.distrusted.load(Ordering::Acquire) != distrusted {
+            // They were read before that, perhaps from another history.
+            self.forget_version();
+        }
+        self.confirm(&version, began_at);
         // Open streams of a key that has expired end here; new requests look at the time themselves.
         self.keys.load().iter().filter(|key| !key.key.is_valid_at(now)).for_each(|key| key.end());
         Ok(())
@@ -168,6 +222,10 @@ impl KeyTable {
     pub(super) fn last_use(&self, id: KeyId) -> Option<Timestamp> {
         last_use(self.keys.load().iter().find(|key| key.key.id == id)?)
     }
+}
+
+fn as_ns(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
 }
 
 fn last_use(key: &ActiveKey) -> Option<Timestamp> {

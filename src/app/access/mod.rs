@@ -12,14 +12,16 @@ mod signed_in_user;
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use jiff::Timestamp;
 
 use self::key_table::KeyTable;
 use self::sessions::Sessions;
+use crate::clock::Clock;
 use crate::domain::{Error, ErrorKind, KeyId, KeySecret, Result};
 use crate::openid::{Identity, Provider};
-use crate::store::Store;
+use crate::store::{KeysVersion, Store};
 
 pub use caller::{Caller, CertificateHolder, Principal};
 pub use key_table::ActiveKey;
@@ -78,12 +80,24 @@ impl Access {
         !self.is_closed.load(Ordering::Relaxed) && self.keys.is_empty()
     }
 
-    /// Who presents a credential. While access is open, nobody is asked for one.
+    /// Who presents a credential, at a time and a reading of the monotonic clock. While access is open, nobody is asked
+    /// for one.
     ///
     /// # Errors
-    /// `Unauthenticated` for a key that does not work, or a header that cannot be read.
-    pub fn authenticate(&self, credential: Credential<'_>, now: Timestamp) -> Result<Principal> {
-        if self.is_open() {
+    /// `Unauthenticated` for a key that does not work, or a header that cannot be read; `Overloaded` while it is not
+    /// known which keys work, or whether there are any.
+    pub fn authenticate(
+        &self,
+        credential: Credential<'_>,
+        now: Timestamp,
+        monotonic: Duration,
+    ) -> Result<Principal> {
+        let is_open = self.is_open();
+        // Only certificates, and sessions of people, do not depend on keys.
+        if is_open || matches!(credential, Credential::Key(_)) {
+            self.keys.check_confirmed(monotonic)?;
+        }
+        if is_open {
             return Ok(Principal::Everyone);
         }
         match credential {
@@ -95,7 +109,11 @@ impl Access {
             }
             // A page whose session has ended must be able to sign in again.
             Credential::Session(token) => {
-                Ok(self.sessions.principal_of(token, now).unwrap_or(Principal::Anonymous))
+                let principal = self.sessions.principal_of(token, now).unwrap_or(Principal::Anonymous);
+                if let Principal::Key(_) = principal {
+                    self.keys.check_confirmed(monotonic)?;
+                }
+                Ok(principal)
             }
             Credential::Unreadable => Err(Error::refused(
                 ErrorKind::Unauthenticated,
@@ -134,9 +152,26 @@ impl Access {
     ///
     /// # Errors
     /// A fault if the store cannot be read.
-    pub async fn refresh(&self, store: &Store, now: Timestamp) -> Result<()> {
+    pub async fn refresh(&self, store: &Store, clock: &Clock) -> Result<()> {
+        let (now, began_at) = (clock.now(), clock.monotonic());
         self.sessions.end_expired(now);
-        self.keys.refresh(store, now).await
+        self.keys.refresh(store, now, began_at).await
+    }
+
+    /// Lets keys count for a time only after each look at the store: other processes may revoke them there.
+    pub(super) fn set_lease(&self, lease: Duration) {
+        self.keys.set_lease(lease);
+    }
+
+    /// Notes which version of the keys a look at the store has found that began at this reading of the monotonic clock;
+    /// whether it is that of the keys in memory.
+    pub(super) fn confirm(&self, version: &KeysVersion, began_at: Duration) -> bool {
+        self.keys.confirm(version, began_at)
+    }
+
+    /// Lets no key in until the next refresh, which reads all of them.
+    pub(super) fn distrust(&self) {
+        self.keys.distrust();
     }
 
     /// Stores when keys were used last.

@@ -21,6 +21,9 @@ impl Store {
     ) -> Result<ApiKey> {
         let mut transaction = self.writer().await?;
         lock_limit(&mut transaction, Limit::Keys).await?;
+        if let Some(known) = find_by_digest(&mut transaction, digest).await? {
+            return Ok(known);
+        }
         make_room(&mut transaction, self.limits().keys, now).await?;
         let cameras: Vec<&str> = key.scope.cameras().iter().map(CameraId::as_str).collect();
         sqlx::query(
@@ -75,23 +78,11 @@ impl Store {
     }
 
     pub(crate) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
-        let mut reader = self.reader().await?;
-        let row = sqlx::query(select!("WHERE sha256 = $1"))
-            .bind(digest.as_bytes().as_slice())
-            .fetch_optional(&mut *reader)
-            .await
-            .map_err(failed)?;
-        row.map(|row| Ok(read_key(&row)?.0)).transpose()
+        find_by_digest(&mut *self.reader().await?, digest).await
     }
 
     pub(crate) async fn keys_version(&self) -> Result<KeysVersion> {
-        let mut reader = self.reader().await?;
-        let (rows, revoked, latest) =
-            sqlx::query_as("SELECT count(*), count(revoked_at_us), max(id) FROM api_keys")
-                .fetch_one(&mut *reader)
-                .await
-                .map_err(failed)?;
-        Ok(KeysVersion { rows, revoked, latest })
+        keys_version(&mut *self.reader().await?).await
     }
 
     pub(crate) async fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey> {
@@ -127,6 +118,25 @@ impl Store {
         }
         transaction.commit().await.map_err(failed)
     }
+}
+
+/// What tells whether keys have changed.
+pub(super) async fn keys_version(connection: &mut PgConnection) -> Result<KeysVersion> {
+    let (rows, revoked, latest) =
+        sqlx::query_as("SELECT count(*), count(revoked_at_us), max(id) FROM api_keys")
+            .fetch_one(connection)
+            .await
+            .map_err(failed)?;
+    Ok(KeysVersion { rows, revoked, latest })
+}
+
+async fn find_by_digest(connection: &mut PgConnection, digest: &SecretDigest) -> Result<Option<ApiKey>> {
+    let row = sqlx::query(select!("WHERE sha256 = $1"))
+        .bind(digest.as_bytes().as_slice())
+        .fetch_optional(connection)
+        .await
+        .map_err(failed)?;
+    row.map(|row| Ok(read_key(&row)?.0)).transpose()
 }
 
 async fn make_room(connection: &mut PgConnection, limit: u32, now: Timestamp) -> Result<()> {

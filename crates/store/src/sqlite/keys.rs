@@ -1,7 +1,7 @@
 //! Keys that clients present: digests, scopes, last use, revocation.
 
 use jiff::Timestamp;
-use sqlx::SqliteConnection;
+use sqlx::{SqliteConnection, SqliteExecutor};
 
 use super::Store;
 use super::errors::failed;
@@ -20,6 +20,9 @@ impl Store {
     ) -> Result<ApiKey> {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
+        if let Some(known) = find_by_digest(&mut *transaction, digest).await? {
+            return Ok(known);
+        }
         make_room(&mut transaction, self.limits().keys, now).await?;
         let cameras: Vec<&str> = key.scope.cameras().iter().map(CameraId::as_str).collect();
         sqlx::query(
@@ -71,12 +74,7 @@ impl Store {
     }
 
     pub(crate) async fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>> {
-        let row = sqlx::query(select!("WHERE sha256 = ?"))
-            .bind(digest.as_bytes().as_slice())
-            .fetch_optional(self.readers())
-            .await
-            .map_err(failed)?;
-        row.map(|row| Ok(read_key(&row)?.0)).transpose()
+        find_by_digest(self.readers(), digest).await
     }
 
     pub(crate) async fn keys_version(&self) -> Result<KeysVersion> {
@@ -122,6 +120,15 @@ impl Store {
         }
         transaction.commit().await.map_err(failed)
     }
+}
+
+async fn find_by_digest(executor: impl SqliteExecutor<'_>, digest: &SecretDigest) -> Result<Option<ApiKey>> {
+    let row = sqlx::query(select!("WHERE sha256 = ?"))
+        .bind(digest.as_bytes().as_slice())
+        .fetch_optional(executor)
+        .await
+        .map_err(failed)?;
+    row.map(|row| Ok(read_key(&row)?.0)).transpose()
 }
 
 async fn make_room(connection: &mut SqliteConnection, limit: u32, now: Timestamp) -> Result<()> {

@@ -6,6 +6,7 @@ mod connections;
 pub(super) mod copy;
 mod evaluations;
 pub(super) mod group;
+mod keys;
 mod models;
 mod runs;
 mod samples;
@@ -98,7 +99,6 @@ impl Fixture {
         on_backend!(self.store, store => store.tamper(sql).await);
     }
 
-    /// As [`Fixture::tamper`], in the words of each backend.
     /// Lets the leases of all jobs expire, by whichever clock they are measured.
     async fn let_leases_expire(&self) {
         self.tamper(
@@ -114,6 +114,7 @@ impl Fixture {
         self.tamper("UPDATE training_runs SET lease_until_us = lease_until_us + 34560000000000").await;
     }
 
+    /// As [`Fixture::tamper`], in the words of each backend.
     async fn tamper_each(&self, sqlite: &'static str, postgres: &'static str) {
         match &self.store.0 {
             Backend::Sqlite(store) => store.tamper(sqlite).await,

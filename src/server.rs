@@ -127,7 +127,7 @@ impl Server {
         });
         let monitoring = monitoring.transpose()?;
         if config.role.answers_clients() {
-            refresh_registries(&app).await?;
+            app.refresh_registries().await?;
         }
         app.join(NodeSettings::of(&config, reachable_url(&listener, tls.is_some())?)).await?;
         Ok(Self { config, app, listener, monitoring, tls, proxies, shutdown: Shutdown::new() })
@@ -289,7 +289,7 @@ async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown
         gather_figures(app).await;
         // A worker reads what it trains when it trains it.
         if role.answers_clients()
-            && let Err(error) = refresh_registries(app).await
+            && let Err(error) = app.refresh_registries().await
         {
             tracing::error!(%error, "cannot look for changed sites and cameras");
         }
@@ -306,11 +306,6 @@ async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown
             tracing::error!(%error, "cannot retrain moved cameras");
         }
     }
-}
-
-async fn refresh_registries(app: &App) -> Result<(), Error> {
-    app.site_registry.refresh(&app.store).await?;
-    app.registry.refresh(&app.store).await
 }
 
 /// Time between deletions of old samples, and before another attempt where one failed.

@@ -46,7 +46,7 @@ use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
-pub use cluster::{CameraLease, Cluster, ConnectionLease, NodeSettings, NodeStatus, Watch};
+pub use cluster::{CameraLease, Cluster, ConnectionLease, DatabaseHistory, NodeSettings, NodeStatus, Watch};
 pub use connections::{
     ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage,
     LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
@@ -204,6 +204,15 @@ impl App {
     #[must_use]
     pub const fn caller(&self) -> &Caller {
         &self.caller
+    }
+
+    /// Brings sites and cameras up to date, including changes of other processes.
+    ///
+    /// # Errors
+    /// A fault if the store cannot be read.
+    pub async fn refresh_registries(&self) -> crate::domain::Result<()> {
+        self.site_registry.refresh(&self.store).await?;
+        self.registry.refresh(&self.store).await
     }
 
     /// Waits for the work that answers have handed over, then closes the store. Streams must have ended.

@@ -5,6 +5,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use arc_swap::ArcSwap;
 use jiff::Timestamp;
@@ -106,6 +107,8 @@ pub struct Registry {
     cameras: ArcSwap<HashMap<CameraId, Arc<ActiveCamera>>>,
     /// Held from reading the store to replacing the map, so that no change undoes a later one.
     change: Mutex<Refreshed>,
+    /// What is known may be of a history that the database has not; it is read again, whatever version it has.
+    is_distrusted: AtomicBool,
     /// Tells this run of the server apart from others.
     run_id: u64,
 }
@@ -141,7 +144,8 @@ impl Registry {
         let _change = self.change.lock().await;
         let read = store.camera_contents(std::slice::from_ref(id)).await?.pop();
         let loaded = read.ok_or_else(|| Error::fault("the store answers for no camera"))?;
-        let loaded = loaded.and_then(|content| self.load(content));
+        let loaded =
+            loaded.and_then(|content| self.load(content, self.is_distrusted.load(Ordering::Acquire)));
         match &loaded {
             Ok(camera) => self.replace(|cameras| cameras.insert(id.clone(), camera.clone())),
             Err(error) if error.kind() == ErrorKind::CameraNotFound => self.remove(vec![id.clone()]),
@@ -159,29 +163,57 @@ impl Registry {
     /// A fault if the store cannot be read.
     pub async fn refresh(&self, store: &Store) -> Result<()> {
         let mut change = self.change.lock().await;
-        // Whatever goes wrong, the next refresh reads all.
         let Refreshed { upto, of_changes } = std::mem::take(&mut *change);
-        let since = upto.filter(|_| of_changes < REFRESHES_OF_CHANGES);
+        let is_distrusted = self.is_distrusted.swap(false, Ordering::AcqRel);
+        let refreshed = self.refresh_since(store, upto, of_changes, is_distrusted).await;
+        match &refreshed {
+            Ok(Some(_)) => {}
+            // Whatever goes wrong, the next refresh reads it all.
+            Ok(None) | Err(_) => drop(self.is_distrusted.fetch_or(is_distrusted, Ordering::AcqRel)),
+        }
+        *change = refreshed?.unwrap_or_default();
+        Ok(())
+    }
+
+    /// Until where this refresh has read; `None` if not every camera could be read.
+    async fn refresh_since(
+        &self,
+        store: &Store,
+        upto: Option<ChangeMark>,
+        of_changes: u32,
+        is_distrusted: bool,
+    ) -> Result<Option<Refreshed>> {
+        let since = upto.filter(|_| of_changes < REFRESHES_OF_CHANGES && !is_distrusted);
         let CameraVersions { versions, deleted, upto } = store.camera_versions(since).await?;
         let known = self.cameras.load_full();
         let deleted = deleted.unwrap_or_else(|| missing(&known, &versions));
         let is_known = |(id, key): &(CameraId, CameraKey)| known.get(id).is_some_and(|it| it.key == *key);
         self.remove(deleted.into_iter().filter(is_known).map(|(id, _)| id).collect());
-        let is_complete = self.read(store, &stale(&known, versions)).await?;
-        if is_complete {
-            *change = Refreshed { upto, of_changes: if since.is_some() { of_changes + 1 } else { 0 } };
-        }
-        Ok(())
+        let ids = if is_distrusted {
+            versions.into_iter().map(|version| version.id).collect()
+        } else {
+            stale(&known, versions)
+        };
+        let is_complete = self.read(store, &ids, is_distrusted).await?;
+        let of_changes = if since.is_some() { of_changes + 1 } else { 0 };
+        Ok(is_complete.then_some(Refreshed { upto, of_changes }))
     }
 
-    /// Loads cameras as they are stored; whether all could be read.
-    async fn read(&self, store: &Store, ids: &[CameraId]) -> Result<bool> {
+    /// Lets the next refresh read every camera and its model again: the database's history has changed, in which
+    /// revisions and versions are given out again.
+    pub(super) fn distrust(&self) {
+        self.is_distrusted.store(true, Ordering::Release);
+    }
+
+    /// Loads cameras as they are stored, with models that are known already unless they are distrusted; whether all
+    /// could be read.
+    async fn read(&self, store: &Store, ids: &[CameraId], is_distrusted: bool) -> Result<bool> {
         let mut is_complete = true;
         for shown in ids.chunks(SHOWN_AT_ONCE) {
             let mut loaded = Vec::with_capacity(shown.len());
             for group in shown.chunks(READ_AT_ONCE) {
                 for (id, content) in group.iter().zip(store.camera_contents(group).await?) {
-                    match content.and_then(|content| self.load(content)) {
+                    match content.and_then(|content| self.load(content, is_distrusted)) {
                         Ok(camera) => loaded.push((id, Some(camera))),
                         Err(error) => {
                             if error.kind() == ErrorKind::CameraNotFound {
@@ -271,7 +303,7 @@ impl Registry {
         });
     }
 
-    fn load(&self, content: CameraContent) -> Result<Arc<ActiveCamera>> {
+    fn load(&self, content: CameraContent, is_distrusted: bool) -> Result<Arc<ActiveCamera>> {
         let CameraContent { camera, moved, model: stored } = content;
         let (id, moved) = (camera.id(), moved.map(Arc::new));
         let known = self.get(id);
@@ -280,7 +312,7 @@ impl Registry {
             replaced.live.end();
         }
         let loaded = same
-            .filter(|known| known.moved == moved)
+            .filter(|known| known.moved == moved && !is_distrusted)
             .and_then(|known| Some((known.model.clone()?, known.model_summary.clone()?)));
         let mut model_fault = None;
         let model = match (camera.active_model.zip(stored), loaded) {

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use arc_swap::ArcSwap;
 use tokio::sync::Mutex;
@@ -26,6 +27,8 @@ pub struct SiteRegistry {
     sites: ArcSwap<HashMap<SiteId, Arc<ActiveSite>>>,
     /// Held from reading the store to replacing the map, so that no change undoes a later one.
     change: Mutex<()>,
+    /// What is known may be of a history that the database has not; it is read again, whatever revision it has.
+    is_distrusted: AtomicBool,
     randomness: Randomness,
     /// Events of a site that a reader may continue behind.
     events_per_site: usize,
@@ -33,7 +36,13 @@ pub struct SiteRegistry {
 
 impl SiteRegistry {
     pub(super) fn new(randomness: Randomness, events_per_site: usize) -> Self {
-        Self { sites: ArcSwap::default(), change: Mutex::default(), randomness, events_per_site }
+        Self {
+            sites: ArcSwap::default(),
+            change: Mutex::default(),
+            is_distrusted: AtomicBool::default(),
+            randomness,
+            events_per_site,
+        }
     }
 
     /// A site; `None` if there is none of that id, or it was created a moment ago by another process.
@@ -64,6 +73,15 @@ impl SiteRegistry {
     /// A fault if the store cannot be read.
     pub async fn refresh(&self, store: &Store) -> Result<()> {
         let _change = self.change.lock().await;
+        let is_distrusted = self.is_distrusted.swap(false, Ordering::AcqRel);
+        let refreshed = self.read_all(store, is_distrusted).await;
+        if refreshed.is_err() {
+            self.is_distrusted.fetch_or(is_distrusted, Ordering::AcqRel);
+        }
+        refreshed
+    }
+
+    async fn read_all(&self, store: &Store, is_distrusted: bool) -> Result<()> {
         let versions = store.site_versions().await?;
         let keys: HashMap<_, _> = versions.iter().map(|(id, key, _)| (id, *key)).collect();
         let known = self.sites.load_full();
@@ -72,7 +90,7 @@ impl SiteRegistry {
         }
         for (id, key, revision) in &versions {
             let is_current = |site: &Arc<ActiveSite>| (site.key, site.revision) == (*key, *revision);
-            if known.get(id).is_some_and(is_current) {
+            if !is_distrusted && known.get(id).is_some_and(is_current) {
                 continue;
             }
             match store.site(id).await {
@@ -82,6 +100,11 @@ impl SiteRegistry {
             }
         }
         Ok(())
+    }
+
+    /// Lets the next refresh read every site again, as [`super::Registry::distrust`] does.
+    pub(super) fn distrust(&self) {
+        self.is_distrusted.store(true, Ordering::Release);
     }
 
     /// Clears a site's tracks and events, since another node had its cameras in between.

@@ -11,6 +11,7 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::access::CallerApp;
 use super::problem::{ApiResult, Problem};
+use crate::app::DatabaseHistory;
 use crate::app::access::Permission;
 use crate::domain::{Error, ErrorKind};
 
@@ -37,7 +38,8 @@ const NAMED_CAMERAS: usize = 100;
 ///
 /// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
 /// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
-/// a line `degraded: insufficient-storage: ...`, nor damaged pages, of which a line `degraded: database: ...` tells. Callers that may not read get the first line only.
+/// a line `degraded: insufficient-storage: ...`, nor damaged pages, nor a database that went on from before what it had acknowledged, of which a line
+/// `degraded: database: ...` tells. Callers that may not read get the first line only.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -53,9 +55,19 @@ async fn readyz(State(rest): State<Rest>, CallerApp(app): CallerApp) -> ApiResul
         Ok(answered) => answered?,
         Err(_) => return Err(slow_store().into()),
     }
+    let history = app.database_history();
+    if history == DatabaseHistory::Reading {
+        let message = "the history of the database has changed; everything is read again";
+        return Err(Error::refused(ErrorKind::Overloaded, message).into());
+    }
     let mut text = "ready\n".to_owned();
     if app.caller().authorize(Permission::Read).is_err() {
         return Ok(text);
+    }
+    if let DatabaseHistory::BrokenAt(time) = history {
+        text.push_str(&format!(
+            "degraded: database: its history changed, as was noticed at {time}; what it had acknowledged last may be lost\n"
+        ));
     }
     let faults = app.registry.model_faults();
     if app.store.is_full() {

@@ -202,6 +202,11 @@ impl Metrics {
         self.cluster.registrations_lost.increment(1);
     }
 
+    /// The database may have lost what it had acknowledged.
+    pub fn database_history_broke(&self) {
+        self.cluster.history_breaks.increment(1);
+    }
+
     /// A box or fix was handed to the tracker of a site.
     pub fn site_item(&self, outcome: SiteItemOutcome) {
         for (known, counter) in &self.sites.items {

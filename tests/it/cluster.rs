@@ -4,6 +4,7 @@ mod balancer;
 mod connections;
 mod database;
 mod database_faults;
+mod fail_over;
 mod faults;
 mod feed;
 mod proxy;

@@ -189,6 +189,53 @@ async fn a_frozen_worker_can_neither_end_nor_overwrite_a_run() {
     drop(awake);
 }
 
+/// Several nodes that start on a new database with one admin key: all start, and none ever serves anybody without it.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn nodes_that_start_at_once_with_one_admin_key_serve_nobody_without_it() {
+    let secret = run(&["keys", "generate"]).trim().to_owned();
+    let new_key = json!({"name": "mine", "role": "admin"});
+    for _ in 0..4 {
+        let folder = data_folder();
+        run(&["migrate", "--data", folder.path().to_str().expect("UTF-8")]);
+        let starting = (0..4).map(|_| {
+            let (folder, secret) = (folder.path().to_owned(), secret.clone());
+            tokio::task::spawn_blocking(move || {
+                TestServer::start_with(&folder, &[("SIGHTFIX_ADMIN_KEY", &*secret)])
+            })
+        });
+        for starting in starting.collect::<Vec<_>>() {
+            let server = starting.await.expect("it starts");
+            assert_eq!(server.post("/v1/keys", &new_key).await.status, 401);
+        }
+    }
+}
+
+/// Idle workers look for runs whose lease has expired, at moments of their own.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn live_runs_are_not_taken_by_idle_workers() {
+    let folder = data_folder();
+    let server = node(folder.path(), "serve");
+    let mut paths = Vec::new();
+    let headers = [("content-type", "text/csv")];
+    for camera in ["a", "b"] {
+        server.post("/v1/cameras", &json!({"id": camera})).await.expect(201);
+        let samples = format!("/v1/cameras/{camera}/samples");
+        server.send("POST", &samples, &headers, simulated_csv()).await.expect(200);
+        let runs = format!("/v1/cameras/{camera}/training-runs");
+        let run =
+            server.post(&runs, &json!({"recipe": "paper", "seed": 7, "epochs": 2_000})).await.expect(202);
+        paths.push(run.header("location").to_owned());
+    }
+    let workers: Vec<_> = (0..6).map(|_| node(folder.path(), "train")).collect();
+    for path in paths {
+        let ended = until(&server, &path, |run| run["ended_at"].is_string()).await;
+        assert_eq!((&ended["state"], &ended["attempt"]), (&json!("succeeded"), &json!(1)), "{ended}");
+    }
+    drop(workers);
+}
+
 /// A command and a server share the database; the URL's password is nowhere in logs or errors.
 #[tokio::test]
 #[ignore = "needs PostgreSQL: .ci/postgres"]
@@ -210,6 +257,10 @@ async fn commands_use_the_database_and_those_for_folders_say_so() {
         let text = String::from_utf8_lossy(&refused.stderr).into_owned();
         assert!(!refused.status.success() && text.contains("pg_dump"), "{text}");
     }
+    let copy = folder.path().join("copy");
+    let refused = sightfix().args(["copy", "--from", &url, "--to"]).arg(&copy).output().expect("runs");
+    let text = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(!refused.status.success() && text.contains(&server.address.to_string()), "{text}");
     let doctor = sightfix().args(["doctor", &flag, &url]).output().expect("runs");
     let text = String::from_utf8_lossy(&doctor.stdout).into_owned();
     assert!(text.contains("reachable, schema up to date"), "{text}");

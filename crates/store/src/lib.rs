@@ -45,7 +45,7 @@ pub use group_commit::{Completion, InsertOptions, Inserted};
 pub use jobs::{Claim, Heartbeat, JobCounts, JobEnd, LiveJobs};
 pub use limits::{StorageStatus, StoreLimits};
 pub use location::{DatabaseUrl, Location};
-pub use postgres::{Acquired, ConnectionReports, NodeLeases};
+pub use postgres::{Acquired, ConnectionReports, HistoryMark, NodeLeases, Renewed};
 pub use rows::cameras::{CameraContent, CameraVersion, CameraVersions, ChangeMark};
 pub use rows::idempotency::{IdempotencyRecord, StoredAnswer};
 pub use rows::keys::KeysVersion;

@@ -5,12 +5,15 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use super::history::DatabaseHistory;
 use super::membership::Membership;
 use super::registration::Registration;
 use super::watches::Watched;
 use crate::app::App;
+use crate::config::NodeRole;
 use crate::domain::{Error, ErrorKind, NodeId, Result};
 use crate::shutdown::Shutdown;
+use crate::store::Renewed;
 
 /// Renewals per lease.
 const RENEWALS: u32 = 4;
@@ -66,11 +69,22 @@ async fn renew(app: &App, membership: &Membership) -> Result<()> {
         return register_again(app, membership, &registration).await;
     }
     let is_draining = membership.is_draining.load(Ordering::Acquire);
-    let Some(nodes) = membership.leases.renew(registration.id, random(app), is_draining).await? else {
+    let renewed = membership.leases.renew(registration.id, random(app), is_draining).await?;
+    let Some(Renewed { nodes, keys, mark }) = renewed else {
         membership.lose(app);
         return register_again(app, membership, &registration).await;
     };
+    if membership.history.observe(app, mark) {
+        // Acquisitions may be among what was lost, and others have made them again.
+        membership.lose(app);
+        membership.is_outdated.notify_one();
+        return register_again(app, membership, &registration).await;
+    }
     registration.extend(membership.valid_until(sent_at));
+    if !app.access.confirm(&keys, sent_at) {
+        membership.has_other_keys.store(true, Ordering::Release);
+        membership.is_outdated.notify_one();
+    }
     app.metrics.nodes(nodes.len());
     let silent = membership.observe(nodes, registration.id, app.clock.monotonic());
     for (id, renewal) in silent {
@@ -85,16 +99,22 @@ async fn register_again(app: &App, membership: &Membership, before: &Registratio
     membership.leases.end(before.id).await?;
     let sent_at = app.clock.monotonic();
     let id = NodeId(app.randomness.uuid_v7(app.clock.now()));
-    membership.leases.register(id, &membership.profile, random(app)).await?;
+    let mark = membership.leases.register(id, &membership.profile, random(app)).await?;
+    if membership.history.observe(app, mark) {
+        membership.is_outdated.notify_one();
+    }
     membership.registration.store(Arc::new(Registration::new(id, membership.valid_until(sent_at))));
     tracing::info!(node = %id, "this node is registered again");
     Ok(())
 }
 
-/// Gives up what is not used any more, and ends readers whose camera or site another node owns.
+/// Reads what has changed, gives up what is not used any more, and ends readers whose camera or site another node owns.
 async fn tend_on(app: &App, membership: &Membership) {
     loop {
-        tokio::time::sleep(membership.profile.lease / RENEWALS).await;
+        tokio::select! {
+            () = tokio::time::sleep(membership.profile.lease / RENEWALS) => {}
+            () = membership.is_outdated.notified() => {}
+        }
         let now = app.clock.monotonic();
         membership.give_up(|lease, is_used| {
             let camera = app.registry.get(&lease.camera).filter(|camera| camera.key == lease.key);
@@ -104,14 +124,33 @@ async fn tend_on(app: &App, membership: &Membership) {
         });
         app.metrics.owned_cameras(membership.owned());
         let tended = async {
+            catch_up(app, membership).await?;
             give_up_wanted(membership).await?;
             membership.release().await?;
             end_watches(membership).await
         };
         if let Err(error) = tended.await {
-            tracing::warn!(%error, "cannot look for cameras that other nodes own");
+            tracing::warn!(%error, "cannot look for changed keys and for cameras that other nodes own");
         }
     }
+}
+
+/// Reads what a renewal found to be outdated.
+async fn catch_up(app: &App, membership: &Membership) -> Result<()> {
+    let (breaks, is_broken) =
+        (membership.history.breaks(), membership.history.state() == DatabaseHistory::Reading);
+    if membership.has_other_keys.swap(false, Ordering::AcqRel) || is_broken {
+        app.access.refresh(&app.store, &app.clock).await?;
+    }
+    if is_broken {
+        // A process that only works on jobs reads a camera when it needs it.
+        if membership.profile.role != NodeRole::Train.as_str() {
+            app.refresh_registries().await?;
+        }
+        membership.history.has_read_after(breaks);
+        tracing::info!("everything was read again from the database");
+    }
+    Ok(())
 }
 
 /// Gives up the cameras that sources of other nodes feed; who streams to them goes there.

@@ -10,6 +10,7 @@ use tokio::sync::Notify;
 
 use super::camera_lease::{CameraLease, HeldLease, between_nodes, camera_text};
 use super::connection_lease::HeldConnection;
+use super::history::HistoryWatch;
 use super::registration::Registration;
 use super::watches::Watches;
 use crate::app::App;
@@ -17,7 +18,7 @@ use crate::app::live::sync::lock;
 use crate::app::registry::ActiveCamera;
 use crate::config::NodeRole;
 use crate::domain::{CameraKey, ConnectionKey, Error, Node, NodeId, NodeProfile, Result, SiteId};
-use crate::store::{Acquired, NodeLeases};
+use crate::store::{Acquired, HistoryMark, NodeLeases};
 
 /// Acquisitions of one camera follow one another; those of others share these locks.
 const ACQUISITION_LOCKS: usize = 64;
@@ -26,6 +27,11 @@ pub(super) struct Membership {
     pub(super) leases: NodeLeases,
     pub(super) profile: NodeProfile,
     pub(super) registration: ArcSwap<Registration>,
+    pub(super) history: HistoryWatch,
+    /// A renewal found other keys than those in memory.
+    pub(super) has_other_keys: AtomicBool,
+    /// Notified when something of the database is to be read at once.
+    pub(super) is_outdated: Notify,
     pub(super) is_draining: AtomicBool,
     /// Notified when the drain begins, which the others are to hear at once.
     pub(super) drain_begun: Notify,
@@ -48,11 +54,19 @@ pub(super) struct ObservedNode {
 }
 
 impl Membership {
-    pub(super) fn new(leases: NodeLeases, profile: NodeProfile, registration: Registration) -> Self {
+    pub(super) fn new(
+        leases: NodeLeases,
+        profile: NodeProfile,
+        registration: Registration,
+        mark: HistoryMark,
+    ) -> Self {
         Self {
             leases,
             profile,
             registration: ArcSwap::from_pointee(registration),
+            history: HistoryWatch::new(mark),
+            has_other_keys: AtomicBool::new(false),
+            is_outdated: Notify::new(),
             is_draining: AtomicBool::new(false),
             drain_begun: Notify::new(),
             let_go: Notify::new(),
@@ -171,7 +185,7 @@ impl Membership {
         stored
     }
 
-    /// Ends everything that this node owned: another one may own it from now on.
+    /// Ends everything that this node owned, and what reads it: another one may own it from now on.
     pub(super) fn lose(&self, app: &App) {
         if !self.registration.load().invalidate() {
             return;
@@ -180,12 +194,11 @@ impl Membership {
         lock(&self.unreleased).clear();
         lost.values().for_each(|lease| lease.ended.cancel());
         lock(&self.connections).drain().for_each(|(_, lease)| lease.ended.cancel());
-        if !lost.is_empty() {
-            tracing::warn!(
-                cameras = lost.len(),
-                "the database was not reached within the lease of this node: its live streams end here"
-            );
-        }
+        self.watches.end_all();
+        tracing::warn!(
+            cameras = lost.len(),
+            "this node has lost its registration: its live streams end here"
+        );
         app.metrics.node_registration_lost();
     }
 

@@ -13,6 +13,7 @@ mod camera_lease;
 mod connection_lease;
 mod connections;
 mod heartbeat;
+mod history;
 mod membership;
 mod registration;
 mod watches;
@@ -31,6 +32,7 @@ use crate::domain::{CameraId, Error, Node, NodeId, NodeProfile, Result, SiteId, 
 
 pub use camera_lease::CameraLease;
 pub use connection_lease::ConnectionLease;
+pub use history::DatabaseHistory;
 pub use watches::Watch;
 
 /// This process among those with the same database.
@@ -115,9 +117,12 @@ impl App {
             }
             Some(leases) => {
                 let sent_at = self.clock.monotonic();
-                leases.register(id, &profile, heartbeat::random(self)).await?;
+                let mark = leases.register(id, &profile, heartbeat::random(self)).await?;
+                // What is read from here on is of that history, or of a later one that a renewal notices.
+                self.access.set_lease(lease);
+                self.access.refresh(&self.store, &self.clock).await?;
                 let registration = Registration::new(id, sent_at);
-                let membership = Membership::new(leases.clone(), profile, registration);
+                let membership = Membership::new(leases.clone(), profile, registration, mark);
                 membership.registration.load().extend(membership.valid_until(sent_at));
                 Joined::Shared(Box::new(membership))
             }
@@ -181,6 +186,13 @@ impl App {
     pub(super) fn watch_site_owner(&self, site: SiteKey) -> Watch {
         let membership = self.cluster.membership();
         membership.map_or_else(Watch::default, |it| it.watches.begin(Watched::Site(site)))
+    }
+
+    /// Whether what this process knows is of the history that the database has.
+    #[must_use]
+    pub fn database_history(&self) -> DatabaseHistory {
+        let membership = self.cluster.membership();
+        membership.map_or(DatabaseHistory::Unbroken, |it| it.history.state())
     }
 
     /// The nodes that share the database, by the time of their start.

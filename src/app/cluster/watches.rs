@@ -20,7 +20,7 @@ pub(super) enum Watched {
 pub struct Watch(Option<Arc<CancellationToken>>);
 
 impl Watch {
-    /// Waits until another node has become the owner; without end for a server that owns everything.
+    /// Waits until another node has become the owner, or may have; without end for a server that owns everything.
     pub async fn ended(&self) {
         match &self.0 {
             None => std::future::pending().await,
@@ -28,7 +28,7 @@ impl Watch {
         }
     }
 
-    /// Whether another node has become the owner.
+    /// Whether another node has become the owner, or may have.
     #[must_use]
     pub fn has_ended(&self) -> bool {
         self.0.as_ref().is_some_and(|ended| ended.is_cancelled())
@@ -62,6 +62,11 @@ impl Watches {
             }
         }
         (cameras, sites)
+    }
+
+    pub(super) fn end_all(&self) {
+        let watches = std::mem::take(&mut *lock(&self.0));
+        watches.into_values().filter_map(|watch| watch.upgrade()).for_each(|watch| watch.cancel());
     }
 
     pub(super) fn end(&self, watched: Watched) {

@@ -10,6 +10,7 @@ pub(super) struct ClusterMetrics {
     pub(super) owned_cameras: Gauge,
     pub(super) takeovers: Counter,
     pub(super) registrations_lost: Counter,
+    pub(super) history_breaks: Counter,
 }
 
 impl ClusterMetrics {
@@ -29,6 +30,11 @@ impl ClusterMetrics {
             registrations_lost: registry.counter(
                 "sightfix_node_registrations_lost_total",
                 "Times that this node could not renew its registration in time, and lost its cameras",
+                &[],
+            ),
+            history_breaks: registry.counter(
+                "sightfix_database_history_breaks_total",
+                "Times that the database went on from before what it had acknowledged, or may have, as after a fail-over",
                 &[],
             ),
         }

@@ -26,6 +26,49 @@ pub(super) struct Database {
 impl Database {
     /// Starts a server in a folder; on a small disk of its own where this process may mount one.
     pub(super) async fn start() -> Self {
+        let settings =
+            ["-U", "postgres", "-E", "UTF8", "--locale=C.UTF-8", "-A", "trust", "-N", "--wal-segsize=1"];
+        Self::create("initdb", &settings).await
+    }
+
+    /// A standby of this server, which has everything that is acknowledged up to now and receives what follows without
+    /// the primary waiting for it.
+    pub(super) async fn standby(&self) -> Self {
+        let (port, flush) = (self.port.to_string(), "SELECT pg_current_wal_flush_lsn()");
+        let from =
+            ["-h", "127.0.0.1", "-p", &port, "-U", "postgres", "-R", "-X", "stream", "-c", "fast", "-N"];
+        let standby = Self::create("pg_basebackup", &from).await;
+        let position = self.sql(flush).expect("the primary answers");
+        standby.until(&format!("SELECT pg_last_wal_replay_lsn() >= '{position}'")).await;
+        standby
+    }
+
+    /// Receives nothing more from its primary.
+    pub(super) async fn stop_receiving(&self) {
+        self.sql("ALTER SYSTEM SET primary_conninfo = ''").expect("set");
+        self.sql("SELECT pg_reload_conf()").expect("loaded");
+        self.until("SELECT count(*) = 0 FROM pg_stat_wal_receiver").await;
+    }
+
+    /// Becomes a primary.
+    pub(super) async fn promote(&self) {
+        self.sql("SELECT pg_promote()").expect("promoted");
+        self.until("SELECT NOT pg_is_in_recovery()").await;
+    }
+
+    /// Waits until a statement gives true.
+    async fn until(&self, statement: &str) {
+        for _ in 0..400 {
+            if self.sql(statement).is_ok_and(|answer| answer == "t") {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+        panic!("{statement}: {}", self.log());
+    }
+
+    /// Makes the files of a server by one of PostgreSQL's programs, and starts it.
+    async fn create(program: &str, arguments: &[&str]) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let is_mounted = is_superuser();
         if is_mounted {
@@ -36,20 +79,9 @@ impl Database {
             assert!(owner.expect("chown runs").success());
         }
         let (binaries, port) = (binaries(), own_address().port());
-        let mut create = as_owner(&binaries.join("initdb"));
-        create.arg("-D").arg(folder.path().join("data")).current_dir(folder.path());
-        create.args([
-            "-U",
-            "postgres",
-            "-E",
-            "UTF8",
-            "--locale=C.UTF-8",
-            "-A",
-            "trust",
-            "-N",
-            "--wal-segsize=1",
-        ]);
-        let created = create.output().expect("initdb runs");
+        let mut create = as_owner(&binaries.join(program));
+        create.arg("-D").arg(folder.path().join("data")).current_dir(folder.path()).args(arguments);
+        let created = create.output().expect("the program runs");
         assert!(created.status.success(), "{}", String::from_utf8_lossy(&created.stderr));
         let process = run(&binaries, folder.path(), port);
         let mut database = Self { process, binaries, port, folder, is_mounted };
@@ -183,58 +215,86 @@ fn binaries() -> PathBuf {
     versions.pop().expect("a version").join("bin")
 }
 
-/// A way to the database which may be cut: what is sent stays on the way, and nothing is closed.
+/// What becomes of what is sent on a way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum LinkState {
+    /// It comes through, to this server.
+    To(SocketAddr),
+    /// It stays on the way, and nothing is closed.
+    Cut,
+    /// Every connection is accepted and closed, as by a balancer without a server.
+    Closing,
+}
+
+/// A way to the database which may be cut, closed or led to another server.
 pub(super) struct Link {
     pub(super) port: u16,
-    is_up: watch::Sender<bool>,
+    target: SocketAddr,
+    state: watch::Sender<LinkState>,
 }
 
 impl Link {
     pub(super) async fn to(target: SocketAddr) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let port = listener.local_addr().expect("an address").port();
-        let (is_up, up) = watch::channel(true);
+        let (state, current) = watch::channel(LinkState::To(target));
         tokio::spawn(async move {
             while let Ok((client, _)) = listener.accept().await {
-                tokio::spawn(forward(client, target, up.clone()));
+                tokio::spawn(forward(client, current.clone()));
             }
         });
-        Self { port, is_up }
+        Self { port, target, state }
     }
 
     pub(super) fn cut(&self) {
-        self.is_up.send_replace(false);
+        self.state.send_replace(LinkState::Cut);
+    }
+
+    pub(super) fn close(&self) {
+        self.state.send_replace(LinkState::Closing);
     }
 
     pub(super) fn mend(&self) {
-        self.is_up.send_replace(true);
+        self.state.send_replace(LinkState::To(self.target));
+    }
+
+    /// Ends all connections; new ones lead to another server.
+    pub(super) fn lead_to(&mut self, target: SocketAddr) {
+        self.close();
+        self.target = target;
+        self.mend();
     }
 }
 
-async fn forward(client: TcpStream, target: SocketAddr, mut up: watch::Receiver<bool>) {
-    if up.wait_for(|is_up| *is_up).await.is_err() {
+/// Passes on what is sent as long as the way leads to one server.
+async fn forward(client: TcpStream, mut state: watch::Receiver<LinkState>) {
+    let Ok(begun) = state.wait_for(|state| *state != LinkState::Cut).await.map(|state| *state) else {
         return;
-    }
+    };
+    let LinkState::To(target) = begun else { return };
     let Ok(server) = TcpStream::connect(target).await else { return };
     let (mut from_client, mut to_client) = client.into_split();
     let (mut from_server, mut to_server) = server.into_split();
+    let mut until = state.clone();
     tokio::select! {
-        () = copy(&mut from_client, &mut to_server, up.clone()) => {}
-        () = copy(&mut from_server, &mut to_client, up) => {}
+        () = copy(&mut from_client, &mut to_server, state.clone(), begun) => {}
+        () = copy(&mut from_server, &mut to_client, state, begun) => {}
+        _ = until.wait_for(|state| *state != begun && *state != LinkState::Cut) => {}
     }
 }
 
 async fn copy(
     from: &mut tokio::net::tcp::OwnedReadHalf,
     to: &mut tokio::net::tcp::OwnedWriteHalf,
-    mut up: watch::Receiver<bool>,
+    mut state: watch::Receiver<LinkState>,
+    begun: LinkState,
 ) {
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 
     let mut bytes = vec![0; 65_536];
     while let Ok(count) = from.read(&mut bytes).await {
         if count == 0
-            || up.wait_for(|is_up| *is_up).await.is_err()
+            || state.wait_for(|state| *state == begun).await.is_err()
             || to.write_all(&bytes[..count]).await.is_err()
         {
             return;

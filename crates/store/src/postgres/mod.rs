@@ -16,6 +16,7 @@ mod copy;
 mod errors;
 mod evaluations;
 mod group_commit;
+mod history;
 mod idempotency;
 mod jobs;
 mod keys;
@@ -49,11 +50,12 @@ use super::location::DatabaseUrl;
 use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
 
 use errors::failed;
-use group_commit::GroupWriter;
 pub(super) use errors::{Attempts, repeated};
+use group_commit::GroupWriter;
 
 pub use connection_owners::ConnectionReports;
-pub use nodes::{Acquired, NodeLeases};
+pub use history::HistoryMark;
+pub use nodes::{Acquired, NodeLeases, Renewed};
 
 /// The store of one database.
 #[derive(Clone)]

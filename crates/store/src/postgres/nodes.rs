@@ -9,13 +9,15 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use sqlx::{PgConnection, PgPool, Postgres, Transaction};
+use sqlx::{AssertSqlSafe, PgConnection, PgPool, Postgres, Transaction};
 use uuid::Uuid;
 
-use super::connection::{begin_read, begin_write};
-use super::database_now_us;
-use super::errors::failed;
+use super::connection::{DATABASE_NOW_US, begin_read, begin_write};
+use super::errors::{failed, repeated};
+use super::history::{self, HistoryMark};
+use super::keys::keys_version;
 use crate::domain::{CameraKey, Durability, Error, ErrorKind, Node, NodeId, NodeProfile, Result, SiteKey};
+use crate::rows::keys::KeysVersion;
 
 /// The registrations and ownerships of the nodes of one database.
 #[derive(Clone)]
@@ -45,30 +47,42 @@ pub enum Acquired {
 const COLUMNS: &str = "id, url, role, version, lease_ms, renewal, is_draining, started_at_us, renewed_at_us";
 type NodeRow = (String, Option<String>, String, String, i64, i64, bool, i64, i64);
 
+/// What a renewal has found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Renewed {
+    /// All registered nodes.
+    pub nodes: Vec<Node>,
+    /// Tells whether keys have changed.
+    pub keys: KeysVersion,
+    /// Where the renewal is in the history of the database.
+    pub mark: HistoryMark,
+}
+
 impl NodeLeases {
-    /// Registers a node under an id that was never used before.
+    /// Registers a node under an id that was never used before; where the registration is in the history of the database.
     ///
     /// # Errors
     /// Faults; `Overloaded` where the database does not answer.
-    pub async fn register(&self, id: NodeId, profile: &NodeProfile, renewal: i64) -> Result<()> {
+    pub async fn register(&self, id: NodeId, profile: &NodeProfile, renewal: i64) -> Result<HistoryMark> {
         let mut transaction = self.renewing().await?;
-        sqlx::query(concat!(
+        let sql = format!(
             "INSERT INTO nodes (id, url, role, version, lease_ms, renewal, started_at_us, renewed_at_us) \
-             VALUES ($1, $2, $3, $4, $5, $6, $7, ",
-            database_now_us!(),
-            ")"
-        ))
-        .bind(id.to_string())
-        .bind(&profile.url)
-        .bind(&profile.role)
-        .bind(&profile.version)
-        .bind(i64::try_from(profile.lease.as_millis()).unwrap_or(i64::MAX))
-        .bind(renewal)
-        .bind(profile.started_at.as_microsecond())
-        .execute(&mut *transaction)
-        .await
-        .map_err(failed)?;
-        transaction.commit().await.map_err(failed)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, {DATABASE_NOW_US}) RETURNING {}",
+            history::COLUMNS
+        );
+        let row = sqlx::query(AssertSqlSafe(sql))
+            .bind(id.to_string())
+            .bind(&profile.url)
+            .bind(&profile.role)
+            .bind(&profile.version)
+            .bind(i64::try_from(profile.lease.as_millis()).unwrap_or(i64::MAX))
+            .bind(renewal)
+            .bind(profile.started_at.as_microsecond())
+            .fetch_one(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        transaction.commit().await.map_err(failed)?;
+        HistoryMark::read(&row)
     }
 
     /// Renews a registration, and reads all of them; `None` if there is none any more. `renewal` is a number that no
@@ -76,25 +90,25 @@ impl NodeLeases {
     ///
     /// # Errors
     /// As [`NodeLeases::register`].
-    pub async fn renew(&self, id: NodeId, renewal: i64, is_draining: bool) -> Result<Option<Vec<Node>>> {
+    pub async fn renew(&self, id: NodeId, renewal: i64, is_draining: bool) -> Result<Option<Renewed>> {
         let mut transaction = self.renewing().await?;
-        let renewed = sqlx::query(concat!(
-            "UPDATE nodes SET renewal = $2, is_draining = $3, renewed_at_us = ",
-            database_now_us!(),
-            " WHERE id = $1"
-        ))
-        .bind(id.to_string())
-        .bind(renewal)
-        .bind(is_draining)
-        .execute(&mut *transaction)
-        .await
-        .map_err(failed)?;
-        if renewed.rows_affected() == 0 {
-            return Ok(None);
-        }
+        let sql = format!(
+            "UPDATE nodes SET renewal = $2, is_draining = $3, renewed_at_us = {DATABASE_NOW_US} WHERE id = $1 \
+             RETURNING {}",
+            history::COLUMNS
+        );
+        let row = sqlx::query(AssertSqlSafe(sql))
+            .bind(id.to_string())
+            .bind(renewal)
+            .bind(is_draining)
+            .fetch_optional(&mut *transaction)
+            .await
+            .map_err(failed)?;
+        let Some(row) = row else { return Ok(None) };
         let nodes = read_nodes(&mut transaction).await?;
+        let keys = keys_version(&mut transaction).await?;
         transaction.commit().await.map_err(failed)?;
-        Ok(Some(nodes))
+        Ok(Some(Renewed { nodes, keys, mark: HistoryMark::read(&row)? }))
     }
 
     /// Ends the registration of a node that has not renewed it since; whether it was there.
@@ -102,7 +116,7 @@ impl NodeLeases {
     /// # Errors
     /// As [`NodeLeases::register`].
     pub async fn end_unrenewed(&self, id: NodeId, renewal: i64) -> Result<bool> {
-        let mut transaction = begin_write(&self.renewals, Durability::Synced).await?;
+        let mut transaction = self.renewing().await?;
         let ended = sqlx::query("DELETE FROM nodes WHERE id = $1 AND renewal = $2")
             .bind(id.to_string())
             .bind(renewal)
@@ -155,6 +169,10 @@ impl NodeLeases {
     /// # Errors
     /// `CameraNotFound`; as [`NodeLeases::register`].
     pub async fn acquire(&self, camera: CameraKey, id: NodeId) -> Result<Acquired> {
+        repeated!(self.try_acquire(camera, id))
+    }
+
+    async fn try_acquire(&self, camera: CameraKey, id: NodeId) -> Result<Acquired> {
         let mut transaction = begin_write(&self.pool, Durability::Synced).await?;
         let (before, fence, site) = lock_ownership(&mut transaction, camera).await?;
         let registered: Option<i32> = sqlx::query_scalar("SELECT 1 FROM nodes WHERE id = $1 FOR KEY SHARE")
@@ -188,6 +206,10 @@ impl NodeLeases {
     /// # Errors
     /// `CameraNotFound`; as [`NodeLeases::register`].
     pub async fn want(&self, camera: CameraKey, id: NodeId) -> Result<()> {
+        repeated!(self.try_want(camera, id))
+    }
+
+    async fn try_want(&self, camera: CameraKey, id: NodeId) -> Result<()> {
         let mut transaction = begin_write(&self.pool, Durability::Synced).await?;
         let (_, _, site) = lock_ownership(&mut transaction, camera).await?;
         sqlx::query(
@@ -225,6 +247,10 @@ impl NodeLeases {
     /// # Errors
     /// As [`NodeLeases::register`].
     pub async fn release(&self, id: NodeId, cameras: &[(CameraKey, i64)]) -> Result<()> {
+        repeated!(self.try_release(id, cameras))
+    }
+
+    async fn try_release(&self, id: NodeId, cameras: &[(CameraKey, i64)]) -> Result<()> {
         let (keys, fences): (Vec<i64>, Vec<i64>) = cameras.iter().map(|(key, fence)| (key.0, *fence)).unzip();
         let mut transaction = begin_write(&self.pool, Durability::Synced).await?;
         sqlx::query(
@@ -293,14 +319,14 @@ impl NodeLeases {
         ))
     }
 
-    /// A power cut of the database may undo a renewal, which then counts as none.
+    /// A renewal that a crash of the database undoes would let others end a registration that its node counts on.
     async fn renewing(&self) -> Result<Transaction<'static, Postgres>> {
-        begin_write(&self.renewals, Durability::Relaxed).await
+        begin_write(&self.renewals, Durability::Synced).await
     }
 }
 
 async fn read_nodes(connection: &mut PgConnection) -> Result<Vec<Node>> {
-    let sql = sqlx::AssertSqlSafe(format!("SELECT {COLUMNS} FROM nodes ORDER BY started_at_us, id"));
+    let sql = AssertSqlSafe(format!("SELECT {COLUMNS} FROM nodes ORDER BY started_at_us, id"));
     let rows: Vec<NodeRow> = sqlx::query_as(sql).fetch_all(connection).await.map_err(failed)?;
     rows.into_iter().map(read_node).collect()
 }

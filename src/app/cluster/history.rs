@@ -1,0 +1,73 @@
+//! What a node does where the database goes on from before what it has acknowledged, as after a fail-over to a standby
+//! that had not received everything.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use jiff::Timestamp;
+
+use crate::app::App;
+use crate::app::live::sync::lock;
+use crate::store::HistoryMark;
+
+/// Whether what this process knows is of the history that the database has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DatabaseHistory {
+    /// It is.
+    Unbroken,
+    /// It may not be, and is being read again.
+    Reading,
+    /// Everything was read again after the history broke at this time.
+    BrokenAt(Timestamp),
+}
+
+/// The history of the database as the renewals of this node have met it.
+pub(super) struct HistoryWatch {
+    mark: Mutex<HistoryMark>,
+    breaks: AtomicU64,
+    /// After how many breaks everything was read again.
+    read_after: AtomicU64,
+    broke_at: Mutex<Option<Timestamp>>,
+}
+
+impl HistoryWatch {
+    pub(super) fn new(mark: HistoryMark) -> Self {
+        let (breaks, read_after) = (AtomicU64::new(0), AtomicU64::new(0));
+        Self { mark: Mutex::new(mark), breaks, read_after, broke_at: Mutex::default() }
+    }
+
+    /// Notes where a renewal was stored; whether what was acknowledged before may be lost.
+    pub(super) fn observe(&self, app: &App, mark: HistoryMark) -> bool {
+        let before = std::mem::replace(&mut *lock(&self.mark), mark.clone());
+        let Some(reason) = mark.break_since(&before) else { return false };
+        tracing::error!(
+            reason,
+            "the history of the database has changed: without synchronous replication what it acknowledged last is lost; \
+             everything is read again"
+        );
+        app.metrics.database_history_broke();
+        *lock(&self.broke_at) = Some(app.clock.now());
+        self.breaks.fetch_add(1, Ordering::AcqRel);
+        app.access.distrust();
+        app.site_registry.distrust();
+        app.registry.distrust();
+        true
+    }
+
+    /// How often it broke.
+    pub(super) fn breaks(&self) -> u64 {
+        self.breaks.load(Ordering::Acquire)
+    }
+
+    /// Notes that everything was read again after so many breaks.
+    pub(super) fn has_read_after(&self, breaks: u64) {
+        self.read_after.store(breaks, Ordering::Release);
+    }
+
+    pub(super) fn state(&self) -> DatabaseHistory {
+        if self.breaks() != self.read_after.load(Ordering::Acquire) {
+            return DatabaseHistory::Reading;
+        }
+        lock(&self.broke_at).map_or(DatabaseHistory::Unbroken, DatabaseHistory::BrokenAt)
+    }
+}

@@ -59,7 +59,7 @@ pub use names::{
     CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels, check_text,
 };
 pub use node::{Node, NodeId, NodeProfile};
-pub use noise::{GaussMarkovNoise, NoiseCorrelation};
+pub use noise::{GaussMarkovNoise, NoiseCorrelation, SessionBias};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};

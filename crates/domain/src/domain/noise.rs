@@ -27,6 +27,20 @@ impl NoiseCorrelation {
     }
 }
 
+/// The part of a receiver's error that lasts for a session: atmosphere, satellites, the way that it is carried.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SessionBias {
+    /// Share of the error variance of a fix, 0 to 1.
+    pub share: f64,
+    /// Time in which its correlation falls to 1/e, s.
+    pub time_constant_s: f64,
+}
+
+impl SessionBias {
+    /// An hour, where nothing else is known.
+    pub const DEFAULT_TIME_CONSTANT_S: f64 = 3_600.0;
+}
+
 /// Zero-mean noise per axis with its variance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GaussMarkovNoise {

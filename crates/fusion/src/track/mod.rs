@@ -24,7 +24,7 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 
 pub use measurement::{MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason};
-pub use settings::{MotionModel, RegressionNoise, SessionBias, TrackSettings};
+pub use settings::{MotionModel, RegressionNoise, TrackSettings};
 pub use state::{Innovation, TrackState, Velocity};
 
 use self::gate::GateOutcome;

@@ -1,6 +1,7 @@
 //! Noise, motion and window parameters of a track.
 
-use crate::domain::NoiseCorrelation;
+use super::measurement::MeasurementSource;
+use crate::domain::{NoiseCorrelation, SessionBias};
 use crate::model::Regressor;
 
 /// Correlation in time and space of a regressed position's error, whose variance is known.
@@ -25,21 +26,6 @@ impl Default for RegressionNoise {
             correlation_length_m: 10.0,
             detector_correlation_s: 0.5,
         }
-    }
-}
-
-/// The part of a receiver's error that lasts for a session: atmosphere, satellites, the way that it is carried.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SessionBias {
-    /// Share of the error variance of a fix, 0 to 1.
-    pub share: f64,
-    /// Time in which its correlation falls to 1/e, s.
-    pub time_constant_s: f64,
-}
-
-impl Default for SessionBias {
-    fn default() -> Self {
-        Self { share: 0.0, time_constant_s: 3_600.0 }
     }
 }
 
@@ -109,7 +95,7 @@ impl Default for TrackSettings {
     fn default() -> Self {
         Self {
             gnss: NoiseCorrelation::PHONE,
-            gnss_session: SessionBias::default(),
+            gnss_session: SessionBias { share: 0.0, time_constant_s: SessionBias::DEFAULT_TIME_CONSTANT_S },
             regression: RegressionNoise::default(),
             motion: MotionModel::default(),
             // Rejects one consistent measurement in 2,000.
@@ -130,7 +116,7 @@ impl TrackSettings {
         let Some(noise) = regressor.track_noise() else { return Self::default() };
         Self {
             gnss: noise.gnss,
-            gnss_session: SessionBias { share: noise.gnss_session_share, ..SessionBias::default() },
+            gnss_session: noise.gnss_session,
             regression: RegressionNoise {
                 correlation: noise.regression,
                 correlation_length_m: noise.regression_length_m,

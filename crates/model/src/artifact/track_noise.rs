@@ -2,15 +2,15 @@
 //! model's metadata.
 
 use super::ModelParts;
-use crate::domain::{NoiseCorrelation, Result};
+use crate::domain::{NoiseCorrelation, Result, SessionBias};
 
 /// Correlation of the errors of receiver and model, whose variances are stated elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackNoiseModel {
     /// Of the receiver's error beside its bias of the session.
     pub gnss: NoiseCorrelation,
-    /// Share of the receiver's error variance that is constant over a session, 0 to 1.
-    pub gnss_session_share: f64,
+    /// Of the receiver's error, the part that lasts for a session.
+    pub gnss_session: SessionBias,
     /// Of the model's error while the target is stationary.
     pub regression: NoiseCorrelation,
     /// Distance over which the correlation of the model's error falls to 1/e, m.
@@ -29,8 +29,9 @@ const NAMES: [&str; 5] = [
     "track_regression_length_m",
 ];
 
-/// Missing in models before it was estimated.
+/// Missing in models before they were estimated.
 const SESSION_SHARE: &str = "track_gnss_session_share";
+const SESSION_TIME: &str = "track_gnss_session_time_constant_s";
 
 impl TrackNoiseModel {
     /// Adds the scalars to the parts of a model.
@@ -45,7 +46,8 @@ impl TrackNoiseModel {
         for (name, value) in NAMES.into_iter().zip(values) {
             parts.set(name, value);
         }
-        parts.set(SESSION_SHARE, self.gnss_session_share);
+        parts.set(SESSION_SHARE, self.gnss_session.share);
+        parts.set(SESSION_TIME, self.gnss_session.time_constant_s);
     }
 
     /// The scalars of a model's metadata; `None` in an earlier format, which has none of them.
@@ -62,12 +64,23 @@ impl TrackNoiseModel {
                 white_share: parts.parameter(gnss_share)?.clamp(LEAST_GNSS_WHITE_SHARE, 1.0),
                 time_constant_s: parts.positive_parameter(gnss_constant)?,
             },
-            gnss_session_share: parts.parameter_or(SESSION_SHARE, 0.0)?.clamp(0.0, 1.0),
+            gnss_session: SessionBias {
+                share: parts.parameter_or(SESSION_SHARE, 0.0)?.clamp(0.0, 1.0),
+                time_constant_s: session_time_constant_s(parts)?,
+            },
             regression: NoiseCorrelation {
                 white_share: parts.parameter(regression_share)?.clamp(0.0, 1.0),
                 time_constant_s: parts.positive_parameter(regression_constant)?,
             },
             regression_length_m: parts.positive_parameter(regression_length)?,
         }))
+    }
+}
+
+fn session_time_constant_s(parts: &ModelParts) -> Result<f64> {
+    if parts.parameters.contains_key(SESSION_TIME) {
+        parts.positive_parameter(SESSION_TIME)
+    } else {
+        Ok(SessionBias::DEFAULT_TIME_CONSTANT_S)
     }
 }

@@ -3,7 +3,7 @@
 
 use super::gnss_noise::{TimedResidual, estimate_gnss_noise};
 use crate::artifact::{ModelParts, TrackNoiseModel};
-use crate::domain::{NoiseCorrelation, Sample};
+use crate::domain::{NoiseCorrelation, Sample, SessionBias};
 use crate::encoder::gaussian_process;
 use crate::filters::noise_of_fixes;
 use crate::geo::EastNorth;
@@ -18,7 +18,8 @@ const MODEL_TIME_CONSTANT_S: f64 = 86_400.0;
 const MODEL_LENGTH_SIGMAS: f64 = 3.0;
 /// Share of the receiver's variance that is taken to last for a session where the fit does not estimate it:
 /// half the standard deviation of the rest, as the prior of the recipe `gaussian_process`.
-const SESSION_SHARE: f64 = 0.2;
+const SESSION: SessionBias =
+    SessionBias { share: 0.2, time_constant_s: SessionBias::DEFAULT_TIME_CONSTANT_S };
 /// Below this many samples the receiver's correlation is not estimated; that of a phone is used.
 const MIN_SAMPLES: usize = 200;
 
@@ -46,8 +47,8 @@ pub(super) fn estimate_track_noise(
     let regression =
         NoiseCorrelation { white_share: regressor.white_share(), time_constant_s: MODEL_TIME_CONSTANT_S };
     let regression_length_m = MODEL_LENGTH_SIGMAS * position_sigma_m(&positions);
-    if let Some((gnss, gnss_session_share)) = gaussian_process::receiver_correlation(parts) {
-        return TrackNoiseModel { gnss, gnss_session_share, regression, regression_length_m };
+    if let Some((gnss, gnss_session)) = gaussian_process::receiver_correlation(parts) {
+        return TrackNoiseModel { gnss, gnss_session, regression, regression_length_m };
     }
     let gnss = if samples.len() < MIN_SAMPLES {
         NoiseCorrelation::PHONE
@@ -56,7 +57,7 @@ pub(super) fn estimate_track_noise(
         let from_fixes = || noise_of_fixes(regressor.e_gnss_m2(), &fix_sequences(samples, plane));
         estimate_gnss_noise(&residuals, e_regression_m2, &regression).unwrap_or_else(from_fixes).correlation
     };
-    TrackNoiseModel { gnss, gnss_session_share: SESSION_SHARE, regression, regression_length_m }
+    TrackNoiseModel { gnss, gnss_session: SESSION, regression, regression_length_m }
 }
 
 /// Standard deviation per axis of positions, at least 1 m.

@@ -8,7 +8,7 @@ use super::noise::Epoch;
 use super::predictor::Predictor;
 use super::upright_camera::UprightCamera;
 use crate::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
-use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, TargetClass};
+use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, SessionBias, TargetClass};
 use crate::encoder::FittedEncoder;
 use crate::encoder::auto_encoder::AutoEncoder;
 use crate::encoder::features::{Encoded, features_of};
@@ -105,16 +105,20 @@ pub(crate) fn fit(
     Ok(FittedEncoder { parts, covariance: None })
 }
 
-/// How the receiver's error is correlated beside its bias of the session, and the share of the latter in its
-/// variance; `None` in the parts of another recipe.
-pub(crate) fn receiver_correlation(parts: &ModelParts) -> Option<(NoiseCorrelation, f64)> {
+/// How the receiver's error is correlated beside its bias of the session, and the latter; `None` in the parts of
+/// another recipe.
+pub(crate) fn receiver_correlation(parts: &ModelParts) -> Option<(NoiseCorrelation, SessionBias)> {
     let of = |name: &str| parts.parameters.get(name).copied();
     let (white_m2, short_m2) = (of("receiver_white_m2")?, of("receiver_short_m2")?);
     let (session_m2, short_time_s) = (of("receiver_session_m2")?, of("receiver_short_time_s")?);
     let within_m2 = white_m2 + short_m2;
     let white_share = (white_m2 / within_m2).clamp(LEAST_GNSS_WHITE_SHARE, 1.0);
     let correlation = NoiseCorrelation { white_share, time_constant_s: short_time_s };
-    Some((correlation, session_m2 / (within_m2 + session_m2)))
+    let session = SessionBias {
+        share: session_m2 / (within_m2 + session_m2),
+        time_constant_s: of("receiver_session_time_s")?,
+    };
+    Some((correlation, session))
 }
 
 /// Training rows as a map is fitted to them.

@@ -6,8 +6,9 @@ use super::encoder::features::{Encoded, reconstruction_error};
 use super::encoder::gaussian_process::RecentBoxes;
 use super::site::JointMap;
 use super::uncertainty::error_model::{BoxError, ErrorModel};
+use super::uncertainty::scene::{Limited, Scene};
 use crate::domain::{BoundingBox, ImageSize, Result, RunId};
-use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
+use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, PlaneCovariance};
 use crate::statistics::R95_PER_SIGMA;
 
 /// How the error of a box's position divides among cameras that were trained together, m2: parts of
@@ -36,6 +37,10 @@ impl JointError {
 
 /// White share of a regression's error variance where the model does not state it.
 const DEFAULT_WHITE_SHARE: f64 = 0.3;
+/// Time after which repeated boxes are frozen where the model does not state it, s.
+const DEFAULT_FROZEN_S: f64 = 60.0;
+/// Least radius of the scene of a model that does not state it, m.
+const LEAST_SCENE_RADIUS_M: f64 = 100.0;
 /// Range of the error variance, m2: weights and radii are finite for every box.
 pub(super) const VARIANCE_RANGE_M2: [f64; 2] = [1e-6, 1e12];
 
@@ -97,6 +102,9 @@ pub struct Regressor {
     track_noise: Option<TrackNoiseModel>,
     /// Added to every error variance, m2 per axis.
     added_m2: f64,
+    /// Models of earlier formats have none.
+    pub(super) scene: Option<Scene>,
+    frozen_after_s: f64,
     pub(super) error_model: ErrorModel,
     pub(super) encoder: Encoder,
     joint_map: Option<JointMap>,
@@ -111,6 +119,8 @@ impl Regressor {
         let joint_map = JointMap::take(&mut parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
         let track_noise = TrackNoiseModel::read(&parts)?;
+        let scene = Scene::read(&parts)?;
+        let frozen_after_s = parts.parameter_or("frozen_after_s", DEFAULT_FROZEN_S)?;
         let white_share = parts.parameter_or("unrest_share", DEFAULT_WHITE_SHARE)?.clamp(0.0, 1.0);
         let ModelParts { plane, e_gnss_m2, tensors, .. } = parts;
         tensors.finish()?;
@@ -121,6 +131,8 @@ impl Regressor {
             white_share,
             track_noise,
             added_m2: 0.0,
+            scene,
+            frozen_after_s,
             error_model,
             encoder,
             joint_map,
@@ -163,6 +175,44 @@ impl Regressor {
     #[must_use]
     pub fn scene_radius_m(&self) -> f64 {
         self.track_noise.map_or(f64::INFINITY, |noise| noise.regression_length_m)
+    }
+
+    /// Distance of a point from the ground that a target in view can be on, m.
+    #[must_use]
+    pub fn distance_from_scene_m(&self, point: EastNorth) -> f64 {
+        match &self.scene {
+            Some(scene) => scene.nearest(point).distance_m(point),
+            None => {
+                let radius_m = self.scene_radius_m().max(LEAST_SCENE_RADIUS_M);
+                (point.distance_m(EastNorth::default()) - radius_m).max(0.0)
+            }
+        }
+    }
+
+    /// Whether an answer's error is as large as the ground that training covers.
+    #[must_use]
+    pub fn is_vague(&self, regression: &Regression) -> bool {
+        regression.r95_m() > self.scene_radius_m().max(LEAST_SCENE_RADIUS_M)
+    }
+
+    /// An answer whose target may be anywhere in the scene.
+    #[must_use]
+    pub fn anywhere_in_scene(&self, regression: Regression) -> Regression {
+        let reach_m = self.scene.map_or(PLANE_RANGE_M, |scene| scene.reach_m(regression.regressed));
+        let e_regression_m2 = (reach_m / regression.r95_scale).powi(2).max(regression.e_regression_m2);
+        Regression {
+            e_regression_m2,
+            covariance: PlaneCovariance::isotropic(e_regression_m2),
+            box_noise: PlaneCovariance::default(),
+            ..regression
+        }
+    }
+
+    /// Boxes of a target that are the same to the pixel for this long, s, are frozen: no standing target of the training
+    /// showed it.
+    #[must_use]
+    pub const fn frozen_after_s(&self) -> f64 {
+        self.frozen_after_s
     }
 
     /// White share of the regression's error variance, 0 to 1, which is independent between boxes; the rest
@@ -247,13 +297,20 @@ impl Regressor {
                 (estimate.encoded.position, error, self.error_model.extrapolation_ratio(bounding_box))
             }
         };
-        let e_regression_m2 =
-            (error.variance_m2 + self.added_m2).clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]);
         let (covariance, box_noise) = stated.unwrap_or_else(|| {
             let isotropic = PlaneCovariance::isotropic(error.variance_m2);
             (isotropic, isotropic.scaled(self.white_share))
         });
-        let covariance = covariance.plus(PlaneCovariance::isotropic(e_regression_m2 - error.variance_m2));
+        let unlimited = || Limited { position: regressed, covariance, factor: 1.0 };
+        let Limited { position: regressed, covariance, factor } =
+            self.scene.map_or_else(unlimited, |scene| {
+                let radius_m = |covariance: PlaneCovariance| r95_scale * covariance.per_axis_m2().sqrt();
+                scene.limit(regressed, covariance, extrapolation_ratio, radius_m)
+            });
+        let box_noise = box_noise.scaled(factor);
+        let variance_m2 = covariance.per_axis_m2();
+        let e_regression_m2 = (variance_m2 + self.added_m2).clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]);
+        let covariance = covariance.plus(PlaneCovariance::isotropic(e_regression_m2 - variance_m2));
         Regression {
             regressed,
             reconstruction_error: error.reconstruction_error,

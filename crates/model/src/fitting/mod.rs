@@ -5,6 +5,7 @@ mod candidates;
 mod findings;
 mod gnss_noise;
 mod held_out;
+mod observed_scene;
 mod pipeline;
 mod report;
 mod site;

@@ -10,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::candidates::{self, Candidate, Estimator, FitContext};
 use super::findings::{Selection, training_report};
 use super::held_out::{choose, cross_validate};
+use super::observed_scene::put_scene;
 use super::report::{
     coverage_of_fixes, held_out_error, mean_variance_m2, note_choice, note_errors, note_samples,
 };
@@ -296,6 +297,7 @@ impl FinalFit<'_> {
         parts.set("labels_smoothed", f64::from(u8::from(candidate.is_smoothed())));
         let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
         estimate_track_noise(samples, &regressor, &parts).put(&mut parts);
+        put_scene(samples, &regressor, &mut parts);
         Ok((parts, held_out))
     }
 }

@@ -9,6 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::held_out::HeldOutResiduals;
+use super::observed_scene::put_scene;
 use super::pipeline::{MAX_ROWS, receiver_variance};
 use super::report::{coverage_of_fixes, held_out_error};
 use super::track_noise::estimate_track_noise;
@@ -416,6 +417,7 @@ impl SiteFit<'_> {
         parts.set("held_out_widening", factor);
         let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
         estimate_track_noise(samples, &regressor, &parts).put(&mut parts);
+        put_scene(samples, &regressor, &mut parts);
         let error_of = |residuals: &HeldOutResiduals| held_out_error(residuals, self.groups.count, e_gnss_m2);
         let apart = own.apart.as_ref().map(error_of);
         let mut together = error_of(&own.together);

@@ -17,6 +17,7 @@ mod network;
 mod paper;
 mod plane;
 mod projective;
+mod scene;
 
 use bytes::Bytes;
 use prost::Message as _;
@@ -99,6 +100,15 @@ fn put_outputs(regressor: &Regressor, graph: &Graph) {
     let lookup = error_model::look_up(&regressor.error_model.coverage, boxes);
     let Answer { position_m, position_deg, covariance_m2, r95_scale, reconstruction_error } =
         answer(regressor, boxes, &lookup);
+    let (position_m, position_deg, covariance_m2) = match &regressor.scene {
+        Some(scene) => {
+            let ratio = lookup.extrapolation_ratio;
+            let (position_m, covariance_m2) =
+                scene::limit(scene, position_m, covariance_m2, ratio, r95_scale);
+            (position_m, plane::to_position(regressor.plane(), position_m), covariance_m2)
+        }
+        None => (position_m, position_deg, covariance_m2),
+    };
     let [east_m2, cross_m2, north_m2] = covariance_m2;
     let variance_m2 = (east_m2 + north_m2) * 0.5;
     let limited_m2 = variance_m2.clamp(VARIANCE_RANGE_M2[0], VARIANCE_RANGE_M2[1]);

@@ -7,4 +7,5 @@ pub(crate) mod error_model;
 mod excess_calibration;
 mod jacobian;
 pub(crate) mod local_boxes;
+pub(crate) mod scene;
 pub(crate) mod variance_components;

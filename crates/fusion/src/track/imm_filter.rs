@@ -21,6 +21,7 @@ use crate::geo::PlaneCovariance;
 const MODES: usize = 3;
 /// Index of the stationary mode; steady and agile follow.
 const STATIONARY: usize = 0;
+const AGILE: usize = 2;
 
 /// Floor of a mode probability inside a logarithm or a division.
 const MIN_PROBABILITY: f64 = 1e-12;
@@ -123,6 +124,8 @@ impl ImmFilter {
             }
         }
         mix(&mut self.modes, &weights);
+        // Who stood and now moves has a velocity of which nothing is known yet.
+        self.modes[AGILE].add_velocity_variance(weights[AGILE][STATIONARY] * self.speed_envelope_m2_s2);
         let total: f64 = probabilities.iter().sum();
         self.mode_probabilities = probabilities.map(|probability| probability / total);
     }

@@ -318,6 +318,13 @@ impl ModeFilter {
         }
     }
 
+    /// Makes the velocity less certain, m2/s2 per axis.
+    pub(super) fn add_velocity_variance(&mut self, variance_m2_s2: f64) {
+        for state in [VELOCITY, VELOCITY + 1] {
+            self.covariance[state][state] += variance_m2_s2;
+        }
+    }
+
     /// Sets a bias to 0 with a wide variance, uncorrelated with everything else.
     pub(super) fn reset_bias(&mut self, bias: usize) {
         for state in [bias, bias + 1] {

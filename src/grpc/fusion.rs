@@ -88,6 +88,7 @@ impl From<Flag> for proto::Flag {
             Flag::FixRejected => Self::FixRejected,
             Flag::BoxRejected => Self::BoxRejected,
             Flag::FixOutOfRange => Self::FixOutOfRange,
+            Flag::BoxFrozen => Self::BoxFrozen,
         }
     }
 }

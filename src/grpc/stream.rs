@@ -355,6 +355,7 @@ impl From<&TrackPoint> for proto::TrackPoint {
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
             restarted: state.reinitialized,
+            sources_disagree: state.sources_disagree,
         }
     }
 }
@@ -372,6 +373,8 @@ impl From<&Rejection> for proto::TrackRejection {
             RejectionReason::Duplicate => wire::Reason::Duplicate,
             RejectionReason::UnusableVariance => wire::Reason::UnusableVariance,
             RejectionReason::OutOfRange => wire::Reason::OutOfRange,
+            RejectionReason::Frozen => wire::Reason::Frozen,
+            RejectionReason::Implausible => wire::Reason::Implausible,
         };
         Self { source: source.into(), reason: reason.into(), nis: rejection.nis }
     }

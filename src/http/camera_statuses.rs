@@ -40,6 +40,11 @@ struct CameraStatus {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     last_observed_at: Option<Timestamp>,
+    /// Since when every live box has been frozen, by the server's clock: the same to the pixel for longer than a standing
+    /// target shows. The picture or the detector stands still.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, format = DateTime)]
+    frozen_since: Option<Timestamp>,
 }
 
 /// The latest training run of a camera.
@@ -85,6 +90,7 @@ impl CameraStatus {
             targets: activity.targets,
             streams: activity.streams,
             last_observed_at: activity.last_observed_at,
+            frozen_since: activity.frozen_since,
         }
     }
 }

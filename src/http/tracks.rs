@@ -57,10 +57,15 @@ enum RejectionReason {
     TooLate,
     /// A measurement of the same source and instant was used before.
     Duplicate,
-    /// Its error variance is not positive.
+    /// Its error variance is not positive, or its error is as large as the camera's scene.
     UnusableVariance,
     /// Farther than 20 km from the origin of the track's plane.
     OutOfRange,
+    /// The target's boxes have been the same to the pixel for longer than a standing target shows.
+    Frozen,
+    /// Boxes and fixes differ by more than chance explains, and those of this source are not the positions of
+    /// a moving target.
+    Implausible,
 }
 
 impl From<track::RejectionReason> for RejectionReason {
@@ -71,6 +76,8 @@ impl From<track::RejectionReason> for RejectionReason {
             track::RejectionReason::Duplicate => Self::Duplicate,
             track::RejectionReason::UnusableVariance => Self::UnusableVariance,
             track::RejectionReason::OutOfRange => Self::OutOfRange,
+            track::RejectionReason::Frozen => Self::Frozen,
+            track::RejectionReason::Implausible => Self::Implausible,
         }
     }
 }
@@ -132,6 +139,9 @@ struct TrackState {
     rejections: Vec<Rejection>,
     /// Whether the track was restarted at this measurement.
     restarted: bool,
+    /// Whether boxes and fixes have lately differed by more than chance explains; `r95_m` then holds the true
+    /// position whichever of them is right, or one of them is not used.
+    sources_disagree: bool,
 }
 
 impl From<&TrackPoint> for TrackState {
@@ -148,6 +158,7 @@ impl From<&TrackPoint> for TrackState {
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
             restarted: state.reinitialized,
+            sources_disagree: state.sources_disagree,
         }
     }
 }

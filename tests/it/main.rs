@@ -60,3 +60,4 @@ mod tls;
 mod usage;
 mod walk;
 mod world_tracks;
+mod wrong_boxes;

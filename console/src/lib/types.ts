@@ -71,6 +71,7 @@ export interface CameraStatus {
   targets: number;
   streams: number;
   last_observed_at?: string;
+  frozen_since?: string;
 }
 export interface Page<T> {
   items: T[];

@@ -25,3 +25,10 @@ pub const GROSS_SIGMAS: f64 = 7.0;
 /// Radius that contains 95 % of an isotropic normal distribution in the plane, in standard deviations per
 /// axis: `sqrt(-2 ln 0.05)`.
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
+
+/// Quantiles of chi-square with 2 degrees of freedom: 95 %, -2 ln(0.05), and 99.9 %.
+pub const CHI_SQUARE_95: f64 = 5.991;
+/// See [`CHI_SQUARE_95`].
+pub const CHI_SQUARE_99_9: f64 = 13.816;
+/// 95 % quantile of the standard normal distribution, one-sided.
+pub const ONE_SIDED_95: f64 = 1.645;

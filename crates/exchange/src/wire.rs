@@ -373,6 +373,9 @@ pub enum Flag {
     BoxRejected,
     /// The fix lies farther than 20 km from the camera's scene.
     FixOutOfRange,
+    /// The target's boxes have been the same to the pixel for longer than a standing target shows: the
+    /// picture or the detector stands still. Live answers alone have it.
+    BoxFrozen,
 }
 
 /// Flags by their names.

@@ -8,16 +8,15 @@ use super::track::MeasurementSource;
 use crate::domain::{BoundingBox, ImageSize, Observation, SigmaM};
 use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, PlaneCovariance, Position};
 use crate::model::{RecentBoxes, Regression, Regressor};
+use crate::statistics::CHI_SQUARE_99_9;
 
-/// 99.9 % quantile of chi-square with 2 degrees of freedom, -2 ln(0.001): beyond it box and fix are taken
-/// to contradict each other. One consistent pair in 1,000 is.
-pub const PAIR_GATE: f64 = 13.816;
+/// Beyond this quantile of chi-square, 99.9 %, box and fix are taken to contradict each other. One consistent pair in
+/// 1,000 is.
+pub const PAIR_GATE: f64 = CHI_SQUARE_99_9;
 
 /// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
 pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 
-/// Least radius of a camera's scene, m: a target may be beyond what few samples of one place have shown.
-const LEAST_SCENE_RADIUS_M: f64 = 100.0;
 /// Standard deviations of a fix beyond the scene's radius from which it cannot be of a target in view.
 const SCENE_MARGIN_SIGMAS: f64 = 4.0;
 
@@ -42,9 +41,11 @@ pub struct ObservedFix {
     pub variance_m2: f64,
     /// In the model's plane; `None` without a model, or beyond the plane's range.
     pub in_plane: Option<EastNorth>,
-    /// Whether it may be of a target in view: within [`Regressor::scene_radius_m`] (at least
-    /// [`LEAST_SCENE_RADIUS_M`]) and four of its standard deviations of the scene's centre.
+    /// Whether it may be of a target in view: within four of its standard deviations of the model's scene
+    /// ([`Regressor::distance_from_scene_m`]).
     pub is_in_scene: bool,
+    /// For how long the target's fixes have been the same to the last digit, s.
+    pub repeated_s: f64,
 }
 
 /// A box as a measured position.
@@ -59,6 +60,13 @@ pub struct ObservedBox {
     pub is_usable: bool,
     /// Whether the box is unlike those of training or cut by the image's border.
     pub is_unusual: bool,
+    /// Whether its error is as large as the scene: it says no more than that a target is in view.
+    pub is_vague: bool,
+    /// For how long the target's boxes have been the same to the pixel, s.
+    pub repeated_s: f64,
+    /// Whether that is longer than a standing target shows: the picture or the detector stands still, and the target may
+    /// be anywhere in the scene.
+    pub is_frozen: bool,
 }
 
 /// What an observation measures.
@@ -90,10 +98,9 @@ impl ObservedFix {
         let variance_m2 = fix_variance_m2(observation, regressor, e_gnss_m2);
         let in_plane = regressor.and_then(|regressor| regressor.plane().to_plane_within_range(position));
         let is_in_scene = regressor.zip(in_plane).is_some_and(|(regressor, point)| {
-            let radius_m = regressor.scene_radius_m().max(LEAST_SCENE_RADIUS_M);
-            point.distance_m(EastNorth::default()) <= radius_m + SCENE_MARGIN_SIGMAS * variance_m2.sqrt()
+            regressor.distance_from_scene_m(point) <= SCENE_MARGIN_SIGMAS * variance_m2.sqrt()
         });
-        Some(Self { position, variance_m2, in_plane, is_in_scene })
+        Some(Self { position, variance_m2, in_plane, is_in_scene, repeated_s: 0.0 })
     }
 }
 
@@ -118,6 +125,19 @@ impl ObservedBox {
             independent: if is_usable { independent } else { anywhere_in_range(&independent) },
             is_usable,
             is_unusual: independent.outside_training || bounding_box.touches_border(image_size),
+            is_vague: regressor.is_vague(&independent),
+            repeated_s: 0.0,
+            is_frozen: false,
+        }
+    }
+
+    /// The box after its target's boxes have been the same to the pixel for some time.
+    pub(super) fn repeated_for(&mut self, repeated_s: f64, regressor: &Regressor) {
+        self.repeated_s = repeated_s;
+        self.is_frozen = repeated_s >= regressor.frozen_after_s();
+        if self.is_frozen {
+            self.independent = regressor.anywhere_in_scene(self.independent);
+            self.one_step = regressor.anywhere_in_scene(self.one_step);
         }
     }
 }

@@ -13,7 +13,7 @@ use super::track::{
     MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason, Track, TrackSettings,
     TrackState,
 };
-use crate::domain::{ImageSize, Observation};
+use crate::domain::{BoundingBox, ImageSize, Observation};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::{RecentBoxes, Regression, Regressor};
 
@@ -32,6 +32,27 @@ pub struct TargetTrack {
     /// Measurements in a row that are older than the track by more than its time to live.
     rewound: u32,
     recent_boxes: RecentBoxes,
+    same_box: Repetition<BoundingBox>,
+    same_fix: Repetition<Position>,
+}
+
+/// For how long a target's measurements have been the same to the last digit.
+#[derive(Debug, Clone, Copy)]
+struct Repetition<T>(Option<(T, Timestamp)>);
+
+impl<T> Default for Repetition<T> {
+    fn default() -> Self {
+        Self(None)
+    }
+}
+
+impl<T: Copy + PartialEq> Repetition<T> {
+    /// Takes in a measurement; the time since the first of those that are the same, s.
+    fn lasting_s(&mut self, value: T, time: Timestamp) -> f64 {
+        let since = self.0.filter(|(latest, _)| *latest == value).map_or(time, |(_, since)| since);
+        self.0 = Some((value, since));
+        time.duration_since(since).as_secs_f64().max(0.0)
+    }
 }
 
 #[derive(Debug, Clone)]
@@ -60,7 +81,16 @@ impl TargetTrack {
         e_gnss_m2: Option<f64>,
     ) -> ObservedPositions<'a> {
         let recent = Some(&mut self.recent_boxes);
-        ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, recent)
+        let mut observed = ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, recent);
+        if let (Some(seen), Some(bounding_box), Some(regressor)) =
+            (&mut observed.regressed, observation.bounding_box(), regressor)
+        {
+            seen.repeated_for(self.same_box.lasting_s(bounding_box, observed.time), regressor);
+        }
+        if let Some(fix) = &mut observed.fix {
+            fix.repeated_s = self.same_fix.lasting_s(fix.position, observed.time);
+        }
+        observed
     }
 
     /// Feeds what was observed at one instant, late observations at their place in time. `settings` are
@@ -75,6 +105,7 @@ impl TargetTrack {
         let plane = self.plane_for(observed, &mut rejected);
         let Some(plane) = plane else { return self.estimate_with(rejected) };
         let mut measurement = measurement_in(&plane, observed, rejected.is_empty());
+        withhold_useless(&mut measurement, observed, self.active.is_some(), &mut rejected);
         if self.active.is_none() {
             withdraw_contradicting(&mut measurement, observed, &mut rejected);
         }
@@ -120,6 +151,8 @@ impl TargetTrack {
             self.active = None;
             self.rewound = 0;
             self.recent_boxes = RecentBoxes::default();
+            self.same_box = Repetition::default();
+            self.same_fix = Repetition::default();
         }
     }
 
@@ -179,15 +212,41 @@ fn measurement_in(plane: &LocalPlane, observed: &ObservedPositions<'_>, with_fix
     };
     let fix = observed.fix.filter(|_| with_fix).map(|fix| {
         let point = fix.in_plane.map_or_else(|| plane.to_plane(fix.position), from_model_plane);
-        MeasuredPosition::isotropic(point, fix.variance_m2)
+        let measured = MeasuredPosition::isotropic(point, fix.variance_m2);
+        MeasuredPosition { repeated_s: fix.repeated_s, is_doubtful: !fix.is_in_scene, ..measured }
     });
     let regressed = observed.usable_box().map(|observed| {
         let point = from_model_plane(observed.independent.regressed);
         let Regression { covariance, box_noise, .. } = observed.independent;
         let scale = observed.independent.normal_scale();
-        MeasuredPosition { position: point, covariance, white: Some(box_noise), stated_scale: scale }
+        MeasuredPosition {
+            position: point,
+            covariance,
+            white: Some(box_noise),
+            stated_scale: scale,
+            repeated_s: observed.repeated_s,
+            is_doubtful: observed.is_unusual,
+        }
     });
     Measurement { time: observed.time, fix, regressed }
+}
+
+/// A box that says no more than that a target is in view enters no track, and a frozen one starts none.
+fn withhold_useless(
+    measurement: &mut Measurement,
+    observed: &ObservedPositions<'_>,
+    is_active: bool,
+    rejected: &mut Vec<Rejection>,
+) {
+    let reason = match observed.usable_box() {
+        // An active track decides about it, as it has to take back what it learnt from such boxes.
+        Some(seen) if seen.is_frozen && is_active => return,
+        Some(seen) if seen.is_frozen => RejectionReason::Frozen,
+        Some(seen) if seen.is_vague => RejectionReason::UnusableVariance,
+        _ => return,
+    };
+    measurement.regressed = None;
+    rejected.push(Rejection { source: MeasurementSource::Regressed, reason, nis: None });
 }
 
 /// A track must not start between, or at the wrong one of, two positions that contradict each other.

@@ -7,12 +7,11 @@ use super::track::MeasurementSource;
 use crate::domain::{Confidences, Flag, FusedFix, ImageSize, Observation};
 use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, PlaneCovariance, distance_m};
 use crate::model::{R95_PER_SIGMA, Regression, Regressor};
+use crate::statistics::{CHI_SQUARE_95, ONE_SIDED_95};
 
-/// 95 % quantile of chi-square with 2 degrees of freedom, -2 ln(0.05). From here to [`PAIR_GATE`] the
-/// stated radius grows from that of consistent sources to one that holds the truth whichever is right.
-const WIDENING_STARTS_AT: f64 = 5.991;
-/// 95 % quantile of the standard normal distribution, one-sided.
-const ONE_SIDED_95: f64 = 1.645;
+/// From here to [`PAIR_GATE`] the stated radius grows from that of consistent sources to one that holds the truth
+/// whichever is right.
+const WIDENING_STARTS_AT: f64 = CHI_SQUARE_95;
 
 const ALL_REGRESSION: Confidences = Confidences { regression: 1.0, gnss: 0.0 };
 const ALL_GNSS: Confidences = Confidences { regression: 0.0, gnss: 1.0 };
@@ -81,6 +80,9 @@ pub fn fuse_observed(
     }
     if regressed.independent.outside_training {
         flags.push(Flag::OutsideTraining);
+    }
+    if regressed.is_frozen {
+        flags.push(Flag::BoxFrozen);
     }
     let Combined { position, confidences, r95_m, shape } = combine(observed, regressed, &mut flags);
     let Regression { e_regression_m2, reconstruction_error, .. } = regressed.one_step;

@@ -16,6 +16,15 @@ use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
 use crate::domain::{BoundingBox, CameraMoved, FusedFix};
 
+/// When something was observed, by the server's clock.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Observed {
+    /// Last.
+    pub(super) last_at: Option<Timestamp>,
+    /// Since when every box was frozen.
+    pub(super) frozen_since: Option<Timestamp>,
+}
+
 /// What happens in a camera's view.
 #[derive(Debug, Clone)]
 pub enum CameraEvent {
@@ -44,7 +53,7 @@ pub(in crate::app) struct CameraLive {
     pub(super) events: CameraEventLog<CameraEvent>,
     pub(super) moved: watch::Sender<Option<Arc<CameraMoved>>>,
     pub(super) recorder: Mutex<Weak<SampleRecorder>>,
-    last_observed_at: Mutex<Option<Timestamp>>,
+    observed: Mutex<Observed>,
     open_streams: AtomicUsize,
     deleted: CancellationToken,
     replaced: CancellationToken,
@@ -62,7 +71,7 @@ impl CameraLive {
             events: CameraEventLog::new(event_log),
             moved: watch::channel(None).0,
             recorder: Mutex::new(Weak::new()),
-            last_observed_at: Mutex::new(None),
+            observed: Mutex::new(Observed::default()),
             open_streams: AtomicUsize::new(0),
             deleted: CancellationToken::new(),
             replaced: CancellationToken::new(),
@@ -110,14 +119,20 @@ impl CameraLive {
         self.events.push(now, || CameraEvent::Track(Arc::new(update())));
     }
 
-    /// Remembers that something was observed at that time of the server.
-    pub(super) fn observed(&self, now: Timestamp) {
-        *lock(&self.last_observed_at) = Some(now);
+    /// Remembers that something was observed at that time of the server, and whether its box, if it has one, is frozen.
+    pub(super) fn observed(&self, now: Timestamp, is_frozen: Option<bool>) {
+        let mut observed = lock(&self.observed);
+        observed.last_at = Some(now);
+        match is_frozen {
+            Some(true) => _ = observed.frozen_since.get_or_insert(now),
+            Some(false) => observed.frozen_since = None,
+            None => {}
+        }
     }
 
-    /// When something was observed last, by the server's clock, since the server was started.
-    pub(super) fn last_observed_at(&self) -> Option<Timestamp> {
-        *lock(&self.last_observed_at)
+    /// What was observed since the server was started.
+    pub(super) fn latest_observed(&self) -> Observed {
+        *lock(&self.observed)
     }
 
     /// Open live streams.

@@ -80,6 +80,8 @@ pub struct CameraActivity {
     pub streams: usize,
     /// When a live observation came last.
     pub last_observed_at: Option<Timestamp>,
+    /// Since when every box has been the same to the pixel for longer than a standing target shows.
+    pub frozen_since: Option<Timestamp>,
 }
 
 /// The events of one camera from some instant on; they end when it is deleted, or another node has become its owner.
@@ -167,7 +169,7 @@ impl App {
         };
         let fused = fuse_observed(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
-        camera.live.observed(observed_at);
+        camera.live.observed(observed_at, observed.regressed.map(|seen| seen.is_frozen));
         let world_track = self.feed_site(camera, observation, &observed);
         let (track, residual) = match (target, observation.target_id()) {
             (Some(mut target), Some(target_id)) => {
@@ -192,10 +194,12 @@ impl App {
 
     /// What happens in a camera's view.
     pub(super) fn activity(&self, camera: &ActiveCamera) -> CameraActivity {
+        let observed = camera.live.latest_observed();
         CameraActivity {
             targets: camera.live.tracks.latest(self.clock.monotonic()).len(),
             streams: camera.live.open_streams(),
-            last_observed_at: camera.live.last_observed_at(),
+            last_observed_at: observed.last_at,
+            frozen_since: observed.frozen_since,
         }
     }
 

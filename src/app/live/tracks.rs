@@ -182,7 +182,7 @@ struct ResidualSource {
 
 impl ResidualSource {
     /// The drift detector also needs what a gate rejects, or a moved camera would never be found; only a
-    /// position that no plane about the camera holds is left out.
+    /// position that no plane about the camera holds is left out, and a frozen box, which shows no pose.
     fn observe(&mut self, seen: &TargetObservation<'_>) -> Option<ResidualSample> {
         let version = seen.model.map(|(_, version)| version);
         if self.model_version != version {
@@ -190,7 +190,8 @@ impl ResidualSource {
         }
         let estimate =
             |position, variance_m2| TimedEstimate { time: seen.observed.time, position, variance_m2 };
-        let by_box = seen.observed.usable_box().and_then(|observed| {
+        let box_of_now = seen.observed.usable_box().filter(|observed| !observed.is_frozen);
+        let by_box = box_of_now.and_then(|observed| {
             let regression = &observed.independent;
             self.aligner.push_regressed(estimate(regression.regressed, regression.variance_m2()))
         });

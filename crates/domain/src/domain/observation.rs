@@ -203,6 +203,9 @@ pub enum Flag {
     BoxRejected,
     /// The fix lies farther than 20 km from the camera's scene.
     FixOutOfRange,
+    /// The target's boxes have been the same to the pixel for longer than a standing target shows: the picture or the
+    /// detector stands still.
+    BoxFrozen,
 }
 
 impl Flag {

@@ -28,6 +28,24 @@ pub(super) struct GateOutcome {
     pub(super) reinitialized: bool,
 }
 
+impl GateOutcome {
+    /// Of a position that is used, before its innovation is known.
+    pub(super) const fn of(source: MeasurementSource) -> Self {
+        Self {
+            source,
+            innovation: EastNorth { east_m: 0.0, north_m: 0.0 },
+            nis: f64::NAN,
+            rejected: None,
+            reinitialized: false,
+        }
+    }
+
+    /// Of a position that is not used.
+    pub(super) const fn unused(source: MeasurementSource, reason: RejectionReason) -> Self {
+        Self { rejected: Some(reason), ..Self::of(source) }
+    }
+}
+
 /// How a measurement beyond the gate was dealt with.
 pub(super) enum Reacquisition {
     /// It is rejected; the estimate is unchanged.

@@ -6,6 +6,7 @@
 
 use jiff::Timestamp;
 
+use super::agreement::Agreement;
 use super::camera_error::CameraError;
 use super::gate::{ACTIVE_S, GateOutcome, Reach, Reacquisition, SourceHistory};
 use super::measurement::{MeasuredPosition, Measurement, MeasurementSource, RejectionReason};
@@ -41,6 +42,9 @@ pub(super) struct ImmFilter {
     histories: [SourceHistory; 2],
     last_regressed_at: Option<Timestamp>,
     camera: CameraError,
+    agreement: Agreement,
+    /// Whether the filter is to restart from the next fix, as what the boxes have told it is void.
+    awaits_fix: bool,
     /// Square of the highest speed observed with confidence, decaying, m2/s2.
     speed_envelope_m2_s2: f64,
 }
@@ -67,8 +71,24 @@ impl ImmFilter {
             histories,
             last_regressed_at: (source == MeasurementSource::Regressed).then_some(time),
             camera: CameraError::new(settings, (source == MeasurementSource::Regressed).then_some(&measured)),
+            agreement: Agreement::default(),
+            awaits_fix: false,
             speed_envelope_m2_s2: motion.min_speed_m_s.powi(2),
         }
+    }
+
+    /// Starts again from one measured position; what is known of the sources stays.
+    fn restart(&mut self, settings: &TrackSettings, source: MeasurementSource, measured: MeasuredPosition) {
+        *self = Self { agreement: self.agreement, ..Self::new(settings, self.time, source, measured) };
+    }
+
+    /// Holds boxes and fixes against each other.
+    pub(super) fn compare(&mut self, settings: &TrackSettings, measurement: &Measurement) {
+        let used_boxes = self.agreement.verdict().refutes(MeasurementSource::Regressed).is_none();
+        let speed_m_s = LARGEST_SPEED_RATIO * self.speed_envelope_m2_s2.sqrt();
+        self.agreement.observe(settings, measurement, speed_m_s);
+        let uses_boxes = self.agreement.verdict().refutes(MeasurementSource::Regressed).is_none();
+        self.awaits_fix = !uses_boxes && (self.awaits_fix || used_boxes);
     }
 
     /// Propagates to a later instant; an earlier one changes nothing.
@@ -161,17 +181,28 @@ impl ImmFilter {
         measurement: &Measurement,
     ) -> [Option<GateOutcome>; 2] {
         self.predict(settings, measurement.time);
+        self.compare(settings, measurement);
+        let verdict = self.agreement.verdict();
+        let usable_fix = measurement.fix.filter(|_| verdict.refutes(MeasurementSource::Fix).is_none());
         let regressed = measurement.regressed.map(|measured| {
+            if let Some(reason) = verdict.refutes(MeasurementSource::Regressed) {
+                return GateOutcome::unused(MeasurementSource::Regressed, reason);
+            }
             let measured = self.camera.at_place(settings, measured);
             let correlation = self.camera.correlation(settings, &measured);
             for mode in &mut self.modes {
                 mode.decorrelate(CAMERA_BIAS, correlation);
             }
-            self.gate_and_update(settings, MeasurementSource::Regressed, measured, measurement.fix)
+            self.gate_and_update(settings, MeasurementSource::Regressed, measured, usable_fix)
         });
-        let fix = measurement
-            .fix
-            .map(|measured| self.gate_and_update(settings, MeasurementSource::Fix, measured, None));
+        let fix = measurement.fix.map(|measured| match verdict.refutes(MeasurementSource::Fix) {
+            Some(reason) => GateOutcome::unused(MeasurementSource::Fix, reason),
+            None if self.awaits_fix && measured.covariance.is_positive() => {
+                self.restart(settings, MeasurementSource::Fix, measured);
+                GateOutcome { reinitialized: true, ..GateOutcome::of(MeasurementSource::Fix) }
+            }
+            None => self.gate_and_update(settings, MeasurementSource::Fix, measured, None),
+        });
         [regressed, fix]
     }
 
@@ -183,25 +214,18 @@ impl ImmFilter {
         measured: MeasuredPosition,
         fix: Option<MeasuredPosition>,
     ) -> GateOutcome {
-        let mut outcome = GateOutcome {
-            source,
-            innovation: EastNorth::default(),
-            nis: f64::NAN,
-            rejected: Some(RejectionReason::UnusableVariance),
-            reinitialized: false,
-        };
         if !measured.covariance.is_positive() {
-            return outcome;
+            return GateOutcome::unused(source, RejectionReason::UnusableVariance);
         }
+        let mut outcome = GateOutcome::of(source);
         let decomposition = self.decompose(settings, source, measured);
         let mut predicted = self.predict_measurement(&decomposition);
         (outcome.innovation, outcome.nis) = self.innovation(&predicted);
-        outcome.rejected = None;
         if !self.passes_gate(settings, &predicted, outcome.nis) {
             let confirming = fix.filter(|fix| agree(settings, measured, *fix));
             if confirming.is_some_and(|fix| self.is_outside(settings, MeasurementSource::Fix, fix)) {
                 // The track's target id now names another target.
-                *self = Self::new(settings, self.time, source, measured);
+                self.restart(settings, source, measured);
                 outcome.reinitialized = true;
                 return outcome;
             }
@@ -280,7 +304,7 @@ impl ImmFilter {
             history.agree_on(now, measured.position, reach) && (!other_is_active || is_confirmed);
         let rejected_s = history.record_rejection(now, settings.reacquire_after_s);
         if is_another {
-            *self = Self::new(settings, now, source, measured);
+            self.restart(settings, source, measured);
             return Reacquisition::Reinitialized;
         }
         let Some(rejected_s) = rejected_s else { return Reacquisition::Rejected };
@@ -300,7 +324,7 @@ impl ImmFilter {
         // bias reconciles them, the camera prevails.
         let camera_prevails = source == MeasurementSource::Regressed && rejected_s >= ACTIVE_S;
         if !other_is_active || camera_prevails {
-            *self = Self::new(settings, now, source, measured);
+            self.restart(settings, source, measured);
             return Reacquisition::Reinitialized;
         }
         Reacquisition::Rejected
@@ -413,12 +437,13 @@ impl ImmFilter {
             position: EastNorth { east_m: mean[0], north_m: mean[1] },
             velocity: Velocity { east_m_s: mean[2], north_m_s: mean[3] },
             covariance,
-            r95_m: covariance.r95_m(),
+            r95_m: self.agreement.radius_m(covariance.r95_m()),
             stationary_probability: self.mode_probabilities[STATIONARY],
             nis: None,
             innovations: Vec::new(),
             rejected: Vec::new(),
             reinitialized: false,
+            sources_disagree: self.agreement.verdict().disagrees,
         }
     }
 }

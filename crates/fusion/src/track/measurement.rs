@@ -19,13 +19,24 @@ pub struct MeasuredPosition {
     /// uncertain. It widens the gate and what the track states, not the weight of the source: the variance that is
     /// expected weighs best, however uncertain it is.
     pub stated_scale: f64,
+    /// For how long this source's positions have been the same to the last digit, s.
+    pub repeated_s: f64,
+    /// Whether its stated error rests on nothing of training: a box unlike those, a fix far from the scene.
+    pub is_doubtful: bool,
 }
 
 impl MeasuredPosition {
     /// A position with `R = variance_m2 * I`: the squared sigma of a fix, or `e_regression_m2`.
     #[must_use]
     pub const fn isotropic(position: EastNorth, variance_m2: f64) -> Self {
-        Self { position, covariance: PlaneCovariance::isotropic(variance_m2), white: None, stated_scale: 1.0 }
+        Self {
+            position,
+            covariance: PlaneCovariance::isotropic(variance_m2),
+            white: None,
+            stated_scale: 1.0,
+            repeated_s: 0.0,
+            is_doubtful: false,
+        }
     }
 }
 
@@ -68,16 +79,28 @@ pub enum RejectionReason {
     TooLate,
     /// The track already has a measurement of that source and instant.
     Duplicate,
-    /// Its covariance is not positive definite.
+    /// Its covariance is not positive definite, or the error is as large as the camera's scene.
     UnusableVariance,
     /// It is farther than 20 km from the origin of the track's plane.
     OutOfRange,
+    /// The target's boxes have been the same to the pixel for longer than a standing target shows.
+    Frozen,
+    /// Boxes and fixes differ by more than chance explains, and those of this source are not the positions of a moving
+    /// target.
+    Implausible,
 }
 
 impl RejectionReason {
     /// All reasons.
-    pub const ALL: [Self; 5] =
-        [Self::OutsideGate, Self::TooLate, Self::Duplicate, Self::UnusableVariance, Self::OutOfRange];
+    pub const ALL: [Self; 7] = [
+        Self::OutsideGate,
+        Self::TooLate,
+        Self::Duplicate,
+        Self::UnusableVariance,
+        Self::OutOfRange,
+        Self::Frozen,
+        Self::Implausible,
+    ];
 
     /// Name in logs, metrics and wire formats.
     #[must_use]

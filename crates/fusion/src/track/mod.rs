@@ -8,6 +8,7 @@
 //! and the filter is replayed from the last checkpoint before them, so the order of arrival does
 //! not change the state by a single bit. What never happens here: clocks, I/O, pixels, degrees.
 
+mod agreement;
 mod camera_error;
 mod gate;
 mod imm_filter;
@@ -66,6 +67,7 @@ impl Track {
             (None, None) => return None,
         };
         let mut filter = ImmFilter::new(&settings, first.time, source, measured);
+        filter.compare(&settings, first);
         if remaining_fix.is_some() {
             let fix_only = Measurement { time: first.time, fix: remaining_fix, regressed: None };
             filter.step(&settings, &fix_only);

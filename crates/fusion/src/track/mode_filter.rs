@@ -479,10 +479,10 @@ mod tests {
     fn decomposition(source: MeasurementSource, [east_m, north_m]: [f64; 2]) -> NoiseDecomposition {
         let covariance = PlaneCovariance { east_m2: 4.0, north_m2: 2.5, east_north_m2: 0.7 };
         let measured = MeasuredPosition {
-            position: EastNorth { east_m, north_m },
-            covariance,
             white: Some(covariance.scaled(0.2)),
+            covariance,
             stated_scale: 1.4,
+            ..MeasuredPosition::isotropic(EastNorth { east_m, north_m }, 1.0)
         };
         NoiseDecomposition::new(&TrackSettings::default(), source, measured, 1.5)
     }

@@ -83,6 +83,8 @@ pub struct TrackSettings {
     pub gate: f64,
     /// A source is reacquired after at least five consecutive rejections over at least this time, s.
     pub reacquire_after_s: f64,
+    /// Boxes are frozen that have been the same to the pixel for this long, s.
+    pub frozen_after_s: f64,
     /// Largest delay of an out-of-sequence measurement, s.
     pub window_s: f64,
     /// Largest number of measurements in that window; at high rates the window is shorter.
@@ -101,6 +103,7 @@ impl Default for TrackSettings {
             // Rejects one consistent measurement in 2,000.
             gate: 15.2,
             reacquire_after_s: 3.0,
+            frozen_after_s: f64::INFINITY,
             window_s: 3.0,
             window_items: 128,
             time_to_live_s: 60.0,
@@ -109,6 +112,14 @@ impl Default for TrackSettings {
 }
 
 impl TrackSettings {
+    /// White share of the error variance of a source's positions, 0 to 1, where they do not state it.
+    pub(super) fn white_share(&self, source: MeasurementSource) -> f64 {
+        match source {
+            MeasurementSource::Fix => self.gnss.white_share * (1.0 - self.gnss_session.share),
+            MeasurementSource::Regressed => self.regression.correlation.white_share,
+        }
+    }
+
     /// The settings with the noise model that was estimated with a camera's model; the defaults for a model
     /// of an earlier format without it.
     #[must_use]
@@ -122,6 +133,7 @@ impl TrackSettings {
                 correlation_length_m: noise.regression_length_m,
                 ..RegressionNoise::default()
             },
+            frozen_after_s: regressor.frozen_after_s(),
             ..Self::default()
         }
     }

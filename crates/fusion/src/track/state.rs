@@ -60,6 +60,9 @@ pub struct TrackState {
     /// track, or after a series of rejections that no bias
     /// explains.
     pub reinitialized: bool,
+    /// Whether boxes and fixes have lately differed by more than chance explains. `r95_m` then holds the truth whichever
+    /// of them is right, or one of them is not used.
+    pub sources_disagree: bool,
 }
 
 impl TrackState {

@@ -189,10 +189,16 @@ impl Regressor {
         }
     }
 
-    /// Whether an answer's error is as large as the ground that training covers.
+    /// Whether an answer says no more than that a target is in view: its error is as large as the ground that training
+    /// covers, and larger than twice a fix's.
     #[must_use]
     pub fn is_vague(&self, regression: &Regression) -> bool {
-        regression.r95_m() > self.scene_radius_m().max(LEAST_SCENE_RADIUS_M)
+        let anywhere_m2 = self.scene.map_or(f64::INFINITY, |scene| {
+            let [east_m2, north_m2] = scene.variance_m2();
+            0.5 * (east_m2 + north_m2)
+        });
+        let least_m2 = anywhere_m2.max(4.0 * self.e_gnss_m2);
+        regression.r95_m() > R95_PER_SIGMA * least_m2.sqrt()
     }
 
     /// An answer whose target may be anywhere in the scene.

@@ -17,6 +17,8 @@ pub const PAIR_GATE: f64 = CHI_SQUARE_99_9;
 /// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
 pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 
+/// Least radius of a camera's scene, m: a target may be beyond what few samples of one place have shown.
+const LEAST_SCENE_RADIUS_M: f64 = 100.0;
 /// Standard deviations of a fix beyond the scene's radius from which it cannot be of a target in view.
 const SCENE_MARGIN_SIGMAS: f64 = 4.0;
 
@@ -41,8 +43,8 @@ pub struct ObservedFix {
     pub variance_m2: f64,
     /// In the model's plane; `None` without a model, or beyond the plane's range.
     pub in_plane: Option<EastNorth>,
-    /// Whether it may be of a target in view: within four of its standard deviations of the model's scene
-    /// ([`Regressor::distance_from_scene_m`]).
+    /// Whether it may be of a target in view: within [`Regressor::scene_radius_m`] (at least
+    /// [`LEAST_SCENE_RADIUS_M`]) and four of its standard deviations of the scene's centre.
     pub is_in_scene: bool,
     /// For how long the target's fixes have been the same to the last digit, s.
     pub repeated_s: f64,
@@ -98,7 +100,8 @@ impl ObservedFix {
         let variance_m2 = fix_variance_m2(observation, regressor, e_gnss_m2);
         let in_plane = regressor.and_then(|regressor| regressor.plane().to_plane_within_range(position));
         let is_in_scene = regressor.zip(in_plane).is_some_and(|(regressor, point)| {
-            regressor.distance_from_scene_m(point) <= SCENE_MARGIN_SIGMAS * variance_m2.sqrt()
+            let radius_m = regressor.scene_radius_m().max(LEAST_SCENE_RADIUS_M);
+            point.distance_m(EastNorth::default()) <= radius_m + SCENE_MARGIN_SIGMAS * variance_m2.sqrt()
         });
         Some(Self { position, variance_m2, in_plane, is_in_scene, repeated_s: 0.0 })
     }
@@ -215,15 +218,18 @@ impl<'a> ObservedPositions<'a> {
         Some(PairInnovation { distance_m, nis: distance_m * distance_m / variance_m2 })
     }
 
-    /// The source not to use where the two contradict each other: the box if it is unusual, for then its
+    /// The source not to use where the two contradict each other, or where the box says no more than that the target is in
+    /// view and the fix is of none there: the box if it is unusual, for then its
     /// stated error rests on no training box, and the fix is of the scene; else the fix, for multipath, a
     /// frozen receiver and swapped coordinates give it errors that no receiver states.
     #[must_use]
     pub fn contradicting_source(&self) -> Option<MeasurementSource> {
-        let contradicts = self.innovation().is_some_and(|innovation| innovation.nis > PAIR_GATE);
+        let PairInnovation { nis, .. } = self.innovation()?;
+        let is_in_scene = self.fix.is_some_and(|fix| fix.is_in_scene);
+        let says_in_view_alone = self.usable_box().is_some_and(|observed| observed.is_vague);
+        let contradicts = nis > PAIR_GATE || (says_in_view_alone && !is_in_scene);
         let is_unusual =
             contradicts.then(|| self.usable_box().is_some_and(|observed| observed.is_unusual))?;
-        let is_in_scene = self.fix.is_some_and(|fix| fix.is_in_scene);
         Some(if is_unusual && is_in_scene { MeasurementSource::Regressed } else { MeasurementSource::Fix })
     }
 }

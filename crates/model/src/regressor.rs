@@ -39,8 +39,6 @@ impl JointError {
 const DEFAULT_WHITE_SHARE: f64 = 0.3;
 /// Time after which repeated boxes are frozen where the model does not state it, s.
 const DEFAULT_FROZEN_S: f64 = 60.0;
-/// Least radius of the scene of a model that does not state it, m.
-const LEAST_SCENE_RADIUS_M: f64 = 100.0;
 /// Range of the error variance, m2: weights and radii are finite for every box.
 pub(super) const VARIANCE_RANGE_M2: [f64; 2] = [1e-6, 1e12];
 
@@ -175,18 +173,6 @@ impl Regressor {
     #[must_use]
     pub fn scene_radius_m(&self) -> f64 {
         self.track_noise.map_or(f64::INFINITY, |noise| noise.regression_length_m)
-    }
-
-    /// Distance of a point from the ground that a target in view can be on, m.
-    #[must_use]
-    pub fn distance_from_scene_m(&self, point: EastNorth) -> f64 {
-        match &self.scene {
-            Some(scene) => scene.nearest(point).distance_m(point),
-            None => {
-                let radius_m = self.scene_radius_m().max(LEAST_SCENE_RADIUS_M);
-                (point.distance_m(EastNorth::default()) - radius_m).max(0.0)
-            }
-        }
     }
 
     /// Whether an answer says no more than that a target is in view: its error is as large as the ground that training

@@ -2,10 +2,10 @@
 //! box.
 
 use crate::domain::Sample;
-use crate::model::artifact::ModelParts;
-use crate::model::regressor::Regressor;
-use crate::model::samples::sequences::sequences;
-use crate::model::uncertainty::scene::Scene;
+use crate::artifact::ModelParts;
+use crate::regressor::Regressor;
+use crate::samples::sequences::sequences;
+use crate::uncertainty::scene::Scene;
 
 /// A box is frozen when it has been the same to the pixel for that many times as long as any of training, and
 /// [`LEAST_FROZEN_S`] more.

@@ -1,7 +1,7 @@
 //! Positions within the scene, and their errors: `uncertainty/scene.rs`.
 
 use super::expression::Expr;
-use crate::model::uncertainty::scene::{CREDIBLE_RATIO, Scene};
+use crate::uncertainty::scene::{CREDIBLE_RATIO, Scene};
 
 /// `Scene::limit`: position (east, north, m) and covariance (east, cross, north, m2).
 pub(super) fn limit<'g>(

@@ -3,7 +3,7 @@
 
 use crate::domain::{Error, Result};
 use crate::geo::{EastNorth, PlaneCovariance};
-use crate::model::artifact::ModelParts;
+use crate::artifact::ModelParts;
 
 /// West, east, south and north end of the training positions, m; missing in earlier formats.
 const NAMES: [&str; 4] = ["scene_west_m", "scene_east_m", "scene_south_m", "scene_north_m"];

@@ -1,11 +1,11 @@
 //! `/v2`: the Open Inference Protocol (KServe's V2). A model is a camera, a version one of its model versions.
 
-use std::borrow::Cow;
+use std::fmt;
 
 use axum::extract::State;
 use hyper::http::request::Parts;
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde::de::{DeserializeSeed, IgnoredAny, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -126,7 +126,7 @@ struct InferenceRequest {
     /// Parameters; none is used.
     #[schema(value_type = Option<Object>)]
     #[serde(rename = "parameters")]
-    _parameters: Option<Value>,
+    _parameters: Option<IgnoredAny>,
     /// One tensor, `boxes`: a row of left, top, width and height in pixels per box.
     inputs: Vec<InputTensor>,
     /// The outputs that are wanted; all if left out.
@@ -149,18 +149,94 @@ struct InputTensor {
     /// Parameters; none is used.
     #[schema(value_type = Option<Object>)]
     #[serde(rename = "parameters")]
-    _parameters: Option<Value>,
+    _parameters: Option<IgnoredAny>,
     /// Its elements row by row, as one array or as an array per row.
     #[schema(value_type = Vec<f64>, example = json!([[475.0, 11.0, 28.0, 77.0]]))]
     data: TensorData,
 }
 
-/// Elements of a tensor.
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum TensorData {
-    Flat(Vec<f64>),
-    Rows(Vec<Vec<f64>>),
+/// Elements of a tensor, row by row. They are read without a copy between the text and them.
+#[derive(Default)]
+struct TensorData {
+    numbers: Vec<f64>,
+    is_of_rows: bool,
+}
+
+impl<'de> Deserialize<'de> for TensorData {
+    fn deserialize<D: Deserializer<'de>>(source: D) -> std::result::Result<Self, D::Error> {
+        source.deserialize_seq(TensorVisitor)
+    }
+}
+
+struct TensorVisitor;
+
+impl<'de> Visitor<'de> for TensorVisitor {
+    type Value = TensorData;
+
+    fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str("an array of numbers, or of rows")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> std::result::Result<TensorData, A::Error> {
+        let mut data = TensorData::default();
+        while items.next_element_seed(TensorItem(&mut data))?.is_some() {}
+        Ok(data)
+    }
+}
+
+/// A number, or a row of them, which is added to the others.
+struct TensorItem<'t>(&'t mut TensorData);
+
+impl TensorItem<'_> {
+    fn add<E: serde::de::Error>(self, number: f64) -> std::result::Result<(), E> {
+        if self.0.is_of_rows {
+            return Err(E::custom(format!("must have {BOX_COLUMNS} numbers")));
+        }
+        self.0.numbers.push(number);
+        Ok(())
+    }
+}
+
+impl<'de> DeserializeSeed<'de> for TensorItem<'_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, source: D) -> std::result::Result<(), D::Error> {
+        source.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for TensorItem<'_> {
+    type Value = ();
+
+    fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "a number, or a row of {BOX_COLUMNS}")
+    }
+
+    fn visit_f64<E: serde::de::Error>(self, number: f64) -> std::result::Result<(), E> {
+        self.add(number)
+    }
+
+    fn visit_i64<E: serde::de::Error>(self, number: i64) -> std::result::Result<(), E> {
+        self.add(number as f64)
+    }
+
+    fn visit_u64<E: serde::de::Error>(self, number: u64) -> std::result::Result<(), E> {
+        self.add(number as f64)
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> std::result::Result<(), A::Error> {
+        let Self(data) = self;
+        let begin = data.numbers.len();
+        let is_first = begin == 0;
+        while let Some(number) = items.next_element()? {
+            data.numbers.push(number);
+        }
+        if data.numbers.len() != begin + BOX_COLUMNS || !(data.is_of_rows || is_first) {
+            return Err(serde::de::Error::custom(format!("must have {BOX_COLUMNS} numbers")));
+        }
+        data.is_of_rows = true;
+        Ok(())
+    }
 }
 
 /// An output that is asked for.
@@ -172,7 +248,7 @@ struct RequestedOutput {
     /// Parameters; none is used.
     #[schema(value_type = Option<Object>)]
     #[serde(rename = "parameters")]
-    _parameters: Option<Value>,
+    _parameters: Option<IgnoredAny>,
 }
 
 /// Positions of boxes.
@@ -348,7 +424,7 @@ async fn inferred(app: &App, model: ModelName, body: &JsonBody) -> ApiResult {
         return Err(Error::invalid("inputs", format!("must be one tensor, `{BOXES}`")).into());
     };
     let boxes = boxes(input)?;
-    let answer = app.infer(&model.camera, model.version.as_deref(), &boxes, &outputs).await?;
+    let answer = app.infer(&model.camera, model.version.as_deref(), boxes, &outputs).await?;
     let Inferred { version, outputs } = answer;
     let numbers: usize = outputs.iter().map(|(_, numbers)| numbers.len()).sum();
     let outputs = outputs.into_iter().map(|(output, data)| OutputData {
@@ -367,23 +443,14 @@ async fn inferred(app: &App, model: ModelName, body: &JsonBody) -> ApiResult {
 }
 
 /// The rows of the input tensor.
-fn boxes(input: &InputTensor) -> Result<Vec<[f64; BOX_COLUMNS]>> {
+fn boxes(input: &InputTensor) -> Result<&[[f64; BOX_COLUMNS]]> {
     if input.name != BOXES {
         return Err(Error::invalid("inputs[0].name", format!("must be {BOXES}")));
     }
     if !matches!(input.datatype.as_str(), FP64 | "FP32") {
         return Err(Error::invalid("inputs[0].datatype", "must be FP64 or FP32"));
     }
-    let numbers: Cow<'_, [f64]> = match &input.data {
-        TensorData::Flat(numbers) => Cow::Borrowed(numbers),
-        TensorData::Rows(rows) => {
-            if let Some(row) = rows.iter().position(|row| row.len() != BOX_COLUMNS) {
-                let message = format!("must have {BOX_COLUMNS} numbers");
-                return Err(Error::invalid(format!("inputs[0].data[{row}]"), message));
-            }
-            Cow::Owned(rows.concat())
-        }
-    };
+    let numbers = &input.data.numbers;
     let (rows, rest) = numbers.as_chunks::<BOX_COLUMNS>();
     if !rest.is_empty() || input.shape != [rows.len() as u64, BOX_COLUMNS as u64] {
         let message = format!(
@@ -392,5 +459,5 @@ fn boxes(input: &InputTensor) -> Result<Vec<[f64; BOX_COLUMNS]>> {
         );
         return Err(Error::invalid("inputs[0].shape", message));
     }
-    Ok(rows.to_vec())
+    Ok(rows)
 }

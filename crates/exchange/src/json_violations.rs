@@ -71,7 +71,7 @@ impl Fault {
     fn find<'de, T: Deserialize<'de>>(document: &Value) -> Option<Self> {
         let mut track = Track::new();
         let tracked = serde_path_to_error::Deserializer::new(document.clone(), &mut track);
-        let error = objects_only::deserialize::<T, _>(tracked).err()?;
+        let error = objects_only::deserialize::<T, _>(tracked, usize::MAX).err()?;
         let path = track.path();
         let steps = path.iter().filter_map(|segment| match segment {
             Segment::Seq { index } => Some(Step::Item(*index)),

@@ -1,6 +1,8 @@
-//! A deserializer that takes objects for structs only. serde's own also takes an array with the fields in the
-//! order of their declaration, which no interface describes.
+//! A deserializer that takes objects for structs only, and no more elements than the text has memory for. serde's own
+//! also takes an array with the fields in the order of their declaration, which no interface describes; and `{}` is two
+//! bytes that may become hundreds.
 
+use std::cell::Cell;
 use std::fmt;
 
 use serde::de::{
@@ -8,26 +10,54 @@ use serde::de::{
     Visitor,
 };
 
-/// Parses a value whose structs are objects.
+/// A vector that grows has twice the place of its elements; so have maps.
+const GROWTH: usize = 2;
+
+/// Parses a value whose structs are objects, and whose elements and map entries come to at most so many bytes in memory.
 ///
 /// # Errors
-/// Those of the deserializer, also for an array in the place of an object.
-pub(super) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(source: D) -> Result<T, D::Error> {
-    T::deserialize(ObjectsOnly(source))
+/// Those of the deserializer, also for an array in the place of an object, and for more elements.
+pub(super) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
+    source: D,
+    memory_bytes: usize,
+) -> Result<T, D::Error> {
+    T::deserialize(ObjectsOnly { inner: source, left_bytes: &Cell::new(memory_bytes), is_map: false })
 }
 
 /// Any part of a deserializer, so that nested values are parsed by the same rule.
-struct ObjectsOnly<T>(T);
+struct ObjectsOnly<'b, T> {
+    inner: T,
+    /// What may still be taken for elements, bytes.
+    left_bytes: &'b Cell<usize>,
+    /// Whether the keys of an object are entries of a map, and not fields of a struct.
+    is_map: bool,
+}
+
+impl<'b, T> ObjectsOnly<'b, T> {
+    const fn with<U>(&self, inner: U) -> ObjectsOnly<'b, U> {
+        ObjectsOnly { inner, left_bytes: self.left_bytes, is_map: true }
+    }
+
+    /// Takes the memory of an element.
+    fn take<E: Error>(&self, bytes: usize) -> Result<(), E> {
+        let left_bytes = self.left_bytes.get().checked_sub(GROWTH * bytes);
+        self.left_bytes.set(left_bytes.ok_or_else(|| {
+            E::custom("has more elements than the length of the body has memory for; send fewer at once")
+        })?);
+        Ok(())
+    }
+}
 
 macro_rules! forward {
     ($($method:ident)*) => {$(
         fn $method<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
-            self.0.$method(ObjectsOnly(visitor))
+            let visitor = self.with(visitor);
+            self.inner.$method(visitor)
         }
     )*};
 }
 
-impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectsOnly<D> {
+impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectsOnly<'_, D> {
     type Error = D::Error;
 
     forward! {
@@ -44,7 +74,8 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectsOnly<D> {
         _fields: &'static [&'static str],
         visitor: V,
     ) -> Result<V::Value, D::Error> {
-        self.0.deserialize_map(ObjectsOnly(visitor))
+        let visitor = ObjectsOnly { is_map: false, ..self.with(visitor) };
+        self.inner.deserialize_map(visitor)
     }
 
     fn deserialize_unit_struct<V: Visitor<'de>>(
@@ -52,7 +83,8 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectsOnly<D> {
         name: &'static str,
         visitor: V,
     ) -> Result<V::Value, D::Error> {
-        self.0.deserialize_unit_struct(name, ObjectsOnly(visitor))
+        let visitor = self.with(visitor);
+        self.inner.deserialize_unit_struct(name, visitor)
     }
 
     fn deserialize_newtype_struct<V: Visitor<'de>>(
@@ -60,11 +92,13 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectsOnly<D> {
         name: &'static str,
         visitor: V,
     ) -> Result<V::Value, D::Error> {
-        self.0.deserialize_newtype_struct(name, ObjectsOnly(visitor))
+        let visitor = self.with(visitor);
+        self.inner.deserialize_newtype_struct(name, visitor)
     }
 
     fn deserialize_tuple<V: Visitor<'de>>(self, length: usize, visitor: V) -> Result<V::Value, D::Error> {
-        self.0.deserialize_tuple(length, ObjectsOnly(visitor))
+        let visitor = self.with(visitor);
+        self.inner.deserialize_tuple(length, visitor)
     }
 
     fn deserialize_tuple_struct<V: Visitor<'de>>(
@@ -73,7 +107,8 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectsOnly<D> {
         length: usize,
         visitor: V,
     ) -> Result<V::Value, D::Error> {
-        self.0.deserialize_tuple_struct(name, length, ObjectsOnly(visitor))
+        let visitor = self.with(visitor);
+        self.inner.deserialize_tuple_struct(name, length, visitor)
     }
 
     fn deserialize_enum<V: Visitor<'de>>(
@@ -82,27 +117,28 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectsOnly<D> {
         variants: &'static [&'static str],
         visitor: V,
     ) -> Result<V::Value, D::Error> {
-        self.0.deserialize_enum(name, variants, ObjectsOnly(visitor))
+        let visitor = self.with(visitor);
+        self.inner.deserialize_enum(name, variants, visitor)
     }
 
     fn is_human_readable(&self) -> bool {
-        self.0.is_human_readable()
+        self.inner.is_human_readable()
     }
 }
 
 macro_rules! visit {
     ($($method:ident($kind:ty))*) => {$(
         fn $method<E: Error>(self, value: $kind) -> Result<V::Value, E> {
-            self.0.$method(value)
+            self.inner.$method(value)
         }
     )*};
 }
 
-impl<'de, V: Visitor<'de>> Visitor<'de> for ObjectsOnly<V> {
+impl<'de, V: Visitor<'de>> Visitor<'de> for ObjectsOnly<'_, V> {
     type Value = V::Value;
 
     fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.expecting(out)
+        self.inner.expecting(out)
     }
 
     visit! {
@@ -113,93 +149,116 @@ impl<'de, V: Visitor<'de>> Visitor<'de> for ObjectsOnly<V> {
     }
 
     fn visit_none<E: Error>(self) -> Result<V::Value, E> {
-        self.0.visit_none()
+        self.inner.visit_none()
     }
 
     fn visit_unit<E: Error>(self) -> Result<V::Value, E> {
-        self.0.visit_unit()
+        self.inner.visit_unit()
     }
 
     fn visit_some<D: Deserializer<'de>>(self, source: D) -> Result<V::Value, D::Error> {
-        self.0.visit_some(ObjectsOnly(source))
+        let source = self.with(source);
+        self.inner.visit_some(source)
     }
 
     fn visit_newtype_struct<D: Deserializer<'de>>(self, source: D) -> Result<V::Value, D::Error> {
-        self.0.visit_newtype_struct(ObjectsOnly(source))
+        let source = self.with(source);
+        self.inner.visit_newtype_struct(source)
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, items: A) -> Result<V::Value, A::Error> {
-        self.0.visit_seq(ObjectsOnly(items))
+        let items = self.with(items);
+        self.inner.visit_seq(items)
     }
 
     fn visit_map<A: MapAccess<'de>>(self, entries: A) -> Result<V::Value, A::Error> {
-        self.0.visit_map(ObjectsOnly(entries))
+        let entries = ObjectsOnly { is_map: self.is_map, ..self.with(entries) };
+        self.inner.visit_map(entries)
     }
 
     fn visit_enum<A: EnumAccess<'de>>(self, variant: A) -> Result<V::Value, A::Error> {
-        self.0.visit_enum(ObjectsOnly(variant))
+        let variant = self.with(variant);
+        self.inner.visit_enum(variant)
     }
 }
 
-impl<'de, S: DeserializeSeed<'de>> DeserializeSeed<'de> for ObjectsOnly<S> {
+impl<'de, S: DeserializeSeed<'de>> DeserializeSeed<'de> for ObjectsOnly<'_, S> {
     type Value = S::Value;
 
     fn deserialize<D: Deserializer<'de>>(self, source: D) -> Result<S::Value, D::Error> {
-        self.0.deserialize(ObjectsOnly(source))
+        let source = self.with(source);
+        self.inner.deserialize(source)
     }
 }
 
-impl<'de, A: SeqAccess<'de>> SeqAccess<'de> for ObjectsOnly<A> {
+impl<'de, A: SeqAccess<'de>> SeqAccess<'de> for ObjectsOnly<'_, A> {
     type Error = A::Error;
 
     fn next_element_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, A::Error> {
-        self.0.next_element_seed(ObjectsOnly(seed))
+        let seed = self.with(seed);
+        let element = self.inner.next_element_seed(seed)?;
+        if element.is_some() {
+            self.take(size_of::<S::Value>())?;
+        }
+        Ok(element)
     }
 
     fn size_hint(&self) -> Option<usize> {
-        self.0.size_hint()
+        self.inner.size_hint()
     }
 }
 
-impl<'de, A: MapAccess<'de>> MapAccess<'de> for ObjectsOnly<A> {
+impl<'de, A: MapAccess<'de>> MapAccess<'de> for ObjectsOnly<'_, A> {
     type Error = A::Error;
 
     fn next_key_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, A::Error> {
-        self.0.next_key_seed(ObjectsOnly(seed))
+        let seed = self.with(seed);
+        let key = self.inner.next_key_seed(seed)?;
+        if self.is_map && key.is_some() {
+            self.take(size_of::<S::Value>())?;
+        }
+        Ok(key)
     }
 
     fn next_value_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<S::Value, A::Error> {
-        self.0.next_value_seed(ObjectsOnly(seed))
+        if self.is_map {
+            self.take(size_of::<S::Value>())?;
+        }
+        let seed = self.with(seed);
+        self.inner.next_value_seed(seed)
     }
 
     fn size_hint(&self) -> Option<usize> {
-        self.0.size_hint()
+        self.inner.size_hint()
     }
 }
 
-impl<'de, A: EnumAccess<'de>> EnumAccess<'de> for ObjectsOnly<A> {
+impl<'b, 'de, A: EnumAccess<'de>> EnumAccess<'de> for ObjectsOnly<'b, A> {
     type Error = A::Error;
-    type Variant = ObjectsOnly<A::Variant>;
+    type Variant = ObjectsOnly<'b, A::Variant>;
 
     fn variant_seed<S: DeserializeSeed<'de>>(self, seed: S) -> Result<(S::Value, Self::Variant), A::Error> {
-        let (value, variant) = self.0.variant_seed(ObjectsOnly(seed))?;
-        Ok((value, ObjectsOnly(variant)))
+        let Self { inner, left_bytes, is_map } = self;
+        let (value, variant) = inner.variant_seed(ObjectsOnly { inner: seed, left_bytes, is_map })?;
+        Ok((value, ObjectsOnly { inner: variant, left_bytes, is_map }))
     }
 }
 
-impl<'de, A: VariantAccess<'de>> VariantAccess<'de> for ObjectsOnly<A> {
+impl<'de, A: VariantAccess<'de>> VariantAccess<'de> for ObjectsOnly<'_, A> {
     type Error = A::Error;
 
     fn unit_variant(self) -> Result<(), A::Error> {
-        self.0.unit_variant()
+        self.inner.unit_variant()
     }
 
     fn newtype_variant_seed<S: DeserializeSeed<'de>>(self, seed: S) -> Result<S::Value, A::Error> {
-        self.0.newtype_variant_seed(ObjectsOnly(seed))
+        let seed = self.with(seed);
+        self.inner.newtype_variant_seed(seed)
     }
 
     fn tuple_variant<V: Visitor<'de>>(self, length: usize, visitor: V) -> Result<V::Value, A::Error> {
-        self.0.tuple_variant(length, ObjectsOnly(visitor))
+        let visitor = self.with(visitor);
+        self.inner.tuple_variant(length, visitor)
     }
 
     fn struct_variant<V: Visitor<'de>>(
@@ -207,6 +266,43 @@ impl<'de, A: VariantAccess<'de>> VariantAccess<'de> for ObjectsOnly<A> {
         fields: &'static [&'static str],
         visitor: V,
     ) -> Result<V::Value, A::Error> {
-        self.0.struct_variant(fields, ObjectsOnly(visitor))
+        let visitor = ObjectsOnly { is_map: false, ..self.with(visitor) };
+        self.inner.struct_variant(fields, visitor)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use serde_json::Value;
+
+    use super::*;
+
+    fn parsed<T: serde::de::DeserializeOwned>(json: &str, memory_bytes: usize) -> Result<T, String> {
+        let mut source = serde_json::Deserializer::from_str(json);
+        deserialize(&mut source, memory_bytes).map_err(|error| error.to_string())
+    }
+
+    #[derive(Deserialize)]
+    #[serde(crate = "serde")]
+    struct Item {
+        #[expect(dead_code, reason = "only its size matters")]
+        number: Option<f64>,
+    }
+
+    #[test]
+    fn elements_have_no_more_memory_than_is_given() {
+        let item = GROWTH * size_of::<Item>();
+        assert!(parsed::<Vec<Item>>("[{},{},{}]", 3 * item).is_ok());
+        assert!(parsed::<Vec<Item>>("[{},{},{}]", 3 * item - 1).is_err());
+        assert!(parsed::<Item>(r#"{"number": 1}"#, 0).is_ok(), "fields are within their struct");
+        let value = GROWTH * size_of::<Value>();
+        assert!(parsed::<Value>("[[],[[]]]", 3 * value).is_ok(), "nested ones count, too");
+        let refused = parsed::<Value>("[[],[[]]]", 3 * value - 1).expect_err("one too many");
+        assert!(refused.contains("send fewer at once"), "{refused}");
+        let entry = GROWTH * (size_of::<String>() + size_of::<u8>());
+        assert!(parsed::<BTreeMap<String, u8>>(r#"{"a":1,"b":2}"#, 2 * entry).is_ok());
+        assert!(parsed::<BTreeMap<String, u8>>(r#"{"a":1,"b":2}"#, 2 * entry - 1).is_err());
     }
 }

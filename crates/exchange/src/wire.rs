@@ -400,6 +400,15 @@ impl fmt::Display for Flags<'_> {
     }
 }
 
+/// What the elements of a text may come to in memory, for each of its bytes, bytes.
+const MEMORY_PER_BYTE: usize = 8;
+/// The same whatever its length: a batch of a thousand short observations.
+const FREE_MEMORY_BYTES: usize = 512 * 1024;
+
+const fn memory_bytes(json: &[u8]) -> usize {
+    FREE_MEMORY_BYTES + MEMORY_PER_BYTE * json.len()
+}
+
 /// Parses a value from JSON text.
 ///
 /// # Errors
@@ -408,7 +417,8 @@ impl fmt::Display for Flags<'_> {
 pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
     // Tracking the path is slow, so it is done only for an error.
     let mut source = serde_json::Deserializer::from_slice(json);
-    match objects_only::deserialize(&mut source).and_then(|value| source.end().map(|()| value)) {
+    let value = objects_only::deserialize(&mut source, memory_bytes(json));
+    match value.and_then(|value| source.end().map(|()| value)) {
         Ok(value) => Ok(value),
         Err(_) => parse_with_path(json),
     }
@@ -426,7 +436,7 @@ fn parse_with_path<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
     let mut source = serde_json::Deserializer::from_slice(json);
     let mut track = Track::new();
     let tracked = serde_path_to_error::Deserializer::new(&mut source, &mut track);
-    let value = objects_only::deserialize(tracked).map_err(|error| {
+    let value = objects_only::deserialize(tracked, memory_bytes(json)).map_err(|error| {
         let path = track.path().to_string();
         refusal_of(if path == "." { "" } else { &path }, &error)
     })?;

@@ -6,19 +6,24 @@
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
+mod decoded_memory;
+mod rates;
+
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-use std::time::Duration;
-
-use tokio::time::Instant;
 
 use crate::config::Limits;
 use crate::domain::{Error, ErrorKind, KeyId, Refusal, Result};
 
+pub use decoded_memory::DecodedMemory;
+pub use rates::{RateLimit, RefusedBodies, TokenBucket};
+
 /// What a request costs while it is open, besides its body: connection buffers and its task. Charged
 /// to [`Quotas::request_memory`].
 const REQUEST_OVERHEAD_BYTES: u64 = 16 << 10;
+/// Sign-ins that wait for the OpenID provider at a time.
+const WAITING_SIGN_INS: usize = 16;
 
 /// A client as limits count it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -198,138 +203,14 @@ impl Drop for Lease {
     }
 }
 
-/// A rate as a bucket that holds one second's worth of tokens and is refilled continuously.
-#[derive(Debug, Clone, Copy)]
-pub struct TokenBucket {
-    tokens: f64,
-    refilled_at: Instant,
-}
-
-impl TokenBucket {
-    /// A full bucket.
-    #[must_use]
-    pub const fn full(per_s: f64, now: Instant) -> Self {
-        Self { tokens: per_s, refilled_at: now }
-    }
-
-    /// Takes tokens; false, and none taken, if there are too few.
-    pub fn take(&mut self, count: f64, per_s: f64, now: Instant) -> bool {
-        let refill = now.saturating_duration_since(self.refilled_at).as_secs_f64() * per_s;
-        self.tokens = (self.tokens + refill).min(per_s);
-        self.refilled_at = now;
-        let is_enough = self.tokens >= count;
-        if is_enough {
-            self.tokens -= count;
-        }
-        is_enough
-    }
-}
-
-/// Requests per second of each client. Unlike a [`Quota`] it does not depend on how long they take.
-pub struct RateLimit {
-    per_s: u32,
-    buckets: Mutex<HashMap<ClientId, TokenBucket>>,
-}
-
-/// Buckets beyond which those that are full again are dropped before one is added.
-const MOST_BUCKETS: usize = 4_096;
-/// Time in which an empty bucket is full again.
-const REFILL_TIME: Duration = Duration::from_secs(1);
-
-impl RateLimit {
-    /// A limit of so many; 0 is no limit.
-    #[must_use]
-    pub fn new(per_s: u32) -> Self {
-        Self { per_s, buckets: Mutex::default() }
-    }
-
-    /// Counts a request.
-    ///
-    /// # Errors
-    /// `RateLimited`.
-    pub fn count(&self, client: ClientId, now: Instant) -> Result<()> {
-        if self.per_s == 0 {
-            return Ok(());
-        }
-        let per_s = f64::from(self.per_s);
-        let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
-        if buckets.len() >= MOST_BUCKETS && !buckets.contains_key(&client) {
-            buckets.retain(|_, bucket| now.saturating_duration_since(bucket.refilled_at) < REFILL_TIME);
-        }
-        let bucket = buckets.entry(client).or_insert_with(|| TokenBucket::full(per_s, now));
-        if bucket.take(1.0, per_s, now) {
-            return Ok(());
-        }
-        let message = format!("one client may send {} requests per second; send fewer", self.per_s);
-        Err(Error::refused(ErrorKind::RateLimited, message))
-    }
-}
-
-/// What bodies cost that are refused for what they contain: they are read and parsed in vain. Each client has some for
-/// free; beyond, it waits before its next body is read.
-pub struct RefusedBodies {
-    bytes_per_s: f64,
-    debts: Mutex<HashMap<ClientId, Debt>>,
-}
-
-/// Bytes of refused bodies, less what has been forgiven by the time.
-#[derive(Debug, Clone, Copy)]
-struct Debt {
-    bytes: f64,
-    at: Instant,
-}
-
-impl Debt {
-    fn left(self, bytes_per_s: f64, now: Instant) -> f64 {
-        (self.bytes - now.saturating_duration_since(self.at).as_secs_f64() * bytes_per_s).max(0.0)
-    }
-}
-
-/// What is free, in seconds of the rate: a wrong file or two.
-const FREE_S: f64 = 16.0;
-/// Longest wait, s.
-const MAX_WAIT_S: f64 = 10.0;
-
-impl RefusedBodies {
-    /// Forgives so many bytes per second; 0 charges nothing.
-    #[must_use]
-    pub fn new(bytes_per_s: u32) -> Self {
-        Self { bytes_per_s: f64::from(bytes_per_s), debts: Mutex::default() }
-    }
-
-    fn lock(&self) -> MutexGuard<'_, HashMap<ClientId, Debt>> {
-        self.debts.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// A body of a client was refused.
-    pub fn charge(&self, client: ClientId, bytes: u64, now: Instant) {
-        if self.bytes_per_s == 0.0 {
-            return;
-        }
-        let mut debts = self.lock();
-        if debts.len() >= MOST_BUCKETS && !debts.contains_key(&client) {
-            debts.retain(|_, debt| debt.left(self.bytes_per_s, now) > 0.0);
-        }
-        let left = debts.get(&client).map_or(0.0, |debt| debt.left(self.bytes_per_s, now));
-        let most = (FREE_S + MAX_WAIT_S) * self.bytes_per_s;
-        debts.insert(client, Debt { bytes: (left + bytes as f64).min(most), at: now });
-    }
-
-    /// How long a client waits until its next body is read; `None` for not at all.
-    #[must_use]
-    pub fn wait(&self, client: ClientId, now: Instant) -> Option<Duration> {
-        let debt = *self.lock().get(&client)?;
-        let beyond = debt.left(self.bytes_per_s, now) - FREE_S * self.bytes_per_s;
-        (beyond > 0.0).then(|| Duration::from_secs_f64(beyond / self.bytes_per_s))
-    }
-}
-
 /// The quotas of a server.
 pub struct Quotas {
     /// Bodies that were refused, by client.
     pub refused_bodies: RefusedBodies,
     /// Requests per second of one client.
     pub request_rate: RateLimit,
+    /// Requests per second of one address without a credential that works.
+    pub anonymous_rate: RateLimit,
     /// Requests that are worked on, but for the reserved places.
     requests: Quota,
     /// Places that only fusions take.
@@ -345,6 +226,8 @@ pub struct Quotas {
     pub live_streams: Quota,
     /// Open event streams, server-sent events and watched runs alike.
     pub event_streams: Quota,
+    /// Sign-ins that wait for the OpenID provider.
+    pub sign_ins: Quota,
 }
 
 impl Quotas {
@@ -354,7 +237,8 @@ impl Quotas {
         let quota = |what, total| Quota::new(what, total, limits.client_share);
         Self {
             refused_bodies: RefusedBodies::new(limits.refused_bytes_per_s),
-            request_rate: RateLimit::new(limits.requests_per_s),
+            request_rate: RateLimit::new("requests", limits.requests_per_s),
+            anonymous_rate: RateLimit::new("requests without a key", limits.anonymous_requests_per_s),
             requests: quota("requests at work", limits.requests.saturating_sub(limits.reserved_requests)),
             reserved_requests: quota("requests at work", limits.reserved_requests),
             import_streams: quota("import streams", limits.import_streams),
@@ -363,6 +247,7 @@ impl Quotas {
             import_disk: quota("bytes of imports in temporary files", limits.spool_disk_bytes),
             live_streams: quota("live streams", limits.live_streams),
             event_streams: quota("event streams", limits.event_streams),
+            sign_ins: quota("sign-ins that wait for the provider", WAITING_SIGN_INS),
         }
     }
 
@@ -402,6 +287,12 @@ impl Quotas {
     /// `Overloaded`.
     pub fn open_request(&self, client: ClientId) -> Result<Lease> {
         self.request_memory.try_acquire(client, REQUEST_OVERHEAD_BYTES)
+    }
+
+    /// What the messages of one request come to when they are decoded, besides the bytes of its body.
+    #[must_use]
+    pub fn decoded_memory(&self, client: ClientId, refusal: BodyRefusal) -> DecodedMemory {
+        DecodedMemory::new(self.request_memory.clone(), client, refusal)
     }
 
     /// The place of a request that begins to be worked on; `None` where the class needs none.
@@ -464,49 +355,6 @@ mod tests {
         let _fusion = quotas.begin_work(RequestClass::Fusion, client(2)).expect("the reserved place");
         assert!(quotas.begin_work(RequestClass::Fusion, client(2)).is_err());
         assert!(quotas.begin_work(RequestClass::Probe, client(2)).expect("always").is_none());
-    }
-
-    #[test]
-    fn a_client_has_one_seconds_worth_of_requests() {
-        let limit = RateLimit::new(3);
-        let begin = Instant::now();
-        let allowed = |client, now| (0..10).filter(|_| limit.count(client, now).is_ok()).count();
-        assert_eq!(allowed(client(1), begin), 3);
-        assert_eq!(allowed(client(2), begin), 3, "another client has its own");
-        assert_eq!(allowed(client(1), begin + Duration::from_millis(340)), 1);
-        assert_eq!(allowed(client(1), begin + 100 * REFILL_TIME), 3, "a pause saves up no more");
-        let refused = limit.count(client(1), begin + 100 * REFILL_TIME).expect_err("the bucket is empty");
-        assert_eq!(refused.kind(), ErrorKind::RateLimited);
-        let unlimited = RateLimit::new(0);
-        assert!((0..1_000).all(|_| unlimited.count(client(1), begin).is_ok()));
-    }
-
-    #[test]
-    fn refused_bodies_make_their_sender_wait() {
-        let bodies = RefusedBodies::new(1_000);
-        let begin = Instant::now();
-        bodies.charge(client(1), 16_000, begin);
-        assert_eq!(bodies.wait(client(1), begin), None, "that much is free");
-        bodies.charge(client(1), 2_000, begin);
-        assert_eq!(bodies.wait(client(1), begin), Some(Duration::from_secs(2)));
-        assert_eq!(bodies.wait(client(1), begin + Duration::from_secs(2)), None);
-        assert_eq!(bodies.wait(client(2), begin), None, "another client");
-        bodies.charge(client(1), u64::MAX, begin);
-        assert_eq!(bodies.wait(client(1), begin), Some(Duration::from_secs_f64(MAX_WAIT_S)));
-        let unlimited = RefusedBodies::new(0);
-        unlimited.charge(client(1), u64::MAX, begin);
-        assert_eq!(unlimited.wait(client(1), begin), None);
-    }
-
-    #[test]
-    fn buckets_of_clients_that_are_gone_are_dropped() {
-        let limit = RateLimit::new(1);
-        let begin = Instant::now();
-        for address in 0..3 * MOST_BUCKETS as u32 {
-            let client = ClientId::from(IpAddr::from(address.to_be_bytes()));
-            limit.count(client, begin + Duration::from_millis(address.into())).expect("its first");
-        }
-        assert!(limit.buckets.lock().expect("no panic").len() <= MOST_BUCKETS);
     }
 
     #[test]

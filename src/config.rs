@@ -222,6 +222,13 @@ pub struct Limits {
     pub reserved_requests: usize,
     /// Requests per second of one client, which is a key, or an address without one; 0 is no limit.
     pub requests_per_s: u32,
+    /// Requests per second of one address without a key, session or certificate that works, where one is needed; 0 is
+    /// no limit.
+    pub anonymous_requests_per_s: u32,
+    /// Sessions of browsers at a time; beyond, nobody signs in.
+    pub sessions: usize,
+    /// Sessions of one key, or of one person, at a time; beyond, their oldest ends.
+    pub sessions_per_key: usize,
     /// Share of each limit on requests, streams and bytes that one client (a key, or an address without
     /// one) may hold, and of the limit on connections that one address may hold; above 0 and up to 1.
     pub client_share: f64,
@@ -402,6 +409,9 @@ impl Default for Limits {
             requests: 1_024,
             reserved_requests: 256,
             requests_per_s: 0,
+            anonymous_requests_per_s: 200,
+            sessions: 10_000,
+            sessions_per_key: 16,
             client_share: 0.5,
             event_streams: 256,
             tracks_per_camera: 256,

@@ -2,6 +2,7 @@
 
 use super::access::{Access, Principal, SessionToken};
 use super::{App, Page, page_of};
+use crate::admission::{ClientId, Lease};
 use crate::domain::{ApiKey, Error, ErrorKind, KeyId, KeySecret, NewKey, Result, Role, Scope};
 use crate::openid::{Provider, SignInSecret};
 
@@ -99,7 +100,7 @@ impl App {
     /// `Unauthenticated` for a key that does not work.
     pub fn start_session(&self, secret: &str) -> Result<(SessionToken, Principal)> {
         let token = SessionToken::generate(|bytes| self.randomness.fill(bytes));
-        let principal = self.access.start_session(secret, &token, self.clock.now())?;
+        let principal = self.access.start_session(secret, &token, self.clock.now(), &self.limits)?;
         Ok((token, principal))
     }
 
@@ -107,9 +108,10 @@ impl App {
     ///
     /// # Errors
     /// `RouteNotFound` where the settings name no provider; what
-    /// [`Provider::authorization_url`] refuses.
+    /// [`Provider::authorization_url`] refuses; `Overloaded` where too many wait for the provider.
     pub async fn begin_sign_in(&self) -> Result<(SignInSecret, String)> {
         let secret = SignInSecret::generate(|bytes| self.randomness.fill(bytes));
+        let _turn = self.sign_in_turn()?;
         let url = self.openid()?.authorization_url(&secret, self.clock.now()).await?;
         Ok((secret, url))
     }
@@ -124,11 +126,18 @@ impl App {
         state: &str,
         code: &str,
     ) -> Result<SessionToken> {
+        let _turn = self.sign_in_turn()?;
         let identity = self.openid()?.identity(secret, state, code, self.clock.now()).await?;
         tracing::info!(user = identity.name, role = %identity.scope.role(), "a person has signed in");
         let token = SessionToken::generate(|bytes| self.randomness.fill(bytes));
-        self.access.start_user_session(identity, &token, self.clock.now());
+        self.access.start_user_session(identity, &token, self.clock.now(), &self.limits)?;
         Ok(token)
+    }
+
+    /// A place among the sign-ins that wait for the provider, of which one address has its share.
+    fn sign_in_turn(&self) -> Result<Lease> {
+        let client = self.caller().actor().address.map_or(ClientId::UNKNOWN, ClientId::from);
+        self.quotas.sign_ins.try_acquire(client, 1)
     }
 
     fn openid(&self) -> Result<&Provider> {

@@ -14,7 +14,7 @@ use utoipa_axum::routes;
 use super::Rest;
 use super::access::CallerApp;
 use super::problem::{ApiResult, Problem};
-use super::session::{cookie, with_cookie};
+use super::session::{HOST_PREFIX, cookie, end_former, host_cookie, with_cookie};
 use super::wire::{empty, json};
 use crate::app::App;
 use crate::app::access::SESSION_TIME;
@@ -105,10 +105,12 @@ async fn finish(app: &App, uri: &Uri, headers: &HeaderMap) -> Result<Response> {
         return Err(Error::refused(ErrorKind::Unauthenticated, message));
     }
     let missing = || Error::refused(ErrorKind::Unauthenticated, "the sign-in was not begun in this browser");
-    let secret = SignInSecret::of_cookie(cookie(headers, SIGN_IN_COOKIE).ok_or_else(missing)?);
+    let is_https = app.access.openid().is_some_and(Provider::is_https);
+    let read = if is_https { host_cookie } else { cookie };
+    let secret = SignInSecret::of_cookie(read(headers, SIGN_IN_COOKIE).ok_or_else(missing)?);
     let (state, code) = parameter("state").zip(parameter("code")).ok_or_else(missing)?;
     let token = app.finish_sign_in(&secret, &state, &code).await?;
-    let is_https = app.access.openid().is_some_and(Provider::is_https);
+    end_former(app, headers);
     // The address has the code, which no page is to learn.
     let response = with_cookie(see_other("/")?, is_https, token.reveal(), SESSION_TIME.as_secs())?;
     with_sign_in_cookie(response, is_https, "", 0)
@@ -125,9 +127,11 @@ fn see_other(url: &str) -> Result<Response> {
 
 /// `Lax`, since the browser comes back from a page of the provider.
 fn with_sign_in_cookie(mut response: Response, is_https: bool, secret: &str, age_s: u32) -> Result<Response> {
-    let secure = if is_https { "; Secure" } else { "" };
+    // The prefix is for cookies of all paths.
+    let (prefix, path, secure) =
+        if is_https { (HOST_PREFIX, "/", "; Secure") } else { ("", "/v1/session/openid", "") };
     let cookie = format!(
-        "{SIGN_IN_COOKIE}={secret}; Path=/v1/session/openid; Max-Age={age_s}; HttpOnly; SameSite=Lax{secure}"
+        "{prefix}{SIGN_IN_COOKIE}={secret}; Path={path}; Max-Age={age_s}; HttpOnly; SameSite=Lax{secure}"
     );
     response.headers_mut().append(SET_COOKIE, HeaderValue::from_str(&cookie).map_err(Error::fault)?);
     Ok(response)

@@ -15,11 +15,14 @@ use super::extract::JsonBody;
 use super::keys::{Role, camera_ids};
 use super::problem::{ApiResult, Problem};
 use super::wire::{empty, json};
+use crate::app::App;
 use crate::app::access::{Principal, SESSION_TIME};
 use crate::domain::{Error, Result};
 
 /// Name of the cookie that carries a session's token.
 pub(super) const SESSION_COOKIE: &str = "sightfix_session";
+/// Begins the name of a cookie that no other host and no page over plain HTTP can set (RFC 6265bis, 4.1.3.2).
+pub(super) const HOST_PREFIX: &str = "__Host-";
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(start_session, get_session, end_session))
@@ -74,8 +77,9 @@ impl Session {
 
 /// Sign in with a key
 ///
-/// Sets a cookie (`HttpOnly`, `SameSite=Strict`, over HTTPS also `Secure`) that stands for the key for
-/// twelve hours, or until the key is revoked or the server restarts. Changes with the cookie are taken
+/// Sets a cookie (`HttpOnly`, `SameSite=Strict`, over HTTPS also `Secure` and with `__Host-` before its name) that stands
+/// for the key for twelve hours, or until the key is revoked or the server restarts. A session that the browser had
+/// before ends, and so does the key's oldest beyond the limit `sessions_per_key`. Changes with the cookie are taken
 /// from pages of this server only.
 #[utoipa::path(
     post, path = "/v1/session", tag = "access", request_body = SessionDraft,
@@ -87,6 +91,7 @@ impl Session {
 async fn start_session(CallerApp(app): CallerApp, headers: HeaderMap, body: JsonBody) -> ApiResult {
     let SessionDraft { key } = body.read()?;
     let (token, principal) = app.start_session(&key)?;
+    end_former(&app, &headers);
     let response = json(&Session::of(&principal))?;
     Ok(with_cookie(response, is_https(&headers), token.reveal(), SESSION_TIME.as_secs())?)
 }
@@ -106,24 +111,40 @@ async fn get_session(CallerApp(app): CallerApp) -> ApiResult {
     responses((status = 204, description = "The session has ended"))
 )]
 async fn end_session(CallerApp(app): CallerApp, headers: HeaderMap) -> ApiResult {
-    if let Some(token) = session_token(&headers) {
-        app.access.end_session(token);
-    }
+    end_former(&app, &headers);
     Ok(with_cookie(empty(), is_https(&headers), "", 0)?)
 }
 
-/// The token of the session's cookie.
+/// Ends the session that the browser has.
+pub(super) fn end_former(app: &App, headers: &HeaderMap) {
+    if let Some(token) = session_token(headers, false) {
+        app.access.end_session(token);
+    }
+}
+
+/// The token of the session's cookie. Over TLS the name without the prefix counts for nothing: a page of another host
+/// of the same domain can set it.
 #[must_use]
-pub fn session_token(headers: &HeaderMap) -> Option<&str> {
-    cookie(headers, SESSION_COOKIE)
+pub fn session_token(headers: &HeaderMap, is_tls: bool) -> Option<&str> {
+    let secure = host_cookie(headers, SESSION_COOKIE);
+    if is_tls { secure } else { secure.or_else(|| cookie(headers, SESSION_COOKIE)) }
+}
+
+/// The value of a cookie with the prefix before its name.
+pub(super) fn host_cookie<'h>(headers: &'h HeaderMap, wanted: &str) -> Option<&'h str> {
+    find_cookie(headers, |name| name.strip_prefix(HOST_PREFIX) == Some(wanted))
 }
 
 /// The value of a cookie.
 pub(super) fn cookie<'h>(headers: &'h HeaderMap, wanted: &str) -> Option<&'h str> {
+    find_cookie(headers, |name| name == wanted)
+}
+
+fn find_cookie(headers: &HeaderMap, is_wanted: impl Fn(&str) -> bool) -> Option<&str> {
     let cookies = headers.get_all(COOKIE).iter().filter_map(|header| header.to_str().ok());
     cookies.flat_map(|cookies| cookies.split(';')).find_map(|cookie| {
         let (name, value) = cookie.trim().split_once('=')?;
-        (name == wanted).then_some(value)
+        is_wanted(name).then_some(value)
     })
 }
 
@@ -139,9 +160,10 @@ pub(super) fn with_cookie(
     token: &str,
     age_s: i64,
 ) -> Result<Response> {
-    let secure = if is_https { "; Secure" } else { "" };
-    let cookie =
-        format!("{SESSION_COOKIE}={token}; Path=/; Max-Age={age_s}; HttpOnly; SameSite=Strict{secure}");
+    let (prefix, secure) = if is_https { (HOST_PREFIX, "; Secure") } else { ("", "") };
+    let cookie = format!(
+        "{prefix}{SESSION_COOKIE}={token}; Path=/; Max-Age={age_s}; HttpOnly; SameSite=Strict{secure}"
+    );
     response.headers_mut().append(SET_COOKIE, HeaderValue::from_str(&cookie).map_err(Error::fault)?);
     Ok(response)
 }

@@ -19,7 +19,6 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 use sha2::{Digest as _, Sha256};
 use subtle::ConstantTimeEq as _;
-use tokio::sync::Semaphore;
 
 use self::fetch::Fetch;
 use self::id_token::{Expected, KeySet};
@@ -28,8 +27,6 @@ use crate::domain::{Error, ErrorKind, Result, Role, Scope};
 
 /// How long the provider's description of itself is used.
 const DISCOVERY_TIME: SignedDuration = SignedDuration::from_mins(10);
-/// Sign-ins that wait for the provider at a time.
-const MAX_SIGN_INS: usize = 16;
 /// Longest name of a person that is stored, in bytes.
 const MAX_NAME_BYTES: usize = 128;
 
@@ -114,7 +111,6 @@ pub struct Provider {
     roles: [(Role, Vec<String>); 3],
     fetch: Fetch,
     discovery: Mutex<Option<(Discovery, Timestamp)>>,
-    sign_ins: Semaphore,
 }
 
 impl Provider {
@@ -138,7 +134,6 @@ impl Provider {
             ],
             fetch: Fetch::new(settings.ca.as_deref())?,
             discovery: Mutex::default(),
-            sign_ins: Semaphore::new(MAX_SIGN_INS),
         }))
     }
 
@@ -151,9 +146,8 @@ impl Provider {
     /// Where the browser is sent to sign in.
     ///
     /// # Errors
-    /// `SignInUnavailable` if the provider does not answer, `Overloaded`.
+    /// `SignInUnavailable` if the provider does not answer.
     pub async fn authorization_url(&self, secret: &SignInSecret, now: Timestamp) -> Result<String> {
-        let _turn = self.turn()?;
         let endpoint = self.discovery(now).await?.authorization_endpoint;
         let challenge = URL_SAFE_NO_PAD.encode(Sha256::digest(secret.verifier()));
         let query = Serializer::new(String::new())
@@ -174,7 +168,7 @@ impl Provider {
     ///
     /// # Errors
     /// `Unauthenticated` for a state of another browser, or a code or token that does not hold;
-    /// `PermissionDenied` for a person without a role; `SignInUnavailable`, `Overloaded`.
+    /// `PermissionDenied` for a person without a role; `SignInUnavailable`.
     pub async fn identity(
         &self,
         secret: &SignInSecret,
@@ -185,7 +179,6 @@ impl Provider {
         if !bool::from(secret.state().as_bytes().ct_eq(state.as_bytes())) {
             return Err(not_signed_in("the sign-in was not begun in this browser, or too long ago"));
         }
-        let _turn = self.turn()?;
         let discovery = self.discovery(now).await?;
         let token = self.redeem(&discovery, code, secret).await?;
         let keys: KeySet = self.provided(self.fetch.get(&discovery.jwks_uri).await)?;
@@ -205,13 +198,6 @@ impl Provider {
         let id = claims.get("sub").and_then(Value::as_str).unwrap_or_default();
         let subject = format!("{} {id}", self.issuer);
         Ok(Identity { name, subject, scope: Scope::new(role, Vec::new())? })
-    }
-
-    fn turn(&self) -> Result<tokio::sync::SemaphorePermit<'_>> {
-        self.sign_ins.try_acquire().map_err(|_| {
-            let message = format!("{MAX_SIGN_INS} sign-ins wait for the provider; try again in a second");
-            Error::refused(ErrorKind::Overloaded, message)
-        })
     }
 
     async fn discovery(&self, now: Timestamp) -> Result<Discovery> {

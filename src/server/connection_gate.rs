@@ -39,7 +39,7 @@ pub(super) struct ConnectionGate {
 impl ConnectionGate {
     pub(super) fn new(limits: &Limits, proxies: TrustedProxies) -> Arc<Self> {
         Arc::new(Self {
-            rate: RateLimit::new(limits.connections_per_s),
+            rate: RateLimit::new("connections", limits.connections_per_s),
             penalty: Duration::from_secs(limits.flood_penalty_s),
             penalties: Mutex::default(),
             held: Quota::new("held connections", HELD_CONNECTIONS, HELD_SHARE),

@@ -11,6 +11,7 @@ use crate::http::session_token;
 pub(super) fn credential<'r, B>(
     request: &'r Request<B>,
     certificate: Option<&'r CertificateHolder>,
+    is_tls: bool,
     is_grpc: bool,
 ) -> Credential<'r> {
     let mut headers = request.headers().get_all(AUTHORIZATION).iter();
@@ -23,7 +24,7 @@ pub(super) fn credential<'r, B>(
             _ => Credential::Unreadable,
         };
     }
-    if !is_grpc && let Some(token) = session_token(request.headers()) {
+    if !is_grpc && let Some(token) = session_token(request.headers(), is_tls) {
         return Credential::Session(token);
     }
     certificate.map_or(Credential::None, Credential::Certificate)
@@ -38,6 +39,10 @@ mod tests {
 
     /// The credential of a request with these headers over a connection with a certificate.
     fn shown(headers: &[(&str, &str)], is_grpc: bool) -> String {
+        shown_over(headers, false, is_grpc)
+    }
+
+    fn shown_over(headers: &[(&str, &str)], is_tls: bool, is_grpc: bool) -> String {
         let holder = CertificateHolder {
             fingerprint: "00".into(),
             scope: Arc::new(Scope::new(Role::Viewer, Vec::new()).expect("all cameras")),
@@ -47,7 +52,7 @@ mod tests {
             request = request.header(*name, *value);
         }
         let request = request.body(()).expect("a request");
-        match credential(&request, Some(&holder), is_grpc) {
+        match credential(&request, Some(&holder), is_tls, is_grpc) {
             Credential::Key(key) => format!("key {key}"),
             Credential::Session(token) => format!("session {token}"),
             other => format!("{other:?}").split('(').next().unwrap_or_default().to_owned(),
@@ -60,6 +65,10 @@ mod tests {
         assert_eq!(shown(&[], false), "Certificate");
         assert_eq!(shown(&[cookie], false), "session t0");
         assert_eq!(shown(&[cookie], true), "Certificate", "cookies are for pages");
+        let own = ("cookie", "sightfix_session=t0; __Host-sightfix_session=t1");
+        assert_eq!(shown(&[own], false), "session t1", "TLS may end at a proxy");
+        assert_eq!(shown_over(&[own], true, false), "session t1");
+        assert_eq!(shown_over(&[cookie], true, false), "Certificate", "another host can set it");
         assert_eq!(shown(&[cookie, ("authorization", "bearer  k")], false), "key k");
         assert_eq!(shown(&[("authorization", "Basic eDp5")], false), "Unreadable");
         assert_eq!(

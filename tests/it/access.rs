@@ -409,6 +409,65 @@ async fn a_browser_signs_in_with_a_cookie_that_pages_of_others_cannot_use() {
     server.send("POST", "/v1/session", &headers, again).await.expect(200);
 }
 
+/// Signs in with a key; the cookie.
+async fn signed_in(server: &TestServer, key: &str, cookie: Option<&str>) -> Answer {
+    let own = format!("http://{}", server.address);
+    let mut headers = vec![("content-type", "application/json"), ("origin", own.as_str())];
+    headers.extend(cookie.map(|cookie| ("cookie", cookie)));
+    server.send("POST", "/v1/session", &headers, json!({ "key": key }).to_string()).await
+}
+
+fn cookie_of(answer: &Answer) -> String {
+    answer.header("set-cookie").split(';').next().expect("a cookie").to_owned()
+}
+
+async fn session_status(server: &TestServer, cookie: &str) -> StatusCode {
+    server.send("GET", "/v1/session", &[("cookie", cookie)], "").await.status
+}
+
+#[tokio::test]
+async fn nobodys_sign_in_ends_the_session_of_another() {
+    let folder = data_folder();
+    let [admin, edge] = [Role::Admin, Role::Edge].map(|role| create_key(&folder, role));
+    let limits = [("SIGHTFIX_LIMITS__SESSIONS_PER_KEY", "3"), ("SIGHTFIX_LIMITS__SESSIONS", "4")];
+    let server = TestServer::start_with(folder.path(), &limits);
+    let of_admin = cookie_of(&signed_in(&server, &admin, None).await.expect(200));
+    let mut of_edge = Vec::new();
+    for _ in 0..8 {
+        of_edge.push(cookie_of(&signed_in(&server, &edge, None).await.expect(200)));
+    }
+    assert_eq!(session_status(&server, &of_admin).await, 200, "of another key");
+    for (index, cookie) in of_edge.iter().enumerate() {
+        let status = if index < 5 { 401 } else { 200 };
+        assert_eq!(session_status(&server, cookie).await, status, "the key's oldest end: {index}");
+    }
+    let refused = signed_in(&server, &admin, None).await.expect(503);
+    assert!(refused.text().contains("4 sessions"), "{}", refused.text());
+    assert_eq!(session_status(&server, &of_admin).await, 200);
+    assert_eq!(session_status(&server, &of_edge[7]).await, 200);
+}
+
+#[tokio::test]
+async fn a_browser_has_one_session_and_over_https_a_cookie_of_its_host_alone() {
+    let (_folder, server, admin) = with_admin().await;
+    let first = cookie_of(&signed_in(&server, &admin, None).await.expect(200));
+    let second = cookie_of(&signed_in(&server, &admin, Some(&first)).await.expect(200));
+    assert_eq!(session_status(&server, &first).await, 401, "the one before has ended");
+    assert_eq!(session_status(&server, &second).await, 200);
+
+    let headers = [("content-type", "application/json"), ("origin", "https://127.0.0.1")];
+    let body = json!({ "key": admin }).to_string();
+    let secure = server.send("POST", "/v1/session", &headers, body).await.expect(200);
+    let cookie = secure.header("set-cookie").to_owned();
+    assert!(cookie.starts_with("__Host-sightfix_session=") && cookie.ends_with("; Secure"), "{cookie}");
+    assert!(cookie.contains("; Path=/;"), "{cookie}");
+    let both = format!("{second}; {}", cookie_of(&secure));
+    let ended = [("cookie", both.as_str()), ("origin", "https://127.0.0.1")];
+    server.send("DELETE", "/v1/session", &ended, "").await.expect(204);
+    assert_eq!(session_status(&server, &cookie_of(&secure)).await, 401, "the host's own counts");
+    assert_eq!(session_status(&server, &second).await, 200);
+}
+
 #[tokio::test]
 async fn an_address_that_others_reach_needs_a_key() {
     let folder = data_folder();

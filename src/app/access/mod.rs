@@ -19,6 +19,7 @@ use jiff::Timestamp;
 use self::key_table::KeyTable;
 use self::sessions::Sessions;
 use crate::clock::Clock;
+use crate::config::Limits;
 use crate::domain::{Error, ErrorKind, KeyId, KeySecret, Result};
 use crate::openid::{Identity, Provider};
 use crate::store::{KeysVersion, Store};
@@ -125,21 +126,31 @@ impl Access {
     /// Starts a session for the holder of a key.
     ///
     /// # Errors
-    /// `Unauthenticated` for a key that does not work.
+    /// `Unauthenticated` for a key that does not work; `Overloaded`.
     pub(super) fn start_session(
         &self,
         secret: &str,
         token: &SessionToken,
         now: Timestamp,
+        limits: &Limits,
     ) -> Result<Principal> {
         let key = self.keys.use_key(&KeySecret::parse(secret)?.digest(), now)?;
-        self.sessions.start_for_key(token, key.clone(), now);
+        self.sessions.start_for_key(token, key.clone(), now, limits)?;
         Ok(Principal::Key(key))
     }
 
     /// Starts a session for a person who has signed in.
-    pub(super) fn start_user_session(&self, identity: Identity, token: &SessionToken, now: Timestamp) {
-        self.sessions.start_for_user(token, identity, now);
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub(super) fn start_user_session(
+        &self,
+        identity: Identity,
+        token: &SessionToken,
+        now: Timestamp,
+        limits: &Limits,
+    ) -> Result<()> {
+        self.sessions.start_for_user(token, identity, now, limits)
     }
 
     /// Ends a session; nothing happens if there is none.

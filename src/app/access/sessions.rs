@@ -1,5 +1,5 @@
 //! Sessions of browsers: a token in a cookie stands for a key, so that no page holds the key itself, or for a person who
-//! has signed in by OpenID Connect.
+//! has signed in by OpenID Connect. Nobody's sign-in ends the session of somebody else.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,13 +11,12 @@ use jiff::{SignedDuration, Timestamp};
 use super::caller::Principal;
 use super::key_table::ActiveKey;
 use super::signed_in_user::SignedInUser;
-use crate::domain::SecretDigest;
+use crate::config::Limits;
+use crate::domain::{Error, ErrorKind, Result, SecretDigest};
 use crate::openid::Identity;
 
 /// How long a session lasts.
 pub const SESSION_TIME: SignedDuration = SignedDuration::from_hours(12);
-/// Sessions at a time; beyond, the oldest ends.
-const MAX_SESSIONS: usize = 1_000;
 
 /// The secret of a session.
 pub struct SessionToken(String);
@@ -41,6 +40,16 @@ impl SessionToken {
 enum Holder {
     Key(Arc<ActiveKey>),
     User(Arc<SignedInUser>),
+}
+
+impl Holder {
+    fn is(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Key(one), Self::Key(other)) => one.key().id == other.key().id,
+            (Self::User(one), Self::User(other)) => one.name() == other.name(),
+            _ => false,
+        }
+    }
 }
 
 struct Session {
@@ -75,25 +84,50 @@ impl Sessions {
     }
 
     /// A session of the holder of a key.
-    pub(super) fn start_for_key(&self, token: &SessionToken, key: Arc<ActiveKey>, now: Timestamp) {
-        self.start(token, Holder::Key(key), now);
+    ///
+    /// # Errors
+    /// `Overloaded` if there are as many sessions as there may be.
+    pub(super) fn start_for_key(
+        &self,
+        token: &SessionToken,
+        key: Arc<ActiveKey>,
+        now: Timestamp,
+        limits: &Limits,
+    ) -> Result<()> {
+        self.start(token, Holder::Key(key), now, limits)
     }
 
     /// A session of a person; who they are to all requests that come with its token.
-    pub(super) fn start_for_user(&self, token: &SessionToken, identity: Identity, now: Timestamp) {
-        self.start(token, Holder::User(Arc::new(SignedInUser::new(identity))), now);
+    ///
+    /// # Errors
+    /// As [`Sessions::start_for_key`].
+    pub(super) fn start_for_user(
+        &self,
+        token: &SessionToken,
+        identity: Identity,
+        now: Timestamp,
+        limits: &Limits,
+    ) -> Result<()> {
+        self.start(token, Holder::User(Arc::new(SignedInUser::new(identity))), now, limits)
     }
 
-    fn start(&self, token: &SessionToken, holder: Holder, now: Timestamp) {
+    fn start(&self, token: &SessionToken, holder: Holder, now: Timestamp, limits: &Limits) -> Result<()> {
         self.end_expired(now);
         let mut sessions = self.lock();
-        if sessions.len() >= MAX_SESSIONS {
-            let oldest = sessions.iter().min_by_key(|(_, session)| session.expires_at).map(|it| *it.0);
-            oldest.and_then(|oldest| sessions.remove(&oldest));
+        let of_holder = sessions.iter().filter(|(_, session)| session.holder.is(&holder));
+        let (count, oldest) = (of_holder.clone().count(), of_holder.min_by_key(|(_, it)| it.expires_at));
+        // A person who signs in again and again is let in; what they have forgotten ends.
+        if let Some(oldest) = oldest.map(|it| *it.0).filter(|_| count >= limits.sessions_per_key) {
+            sessions.remove(&oldest);
+        }
+        if sessions.len() >= limits.sessions {
+            let message = format!("there are {} sessions, the limit; try again later", limits.sessions);
+            return Err(Error::refused(ErrorKind::Overloaded, message));
         }
         let digest = SecretDigest::of(token.0.as_bytes());
         let expires_at = now.saturating_add(SESSION_TIME).unwrap_or(Timestamp::MAX);
         sessions.insert(digest.bucket(), Session { digest, holder, expires_at });
+        Ok(())
     }
 
     /// Whom a token stands for, who makes a request now.

@@ -31,11 +31,15 @@ fn main() -> Result<(), Box<dyn Error>> {
     let descriptors = protox::compile(FILES, [FOLDER])?;
     let folder = PathBuf::from(env::var("OUT_DIR")?);
     fs::write(folder.join("sightfix_descriptor.bin"), descriptors.encode_to_vec())?;
+    let mut prost = tonic_prost_build::Config::new();
+    // A codec finds the description of a message by its name.
+    prost.enable_type_names();
     tonic_prost_build::configure()
         .bytes(".")
+        .codec_path("crate::grpc::bounded_codec::BoundedCodec")
         // Half a kilobyte that would be moved a dozen times on its way out.
         .boxed(".sightfix.v1.StreamResponse.kind.answer")
-        .compile_fds(descriptors)?;
+        .compile_fds_with_config(descriptors, prost)?;
     fs::write(folder.join("console_assets.rs"), console_assets()?)?;
     Ok(())
 }

@@ -7,6 +7,7 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod audit;
+mod bounded_codec;
 mod cameras;
 mod cancel_on_shutdown;
 pub mod client;
@@ -17,6 +18,7 @@ mod idempotency;
 mod inference;
 mod keys;
 mod mask;
+mod message_memory;
 mod models;
 mod outbox;
 mod pages;

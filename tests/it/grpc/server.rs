@@ -120,21 +120,21 @@ pub(super) fn refusal_of(status: &Status, code: Code, reason: &str) -> (String, 
 }
 
 /// Calls a method that no client has been generated for, with these bytes as the message.
-async fn call(channel: &Channel, path: &'static str, message: &'static [u8]) -> Status {
+async fn call(channel: &Channel, path: &'static str, message: impl Into<Vec<u8>>) -> Status {
     let mut client = tonic::client::Grpc::new(channel.clone());
     client.ready().await.expect("a connection");
     let codec = tonic_prost::ProstCodec::<AsIs, AsIs>::default();
     let path = hyper::http::uri::PathAndQuery::from_static(path);
-    client.unary(Request::new(AsIs(message)), path, codec).await.expect_err("refused")
+    client.unary(Request::new(AsIs(message.into())), path, codec).await.expect_err("refused")
 }
 
 /// Bytes that are sent as they are.
 #[derive(Debug, Default)]
-struct AsIs(&'static [u8]);
+struct AsIs(Vec<u8>);
 
 impl prost::Message for AsIs {
     fn encode_raw(&self, buffer: &mut impl bytes::BufMut) {
-        buffer.put_slice(self.0);
+        buffer.put_slice(&self.0);
     }
 
     fn merge_field(
@@ -152,7 +152,7 @@ impl prost::Message for AsIs {
     }
 
     fn clear(&mut self) {
-        self.0 = &[];
+        self.0.clear();
     }
 }
 
@@ -176,6 +176,31 @@ async fn messages_that_cannot_be_read_are_the_clients_fault() {
     let request = proto::GetCameraRequest { camera_id: "x".repeat(1_001) };
     let status = server.cameras().get_camera(request).await.expect_err("too large");
     refusal_of(&status, Code::ResourceExhausted, "too-large");
+}
+
+#[tokio::test]
+async fn a_message_has_no_more_elements_than_its_length_has_memory_for() {
+    let server = Server::start().await;
+    // A field of two bytes, again and again: an empty message, or an empty text.
+    let contents =
+        [&[0x2a, 0x84, 0x80, 0x20, 0x2a, 0x80, 0x80, 0x20][..], &b"\x42\0".repeat(1 << 18)].concat();
+    for (path, message) in [
+        ("/sightfix.v1.FusionService/Fuse", b"\x12\0".repeat(1 << 20)),
+        ("/sightfix.v1.SampleService/ImportSamples", b"\x12\0".repeat(1 << 20)),
+        ("/sightfix.v1.ModelService/EstimateGnssError", b"\x12\0".repeat(1 << 20)),
+        ("/sightfix.v1.KeyService/CreateKey", b"\x1a\0".repeat(1 << 20)),
+        ("/inference.GRPCInferenceService/ModelInfer", b"\x2a\0".repeat(1 << 20)),
+        ("/inference.GRPCInferenceService/ModelInfer", b"\x3a\0".repeat(1 << 20)),
+        ("/inference.GRPCInferenceService/ModelInfer", contents),
+    ] {
+        let status = call(&server.channel, path, message).await;
+        let (message, _) = refusal_of(&status, Code::ResourceExhausted, "too-large");
+        assert!(message.contains("elements"), "{path}: {message}");
+    }
+    // A thousand short observations are a batch.
+    let fix = b"\x12\x14\x22\x12\x09\0\0\0\0\0\0\x20\x40\x11\0\0\0\0\0\x80\x47\x40";
+    let status = call(&server.channel, "/sightfix.v1.FusionService/Fuse", fix.repeat(1_000)).await;
+    assert!(!status.message().contains("elements"), "{status:?}");
 }
 
 #[tokio::test]

@@ -2,7 +2,7 @@
 //!
 //! A request is answered here first. If the answer is that another node has the camera, the request goes there: what was
 //! read of its body, which is recorded until the answer begins, then the rest. So this file knows no route, and a request
-//! that this node answers costs the record alone.
+//! that this node answers costs the record alone. Imports are not recorded: any node stores them.
 
 use std::collections::VecDeque;
 use std::io;
@@ -32,7 +32,10 @@ use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 
 use super::activity::GRPC_STATUS;
-use crate::admission::RequestClass;
+use super::proxies::{X_FORWARDED_FOR, X_FORWARDED_PROTO};
+use crate::admission::{Lease, RequestClass};
+use crate::app::access::Caller;
+use crate::domain::Error;
 use crate::grpc;
 use crate::shutdown::Shutdown;
 use crate::tls_client::{authorities, client_config};
@@ -65,19 +68,22 @@ impl Forwarder {
     pub(super) async fn answer<F>(
         &self,
         request: Request<Body>,
+        class: RequestClass,
         is_grpc: bool,
+        memory: Result<Lease, Error>,
         answer_here: impl FnOnce(Request<Body>) -> F,
     ) -> Response<Body>
     where
         F: Future<Output = Response<Body>>,
     {
         // Sessions of browsers are those of one node.
-        if request.headers().contains_key(FORWARDED) || request.headers().contains_key(COOKIE) {
+        let is_own = request.headers().contains_key(FORWARDED) || request.headers().contains_key(COOKIE);
+        if is_own || matches!(class, RequestClass::Import | RequestClass::ImportStream) {
             return answer_here(request).await;
         }
         let (parts, body) = request.into_parts();
-        let is_live = is_grpc && grpc::class(parts.uri.path()) == RequestClass::LiveStream;
-        let record = Record::of(body, self.record_bytes);
+        let is_live = class == RequestClass::LiveStream;
+        let record = Record::of(body, self.record_bytes, memory.ok());
         let head = copy_of(&parts);
         let here = answer_here(Request::from_parts(parts, Body::new(RecordedBody(record.clone())))).await;
         let (here, owner) = owner_of(here, is_grpc, is_live).await;
@@ -142,6 +148,18 @@ fn copy_of(parts: &Parts) -> Parts {
     for name in OF_ONE_CONNECTION {
         copy.headers.remove(name);
     }
+    // The other node may trust this one, which is no word for what the client claims.
+    copy.headers.remove(X_FORWARDED_FOR);
+    copy.headers.remove(X_FORWARDED_PROTO);
+    let address = parts.extensions.get::<Caller>().and_then(|caller| caller.actor().address);
+    if let Some(address) = address.and_then(|address| HeaderValue::from_str(&address.to_string()).ok()) {
+        copy.headers.insert(X_FORWARDED_FOR, address);
+    }
+    if let Some(scheme) =
+        parts.extensions.get::<Scheme>().and_then(|it| HeaderValue::from_str(it.as_str()).ok())
+    {
+        copy.headers.insert(X_FORWARDED_PROTO, scheme);
+    }
     copy.headers.insert(FORWARDED, HeaderValue::from_static("1"));
     copy.headers.insert(TE, HeaderValue::from_static("trailers"));
     copy
@@ -167,7 +185,7 @@ async fn owner_of(response: Response<Body>, is_grpc: bool, is_live: bool) -> (Re
         return (Response::from_parts(parts, body), None);
     };
     let owner = first.as_ref().ok().and_then(Frame::trailers_ref).and_then(grpc_owner);
-    let body = Body::new(Replay { read: VecDeque::from([first]), rest: body, end: None });
+    let body = Body::new(Replay { read: VecDeque::from([first]), rest: body, end: None, memory: None });
     (Response::from_parts(parts, body), owner)
 }
 
@@ -193,11 +211,15 @@ struct Recorded {
     read: Option<VecDeque<Result<Frame<Bytes>, axum::Error>>>,
     /// How much more may be recorded, bytes.
     room_bytes: usize,
+    /// What is recorded, as limits count it.
+    memory: Option<Lease>,
 }
 
 impl Record {
-    fn of(body: Body, room_bytes: usize) -> Self {
-        Self(Arc::new(Mutex::new(Recorded { rest: Some(body), read: Some(VecDeque::new()), room_bytes })))
+    /// Records nothing where no memory is granted.
+    fn of(body: Body, room_bytes: usize, memory: Option<Lease>) -> Self {
+        let read = memory.is_some().then(VecDeque::new);
+        Self(Arc::new(Mutex::new(Recorded { rest: Some(body), read, room_bytes, memory })))
     }
 
     fn lock(&self) -> MutexGuard<'_, Recorded> {
@@ -206,27 +228,34 @@ impl Record {
 
     /// Records nothing from now on.
     fn stop(&self) {
-        self.lock().read = None;
+        self.lock().stop();
     }
 
     /// The whole body from its start, unless more was read than is recorded. The reader here gets no more of it.
     fn replay(&self) -> Option<Replay> {
         let mut recorded = self.lock();
         let read = recorded.read.take()?;
-        Some(Replay { read, rest: recorded.rest.take()?, end: None })
+        let memory = recorded.memory.take();
+        Some(Replay { read, rest: recorded.rest.take()?, end: None, memory })
     }
 }
 
 impl Recorded {
     fn record(&mut self, frame: &Frame<Bytes>) {
         let (Some(data), Some(read)) = (frame.data_ref(), &mut self.read) else { return };
+        let is_counted = |memory: &mut Lease| memory.try_grow(data.len() as u64).is_ok();
         match self.room_bytes.checked_sub(data.len()) {
-            Some(room_bytes) => {
+            Some(room_bytes) if self.memory.as_mut().is_some_and(is_counted) => {
                 self.room_bytes = room_bytes;
                 read.push_back(Ok(Frame::data(data.clone())));
             }
-            None => self.read = None,
+            _ => self.stop(),
         }
+    }
+
+    fn stop(&mut self) {
+        self.read = None;
+        self.memory = None;
     }
 }
 
@@ -268,6 +297,8 @@ struct Replay {
     rest: Body,
     /// When it ends, whatever the client still sends.
     end: Option<BoxFuture<'static, ()>>,
+    /// What was read, as limits count it.
+    memory: Option<Lease>,
 }
 
 impl Replay {
@@ -288,6 +319,7 @@ impl HttpBody for Replay {
         if let Some(frame) = self.read.pop_front() {
             return Poll::Ready(Some(frame));
         }
+        self.memory = None;
         if self.end.as_mut().is_some_and(|end| end.poll_unpin(context).is_ready()) {
             self.end = None;
             self.rest = Body::empty();

@@ -12,8 +12,9 @@ use super::peer::Peer;
 use crate::admission::ClientId;
 
 /// Addresses of the client and of the proxies that passed its request on, in this order.
-const X_FORWARDED_PROTO: &str = "x-forwarded-proto";
-const X_FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
+pub(super) const X_FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
+/// The scheme by which the first proxy got the request.
+pub(super) const X_FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
 
 /// The proxies whose statement of the client's address is used.
 #[derive(Clone, Default)]

@@ -76,3 +76,29 @@ async fn a_killed_owner_is_followed_behind_a_node_that_sends_on() {
     assert_eq!((feed.answered_by(), fence(folder.path(), "yard")), (&*url(&second), 2));
     assert_stored_once(&second, &feed).await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_node_says_itself_whose_request_it_sends_on() {
+    let folder = data_folder();
+    let settings = [
+        ("SIGHTFIX_NODE_LEASE_S", "2"),
+        ("SIGHTFIX_TRUSTED_PROXIES", "127.0.0.1"),
+        ("SIGHTFIX_LIMITS__REQUESTS_PER_S", "3"),
+    ];
+    let (owner, other) = (TestServer::start_with(folder.path(), &settings), proxying_node(folder.path()));
+    create(&owner, &json!({"id": "yard"})).await;
+    let path = "/v1/cameras/yard/tracks?store_samples=false";
+    let observation = json!({"time": "2026-01-01T00:00:00Z", "target_id": "a",
+        "fix": {"longitude_deg": 8.0, "latitude_deg": 47.0}});
+    owner.post(path, &observation).await.expect(200);
+    // Each claims to be of another client; all are of one address.
+    let mut statuses = Vec::new();
+    for number in 0..50 {
+        let headers =
+            [("content-type", "application/json"), ("x-forwarded-for", &*format!("203.0.113.{number}"))];
+        let answer = other.send("POST", path, &headers, observation.to_string()).await;
+        statuses.push(answer.status.as_u16());
+    }
+    assert!(statuses.contains(&200) && statuses.contains(&429), "{statuses:?}");
+}

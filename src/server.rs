@@ -18,6 +18,7 @@ mod host_check;
 mod peer;
 mod pipeline;
 mod proxies;
+mod refused_body;
 mod request_body;
 mod revocable_body;
 mod tls;

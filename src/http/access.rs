@@ -7,7 +7,7 @@ use std::task::{Context, Poll};
 
 use axum::extract::{FromRequestParts, MatchedPath, Request};
 use axum::response::{IntoResponse as _, Response};
-use futures_util::future::{BoxFuture, Either};
+use futures_util::future::{Either, Ready, ready};
 use hyper::http::request::Parts;
 use hyper::{Method, Uri};
 use tower::{Layer, Service};
@@ -15,7 +15,7 @@ use utoipa::openapi::path::ParameterIn;
 use utoipa::openapi::{OpenApi, RefOr};
 
 use super::Rest;
-use super::body::discard;
+use super::body_coding::decoded;
 use super::extract::Params;
 use super::problem::{ApiError, ApiResult};
 use crate::app::App;
@@ -69,7 +69,7 @@ impl QueryParameters {
 }
 
 /// Refuses a request before its handler runs, if the caller may not use the matched route, or the query has
-/// what the operation does not know.
+/// what the operation does not know. Only the body of a request that is let through is decoded.
 #[derive(Clone)]
 pub(super) struct AuthorizeLayer(Arc<QueryParameters>);
 
@@ -112,20 +112,17 @@ impl<S> Authorize<S> {
 impl<S: Service<Request, Response = Response>> Service<Request> for Authorize<S> {
     type Response = Response;
     type Error = S::Error;
-    type Future = Either<S::Future, BoxFuture<'static, std::result::Result<Response, S::Error>>>;
+    type Future = Either<S::Future, Ready<std::result::Result<Response, S::Error>>>;
 
     fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<std::result::Result<(), S::Error>> {
         self.inner.poll_ready(context)
     }
 
     fn call(&mut self, request: Request) -> Self::Future {
-        match self.check(&request) {
-            Ok(()) => Either::Left(self.inner.call(request)),
-            Err(error) => Either::Right(Box::pin(async move {
-                let (head, mut body) = request.into_parts();
-                discard(&head.headers, &mut body).await;
-                Ok(ApiError::from(error).into_response())
-            })),
+        let checked = self.check(&request).map_err(|error| ApiError::from(error).into_response());
+        match checked.and_then(|()| decoded(request)) {
+            Ok(request) => Either::Left(self.inner.call(request)),
+            Err(refusal) => Either::Right(ready(Ok(refusal))),
         }
     }
 }

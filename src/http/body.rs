@@ -1,30 +1,23 @@
 //! Request bodies: read up to a limit, or spooled to a file so that a long one costs no memory.
 
-use std::time::Duration;
-
 use axum::body::Body;
 use bytes::{Bytes, BytesMut};
 use http_body_util::BodyExt as _;
 use hyper::HeaderMap;
-use hyper::header::{CONTENT_LENGTH, EXPECT};
+use hyper::header::CONTENT_LENGTH;
 use hyper::http::request::Parts;
 
-use super::body_error::is_undecodable;
+use super::body_error::BodyError;
 use crate::admission::ClientId;
 use crate::app::{App, Spool, Spooled};
 use crate::domain::{Error, ErrorKind, Result};
 
-/// What is read and thrown away of a body that is too large, so that the client gets its answer
-/// and not a broken connection, and for how long.
-const DISCARD_BYTES: u64 = 256 << 20;
-const DISCARD_TIME: Duration = Duration::from_secs(10);
-
-/// The whole body.
+/// The whole body. What is beyond the limit is not read, and so never decoded.
 ///
 /// # Errors
 /// `TooLarge` beyond the limit; `Timeout` and `Cancelled` for a body that does not come.
 pub(super) async fn whole(headers: &HeaderMap, mut body: Body, limit: usize) -> Result<Bytes> {
-    check_announced(headers, &mut body, limit).await?;
+    check_announced(headers, limit)?;
     let Some(first) = next(&mut body).await? else { return Ok(Bytes::new()) };
     let mut gathered = Gathered::One(first);
     while let Some(part) = next(&mut body).await? {
@@ -33,11 +26,7 @@ pub(super) async fn whole(headers: &HeaderMap, mut body: Body, limit: usize) -> 
             break;
         }
     }
-    if gathered.len() > limit {
-        discard(headers, &mut body).await;
-        return Err(too_large(limit));
-    }
-    Ok(gathered.into_bytes())
+    if gathered.len() > limit { Err(too_large(limit)) } else { Ok(gathered.into_bytes()) }
 }
 
 /// Mostly a body comes in one part, which then need not be copied.
@@ -78,15 +67,13 @@ impl Gathered {
 /// temporary file cannot be written.
 pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
     let limit = app.limits.import_bytes;
-    check_announced(&head.headers, &mut body, limit).await?;
+    check_announced(&head.headers, limit)?;
     let mut spool = Spool::new(app, client_id(head))?;
     while let Some(part) = next(&mut body).await? {
-        let pushed =
-            if spool.length() + part.len() > limit { Err(too_large(limit)) } else { spool.push(part).await };
-        if let Err(error) = pushed {
-            discard(&head.headers, &mut body).await;
-            return Err(error);
+        if spool.length() + part.len() > limit {
+            return Err(too_large(limit));
         }
+        spool.push(part).await?;
     }
     spool.finish().await
 }
@@ -100,14 +87,7 @@ async fn next(body: &mut Body) -> Result<Option<Bytes>> {
     loop {
         match body.frame().await {
             None => return Ok(None),
-            Some(Err(error)) if is_undecodable(&error) => {
-                return Err(Error::refused(
-                    ErrorKind::MalformedBody,
-                    "the body is not of its content-encoding, or is cut off",
-                ));
-            }
-            // Why a body was refused is known, and reported, where requests are admitted.
-            Some(Err(_)) => return Err(Error::refused(ErrorKind::Cancelled, "the body broke off")),
+            Some(Err(error)) => return Err(BodyError::of(&error).refusal()),
             Some(Ok(frame)) => {
                 if let Ok(part) = frame.into_data() {
                     return Ok(Some(part));
@@ -122,9 +102,8 @@ fn too_large(limit: usize) -> Error {
 }
 
 /// Refuses a body by the length that its header announces, before any of it is read.
-async fn check_announced(headers: &HeaderMap, body: &mut Body, limit: usize) -> Result<()> {
+fn check_announced(headers: &HeaderMap, limit: usize) -> Result<()> {
     if announced(headers).is_some_and(|length| length > limit as u64) {
-        discard(headers, body).await;
         return Err(too_large(limit));
     }
     Ok(())
@@ -132,23 +111,4 @@ async fn check_announced(headers: &HeaderMap, body: &mut Body, limit: usize) -> 
 
 fn announced(headers: &HeaderMap) -> Option<u64> {
     headers.get(CONTENT_LENGTH)?.to_str().ok()?.parse().ok()
-}
-
-/// Many clients send all before they read a word; an answer to a half-read body would reach them
-/// as a reset connection. One that waits for `100 Continue` is answered at once.
-pub(super) async fn discard(headers: &HeaderMap, body: &mut Body) {
-    if headers.contains_key(EXPECT) || announced(headers).is_some_and(|length| length > DISCARD_BYTES) {
-        return;
-    }
-    let reading = async {
-        let mut left = DISCARD_BYTES;
-        while let Ok(Some(part)) = next(body).await {
-            left = left.saturating_sub(part.len() as u64);
-            if left == 0 {
-                return;
-            }
-        }
-    };
-    // Whether all came or not, the answer is the same.
-    let _ = tokio::time::timeout(DISCARD_TIME, reading).await;
 }

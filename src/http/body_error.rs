@@ -3,34 +3,54 @@
 use std::error::Error as StdError;
 use std::fmt;
 
-/// Why a decoded body ends early.
-#[derive(Debug, PartialEq, Eq)]
+use crate::domain::{Error, ErrorKind};
+
+/// Why a body ends early.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum BodyError {
-    /// The coded body broke off or was refused.
+    /// It broke off, or was refused where requests are admitted, which is known and reported there.
     Broken,
     /// It is not of its coding.
     Undecodable,
+    /// It decodes to more than its length allows.
+    TooDense,
+}
+
+impl BodyError {
+    /// Why a body ended early.
+    pub(super) fn of(error: &axum::Error) -> Self {
+        let mut cause: Option<&(dyn StdError + 'static)> = Some(error);
+        while let Some(error) = cause {
+            if let Some(reason) = error.downcast_ref::<Self>() {
+                return *reason;
+            }
+            cause = error.source();
+        }
+        Self::Broken
+    }
+
+    /// What its sender is told.
+    pub(super) fn refusal(self) -> Error {
+        let kind = match self {
+            Self::Broken => ErrorKind::Cancelled,
+            Self::Undecodable => ErrorKind::MalformedBody,
+            Self::TooDense => ErrorKind::TooLarge,
+        };
+        Error::refused(kind, self.to_string())
+    }
 }
 
 impl fmt::Display for BodyError {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
             Self::Broken => "the body broke off",
-            Self::Undecodable => "the body cannot be decoded",
+            Self::Undecodable => "the body is not of its content-encoding, or is cut off",
+            Self::TooDense => {
+                "the body decodes to more than its length allows (docs/operations.md, limits); send it without \
+                 a content-encoding"
+            }
         })
     }
 }
 
 impl StdError for BodyError {}
-
-/// Whether a body ended early because it is not of its coding.
-pub(super) fn is_undecodable(error: &axum::Error) -> bool {
-    let mut cause: Option<&(dyn StdError + 'static)> = Some(error);
-    while let Some(error) = cause {
-        if error.downcast_ref() == Some(&BodyError::Undecodable) {
-            return true;
-        }
-        cause = error.source();
-    }
-    false
-}

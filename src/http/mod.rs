@@ -75,6 +75,7 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
+pub use body_coding::most_decoded_bytes;
 pub use session::session_token;
 
 /// What the handlers share.
@@ -126,10 +127,7 @@ impl Transport {
         // Not as layers of the router: axum would box the service and the future of every request for each.
         let coding = body_coding::AcceptedCoding::of(&request);
         let refused = problem::Refused::of(&request);
-        let answer = match body_coding::decoded(request).await {
-            Ok(request) => AssertUnwindSafe(self.0.clone().call(request)).catch_unwind().await,
-            Err(refusal) => Ok(Ok(refusal)),
-        };
+        let answer = AssertUnwindSafe(self.0.clone().call(request)).catch_unwind().await;
         let answer =
             answer.map_or_else(problem::panicked, |answer| answer.unwrap_or_else(|never| match never {}));
         coding.encode(refused.explain(answer)).await

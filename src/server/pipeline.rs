@@ -7,13 +7,11 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Body;
-use http_body_util::BodyExt as _;
 use hyper::body::{Body as _, Incoming};
 use hyper::header::{CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, EXPECT, X_CONTENT_TYPE_OPTIONS};
 use hyper::http::HeaderValue;
 use hyper::http::uri::Scheme;
 use hyper::{Method, Request, Response, Version};
-use tokio::sync::Semaphore;
 use tower::{Layer as _, Service as _, ServiceExt as _, service_fn};
 use tower_http::cors::CorsLayer;
 use tracing::field::{Empty, display};
@@ -25,6 +23,7 @@ use super::forward::Forwarder;
 use super::host_check::HostCheck;
 use super::peer::Peer;
 use super::proxies::TrustedProxies;
+use super::refused_body::{Discards, read_in_vain};
 use super::request_body::{AdmittedBody, RateGuard, Ticket};
 use super::revocable_body::RevocableBody;
 use crate::admission::{BodyRefusal, ClientId, RequestClass};
@@ -34,16 +33,12 @@ use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::shutdown::Shutdown;
 use crate::telemetry::{MatchedRoute, Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
-use crate::{grpc, http, status};
+use crate::{grpc, http};
 
 /// Longest request id that is taken from a client, in bytes.
 const LONGEST_REQUEST_ID: usize = 128;
-/// Bodies of refused requests that are read to their end at a time; more clients are answered at once.
-const DISCARDED_BODIES: usize = 256;
 /// Longest time for which the refusal of a client waits whose bodies were refused before.
 const REFUSED_WAIT: Duration = Duration::from_secs(1);
-/// How long the body of a refused request is read.
-const DISCARD_TIME: Duration = Duration::from_secs(10);
 
 /// Whom a listener serves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -76,7 +71,7 @@ pub(super) struct RequestPipeline {
     hosts: HostCheck,
     proxies: TrustedProxies,
     shutdown: Shutdown,
-    discards: Semaphore,
+    discards: Discards,
     audience: Audience,
     cors: Option<CorsLayer>,
 }
@@ -87,6 +82,7 @@ struct Granted {
     caller: Caller,
     /// As limits count the caller.
     client: ClientId,
+    class: RequestClass,
 }
 
 /// The body of every response; it holds the request's memory until its end.
@@ -110,7 +106,7 @@ impl RequestPipeline {
             proxies,
             cors,
             shutdown: shutdown.clone(),
-            discards: Semaphore::new(DISCARDED_BODIES),
+            discards: Discards::default(),
             audience: Audience::Clients,
             app,
         }
@@ -126,7 +122,7 @@ impl RequestPipeline {
             proxies: TrustedProxies::default(),
             cors: None,
             shutdown: shutdown.clone(),
-            discards: Semaphore::new(DISCARDED_BODIES),
+            discards: Discards::default(),
             audience: Audience::Monitoring,
             app,
         }
@@ -232,11 +228,9 @@ impl RequestPipeline {
         id: &RequestId,
     ) -> (Response<Body>, Option<Ticket>) {
         let is_grpc = counted.is_grpc();
-        let is_encoded = request.headers().contains_key(CONTENT_ENCODING);
         match self.admit(request, counted, peer, id).await {
             Ok((request, granted)) => {
                 let response = self.route(is_grpc, request, &granted, id).await;
-                self.charge_refused(&response, &granted, is_encoded);
                 (response, Some(granted.ticket))
             }
             Err(error) => {
@@ -268,7 +262,7 @@ impl RequestPipeline {
         };
         match granted {
             Ok(granted) => {
-                let Granted { ticket, caller, client } = &granted;
+                let Granted { ticket, caller, client, .. } = &granted;
                 let limits = &self.app.limits;
                 // A live stream may be silent for longer, and looks after that itself.
                 let pace = (class != RequestClass::LiveStream)
@@ -289,9 +283,23 @@ impl RequestPipeline {
                 Ok((request, granted))
             }
             Err(error) => {
-                self.discard(request).await;
+                // HTTP/2 ends the stream alone.
+                self.discard_refused(request, &error, peer).await;
                 Err(error)
             }
+        }
+    }
+
+    /// Reads the body of a request that was refused by its head. That of a stranger counts for the address.
+    async fn discard_refused(&self, request: Request<Incoming>, error: &Error, peer: &Peer) {
+        let (bodies, now) = (&self.app.quotas.refused_bodies, tokio::time::Instant::now);
+        let is_stranger = matches!(error.kind(), ErrorKind::Unauthenticated | ErrorKind::PermissionDenied);
+        let is_in_debt = is_stranger && bodies.wait(peer.client, now()).is_some();
+        // HTTP/2 ends the stream alone, and one that waits for `100 Continue` sends no more.
+        let is_read = request.version() < Version::HTTP_2 && !request.headers().contains_key(EXPECT);
+        let bytes = self.discards.read((is_read && !is_in_debt).then(|| request.into_body())).await;
+        if is_stranger {
+            bodies.charge(peer.client, bytes, now());
         }
     }
 
@@ -315,29 +323,6 @@ impl RequestPipeline {
         Err(Error::refused(ErrorKind::RateLimited, message))
     }
 
-    /// Charges a client for a body that was read in vain.
-    fn charge_refused(&self, response: &Response<Body>, granted: &Granted, is_encoded: bool) {
-        let is = |kind| response.status().as_u16() == status::of(kind).http;
-        let received = granted.ticket.received_bytes();
-        let body_bytes = self.app.limits.body_bytes as u64;
-        let bytes = match response.headers().get(GRPC_STATUS).map(HeaderValue::to_str) {
-            // Of the codes of gRPC only this one is always about the content.
-            Some(Ok(code)) if code.parse::<i32>() == Ok(status::of(ErrorKind::InvalidArgument).grpc) => {
-                received
-            }
-            Some(_) => return,
-            // What is beyond a limit is not looked at.
-            None if is(ErrorKind::TooLarge) => received.min(body_bytes),
-            None if is(ErrorKind::InvalidArgument) || is(ErrorKind::MalformedBody) => received,
-            None => return,
-        };
-        // What was decoded is not known here; what a body may be at most is.
-        let bytes = if is_encoded && bytes > 0 { bytes.max(body_bytes) } else { bytes };
-        if bytes > 0 {
-            self.app.quotas.refused_bodies.charge(granted.client, bytes, tokio::time::Instant::now());
-        }
-    }
-
     fn grant(
         &self,
         request: &Request<Incoming>,
@@ -352,14 +337,15 @@ impl RequestPipeline {
             return Err(Error::Refused(refusal.clone()));
         }
         self.hosts.check(request)?;
-        let now = tokio::time::Instant::now();
         let caller = self.caller(request, class, is_grpc, peer, id).map_err(|error| {
             // Guesses of keys count for the address that they come from.
-            self.app.quotas.request_rate.count(peer.client, now).err().unwrap_or(error)
+            self.count_anonymous(peer.client).err().unwrap_or(error)
         })?;
         let client = caller.actor().key_id.map_or(peer.client, ClientId::Key);
-        if class != RequestClass::Probe {
-            self.app.quotas.request_rate.count(client, now)?;
+        match caller.principal() {
+            _ if class == RequestClass::Probe => {}
+            Principal::Anonymous => self.count_anonymous(client)?,
+            _ => self.app.quotas.request_rate.count(client, tokio::time::Instant::now())?,
         }
         if is_grpc {
             // `http` compares a route's permission itself: it knows the template of the path.
@@ -382,7 +368,14 @@ impl RequestPipeline {
         if has_no_body || class == RequestClass::ImportStream {
             ticket.begin_work()?;
         }
-        Ok(Granted { ticket, caller, client })
+        Ok(Granted { ticket, caller, client, class })
+    }
+
+    /// Counts a request without a credential that works.
+    fn count_anonymous(&self, client: ClientId) -> Result<()> {
+        let (quotas, now) = (&self.app.quotas, tokio::time::Instant::now());
+        quotas.request_rate.count(client, now)?;
+        quotas.anonymous_rate.count(client, now)
     }
 
     /// Who makes the request.
@@ -397,7 +390,7 @@ impl RequestPipeline {
         if self.audience == Audience::Monitoring {
             return Ok(Caller::program("monitoring"));
         }
-        let credential = credential(request, peer.certificate.as_ref(), is_grpc);
+        let credential = credential(request, peer.certificate.as_ref(), peer.is_tls, is_grpc);
         if let Credential::Session(_) = credential {
             self.hosts.check_same_origin(request)?;
         }
@@ -421,20 +414,27 @@ impl RequestPipeline {
         granted: &Granted,
         id: &RequestId,
     ) -> Response<Body> {
-        let Granted { ticket, caller, .. } = granted;
+        let Granted { ticket, caller, class, .. } = granted;
         let time = Duration::from_secs(self.app.limits.request_s);
         // An import stream reports by itself what it has stored of a body that was refused.
         let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
+        let is_encoded = request.headers().contains_key(CONTENT_ENCODING);
+        // HTTP/2 ends the stream alone, and one that waits for `100 Continue` sends no more.
+        let is_discarded = !is_grpc && !request.headers().contains_key(EXPECT);
         let answer_here = |request| async move {
             if !is_grpc {
                 return self.http.answer(request).await;
             }
-            let answer = self.grpc.clone().call(request).await;
+            let memory = self.app.quotas.decoded_memory(granted.client, ticket.refusal());
+            let answer = memory.scope(self.grpc.clone().call(request)).await;
             answer.unwrap_or_else(|never| match never {})
         };
         let answer = async {
             match &self.forwarder {
-                Some(forwarder) => forwarder.answer(request, is_grpc, answer_here).await,
+                Some(forwarder) => {
+                    let memory = self.app.quotas.open_request(granted.client);
+                    forwarder.answer(request, *class, is_grpc, memory, answer_here).await
+                }
                 None => answer_here(request).await,
             }
         };
@@ -444,33 +444,32 @@ impl RequestPipeline {
             error = caller.ended() => Err(error),
             () = self.shutdown.forced() => Err(shutting_down()),
         };
-        ticket.end_work();
+        let rest = ticket.end_work().filter(|_| is_discarded);
         let refusal = ticket.refusal().get().filter(|_| !reports_refusal);
         match (answer, refusal) {
-            (Err(error), _) | (Ok(_), Some(error)) => {
-                if error.kind() == ErrorKind::Overloaded {
-                    self.app.metrics.refused();
-                }
-                refuse(is_grpc, &error, id)
+            (Err(error), _) => self.refuse_admitted(is_grpc, &error, id),
+            (Ok(_), Some(error)) => {
+                self.discards.read(rest).await;
+                self.refuse_admitted(is_grpc, &error, id)
             }
             (Ok(response), None) => {
+                let is_refused = response.status().is_client_error() || response.status().is_server_error();
+                let discarded = self.discards.read(rest.filter(|_| is_refused)).await;
                 let response = if is_grpc { grpc::explain(response, id) } else { response };
+                let received = ticket.received_bytes();
+                let in_vain = read_in_vain(&response, received, discarded, is_encoded, &self.app.limits);
+                let bodies = &self.app.quotas.refused_bodies;
+                bodies.charge(granted.client, in_vain, tokio::time::Instant::now());
                 revocable(response, caller, is_grpc.then_some(id))
             }
         }
     }
 
-    /// Reads the body of a refused HTTP/1 request: a client that sends all before it reads a word
-    /// would else find a broken connection instead of the refusal. HTTP/2 ends the stream alone.
-    async fn discard(&self, request: Request<Incoming>) {
-        if request.version() >= Version::HTTP_2 || request.headers().contains_key(EXPECT) {
-            return;
+    fn refuse_admitted(&self, is_grpc: bool, error: &Error, id: &RequestId) -> Response<Body> {
+        if error.kind() == ErrorKind::Overloaded {
+            self.app.metrics.refused();
         }
-        let Ok(_turn) = self.discards.try_acquire() else { return };
-        let mut body = request.into_body();
-        let reading = async { while let Some(Ok(_)) = body.frame().await {} };
-        // Whether all came or not, the answer is the same.
-        let _ = tokio::time::timeout(DISCARD_TIME, reading).await;
+        refuse(is_grpc, error, id)
     }
 
     /// The client's own id where it can be logged as it is, else a new one.

@@ -19,10 +19,6 @@ use crate::app::App;
 use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Result};
 
-/// What is read and discarded of a refused request, so that its client reads the refusal and not a
-/// broken connection.
-const DISCARD_BYTES: u64 = 64 << 20;
-
 /// What one request was granted, shared between its body and the pipeline.
 #[derive(Clone)]
 pub(super) struct Ticket(Arc<Mutex<Grant>>);
@@ -37,6 +33,9 @@ struct Grant {
     memory: Option<Lease>,
     place: Option<Lease>,
     refusal: BodyRefusal,
+    /// What its reader left of the body.
+    rest: Option<Incoming>,
+    is_answered: bool,
 }
 
 impl Ticket {
@@ -63,6 +62,8 @@ impl Ticket {
             memory,
             place: None,
             refusal: BodyRefusal::default(),
+            rest: None,
+            is_answered: false,
         };
         Ok(Self(Arc::new(Mutex::new(grant))))
     }
@@ -83,9 +84,20 @@ impl Ticket {
         Ok(())
     }
 
-    /// The work is done and the answer begins.
-    pub(super) fn end_work(&self) {
-        self.lock().place = None;
+    /// The work is done and the answer begins. What its reader left of the body is for the caller.
+    pub(super) fn end_work(&self) -> Option<Incoming> {
+        let mut grant = self.lock();
+        grant.place = None;
+        grant.is_answered = true;
+        grant.rest.take()
+    }
+
+    /// Keeps what its reader leaves of a body until the answer begins.
+    fn leave(&self, rest: Incoming) {
+        let mut grant = self.lock();
+        if !grant.is_answered {
+            grant.rest = Some(rest);
+        }
     }
 
     /// Bytes of the body that were passed on.
@@ -126,49 +138,34 @@ impl Ticket {
 
 /// The body of a request.
 pub(super) struct AdmittedBody {
-    body: Incoming,
+    /// `None` once it has ended.
+    body: Option<Incoming>,
     ticket: Ticket,
     caller: Caller,
     /// `None` for a body that may be silent.
     pace: Option<RateGuard>,
-    state: BodyState,
-}
-
-#[derive(PartialEq, Eq)]
-enum BodyState {
-    Open,
-    /// Refused; so many bytes are still discarded before the reader gets the error.
-    Discarding(u64),
-    Ended,
 }
 
 impl AdmittedBody {
     pub(super) const fn new(body: Incoming, ticket: Ticket, caller: Caller, pace: Option<RateGuard>) -> Self {
-        Self { body, ticket, caller, pace, state: BodyState::Open }
+        Self { body: Some(body), ticket, caller, pace }
     }
 
-    /// What to do with a frame: pass it on, or begin to discard the body.
-    fn receive(&mut self, frame: Frame<Bytes>) -> Option<Frame<Bytes>> {
+    /// Counts a frame, the last one of the body or not.
+    fn receive(&mut self, frame: &Frame<Bytes>, is_last: bool) -> Result<()> {
         let bytes = frame.data_ref().map_or(0, Bytes::len) as u64;
         if let Some(pace) = &mut self.pace {
             pace.received(bytes);
         }
-        if let BodyState::Discarding(left) = &mut self.state {
-            *left = left.saturating_sub(bytes);
-            return None;
-        }
-        let charged = self.ticket.receive(bytes).and_then(|()| {
-            // Readers that know the length do not ask for the end.
-            if self.body.is_end_stream() { self.ticket.begin_work() } else { Ok(()) }
-        });
-        match charged {
-            Ok(()) => Some(frame),
-            Err(error) => {
-                self.ticket.refuse(error);
-                self.state = BodyState::Discarding(DISCARD_BYTES);
-                None
-            }
-        }
+        self.ticket.receive(bytes)?;
+        // Readers that know the length do not ask for the end.
+        if is_last { self.ticket.begin_work() } else { Ok(()) }
+    }
+
+    /// Ends the body with an error, which the ticket knows.
+    fn refuse(&mut self, error: Error) -> Poll<Option<Result<Frame<Bytes>, BodyRefused>>> {
+        self.ticket.refuse(error);
+        Poll::Ready(Some(Err(BodyRefused)))
     }
 }
 
@@ -181,60 +178,54 @@ impl Body for AdmittedBody {
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, BodyRefused>>> {
         let this = &mut *self;
-        if this.state == BodyState::Open
-            && let Err(error) = this.caller.check_active()
-        {
-            this.ticket.refuse(error);
-            this.state = BodyState::Ended;
-            return Poll::Ready(Some(Err(BodyRefused)));
+        let Some(mut body) = this.body.take() else { return Poll::Ready(None) };
+        if let Err(error) = this.caller.check_active() {
+            return this.refuse(error);
         }
-        loop {
-            match this.state {
-                BodyState::Ended => return Poll::Ready(None),
-                BodyState::Discarding(0) => {
-                    this.state = BodyState::Ended;
-                    return Poll::Ready(Some(Err(BodyRefused)));
+        match Pin::new(&mut body).poll_frame(context) {
+            Poll::Ready(Some(Ok(frame))) => match this.receive(&frame, body.is_end_stream()) {
+                Ok(()) => {
+                    this.body = Some(body);
+                    Poll::Ready(Some(Ok(frame)))
                 }
-                BodyState::Open | BodyState::Discarding(_) => {}
-            }
-            let end = match Pin::new(&mut this.body).poll_frame(context) {
-                Poll::Ready(Some(Ok(frame))) => {
-                    if let Some(frame) = this.receive(frame) {
-                        return Poll::Ready(Some(Ok(frame)));
-                    }
-                    continue;
-                }
-                Poll::Ready(Some(Err(error))) => {
-                    let message = format!("the body broke off: {error}");
-                    Err(Error::refused(ErrorKind::Cancelled, message))
-                }
-                Poll::Ready(None) => this.ticket.begin_work(),
-                Poll::Pending => match &mut this.pace {
-                    None => return Poll::Pending,
-                    Some(pace) => Err(ready!(pace.poll_too_slow(context))),
-                },
-            };
-            let was_open = this.state == BodyState::Open;
-            this.state = BodyState::Ended;
-            return Poll::Ready(match end {
-                Ok(()) if was_open => None,
-                Ok(()) => Some(Err(BodyRefused)),
                 Err(error) => {
-                    if was_open {
-                        this.ticket.refuse(error);
-                    }
-                    Some(Err(BodyRefused))
+                    this.ticket.leave(body);
+                    this.refuse(error)
                 }
-            });
+            },
+            Poll::Ready(Some(Err(error))) => {
+                let message = format!("the body broke off: {error}");
+                this.refuse(Error::refused(ErrorKind::Cancelled, message))
+            }
+            Poll::Ready(None) => match this.ticket.begin_work() {
+                Ok(()) => Poll::Ready(None),
+                Err(error) => this.refuse(error),
+            },
+            Poll::Pending => match this.pace.as_mut().map(|pace| pace.poll_too_slow(context)) {
+                Some(Poll::Ready(error)) => this.refuse(error),
+                Some(Poll::Pending) | None => {
+                    this.body = Some(body);
+                    Poll::Pending
+                }
+            },
         }
     }
 
     fn is_end_stream(&self) -> bool {
-        self.state == BodyState::Ended || self.state == BodyState::Open && self.body.is_end_stream()
+        self.body.as_ref().is_none_or(Body::is_end_stream)
     }
 
     fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
+        self.body.as_ref().map_or_else(|| SizeHint::with_exact(0), Body::size_hint)
+    }
+}
+
+/// What nobody reads is left to the pipeline.
+impl Drop for AdmittedBody {
+    fn drop(&mut self) {
+        if let Some(rest) = self.body.take().filter(|body| !body.is_end_stream()) {
+            self.ticket.leave(rest);
+        }
     }
 }
 

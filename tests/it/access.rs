@@ -455,14 +455,15 @@ async fn a_browser_has_one_session_and_over_https_a_cookie_of_its_host_alone() {
     assert_eq!(session_status(&server, &first).await, 401, "the one before has ended");
     assert_eq!(session_status(&server, &second).await, 200);
 
-    let headers = [("content-type", "application/json"), ("origin", "https://127.0.0.1")];
+    let own = format!("https://{}", server.address);
+    let headers = [("content-type", "application/json"), ("origin", own.as_str())];
     let body = json!({ "key": admin }).to_string();
     let secure = server.send("POST", "/v1/session", &headers, body).await.expect(200);
     let cookie = secure.header("set-cookie").to_owned();
     assert!(cookie.starts_with("__Host-sightfix_session=") && cookie.ends_with("; Secure"), "{cookie}");
     assert!(cookie.contains("; Path=/;"), "{cookie}");
     let both = format!("{second}; {}", cookie_of(&secure));
-    let ended = [("cookie", both.as_str()), ("origin", "https://127.0.0.1")];
+    let ended = [("cookie", both.as_str()), ("origin", own.as_str())];
     server.send("DELETE", "/v1/session", &ended, "").await.expect(204);
     assert_eq!(session_status(&server, &cookie_of(&secure)).await, 401, "the host's own counts");
     assert_eq!(session_status(&server, &second).await, 200);

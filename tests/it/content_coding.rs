@@ -103,6 +103,39 @@ async fn a_body_that_decodes_to_too_much_is_refused() {
 }
 
 #[tokio::test]
+async fn a_body_decodes_to_no_more_than_its_length_allows() {
+    let (_folder, server) = with_camera(&[]).await;
+    let refused = async |coding: &str, body: Vec<u8>| {
+        let headers = [("content-type", "text/csv"), ("content-encoding", coding)];
+        let problem = server.send("POST", SAMPLES, &headers, body).await.expect(413).json();
+        let detail = problem["detail"].as_str().unwrap_or_default();
+        assert!(detail.contains("without a content-encoding"), "{coding}: {problem}");
+    };
+    for coding in ["gzip", "zstd"] {
+        // Well within the limit of an import.
+        refused(coding, encoded(coding, &vec![b' '; 4_000_000]).await).await;
+        // Each needs a decoder of its own, and gives nothing.
+        refused(coding, encoded(coding, b"").await.repeat(1_000)).await;
+    }
+}
+
+#[tokio::test]
+async fn a_body_of_several_members_is_one() {
+    let csv = simulated_csv();
+    let lines: Vec<&str> = csv.split_inclusive('\n').collect();
+    for coding in ["gzip", "zstd"] {
+        let (_folder, server) = with_camera(&[]).await;
+        let mut body = Vec::new();
+        for part in lines.chunks(lines.len() / 3) {
+            body.extend(encoded(coding, part.concat().as_bytes()).await);
+        }
+        let headers = [("content-type", "text/csv"), ("content-encoding", coding)];
+        let report = server.send("POST", SAMPLES, &headers, body).await.expect(200).json();
+        assert_eq!(report["accepted"], lines.len() as u64 - 1, "{coding}");
+    }
+}
+
+#[tokio::test]
 async fn a_body_that_is_not_of_its_coding_is_refused_and_says_so() {
     let (_folder, server) = with_camera(&[]).await;
     let whole = encoded("gzip", simulated_csv().as_bytes()).await;

@@ -3,7 +3,7 @@
 
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 
-use crate::harness::{TestServer, connect_from, data_folder};
+use crate::harness::{TestServer, connect_from, data_folder, run};
 
 const ATTACKER: [u8; 4] = [127, 0, 0, 2];
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
@@ -117,4 +117,60 @@ async fn bodies_that_are_refused_make_their_sender_wait() {
                  content-type: application/json\r\ncontent-length: 10\r\n\r\n{\"id\":\"d\"}";
     let answer = exchange(&server, ATTACKER, other.as_bytes()).await;
     assert!(answer.starts_with("HTTP/1.1 201"), "{answer}");
+}
+
+/// A server with a viewer's key, which it returns as its header.
+fn with_viewer(settings: &[(&str, &str)]) -> (tempfile::TempDir, TestServer, String) {
+    let folder = data_folder();
+    let path = folder.path().to_str().expect("UTF-8").to_owned();
+    let key = run(&["keys", "create", "--name", "v", "--role", "viewer", "--data", &path]);
+    let server = TestServer::start_with(folder.path(), settings);
+    (folder, server, format!("Bearer {}", key.trim()))
+}
+
+/// Sends a body that claims to be gzip, and is not, to each of these paths; the statuses.
+async fn statuses(server: &TestServer, authorization: Option<&str>, paths: &[&str]) -> Vec<u16> {
+    let mut headers = vec![("content-type", "application/json"), ("content-encoding", "gzip")];
+    headers.extend(authorization.map(|key| ("authorization", key)));
+    let mut statuses = Vec::new();
+    for path in paths {
+        statuses.push(server.send("POST", path, &headers, "x".repeat(40_000)).await.status.as_u16());
+    }
+    statuses
+}
+
+#[tokio::test]
+async fn bodies_of_those_who_may_not_send_them_count_as_refused() {
+    let rate = ("SIGHTFIX_LIMITS__REFUSED_BYTES_PER_S", "1000");
+    for (has_key, path, status) in
+        [(false, "/v1/cameras", 401), (true, "/v1/cameras", 403), (true, "/v1/nothing", 404)]
+    {
+        let (_folder, server, key) = with_viewer(&[rate]);
+        let key = has_key.then_some(&*key);
+        // Not 400: nobody tried to decode it.
+        assert_eq!(statuses(&server, key, &[path, path]).await, [status, 429], "{path}");
+        server.get("/livez").await.expect(200);
+    }
+}
+
+#[tokio::test]
+async fn an_address_without_a_key_has_its_rate_of_requests() {
+    let (_folder, server, key) = with_viewer(&[("SIGHTFIX_LIMITS__ANONYMOUS_REQUESTS_PER_S", "2")]);
+    let get = async |key: Option<&str>| {
+        let headers: Vec<(&str, &str)> = key.map(|key| ("authorization", key)).into_iter().collect();
+        server.send("GET", "/v1/cameras", &headers, "").await
+    };
+    for credential in [None, Some("Bearer sf_0000000000000000000000000000000000000"), Some("Basic x")] {
+        let refused = loop {
+            let answer = get(credential).await;
+            if answer.status != 401 {
+                break answer.expect(429);
+            }
+        };
+        assert!(refused.text().contains("without a key"), "{}", refused.text());
+    }
+    for _ in 0..50 {
+        get(Some(&key)).await.expect(200);
+        server.get("/livez").await.expect(200);
+    }
 }

@@ -1,12 +1,14 @@
 //! Puts lines together.
 
-use bytes::{Buf as _, Bytes, BytesMut};
+use bytes::{Buf as _, BufMut as _, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncReadExt as _};
 
 use super::inbox::{ByteBudget, HeldBytes};
 
-/// Bytes that are read at a time.
-const CHUNK_BYTES: usize = 8 << 10;
+/// A shorter line is charged to nobody.
+const SHORT_BYTES: usize = 8 << 10;
+/// Bytes that are read at a time: after a line, less than a short line is left.
+const CHUNK_BYTES: usize = 4 << 10;
 
 /// What was read.
 #[derive(Debug, PartialEq, Eq)]
@@ -33,7 +35,7 @@ pub(super) struct LineReader<S> {
 
 impl<S: AsyncRead + Unpin> LineReader<S> {
     pub(super) fn new(stream: S, max_bytes: usize, budget: Option<ByteBudget>) -> Self {
-        let buffer = BytesMut::with_capacity(CHUNK_BYTES);
+        let buffer = BytesMut::with_capacity(SHORT_BYTES);
         Self { stream, buffer, searched: 0, max_bytes, skips: false, budget, held: None }
     }
 
@@ -49,8 +51,8 @@ impl<S: AsyncRead + Unpin> LineReader<S> {
                     return Ok(Some(Line::TooLong));
                 }
             }
-            self.buffer.reserve(CHUNK_BYTES / 2);
-            if self.stream.read_buf(&mut self.buffer).await? == 0 {
+            self.buffer.reserve(CHUNK_BYTES);
+            if self.stream.read_buf(&mut (&mut self.buffer).limit(CHUNK_BYTES)).await? == 0 {
                 return Ok(None);
             }
         }
@@ -79,11 +81,12 @@ impl<S: AsyncRead + Unpin> LineReader<S> {
         if length > self.max_bytes {
             return true;
         }
-        let Some(budget) = self.budget.as_ref().filter(|_| length >= CHUNK_BYTES) else { return false };
+        let Some(budget) = self.budget.as_ref().filter(|_| length >= SHORT_BYTES) else { return false };
         let held = self.held.as_ref().map_or(0, HeldBytes::num_permits);
         if length <= held {
             return false;
         }
+        // The buffer grows by doubling.
         match budget.try_hold(2 * length - held) {
             Some(more) => {
                 match &mut self.held {
@@ -102,12 +105,12 @@ impl<S: AsyncRead + Unpin> LineReader<S> {
         self.shrink();
     }
 
-    /// Gives back the memory of a long line.
+    /// Gives back the memory of a long line, and what was charged for it: who waits for a budget must hold nothing of it.
     fn shrink(&mut self) {
-        if self.buffer.len() < CHUNK_BYTES {
+        if self.buffer.len() < SHORT_BYTES {
             self.held = None;
-            if self.buffer.capacity() > 4 * CHUNK_BYTES {
-                let mut small = BytesMut::with_capacity(2 * CHUNK_BYTES);
+            if self.buffer.capacity() > 4 * SHORT_BYTES {
+                let mut small = BytesMut::with_capacity(SHORT_BYTES);
                 small.extend_from_slice(&self.buffer);
                 self.buffer = small;
             }

@@ -24,6 +24,7 @@ impl ByteBudget {
     }
 
     /// All of it.
+    #[cfg(test)]
     pub(super) const fn bytes(&self) -> usize {
         self.bytes
     }

@@ -644,10 +644,10 @@ async fn a_key_works_again_when_a_wrong_clock_is_set_back() {
     assert_eq!(status().await, 200);
     wall_s.fetch_add(86_400, Ordering::SeqCst);
     // What the server does every two seconds: it ends what is open for the key.
-    app.access.refresh(&app.store, app.clock.now()).await.expect("read");
+    app.access.refresh(&app.store, &app.clock).await.expect("read");
     assert_eq!(status().await, 401);
     wall_s.fetch_sub(86_400, Ordering::SeqCst);
-    app.access.refresh(&app.store, app.clock.now()).await.expect("read");
+    app.access.refresh(&app.store, &app.clock).await.expect("read");
     assert_eq!(status().await, 200);
     shutdown.drain();
     running.await.expect("no panic").expect("ends well");

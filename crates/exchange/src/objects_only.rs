@@ -284,8 +284,7 @@ mod tests {
         deserialize(&mut source, memory_bytes).map_err(|error| error.to_string())
     }
 
-    #[derive(Deserialize)]
-    #[serde(crate = "serde")]
+    #[derive(serde::Deserialize)]
     struct Item {
         #[expect(dead_code, reason = "only its size matters")]
         number: Option<f64>,

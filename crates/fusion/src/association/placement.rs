@@ -241,13 +241,8 @@ impl PlacementSearch {
     /// Log-likelihood ratio of each pair where ground and plane are the same.
     #[cfg(test)]
     pub(super) fn log_ratios_at_identity(&self) -> Vec<f64> {
-        self.all_pairs()
-            .map(|pair| pair.log_ratio(&Coefficients::new(C::new(1.0, 0.0), C::default())))
-            .collect()
-    }
-
-    fn all_pairs(&self) -> impl Iterator<Item = &Pair> {
-        self.pairs.iter().flat_map(|own| &own.pairs)
+        let all_pairs = self.pairs.iter().flat_map(|own| &own.pairs);
+        all_pairs.map(|pair| pair.log_ratio(&Coefficients::new(C::new(1.0, 0.0), C::default()))).collect()
     }
 
     /// The longest pairs, those of all receivers among them: pairs of a few only would all be wrong where these are out of

@@ -1,8 +1,8 @@
 //! What training shows of the scene in view: where its targets are, and for how long one stands without a change of its
 //! box.
 
-use crate::domain::Sample;
 use crate::artifact::ModelParts;
+use crate::domain::Sample;
 use crate::regressor::Regressor;
 use crate::samples::sequences::sequences;
 use crate::uncertainty::scene::Scene;

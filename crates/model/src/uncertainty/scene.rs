@@ -1,9 +1,9 @@
 //! The scene of a model: the ground that its training boxes were on. A target in view is there or near it, so no
 //! answer lies far outside, and no error is larger than the scene.
 
+use crate::artifact::ModelParts;
 use crate::domain::{Error, Result};
 use crate::geo::{EastNorth, PlaneCovariance};
-use crate::artifact::ModelParts;
 
 /// West, east, south and north end of the training positions, m; missing in earlier formats.
 const NAMES: [&str; 4] = ["scene_west_m", "scene_east_m", "scene_south_m", "scene_north_m"];

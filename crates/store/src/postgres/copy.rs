@@ -9,8 +9,8 @@ use tokio::sync::mpsc;
 use super::Store;
 use super::connection::DATABASE_NOW_US;
 use super::errors::failed;
-use crate::domain::{Error, ErrorKind, Result};
 use crate::copy::{Column, CopyTransaction, Kind, ROWS_AT_A_TIME, Rows, Table, Value, names_of};
+use crate::domain::{Error, ErrorKind, Result};
 
 /// A copy may take long, and there is nobody whom it could keep waiting.
 const NO_TIMEOUTS: &str =

@@ -57,11 +57,7 @@ impl Store {
         Ok(lost.into_iter().map(ConnectionKey).collect())
     }
 
-    pub(crate) async fn close_outbox_logs(
-        &self,
-        own: &OutboxLog,
-        sinks: &[ConnectionKey],
-    ) -> Result<()> {
+    pub(crate) async fn close_outbox_logs(&self, own: &OutboxLog, sinks: &[ConnectionKey]) -> Result<()> {
         let mut transaction = self.writer().await?;
         sqlx::query("DELETE FROM outbox_logs WHERE log = $1 AND connection_key = ANY($2)")
             .bind(own.id.to_string())

@@ -103,20 +103,12 @@ impl Store {
         rows.iter().map(read_dead_letter).collect()
     }
 
-    pub(crate) async fn retry_dead_letters(
-        &self,
-        connection: &Connection,
-        now: Timestamp,
-    ) -> Result<u64> {
+    pub(crate) async fn retry_dead_letters(&self, connection: &Connection, now: Timestamp) -> Result<u64> {
         let change = (AuditAction::DeadLettersRetried, "UPDATE outbox SET dead_reason = NULL");
         self.change_dead_letters(connection, change, now).await
     }
 
-    pub(crate) async fn delete_dead_letters(
-        &self,
-        connection: &Connection,
-        now: Timestamp,
-    ) -> Result<u64> {
+    pub(crate) async fn delete_dead_letters(&self, connection: &Connection, now: Timestamp) -> Result<u64> {
         let change = (AuditAction::DeadLettersDeleted, "DELETE FROM outbox");
         self.change_dead_letters(connection, change, now).await
     }

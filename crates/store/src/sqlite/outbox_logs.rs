@@ -30,11 +30,7 @@ impl Store {
         Ok(lost.into_iter().map(ConnectionKey).collect())
     }
 
-    pub(crate) async fn close_outbox_logs(
-        &self,
-        own: &OutboxLog,
-        sinks: &[ConnectionKey],
-    ) -> Result<()> {
+    pub(crate) async fn close_outbox_logs(&self, own: &OutboxLog, sinks: &[ConnectionKey]) -> Result<()> {
         let mut writer = self.synced().await?;
         let mut transaction = writer.begin().await?;
         for key in sinks {

@@ -26,11 +26,7 @@ impl Store {
         Ok(now)
     }
 
-    pub(crate) async fn retain_samples(
-        &self,
-        since: Option<Timestamp>,
-        now: Timestamp,
-    ) -> Result<u64> {
+    pub(crate) async fn retain_samples(&self, since: Option<Timestamp>, now: Timestamp) -> Result<u64> {
         let Some(since) = since else { return Ok(0) };
         let before_us = since.as_microsecond();
         let cameras: Vec<i64> = sqlx::query_scalar(

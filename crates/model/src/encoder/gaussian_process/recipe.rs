@@ -8,7 +8,9 @@ use super::noise::Epoch;
 use super::predictor::Predictor;
 use super::upright_camera::UprightCamera;
 use crate::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
-use crate::domain::{BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, SessionBias, TargetClass};
+use crate::domain::{
+    BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, SessionBias, TargetClass,
+};
 use crate::encoder::FittedEncoder;
 use crate::encoder::auto_encoder::AutoEncoder;
 use crate::encoder::features::{Encoded, features_of};

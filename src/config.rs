@@ -303,7 +303,7 @@ pub struct Limits {
     pub site_wait_ms: u64,
     /// World tracks of one site.
     pub tracks_per_site: usize,
-    /// Events of one site that a reader may continue behind; a slower one loses the oldest.
+    /// Events of one site that a reader may continue after; a slower one loses the oldest.
     pub site_events: usize,
     /// Samples of one camera.
     pub samples_per_camera: u64,

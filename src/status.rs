@@ -48,7 +48,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::UnsupportedMediaType => (415, code::INVALID_ARGUMENT, "The content type is not read here"),
         Kind::NotAcceptable => (406, code::INVALID_ARGUMENT, "None of the accepted types is written here"),
         Kind::TooLarge => (413, code::RESOURCE_EXHAUSTED, "The request is beyond a limit"),
-        Kind::RangeNotSatisfiable => (416, code::OUT_OF_RANGE, "The range is behind the end"),
+        Kind::RangeNotSatisfiable => (416, code::OUT_OF_RANGE, "The range begins after the end"),
         Kind::RouteNotFound => (404, code::UNIMPLEMENTED, "There is no such path"),
         Kind::MethodNotAllowed => (405, code::UNIMPLEMENTED, "The path does not know this method"),
         Kind::CameraNotFound => (404, code::NOT_FOUND, "There is no such camera"),

@@ -29,7 +29,7 @@ impl DecodedMemory {
         OF_REQUEST.scope(self, answer).await
     }
 
-    /// Charges the request that is answered for a message about to be decoded, in the place of the one before. Nobody is
+    /// Charges the request that is answered for a message about to be decoded, instead of the one before. Nobody is
     /// charged outside of a request.
     ///
     /// # Errors

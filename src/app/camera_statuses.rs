@@ -28,7 +28,7 @@ impl App {
         Ok(self.status_of(self.store.camera(id).await?, None))
     }
 
-    /// Statuses of cameras by id, from behind a cursor on.
+    /// Statuses of cameras by id, after a cursor.
     ///
     /// # Errors
     /// A fault of the store.

@@ -22,7 +22,7 @@ impl App {
         self.store.camera(id).await
     }
 
-    /// Cameras, of a site or of all, by id, from behind a cursor on.
+    /// Cameras, of a site or of all, by id, after a cursor.
     ///
     /// # Errors
     /// `SiteNotFound`.

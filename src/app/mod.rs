@@ -290,7 +290,7 @@ pub fn store_location(config: &Config) -> crate::domain::Result<Location> {
     Location::new(&config.data, config.database.as_ref().map(Secret::reveal))
 }
 
-/// One page of a list, and the cursor behind which the next begins.
+/// One page of a list, and the cursor after which the next begins.
 #[derive(Debug, Clone)]
 pub struct Page<T, C> {
     /// The items, in the list's order.

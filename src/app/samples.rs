@@ -181,7 +181,7 @@ impl App {
         Ok(self.active_camera(id).await?.row_rules(self.clock.now()))
     }
 
-    /// Samples by time and target, from behind a cursor on.
+    /// Samples by time and target, after a cursor.
     ///
     /// # Errors
     /// `CameraNotFound`.

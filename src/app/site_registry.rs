@@ -30,7 +30,7 @@ pub struct SiteRegistry {
     /// What is known may be of a history that the database has not; it is read again, whatever revision it has.
     is_distrusted: AtomicBool,
     randomness: Randomness,
-    /// Events of a site that a reader may continue behind.
+    /// Events of a site that a reader may continue after.
     events_per_site: usize,
 }
 

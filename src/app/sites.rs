@@ -22,7 +22,7 @@ impl App {
         self.store.site(id).await
     }
 
-    /// Sites by id, from behind a cursor on.
+    /// Sites by id, after a cursor.
     ///
     /// # Errors
     /// A fault of the store.

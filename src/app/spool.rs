@@ -23,7 +23,7 @@ pub struct Spooled {
 }
 
 impl Spooled {
-    /// Adds the content to what a request asks for, and goes back to its begin.
+    /// Adds the content to what a request asks for, and goes back to its start.
     ///
     /// # Errors
     /// A fault if the temporary file cannot be read.
@@ -61,7 +61,7 @@ impl Content {
 pub enum Content {
     /// Piece by piece.
     Memory(VecDeque<Bytes>),
-    /// At its begin.
+    /// At its start.
     File(File),
 }
 
@@ -155,7 +155,7 @@ impl Spool {
         Ok(())
     }
 
-    /// The whole, to be read from its begin.
+    /// The whole, to be read from its start.
     ///
     /// # Errors
     /// A fault if the temporary file cannot be written.

@@ -95,7 +95,7 @@ enum Command {
     Keys(keys::Keys),
     /// Copy the database into one verified file, also while a server uses it
     Backup(backup::Backup),
-    /// Put a backup in the place of the database
+    /// Put a backup in place of the database
     Restore(restore::Restore),
     /// Copy everything from a data folder or database into another one, and compare
     Copy(copy::Copy),
@@ -163,7 +163,7 @@ struct DataFolder {
     /// Folder of the database [env: SIGHTFIX_DATA]
     #[arg(long, value_name = "DIR", conflicts_with = "database")]
     data: Option<PathBuf>,
-    /// PostgreSQL database in place of the folder: postgres://user@host/name. Others on this machine see it; set
+    /// PostgreSQL database instead of the folder: postgres://user@host/name. Others on this machine see it; set
     /// SIGHTFIX_DATABASE if it has a password
     #[arg(long, value_name = "URL")]
     database: Option<String>,

@@ -33,7 +33,7 @@ pub struct OpenIdSettings {
     pub operators: Vec<String>,
     /// Values that make a viewer; `*` is everybody who signs in.
     pub viewers: Vec<String>,
-    /// File with the authority of the provider's certificate (PEM), in the place of the system's authorities.
+    /// File with the authority of the provider's certificate (PEM), instead of the system's authorities.
     pub ca: Option<PathBuf>,
 }
 

@@ -226,7 +226,7 @@ impl Intake {
     /// The oldest messages of which all is stored that was to be, in their order.
     ///
     /// # Errors
-    /// Samples could not be stored: nothing behind is acknowledged.
+    /// Samples could not be stored: nothing after them is acknowledged.
     pub(super) fn settled(&mut self) -> Result<Vec<Settled>> {
         let mut settled = Vec::new();
         while let Some(message) = self.pending.front() {

@@ -1,7 +1,7 @@
 //! A sink of NATS.
 //!
 //! Messages are published with the header `Nats-Msg-Id`, by which a JetStream stream recognises repetitions, and count
-//! as delivered when the server has answered a `PING` behind them: it has taken all that came before. Whether somebody
+//! as delivered when the server has answered a `PING` after them: it has taken all that came before. Whether somebody
 //! keeps them is the server's business.
 
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::exchange::Address;
 
 /// Longest line of the server that is read; `INFO` is the longest.
 const MAX_LINE_BYTES: u64 = 64 << 10;
-/// Messages behind which one `PING` is sent.
+/// Messages after which one `PING` is sent.
 const WINDOW: usize = 128;
 
 type Output = Arc<Mutex<WriteHalf<Box<dyn ByteStream>>>>;

@@ -1,4 +1,4 @@
-//! Messages one behind the other over TCP or TLS, as TAK servers take Cursor on Target events.
+//! Messages one after the other over TCP or TLS, as TAK servers take Cursor on Target events.
 
 use futures_util::future::BoxFuture;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, ReadHalf, WriteHalf};

@@ -2,7 +2,7 @@
 //!
 //! The headers `webhook-id`, `webhook-timestamp` (seconds since 1970 of the attempt) and `webhook-signature`
 //! (`v1,` and the base64 of HMAC-SHA256 over `id.timestamp.body`) let the receiver recognise repetitions, old messages
-//! and forgeries. The key is the secret `signing_key`: base64 behind `whsec_`, else its bytes.
+//! and forgeries. The key is the secret `signing_key`: base64 after `whsec_`, else its bytes.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -124,7 +124,7 @@ fn signing_key(secret: &str) -> Result<Vec<u8>, PeerError> {
     match secret.strip_prefix("whsec_") {
         None => Ok(secret.as_bytes().to_vec()),
         Some(encoded) => {
-            STANDARD.decode(encoded).map_err(|_| "the secret signing_key is not base64 behind whsec_".into())
+            STANDARD.decode(encoded).map_err(|_| "the secret signing_key is not base64 after whsec_".into())
         }
     }
 }

@@ -197,7 +197,7 @@ impl StreamSession {
         Ok(None)
     }
 
-    /// Answers a message and those behind it that are there already; how many, or `None` at the end.
+    /// Answers a message and those after it that are there already; how many, or `None` at the end.
     async fn answer_batch(
         &mut self,
         stream: &mut LiveStream,
@@ -282,7 +282,7 @@ const fn ends_stream(kind: ErrorKind) -> bool {
 fn ending() -> Error {
     Error::refused(
         ErrorKind::ShuttingDown,
-        "the server is ending; open the stream again behind the last acknowledged seq",
+        "the server is ending; open the stream again after the last acknowledged seq",
     )
 }
 

@@ -26,7 +26,7 @@ pub(super) mod live_id {
         })
     }
 
-    /// The event to continue behind, if one is named.
+    /// The event to continue after, if one is named.
     pub(in crate::grpc) fn to_resume_after(text: &str) -> Result<Option<LiveId>> {
         if text.is_empty() {
             return Ok(None);

@@ -67,7 +67,7 @@ pub(super) async fn with_etag<K: Into<i64>>(
     Ok(Response::from_parts(head, Body::from(body)))
 }
 
-/// A 304 in the place of what the client has shown already.
+/// A 304 instead of what the client has shown already.
 pub(super) fn unless_known(headers: &HeaderMap, response: Response) -> Response {
     let Some(etag) = response.headers().get(ETAG).and_then(|etag| etag.to_str().ok()) else {
         return response;

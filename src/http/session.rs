@@ -1,4 +1,4 @@
-//! `/v1/session`: a browser's session in the place of a key.
+//! `/v1/session`: a browser's session instead of a key.
 
 use axum::response::Response;
 use hyper::HeaderMap;

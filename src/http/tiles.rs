@@ -40,7 +40,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         (status = 200, description = "The whole file", content_type = "application/vnd.pmtiles", body = Vec<u8>),
         (status = 206, description = "The range of it", content_type = "application/vnd.pmtiles", body = Vec<u8>),
         (status = 404, description = "No file is set", body = Problem, content_type = "application/problem+json"),
-        (status = 416, description = "The range is behind its end", body = Problem, content_type = "application/problem+json"),
+        (status = 416, description = "The range begins after its end", body = Problem, content_type = "application/problem+json"),
     )
 )]
 async fn get_tiles(State(rest): State<Rest>, headers: HeaderMap) -> ApiResult {
@@ -96,7 +96,7 @@ impl ByteRange {
         if !is_number(first) || !is_number(last) || (first.is_empty() && last.is_empty()) {
             return None;
         }
-        // Beyond u64 is behind every end.
+        // Beyond u64 is after every end.
         let number = |part: &str| part.parse().unwrap_or(u64::MAX);
         let range = if first.is_empty() {
             let count = number(last).min(length);

@@ -489,7 +489,7 @@ enum CameraEventBody<'a> {
 /// measured, `camera_moved` when the camera's pose is found to have changed, and `lost` with the number
 /// of events that were lost because the client read too slowly. They end when the camera is deleted.
 ///
-/// A client that comes back with the `last-event-id` of an event goes on behind it. The latest 1,024 events are
+/// A client that comes back with the `last-event-id` of an event goes on after it. The latest 1,024 events are
 /// kept, up to a minute without a client; of those that are not kept any more, `lost` tells the number, or
 /// `null` where it is not known.
 #[utoipa::path(

@@ -27,7 +27,7 @@ use crate::app::{LostSiteEvents, SiteEventKind, StoredSiteEvent, WorldTrackPoint
 use crate::domain::{Error, LiveId, Result, TargetId};
 use crate::exchange::wire::{PlaneCovariance, Position};
 
-/// Header and query parameter that name the event to continue behind.
+/// Header and query parameter that name the event to continue after.
 const LAST_EVENT_HEADER: &str = "last-event-id";
 const LAST_EVENT_PARAMETER: &str = "last_event_id";
 /// How long a browser waits before it connects again.
@@ -124,7 +124,7 @@ impl From<&WorldTrackPoint> for WorldTrack {
 struct WorldTracks {
     /// Tracks by id; or the points of one track, oldest first.
     items: Vec<WorldTrack>,
-    /// The event behind which `events` misses nothing that is not among the tracks; missing for one track.
+    /// The event after which `events` misses nothing that is not among the tracks; missing for one track.
     #[serde(skip_serializing_if = "Option::is_none")]
     last_event_id: Option<String>,
 }
@@ -262,7 +262,7 @@ impl TrackChange {
 /// Events that did not reach a reader.
 #[derive(Serialize, ToSchema)]
 struct LostSiteEventCount {
-    /// `too_old`: the event to continue behind is not kept any more; `restarted`: it is of before the start of the
+    /// `too_old`: the event to continue after is not kept any more; `restarted`: it is of before the start of the
     /// server; `too_slow`: the client reads too slowly.
     reason: &'static str,
     /// How many, if it is known.
@@ -288,12 +288,12 @@ enum SiteEventBody {
 /// Server-sent events: `track` with a position as a GeoJSON feature when a target was measured, at most five a
 /// second and track; `track_started`, `handed_over` from camera to camera, `identified` by a receiver, `merged` and
 /// `track_ended`. Each has an id; a client that connects again with `last-event-id`, as browsers do by themselves,
-/// continues behind it. `lost` counts events that are no longer stored. They end when the site is deleted.
+/// continues after it. `lost` counts events that are no longer stored. They end when the site is deleted.
 #[utoipa::path(
     get, path = "/v1/sites/{site}/events", tag = "sites",
     params(
         ("site" = String, Path, description = "The site's id"),
-        ("last-event-id" = Option<String>, Header, description = "The event to continue behind; from now on if left out"),
+        ("last-event-id" = Option<String>, Header, description = "The event to continue after; from now on if left out"),
         ("last_event_id" = Option<String>, Query, description = "The same for a first request, which a browser cannot give headers"),
     ),
     responses((status = 200, description = "Events", body = SiteEventBody, content_type = "text/event-stream"))

@@ -92,7 +92,7 @@ impl Forwarder {
             return here;
         };
         let Some(body) = record.replay() else { return here };
-        // The client of a live stream opens it again elsewhere behind the last acknowledgement.
+        // The client of a live stream opens it again elsewhere after the last acknowledgement.
         let body = if is_live { body.ended_by(self.shutdown.clone()) } else { body };
         match self.send(&owner, head, body).await {
             Ok(response) => response,

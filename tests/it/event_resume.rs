@@ -129,7 +129,7 @@ async fn what_is_kept_no_more_is_said_to_be_lost() {
         kept.push(again.next().await.expect("an event"));
     }
     assert_eq!(times(&kept).last(), Some(&"2020-12-14T08:16:39Z"));
-    // The next event goes on behind the loss.
+    // The next event goes on after the loss.
     let mut behind = Events::open(&server, EVENTS, Some(&lost.id)).await;
     assert_eq!(behind.next().await.as_ref(), kept.first());
 

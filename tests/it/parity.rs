@@ -465,7 +465,7 @@ async fn tracks_and_events_are_the_same() {
     let second = events.message().await.expect("an event").expect("an event");
     let Some(proto::watch_camera_response::Event::Track(update)) = second.event else { panic!("a track") };
     let time = update.track.expect("a track").time.expect("a time");
-    assert_eq!(time.seconds, 1_767_225_601, "the reader goes on behind the event that it has seen");
+    assert_eq!(time.seconds, 1_767_225_601, "the reader goes on after the event that it has seen");
     both.server.send("DELETE", "/v1/cameras/c", &[], "").await.expect(204);
     let ended = loop {
         match events.message().await {

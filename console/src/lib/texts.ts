@@ -274,7 +274,7 @@ const table = {
   'example.apart': ['Detections and fixes apart', 'Detektionen und Fixe getrennt'],
   'example.apart.text': ['Two files, dropped together or one after the other. They are paired by time; say in the profile which target carries which receiver where their names differ.', 'Zwei Dateien, zusammen oder nacheinander abgelegt. Sie werden nach der Zeit gepaart; das Profil sagt, welches Ziel welchen Empfänger trägt, wo die Namen verschieden sind.'],
   'example.receiver': ['A receiver’s own log', 'Das Protokoll eines Empfängers'],
-  'example.receiver.text': ['NMEA or GPX in the place of the file of fixes, read as it is.', 'NMEA oder GPX anstelle der Datei mit Fixen, unverändert gelesen.'],
+  'example.receiver.text': ['NMEA or GPX instead of the file of fixes, read as it is.', 'NMEA oder GPX anstelle der Datei mit Fixen, unverändert gelesen.'],
   'example.samples': ['Boxes with fixes', 'Boxen mit Fixen'],
   'example.samples.text': ['One file. Leave longitude and latitude empty where there was no fix.', 'Eine Datei. Länge und Breite bleiben leer, wo es keinen Fix gab.'],
   'example.title': ['What a file may look like', 'Wie eine Datei aussehen darf'],

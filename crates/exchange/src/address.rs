@@ -150,7 +150,7 @@ impl Address {
         }
         let has_path = matches!(scheme, Scheme::Http | Scheme::Https);
         if !has_path && !matches!(path, "" | "/") {
-            return Err(invalid("must end behind the port".to_owned()));
+            return Err(invalid("must end after the port".to_owned()));
         }
         if path.contains(|it: char| it.is_whitespace() || !it.is_ascii()) {
             return Err(invalid("must be ASCII without spaces".to_owned()));
@@ -197,7 +197,7 @@ impl Address {
         let baud = baud.filter(|baud| SerialLine::BAUDS.contains(baud));
         let baud = baud.ok_or_else(|| {
             let known: Vec<String> = SerialLine::BAUDS.iter().map(u32::to_string).collect();
-            invalid(&format!("must end behind the device, or with ?baud= and one of {}", known.join(", ")))
+            invalid(&format!("must end after the device, or with ?baud= and one of {}", known.join(", ")))
         })?;
         Ok(SerialLine { path: path.into(), baud })
     }

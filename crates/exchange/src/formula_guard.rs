@@ -1,7 +1,7 @@
 //! Text cells of CSV that a spreadsheet would run as a formula.
 //!
 //! Spreadsheets take a cell that begins with `=`, `+`, `-` or `@` for a formula, and ids come from
-//! clients. Such a text is written behind an apostrophe and read back without it; what begins with
+//! clients. Such a text is written after an apostrophe and read back without it; what begins with
 //! apostrophes before one of these gets one more, so that every text comes back as it went.
 
 use std::borrow::Cow;

@@ -16,7 +16,7 @@ const GROWTH: usize = 2;
 /// Parses a value whose structs are objects, and whose elements and map entries come to at most so many bytes in memory.
 ///
 /// # Errors
-/// Those of the deserializer, also for an array in the place of an object, and for more elements.
+/// Those of the deserializer, also for an array instead of an object, and for more elements.
 pub(super) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
     source: D,
     memory_bytes: usize,

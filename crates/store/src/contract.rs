@@ -75,7 +75,7 @@ contract! {
     /// Faults only; for one camera [`ErrorKind::CameraNotFound`], or a fault of its rows.
     fn camera_contents(&self, ids: &[CameraId]) -> Result<Vec<Result<CameraContent>>>;
 
-    /// Puts a profile in the place of the stored one and counts its revision up, if the stored
+    /// Replaces the stored profile and counts its revision up, if the stored
     /// revision is the expected one.
     ///
     /// # Errors
@@ -145,7 +145,7 @@ contract! {
     /// Faults only.
     fn site_versions(&self) -> Result<Vec<(SiteId, SiteKey, Revision)>>;
 
-    /// Puts a profile in the place of the stored one and counts its revision up, if the stored revision is the
+    /// Replaces the stored profile and counts its revision up, if the stored revision is the
     /// expected one.
     ///
     /// # Errors
@@ -185,7 +185,7 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn count_truths(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64>;
 
-    /// Time of the sample with a fix that has so many before it, in order of time; `None` behind the last.
+    /// Time of the sample with a fix that has so many before it, in order of time; `None` after the last.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`].
@@ -577,7 +577,7 @@ contract! {
     /// Faults only.
     fn connections(&self, after: Option<&ConnectionId>, limit: u32) -> Result<Vec<Connection>>;
 
-    /// Puts a profile in the place of the stored one and counts its revision up, if the stored revision is the
+    /// Replaces the stored profile and counts its revision up, if the stored revision is the
     /// expected one.
     ///
     /// # Errors

@@ -17,7 +17,7 @@ pub(super) struct Table {
     pub(super) key: &'static str,
 }
 
-/// All tables, each behind those that it refers to. A camera and its active model refer to each other, which both
+/// All tables, each after those that it refers to. A camera and its active model refer to each other, which both
 /// backends check at the end of the transaction.
 pub(super) const TABLES: &[Table] = &[
     Table { name: "sites", key: "key" },

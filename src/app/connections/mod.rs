@@ -155,7 +155,7 @@ impl App {
         self.store.connection(id).await
     }
 
-    /// Connections by id, from behind a cursor on.
+    /// Connections by id, after a cursor.
     ///
     /// # Errors
     /// A fault of the store.

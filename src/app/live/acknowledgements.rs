@@ -162,12 +162,12 @@ fn not_stored_error(kind: ErrorKind) -> Error {
         ErrorKind::CameraNotFound => Error::refused(kind, "the camera was deleted"),
         ErrorKind::InsufficientStorage => Error::refused(
             kind,
-            "there is no space for more samples; open the stream again behind the last acknowledged seq when \
+            "there is no space for more samples; open the stream again after the last acknowledged seq when \
              some has been freed",
         ),
         _ => Error::refused(
             ErrorKind::Overloaded,
-            "samples could not be stored; open the stream again behind the last acknowledged seq",
+            "samples could not be stored; open the stream again after the last acknowledged seq",
         ),
     }
 }

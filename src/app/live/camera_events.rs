@@ -85,7 +85,7 @@ impl<E> CameraEventLog<E> {
         }
     }
 
-    /// A place behind the last event that the reader has seen, else at the end.
+    /// The place after the last event that the reader has seen, else at the end.
     pub(super) fn reader(&self, last_seen: Option<EventId>) -> CameraEventReader<E> {
         let kept = self.kept();
         let latest = kept.log.latest();

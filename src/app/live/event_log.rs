@@ -1,4 +1,4 @@
-//! Events with numbers, of which the latest are kept: readers continue behind any of these, and one that is too
+//! Events with numbers, of which the latest are kept: readers continue after any of these, and one that is too
 //! slow loses the oldest.
 
 use std::collections::VecDeque;
@@ -35,7 +35,7 @@ impl<T> EventLog<T> {
         *self.latest.borrow()
     }
 
-    /// A reader behind an event; number 0 begins at the oldest that is kept.
+    /// A reader after an event; number 0 begins at the oldest that is kept.
     pub(super) fn reader(self: &Arc<Self>, after: u64) -> EventReader<T> {
         let after = after.min(self.latest());
         EventReader { latest: self.latest.subscribe(), log: self.clone(), after }
@@ -46,7 +46,7 @@ impl<T> EventLog<T> {
 pub(super) enum NextEvent<T> {
     /// An event with its number.
     Event(u64, Arc<T>),
-    /// So many events behind the reader's place are not kept any more; the number is that of the last of them.
+    /// So many events after the reader's place are not kept any more; the number is that of the last of them.
     Lost(u64, u64),
 }
 

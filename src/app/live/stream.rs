@@ -316,7 +316,7 @@ impl LiveStream {
     /// What is settled; `None` on a stream that stores nothing.
     ///
     /// # Errors
-    /// The samples could not be stored; the stream must end, for nothing behind is acknowledged.
+    /// The samples could not be stored; the stream must end, for nothing after them is acknowledged.
     pub fn acknowledgement(&self) -> Result<Option<Acknowledgement>> {
         let Some(recording) = &self.recording else { return Ok(None) };
         recording.tracker.is_settled()?;

@@ -1,7 +1,7 @@
 //! Kafka: a source of topics, and a sink.
 //!
 //! The library has no consumer groups. A source reads every partition of its topics, and the store keeps the offset
-//! behind the last message whose content is stored: what came after it is read again after a crash. A new source begins
+//! after the last message whose content is stored: what came after it is read again after a crash. A new source begins
 //! with the messages that come from then on; partitions that are added later are read from their beginning. A sink counts
 //! a message as delivered when all replicas in sync have it.
 

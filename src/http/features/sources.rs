@@ -67,7 +67,7 @@ fn coordinates(position: Position) -> [f64; 2] {
     [position.longitude_deg(), position.latitude_deg()].map(|degrees| (degrees * 1e7).round() / 1e7)
 }
 
-/// The page of a collection behind a cursor.
+/// The page of a collection after a cursor.
 ///
 /// # Errors
 /// `CameraNotFound`; `InvalidArgument` for a cursor of another list.

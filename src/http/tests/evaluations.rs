@@ -87,7 +87,7 @@ async fn an_evaluation_is_queued_listed_cancelled_and_deleted() {
 async fn what_is_left_out_is_filled_in() {
     let rest = taught(Limits::default()).await;
     let plain = rest.post(EVALUATIONS, &json!({"camera_id": "c"})).await.expect(202).json();
-    // 200 samples: the last fifth begins with the one at 160 s and ends behind that at 199 s.
+    // 200 samples: the last fifth begins with the one at 160 s and ends after that at 199 s.
     assert_eq!(plain["train"], json!({"until": "2025-01-01T00:02:40Z"}));
     assert_eq!(
         plain["test"],

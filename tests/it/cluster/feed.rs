@@ -1,4 +1,4 @@
-//! A client that stores samples by live streams: it follows the owner's address and resumes behind what was acknowledged.
+//! A client that stores samples by live streams: it follows the owner's address and resumes after what was acknowledged.
 
 use std::time::{Duration, Instant};
 

@@ -1,4 +1,4 @@
-//! Nodes that send requests on to the owner of a camera in place of redirecting them.
+//! Nodes that send requests on to the owner of a camera instead of redirecting them.
 
 use std::path::Path;
 

@@ -80,7 +80,7 @@ async fn a_server_under_more_load_than_it_takes_loses_nothing_and_fails_never() 
     for resident in &memory_mb {
         let last = resident.len().saturating_sub(1);
         let at = [0, last / 2, last].map(|index| resident.get(index).copied().unwrap_or_default());
-        println!("resident memory at the begin, in the middle, at the end of a life: {at:.0?} MB");
+        println!("resident memory at the start, in the middle, at the end of a life: {at:.0?} MB");
     }
     assert!(findings.lost.is_empty() && findings.inconsistent.is_empty(), "{findings:?}");
     assert_eq!(statuses.get(&500), None, "{statuses:?}");

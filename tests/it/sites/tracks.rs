@@ -164,7 +164,7 @@ async fn people_keep_their_world_track_from_camera_to_camera() {
     resumes_alike(&server, &events).await;
 }
 
-/// Both transports continue behind any event, with the same ids and kinds.
+/// Both transports continue after any event, with the same ids and kinds.
 async fn resumes_alike(server: &TestServer, events: &[SiteEvent]) {
     let (read, rest) = events.split_at(events.len() / 2);
     let last = &read.last().expect("events").id;

@@ -29,7 +29,7 @@ pub enum ErrorKind {
     NotAcceptable,
     /// Body, batch or message beyond its limit.
     TooLarge,
-    /// `Range` asks for bytes behind the end.
+    /// `Range` asks for bytes after the end.
     RangeNotSatisfiable,
     /// No such path.
     RouteNotFound,

@@ -119,7 +119,7 @@ fn minimal_object(text: &str) -> Result<Seen, String> {
         *side = field.trim().parse().map_err(|_| format!("`{field}` is not a number of pixels"))?;
     }
     let class = fields.next().map(|name| name.trim().to_owned());
-    // Objects with attributes end with the score of their classifier; others have nothing behind the class.
+    // Objects with attributes end with the score of their classifier; others have nothing after the class.
     let score = fields.next_back().and_then(|field| field.trim().parse().ok());
     Ok(Seen { id, corners_px, class, score })
 }

@@ -415,7 +415,7 @@ fn check_scores(scores: &WorldScores, min_margin: f64) -> Result<()> {
     Ok(())
 }
 
-/// Tracklets on the ground of a camera: right and forward in the place of east and north.
+/// Tracklets on the ground of a camera: right and forward instead of east and north.
 fn on_ground(scene: &Scene<'_>, camera: &GroundCamera, ground: &GroundPrior) -> Vec<Tracklet> {
     let located = scene.located(|bounding_box| {
         let point = camera.ground_point(bounding_box)?;

@@ -78,7 +78,7 @@ pub(super) fn links(tracks: &[Tracklet], motion: SceneMotion) -> Vec<Link> {
     weights
 }
 
-/// Links with their weights in the place of probabilities.
+/// Links with their weights instead of probabilities.
 fn weights(tracks: &[Tracklet], motion: SceneMotion) -> Vec<Link> {
     let mut by_start: Vec<usize> = (0..tracks.len()).collect();
     let start_s = |at: usize| tracks[at].span_s()[0];

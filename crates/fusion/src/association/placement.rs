@@ -207,7 +207,7 @@ pub(super) struct PlacementSearch {
 }
 
 impl PlacementSearch {
-    /// `tracklets` have positions (right, forward) in the place of (east, north).
+    /// `tracklets` have positions (right, forward) instead of (east, north).
     pub(super) fn new(
         tracklets: &[Tracklet],
         receivers: &[Vec<TimedFix>],

@@ -116,7 +116,7 @@ impl NodeLeases {
         transaction.commit().await.map_err(failed)
     }
 
-    /// Stores what a node knows of connections, in the place of what it has stored of them before.
+    /// Stores what a node knows of connections, instead of what it has stored of them before.
     ///
     /// # Errors
     /// As [`NodeLeases::register`].

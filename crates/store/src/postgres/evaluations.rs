@@ -91,7 +91,7 @@ impl Store {
         limit: u32,
     ) -> Result<Vec<EvaluationJob>> {
         let mut reader = self.reader().await?;
-        // "~" sorts behind all UUIDs.
+        // "~" sorts after all UUIDs.
         let before = before.map_or_else(|| "~".to_owned(), |id| id.to_string());
         let query = match camera {
             Some(camera) => {

@@ -59,7 +59,7 @@ impl Store {
     pub(crate) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
         let mut reader = self.reader().await?;
         let rows = sqlx::query(select!("WHERE id < $1 ORDER BY id DESC LIMIT $2"))
-            // "~" sorts behind all UUIDs.
+            // "~" sorts after all UUIDs.
             .bind(before.map_or_else(|| "~".to_owned(), |id| id.to_string()))
             .bind(i64::from(limit))
             .fetch_all(&mut *reader)

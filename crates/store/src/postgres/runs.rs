@@ -105,7 +105,7 @@ impl Store {
     ) -> Result<Vec<TrainingRun>> {
         let mut reader = self.reader().await?;
         let key = camera_key(&mut reader, camera).await?;
-        // "~" sorts behind all UUIDs.
+        // "~" sorts after all UUIDs.
         let before = before.map_or_else(|| "~".to_owned(), |run| run.to_string());
         let rows = sqlx::query(select!(
             "WHERE runs.camera_key = $1 AND runs.id < $2 ORDER BY runs.id DESC LIMIT $3"

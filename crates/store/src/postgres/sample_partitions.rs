@@ -15,7 +15,7 @@ use crate::rows::audit::Change;
 use crate::rows::samples::{SampleTable, expired};
 
 const WEEK_US: i64 = 7 * 86_400 * 1_000_000;
-/// Weeks behind the present one that have a partition already.
+/// Weeks after the present one that have a partition already.
 const WEEKS_AHEAD: i64 = 2;
 /// Length of a day in the name of a partition: year, month, day.
 const DAY_LENGTH: usize = 8;
@@ -177,7 +177,7 @@ async fn has_default_rows(connection: &mut PgConnection, table: SampleTable, wee
         .map_err(failed)
 }
 
-/// The last characters of a name: the first day of a week, or of the first week behind.
+/// The last characters of a name: the first day of a week, or of the first week after them.
 fn day_of(name: &str) -> &str {
     name.len().checked_sub(DAY_LENGTH).and_then(|start| name.get(start..)).unwrap_or(name)
 }

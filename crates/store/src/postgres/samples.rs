@@ -197,7 +197,7 @@ impl Range {
         format!("{statement} WHERE camera_key = $1 AND (time_us, target_id) > ($2, $3){until}{target}")
     }
 
-    /// Number of the parameter behind those of [`Range::bind`].
+    /// Number of the parameter after those of [`Range::bind`].
     fn next_parameter(&self) -> usize {
         4 + usize::from(self.until_us.is_some()) + usize::from(self.target_id.is_some())
     }

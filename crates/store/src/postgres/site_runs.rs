@@ -82,7 +82,7 @@ impl Store {
     ) -> Result<Vec<SiteTrainingRun>> {
         let mut reader = self.reader().await?;
         let key = site_key(&mut reader, site).await?;
-        // "~" sorts behind all UUIDs.
+        // "~" sorts after all UUIDs.
         let before = before.map_or_else(|| "~".to_owned(), |run| run.to_string());
         let rows =
             sqlx::query(select!("WHERE runs.site_key = $1 AND runs.id < $2 ORDER BY runs.id DESC LIMIT $3"))

@@ -89,7 +89,7 @@ impl Store {
         before: Option<EvaluationId>,
         limit: u32,
     ) -> Result<Vec<EvaluationJob>> {
-        // "~" sorts behind all UUIDs.
+        // "~" sorts after all UUIDs.
         let before = before.map_or_else(|| "~".to_owned(), |id| id.to_string());
         let query = match camera {
             Some(camera) => {

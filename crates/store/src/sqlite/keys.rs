@@ -56,7 +56,7 @@ impl Store {
 
     pub(crate) async fn keys(&self, before: Option<KeyId>, limit: u32) -> Result<Vec<ApiKey>> {
         let rows = sqlx::query(select!("WHERE id < ? ORDER BY id DESC LIMIT ?"))
-            // "~" sorts behind all UUIDs.
+            // "~" sorts after all UUIDs.
             .bind(before.map_or_else(|| "~".to_owned(), |id| id.to_string()))
             .bind(limit)
             .fetch_all(self.readers())

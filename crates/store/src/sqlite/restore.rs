@@ -1,4 +1,4 @@
-//! A backup in the place of a folder's database.
+//! A backup instead of a folder's database.
 
 use std::fs;
 use std::io;
@@ -38,7 +38,7 @@ pub struct Restored {
     pub kept: Option<PathBuf>,
 }
 
-/// Puts a backup in the place of a folder's database, which is kept under another name. The folder is made if
+/// Puts a backup in place of a folder's database, which is kept under another name. The folder is made if
 /// there is none. Whenever the process is killed, the folder has either database, complete.
 ///
 /// # Errors

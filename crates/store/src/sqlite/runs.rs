@@ -107,7 +107,7 @@ impl Store {
         limit: u32,
     ) -> Result<Vec<TrainingRun>> {
         let key = camera_key(self.readers(), camera).await?;
-        // "~" sorts behind all UUIDs.
+        // "~" sorts after all UUIDs.
         let before = before.map_or_else(|| "~".to_owned(), |run| run.to_string());
         let rows =
             sqlx::query(select!("WHERE runs.camera_key = ? AND runs.id < ? ORDER BY runs.id DESC LIMIT ?"))

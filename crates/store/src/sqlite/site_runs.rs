@@ -80,7 +80,7 @@ impl Store {
         limit: u32,
     ) -> Result<Vec<SiteTrainingRun>> {
         let key = site_key(self.readers(), site).await?;
-        // "~" sorts behind all UUIDs.
+        // "~" sorts after all UUIDs.
         let before = before.map_or_else(|| "~".to_owned(), |run| run.to_string());
         let rows =
             sqlx::query(select!("WHERE runs.site_key = ? AND runs.id < ? ORDER BY runs.id DESC LIMIT ?"))

@@ -28,7 +28,7 @@ pub use reader::{LossReason, LostSiteEvents, SiteEvents, StoredSiteEvent};
 pub struct SiteTracks {
     /// The latest point of every track, in the order of the ids.
     pub points: Vec<Arc<WorldTrackPoint>>,
-    /// The event behind which a reader misses nothing that is not among the points.
+    /// The event after which a reader misses nothing that is not among the points.
     pub last_event: LiveId,
 }
 
@@ -57,7 +57,7 @@ impl App {
         })
     }
 
-    /// What happens at a site: behind an event, or from now on.
+    /// What happens at a site: after an event, or from now on.
     ///
     /// # Errors
     /// As [`App::world_tracks`].

@@ -12,7 +12,7 @@ use crate::telemetry::Metrics;
 /// An event with its id.
 #[derive(Debug, Clone)]
 pub struct StoredSiteEvent {
-    /// A reader continues behind it.
+    /// A reader continues after it.
     pub id: LiveId,
     /// The event.
     pub event: Arc<SiteEvent>,
@@ -21,7 +21,7 @@ pub struct StoredSiteEvent {
 /// Events that a reader did not get.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LostSiteEvents {
-    /// The last of them; a reader continues behind it.
+    /// The last of them; a reader continues after it.
     pub id: LiveId,
     /// How many; `None` where nobody knows.
     pub events: Option<u64>,
@@ -32,9 +32,9 @@ pub struct LostSiteEvents {
 /// Why a reader did not get events.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LossReason {
-    /// The event that it wanted to continue behind is not kept any more.
+    /// The event that it wanted to continue after is not kept any more.
     TooOld,
-    /// The event that it wanted to continue behind is of before the start of the server.
+    /// The event that it wanted to continue after is of before the start of the server.
     Restarted,
     /// It reads too slowly.
     TooSlow,

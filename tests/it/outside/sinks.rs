@@ -463,14 +463,11 @@ async fn outages_of_the_outbox_lose_no_position() {
         for item in 0..10 {
             send_fix(&server, &format!("van-{outage}-{item}"), &now().to_string(), 103.98678, false).await;
         }
-        let waits =
-            |status: &Value| status["last_error"]["message"].as_str().is_some_and(|it| it.contains("outbox"));
         server.logged(|line| line.to_string().contains("positions wait for the outbox")).await;
         tokio::time::sleep(std::time::Duration::from_millis(500)).await;
         database.execute_batch("ALTER TABLE away RENAME TO outbox").expect("renamed");
         let shown = connection_when(&server, "hook", |status| status["items"] == 10 * (outage + 1)).await;
         assert_eq!(shown["status"]["dropped"], 0, "{shown}");
-        assert!(waits(&shown["status"]) || shown["status"]["state"] == "waiting", "{shown}");
     }
     let listener = TcpListener::bind(address).await.expect("the address is free");
     let mut ids = delivered(&listener, 30).await;

@@ -39,10 +39,10 @@ impl DecodedMemory {
     }
 
     fn hold(&self, bytes: u64) -> Result<()> {
-        self.held.replace(None);
+        drop(self.held.take());
         match self.quota.try_acquire(self.client, bytes) {
             Ok(lease) => {
-                self.held.replace(Some(lease));
+                *self.held.borrow_mut() = Some(lease);
                 Ok(())
             }
             Err(error) => {

@@ -39,16 +39,16 @@ const ZSTD_WINDOW_LOG: u32 = 23;
 const CHUNK_BYTES: usize = 32 * 1024;
 /// Decoded until other tasks have their turn.
 const TURN_BYTES: u64 = 64 * 1024;
-/// Bytes that a coded byte may decode to. Rows of a target that stands still, as JSON, come to about 30.
-const MOST_RATIO: u64 = 32;
+/// Bytes that a coded byte may decode to. NDJSON of a target that stands still, with the same box and fix in every row, comes
+/// to 76 by gzip and to 217 by zstd at its best; zeros come to 1,030 and to more than 20,000.
+const MOST_RATIO: u64 = 256;
 /// What a body may decode to besides, whatever its length.
-const FREE_BYTES: u64 = 256 * 1024;
+const FREE_BYTES: u64 = 1024 * 1024;
 /// What a member of gzip, or a frame of zstd, counts as if it had decoded to that much: it needs a decoder of its own.
-const MEMBER_BYTES: u64 = 16 * 1024;
+const MEMBER_BYTES: u64 = 64 * 1024;
 
 /// The most that so many coded bytes decode to.
-#[must_use]
-pub const fn most_decoded_bytes(coded_bytes: u64) -> u64 {
+const fn most_decoded_bytes(coded_bytes: u64) -> u64 {
     coded_bytes.saturating_mul(MOST_RATIO).saturating_add(FREE_BYTES)
 }
 

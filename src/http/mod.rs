@@ -75,7 +75,6 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
-pub use body_coding::most_decoded_bytes;
 pub use session::session_token;
 
 /// What the handlers share.

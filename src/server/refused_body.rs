@@ -13,7 +13,7 @@ use tokio::sync::Semaphore;
 use super::activity::GRPC_STATUS;
 use crate::config::Limits;
 use crate::domain::ErrorKind;
-use crate::{http, status};
+use crate::status;
 
 /// Bodies of refused requests that are read to their end at a time; more clients are answered at once.
 const DISCARDED_BODIES: usize = 256;
@@ -81,9 +81,11 @@ pub(super) fn read_in_vain(
     if !is_refused {
         return 0;
     }
+    let body_bytes = limits.body_bytes as u64;
+    // What was decoded is not known here; what a body may be at most is.
     let is_decoded = is_encoded && received_bytes > 0;
-    let read_bytes = if is_decoded { http::most_decoded_bytes(received_bytes) } else { received_bytes };
+    let read_bytes = if is_decoded { received_bytes.max(body_bytes) } else { received_bytes };
     // What is beyond a limit is not looked at.
-    let most_bytes = if is(ErrorKind::TooLarge) { limits.body_bytes as u64 } else { u64::MAX };
+    let most_bytes = if is(ErrorKind::TooLarge) { body_bytes } else { u64::MAX };
     (read_bytes + discarded_bytes).min(most_bytes)
 }

@@ -68,13 +68,17 @@ impl<D: Message + Name + Default> Decoder for BoundedDecoder<D> {
 /// Charges for what a message comes to.
 fn admit<D: Name>(message: &[u8]) -> Result<(), Status> {
     let most = FREE_MEMORY_BYTES + MEMORY_PER_BYTE * message.len();
-    let bytes = decoded_bytes(&D::full_name(), message, most).map_err(|misfit| match misfit {
-        Misfit::Malformed => Status::internal("it is cut off, or not of the wire format of Protocol Buffers"),
-        Misfit::TooLarge => Status::out_of_range(format!(
-            "its elements come to more than {most} bytes in memory, {MEMORY_PER_BYTE} for each of its own and \
-             {FREE_MEMORY_BYTES} besides; send fewer at once"
-        )),
-    })?;
+    let bytes = match decoded_bytes(&D::full_name(), message, most) {
+        Ok(bytes) => bytes,
+        // The decoder refuses it, with its reason.
+        Err(Misfit::Malformed) => return Ok(()),
+        Err(Misfit::TooLarge) => {
+            return Err(Status::out_of_range(format!(
+                "its elements come to more than {most} bytes in memory, {MEMORY_PER_BYTE} for each of its own and \
+                 {FREE_MEMORY_BYTES} besides; send fewer at once"
+            )));
+        }
+    };
     // Why is known, and reported, where requests are admitted.
     DecodedMemory::charge(bytes as u64).map_err(|error| Status::resource_exhausted(error.to_string()))
 }

@@ -2,8 +2,8 @@
 //!
 //! Finite parameters do not guarantee finite answers: products overflow, and bounds or offsets may have any
 //! value. Every answer must be finite. At the training boxes the position must be within
-//! [`FARTHEST_AT_TRAINING_BOX_M`] of the plane's origin, anywhere in the image within
-//! [`FARTHEST_IN_IMAGE_M`], which is well inside the range of the local plane.
+//! [`FARTHEST_AT_TRAINING_BOX_M`] of the plane's origin, also without the limits of the model's scene, anywhere in the
+//! image within [`FARTHEST_IN_IMAGE_M`], which is well inside the range of the local plane.
 
 use super::artifact::Artifact;
 use super::regressor::{Regression, Regressor};
@@ -49,8 +49,10 @@ fn check(regressor: &Regressor, training_boxes: &[BoundingBox]) -> Result<()> {
     if training_boxes.is_empty() {
         return Err(failed("coverage.centres hold no box".to_owned()));
     }
+    // There the scene must not be what limits the answers.
+    let unlimited = regressor.without_scene();
     for bounding_box in training_boxes {
-        check_box(regressor, bounding_box, FARTHEST_AT_TRAINING_BOX_M)?;
+        check_box(&unlimited, bounding_box, FARTHEST_AT_TRAINING_BOX_M)?;
     }
     for bounding_box in image_boxes(regressor, training_boxes) {
         check_box(regressor, &bounding_box, FARTHEST_IN_IMAGE_M)?;

@@ -239,6 +239,11 @@ impl Regressor {
         })
     }
 
+    /// The same model with answers that no scene limits.
+    pub(crate) fn without_scene(&self) -> Self {
+        Self { scene: None, ..self.clone() }
+    }
+
     /// Position of a box's target, with its error. Only the recipe `paper` uses the fix, which is among
     /// the inputs of one of its networks.
     #[must_use]

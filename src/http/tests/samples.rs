@@ -18,7 +18,7 @@ async fn every_format_is_imported_and_exported() {
         imported,
         json!({
             "accepted": 2500, "accepted_without_fix": 0, "duplicate": 0, "replaced": 0, "rejected": 0, "rejected_rows": [],
-            "durability": "synced",
+            "durability": "synced", "warnings": [],
         })
     );
     for (media_type, lines) in [("text/csv", 2_501), ("application/x-ndjson", 2_500)] {

@@ -379,7 +379,7 @@ fn traccar_ais_and_gpx_state_their_quality() {
     let of_ais =
         |payload: &str| live_sigmas_mm(MessageFormat::Nmea, &sentence(&format!("AIVDM,1,1,,B,{payload},0")));
     assert_eq!(of_ais("177KQJ5000G?tO`K>RA1wUbN0TKH"), [Some(10_214)], "more than 10 m");
-    assert_eq!(of_ais("177KQJ5000g?tO`K>RA1wUbN0TKH"), [Some(4_085)], "10 m or less");
+    assert_eq!(of_ais("177KQJ5000o?tO`K>RA1wUbN0TKH"), [Some(4_085)], "10 m or less");
 
     let point = |rest: &str| {
         format!(r#"<trkpt lat="30.6" lon="103.9"><time>2026-06-01T11:59:50Z</time>{rest}</trkpt>"#)

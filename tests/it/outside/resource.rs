@@ -58,6 +58,7 @@ async fn a_connection_is_created_read_changed_and_deleted_and_its_secrets_are_ne
             "connection-created",
             "connection-changed",
             "connection-changed",
+            "connection-changed",
             "connection-created"
         ]
     );

@@ -119,10 +119,10 @@ impl<S: Service<Request, Response = Response>> Service<Request> for Authorize<S>
     }
 
     fn call(&mut self, request: Request) -> Self::Future {
-        let checked = self.check(&request).map_err(|error| ApiError::from(error).into_response());
+        let checked = self.check(&request).map_err(|error| Box::new(ApiError::from(error).into_response()));
         match checked.and_then(|()| decoded(request)) {
             Ok(request) => Either::Left(self.inner.call(request)),
-            Err(refusal) => Either::Right(ready(Ok(refusal))),
+            Err(refusal) => Either::Right(ready(Ok(*refusal))),
         }
     }
 }

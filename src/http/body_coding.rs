@@ -88,7 +88,7 @@ impl AcceptedCoding {
 ///
 /// # Errors
 /// The refusal of a coding that is not read here.
-pub(super) fn decoded(request: Request) -> Result<Request, Response> {
+pub(super) fn decoded(request: Request) -> Result<Request, Box<Response>> {
     if !request.headers().contains_key(CONTENT_ENCODING) {
         return Ok(request);
     }
@@ -103,7 +103,7 @@ pub(super) fn decoded(request: Request) -> Result<Request, Response> {
         Err(error) => {
             let mut refusal = ApiError::from(error).into_response();
             refusal.headers_mut().insert(ACCEPT_ENCODING, HeaderValue::from_static("gzip, zstd"));
-            return Err(refusal);
+            return Err(Box::new(refusal));
         }
     }
     Ok(Request::from_parts(head, body))

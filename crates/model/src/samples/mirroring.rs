@@ -78,6 +78,8 @@ pub fn median_position(positions: impl Iterator<Item = Position> + Clone) -> Opt
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::TAU;
+
     use proptest::prelude::*;
 
     use super::*;
@@ -105,7 +107,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_camera_sees_no_mirror_image_and_swapped_positions_are_one(
-            height_m in 4.0..20.0_f64, tilt in 0.2..1.2_f64, pan in 0.0..6.28_f64,
+            height_m in 4.0..20.0_f64, tilt in 0.2..1.2_f64, pan in 0.0..TAU,
             places in proptest::collection::vec((-25.0..25.0_f64, 5.0..60.0_f64), 200..300),
         ) {
             let points = seen(height_m, tilt, pan, &places);
@@ -115,7 +117,7 @@ mod tests {
 
         #[test]
         fn a_line_is_not_taken_for_a_mirror_image(
-            pan in 0.0..6.28_f64, noise in proptest::collection::vec((-3.0..3.0_f64, -3.0..3.0_f64), 200..300),
+            pan in 0.0..TAU, noise in proptest::collection::vec((-3.0..3.0_f64, -3.0..3.0_f64), 200..300),
         ) {
             let places: Vec<(f64, f64)> =
                 noise.iter().enumerate().map(|(at, _)| (at as f64 * 0.1 - 15.0, 20.0)).collect();

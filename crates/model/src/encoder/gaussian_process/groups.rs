@@ -101,11 +101,14 @@ fn interval_of_row(own: &[Epoch], pieces: usize) -> impl Iterator<Item = usize> 
 mod tests {
     use super::*;
 
-    /// Rows of each target, one per second from each of these instants on.
-    fn epochs(targets: &[&[(f64, usize)]]) -> Vec<Epoch> {
-        let of_target = |(sequence, sessions): (usize, &&[(f64, usize)])| {
+    /// When a session begins, s, and its rows, one per second.
+    type Session = (f64, usize);
+
+    /// Rows of targets by their sessions.
+    fn epochs(targets: &[&[Session]]) -> Vec<Epoch> {
+        let of_target = |(sequence, sessions): (usize, &&[Session])| {
             let row = move |time_s| Epoch { time_s, sequence: sequence as u32 };
-            let of_session = |&(from_s, rows): &(f64, usize)| (0..rows).map(move |at| from_s + at as f64);
+            let of_session = |&(from_s, rows): &Session| (0..rows).map(move |at| from_s + at as f64);
             sessions.iter().flat_map(of_session).map(row).collect::<Vec<_>>()
         };
         targets.iter().enumerate().flat_map(of_target).collect()
@@ -113,10 +116,10 @@ mod tests {
 
     #[test]
     fn there_are_at_most_as_many_groups_as_a_model_may_hold() {
-        let (long, short): (&[(f64, usize)], &[(f64, usize)]) = (&[(0.0, 900)], &[(0.0, 5)]);
+        let (long, short): (&[Session], &[Session]) = (&[(0.0, 900)], &[(0.0, 5)]);
         let few = [long, short, short, short, short];
         let many: Vec<_> = std::iter::once(long).chain(std::iter::repeat_n(short, 30)).collect();
-        let days: Vec<(f64, usize)> = (0..12).map(|day| (86_400.0 * f64::from(day), 30)).collect();
+        let days: Vec<Session> = (0..12).map(|day| (86_400.0 * f64::from(day), 30)).collect();
         for (targets, expected) in [(few.as_slice(), 8), (&many, 8), (&[days.as_slice()], 8)] {
             let epochs = epochs(targets);
             let members = groups(&epochs).members();

@@ -46,7 +46,7 @@ impl Store {
             format!("({} {order})", range.sql(&format!("SELECT {} FROM {table}", table.columns())))
         };
         let tables: Vec<String> = SampleTable::asked_for(filter).iter().map(select).collect();
-        let sql = format!("{} {order}", tables.join(" UNION ALL "));
+        let sql = format!("SELECT * FROM ({}) AS page {order}", tables.join(" UNION ALL "));
         let rows =
             range.bind(query(&sql)).bind(i64::from(limit)).fetch_all(&mut *reader).await.map_err(failed)?;
         rows.iter().map(read_sample).collect()

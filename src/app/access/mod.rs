@@ -123,6 +123,14 @@ impl Access {
         }
     }
 
+    /// Checks that it is known which keys work, or that there is none.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub fn check_confirmed(&self, monotonic: Duration) -> Result<()> {
+        self.keys.check_confirmed(monotonic)
+    }
+
     /// Starts a session for the holder of a key.
     ///
     /// # Errors

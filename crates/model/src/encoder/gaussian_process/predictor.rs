@@ -1,8 +1,8 @@
 //! The answer: position, covariance and 95 % radius of one box, by plain loops without allocation.
 //!
-//! The kernel's weights are kept in the eigenbasis of what training has determined of them:
-//! q = U_r^T L^-1 k(x), with U the eigenvectors of Phi^T Phi. Directions that the rows say nothing of
-//! keep their prior, so leaving them out of q changes no mean and never makes the variance smaller.
+//! The variance is taken in the eigenbasis of what training has determined of the kernel's weights:
+//! q = U_r^T L^-1 k(x), with U the eigenvectors of Phi^T Phi. Directions that are left out of q keep their prior,
+//! which never makes the variance smaller. The mean has all weights.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
@@ -58,15 +58,13 @@ pub(crate) struct PositionMap {
     pub(crate) basis: Vec<f64>,
     /// Share of each direction's prior variance that training takes away.
     pub(crate) determined: Vec<f64>,
-    /// Kernel weights per axis in the basis, m.
-    pub(crate) weights: [Vec<f64>; 2],
     /// What the kernel takes over from the tangent: per axis, `rank` rows of 14.
     pub(crate) absorbed: [Vec<f64>; 2],
     /// Lower Cholesky factor of the tangent coefficients' covariance, 14 rows of 14.
     pub(crate) tangent_factor: Vec<f64>,
     /// Scaled so that the sum of squares is the variance to add.
     pub(crate) deviations: Vec<CoefficientDeviation>,
-    /// Kernel weights per inducing point and axis, for derivatives; from `basis` and `weights`.
+    /// Kernel weights per axis and inducing point, m: all of them, for the answer is the mean that was calibrated.
     pub(crate) point_weights: [Vec<f64>; 2],
 }
 
@@ -138,7 +136,7 @@ impl PositionMap {
         let (directions, determined) = determined_directions(candidate);
         let residual_m = if inducing.is_empty() { 0.0 } else { parameters.residual_m };
         let inverse_factor = parameters.lengths.inverse_factor(inducing)?;
-        let basis = directions.transpose() * inverse_factor * residual_m;
+        let basis = directions.transpose() * &inverse_factor * residual_m;
         let project = |weights: &DVector<f64>| (directions.transpose() * weights).as_slice().to_vec();
         let deviations = deviations.iter().map(|(tangent, kernel)| CoefficientDeviation {
             tangent: std::array::from_fn(|at| tangent[at]),
@@ -148,7 +146,7 @@ impl PositionMap {
         let mean = candidate.mean.clone();
         let step = std::array::from_fn(|at| posterior.tangent[at] - mean.coefficients[at]);
         let tangent_factor = tangent_factor.transpose().as_slice().to_vec();
-        let mut map = Self {
+        Some(Self {
             step,
             lengths: parameters.lengths,
             residual_m2: residual_m * residual_m,
@@ -156,15 +154,15 @@ impl PositionMap {
             rank: determined.len(),
             basis: basis.as_slice().to_vec(),
             determined,
-            weights: std::array::from_fn(|axis| project(&posterior.kernel[axis])),
+            point_weights: std::array::from_fn(|axis| {
+                (inverse_factor.tr_mul(&posterior.kernel[axis]) * residual_m).as_slice().to_vec()
+            }),
             absorbed: std::array::from_fn(|axis| {
                 (directions.transpose() * &posterior.absorbed[axis]).transpose().as_slice().to_vec()
             }),
             deviations: deviations.collect(),
             ..Self::without_kernel(weight, mean, tangent_factor)
-        };
-        map.derive();
-        Some(map)
+        })
     }
 
     /// A map without a residual.
@@ -179,22 +177,11 @@ impl PositionMap {
             rank: 0,
             basis: Vec::new(),
             determined: Vec::new(),
-            weights: [Vec::new(), Vec::new()],
             absorbed: [Vec::new(), Vec::new()],
             tangent_factor,
             deviations: Vec::new(),
             point_weights: [Vec::new(), Vec::new()],
         }
-    }
-
-    /// Computes what follows from the other numbers.
-    pub(crate) fn derive(&mut self) {
-        let rank = self.rank;
-        self.point_weights = std::array::from_fn(|axis| {
-            let dot =
-                |own: &[f64]| own.iter().zip(&self.weights[axis]).map(|(basis, weight)| basis * weight).sum();
-            (0..self.inducing.len()).map(|point| dot(&self.basis[point * rank..(point + 1) * rank])).collect()
-        });
     }
 
     #[inline]

@@ -12,9 +12,9 @@ const IGNORED_SHARE: f64 = 0.025;
 /// The scene reaches beyond the training positions by their own range, by this at least, m: a target may be beyond
 /// what few samples of one place have shown.
 const LEAST_MARGIN_M: f64 = 100.0;
-/// Distance from the training boxes in covering radii from which on a box may be of anything: twice that at which it is
-/// outside of the training.
-pub(crate) const CREDIBLE_RATIO: f64 = 3.0;
+/// Distance from the training boxes in covering radii from which on a box may be of anything: four times that at which it
+/// is outside of the training. At twice that ordinary boxes of a crowd had larger errors than they need.
+pub(crate) const CREDIBLE_RATIO: f64 = 6.0;
 
 /// Ends of the training positions, and of the scene about them.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,9 +1,9 @@
 //! Keys: create, list, revoke; sessions of browsers.
 
-use super::access::{Access, Principal, SessionToken};
+use super::access::{Access, Caller, Principal, SessionToken};
 use super::{App, Page, page_of};
 use crate::admission::{ClientId, Lease};
-use crate::domain::{ApiKey, Error, ErrorKind, KeyId, KeySecret, NewKey, Result, Role, Scope};
+use crate::domain::{Actor, ApiKey, Error, ErrorKind, KeyId, KeySecret, NewKey, Result, Role, Scope};
 use crate::openid::{Provider, SignInSecret};
 
 /// Name of the key that the settings give.
@@ -98,10 +98,25 @@ impl App {
     ///
     /// # Errors
     /// `Unauthenticated` for a key that does not work.
-    pub fn start_session(&self, secret: &str) -> Result<(SessionToken, Principal)> {
+    pub async fn start_session(&self, secret: &str) -> Result<(SessionToken, Principal)> {
         let token = SessionToken::generate(|bytes| self.randomness.fill(bytes));
         let principal = self.access.start_session(secret, &token, self.clock.now(), &self.limits)?;
+        self.record_sign_in(principal.clone()).await;
         Ok((token, principal))
+    }
+
+    /// Records a sign-in in the audit log. Where the store takes no entry the person is let in all the same: they may
+    /// come to mend the store.
+    async fn record_sign_in(&self, principal: Principal) {
+        let Actor { address, request_id, .. } = &**self.caller().actor();
+        let caller = Caller::new(principal, *address, request_id.clone());
+        let now = self.clock.now();
+        if !self.access.records_sign_in(caller.actor(), now) {
+            return;
+        }
+        if let Err(error) = self.on_behalf_of(caller).store.record_sign_in(now).await {
+            tracing::warn!(%error, "a sign-in is missing in the audit log");
+        }
     }
 
     /// Begins the sign-in of a person: a secret for their browser, and where it is sent.
@@ -130,7 +145,8 @@ impl App {
         let identity = self.openid()?.identity(secret, state, code, self.clock.now()).await?;
         tracing::info!(user = identity.name, role = %identity.scope.role(), "a person has signed in");
         let token = SessionToken::generate(|bytes| self.randomness.fill(bytes));
-        self.access.start_user_session(identity, &token, self.clock.now(), &self.limits)?;
+        let principal = self.access.start_user_session(identity, &token, self.clock.now(), &self.limits)?;
+        self.record_sign_in(principal).await;
         Ok(token)
     }
 

@@ -448,6 +448,26 @@ async fn nobodys_sign_in_ends_the_session_of_another() {
 }
 
 #[tokio::test]
+async fn the_audit_log_has_sign_ins_and_nobody_fills_it_with_theirs() {
+    let (_folder, server, admin) = with_admin().await;
+    let draft = json!({"name": "gate", "role": "edge", "camera_ids": ["c"]});
+    let (id, edge) = create_remotely(&server, &admin, &draft).await;
+    for _ in 0..15 {
+        signed_in(&server, &edge, None).await.expect(200);
+    }
+    signed_in(&server, "sf_wrong", None).await.expect(401);
+    signed_in(&server, &admin, None).await.expect(200);
+
+    let log = send(&server, "GET", "/v1/audit", &admin, "").await.expect(200).json();
+    let items = log["items"].as_array().expect("items");
+    let sign_ins: Vec<&Value> = items.iter().filter(|entry| entry["action"] == "signed-in").collect();
+    assert_eq!(sign_ins.len(), 11, "ten of the edge key in an hour, and the administrator's: {log}");
+    assert!(sign_ins[1..].iter().all(|entry| entry["actor"] == "gate" && entry["key_id"] == id), "{log}");
+    assert_eq!(sign_ins[0]["address"], "127.0.0.1");
+    assert!(items.iter().any(|entry| entry["action"] == "camera-created"), "{log}");
+}
+
+#[tokio::test]
 async fn a_browser_has_one_session_and_over_https_a_cookie_of_its_host_alone() {
     let (_folder, server, admin) = with_admin().await;
     let first = cookie_of(&signed_in(&server, &admin, None).await.expect(200));

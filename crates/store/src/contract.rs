@@ -514,6 +514,12 @@ contract! {
     /// [`ErrorKind::KeyNotFound`].
     fn revoke_key(&self, id: KeyId, now: Timestamp) -> Result<ApiKey>;
 
+    /// Records in the audit log that the caller has signed in. A power cut may undo it.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn record_sign_in(&self, now: Timestamp) -> Result<()>;
+
     /// Stores when keys were used last. A power cut may undo it.
     ///
     /// # Errors

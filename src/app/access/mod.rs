@@ -8,6 +8,7 @@ mod caller;
 mod key_table;
 mod permission;
 mod sessions;
+mod sign_in_log;
 mod signed_in_user;
 
 use std::sync::OnceLock;
@@ -18,9 +19,10 @@ use jiff::Timestamp;
 
 use self::key_table::KeyTable;
 use self::sessions::Sessions;
+use self::sign_in_log::SignInLog;
 use crate::clock::Clock;
 use crate::config::Limits;
-use crate::domain::{Error, ErrorKind, KeyId, KeySecret, Result};
+use crate::domain::{Actor, Error, ErrorKind, KeyId, KeySecret, Result};
 use crate::openid::{Identity, Provider};
 use crate::store::{KeysVersion, Store};
 
@@ -50,6 +52,7 @@ pub enum Credential<'a> {
 pub struct Access {
     keys: KeyTable,
     sessions: Sessions,
+    sign_ins: SignInLog,
     /// Credentials are needed although no key exists, because there are client certificates.
     is_closed: AtomicBool,
     /// Where people sign in, if the settings say.
@@ -157,8 +160,13 @@ impl Access {
         token: &SessionToken,
         now: Timestamp,
         limits: &Limits,
-    ) -> Result<()> {
+    ) -> Result<Principal> {
         self.sessions.start_for_user(token, identity, now, limits)
+    }
+
+    /// Whether the audit log records a sign-in; it is counted then.
+    pub(super) fn records_sign_in(&self, actor: &Actor, now: Timestamp) -> bool {
+        self.sign_ins.takes(actor, now)
     }
 
     /// Ends a session; nothing happens if there is none.

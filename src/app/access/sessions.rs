@@ -107,8 +107,10 @@ impl Sessions {
         identity: Identity,
         now: Timestamp,
         limits: &Limits,
-    ) -> Result<()> {
-        self.start(token, Holder::User(Arc::new(SignedInUser::new(identity))), now, limits)
+    ) -> Result<Principal> {
+        let user = Arc::new(SignedInUser::new(identity));
+        self.start(token, Holder::User(user.clone()), now, limits)?;
+        Ok(Principal::User(user))
     }
 
     fn start(&self, token: &SessionToken, holder: Holder, now: Timestamp, limits: &Limits) -> Result<()> {

@@ -97,6 +97,8 @@ pub enum AuditAction {
     KeyCreated,
     /// A key was revoked.
     KeyRevoked,
+    /// A browser's session was started for the holder of a key, or for a person.
+    SignedIn,
 }
 
 impl AuditAction {

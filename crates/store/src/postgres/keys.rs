@@ -103,6 +103,12 @@ impl Store {
         self.key(id).await
     }
 
+    pub(crate) async fn record_sign_in(&self, now: Timestamp) -> Result<()> {
+        let mut transaction = self.relaxed_writer().await?;
+        self.record(&mut transaction, Change::of(AuditAction::SignedIn, "session".to_owned()), now).await?;
+        transaction.commit().await.map_err(failed)
+    }
+
     pub(crate) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
         let mut transaction = self.relaxed_writer().await?;
         // In one order everywhere, or two nodes could wait for each other.

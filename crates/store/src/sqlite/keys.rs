@@ -105,6 +105,13 @@ impl Store {
         self.key(id).await
     }
 
+    pub(crate) async fn record_sign_in(&self, now: Timestamp) -> Result<()> {
+        let mut writer = self.relaxed().await?;
+        let mut transaction = writer.begin().await?;
+        self.record(&mut transaction, Change::of(AuditAction::SignedIn, "session".to_owned()), now).await?;
+        transaction.commit().await.map_err(failed)
+    }
+
     pub(crate) async fn note_key_uses(&self, uses: &[(KeyId, Timestamp)]) -> Result<()> {
         let mut writer = self.relaxed().await?;
         let mut transaction = writer.begin().await?;

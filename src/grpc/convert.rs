@@ -171,10 +171,10 @@ pub(super) fn sample(sample: proto::Sample, rules: &RowRules) -> Result<StoredSa
         time: checked_time(sample.time, rules)?,
         target_id: TargetId::new(required_text(&sample.target_id, "target_id")?)?,
         bounding_box: bounding_box(required(sample.bounding_box, "bounding_box")?, rules)?,
-        fix: sample.fix.map(fix).transpose().map_err(|error| error.under("fix"))?,
+        fix: sample.fix.map(|it| fix(*it)).transpose().map_err(|error| error.under("fix"))?,
         class: sample.class.as_deref().map(TargetClass::new).transpose()?,
         score: sample.score.map(Score::new).transpose()?,
-        truth: sample.truth.map(position).transpose().map_err(|error| error.under("truth"))?,
+        truth: sample.truth.map(|it| position(*it)).transpose().map_err(|error| error.under("truth"))?,
     })
 }
 
@@ -256,10 +256,10 @@ impl From<StoredSample> for proto::Sample {
             time: Some(timestamp(sample.time)),
             target_id: sample.target_id.as_str().to_owned(),
             bounding_box: Some(sample.bounding_box.into()),
-            fix: sample.fix.map(Into::into),
+            fix: sample.fix.map(|it| Box::new(it.into())),
             class: sample.class.map(|class| class.as_str().to_owned()),
             score: sample.score.map(Score::value),
-            truth: sample.truth.map(Into::into),
+            truth: sample.truth.map(|it| Box::new(it.into())),
         }
     }
 }
@@ -288,14 +288,14 @@ mod tests {
                 width_px: Some(28.0),
                 height_px: Some(77.0),
             }),
-            fix: Some(proto::Fix {
+            fix: Some(Box::new(proto::Fix {
                 longitude_deg: Some(103.98678),
                 latitude_deg: Some(30.628),
                 sigma_m: Some(2.0),
-            }),
+            })),
             class: Some("person".to_owned()),
             score: Some(0.5),
-            truth: Some(proto::Position { longitude_deg: Some(0.0), latitude_deg: Some(-90.0) }),
+            truth: Some(Box::new(proto::Position { longitude_deg: Some(0.0), latitude_deg: Some(-90.0) })),
         }
     }
 
@@ -318,11 +318,11 @@ mod tests {
         assert_eq!(without(|sample| sample.time = None), "time");
         assert_eq!(without(|sample| sample.target_id.clear()), "target_id");
         assert_eq!(without(|sample| sample.bounding_box = None), "bounding_box");
-        let fix = |sample: &mut proto::Sample| sample.fix = Some(proto::Fix::default());
+        let fix = |sample: &mut proto::Sample| sample.fix = Some(Box::default());
         assert_eq!(without(fix), "fix.longitude_deg");
         let sides = |sample: &mut proto::Sample| sample.bounding_box.as_mut().expect("set").top_px = None;
         assert_eq!(without(sides), "bounding_box.top_px");
-        let truth = |sample: &mut proto::Sample| sample.truth = Some(proto::Position::default());
+        let truth = |sample: &mut proto::Sample| sample.truth = Some(Box::default());
         assert_eq!(without(truth), "truth.longitude_deg");
         let nanos = |sample: &mut proto::Sample| sample.time.as_mut().expect("set").nanos = -1;
         assert_eq!(without(nanos), "time.nanos");

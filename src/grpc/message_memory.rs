@@ -51,8 +51,8 @@ struct Shape {
 enum Field {
     /// A text or bytes, each with so many bytes besides its content.
     Text { header_bytes: usize },
-    /// A message, by its place among the shapes, one or many.
-    Message { shape: usize, is_repeated: bool },
+    /// A message, by its place among the shapes, and how many of its structs each one takes besides the message around it.
+    Message { shape: usize, structs: usize },
     /// Many numbers, each of so many bytes in memory and, if that is fixed, on the wire.
     Numbers { bytes: usize, wire_bytes: Option<usize> },
 }
@@ -75,20 +75,23 @@ impl Shapes {
         }
         let by_name: HashMap<String, usize> =
             described.iter().enumerate().map(|(place, (name, _))| (name.clone(), place)).collect();
-        let shape = |(_, message): &(String, &DescriptorProto)| Shape {
-            bytes: struct_bytes(message, &described, &by_name, 0),
-            fields: fields(message, &by_name),
+        let shape = |place: usize| Shape {
+            bytes: struct_bytes(place, &described, &by_name, 0),
+            fields: fields(&described[place], &by_name),
         };
-        Self { messages: described.iter().map(shape).collect(), by_name }
+        Self { messages: (0..described.len()).map(shape).collect(), by_name }
     }
 }
 
-fn fields(message: &DescriptorProto, by_name: &HashMap<String, usize>) -> Vec<Option<Field>> {
+fn fields(
+    (name, message): &(String, &DescriptorProto),
+    by_name: &HashMap<String, usize>,
+) -> Vec<Option<Field>> {
     let mut fields = Vec::new();
     for field in &message.field {
         let number = usize::try_from(field.number()).unwrap_or_default();
         fields.resize_with(fields.len().max(number + 1), || None);
-        fields[number] = held(field, by_name);
+        fields[number] = held(name, field, by_name);
     }
     fields
 }
@@ -114,19 +117,27 @@ fn is_repeated(field: &FieldDescriptorProto) -> bool {
     field.label() == Label::Repeated
 }
 
+/// Whether the build has a field of a message held by a pointer.
+fn is_boxed(message: &str, field: &FieldDescriptorProto) -> bool {
+    env!("BOXED_FIELDS").split(' ').any(|boxed| boxed == format!("{message}.{}", field.name()))
+}
+
 /// What the struct of a message takes, at most; of a oneof every field counts.
 fn struct_bytes(
-    message: &DescriptorProto,
+    place: usize,
     described: &[(String, &DescriptorProto)],
     by_name: &HashMap<String, usize>,
     depth: u32,
 ) -> usize {
-    let inner = |field| by_name.get(message_name(field)).map(|&place| described[place].1);
-    let is_map =
-        |field| inner(field).is_some_and(|inner| inner.options.as_ref().is_some_and(|it| it.map_entry()));
+    let (name, message) = &described[place];
+    let inner = |field| by_name.get(message_name(field)).copied();
+    let is_map = |field| {
+        inner(field).is_some_and(|inner| described[inner].1.options.as_ref().is_some_and(|it| it.map_entry()))
+    };
     let fields = message.field.iter().map(|field| match field.r#type() {
         Type::Message if is_map(field) => size_of::<HashMap<String, ()>>(),
         _ if is_repeated(field) => size_of::<Vec<()>>(),
+        Type::Message if is_boxed(name, field) => size_of::<Box<()>>(),
         Type::String => size_of::<String>(),
         Type::Bytes => size_of::<bytes::Bytes>(),
         Type::Message if depth < MOST_DEPTH => {
@@ -139,7 +150,7 @@ fn struct_bytes(
 }
 
 /// How a field is held, unless it is within its message's struct.
-fn held(field: &FieldDescriptorProto, by_name: &HashMap<String, usize>) -> Option<Field> {
+fn held(message: &str, field: &FieldDescriptorProto, by_name: &HashMap<String, usize>) -> Option<Field> {
     let is_repeated = is_repeated(field);
     let (bytes, wire_bytes) = match field.r#type() {
         Type::String | Type::Bytes => {
@@ -148,7 +159,8 @@ fn held(field: &FieldDescriptorProto, by_name: &HashMap<String, usize>) -> Optio
         }
         Type::Message | Type::Group => {
             let shape = *by_name.get(message_name(field))?;
-            return Some(Field::Message { shape, is_repeated });
+            let boxes = usize::from(is_boxed(message, field));
+            return Some(Field::Message { shape, structs: if is_repeated { GROWTH } else { boxes } });
         }
         Type::Double | Type::Fixed64 | Type::Sfixed64 => (8, Some(8)),
         Type::Float | Type::Fixed32 | Type::Sfixed32 => (4, Some(4)),
@@ -215,10 +227,8 @@ impl Scan<'_> {
                 };
                 self.add(GROWTH * bytes * count)
             }
-            Some(Field::Message { shape, is_repeated }) => {
-                if is_repeated {
-                    self.add(GROWTH * self.messages[shape].bytes)?;
-                }
+            Some(Field::Message { shape, structs }) => {
+                self.add(structs * self.messages[shape].bytes)?;
                 if depth == MOST_DEPTH {
                     return Err(Misfit::Malformed);
                 }
@@ -236,8 +246,8 @@ impl Scan<'_> {
 fn varint(rest: &mut &[u8]) -> Result<u64, Misfit> {
     let mut value = 0;
     for shift in (0..70).step_by(7) {
-        let (&byte, behind) = rest.split_first().ok_or(Misfit::Malformed)?;
-        *rest = behind;
+        let (&byte, after) = rest.split_first().ok_or(Misfit::Malformed)?;
+        *rest = after;
         value |= u64::from(byte & 0x7f).checked_shl(shift).unwrap_or_default();
         if byte < 0x80 {
             return Ok(value);
@@ -248,8 +258,8 @@ fn varint(rest: &mut &[u8]) -> Result<u64, Misfit> {
 
 fn split<'m>(rest: &mut &'m [u8], length: u64) -> Result<&'m [u8], Misfit> {
     let at = usize::try_from(length).map_err(|_| Misfit::Malformed)?;
-    let (content, behind) = rest.split_at_checked(at).ok_or(Misfit::Malformed)?;
-    *rest = behind;
+    let (content, after) = rest.split_at_checked(at).ok_or(Misfit::Malformed)?;
+    *rest = after;
     Ok(content)
 }
 

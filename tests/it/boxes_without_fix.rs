@@ -170,7 +170,8 @@ async fn both_transports_store_list_count_and_reject_alike() {
         fix,
         ..Default::default()
     };
-    let place = |latitude_deg| Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg, sigma_m: None });
+    let place =
+        |latitude_deg| Some(Box::new(proto::Fix { longitude_deg: Some(103.9), latitude_deg, sigma_m: None }));
     let samples =
         vec![sample(0, place(Some(30.6))), sample(1, None), sample(2, place(None)), sample(1, None)];
     let message = proto::ImportSamplesRequest { camera_id: "g".to_owned(), samples, ..Default::default() };

@@ -344,7 +344,11 @@ pub(crate) fn import_message() -> proto::ImportSamplesRequest {
             width_px: side,
             height_px: side,
         }),
-        fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
+        fix: Some(Box::new(proto::Fix {
+            longitude_deg: Some(103.9),
+            latitude_deg: Some(30.6),
+            sigma_m: None,
+        })),
         ..proto::Sample::default()
     };
     proto::ImportSamplesRequest { camera_id: "c".to_owned(), samples: vec![sample], ..Default::default() }

@@ -201,7 +201,11 @@ fn message(second: i64, left_px: f64, on_conflict: proto::OnConflict) -> proto::
                 width_px: Some(30.0),
                 height_px: Some(60.0),
             }),
-            fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
+            fix: Some(Box::new(proto::Fix {
+                longitude_deg: Some(103.9),
+                latitude_deg: Some(30.6),
+                sigma_m: None,
+            })),
             ..Default::default()
         }],
         on_conflict: on_conflict.into(),

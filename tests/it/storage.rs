@@ -152,7 +152,11 @@ async fn check_full_storage(server: &TestServer, refused: &Answer) {
                 width_px: Some(30.0),
                 height_px: Some(60.0),
             }),
-            fix: Some(proto::Fix { longitude_deg: Some(103.9), latitude_deg: Some(30.6), sigma_m: None }),
+            fix: Some(Box::new(proto::Fix {
+                longitude_deg: Some(103.9),
+                latitude_deg: Some(30.6),
+                sigma_m: None,
+            })),
             ..Default::default()
         }
     });

@@ -114,11 +114,11 @@ async fn grpc_and_the_command_tell_of_swapped_columns() {
                 width_px: Some(*width),
                 height_px: Some(*height),
             }),
-            fix: Some(proto::Fix {
+            fix: Some(Box::new(proto::Fix {
                 longitude_deg: Some(*longitude),
                 latitude_deg: Some(*latitude),
                 sigma_m: None,
-            }),
+            })),
             ..Default::default()
         }
     };

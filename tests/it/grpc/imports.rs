@@ -22,11 +22,11 @@ fn sample(second: i64) -> proto::Sample {
             width_px: Some(30.0),
             height_px: Some(60.0),
         }),
-        fix: Some(proto::Fix {
+        fix: Some(Box::new(proto::Fix {
             longitude_deg: Some(103.9 + second as f64 * 1e-6),
             latitude_deg: Some(30.6),
             sigma_m: Some(2.0),
-        }),
+        })),
         class: Some("person".to_owned()),
         score: Some(0.75),
         truth: None,
@@ -62,6 +62,21 @@ pub(super) async fn import(
 async fn count(server: &Server, filter: Option<proto::SampleFilter>) -> u64 {
     let request = proto::CountSamplesRequest { camera_id: "yard".to_owned(), filter };
     client(server).count_samples(request).await.expect("a number").into_inner().count
+}
+
+/// The bound on what a message comes to in memory is none for rows that have nothing but what they must have.
+#[tokio::test]
+async fn a_message_of_many_short_rows_is_taken() {
+    let server = Server::with_camera(proto::CameraProfile::default()).await;
+    let short = |second| proto::Sample {
+        target_id: "7".to_owned(),
+        fix: None,
+        class: None,
+        score: None,
+        ..sample(second)
+    };
+    let imported = import(&server, (0..20_000).map(short).collect()).await.expect("taken");
+    assert_eq!(imported.accepted, 20_000);
 }
 
 #[tokio::test]

@@ -104,7 +104,7 @@ struct CameraDraft {
     #[schema(max_items = 64, example = json!(["person"]))]
     target_classes: Vec<String>,
     /// Free-form labels.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::wire::labels")]
     labels: BTreeMap<String, String>,
     /// Whose the GNSS receivers are; one that is not named here carries its own id as target id.
     #[serde(default)]

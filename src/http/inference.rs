@@ -6,6 +6,7 @@ use axum::extract::State;
 use hyper::http::request::Parts;
 use serde::de::{DeserializeSeed, IgnoredAny, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::value::RawValue;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -17,6 +18,7 @@ use super::problem::{ApiError, ApiResult, Problem};
 use super::wire::{json, json_of_about};
 use crate::app::{App, BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 use crate::domain::{CameraId, Error, ErrorKind, Result};
+use crate::exchange::wire::parse_field;
 
 const FP64: &str = "FP64";
 /// Any extent.
@@ -120,7 +122,7 @@ struct TensorMetadata {
 
 /// Asks for the positions of boxes.
 #[derive(Deserialize, ToSchema)]
-struct InferenceRequest {
+struct InferenceRequest<'r> {
     /// Returned in the answer.
     id: Option<String>,
     /// Parameters; none is used.
@@ -128,7 +130,8 @@ struct InferenceRequest {
     #[serde(rename = "parameters")]
     _parameters: Option<IgnoredAny>,
     /// One tensor, `boxes`: a row of left, top, width and height in pixels per box.
-    inputs: Vec<InputTensor>,
+    #[serde(borrow)]
+    inputs: Vec<InputTensor<'r>>,
     /// The outputs that are wanted; all if left out.
     #[serde(default)]
     outputs: Vec<RequestedOutput>,
@@ -136,7 +139,7 @@ struct InferenceRequest {
 
 /// An input tensor.
 #[derive(Deserialize, ToSchema)]
-struct InputTensor {
+struct InputTensor<'r> {
     /// `boxes`.
     #[schema(example = "boxes")]
     name: String,
@@ -152,23 +155,47 @@ struct InputTensor {
     _parameters: Option<IgnoredAny>,
     /// Its elements row by row, as one array or as an array per row.
     #[schema(value_type = Vec<f64>, example = json!([[475.0, 11.0, 28.0, 77.0]]))]
-    data: TensorData,
+    #[serde(borrow)]
+    data: &'r RawValue,
 }
 
-/// Elements of a tensor, row by row. They are read without a copy between the text and them.
-#[derive(Default)]
+/// Elements of a tensor, row by row.
 struct TensorData {
     numbers: Vec<f64>,
     is_of_rows: bool,
+    /// How many there are, of which at most `most` are kept.
+    count: usize,
+    most: usize,
 }
 
-impl<'de> Deserialize<'de> for TensorData {
-    fn deserialize<D: Deserializer<'de>>(source: D) -> std::result::Result<Self, D::Error> {
-        source.deserialize_seq(TensorVisitor)
+impl TensorData {
+    /// The elements of a tensor, of which those of at most so many boxes are kept.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the tensor's data.
+    fn read(json: &RawValue, most_boxes: usize) -> Result<Self> {
+        let most = most_boxes.saturating_mul(BOX_COLUMNS);
+        let data = Self { numbers: Vec::new(), is_of_rows: false, count: 0, most };
+        parse_field("inputs[0].data", json, TensorVisitor(data))
+    }
+
+    fn add(&mut self, number: f64) {
+        self.count += 1;
+        if self.count <= self.most {
+            self.numbers.push(number);
+        }
     }
 }
 
-struct TensorVisitor;
+struct TensorVisitor(TensorData);
+
+impl<'de> DeserializeSeed<'de> for TensorVisitor {
+    type Value = TensorData;
+
+    fn deserialize<D: Deserializer<'de>>(self, source: D) -> std::result::Result<TensorData, D::Error> {
+        source.deserialize_seq(self)
+    }
+}
 
 impl<'de> Visitor<'de> for TensorVisitor {
     type Value = TensorData;
@@ -178,7 +205,7 @@ impl<'de> Visitor<'de> for TensorVisitor {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> std::result::Result<TensorData, A::Error> {
-        let mut data = TensorData::default();
+        let Self(mut data) = self;
         while items.next_element_seed(TensorItem(&mut data))?.is_some() {}
         Ok(data)
     }
@@ -192,7 +219,7 @@ impl TensorItem<'_> {
         if self.0.is_of_rows {
             return Err(E::custom(format!("must have {BOX_COLUMNS} numbers")));
         }
-        self.0.numbers.push(number);
+        self.0.add(number);
         Ok(())
     }
 }
@@ -226,12 +253,12 @@ impl<'de> Visitor<'de> for TensorItem<'_> {
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> std::result::Result<(), A::Error> {
         let Self(data) = self;
-        let begin = data.numbers.len();
+        let begin = data.count;
         let is_first = begin == 0;
         while let Some(number) = items.next_element()? {
-            data.numbers.push(number);
+            data.add(number);
         }
-        if data.numbers.len() != begin + BOX_COLUMNS || !(data.is_of_rows || is_first) {
+        if data.count != begin + BOX_COLUMNS || !(data.is_of_rows || is_first) {
             return Err(serde::de::Error::custom(format!("must have {BOX_COLUMNS} numbers")));
         }
         data.is_of_rows = true;
@@ -418,12 +445,14 @@ async fn infer_version(CallerApp(app): CallerApp, model: ModelName, body: JsonBo
 }
 
 async fn inferred(app: &App, model: ModelName, body: &JsonBody) -> ApiResult {
-    let request: InferenceRequest = body.read()?;
+    let request: InferenceRequest<'_> = body.read()?;
     let outputs = OutputTensor::named(request.outputs.iter().map(|output| output.name.as_str()))?;
     let [input] = &request.inputs[..] else {
         return Err(Error::invalid("inputs", format!("must be one tensor, `{BOXES}`")).into());
     };
-    let boxes = boxes(input)?;
+    let data = TensorData::read(input.data, app.limits.batch_observations)?;
+    app.check_batch(data.count.div_ceil(BOX_COLUMNS)).map_err(|error| error.at(BOXES))?;
+    let boxes = boxes(input, &data.numbers)?;
     let answer = app.infer(&model.camera, model.version.as_deref(), boxes, &outputs).await?;
     let Inferred { version, outputs } = answer;
     let numbers: usize = outputs.iter().map(|(_, numbers)| numbers.len()).sum();
@@ -443,14 +472,13 @@ async fn inferred(app: &App, model: ModelName, body: &JsonBody) -> ApiResult {
 }
 
 /// The rows of the input tensor.
-fn boxes(input: &InputTensor) -> Result<&[[f64; BOX_COLUMNS]]> {
+fn boxes<'n>(input: &InputTensor<'_>, numbers: &'n [f64]) -> Result<&'n [[f64; BOX_COLUMNS]]> {
     if input.name != BOXES {
         return Err(Error::invalid("inputs[0].name", format!("must be {BOXES}")));
     }
     if !matches!(input.datatype.as_str(), FP64 | "FP32") {
         return Err(Error::invalid("inputs[0].datatype", "must be FP64 or FP32"));
     }
-    let numbers = &input.data.numbers;
     let (rows, rest) = numbers.as_chunks::<BOX_COLUMNS>();
     if !rest.is_empty() || input.shape != [rows.len() as u64, BOX_COLUMNS as u64] {
         let message = format!(

@@ -39,7 +39,7 @@ struct SiteDraft {
     #[schema(max_length = 200, example = "Harbour")]
     display_name: Option<String>,
     /// Free-form labels.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::wire::labels")]
     labels: BTreeMap<String, String>,
     /// Origin of the plane in which targets are tracked; that of the first camera's model if left out. Targets
     /// farther than 20 km from it are not tracked.

@@ -1,15 +1,19 @@
 //! Shapes that several resources share.
 
+use std::collections::BTreeMap;
+use std::fmt;
+
 use axum::body::Body;
 use axum::response::Response;
 use hyper::StatusCode;
 use hyper::header::{CONTENT_TYPE, IntoHeaderName, LOCATION};
 use hyper::http::HeaderValue;
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
+use serde::de::{MapAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
 use utoipa::ToSchema;
 
-use crate::domain::{self, Error, Result, parse_time};
+use crate::domain::{self, Error, MAX_LABELS, Result, parse_time};
 
 /// How a camera is learnt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -48,6 +52,34 @@ impl From<crate::domain::Recipe> for Recipe {
             crate::domain::Recipe::GaussianProcess => Self::GaussianProcess,
             crate::domain::Recipe::Auto => Self::Auto,
         }
+    }
+}
+
+/// Reads labels. More than there may be are not kept while they are read.
+pub(super) fn labels<'de, D: Deserializer<'de>>(
+    source: D,
+) -> std::result::Result<BTreeMap<String, String>, D::Error> {
+    source.deserialize_map(LabelsVisitor)
+}
+
+struct LabelsVisitor;
+
+impl<'de> Visitor<'de> for LabelsVisitor {
+    type Value = BTreeMap<String, String>;
+
+    fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str("an object of texts")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut items: A) -> std::result::Result<Self::Value, A::Error> {
+        let mut labels = BTreeMap::new();
+        while let Some((name, value)) = items.next_entry()? {
+            labels.insert(name, value);
+            if labels.len() > MAX_LABELS {
+                return Err(serde::de::Error::custom(format!("must be at most {MAX_LABELS}")));
+            }
+        }
+        Ok(labels)
     }
 }
 

@@ -114,6 +114,10 @@ async fn rest_refuses_what_is_no_tensor_of_boxes() {
         assert_eq!(problem["violations"][0]["field"], field, "{problem}");
         assert_eq!(problem["error"], problem["detail"], "clients of the protocol read `error`");
     }
+    // More boxes than a request may have are counted, not kept.
+    let many = with("data", json!(vec![1.0; 4_004]));
+    let problem = server.post("/v2/models/square/infer", &many).await.expect(413).json();
+    assert_eq!(problem["violations"][0]["field"], "boxes", "{problem}");
     for (path, status) in [
         ("/v2/models/none", 404),
         ("/v2/models/square/versions/2", 404),

@@ -7,7 +7,9 @@ use std::borrow::Cow;
 use std::fmt;
 
 use jiff::Timestamp;
+use serde::de::DeserializeSeed;
 use serde::{Deserialize, Serialize};
+use serde_json::value::RawValue;
 use serde_path_to_error::Track;
 use utoipa::ToSchema;
 
@@ -422,6 +424,19 @@ pub fn parse_json<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T> {
         Ok(value) => Ok(value),
         Err(_) => parse_with_path(json),
     }
+}
+
+/// Parses a field that is read by a rule with a state of its own, such as a limit.
+///
+/// # Errors
+/// As [`parse_json`].
+pub fn parse_field<'a, S: DeserializeSeed<'a>>(field: &str, json: &'a RawValue, seed: S) -> Result<S::Value> {
+    let mut source = serde_json::Deserializer::from_str(json.get());
+    let mut track = Track::new();
+    seed.deserialize(serde_path_to_error::Deserializer::new(&mut source, &mut track)).map_err(|error| {
+        let path = track.path().to_string();
+        refusal_of(&format!("{field}{}", if path == "." { "" } else { &path }), &error)
+    })
 }
 
 /// Parses a document from JSON text; its refusal names all fields at fault, and takes several passes.

@@ -56,7 +56,8 @@ pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
 pub use model_format::ModelFormat;
 pub use names::{
-    CameraId, ConnectionId, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels, check_text,
+    CameraId, ConnectionId, MAX_LABELS, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels,
+    check_text,
 };
 pub use node::{Node, NodeId, NodeProfile};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation, SessionBias};

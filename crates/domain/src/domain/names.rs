@@ -169,13 +169,16 @@ pub fn check_text(field: &str, text: &str, max_bytes: usize) -> Result<()> {
     }
 }
 
-/// Checks free-form labels: at most 64, keys of at most 63 bytes, values of at most 255.
+/// Labels that something may have.
+pub const MAX_LABELS: usize = 64;
+
+/// Checks free-form labels: at most [`MAX_LABELS`], keys of at most 63 bytes, values of at most 255.
 ///
 /// # Errors
 /// Names the invalid label under `labels`.
 pub fn check_labels(labels: &BTreeMap<String, String>) -> Result<()> {
-    if labels.len() > 64 {
-        return Err(Error::invalid("labels", "must be at most 64"));
+    if labels.len() > MAX_LABELS {
+        return Err(Error::invalid("labels", format!("must be at most {MAX_LABELS}")));
     }
     for (key, value) in labels {
         check_text(&format!("labels.{key}"), key, 63)?;

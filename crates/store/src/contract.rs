@@ -304,12 +304,6 @@ contract! {
     /// is stored does not match its checksum or cannot be read.
     fn model_content(&self, camera: &CameraId, number: u32) -> Result<(ModelMetadata, Vec<u8>)>;
 
-    /// Fills in the checksums of versions that an earlier release stored; returns how many there were.
-    ///
-    /// # Errors
-    /// Faults only.
-    fn fill_in_model_checksums(&self) -> Result<u64>;
-
     /// The held-out errors that were stored with a version, each with its sample as long as that is
     /// stored; by time and target.
     ///

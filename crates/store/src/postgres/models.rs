@@ -63,34 +63,6 @@ impl Store {
         read_content(camera, number, content)
     }
 
-    pub(crate) async fn fill_in_model_checksums(&self) -> Result<u64> {
-        let mut transaction = self.writer().await?;
-        let missing: Vec<(i64, i64)> =
-            sqlx::query_as("SELECT camera_key, number FROM models WHERE sha256 IS NULL")
-                .fetch_all(&mut *transaction)
-                .await
-                .map_err(failed)?;
-        for (key, number) in &missing {
-            let (document, weights): (Vec<u8>, Vec<u8>) = sqlx::query_as(
-                "SELECT convert_to(metadata, 'UTF8'), weights FROM models WHERE camera_key = $1 AND number = $2",
-            )
-            .bind(key)
-            .bind(number)
-            .fetch_one(&mut *transaction)
-            .await
-            .map_err(failed)?;
-            sqlx::query("UPDATE models SET sha256 = $1 WHERE camera_key = $2 AND number = $3")
-                .bind(model_sha256(&document, &weights))
-                .bind(key)
-                .bind(number)
-                .execute(&mut *transaction)
-                .await
-                .map_err(failed)?;
-        }
-        transaction.commit().await.map_err(failed)?;
-        Ok(missing.len() as u64)
-    }
-
     pub(crate) async fn held_out_errors(
         &self,
         camera: &CameraId,

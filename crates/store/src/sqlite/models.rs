@@ -63,35 +63,6 @@ impl Store {
         read_content(camera, number, content)
     }
 
-    pub(crate) async fn fill_in_model_checksums(&self) -> Result<u64> {
-        let mut writer = self.synced().await?;
-        let mut transaction = writer.begin().await?;
-        let missing: Vec<(i64, i64)> =
-            sqlx::query_as("SELECT camera_key, number FROM models WHERE sha256 IS NULL")
-                .fetch_all(&mut *transaction)
-                .await
-                .map_err(failed)?;
-        for (key, number) in &missing {
-            let (document, weights): (Vec<u8>, Vec<u8>) = sqlx::query_as(
-                "SELECT CAST(metadata AS BLOB), weights FROM models WHERE camera_key = ? AND number = ?",
-            )
-            .bind(key)
-            .bind(number)
-            .fetch_one(&mut *transaction)
-            .await
-            .map_err(failed)?;
-            sqlx::query("UPDATE models SET sha256 = ? WHERE camera_key = ? AND number = ?")
-                .bind(model_sha256(&document, &weights))
-                .bind(key)
-                .bind(number)
-                .execute(&mut *transaction)
-                .await
-                .map_err(failed)?;
-        }
-        transaction.commit().await.map_err(failed)?;
-        Ok(missing.len() as u64)
-    }
-
     pub(crate) async fn held_out_errors(
         &self,
         camera: &CameraId,

@@ -1,7 +1,6 @@
-//! The methods of [`Store`] that both backends have, each with what it promises.
+//! The methods of [`Store`], each with what it promises.
 //!
-//! A new method is added here and to `sqlite` and `postgres` under the same signature, with cases in `tests`. PostgreSQL
-//! may end a transaction in favour of another one; then the method is called again, so what it commits before its last
+//! A new method is added here and to `entities` under the same signature, with cases in `tests`. PostgreSQL may end a transaction in favour of another one; then the method is called again, so what it commits before its last
 //! transaction must bear repetition.
 
 use std::time::Duration;
@@ -10,8 +9,8 @@ use jiff::Timestamp;
 
 use super::postgres::repeated;
 use super::{
-    Backend, CameraContent, CameraVersions, ChangeMark, Claim, Heartbeat, IdempotencyRecord, JobCounts,
-    JobEnd, KeysVersion, RunEnd, SampleFilter, SampleKey, SiteRunEnd, StorageStatus, Store, StoredAnswer,
+    CameraContent, CameraVersions, ChangeMark, Claim, Heartbeat, IdempotencyRecord, JobCounts, JobEnd,
+    KeysVersion, RunEnd, SampleFilter, SampleKey, SiteRunEnd, StorageStatus, Store, StoredAnswer,
     StoredHeldOutError,
 };
 #[cfg(doc)]
@@ -32,10 +31,7 @@ macro_rules! contract {
             $(
                 $(#[$attribute])*
                 pub async fn $name(&self $(, $argument: $type)*) -> $output {
-                    match &self.0 {
-                        Backend::Sqlite(store) => store.$name($($argument),*).await,
-                        Backend::Postgres(store) => repeated!(store.$name($(Clone::clone(&$argument)),*)),
-                    }
+                    repeated!(self.0.$name($(Clone::clone(&$argument)),*))
                 }
             )*
         }

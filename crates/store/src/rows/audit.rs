@@ -29,7 +29,7 @@ pub(crate) fn version(number: impl std::fmt::Display) -> String {
     format!("version {number}")
 }
 
-pub(crate) fn read_entry<'r>(row: impl Into<StoredRow<'r>>) -> Result<AuditEntry> {
+pub(crate) fn read_entry(row: &StoredRow) -> Result<AuditEntry> {
     let mut fields = RowDecoder::new("audit_log", row);
     Ok(AuditEntry {
         number: AuditNumber(fields.parse(|number: i64| u64::try_from(number))?),

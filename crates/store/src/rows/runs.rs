@@ -1,12 +1,14 @@
 //! Rows of training runs, and what finishes them.
 
+use sqlx::AssertSqlSafe;
 use uuid::Uuid;
 
 use super::models::NewModel;
 use crate::domain::{
     CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
 };
-use crate::jobs::{JobEnd, read_state};
+use crate::jobs::{JobEnd, job_state, read_state};
+use crate::query::Dialect;
 use crate::refusals::no_run;
 use crate::row_decoder::{RowDecoder, StoredRow};
 
@@ -28,18 +30,18 @@ pub struct RunOutput<'a> {
 /// How a worker finishes a run.
 pub type RunEnd<'a> = JobEnd<RunOutput<'a>>;
 
-macro_rules! select_runs {
-    ($report:literal, $rest:literal) => {
-        concat!(
-            "SELECT runs.id, cameras.id, runs.recipe, runs.seed, runs.epochs, runs.from_us, runs.until_us, \
-             ", $crate::jobs::job_state!("runs"), ", runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
-             runs.reconstruction_error, runs.regression_error, runs.error_scale, runs.remaining_s, \
-             runs.model_version, (SELECT ", $report, " FROM models \
-             WHERE models.camera_key = runs.camera_key AND models.number = runs.model_version), runs.outcome, runs.created_at_us, runs.started_at_us, runs.ended_at_us \
-             FROM training_runs AS runs JOIN cameras ON cameras.key = runs.camera_key ",
-            $rest
-        )
-    };
+/// A statement for [`read_run`].
+pub(crate) fn select_runs(dialect: Dialect, rest: &'static str) -> AssertSqlSafe<String> {
+    AssertSqlSafe(format!(
+        "SELECT runs.id, cameras.id, runs.recipe, runs.seed, runs.epochs, runs.from_us, runs.until_us, {}, \
+         runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
+         runs.reconstruction_error, runs.regression_error, runs.error_scale, runs.remaining_s, \
+         runs.model_version, (SELECT {} FROM models WHERE models.camera_key = runs.camera_key \
+         AND models.number = runs.model_version), runs.outcome, runs.created_at_us, runs.started_at_us, \
+         runs.ended_at_us FROM training_runs AS runs JOIN cameras ON cameras.key = runs.camera_key {rest}",
+        job_state!("runs"),
+        dialect.training_report()
+    ))
 }
 
 /// The run, if it is one of that camera.
@@ -47,7 +49,7 @@ pub(crate) fn run_of(found: Option<TrainingRun>, camera: &CameraId, run: RunId) 
     found.filter(|found| found.camera_id == *camera).ok_or_else(|| no_run(run))
 }
 
-pub(crate) fn read_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<TrainingRun> {
+pub(crate) fn read_run(row: &StoredRow) -> Result<TrainingRun> {
     let mut fields = RowDecoder::new("training_runs", row);
     Ok(TrainingRun {
         id: RunId(fields.parse(Uuid::parse_str)?),
@@ -79,8 +81,6 @@ pub(crate) fn read_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<TrainingRun>
         ended_at: fields.optional_timestamp()?,
     })
 }
-
-pub(crate) use select_runs;
 
 /// A camera has one live run at most.
 pub(crate) fn check_no_live_run(live: Option<String>) -> Result<()> {

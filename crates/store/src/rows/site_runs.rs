@@ -53,7 +53,7 @@ macro_rules! select_site_runs {
 
 pub(crate) use select_site_runs;
 
-pub(crate) fn read_site_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<SiteTrainingRun> {
+pub(crate) fn read_site_run(row: &StoredRow) -> Result<SiteTrainingRun> {
     let mut fields = RowDecoder::new("site_training_runs", row);
     Ok(SiteTrainingRun {
         id: RunId(fields.parse(Uuid::parse_str)?),

@@ -18,7 +18,8 @@ use jiff::Timestamp;
 use tempfile::TempDir;
 use uuid::Uuid;
 
-use super::{Backend, DatabaseUrl, Location, Store, StoreOptions, on_backend};
+use super::database::Backend;
+use super::{DatabaseUrl, Location, Store, StoreOptions, on_backend};
 use crate::domain::{
     BoundingBox, CameraId, Durability, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg,
     Recipe, Result, RunId, Sample, TargetId, TrainingOptions,
@@ -116,7 +117,7 @@ impl Fixture {
 
     /// As [`Fixture::tamper`], in the words of each backend.
     async fn tamper_each(&self, sqlite: &'static str, postgres: &'static str) {
-        match &self.store.0 {
+        match &self.store.0.backend {
             Backend::Sqlite(store) => store.tamper(sqlite).await,
             Backend::Postgres(store) => store.tamper(postgres).await,
         }

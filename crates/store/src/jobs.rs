@@ -140,11 +140,11 @@ pub(super) fn lease_us(lease: Duration) -> i64 {
 pub(super) const CLOCK_ERROR_US: i64 = 60_000_000;
 
 /// Condition under which no worker holds a live lease on a job, where `now` is an expression for the time now in
-/// microseconds. Rows of earlier releases do not have the length of their lease; an hour is longer than any was.
+/// microseconds.
 pub(super) fn lease_expired(now: &str) -> String {
     format!(
         "(lease_until_us IS NULL OR lease_until_us <= {now} \
-         OR lease_until_us > {now} + coalesce(lease_us, 3600000000) + {CLOCK_ERROR_US})"
+         OR lease_until_us > {now} + lease_us + {CLOCK_ERROR_US})"
     )
 }
 

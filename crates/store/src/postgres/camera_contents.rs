@@ -11,7 +11,7 @@ use crate::rows::cameras::{CameraContent, camera_columns as columns, read_camera
 use crate::rows::models::{read_content, read_move};
 
 /// Id of the camera, metadata document, weights and checksum.
-type StoredModel = (String, Vec<u8>, Vec<u8>, Option<String>);
+type StoredModel = (String, Vec<u8>, Vec<u8>, String);
 
 impl Store {
     pub(crate) async fn camera_contents(&self, ids: &[CameraId]) -> Result<Vec<Result<CameraContent>>> {

@@ -1,6 +1,6 @@
 //! The partitions of samples: one table per week of their time, added before the week begins and dropped as a whole.
 //!
-//! Migration 0018 makes one partition of everything before a week, and a default one. Weeks are those of the Unix epoch.
+//! The schema has one partition of everything before a week, and a default one. Weeks are those of the Unix epoch.
 
 use jiff::Timestamp;
 use jiff::tz::TimeZone;

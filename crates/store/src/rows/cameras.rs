@@ -134,8 +134,7 @@ struct StoredReceiver {
     receiver_id: String,
     target_id: String,
     clock_offset_us: i64,
-    /// Missing in rows of earlier releases.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     sigma_m: Option<f64>,
 }
 

@@ -121,7 +121,7 @@ pub(crate) fn write_metadata(metadata: &ModelMetadata) -> Result<String> {
 }
 
 /// Metadata document, weights and checksum of a version, if it was found.
-pub(crate) type StoredContent = Option<(Vec<u8>, Vec<u8>, Option<String>)>;
+pub(crate) type StoredContent = Option<(Vec<u8>, Vec<u8>, String)>;
 
 /// Metadata and weights of a version as they were stored, with the checksum verified.
 pub(crate) fn read_content(
@@ -130,7 +130,7 @@ pub(crate) fn read_content(
     content: StoredContent,
 ) -> Result<(ModelMetadata, Vec<u8>)> {
     let (document, weights, sha256) = content.ok_or_else(|| no_model(camera, number))?;
-    if sha256.is_some_and(|sha256| sha256 != model_sha256(&document, &weights)) {
+    if sha256 != model_sha256(&document, &weights) {
         return Err(unusable(camera, number, "what is stored does not match its checksum"));
     }
     let metadata = serde_json::from_slice(&document)

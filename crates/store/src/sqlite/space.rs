@@ -151,8 +151,7 @@ impl Store {
         })
     }
 
-    /// Gives some of the free pages back, few enough that nobody waits for long. Does nothing in files
-    /// that were made before free pages could be given back.
+    /// Gives some of the free pages back, few enough that nobody waits for long.
     async fn vacuum(&self) -> Result<()> {
         let (_, free_pages) = self.pages().await?;
         if free_pages <= FREE_PAGES_KEPT {

@@ -142,19 +142,6 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
 }
 
 #[tokio::test]
-async fn a_camera_stored_before_there_were_receivers_has_none() {
-    let fixture = Fixture::new().await;
-    fixture
-        .tamper(
-            "INSERT INTO cameras (id, display_name, recipe, target_classes, labels, revision, created_at_us, \
-             updated_at_us) VALUES ('old', 'old', 'auto', '[]', '{}', 1, 0, 0)",
-        )
-        .await;
-    let old = fixture.store.camera(&id("old")).await.expect("readable");
-    assert!(old.profile.receivers.is_empty());
-}
-
-#[tokio::test]
 async fn a_corrupt_row_is_a_fault_that_names_its_place() {
     let fixture = Fixture::new().await;
     fixture.tamper("UPDATE cameras SET recipe = 'magic' WHERE id = 'square'").await;

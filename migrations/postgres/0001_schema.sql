@@ -1,6 +1,3 @@
--- The schema that migrations/sqlite reaches with step 0011, written once for PostgreSQL. Later steps have the same
--- number and name as their twins in migrations/sqlite.
---
 -- Times are microseconds since 1970-01-01T00:00:00Z. Lists and maps are JSON text. Integers are BIGINT throughout, so
 -- that one type is bound and read. Ids have the collation "C": their order is that of their bytes, as in SQLite.
 -- Keys of cameras are never used twice: a row that names a deleted camera's key can only fail, never land under the
@@ -30,8 +27,8 @@ CREATE TABLE cameras (
     recipe             TEXT    NOT NULL,
     target_classes     TEXT    NOT NULL,
     labels             TEXT    NOT NULL,
-    receivers          TEXT    NOT NULL DEFAULT '[]',
-    retrain_when_moved BOOLEAN NOT NULL DEFAULT FALSE,
+    receivers          TEXT    NOT NULL,
+    retrain_when_moved BOOLEAN NOT NULL,
     revision           BIGINT  NOT NULL,
     created_at_us      BIGINT  NOT NULL,
     updated_at_us      BIGINT  NOT NULL,
@@ -43,7 +40,7 @@ CREATE TABLE cameras (
 CREATE INDEX cameras_of_site ON cameras (site_key, id) WHERE site_key IS NOT NULL;
 
 -- The primary key is at once the rule "one sample per camera, target and time" and the order in which samples of a
--- camera are read. Rows arrive in the order of time, so a BRIN of a few kB finds what is older than an instant.
+-- camera are read.
 CREATE TABLE samples (
     camera_key          BIGINT NOT NULL REFERENCES cameras (key) ON DELETE CASCADE,
     time_us             BIGINT NOT NULL,
@@ -60,8 +57,7 @@ CREATE TABLE samples (
     truth_longitude_deg DOUBLE PRECISION,
     truth_latitude_deg  DOUBLE PRECISION,
     PRIMARY KEY (camera_key, time_us, target_id)
-);
-CREATE INDEX samples_by_time ON samples USING BRIN (time_us);
+) PARTITION BY RANGE (time_us);
 
 -- Boxes that no receiver has a fix for. A key is in one of the two tables only; a sample with a fix takes the place of
 -- one without.
@@ -78,8 +74,25 @@ CREATE TABLE samples_without_fix (
     truth_longitude_deg DOUBLE PRECISION,
     truth_latitude_deg  DOUBLE PRECISION,
     PRIMARY KEY (camera_key, time_us, target_id)
-);
-CREATE INDEX samples_without_fix_by_time ON samples_without_fix USING BRIN (time_us);
+) PARTITION BY RANGE (time_us);
+
+-- Samples are in partitions by week of their time, so that old ones are dropped as tables. What is of the present week or
+-- before is in one partition; those of later weeks are added while the server runs. What has no partition goes to the
+-- default one. Weeks begin with those of the Unix epoch, on Thursdays 00:00 UTC.
+DO $$
+DECLARE
+    week_us CONSTANT BIGINT := 604800000000;
+    upto_us CONSTANT BIGINT := (floor(extract(epoch FROM now()) * 1000000 / week_us)::BIGINT + 1) * week_us;
+    upto    CONSTANT TEXT   := to_char(to_timestamp(upto_us / 1000000) AT TIME ZONE 'UTC', 'YYYYMMDD');
+    name    TEXT;
+BEGIN
+    FOREACH name IN ARRAY ARRAY['samples', 'samples_without_fix'] LOOP
+        EXECUTE format('CREATE TABLE %I PARTITION OF %I DEFAULT', name || '_other', name);
+        EXECUTE format('CREATE TABLE %I PARTITION OF %I FOR VALUES FROM (MINVALUE) TO (%s)',
+                       name || '_before_' || upto, name, upto_us);
+    END LOOP;
+END
+$$;
 
 -- Samples of each camera, counted with every import and deletion, so that a limit needs no scan.
 CREATE TABLE sample_counts (
@@ -90,6 +103,8 @@ CREATE TABLE sample_counts (
 
 -- Ids are UUIDs of version 7 as text: their order is the order of asking.
 -- seed holds the 64 bits of an unsigned number. A progress number that is NULL was not a number.
+-- priority is 1 for a run that a client asked for, 0 for one that the server started by itself. lease_us is the length of the
+-- current lease: one that ends further ahead than its own length was taken while the clock was wrong, and counts as expired.
 CREATE TABLE training_runs (
     id                   TEXT COLLATE "C" NOT NULL PRIMARY KEY,
     camera_key           BIGINT NOT NULL REFERENCES cameras (key) ON DELETE CASCADE,
@@ -117,11 +132,13 @@ CREATE TABLE training_runs (
     created_at_us        BIGINT NOT NULL,
     started_at_us        BIGINT,
     ended_at_us          BIGINT,
+    priority             BIGINT NOT NULL,
     CHECK ((state = 'running') = (lease_until_us IS NOT NULL))
 );
 CREATE UNIQUE INDEX one_live_run_per_camera ON training_runs (camera_key)
     WHERE state IN ('queued', 'running');
-CREATE INDEX live_training_runs ON training_runs (id) WHERE state IN ('queued', 'running');
+-- Waiting runs in the order in which they are claimed.
+CREATE INDEX waiting_training_runs ON training_runs (priority DESC, id) WHERE state IN ('queued', 'running');
 CREATE INDEX training_runs_of_camera ON training_runs (camera_key, id);
 
 CREATE TABLE training_epochs (
@@ -150,7 +167,7 @@ CREATE TABLE models (
     created_at_us BIGINT NOT NULL,
     metadata      TEXT   NOT NULL,
     weights       BYTEA  NOT NULL,
-    sha256        TEXT,
+    sha256        TEXT   NOT NULL,
     PRIMARY KEY (camera_key, number)
 );
 ALTER TABLE cameras ADD FOREIGN KEY (key, active_model) REFERENCES models (camera_key, number)
@@ -283,3 +300,173 @@ CREATE TABLE idempotency_keys (
     UNIQUE (owner, idempotency_key)
 );
 CREATE INDEX idempotency_keys_by_age ON idempotency_keys (created_at_us);
+
+-- Training runs over all cameras of a site: jobs as training runs of a camera are, with the same rules for lease and
+-- fence. The report is JSON and stands last, so that reading all else never touches it.
+CREATE TABLE site_training_runs (
+    id                   TEXT COLLATE "C" NOT NULL PRIMARY KEY,
+    site_key             BIGINT NOT NULL REFERENCES sites (key) ON DELETE CASCADE,
+    seed                 BIGINT NOT NULL,
+    from_us              BIGINT,
+    until_us             BIGINT,
+    state                TEXT NOT NULL
+                         CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')),
+    attempt              BIGINT NOT NULL DEFAULT 0,
+    fence                BIGINT NOT NULL DEFAULT 0,
+    lease_until_us       BIGINT,
+    lease_us             BIGINT,
+    cancel_requested     BIGINT NOT NULL DEFAULT 0,
+    phase                TEXT NOT NULL DEFAULT '',
+    epoch_done           BIGINT NOT NULL DEFAULT 0,
+    epochs_planned       BIGINT NOT NULL DEFAULT 0,
+    reconstruction_error DOUBLE PRECISION DEFAULT 0,
+    regression_error     DOUBLE PRECISION DEFAULT 0,
+    error_scale          DOUBLE PRECISION DEFAULT 0,
+    remaining_s          DOUBLE PRECISION,
+    outcome              TEXT,
+    created_at_us        BIGINT NOT NULL,
+    started_at_us        BIGINT,
+    ended_at_us          BIGINT,
+    report               TEXT,
+    CHECK ((state = 'running') = (lease_until_us IS NOT NULL))
+);
+
+CREATE UNIQUE INDEX one_live_run_per_site ON site_training_runs (site_key) WHERE state IN ('queued', 'running');
+CREATE INDEX live_site_training_runs ON site_training_runs (id) WHERE state IN ('queued', 'running');
+CREATE INDEX site_training_runs_of_site ON site_training_runs (site_key, id);
+
+-- Connections with other systems. `settings` is JSON and never contains a secret; `secrets` is a JSON object of texts,
+-- which no interface shows.
+CREATE TABLE connections (
+    key           BIGINT GENERATED BY DEFAULT AS IDENTITY PRIMARY KEY,
+    id            TEXT COLLATE "C" NOT NULL UNIQUE,
+    display_name  TEXT    NOT NULL,
+    paused        BOOLEAN NOT NULL,
+    settings      TEXT    NOT NULL,
+    secrets       TEXT    NOT NULL,
+    revision      BIGINT  NOT NULL,
+    created_at_us BIGINT  NOT NULL,
+    updated_at_us BIGINT  NOT NULL
+);
+
+-- Messages of sinks, in the order of their delivery. A row is deleted when its receiver has acknowledged it; a row with
+-- a reason is not tried any more.
+CREATE TABLE outbox (
+    number         BIGINT GENERATED BY DEFAULT AS IDENTITY PRIMARY KEY,
+    connection_key BIGINT NOT NULL REFERENCES connections (key) ON DELETE CASCADE,
+    message_id     TEXT   NOT NULL,
+    subject        TEXT   NOT NULL,
+    payload        BYTEA  NOT NULL,
+    created_at_us  BIGINT NOT NULL,
+    dead_reason    TEXT
+);
+CREATE INDEX outbox_queued ON outbox (connection_key, number) WHERE dead_reason IS NULL;
+CREATE INDEX outbox_dead ON outbox (connection_key, number) WHERE dead_reason IS NOT NULL;
+
+-- How far the outbox of a sink has come in the log of positions that a process keeps for it. The row is there before the
+-- process makes positions and goes when all of them are in the outbox, so one whose node is not registered any more tells
+-- of positions that may be lost; `ended_at_us` is when that was first seen.
+CREATE TABLE outbox_logs (
+    connection_key BIGINT NOT NULL REFERENCES connections (key) ON DELETE CASCADE,
+    log            TEXT COLLATE "C" NOT NULL,
+    node_id        TEXT COLLATE "C",
+    position       BIGINT NOT NULL,
+    ended_at_us    BIGINT,
+    PRIMARY KEY (connection_key, log)
+);
+
+-- How far sources have read the partitions of their topics, where the peer does not keep that for them (Kafka). All
+-- messages before `next_offset` are settled.
+CREATE TABLE source_offsets (
+    connection_key   BIGINT NOT NULL REFERENCES connections (key) ON DELETE CASCADE,
+    topic            TEXT COLLATE "C" NOT NULL,
+    partition_number BIGINT NOT NULL,
+    next_offset      BIGINT NOT NULL,
+    PRIMARY KEY (connection_key, topic, partition_number)
+);
+
+-- Processes that share the database. A row is one run of a process and lasts as long as that process renews it: whoever
+-- has seen the same renewal for lease_ms deletes the row, and with it the node's ownership of every camera.
+CREATE TABLE nodes (
+    id            TEXT COLLATE "C" PRIMARY KEY,
+    url           TEXT,
+    role          TEXT    NOT NULL,
+    version       TEXT    NOT NULL,
+    lease_ms      BIGINT  NOT NULL,
+    renewal       BIGINT  NOT NULL,
+    is_draining   BOOLEAN NOT NULL DEFAULT FALSE,
+    started_at_us BIGINT  NOT NULL,
+    renewed_at_us BIGINT  NOT NULL
+);
+
+-- The node that has a camera's live state. Nobody has it where node_id is NULL or no longer among the nodes. The fence
+-- goes up by one with every acquisition. wanted_by is the node whose source feeds a camera that another node owns; the owner
+-- gives the camera up for it.
+CREATE TABLE camera_owners (
+    camera_key BIGINT PRIMARY KEY REFERENCES cameras (key) ON DELETE CASCADE,
+    node_id    TEXT COLLATE "C",
+    fence      BIGINT NOT NULL,
+    wanted_by  TEXT COLLATE "C"
+);
+CREATE INDEX camera_owners_of_node ON camera_owners (node_id);
+CREATE INDEX camera_owners_wanted ON camera_owners (node_id) WHERE wanted_by IS NOT NULL;
+
+-- The node that runs a connection: reads its source, or delivers its outbox. Nobody does where node_id is NULL or no longer among
+-- the nodes. The fence goes up by one with every acquisition.
+CREATE TABLE connection_owners (
+    connection_key BIGINT PRIMARY KEY REFERENCES connections (key) ON DELETE CASCADE,
+    node_id        TEXT COLLATE "C",
+    fence          BIGINT NOT NULL
+);
+
+-- What each node knows of a connection, as JSON, so that every node can show it.
+CREATE TABLE connection_statuses (
+    connection_key BIGINT NOT NULL REFERENCES connections (key) ON DELETE CASCADE,
+    node_id        TEXT COLLATE "C" NOT NULL,
+    status         TEXT   NOT NULL,
+    PRIMARY KEY (connection_key, node_id)
+);
+
+-- In which transaction every camera was changed last, so that a poll reads what has changed and not all cameras. The numbers of
+-- transactions are compared with the oldest one that had not ended at the poll before: none is missed that is committed late.
+-- Rows of deleted cameras stay for a day; processes read all cameras every few minutes in any case.
+CREATE TABLE camera_changes (
+    camera_key BIGINT PRIMARY KEY,
+    id         TEXT COLLATE "C" NOT NULL,
+    is_deleted BOOLEAN          NOT NULL,
+    changed_in XID8             NOT NULL,
+    changed_at TIMESTAMPTZ      NOT NULL
+);
+CREATE INDEX camera_changes_by_transaction ON camera_changes (changed_in);
+CREATE INDEX camera_changes_of_deleted ON camera_changes (changed_at) WHERE is_deleted;
+
+CREATE FUNCTION note_camera_change() RETURNS TRIGGER LANGUAGE plpgsql AS $$
+DECLARE
+    camera cameras%ROWTYPE;
+BEGIN
+    IF TG_OP = 'DELETE' THEN
+        camera := OLD;
+        DELETE FROM camera_changes WHERE is_deleted AND changed_at < clock_timestamp() - INTERVAL '1 day';
+    ELSE
+        camera := NEW;
+    END IF;
+    INSERT INTO camera_changes VALUES (camera.key, camera.id, TG_OP = 'DELETE', pg_current_xact_id(), clock_timestamp())
+    ON CONFLICT (camera_key) DO UPDATE
+    SET is_deleted = EXCLUDED.is_deleted, changed_in = EXCLUDED.changed_in, changed_at = EXCLUDED.changed_at;
+    RETURN NULL;
+END
+$$;
+
+CREATE TRIGGER note_camera_change AFTER INSERT OR DELETE OR UPDATE OF revision, active_model ON cameras
+    FOR EACH ROW EXECUTE FUNCTION note_camera_change();
+
+-- Which server answers, and on which line of its history: a standby that becomes the primary begins a new timeline, and a
+-- backup that is restored to another server has another identifier. Empty where the server does not tell.
+CREATE FUNCTION database_history() RETURNS TEXT LANGUAGE plpgsql AS $$
+BEGIN
+    RETURN (SELECT system_identifier FROM pg_control_system()) || '/'
+        || left(pg_walfile_name(pg_current_wal_insert_lsn()), 8);
+EXCEPTION WHEN OTHERS THEN
+    RETURN '';
+END
+$$;

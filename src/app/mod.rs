@@ -69,7 +69,7 @@ pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
 pub use site_training::SiteRunRequest;
 pub use spool::{Content, Spool, SpoolLeases, Spooled};
-pub use training::RunRequest;
+pub use training::{RunRequest, Trainable};
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.
 #[derive(Clone)]

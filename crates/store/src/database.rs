@@ -14,7 +14,7 @@ use crate::{postgres, sqlite};
 /// The backend of a store, and on whose behalf it is changed. Each of its methods makes one attempt; those of
 /// [`crate::Store`] repeat what a database has ended in favour of another transaction.
 #[derive(Clone)]
-pub(crate) struct Database {
+pub struct Database {
     pub(crate) backend: Backend,
     /// On whose behalf changes are recorded in the audit log.
     pub(crate) actor: Arc<Actor>,

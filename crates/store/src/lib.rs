@@ -46,6 +46,7 @@ use database::{Backend, Database};
 
 pub use crate::domain::{SampleFilter, SampleKey};
 pub use copy::CopiedTable;
+pub use entities::RunSubject;
 pub use folder_fault::{FolderFault, FolderFaultKind};
 pub use group_commit::{Completion, InsertOptions, Inserted};
 pub use jobs::{Claim, Heartbeat, JobCounts, JobEnd, LiveJobs};

@@ -16,13 +16,13 @@ use crate::row_decoder::StoredRow;
 use crate::sqlite::failed as sqlite_failed;
 
 /// A connection to either database.
-pub(crate) enum AnyConnection<'c> {
+pub enum AnyConnection<'c> {
     Sqlite(&'c mut SqliteConnection),
     Postgres(&'c mut PgConnection),
 }
 
 /// What a statement is executed on: a transaction or a connection.
-pub(crate) trait Session: Send {
+pub trait Session: Send {
     fn connection(&mut self) -> AnyConnection<'_>;
 
     fn dialect(&mut self) -> Dialect {
@@ -47,7 +47,7 @@ impl Session for PgConnection {
 
 /// Expressions that the two databases write differently.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Dialect {
+pub enum Dialect {
     Sqlite,
     Postgres,
 }
@@ -151,7 +151,7 @@ values! {
 
 /// A statement with its values; its rows are read as `T`.
 #[must_use]
-pub(crate) struct Query<T> {
+pub struct Query<T> {
     sql: SqlStr,
     lock: Option<RowLock>,
     values: Vec<Value>,

@@ -12,7 +12,7 @@ use super::refusals::Corrupt;
 use crate::domain::{Error, Result, Revision};
 
 /// A row of either backend.
-pub(super) enum StoredRow {
+pub enum StoredRow {
     Sqlite(SqliteRow),
     Postgres(PgRow),
 }
@@ -66,7 +66,7 @@ impl<'r, T> Stored<'r> for T where T: Decode<'r, Sqlite> + Type<Sqlite> + Decode
 
 /// Decodes the columns of one row from left to right. Every SELECT names the key's columns first, so
 /// that a fault can name the row.
-pub(super) struct RowDecoder<'r> {
+pub struct RowDecoder<'r> {
     table: &'static str,
     row: &'r StoredRow,
     next: usize,

@@ -15,8 +15,6 @@ use crate::jobs::{
 use crate::locks::{Limit, lock_limit};
 use crate::query::{RowLock, Session, query, query_as, query_scalar};
 
-pub(super) const RUNS: Jobs = Jobs(&jobs::RUNS);
-pub(super) const SITE_RUNS: Jobs = Jobs(&jobs::SITE_RUNS);
 pub(super) const EVALUATIONS: Jobs = Jobs(&jobs::EVALUATIONS);
 
 impl Database {
@@ -28,7 +26,8 @@ impl Database {
 }
 
 /// The statements of a table of jobs.
-pub(super) struct Jobs(&'static JobTable);
+#[derive(Clone, Copy)]
+pub(super) struct Jobs(pub(super) &'static JobTable);
 
 impl Jobs {
     /// Refuses one job more than `max_live` that have not ended.

@@ -3,6 +3,7 @@
 mod audit;
 mod camera_contents;
 mod camera_moves;
+mod camera_runs;
 mod cameras;
 mod connections;
 mod evaluations;
@@ -27,5 +28,6 @@ pub(crate) use audit::record;
 pub(crate) use camera_contents::all_versions;
 pub(crate) use idempotency::insert_answer;
 pub(crate) use keys::keys_version;
+pub use runs::RunSubject;
 pub(crate) use sample_counts::{count_all_samples, subtract};
 pub(crate) use sample_retention::delete_oldest;

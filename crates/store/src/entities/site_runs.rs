@@ -1,54 +1,34 @@
-//! Training runs of sites: jobs whose output is a model version of each camera.
-
-use std::time::Duration;
+//! What is particular to training runs of a site: their output is a model version of each camera.
 
 use jiff::Timestamp;
 
-use super::idempotency::{find_answer, insert_answer, lock_key};
-use super::jobs::SITE_RUNS;
+use super::jobs::Jobs;
 use super::models::{activate, add_model};
 use super::retention::prune_models;
+use super::runs::RunSubject;
 use crate::database::Database;
-use crate::domain::{
-    AuditAction, Error, Result, RunId, RunProgress, SiteId, SiteTrainingOptions, SiteTrainingReport,
-    SiteTrainingRun,
-};
-use crate::jobs::{Claim, Heartbeat, JobEnd};
-use crate::query::{RowLock, Session, query, query_as, query_scalar};
-use crate::refusals::{no_run, no_site};
+use crate::domain::{AuditAction, Error, Result, RunId, SiteId, SiteTrainingOptions, SiteTrainingReport};
+use crate::jobs::{JobEnd, SITE_RUNS};
+use crate::query::{Query, RowLock, Session, query, query_as, query_scalar};
+use crate::refusals::no_site;
+use crate::row_decoder::StoredRow;
 use crate::rows::audit::{Change, version};
-use crate::rows::idempotency::IdempotencyRecord;
-use crate::rows::site_runs::{
-    SiteCameraOutput, SiteRunEnd, SiteRunOutput, check_no_live_site_run, check_site_run_not_ended,
-    conflict_of, read_site_run, select_site_runs as select, site_run_of,
-};
+use crate::rows::site_runs::{SiteCameraOutput, SiteRunEnd, SiteRunOutput, conflict_of};
 
-impl Database {
-    pub(crate) async fn insert_site_run(
-        &self,
-        run: RunId,
-        site: &SiteId,
-        options: &SiteTrainingOptions,
-        max_live: u32,
-        record: Option<&IdempotencyRecord>,
-        now: Timestamp,
-    ) -> Result<SiteTrainingRun> {
-        let mut writer = self.growing().await?;
-        let mut transaction = writer.begin().await?;
-        let key = lock_site(&mut transaction, site).await?;
-        if let Some(record) = record {
-            let caller = (&*self.actor, &record.key);
-            lock_key(&mut transaction, caller).await?;
-            if let Some(answer) = find_answer(&mut transaction, self.limits(), caller, now).await? {
-                let first = answer.to_request(&record.digest)?.parse()?;
-                return site_run_of(find_run(&mut transaction, first).await?, site, first);
-            }
-            insert_answer(&mut transaction, self.limits(), (&self.actor, record), &run.to_string(), now)
-                .await?;
-        }
-        SITE_RUNS.prune_ended(&mut transaction, key, self.limits().ended_runs_per_camera).await?;
-        check_no_live_site_run(SITE_RUNS.live_of(&mut transaction, key).await?)?;
-        SITE_RUNS.check_capacity(&mut transaction, max_live).await?;
+impl RunSubject for SiteId {
+    type Output<'a> = SiteRunOutput<'a>;
+
+    const ACTIONS: [AuditAction; 2] = [AuditAction::SiteRunStarted, AuditAction::SiteRunCancelled];
+
+    async fn key(&self, session: &mut dyn Session) -> Result<i64> {
+        site_key(session, self).await
+    }
+
+    async fn lock(&self, session: &mut dyn Session) -> Result<i64> {
+        lock_site(session, self).await
+    }
+
+    fn insert(run: RunId, key: i64, options: &SiteTrainingOptions, _priority: i64) -> Query<StoredRow> {
         query(
             "INSERT INTO site_training_runs (id, site_key, seed, from_us, until_us, state, created_at_us) \
              VALUES ($1, $2, $3, $4, $5, 'queued', $6)",
@@ -58,117 +38,36 @@ impl Database {
         .bind(options.seed.cast_signed())
         .bind(options.from.map(Timestamp::as_microsecond))
         .bind(options.until.map(Timestamp::as_microsecond))
-        .bind(now.as_microsecond())
-        .execute(&mut transaction)
-        .await?;
-        self.record(&mut transaction, change(AuditAction::SiteRunStarted, site, run), now).await?;
-        let stored = find_run(&mut transaction, run).await?;
-        transaction.commit().await?;
-        stored.ok_or_else(|| no_run(run))
     }
 
-    pub(crate) async fn site_run(&self, site: &SiteId, run: RunId) -> Result<SiteTrainingRun> {
-        let mut reader = self.reader().await?;
-        site_key(&mut reader, site).await?;
-        site_run_of(find_run(&mut reader, run).await?, site, run)
+    fn change(&self, action: AuditAction, run: RunId) -> Change<'_> {
+        Change::of(action, format!("site {self}, training run {run}"))
     }
 
-    pub(crate) async fn site_runs(
-        &self,
-        site: &SiteId,
-        before: Option<RunId>,
-        limit: u32,
-    ) -> Result<Vec<SiteTrainingRun>> {
-        let mut reader = self.reader().await?;
-        let key = site_key(&mut reader, site).await?;
-        // "~" sorts after all UUIDs.
-        let before = before.map_or_else(|| "~".to_owned(), |run| run.to_string());
-        let rows = query(select!("WHERE runs.site_key = $1 AND runs.id < $2 ORDER BY runs.id DESC LIMIT $3"))
-            .bind(key)
-            .bind(before)
-            .bind(limit)
-            .fetch_all(&mut reader)
-            .await?;
-        rows.iter().map(read_site_run).collect()
+    async fn prepare_end<'a>(
+        session: &mut dyn Session,
+        claimed: (RunId, i64),
+        end: JobEnd<Self::Output<'a>>,
+    ) -> Result<JobEnd<Self::Output<'a>>> {
+        without_conflict(session, claimed, end).await
     }
 
-    pub(crate) async fn claim_site_run(
-        &self,
-        lease: Duration,
+    async fn store_output(
+        database: &Database,
+        session: &mut dyn Session,
+        (run, _): (RunId, i64),
+        SiteRunOutput { mut report, models }: Self::Output<'_>,
         now: Timestamp,
-    ) -> Result<Option<Claim<SiteTrainingRun>>> {
-        let mut writer = self.synced().await?;
-        let mut transaction = writer.begin().await?;
-        let Some(claim) = SITE_RUNS.claim(&mut transaction, lease, now).await? else { return Ok(None) };
-        let id = RunId(claim.job);
-        let job = find_run(&mut transaction, id).await?.ok_or_else(|| no_run(id))?;
-        transaction.commit().await?;
-        Ok(Some(Claim { job, fence: claim.fence, cancel_requested: claim.cancel_requested }))
-    }
-
-    pub(crate) async fn heartbeat_site_run(
-        &self,
-        run: RunId,
-        fence: i64,
-        progress: &RunProgress,
-        lease: Duration,
-        now: Timestamp,
-    ) -> Result<Heartbeat> {
-        let mut writer = self.relaxed().await?;
-        let mut transaction = writer.begin().await?;
-        let heartbeat = SITE_RUNS.heartbeat(&mut transaction, (run.0, fence), lease, now).await?;
-        if heartbeat == Heartbeat::Lost {
-            return Ok(heartbeat);
+    ) -> Result<()> {
+        let activates = report.is_activated;
+        for (output, finding) in models.iter().zip(&mut report.cameras) {
+            finding.model_version = database.add_site_model(session, output, activates, now).await?;
         }
-        SITE_RUNS.record_progress(&mut transaction, run.0, progress).await?;
-        transaction.commit().await?;
-        Ok(heartbeat)
+        store_report(session, run, &report).await
     }
+}
 
-    pub(crate) async fn cancel_site_run(
-        &self,
-        site: &SiteId,
-        run: RunId,
-        now: Timestamp,
-    ) -> Result<SiteTrainingRun> {
-        let mut writer = self.synced().await?;
-        let mut transaction = writer.begin().await?;
-        site_key(&mut transaction, site).await?;
-        SITE_RUNS.lock(&mut transaction, run.0).await?;
-        let stored = site_run_of(find_run(&mut transaction, run).await?, site, run)?;
-        check_site_run_not_ended(&stored)?;
-        SITE_RUNS.cancel(&mut transaction, run.0, now).await?;
-        self.record(&mut transaction, change(AuditAction::SiteRunCancelled, site, run), now).await?;
-        let stored = find_run(&mut transaction, run).await?;
-        transaction.commit().await?;
-        stored.ok_or_else(|| no_run(run))
-    }
-
-    pub(crate) async fn finish_site_run(
-        &self,
-        run: RunId,
-        fence: i64,
-        end: SiteRunEnd<'_>,
-        now: Timestamp,
-    ) -> Result<Option<SiteTrainingRun>> {
-        let mut writer = self.synced().await?;
-        let mut transaction = writer.begin().await?;
-        let end = without_conflict(&mut transaction, (run, fence), end).await?;
-        let Some(finished) = SITE_RUNS.finish(&mut transaction, (run.0, fence), end, now).await? else {
-            return Ok(None);
-        };
-        if let Some(SiteRunOutput { mut report, models }) = finished.output {
-            let activates = report.is_activated;
-            for (output, finding) in models.iter().zip(&mut report.cameras) {
-                finding.model_version = self.add_site_model(&mut transaction, output, activates, now).await?;
-            }
-            store_report(&mut transaction, run, &report).await?;
-        }
-        let stored = find_run(&mut transaction, run).await?;
-        transaction.commit().await?;
-        Ok(stored)
-    }
-
+impl Database {
     /// Stores the model of one camera, and activates it where the set is; returns its number.
     async fn add_site_model(
         &self,
@@ -202,7 +101,9 @@ async fn without_conflict<'a>(
         let camera = query("SELECT key FROM cameras WHERE key = $1").bind(key);
         camera.locking(RowLock::NoKeyUpdate).execute(session).await?;
     }
-    let Some((site_key, _)) = SITE_RUNS.owns_lease(session, (run.0, fence)).await? else { return Ok(end) };
+    let Some((site_key, _)) = Jobs(&SITE_RUNS).owns_lease(session, (run.0, fence)).await? else {
+        return Ok(end);
+    };
     for output in &output.models {
         let stored = query_as("SELECT site_key, active_model FROM cameras WHERE key = $1")
             .bind(output.key.0)
@@ -224,10 +125,6 @@ async fn store_report(session: &mut dyn Session, run: RunId, report: &SiteTraini
     Ok(())
 }
 
-fn change(action: AuditAction, site: &SiteId, run: RunId) -> Change<'static> {
-    Change::of(action, format!("site {site}, training run {run}"))
-}
-
 async fn site_key(session: &mut dyn Session, id: &SiteId) -> Result<i64> {
     query_scalar("SELECT key FROM sites WHERE id = $1")
         .bind(id.as_str())
@@ -244,9 +141,4 @@ async fn lock_site(session: &mut dyn Session, id: &SiteId) -> Result<i64> {
         .fetch_optional(session)
         .await?
         .ok_or_else(|| no_site(id))
-}
-
-async fn find_run(session: &mut dyn Session, run: RunId) -> Result<Option<SiteTrainingRun>> {
-    let row = query(select!("WHERE runs.id = $1")).bind(run.to_string()).fetch_optional(session).await?;
-    row.as_ref().map(read_site_run).transpose()
 }

@@ -2,9 +2,10 @@
 
 use jiff::Timestamp;
 
-use super::jobs::RUNS;
+use super::jobs::Jobs;
 use crate::database::Database;
 use crate::domain::{EpochReport, Result, RunId};
+use crate::jobs::RUNS;
 use crate::query::{Session, query, query_scalar};
 use crate::refusals::no_run;
 use crate::row_decoder::RowDecoder;
@@ -14,7 +15,7 @@ impl Database {
     pub(crate) async fn append_epochs(&self, run: RunId, fence: i64, epochs: &[EpochReport]) -> Result<()> {
         let mut writer = self.relaxed().await?;
         let mut transaction = writer.begin().await?;
-        if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
+        if Jobs(&RUNS).owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
         for report in epochs {
@@ -39,7 +40,7 @@ impl Database {
     pub(crate) async fn append_log(&self, run: RunId, fence: i64, now: Timestamp, line: &str) -> Result<()> {
         let mut writer = self.relaxed().await?;
         let mut transaction = writer.begin().await?;
-        if RUNS.owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
+        if Jobs(&RUNS).owns_lease(&mut transaction, (run.0, fence)).await?.is_none() {
             return Ok(());
         }
         let number: i64 = query_scalar(

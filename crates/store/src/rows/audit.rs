@@ -6,7 +6,7 @@ use crate::domain::{Actor, AuditAction, AuditEntry, AuditNumber, CameraId, KeyId
 use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// A change, for the audit log.
-pub(crate) struct Change<'a> {
+pub struct Change<'a> {
     pub(crate) action: AuditAction,
     pub(crate) camera: Option<&'a CameraId>,
     pub(crate) subject: Option<String>,

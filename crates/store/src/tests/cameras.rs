@@ -121,7 +121,7 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
         .expect("stored");
     store.insert_model(&camera, &metadata(), b"w", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
-    store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
+    store.insert_run(run_id(1), &camera, &options(), 9, None, at(3)).await.expect("queued");
     assert_eq!(kind(store.delete_camera(&camera, None, at(9)).await), ErrorKind::RunLive);
     store.cancel_run(&camera, run_id(1), at(4)).await.expect("cancelled");
 

@@ -207,11 +207,11 @@ async fn futures_can_move_between_threads() {
     movable(store.insert_samples(&camera, Vec::<Sample>::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));
     movable(store.delete_samples(&camera, &filter, at(9)));
-    movable(store.insert_run(run, &camera, &options(), 1, at(0)));
-    movable(store.claim_run(lease, at(0)));
-    movable(store.heartbeat_run(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
+    movable(store.insert_run(run, &camera, &options(), 1, None, at(0)));
+    movable(store.claim_run::<CameraId>(lease, at(0)));
+    movable(store.heartbeat_run::<CameraId>(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
     movable(store.append_epochs(run, 1, &[]));
-    movable(store.finish_run(run, 1, super::RunEnd::Cancelled, at(0)));
+    movable(store.finish_run::<CameraId>(run, 1, super::RunEnd::Cancelled, at(0)));
     movable(store.claim_evaluation(lease, at(0)));
     movable(store.roll_back(&camera, at(0)));
 }

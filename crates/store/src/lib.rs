@@ -1,9 +1,10 @@
 //! Persistent storage behind one type, [`Store`]; the only crate with SQL.
 //!
-//! Two backends, written by hand: a file in a data folder (`sqlite`) and a database of a server (`postgres`). The
-//! methods of [`Store`] are listed once, in `contract`, with what they promise; the suite in `tests` holds both
-//! backends to it. What is in a row (`rows`), the rules of jobs (`jobs`), limits and the queue of samples that are
-//! committed in groups (`group_commit`) are the same for both.
+//! Two backends: a file in a data folder (`sqlite`) and a database of a server (`postgres`). The methods of [`Store`]
+//! are listed once, in `contract`, with what they promise; the suite in `tests` holds both backends to it. What is
+//! stored is written once, an entity per file (`entities`), over the statements of `query` and the transactions of
+//! `database`. What is in a row (`rows`), the rules of jobs (`jobs`), limits and the queue of samples that are
+//! committed in groups (`group_commit`) are the same for both, too.
 //!
 //! The crate reads no clock, and checks no numbers, since they are valid by construction. It holds a transaction across
 //! statements alone, and makes no type of the database library public. Rows that the constructors of `domain` refuse

@@ -41,7 +41,7 @@ pub(crate) fn run() {
             for id in &cameras {
                 let wish =
                     RunRequest { recipe: Some(Recipe::Paper), epochs: Some(10_000), ..RunRequest::default() };
-                runs.push((id, served.app.start_run(id, wish).await.expect("a run").id));
+                runs.push((id, served.app.start_run(id, wish, None).await.expect("a run").id));
             }
             // Until the fits are under way.
             tokio::time::sleep(std::time::Duration::from_millis(700)).await;

@@ -130,11 +130,11 @@ fn claims(url: &str) {
                 for _ in 0..CLAIMS_EACH {
                     let began = Instant::now();
                     let store = &stores[worker % PROCESSES];
-                    let claim = store.claim_run(Duration::from_secs(60), NOW);
+                    let claim = store.claim_run::<CameraId>(Duration::from_secs(60), NOW);
                     let claim = claim.await.expect("the database answers").expect("a queued run");
                     times.push(began.elapsed().as_secs_f64() * 1e3);
                     let end = RunEnd::Failed { outcome: "only claimed".to_owned() };
-                    let ended = store.finish_run(claim.job.id, claim.fence, end, NOW);
+                    let ended = store.finish_run::<CameraId>(claim.job.id, claim.fence, end, NOW);
                     ended.await.expect("the database answers").expect("the lease is held");
                 }
                 times

@@ -68,7 +68,7 @@ impl Served {
 
     /// Trains and waits.
     pub(crate) async fn train(&self, request: RunRequest) {
-        let run = self.app.start_run(&self.camera, request).await.expect("a run");
+        let run = self.app.start_run(&self.camera, request, None).await.expect("a run");
         loop {
             let run = self.app.run(&self.camera, run.id).await.expect("the run");
             if run.state.has_ended() {

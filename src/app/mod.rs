@@ -69,7 +69,7 @@ pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
 pub use site_training::SiteRunRequest;
 pub use spool::{Content, Spool, SpoolLeases, Spooled};
-pub use training::RunRequest;
+pub use training::{RunRequest, Trainable};
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.
 #[derive(Clone)]
@@ -147,10 +147,6 @@ impl App {
         let mut run_id = [0; 8];
         randomness.fill(&mut run_id);
         let registry = Registry::of_run(u64::from_le_bytes(run_id));
-        let filled = store.fill_in_model_checksums().await?;
-        if filled > 0 {
-            tracing::info!(models = filled, "stored checksums of model versions of an earlier release");
-        }
         let site_registry = SiteRegistry::new(randomness.clone(), limits.site_events);
         let access = Access::default();
         access.refresh(&store, &clock).await?;

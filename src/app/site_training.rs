@@ -1,15 +1,10 @@
-//! Training runs of sites: start, list, cancel, watch. `worker` runs them.
+//! What is particular to training runs of sites: their request, and which cameras are trained.
 
-use futures_util::Stream;
 use jiff::Timestamp;
 
-use super::idempotency::record_of;
-use super::training::{check_extent, watch_changes};
-use super::{App, Page, page_of};
-use crate::domain::{
-    Camera, Error, ErrorKind, IdempotentRequest, Result, RunId, SiteId, SiteTrainingOptions, SiteTrainingRun,
-    TimeRange,
-};
+use super::training::{Trainable, check_extent};
+use super::{App, JobQueue};
+use crate::domain::{Camera, Error, ErrorKind, Result, SiteId, SiteTrainingOptions, TimeRange};
 use crate::store::SampleFilter;
 
 /// Fewer cameras than this are not trained together.
@@ -26,41 +21,25 @@ pub struct SiteRunRequest {
     pub until: Option<Timestamp>,
 }
 
-impl App {
-    /// Queues a training run over all cameras of a site. If the client has made the same request before, it gets the
-    /// run of then as it is now.
-    ///
-    /// # Errors
-    /// `SiteNotFound`; `InvalidArgument` naming the field; `UnusableSamples` if the site has too few or too many
-    /// cameras, or one of them has too few samples; `RunLive`; `Overloaded` beyond the limit of live runs;
-    /// `IdempotencyKeyReused`; `RunNotFound` if the run of the first request was deleted since.
-    pub async fn start_site_run(
-        &self,
-        id: &SiteId,
-        request: SiteRunRequest,
-        idempotent: Option<IdempotentRequest>,
-    ) -> Result<SiteTrainingRun> {
-        if let Some(request) = &idempotent
-            && let Some(first) = self.first_answer(request).await?
-        {
-            return self.site_run(id, first.parse()?).await;
-        }
+impl Trainable for SiteId {
+    type RunRequest = SiteRunRequest;
+
+    async fn run_options(&self, app: &App, request: SiteRunRequest) -> Result<SiteTrainingOptions> {
         let SiteRunRequest { seed, from, until } = request;
         let filter = SampleFilter::within(TimeRange::new(from, until)?);
-        for camera in self.cameras_to_train(id).await? {
-            let (count, extent) = self.store.sample_extent(camera.id(), &filter).await?;
+        for camera in app.cameras_to_train(self).await? {
+            let (count, extent) = app.store.sample_extent(camera.id(), &filter).await?;
             check_extent(camera.id(), count, extent)?;
         }
-        let options = SiteTrainingOptions { seed: seed.unwrap_or(0), from, until };
-        let now = self.clock.now();
-        let run = RunId(self.randomness.uuid_v7(now));
-        let record = idempotent.as_ref().map(record_of);
-        let most = self.limits.live_runs;
-        let run = self.store.insert_site_run(run, id, &options, most, record.as_ref(), now).await?;
-        self.site_training_queue.notify();
-        Ok(run)
+        Ok(SiteTrainingOptions { seed: seed.unwrap_or(0), from, until })
     }
 
+    fn queue(app: &App) -> &JobQueue {
+        &app.site_training_queue
+    }
+}
+
+impl App {
     /// The cameras of a site in the order of their ids.
     ///
     /// # Errors
@@ -84,57 +63,5 @@ impl App {
             ));
         }
         Ok(cameras)
-    }
-
-    /// One run of a site.
-    ///
-    /// # Errors
-    /// `SiteNotFound`, `RunNotFound`.
-    pub async fn site_run(&self, id: &SiteId, run: RunId) -> Result<SiteTrainingRun> {
-        self.store.site_run(id, run).await
-    }
-
-    /// A site's runs, newest first, after a cursor.
-    ///
-    /// # Errors
-    /// `SiteNotFound`.
-    pub async fn site_runs(
-        &self,
-        id: &SiteId,
-        before: Option<RunId>,
-        limit: u32,
-    ) -> Result<Page<SiteTrainingRun, RunId>> {
-        let runs = self.store.site_runs(id, before, limit + 1).await?;
-        Ok(page_of(runs, limit, |run| run.id))
-    }
-
-    /// Cancels a run: at once if no worker holds it, at its next step if one does.
-    ///
-    /// # Errors
-    /// `SiteNotFound`, `RunNotFound`, `RunEnded`.
-    pub async fn cancel_site_run(&self, id: &SiteId, run: RunId) -> Result<SiteTrainingRun> {
-        self.store.cancel_site_run(id, run, self.clock.now()).await
-    }
-
-    /// The run now and at each change, until it has ended. Reads the store, so it also sees runs that another process
-    /// works on.
-    ///
-    /// # Errors
-    /// `SiteNotFound`, `RunNotFound` at once; a fault later ends the stream.
-    pub async fn watch_site_run(
-        &self,
-        id: &SiteId,
-        run: RunId,
-    ) -> Result<impl Stream<Item = Result<SiteTrainingRun>> + Send + use<>> {
-        let first = self.store.site_run(id, run).await?;
-        let (app, id) = (self.clone(), id.clone());
-        Ok(watch_changes(
-            first,
-            |run| run.state,
-            move || {
-                let (app, id) = (app.clone(), id.clone());
-                async move { app.store.site_run(&id, run).await }
-            },
-        ))
     }
 }

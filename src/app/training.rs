@@ -6,14 +6,14 @@ use futures_util::{Stream, StreamExt as _, stream};
 use jiff::Timestamp;
 
 use super::idempotency::record_of;
-use super::{App, Page, page_of};
+use super::{App, JobQueue, Page, page_of};
 use crate::domain::{
-    CameraId, EpochReport, Error, ErrorKind, IdempotentRequest, JobState, Recipe, Result, RunId, TimeRange,
+    CameraId, EpochReport, Error, ErrorKind, IdempotentRequest, Recipe, Result, RunId, TimeRange,
     TrainingOptions, TrainingRun,
 };
 use crate::geo::{Position, distance_m};
 use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
-use crate::store::SampleFilter;
+use crate::store::{RunSubject, SampleFilter};
 
 /// How often a watched run is read from the store.
 const WATCH_INTERVAL: Duration = Duration::from_millis(200);
@@ -33,86 +33,105 @@ pub struct RunRequest {
     pub until: Option<Timestamp>,
 }
 
-impl App {
-    /// Queues a training run.
-    ///
-    /// # Errors
-    /// `CameraNotFound`; `InvalidArgument` naming the field; `UnusableSamples` if there is none;
-    /// `RunLive`; `Overloaded` beyond the limit of live runs.
-    pub async fn start_run(&self, id: &CameraId, request: RunRequest) -> Result<TrainingRun> {
-        self.start_run_once(id, request, None).await
-    }
+/// A camera or a site, as clients ask for its training.
+pub trait Trainable: RunSubject {
+    /// A request for a run.
+    type RunRequest: Send;
 
-    /// As [`App::start_run`]; if the client has made the same request before, it gets the run of then as it is
-    /// now.
-    ///
-    /// # Errors
-    /// As [`App::start_run`]; `IdempotencyKeyReused`; `RunNotFound` if the run was deleted since.
-    pub async fn start_run_once(
+    /// The parameters of a run, if the request is valid and the samples are usable.
+    fn run_options(
         &self,
-        id: &CameraId,
-        request: RunRequest,
-        idempotent: Option<IdempotentRequest>,
-    ) -> Result<TrainingRun> {
-        if let Some(request) = &idempotent
-            && let Some(first) = self.first_answer(request).await?
-        {
-            return self.run(id, first.parse()?).await;
-        }
-        let camera = self.store.camera(id).await?;
-        let most = self.limits.epochs;
+        app: &App,
+        request: Self::RunRequest,
+    ) -> impl Future<Output = Result<Self::Options>> + Send;
+
+    /// Notifies the workers of its runs.
+    fn queue(app: &App) -> &JobQueue;
+}
+
+impl Trainable for CameraId {
+    type RunRequest = RunRequest;
+
+    async fn run_options(&self, app: &App, request: RunRequest) -> Result<TrainingOptions> {
+        let camera = app.store.camera(self).await?;
+        let most = app.limits.epochs;
         if request.epochs.is_some_and(|epochs| !(1..=most).contains(&epochs)) {
             return Err(Error::invalid("epochs", format!("must be from 1 to {most}")));
         }
         let range = TimeRange::new(request.from, request.until)?;
-        let options = TrainingOptions {
+        let (count, extent) = app.store.sample_extent(self, &SampleFilter::within(range)).await?;
+        check_extent(self, count, extent)?;
+        Ok(TrainingOptions {
             recipe: request.recipe.unwrap_or(camera.profile.recipe),
             seed: request.seed.unwrap_or(0),
             epochs: request.epochs,
             from: request.from,
             until: request.until,
-        };
-        let (count, extent) = self.store.sample_extent(id, &SampleFilter::within(range)).await?;
-        check_extent(id, count, extent)?;
+        })
+    }
+
+    fn queue(app: &App) -> &JobQueue {
+        &app.training_queue
+    }
+}
+
+impl App {
+    /// Queues a training run of a camera, or over all cameras of a site. If the client has made the same request
+    /// before, it gets the run of then as it is now.
+    ///
+    /// # Errors
+    /// `CameraNotFound` or `SiteNotFound`; `InvalidArgument` naming the field; `UnusableSamples` if there are too few, or
+    /// the site has too few or too many cameras; `RunLive`; `Overloaded` beyond the limit of live runs;
+    /// `IdempotencyKeyReused`; `RunNotFound` if the run of the first request was deleted since.
+    pub async fn start_run<S: Trainable>(
+        &self,
+        subject: &S,
+        request: S::RunRequest,
+        idempotent: Option<IdempotentRequest>,
+    ) -> Result<TrainingRun<S>> {
+        if let Some(request) = &idempotent
+            && let Some(first) = self.first_answer(request).await?
+        {
+            return self.run(subject, first.parse()?).await;
+        }
+        let options = subject.run_options(self, request).await?;
         let now = self.clock.now();
         let run = RunId(self.randomness.uuid_v7(now));
         let record = idempotent.as_ref().map(record_of);
-        let run = self
-            .store
-            .insert_run_once(run, id, &options, self.limits.live_runs, record.as_ref(), now)
-            .await?;
-        self.training_queue.notify();
+        let most = self.limits.live_runs;
+        let run = self.store.insert_run(run, subject, &options, most, record.as_ref(), now).await?;
+        S::queue(self).notify();
         Ok(run)
     }
 
     /// One run.
     ///
     /// # Errors
-    /// `CameraNotFound`, `RunNotFound`.
-    pub async fn run(&self, id: &CameraId, run: RunId) -> Result<TrainingRun> {
-        self.store.run(id, run).await
+    /// `CameraNotFound` or `SiteNotFound`; `RunNotFound`.
+    pub async fn run<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
+        self.store.run(subject, run).await
     }
 
-    /// A camera's runs, newest first, after a cursor.
+    /// Runs of a camera or a site, newest first, after a cursor.
     ///
     /// # Errors
-    /// `CameraNotFound`.
-    pub async fn runs(
+    /// `CameraNotFound` or `SiteNotFound`.
+    pub async fn runs<S: RunSubject>(
         &self,
-        id: &CameraId,
+        subject: &S,
         before: Option<RunId>,
         limit: u32,
-    ) -> Result<Page<TrainingRun, RunId>> {
-        let runs = self.store.runs(id, before, limit + 1).await?;
+    ) -> Result<Page<TrainingRun<S>, RunId>> {
+        let runs = self.store.runs(subject, before, limit + 1).await?;
         Ok(page_of(runs, limit, |run| run.id))
     }
 
     /// Cancels a run: at once if no worker holds it, at its next step if one does.
     ///
     /// # Errors
-    /// `CameraNotFound`, `RunNotFound`, `RunEnded`.
-    pub async fn cancel_run(&self, id: &CameraId, run: RunId) -> Result<TrainingRun> {
-        self.store.cancel_run(id, run, self.clock.now()).await
+    /// `CameraNotFound` or `SiteNotFound`; `RunNotFound`, `RunEnded`.
+    pub async fn cancel_run<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
+        self.store.cancel_run(subject, run, self.clock.now()).await
     }
 
     /// Deletes a run that has ended, with its log and curve. The version that it yielded stays.
@@ -145,47 +164,27 @@ impl App {
     /// another process works on.
     ///
     /// # Errors
-    /// `CameraNotFound`, `RunNotFound` at once; a fault later ends the stream.
-    pub async fn watch_run(
+    /// `CameraNotFound` or `SiteNotFound`; `RunNotFound` at once; a fault later ends the stream.
+    pub async fn watch_run<S: RunSubject>(
         &self,
-        id: &CameraId,
+        subject: &S,
         run: RunId,
-    ) -> Result<impl Stream<Item = Result<TrainingRun>> + Send + use<>> {
-        let first = self.store.run(id, run).await?;
-        let (app, id) = (self.clone(), id.clone());
-        Ok(watch_changes(
-            first,
-            |run| run.state,
-            move || {
-                let (app, id) = (app.clone(), id.clone());
-                async move { app.store.run(&id, run).await }
-            },
-        ))
-    }
-}
-
-/// A run now, and at each change that `read` shows, until it has ended or cannot be read.
-pub(super) fn watch_changes<R, F>(
-    first: R,
-    state: fn(&R) -> JobState,
-    read: impl FnMut() -> F + Send,
-) -> impl Stream<Item = Result<R>> + Send
-where
-    R: Clone + PartialEq + Send,
-    F: Future<Output = Result<R>> + Send,
-{
-    let later = stream::unfold((Some(first.clone()), read), move |(shown, mut read)| async move {
-        let shown = shown.filter(|run| !state(run).has_ended())?;
-        loop {
-            tokio::time::sleep(WATCH_INTERVAL).await;
-            match read().await {
-                Ok(seen) if seen == shown => {}
-                Ok(seen) => return Some((Ok(seen.clone()), (Some(seen), read))),
-                Err(error) => return Some((Err(error), (None, read))),
+    ) -> Result<impl Stream<Item = Result<TrainingRun<S>>> + Send + use<S>> {
+        let first = self.store.run(subject, run).await?;
+        let watched = (Some(first.clone()), self.store.clone(), subject.clone());
+        let later = stream::unfold(watched, move |(shown, store, subject)| async move {
+            let shown = shown.filter(|run| !run.state.has_ended())?;
+            loop {
+                tokio::time::sleep(WATCH_INTERVAL).await;
+                match store.run(&subject, run).await {
+                    Ok(seen) if seen == shown => {}
+                    Ok(seen) => return Some((Ok(seen.clone()), (Some(seen), store, subject))),
+                    Err(error) => return Some((Err(error), (None, store, subject))),
+                }
             }
-        }
-    });
-    stream::once(async move { Ok(first) }).chain(later)
+        });
+        Ok(stream::once(async move { Ok(first) }).chain(later))
+    }
 }
 
 /// Refuses samples that no recipe can be fitted to, before a run is queued; the fit checks more.

@@ -16,7 +16,7 @@ pub(super) struct Restore {
     /// A file of `sightfix backup`
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Restore a file without a digest, of an earlier version or another program: changed values in it are not seen
+    /// Restore a file without a digest, of another program: changed values in it are not seen
     #[arg(long)]
     without_digest: bool,
     #[command(flatten)]

@@ -8,8 +8,8 @@ use futures_util::{Stream, StreamExt as _};
 use super::progress::Progress;
 use super::summary::SummaryFlags;
 use super::{DataFolder, MissingData, camera_id, open_app, runtime, site_id};
-use crate::app::{App, RunRequest, SiteRunRequest};
-use crate::config::Config;
+use crate::app::{App, RunRequest, SiteRunRequest, Trainable};
+use crate::config::{Config, Workers};
 use crate::domain::{CameraId, JobState, Recipe, Result, RunProgress, SiteId, TrainingRun};
 use crate::shutdown::Shutdown;
 use crate::worker;
@@ -56,7 +56,7 @@ impl Train {
     async fn train_camera(&self, app: &App, settings: &Config, camera: &CameraId) -> anyhow::Result<()> {
         let request =
             RunRequest { recipe: self.recipe, seed: self.seed, epochs: self.epochs, ..RunRequest::default() };
-        let ended = train(app, settings, camera, request).await?;
+        let ended = train(app, settings, (camera, request), worker::train).await?;
         let outcome = succeeded(ended.state, ended.outcome.as_deref())?;
         let summary = self.summary.summary(None);
         summary.document(&serde_json::json!({
@@ -71,12 +71,7 @@ impl Train {
 
     async fn train_site(&self, app: &App, settings: &Config, site: &SiteId) -> anyhow::Result<()> {
         let request = SiteRunRequest { seed: self.seed, ..SiteRunRequest::default() };
-        let queued = app.start_site_run(site, request, None).await?;
-        let shutdown = Shutdown::new();
-        shutdown.spawn(worker::train_sites(app.clone(), settings.training.clone(), shutdown.clone()));
-        let changes = app.watch_site_run(site, queued.id).await?;
-        let ended = watched(queued, changes, |run| (run.state, &run.progress)).await?;
-        shutdown.drain_with_timeout(settings.limits.drain_time()).await;
+        let ended = train(app, settings, (site, request), worker::train_sites).await?;
         let outcome = succeeded(ended.state, ended.outcome.as_deref())?;
         let summary = self.summary.summary(None);
         summary.document(&serde_json::json!({
@@ -98,37 +93,36 @@ fn succeeded(state: JobState, outcome: Option<&str>) -> anyhow::Result<&str> {
 
 /// Queues a run, starts a worker in this process (a server on the same folder may claim the run first),
 /// and shows the progress until the run has ended.
-pub(super) async fn train(
+async fn train<S: Trainable, W: Future<Output = ()> + Send + 'static>(
     app: &App,
     settings: &Config,
-    camera: &CameraId,
-    request: RunRequest,
-) -> anyhow::Result<TrainingRun> {
-    let queued = app.start_run(camera, request).await?;
+    (subject, request): (&S, S::RunRequest),
+    work: impl FnOnce(App, Workers, Shutdown) -> W,
+) -> anyhow::Result<TrainingRun<S>> {
+    let queued = app.start_run(subject, request, None).await?;
     let shutdown = Shutdown::new();
-    shutdown.spawn(worker::train(app.clone(), settings.training.clone(), shutdown.clone()));
-    let changes = app.watch_run(camera, queued.id).await?;
-    let latest = watched(queued, changes, |run| (run.state, &run.progress)).await?;
+    shutdown.spawn(work(app.clone(), settings.training.clone(), shutdown.clone()));
+    let changes = app.watch_run(subject, queued.id).await?;
+    let latest = watched(queued, changes).await?;
     shutdown.drain_with_timeout(settings.limits.drain_time()).await;
     Ok(latest)
 }
 
 /// Shows the progress of a run until it has ended.
-async fn watched<R>(
-    queued: R,
-    changes: impl Stream<Item = Result<R>>,
-    of: impl Fn(&R) -> (JobState, &RunProgress),
-) -> anyhow::Result<R> {
+async fn watched<S: Trainable>(
+    queued: TrainingRun<S>,
+    changes: impl Stream<Item = Result<TrainingRun<S>>>,
+) -> anyhow::Result<TrainingRun<S>> {
     let mut bar = Progress::new("{bar:40} {pos}/{len} epochs {msg}");
     let mut latest = queued;
     let mut changes = std::pin::pin!(changes);
     while let Some(run) = changes.next().await {
         latest = run?;
-        let (state, RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. }) = of(&latest);
+        let RunProgress { phase, epoch, epochs, error_scale, remaining_s, .. } = &latest.progress;
         let remaining = remaining_s.map(|seconds| format!(", {seconds:.0} s left")).unwrap_or_default();
         // Before the first epoch there is nothing to count and no error scale.
         let message = match (phase.as_str(), *epoch) {
-            ("", _) => state.as_str().to_owned(),
+            ("", _) => latest.state.as_str().to_owned(),
             (phase, 0) => format!("{phase}{remaining}"),
             (phase, _) => format!("{phase}, Es {error_scale:.3}{remaining}"),
         };

@@ -2,13 +2,13 @@
 
 use super::convert::timestamp;
 use super::proto;
-use crate::domain::{SiteCameraFinding, SiteTrainingReport, SiteTrainingRun};
+use crate::domain::{SiteCameraFinding, SiteId, SiteTrainingReport, TrainingRun};
 
-impl From<SiteTrainingRun> for proto::SiteTrainingRun {
-    fn from(run: SiteTrainingRun) -> Self {
+impl From<TrainingRun<SiteId>> for proto::SiteTrainingRun {
+    fn from(run: TrainingRun<SiteId>) -> Self {
         Self {
             id: run.id.to_string(),
-            site_id: run.site_id.as_str().to_owned(),
+            site_id: run.subject.as_str().to_owned(),
             seed: run.options.seed,
             from: run.options.from.map(timestamp),
             until: run.options.until.map(timestamp),

@@ -136,7 +136,7 @@ impl SiteService for Sites {
                 from: instant(asked.from, "from")?,
                 until: instant(asked.until, "until")?,
             };
-            let run = app.start_site_run(&site_id(&asked.site_id)?, options, idempotent).await?;
+            let run = app.start_run(&site_id(&asked.site_id)?, options, idempotent).await?;
             Ok(proto::StartSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -147,7 +147,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::GetSiteTrainingRunRequest>,
     ) -> Reply<proto::GetSiteTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.site_run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::GetSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -160,7 +160,7 @@ impl SiteService for Sites {
         answer(&self.app, request, |app, asked| async move {
             let site = site_id(&asked.site_id)?;
             let size = pages::size(asked.page_size, &app.limits)?;
-            let page = app.site_runs(&site, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
+            let page = app.runs(&site, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
             Ok(proto::ListSiteTrainingRunsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 runs: page.items.into_iter().map(Into::into).collect(),
@@ -174,7 +174,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::CancelSiteTrainingRunRequest>,
     ) -> Reply<proto::CancelSiteTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.cancel_site_run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.cancel_run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::CancelSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await

@@ -15,8 +15,8 @@ use super::statuses::{Reply, answer, client_id, request_id, to_status};
 use crate::admission::Lease;
 use crate::app::{App, RunRequest};
 use crate::domain::{
-    CandidateFinding, EpochReport, Error, ErrorKind, JobState, Result, RunId, RunProgress, TrainingReport,
-    TrainingRun,
+    CameraId, CandidateFinding, EpochReport, Error, ErrorKind, JobState, Result, RunId, RunProgress,
+    TrainingReport, TrainingRun,
 };
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
@@ -51,7 +51,7 @@ impl TrainingService for Training {
                 from: instant(asked.from, "from")?,
                 until: instant(asked.until, "until")?,
             };
-            let run = app.start_run_once(&camera_id(&asked.camera_id)?, options, idempotent).await?;
+            let run = app.start_run(&camera_id(&asked.camera_id)?, options, idempotent).await?;
             Ok(proto::StartTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -154,7 +154,7 @@ pub(super) type Changes =
 /// Ends with the run, with the first fault, or with the server, which is reported as an error so that
 /// nobody takes the run for ended.
 fn changes(
-    runs: impl Stream<Item = Result<TrainingRun>> + Send + 'static,
+    runs: impl Stream<Item = Result<TrainingRun<CameraId>>> + Send + 'static,
     lease: Lease,
     shutdown: Shutdown,
     id: RequestId,
@@ -184,11 +184,11 @@ fn ending() -> Error {
     Error::refused(ErrorKind::ShuttingDown, "the server is ending; the run goes on when it is back")
 }
 
-impl From<TrainingRun> for proto::TrainingRun {
-    fn from(run: TrainingRun) -> Self {
+impl From<TrainingRun<CameraId>> for proto::TrainingRun {
+    fn from(run: TrainingRun<CameraId>) -> Self {
         Self {
             id: run.id.to_string(),
-            camera_id: run.camera_id.as_str().to_owned(),
+            camera_id: run.subject.as_str().to_owned(),
             recipe: proto::Recipe::from(run.options.recipe).into(),
             seed: run.options.seed,
             epochs: run.options.epochs,

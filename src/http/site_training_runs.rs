@@ -14,7 +14,7 @@ use super::idempotency::Idempotent;
 use super::problem::{ApiResult, Problem};
 use super::wire::{JobState, created, instant, json};
 use crate::app::SiteRunRequest;
-use crate::domain::{self, Result, RunProgress, SiteTrainingReport};
+use crate::domain::{self, Result, RunProgress, SiteId, SiteTrainingReport};
 use crate::exchange::write_cursor;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
@@ -95,11 +95,11 @@ struct SiteTrainingRun {
     ended_at: Option<Timestamp>,
 }
 
-impl From<domain::SiteTrainingRun> for SiteTrainingRun {
-    fn from(run: domain::SiteTrainingRun) -> Self {
+impl From<domain::TrainingRun<SiteId>> for SiteTrainingRun {
+    fn from(run: domain::TrainingRun<SiteId>) -> Self {
         Self {
             id: run.id.to_string(),
-            site_id: run.site_id.as_str().to_owned(),
+            site_id: run.subject.as_str().to_owned(),
             seed: run.options.seed,
             from: run.options.from,
             until: run.options.until,
@@ -152,7 +152,7 @@ async fn start_site_training_run(
         request.hasher.update(body.bytes());
     }
     let draft = body.read_or_default::<SiteRunDraft>()?;
-    let run = app.start_site_run(&id, draft.to_domain()?, idempotent).await?;
+    let run = app.start_run(&id, draft.to_domain()?, idempotent).await?;
     let location = format!("/v1/sites/{id}/training-runs/{}", run.id);
     Ok(created(StatusCode::ACCEPTED, &location, &SiteTrainingRun::from(run))?)
 }
@@ -172,7 +172,7 @@ async fn list_site_training_runs(CallerApp(app): CallerApp, SitePath(id): SitePa
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.site_runs(&id, before, limit).await?;
+    let page = app.runs(&id, before, limit).await?;
     Ok(json(&SiteRunPage {
         items: page.items.into_iter().map(SiteTrainingRun::from).collect(),
         next_cursor: page.next.map(|run| write_cursor(&run)),
@@ -186,7 +186,7 @@ async fn list_site_training_runs(CallerApp(app): CallerApp, SitePath(id): SitePa
     responses((status = 200, description = "The run", body = SiteTrainingRun))
 )]
 async fn get_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): SiteRunPath) -> ApiResult {
-    Ok(json(&SiteTrainingRun::from(app.site_run(&id, run).await?))?)
+    Ok(json(&SiteTrainingRun::from(app.run(&id, run).await?))?)
 }
 
 /// Cancel a training run of a site
@@ -201,5 +201,5 @@ async fn get_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): 
     )
 )]
 async fn cancel_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): SiteRunPath) -> ApiResult {
-    Ok(json(&SiteTrainingRun::from(app.cancel_site_run(&id, run).await?))?)
+    Ok(json(&SiteTrainingRun::from(app.cancel_run(&id, run).await?))?)
 }

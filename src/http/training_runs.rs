@@ -22,7 +22,7 @@ use super::idempotency::Idempotent;
 use super::problem::{ApiResult, Problem};
 use super::wire::{JobState, Recipe, created, empty, instant, json};
 use crate::app::RunRequest;
-use crate::domain::{self, EpochReport, Error, Result, RunProgress, TrainingReport};
+use crate::domain::{self, CameraId, EpochReport, Error, Result, RunProgress, TrainingReport};
 use crate::exchange::write_cursor;
 
 /// How often a silent event stream says that it is still there.
@@ -125,11 +125,11 @@ struct TrainingRun {
     ended_at: Option<Timestamp>,
 }
 
-impl From<domain::TrainingRun> for TrainingRun {
-    fn from(run: domain::TrainingRun) -> Self {
+impl From<domain::TrainingRun<CameraId>> for TrainingRun {
+    fn from(run: domain::TrainingRun<CameraId>) -> Self {
         Self {
             id: run.id.to_string(),
-            camera_id: run.camera_id.as_str().to_owned(),
+            camera_id: run.subject.as_str().to_owned(),
             recipe: run.options.recipe.into(),
             seed: run.options.seed,
             epochs: run.options.epochs,
@@ -183,7 +183,7 @@ async fn start_training_run(
     if let Some(request) = &idempotent {
         request.hasher.update(body.bytes());
     }
-    let run = app.start_run_once(&id, body.read_or_default::<RunDraft>()?.to_domain()?, idempotent).await?;
+    let run = app.start_run(&id, body.read_or_default::<RunDraft>()?.to_domain()?, idempotent).await?;
     let location = format!("/v1/cameras/{id}/training-runs/{}", run.id);
     Ok(created(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
 }
@@ -292,7 +292,7 @@ async fn watch_training_run(
 }
 
 /// The event of a change; `None` for what the client has seen last.
-fn event_of(change: Result<domain::TrainingRun>, last_seen: Option<&str>) -> Option<Event> {
+fn event_of(change: Result<domain::TrainingRun<CameraId>>, last_seen: Option<&str>) -> Option<Event> {
     let event = change.and_then(|run| {
         let has_ended = run.state.has_ended();
         let json = serde_json::to_string(&TrainingRun::from(run)).map_err(Error::fault)?;

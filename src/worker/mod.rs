@@ -5,6 +5,7 @@
 //! the newest fence can make. No database transaction is held across the work, and no work runs on a thread
 //! of tokio.
 
+mod camera_training;
 mod evaluation;
 mod job_thread;
 mod promotion;
@@ -20,8 +21,8 @@ use uuid::Uuid;
 use crate::app::{App, JobQueue};
 use crate::config::Workers;
 use crate::domain::{
-    CameraId, Detection, Error, ErrorKind, EvaluationJob, JobState, Result, Sample, SiteId, SiteTrainingRun,
-    StoredSample, TrainingRun,
+    CameraId, Detection, Error, ErrorKind, EvaluationJob, JobState, Result, Sample, SiteId, StoredSample,
+    TrainingRun,
 };
 use crate::shutdown::Shutdown;
 use crate::store::{Claim, Heartbeat, SampleFilter};
@@ -40,13 +41,14 @@ const PAGE_SAMPLES: u32 = 10_000;
 
 /// Works on queued training runs of cameras until the server shuts down.
 pub async fn train(app: App, settings: Workers, shutdown: Shutdown) {
-    work::<TrainingRun>(app, settings, shutdown).await;
+    work::<TrainingRun<CameraId>>(app, settings, shutdown).await;
 }
 
 /// Works on queued training runs of sites until the server shuts down, one at a time: each has the samples of all its
 /// cameras in memory.
 pub async fn train_sites(app: App, settings: Workers, shutdown: Shutdown) {
-    work::<SiteTrainingRun>(app, Workers { workers: settings.workers.min(1), ..settings }, shutdown).await;
+    let settings = Workers { workers: settings.workers.min(1), ..settings };
+    work::<TrainingRun<SiteId>>(app, settings, shutdown).await;
 }
 
 /// Works on queued evaluations until the server shuts down.

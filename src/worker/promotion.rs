@@ -303,7 +303,7 @@ fn on_new_samples(
     comparison
 }
 
-/// Against a version without stored held-out errors (imported, or of an earlier release): its error is the
+/// Against a version without stored held-out errors (an imported one): its error is the
 /// larger of what its metadata state and what it shows on the new version's samples.
 fn against_recorded(
     new: &PromotionCandidate<'_>,

@@ -384,8 +384,8 @@ async fn a_retraining_that_failed_is_tried_again() {
     let failed = "019b0000-0000-7000-8000-000000000001";
     database
         .execute(
-            "INSERT INTO training_runs (id, camera_key, recipe, seed, state, created_at_us) \
-             SELECT ?, key, 'hybrid', 0, 'failed', 0 FROM cameras",
+            "INSERT INTO training_runs (id, camera_key, recipe, seed, state, created_at_us, priority) \
+             SELECT ?, key, 'hybrid', 0, 'failed', 0, 0 FROM cameras",
             [failed],
         )
         .expect("a run");

@@ -127,7 +127,7 @@ async fn a_flipped_bit_anywhere_in_a_file_is_refused() {
     upload(&server, file).await.expect(201);
 }
 
-/// Files of earlier releases have no checksum.
+/// The format allows files without a checksum.
 #[tokio::test]
 async fn a_file_without_a_checksum_can_be_imported_and_gets_one() {
     let folder = data_folder();
@@ -231,23 +231,4 @@ async fn a_damaged_stored_model_leaves_fixes_and_tells_once() {
     let camera = server.get("/v1/cameras/c").await.expect(200).json();
     assert!(camera["model_fault"].is_null(), "{camera}");
     assert_eq!(server.post(FUSIONS, &observation(true)).await.expect(200).json(), sound);
-}
-
-#[tokio::test]
-async fn rows_of_earlier_releases_get_their_checksum_at_the_first_start() {
-    let folder = data_folder();
-    let server = with_camera(folder.path()).await;
-    upload(&server, artifact(Recipe::Hybrid).to_file().expect("a file").to_vec()).await.expect(201);
-    activate(&server, 1).await.expect(200);
-    server.kill();
-    let database = rusqlite::Connection::open(folder.path().join("sightfix.db")).expect("the database");
-    let checksum = || -> Option<String> {
-        database.query_row("SELECT sha256 FROM models", [], |row| row.get(0)).expect("the row")
-    };
-    let original = checksum();
-    assert!(original.is_some());
-    database.execute_batch("UPDATE models SET sha256 = NULL").expect("the row can be written");
-    let server = TestServer::start(folder.path());
-    server.post(FUSIONS, &observation(false)).await.expect(200);
-    assert_eq!(checksum(), original);
 }

@@ -1,7 +1,6 @@
-//! The methods of [`Store`] that both backends have, each with what it promises.
+//! The methods of [`Store`], each with what it promises.
 //!
-//! A new method is added here and to `sqlite` and `postgres` under the same signature, with cases in `tests`. PostgreSQL
-//! may end a transaction in favour of another one; then the method is called again, so what it commits before its last
+//! A new method is added here and to `entities` under the same signature, with cases in `tests`. PostgreSQL may end a transaction in favour of another one; then the method is called again, so what it commits before its last
 //! transaction must bear repetition.
 
 use std::time::Duration;
@@ -10,9 +9,8 @@ use jiff::Timestamp;
 
 use super::postgres::repeated;
 use super::{
-    Backend, CameraContent, CameraVersions, ChangeMark, Claim, Heartbeat, IdempotencyRecord, JobCounts,
-    JobEnd, KeysVersion, RunEnd, SampleFilter, SampleKey, SiteRunEnd, StorageStatus, Store, StoredAnswer,
-    StoredHeldOutError,
+    CameraContent, CameraVersions, ChangeMark, Claim, Heartbeat, IdempotencyRecord, JobCounts, JobEnd,
+    KeysVersion, RunSubject, SampleFilter, SampleKey, StorageStatus, Store, StoredAnswer, StoredHeldOutError,
 };
 #[cfg(doc)]
 use crate::domain::ErrorKind;
@@ -21,21 +19,17 @@ use crate::domain::{
     DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
     EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
     NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Result, Revision,
-    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
-    SourceOffset, StoredSample, TrainingOptions, TrainingRun,
+    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SourceOffset, StoredSample, TrainingRun,
 };
 use crate::geo::Position;
 
 macro_rules! contract {
-    ($($(#[$attribute:meta])* fn $name:ident(&self $(, $argument:ident: $type:ty)*) -> $output:ty;)*) => {
+    ($($(#[$attribute:meta])* fn $name:ident $(<$subject:ident: $bound:ident>)?(&self $(, $argument:ident: $type:ty)*) -> $output:ty;)*) => {
         impl Store {
             $(
                 $(#[$attribute])*
-                pub async fn $name(&self $(, $argument: $type)*) -> $output {
-                    match &self.0 {
-                        Backend::Sqlite(store) => store.$name($($argument),*).await,
-                        Backend::Postgres(store) => repeated!(store.$name($(Clone::clone(&$argument)),*)),
-                    }
+                pub async fn $name $(<$subject: $bound>)? (&self $(, $argument: $type)*) -> $output {
+                    repeated!(self.0.$name $(::<$subject>)? ($(Clone::clone(&$argument)),*))
                 }
             )*
         }
@@ -204,31 +198,26 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn delete_samples(&self, id: &CameraId, filter: &SampleFilter, now: Timestamp) -> Result<u64>;
 
-    /// Queues a run.
+    /// Queues a run of a camera, or over all cameras of a site; of several requests with the same record, the first
+    /// queues a run and the others get it.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunLive`] if the camera has a run that has not ended,
-    /// [`ErrorKind::Overloaded`] if all cameras together have `max_live` of them.
-    fn insert_run(&self, run: RunId, camera: &CameraId, options: &TrainingOptions, max_live: u32, now: Timestamp) -> Result<TrainingRun>;
+    /// [`ErrorKind::CameraNotFound`] or [`ErrorKind::SiteNotFound`]; [`ErrorKind::RunLive`] if the camera or the site
+    /// has a run that has not ended, [`ErrorKind::Overloaded`] if all of its kind together have `max_live` of them;
+    /// [`ErrorKind::IdempotencyKeyReused`] for a key of another request.
+    fn insert_run<S: RunSubject>(&self, run: RunId, subject: &S, options: &S::Options, max_live: u32, record: Option<&IdempotencyRecord>, now: Timestamp) -> Result<TrainingRun<S>>;
 
-    /// As [`Store::insert_run`]; of several requests with the same record, the first queues a run and the
-    /// others get it.
+    /// One run of a camera or a site.
     ///
     /// # Errors
-    /// As [`Store::insert_run`]; [`ErrorKind::IdempotencyKeyReused`] for a key of another request.
-    fn insert_run_once(&self, run: RunId, camera: &CameraId, options: &TrainingOptions, max_live: u32, record: Option<&IdempotencyRecord>, now: Timestamp) -> Result<TrainingRun>;
+    /// [`ErrorKind::CameraNotFound`] or [`ErrorKind::SiteNotFound`]; [`ErrorKind::RunNotFound`].
+    fn run<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>>;
 
-    /// One run of a camera.
+    /// A page of runs of a camera or a site, newest first, before an id.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`].
-    fn run(&self, camera: &CameraId, run: RunId) -> Result<TrainingRun>;
-
-    /// A page of a camera's runs, newest first, before an id.
-    ///
-    /// # Errors
-    /// [`ErrorKind::CameraNotFound`].
-    fn runs(&self, camera: &CameraId, before: Option<RunId>, limit: u32) -> Result<Vec<TrainingRun>>;
+    /// [`ErrorKind::CameraNotFound`] or [`ErrorKind::SiteNotFound`].
+    fn runs<S: RunSubject>(&self, subject: &S, before: Option<RunId>, limit: u32) -> Result<Vec<TrainingRun<S>>>;
 
     /// Claims the oldest run that is queued or whose lease has expired. Its attempt and fence go up by
     /// one; its curve and progress are reset. Leases of all jobs are measured by the clock of the database's server, or
@@ -236,28 +225,31 @@ contract! {
     ///
     /// # Errors
     /// Faults only.
-    fn claim_run(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<TrainingRun>>>;
+    fn claim_run<S: RunSubject>(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<TrainingRun<S>>>>;
 
     /// Renews the lease and stores the run's progress.
     ///
     /// # Errors
     /// Faults only.
-    fn heartbeat_run(&self, run: RunId, fence: i64, progress: &RunProgress, lease: Duration, now: Timestamp) -> Result<Heartbeat>;
+    fn heartbeat_run<S: RunSubject>(&self, run: RunId, fence: i64, progress: &RunProgress, lease: Duration, now: Timestamp) -> Result<Heartbeat>;
 
     /// Cancels a run: at once where no worker holds a live lease on it, otherwise at its worker's next
     /// heartbeat. Once this has returned, the run produces no model any more.
     ///
     /// # Errors
-    /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunEnded`].
-    fn cancel_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<TrainingRun>;
+    /// [`ErrorKind::CameraNotFound`] or [`ErrorKind::SiteNotFound`]; [`ErrorKind::RunNotFound`],
+    /// [`ErrorKind::RunEnded`].
+    fn cancel_run<S: RunSubject>(&self, subject: &S, run: RunId, now: Timestamp) -> Result<TrainingRun<S>>;
 
     /// Ends a run, or returns it to the queue, if the worker still owns its lease; `None` if it lost it,
-    /// and then nothing was changed. The model, its activation and the run's state are one transaction. A
-    /// run whose cancellation was requested is cancelled even if it succeeded or was returned.
+    /// and then nothing was changed. The models, their activation and the run's state are one transaction. A
+    /// run whose cancellation was requested is cancelled even if it succeeded or was returned. The run of a site fails,
+    /// and nothing else is stored, if a camera was deleted, has left the site, or has another active version than
+    /// its model was compared with.
     ///
     /// # Errors
     /// Faults only.
-    fn finish_run(&self, run: RunId, fence: i64, end: RunEnd<'_>, now: Timestamp) -> Result<Option<TrainingRun>>;
+    fn finish_run<S: RunSubject>(&self, run: RunId, fence: i64, end: JobEnd<S::Output<'_>>, now: Timestamp) -> Result<Option<TrainingRun<S>>>;
 
     /// Adds points to the curve of a run. An epoch that is there already is replaced. Does nothing
     /// once the lease was lost or the run has ended, which the next heartbeat reports.
@@ -304,12 +296,6 @@ contract! {
     /// is stored does not match its checksum or cannot be read.
     fn model_content(&self, camera: &CameraId, number: u32) -> Result<(ModelMetadata, Vec<u8>)>;
 
-    /// Fills in the checksums of versions that an earlier release stored; returns how many there were.
-    ///
-    /// # Errors
-    /// Faults only.
-    fn fill_in_model_checksums(&self) -> Result<u64>;
-
     /// The held-out errors that were stored with a version, each with its sample as long as that is
     /// stored; by time and target.
     ///
@@ -354,57 +340,6 @@ contract! {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunLive`].
     fn delete_run(&self, camera: &CameraId, run: RunId, now: Timestamp) -> Result<()>;
-
-    /// Queues a run over all cameras of a site; of several requests with the same record, the first queues a run and
-    /// the others get it.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RunLive`] if the site has a run that has not ended,
-    /// [`ErrorKind::Overloaded`] if all sites together have `max_live` of them;
-    /// [`ErrorKind::IdempotencyKeyReused`] for a key of another request.
-    fn insert_site_run(&self, run: RunId, site: &SiteId, options: &SiteTrainingOptions, max_live: u32, record: Option<&IdempotencyRecord>, now: Timestamp) -> Result<SiteTrainingRun>;
-
-    /// One run of a site.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RunNotFound`].
-    fn site_run(&self, site: &SiteId, run: RunId) -> Result<SiteTrainingRun>;
-
-    /// A page of a site's runs, newest first, before an id.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SiteNotFound`].
-    fn site_runs(&self, site: &SiteId, before: Option<RunId>, limit: u32) -> Result<Vec<SiteTrainingRun>>;
-
-    /// Claims the oldest run of a site that is queued or whose lease has expired. Its attempt and fence go up by one;
-    /// its progress is reset.
-    ///
-    /// # Errors
-    /// Faults only.
-    fn claim_site_run(&self, lease: Duration, now: Timestamp) -> Result<Option<Claim<SiteTrainingRun>>>;
-
-    /// Renews the lease and stores the run's progress.
-    ///
-    /// # Errors
-    /// Faults only.
-    fn heartbeat_site_run(&self, run: RunId, fence: i64, progress: &RunProgress, lease: Duration, now: Timestamp) -> Result<Heartbeat>;
-
-    /// Cancels a run: at once where no worker holds a live lease on it, otherwise at its worker's next heartbeat. Once
-    /// this has returned, the run produces no models any more.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RunNotFound`], [`ErrorKind::RunEnded`].
-    fn cancel_site_run(&self, site: &SiteId, run: RunId, now: Timestamp) -> Result<SiteTrainingRun>;
-
-    /// Ends a run, or returns it to the queue, if the worker still owns its lease; `None` if it lost it, and then
-    /// nothing was changed. The models of all cameras, their activation and the run's state are one transaction. The run
-    /// fails, and nothing else is stored, if a camera was deleted, has left the site, or has another active version than
-    /// its model was compared with. A run whose cancellation was requested is cancelled even if it succeeded or
-    /// was returned.
-    ///
-    /// # Errors
-    /// Faults only.
-    fn finish_site_run(&self, run: RunId, fence: i64, end: SiteRunEnd<'_>, now: Timestamp) -> Result<Option<SiteTrainingRun>>;
 
     /// Queues an evaluation.
     ///

@@ -13,7 +13,7 @@
 
 use std::time::Duration;
 
-use crate::domain::{Actor, Error, ErrorKind, JobState, Result};
+use crate::domain::{Error, ErrorKind, JobState, Result};
 
 /// A claimed job.
 #[derive(Debug, Clone, PartialEq)]
@@ -140,16 +140,16 @@ pub(super) fn lease_us(lease: Duration) -> i64 {
 pub(super) const CLOCK_ERROR_US: i64 = 60_000_000;
 
 /// Condition under which no worker holds a live lease on a job, where `now` is an expression for the time now in
-/// microseconds. Rows of earlier releases do not have the length of their lease; an hour is longer than any was.
+/// microseconds.
 pub(super) fn lease_expired(now: &str) -> String {
     format!(
         "(lease_until_us IS NULL OR lease_until_us <= {now} \
-         OR lease_until_us > {now} + coalesce(lease_us, 3600000000) + {CLOCK_ERROR_US})"
+         OR lease_until_us > {now} + lease_us + {CLOCK_ERROR_US})"
     )
 }
 
 /// A table of jobs. Only its fixed text goes into statements; values are bound.
-pub(super) struct JobTable {
+pub struct JobTable {
     pub(super) table: &'static str,
     /// Column of what a job belongs to.
     pub(super) owner: &'static str,
@@ -160,11 +160,6 @@ pub(super) struct JobTable {
     /// Columns by which waiting jobs are claimed. Ids rise with time, and a camera has one live run at most, so
     /// no camera is served twice before all that wait with it were served once.
     pub(super) order: &'static str,
-}
-
-/// Priority of a run: what a client asked for comes before what the server starts by itself.
-pub(super) fn run_priority(actor: &Actor) -> i64 {
-    i64::from(actor.is_client())
 }
 
 pub(super) const RUNS: JobTable = JobTable {

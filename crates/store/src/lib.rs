@@ -1,9 +1,10 @@
 //! Persistent storage behind one type, [`Store`]; the only crate with SQL.
 //!
-//! Two backends, written by hand: a file in a data folder (`sqlite`) and a database of a server (`postgres`). The
-//! methods of [`Store`] are listed once, in `contract`, with what they promise; the suite in `tests` holds both
-//! backends to it. What is in a row (`rows`), the rules of jobs (`jobs`), limits and the queue of samples that are
-//! committed in groups (`group_commit`) are the same for both.
+//! Two backends: a file in a data folder (`sqlite`) and a database of a server (`postgres`). The methods of [`Store`]
+//! are listed once, in `contract`, with what they promise; the suite in `tests` holds both backends to it. What is
+//! stored is written once, an entity per file (`entities`), over the statements of `query` and the transactions of
+//! `database`. What is in a row (`rows`), the rules of jobs (`jobs`), limits and the queue of samples that are
+//! committed in groups (`group_commit`) are the same for both, too.
 //!
 //! The crate reads no clock, and checks no numbers, since they are valid by construction. It holds a transaction across
 //! statements alone, and makes no type of the database library public. Rows that the constructors of `domain` refuse
@@ -18,12 +19,16 @@
 
 mod contract;
 mod copy;
+mod database;
+mod entities;
 mod folder_fault;
 mod group_commit;
 mod jobs;
 mod limits;
 mod location;
+mod locks;
 mod postgres;
+mod query;
 mod refusals;
 mod row_decoder;
 mod rows;
@@ -38,8 +43,11 @@ use sightfix_domain::{domain, geo};
 
 use crate::domain::{Actor, CameraId, CameraKey, Durability, Result, StoredSample};
 
+use database::{Backend, Database};
+
 pub use crate::domain::{SampleFilter, SampleKey};
 pub use copy::CopiedTable;
+pub use entities::RunSubject;
 pub use folder_fault::{FolderFault, FolderFaultKind};
 pub use group_commit::{Completion, InsertOptions, Inserted};
 pub use jobs::{Claim, Heartbeat, JobCounts, JobEnd, LiveJobs};
@@ -65,13 +73,7 @@ pub use sqlite::{
 /// database server does not answer, with `InsufficientStorage` when there is no space for what it writes, and with
 /// `ShuttingDown` after [`Store::close`].
 #[derive(Clone)]
-pub struct Store(Backend);
-
-#[derive(Clone)]
-enum Backend {
-    Sqlite(sqlite::Store),
-    Postgres(postgres::Store),
-}
+pub struct Store(Database);
 
 /// How a store is opened.
 #[derive(Debug, Clone)]
@@ -102,9 +104,9 @@ impl Default for StoreOptions {
 /// The same call on whichever backend the store has.
 macro_rules! on_backend {
     ($store:expr, $backend:ident => $call:expr) => {
-        match &$store.0 {
-            $crate::Backend::Sqlite($backend) => $call,
-            $crate::Backend::Postgres($backend) => $call,
+        match &$store.0.backend {
+            $crate::database::Backend::Sqlite($backend) => $call,
+            $crate::database::Backend::Postgres($backend) => $call,
         }
     };
 }
@@ -126,7 +128,9 @@ impl Store {
     /// A [`FolderFault`] that says what is wrong with folder or file: in use by another server, not writable,
     /// not a database, damaged, or written by a newer version.
     pub async fn open_with(folder: &Path, options: StoreOptions) -> Result<Self> {
-        Ok(Self(Backend::Sqlite(sqlite::Store::open_with(folder, options).await?)))
+        let actor = Arc::new(Actor::program(&options.role));
+        let backend = Backend::Sqlite(sqlite::Store::open_with(folder, options).await?);
+        Ok(Self(Database { backend, actor }))
     }
 
     /// Opens the store of a folder ([`Store::open_with`]), or connects to a database and brings its schema up to
@@ -139,7 +143,9 @@ impl Store {
         match location {
             Location::Folder(folder) => Self::open_with(folder, options).await,
             Location::Database(url) => {
-                Ok(Self(Backend::Postgres(postgres::Store::connect(url, options).await?)))
+                let actor = Arc::new(Actor::program(&options.role));
+                let backend = Backend::Postgres(postgres::Store::connect(url, options).await?);
+                Ok(Self(Database { backend, actor }))
             }
         }
     }
@@ -147,10 +153,7 @@ impl Store {
     /// The same store, whose changes are recorded as those of an actor.
     #[must_use]
     pub fn on_behalf_of(&self, actor: Arc<Actor>) -> Self {
-        Self(match &self.0 {
-            Backend::Sqlite(store) => Backend::Sqlite(store.on_behalf_of(actor)),
-            Backend::Postgres(store) => Backend::Postgres(store.on_behalf_of(actor)),
-        })
+        Self(Database { backend: self.0.backend.clone(), actor })
     }
 
     /// Commits what is queued and closes the file or the connections. Later calls are refused with
@@ -171,7 +174,7 @@ impl Store {
     /// whose one server has that of all.
     #[must_use]
     pub fn node_leases(&self) -> Option<&NodeLeases> {
-        match &self.0 {
+        match &self.0.backend {
             Backend::Sqlite(_) => None,
             Backend::Postgres(store) => Some(store.node_leases()),
         }
@@ -181,7 +184,7 @@ impl Store {
     /// that use it. None for a database, which any number of processes may use.
     #[must_use]
     pub fn newcomers(&self) -> Vec<Occupant> {
-        match &self.0 {
+        match &self.0.backend {
             Backend::Sqlite(store) => store.newcomers(),
             Backend::Postgres(_) => Vec::new(),
         }
@@ -189,7 +192,7 @@ impl Store {
 
     /// Logs the processes of [`Store::newcomers`].
     pub fn log_newcomers(&self) {
-        if let Backend::Sqlite(store) = &self.0 {
+        if let Backend::Sqlite(store) = &self.0.backend {
             store.log_newcomers();
         }
     }
@@ -198,7 +201,7 @@ impl Store {
     /// PostgreSQL database its own log tells.
     #[must_use]
     pub fn is_damaged(&self) -> bool {
-        match &self.0 {
+        match &self.0.backend {
             Backend::Sqlite(store) => store.is_damaged(),
             Backend::Postgres(_) => false,
         }
@@ -226,7 +229,7 @@ impl Store {
         options: impl Into<InsertOptions>,
     ) -> Result<Inserted> {
         let samples = stored(samples);
-        on_backend!(self, store => store.insert_samples(id, None, samples, options.into()).await)
+        self.0.insert_samples(id, None, samples, options.into()).await
     }
 
     /// As [`Store::insert_samples`], for the camera of that key alone: if it was deleted and created again
@@ -242,7 +245,7 @@ impl Store {
         durability: Durability,
     ) -> Result<Inserted> {
         let samples = stored(samples);
-        on_backend!(self, store => store.insert_samples(id, Some(key), samples, durability.into()).await)
+        self.0.insert_samples(id, Some(key), samples, durability.into()).await
     }
 }
 

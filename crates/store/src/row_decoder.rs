@@ -5,32 +5,28 @@ use std::fmt::Display;
 use jiff::Timestamp;
 use sqlx::postgres::PgRow;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Column, Decode, Postgres, Row, Sqlite, Type, ValueRef};
+use sqlx::{Column, Decode, Postgres, Row as _, Sqlite, Type, ValueRef};
 
+use super::query::Columns;
 use super::refusals::Corrupt;
 use crate::domain::{Error, Result, Revision};
 
 /// A row of either backend.
-#[derive(Clone, Copy)]
-pub(super) enum StoredRow<'r> {
-    Sqlite(&'r SqliteRow),
-    Postgres(&'r PgRow),
+pub enum StoredRow {
+    Sqlite(SqliteRow),
+    Postgres(PgRow),
 }
 
-impl<'r> From<&'r SqliteRow> for StoredRow<'r> {
-    fn from(row: &'r SqliteRow) -> Self {
-        Self::Sqlite(row)
+impl StoredRow {
+    /// All columns, as a tuple.
+    pub(super) fn columns<T: Columns>(&self) -> sqlx::Result<T> {
+        match self {
+            Self::Sqlite(row) => T::from_row(row),
+            Self::Postgres(row) => T::from_row(row),
+        }
     }
-}
 
-impl<'r> From<&'r PgRow> for StoredRow<'r> {
-    fn from(row: &'r PgRow) -> Self {
-        Self::Postgres(row)
-    }
-}
-
-impl<'r> StoredRow<'r> {
-    fn get<T: Stored<'r>>(self, index: usize) -> sqlx::Result<T> {
+    fn get<'r, T: Stored<'r>>(&'r self, index: usize) -> sqlx::Result<T> {
         match self {
             Self::Sqlite(row) => row.try_get(index),
             Self::Postgres(row) => row.try_get(index),
@@ -38,14 +34,14 @@ impl<'r> StoredRow<'r> {
     }
 
     /// Whether a column is NULL; one that does not exist is.
-    pub(super) fn is_null(self, index: usize) -> bool {
+    pub(super) fn is_null(&self, index: usize) -> bool {
         match self {
             Self::Sqlite(row) => row.try_get_raw(index).map_or(true, |value| value.is_null()),
             Self::Postgres(row) => row.try_get_raw(index).map_or(true, |value| value.is_null()),
         }
     }
 
-    fn column_name(self, index: usize) -> Option<String> {
+    fn column_name(&self, index: usize) -> Option<String> {
         match self {
             Self::Sqlite(row) => row.columns().get(index).map(|column| column.name().to_owned()),
             Self::Postgres(row) => row.columns().get(index).map(|column| column.name().to_owned()),
@@ -53,9 +49,9 @@ impl<'r> StoredRow<'r> {
     }
 
     /// A column of the key as text.
-    fn text(self, index: usize) -> Option<String> {
-        let number = |row: Self| row.get::<i64>(index).map(|number| number.to_string());
-        self.get::<String>(index).or_else(|_| number(self)).ok()
+    fn text(&self, index: usize) -> Option<String> {
+        let number = || self.get::<i64>(index).map(|number| number.to_string());
+        self.get::<String>(index).or_else(|_| number()).ok()
     }
 }
 
@@ -70,15 +66,15 @@ impl<'r, T> Stored<'r> for T where T: Decode<'r, Sqlite> + Type<Sqlite> + Decode
 
 /// Decodes the columns of one row from left to right. Every SELECT names the key's columns first, so
 /// that a fault can name the row.
-pub(super) struct RowDecoder<'r> {
+pub struct RowDecoder<'r> {
     table: &'static str,
-    row: StoredRow<'r>,
+    row: &'r StoredRow,
     next: usize,
 }
 
 impl<'r> RowDecoder<'r> {
-    pub(super) fn new(table: &'static str, row: impl Into<StoredRow<'r>>) -> Self {
-        Self { table, row: row.into(), next: 0 }
+    pub(super) const fn new(table: &'static str, row: &'r StoredRow) -> Self {
+        Self { table, row, next: 0 }
     }
 
     /// Skips columns that are selected only to name the row.

@@ -83,7 +83,7 @@ fn not_receiving(id: &ConnectionId) -> Error {
 /// The stored settings of a connection.
 ///
 /// # Errors
-/// A fault if they cannot be read, which an earlier release may have written otherwise.
+/// A fault if they cannot be read.
 pub fn connection_settings(connection: &Connection) -> Result<(ConnectionSettings, Secrets)> {
     let settings = serde_json::from_str(&connection.profile.settings).map_err(Error::fault)?;
     Ok((settings, serde_json::from_str(&connection.profile.secrets).map_err(Error::fault)?))

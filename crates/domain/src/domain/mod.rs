@@ -70,10 +70,10 @@ pub use sample_filter::{SampleFilter, SampleKey};
 pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
-pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport, SiteTrainingRun};
+pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport};
 pub use time::{TimeBounds, parse_time};
 pub use training::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
     HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,
-    TrainingReport, TrainingRun,
+    TrainingReport, TrainingRun, TrainingSubject,
 };

@@ -6,10 +6,6 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::job::{JobState, RunId};
-use super::names::SiteId;
-use super::training::RunProgress;
-
 /// The parameters of a training run of a site.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SiteTrainingOptions {
@@ -19,33 +15,6 @@ pub struct SiteTrainingOptions {
     pub from: Option<Timestamp>,
     /// Use only samples before this instant.
     pub until: Option<Timestamp>,
-}
-
-/// A training run of a site as stored.
-#[derive(Debug, Clone, PartialEq)]
-pub struct SiteTrainingRun {
-    /// The run's id.
-    pub id: RunId,
-    /// The site to train.
-    pub site_id: SiteId,
-    /// The parameters.
-    pub options: SiteTrainingOptions,
-    /// State of the job.
-    pub state: JobState,
-    /// Progress of the fit; its epochs count fits of all cameras and epochs of networks.
-    pub progress: RunProgress,
-    /// Number of times that a worker has claimed it without returning it to the queue in order.
-    pub attempt: u32,
-    /// What the run found out; `None` unless it has succeeded.
-    pub report: Option<SiteTrainingReport>,
-    /// Whether its versions were activated and why, or why the run failed.
-    pub outcome: Option<String>,
-    /// Time of creation.
-    pub created_at: Timestamp,
-    /// Time of the latest claim by a worker.
-    pub started_at: Option<Timestamp>,
-    /// Time of completion.
-    pub ended_at: Option<Timestamp>,
 }
 
 /// What a training run of a site found out. Everything but the counts is measured on receivers that the fits had not

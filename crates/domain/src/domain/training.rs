@@ -7,8 +7,9 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::job::{JobState, RunId};
-use super::names::{CameraId, TargetId};
+use super::names::{CameraId, SiteId, TargetId};
 use super::recipe::Recipe;
+use super::site_training::{SiteTrainingOptions, SiteTrainingReport};
 
 /// The parameters of a training run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,26 +60,45 @@ pub struct EpochReport {
     pub error_scale: f64,
 }
 
+/// What a training run trains: a camera, or all cameras of a site together.
+pub trait TrainingSubject {
+    /// The parameters of its runs.
+    type Options: fmt::Debug + Clone + PartialEq + Send + Sync + 'static;
+    /// What its runs find out.
+    type Report: fmt::Debug + Clone + PartialEq + Send + Sync + 'static;
+}
+
+impl TrainingSubject for CameraId {
+    type Options = TrainingOptions;
+    type Report = TrainingReport;
+}
+
+impl TrainingSubject for SiteId {
+    type Options = SiteTrainingOptions;
+    type Report = SiteTrainingReport;
+}
+
 /// A training run as stored.
 #[derive(Debug, Clone, PartialEq)]
-pub struct TrainingRun {
+pub struct TrainingRun<S: TrainingSubject> {
     /// The run's id.
     pub id: RunId,
-    /// The camera to train.
-    pub camera_id: CameraId,
+    /// The camera or the site to train.
+    pub subject: S,
     /// The parameters.
-    pub options: TrainingOptions,
+    pub options: S::Options,
     /// State of the job.
     pub state: JobState,
-    /// Progress of the fit.
+    /// Progress of the fit; for a site its epochs count fits of all cameras and epochs of networks.
     pub progress: RunProgress,
     /// Number of times that a worker has claimed it without returning it to the queue in order.
     pub attempt: u32,
-    /// The model version it produced.
+    /// The model version it produced; `None` for a site, whose report has those of its cameras.
     pub model_version: Option<u32>,
-    /// What the run found out, while the version that it produced is stored.
-    pub report: Option<TrainingReport>,
-    /// Whether that version was activated and why, or why the run failed.
+    /// What the run found out: for a camera while the version that it produced is stored, for a site once it has
+    /// succeeded.
+    pub report: Option<S::Report>,
+    /// Whether its versions were activated and why, or why the run failed.
     pub outcome: Option<String>,
     /// Time of creation.
     pub created_at: Timestamp,

@@ -1,14 +1,13 @@
-//! What has changed among the cameras since a poll: rows that a trigger writes (migration 0019).
+//! What has changed among the cameras since a poll: rows that a trigger writes.
 //!
 //! Transactions are committed in another order than they are numbered in. A poll therefore continues from the oldest
 //! transaction that had not ended when it was made, and may list a camera twice.
 
-use sqlx::postgres::PgRow;
-
 use super::Store;
 use super::errors::failed;
 use crate::domain::{CameraId, CameraKey, Error, Result};
-use crate::row_decoder::RowDecoder;
+use crate::entities::all_versions;
+use crate::row_decoder::{RowDecoder, StoredRow};
 use crate::rows::cameras::{CameraVersion, CameraVersions, ChangeMark, read_version};
 
 impl Store {
@@ -20,11 +19,7 @@ impl Store {
             .map_err(failed)?;
         let upto = Some(ChangeMark(upto.parse().map_err(Error::fault)?));
         let Some(since) = since else {
-            let rows = sqlx::query("SELECT id, key, revision, active_model FROM cameras")
-                .fetch_all(&mut *reader)
-                .await
-                .map_err(failed)?;
-            let versions = rows.iter().map(read_version).collect::<Result<_>>()?;
+            let versions = all_versions(&mut *reader).await?;
             return Ok(CameraVersions { versions, deleted: None, upto });
         };
         // Transactions that this server has not begun yet are those of a server whose dump was restored here.
@@ -38,8 +33,8 @@ impl Store {
         .await
         .map_err(failed)?;
         let (mut versions, mut deleted) = (Vec::new(), Vec::new());
-        for row in &rows {
-            match read_change(row)? {
+        for row in rows {
+            match read_change(&StoredRow::Postgres(row))? {
                 Change::Is(version) => versions.push(version),
                 Change::Deleted(id, key) => deleted.push((id, key)),
             }
@@ -53,7 +48,7 @@ enum Change {
     Deleted(CameraId, CameraKey),
 }
 
-fn read_change(row: &PgRow) -> Result<Change> {
+fn read_change(row: &StoredRow) -> Result<Change> {
     let mut fields = RowDecoder::new("camera_changes", row);
     let (id, key) = (fields.parse(CameraId::new)?, CameraKey(fields.get()?));
     match fields.get::<Option<i64>>()? {

@@ -40,7 +40,7 @@ const BEGIN_SCHEMA: &str =
     "BEGIN; DEALLOCATE ALL; SET LOCAL lock_timeout = '30s'; SET LOCAL synchronous_commit = on";
 
 /// The time of the database, in microseconds, as an expression.
-pub(super) const DATABASE_NOW_US: &str = super::database_now_us!();
+pub(crate) const DATABASE_NOW_US: &str = "(extract(epoch FROM clock_timestamp()) * 1000000)::BIGINT";
 
 /// The lock of the library lasts for a session, which a pooler does not keep.
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| {
@@ -88,7 +88,7 @@ pub(super) async fn begin_read(pool: &PgPool) -> Result<Transaction<'static, Pos
 }
 
 /// A transaction that is flushed to the disk when it is committed, or may be undone by a power cut.
-pub(super) async fn begin_write(
+pub(crate) async fn begin_write(
     pool: &PgPool,
     durability: Durability,
 ) -> Result<Transaction<'static, Postgres>> {

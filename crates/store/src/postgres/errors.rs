@@ -57,7 +57,7 @@ pub(super) fn meaning(error: &sqlx::Error) -> Meaning {
 
 /// A failed statement: refused where the caller can do something about it, else a fault. Why a change was refused
 /// for now is logged here, for the refusal does not say it.
-pub(super) fn failed(error: sqlx::Error) -> Error {
+pub(crate) fn failed(error: sqlx::Error) -> Error {
     if matches!(error, sqlx::Error::PoolClosed) {
         return closed();
     }

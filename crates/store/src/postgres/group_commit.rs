@@ -8,13 +8,11 @@ use futures_util::future::BoxFuture;
 use sqlx::pool::PoolConnection;
 use sqlx::{Connection as _, PgConnection, PgPool, Postgres};
 
-use super::audit::record;
 use super::connection::begin_write_statement;
 use super::errors::{Attempts, failed};
-use super::idempotency::insert_answer;
-use super::sample_retention::delete_oldest;
 use super::sample_table::{delete_replaced, delete_stored, insert};
 use crate::domain::{AuditAction, Durability, Error, Result, SampleOverflow};
+use crate::entities::{delete_oldest, insert_answer, record};
 use crate::group_commit::{
     Committing, Completion, Counting, Failure, Inserted, Known, SampleBatch, SampleWriter, WriteSession,
     admit, as_count, changed_counts, count, must_roll_back, note, outcomes_before, rows_of,

@@ -10,7 +10,7 @@ const NAMESPACE: i32 = 0x5366_7801;
 
 /// A rule over all rows of a table, which changes must obey one after another.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Limit {
+pub(crate) enum Limit {
     /// The schema is brought up to date.
     Schema = 0,
     /// Number of cameras.
@@ -30,7 +30,7 @@ pub(super) enum Limit {
 }
 
 /// Waits until no other transaction may change how far a limit is used.
-pub(super) async fn lock_limit(connection: &mut PgConnection, limit: Limit) -> Result<()> {
+pub(crate) async fn lock_limit(connection: &mut PgConnection, limit: Limit) -> Result<()> {
     sqlx::query("SELECT pg_advisory_xact_lock($1, $2)")
         .bind(NAMESPACE)
         .bind(limit as i32)

@@ -4,40 +4,21 @@
 //! a camera's row for what belongs to the camera (`cameras::lock_camera`), an advisory lock for limits over a whole
 //! table (`locks`). Locks are taken in this order: cameras by their keys, an idempotency key, jobs, limits. Jobs are claimed with `SKIP LOCKED`.
 
-mod audit;
 mod camera_changes;
 mod camera_contents;
-mod camera_moves;
-mod cameras;
 mod connection;
 mod connection_owners;
-mod connections;
 mod copy;
 mod errors;
-mod evaluations;
 mod group_commit;
 mod history;
-mod idempotency;
-mod jobs;
-mod keys;
-mod latest_runs;
 mod locks;
-mod models;
 mod nodes;
-mod outbox;
 mod outbox_logs;
-mod retention;
-mod runs;
 mod sample_partitions;
-mod sample_retention;
 mod sample_table;
-mod samples;
-mod site_runs;
-mod sites;
-mod source_offsets;
 #[cfg(test)]
 mod tests;
-mod training;
 
 use std::sync::Arc;
 
@@ -47,10 +28,16 @@ use super::StoreOptions;
 use super::group_commit::GroupCommit;
 use super::limits::{StorageStatus, StoreLimits, Usage};
 use super::location::DatabaseUrl;
-use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
+use crate::domain::{Durability, Error, ErrorKind, Result};
+use crate::entities::count_all_samples;
 
-use errors::failed;
+pub(crate) use connection::{DATABASE_NOW_US, begin_write};
+pub(crate) use errors::failed;
 pub(super) use errors::{Attempts, repeated};
+pub(crate) use locks::{Limit, lock_limit};
+pub(crate) use outbox_logs::lock_log;
+pub(crate) use sample_partitions::start_of_week;
+
 use group_commit::GroupWriter;
 
 pub use connection_owners::ConnectionReports;
@@ -59,10 +46,8 @@ pub use nodes::{Acquired, NodeLeases, Renewed};
 
 /// The store of one database.
 #[derive(Clone)]
-pub(super) struct Store {
+pub(crate) struct Store {
     inner: Arc<Inner>,
-    /// On whose behalf changes are recorded in the audit log.
-    actor: Arc<Actor>,
 }
 
 struct Inner {
@@ -80,13 +65,9 @@ impl Store {
         let samples = GroupCommit::start(Arc::new(writer));
         let leases = NodeLeases { renewals: connection::for_renewals(url)?, pool: pool.clone() };
         let inner = Arc::new(Inner { pool, samples, usage, leases });
-        let store = Self { inner, actor: Arc::new(Actor::program(&options.role)) };
+        let store = Self { inner };
         store.count_all_samples().await?;
         Ok(store)
-    }
-
-    pub(super) fn on_behalf_of(&self, actor: Arc<Actor>) -> Self {
-        Self { inner: Arc::clone(&self.inner), actor }
     }
 
     pub(super) async fn close(&self) {
@@ -143,13 +124,7 @@ impl Store {
     }
 
     async fn count_all_samples(&self) -> Result<()> {
-        let mut reader = self.reader().await?;
-        let samples: i64 =
-            sqlx::query_scalar("SELECT coalesce(sum(samples + without_fix), 0)::BIGINT FROM sample_counts")
-                .fetch_one(&mut *reader)
-                .await
-                .map_err(failed)?;
-        self.inner.usage.counted(samples);
+        self.inner.usage.counted(count_all_samples(&mut *self.reader().await?).await?);
         Ok(())
     }
 
@@ -178,12 +153,17 @@ impl Store {
         transaction.commit().await.expect("commits");
     }
 
-    fn limits(&self) -> &StoreLimits {
+    /// The queue of samples that are committed in groups.
+    pub(crate) fn sample_queue(&self) -> &GroupCommit {
+        &self.inner.samples
+    }
+
+    pub(crate) fn limits(&self) -> &StoreLimits {
         &self.inner.usage.limits
     }
 
     /// A transaction for one or several reads, which all see the same state.
-    async fn reader(&self) -> Result<Transaction<'static, Postgres>> {
+    pub(crate) async fn reader(&self) -> Result<Transaction<'static, Postgres>> {
         connection::begin_read(&self.inner.pool).await
     }
 
@@ -192,21 +172,7 @@ impl Store {
         connection::begin_write(&self.inner.pool, Durability::Synced).await
     }
 
-    /// A transaction for a change that a power cut (not a crash) may undo.
-    async fn relaxed_writer(&self) -> Result<Transaction<'static, Postgres>> {
-        connection::begin_write(&self.inner.pool, Durability::Relaxed).await
+    pub(crate) fn pool(&self) -> &PgPool {
+        &self.inner.pool
     }
-}
-
-/// The time of the database, in microseconds.
-macro_rules! database_now_us {
-    () => {
-        "(extract(epoch FROM clock_timestamp()) * 1000000)::BIGINT"
-    };
-}
-use database_now_us;
-
-/// A number that is not NaN; NaN is stored as NULL in both backends.
-fn finite(number: f64) -> Option<f64> {
-    (!number.is_nan()).then_some(number)
 }

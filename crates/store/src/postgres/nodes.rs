@@ -15,8 +15,8 @@ use uuid::Uuid;
 use super::connection::{DATABASE_NOW_US, begin_read, begin_write};
 use super::errors::{failed, repeated};
 use super::history::{self, HistoryMark};
-use super::keys::keys_version;
 use crate::domain::{CameraKey, Durability, Error, ErrorKind, Node, NodeId, NodeProfile, Result, SiteKey};
+use crate::entities::keys_version;
 use crate::rows::keys::KeysVersion;
 
 /// The registrations and ownerships of the nodes of one database.
@@ -106,7 +106,7 @@ impl NodeLeases {
             .map_err(failed)?;
         let Some(row) = row else { return Ok(None) };
         let nodes = read_nodes(&mut transaction).await?;
-        let keys = keys_version(&mut transaction).await?;
+        let keys = keys_version(&mut *transaction).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(Some(Renewed { nodes, keys, mark: HistoryMark::read(&row)? }))
     }

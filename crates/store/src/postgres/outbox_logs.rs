@@ -1,9 +1,9 @@
 //! How far outboxes have come in the logs of the processes that fill them, and processes that ended too soon.
 
-use sqlx::PgConnection;
+use sqlx::{AssertSqlSafe, PgConnection};
 
 use super::errors::failed;
-use super::{Store, database_now_us};
+use super::{DATABASE_NOW_US, Store};
 use crate::domain::{ConnectionKey, OutboxLog, Result};
 
 /// A process that was cut off registers again as soon as it reaches the database; until then it is not believed to be gone.
@@ -34,20 +34,18 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(failed)?;
-        sqlx::query(concat!(
-            "UPDATE outbox_logs SET ended_at_us = ",
-            database_now_us!(),
-            " WHERE log <> $1 AND ended_at_us IS NULL AND NOT EXISTS (SELECT 1 FROM nodes WHERE id = node_id)"
-        ))
+        sqlx::query(AssertSqlSafe(format!(
+            "UPDATE outbox_logs SET ended_at_us = {DATABASE_NOW_US} \
+             WHERE log <> $1 AND ended_at_us IS NULL AND NOT EXISTS (SELECT 1 FROM nodes WHERE id = node_id)"
+        )))
         .bind(&log)
         .execute(&mut *transaction)
         .await
         .map_err(failed)?;
-        let lost: Vec<i64> = sqlx::query_scalar(concat!(
-            "DELETE FROM outbox_logs WHERE log <> $1 AND ended_at_us < ",
-            database_now_us!(),
-            " - $2 RETURNING connection_key"
-        ))
+        let lost: Vec<i64> = sqlx::query_scalar(AssertSqlSafe(format!(
+            "DELETE FROM outbox_logs WHERE log <> $1 AND ended_at_us < {DATABASE_NOW_US} - $2 \
+             RETURNING connection_key"
+        )))
         .bind(&log)
         .bind(GRACE_US)
         .fetch_all(&mut *transaction)
@@ -56,21 +54,10 @@ impl Store {
         transaction.commit().await.map_err(failed)?;
         Ok(lost.into_iter().map(ConnectionKey).collect())
     }
-
-    pub(crate) async fn close_outbox_logs(&self, own: &OutboxLog, sinks: &[ConnectionKey]) -> Result<()> {
-        let mut transaction = self.writer().await?;
-        sqlx::query("DELETE FROM outbox_logs WHERE log = $1 AND connection_key = ANY($2)")
-            .bind(own.id.to_string())
-            .bind(sinks.iter().map(|key| key.0).collect::<Vec<_>>())
-            .execute(&mut *transaction)
-            .await
-            .map_err(failed)?;
-        transaction.commit().await.map_err(failed)
-    }
 }
 
 /// Locks a log, after its connection as a deletion does; how far the outbox has come in it. `None` for a connection that was deleted.
-pub(super) async fn lock_log(
+pub(crate) async fn lock_log(
     connection: &mut PgConnection,
     key: ConnectionKey,
     log: &OutboxLog,
@@ -87,21 +74,4 @@ pub(super) async fn lock_log(
     .fetch_optional(connection)
     .await
     .map_err(failed)
-}
-
-/// Notes that the outbox has come so far in a log.
-pub(super) async fn note_position(
-    connection: &mut PgConnection,
-    key: ConnectionKey,
-    log: &OutboxLog,
-    position: i64,
-) -> Result<()> {
-    sqlx::query("UPDATE outbox_logs SET position = $3 WHERE connection_key = $1 AND log = $2")
-        .bind(key.0)
-        .bind(log.id.to_string())
-        .bind(position)
-        .execute(connection)
-        .await
-        .map_err(failed)?;
-    Ok(())
 }

@@ -1,6 +1,6 @@
 //! The partitions of samples: one table per week of their time, added before the week begins and dropped as a whole.
 //!
-//! Migration 0018 makes one partition of everything before a week, and a default one. Weeks are those of the Unix epoch.
+//! The schema has one partition of everything before a week, and a default one. Weeks are those of the Unix epoch.
 
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
@@ -9,10 +9,10 @@ use sqlx::{AssertSqlSafe, PgConnection};
 use super::Store;
 use super::errors::failed;
 use super::locks::{Limit, try_lock_limit};
-use super::sample_retention::delete_batch;
-use crate::domain::{AuditAction, Error, Result};
+use crate::domain::{Actor, AuditAction, Error, Result};
+use crate::entities::record;
 use crate::rows::audit::Change;
-use crate::rows::samples::{SampleTable, expired};
+use crate::rows::samples::SampleTable;
 
 const WEEK_US: i64 = 7 * 86_400 * 1_000_000;
 /// Weeks after the present one that have a partition already.
@@ -23,7 +23,14 @@ const DAY_LENGTH: usize = 8;
 const NO_TIMEOUT: &str = "SET LOCAL statement_timeout = 0";
 
 impl Store {
-    pub(crate) async fn retain_samples(&self, since: Option<Timestamp>, now: Timestamp) -> Result<u64> {
+    /// Adds the partitions of the weeks to come, and drops those of weeks that are over at an instant, the start of a
+    /// week; returns how many samples were in them.
+    pub(crate) async fn retain_weeks(
+        &self,
+        actor: &Actor,
+        since: Option<Timestamp>,
+        now: Timestamp,
+    ) -> Result<u64> {
         let mut deleted = 0;
         for table in SampleTable::ALL {
             self.add_partitions(table, now).await?;
@@ -31,13 +38,10 @@ impl Store {
                 self.detach_before(table, since).await?;
             }
             for partition in self.detached(table).await? {
-                deleted += self.drop_detached(table, &partition, now).await?;
+                deleted += self.drop_detached(actor, table, &partition, now).await?;
             }
         }
-        match since {
-            Some(since) => Ok(deleted + self.delete_before(week_of(since), now).await?),
-            None => Ok(deleted),
-        }
+        Ok(deleted)
     }
 
     async fn add_partitions(&self, table: SampleTable, now: Timestamp) -> Result<()> {
@@ -95,7 +99,13 @@ impl Store {
     }
 
     /// Counts the samples of a detached week no more, and drops it; returns how many there were.
-    async fn drop_detached(&self, table: SampleTable, name: &str, now: Timestamp) -> Result<u64> {
+    async fn drop_detached(
+        &self,
+        actor: &Actor,
+        table: SampleTable,
+        name: &str,
+        now: Timestamp,
+    ) -> Result<u64> {
         let mut transaction = self.writer().await?;
         if !try_lock_limit(&mut transaction, Limit::SamplePartitions).await.map_err(failed)? {
             return Ok(0);
@@ -113,42 +123,10 @@ impl Store {
         let sql = format!("DROP TABLE {name}");
         sqlx::raw_sql(AssertSqlSafe(sql)).execute(&mut *transaction).await.map_err(failed)?;
         let subject = format!("{rows} samples of the week of {}, by limits.sample_days", day_of(name));
-        self.record(&mut transaction, Change::of(AuditAction::SamplesDeleted, subject), now).await?;
+        let change = Change::of(AuditAction::SamplesDeleted, subject);
+        record(&mut *transaction, (actor, self.limits()), change, now).await?;
         transaction.commit().await.map_err(failed)?;
         Ok(rows.unsigned_abs())
-    }
-
-    /// Deletes what no partition of a week holds, camera by camera and in short transactions.
-    async fn delete_before(&self, before_us: i64, now: Timestamp) -> Result<u64> {
-        let before = Timestamp::from_microsecond(before_us).map_err(Error::fault)?;
-        let mut reader = self.reader().await?;
-        let cameras: Vec<i64> = sqlx::query_scalar(
-            "SELECT camera_key FROM sample_counts AS counts WHERE EXISTS (SELECT 1 FROM samples \
-             WHERE samples.camera_key = counts.camera_key AND time_us < $1) \
-             OR EXISTS (SELECT 1 FROM samples_without_fix AS boxes WHERE boxes.camera_key = counts.camera_key \
-             AND time_us < $1) ORDER BY camera_key",
-        )
-        .bind(before_us)
-        .fetch_all(&mut *reader)
-        .await
-        .map_err(failed)?;
-        reader.commit().await.map_err(failed)?;
-        let mut deleted = 0;
-        for camera_key in cameras {
-            loop {
-                let mut transaction = self.writer().await?;
-                let rows = delete_batch(&mut transaction, camera_key, before_us).await?;
-                if deleted == 0 && rows > 0 {
-                    self.record(&mut transaction, expired(before), now).await?;
-                }
-                transaction.commit().await.map_err(failed)?;
-                if rows == 0 {
-                    break;
-                }
-                deleted += rows;
-            }
-        }
-        Ok(deleted)
     }
 }
 
@@ -186,6 +164,11 @@ fn day_of(name: &str) -> &str {
 fn is_week(table: SampleTable, name: &str) -> bool {
     let day = name.strip_prefix(&*table.to_string()).and_then(|rest| rest.strip_prefix('_'));
     day.is_some_and(|day| day.len() == DAY_LENGTH && day.bytes().all(|byte| byte.is_ascii_digit()))
+}
+
+/// Start of the week of an instant.
+pub(crate) fn start_of_week(time: Timestamp) -> Result<Timestamp> {
+    Timestamp::from_microsecond(week_of(time)).map_err(Error::fault)
 }
 
 /// Start of the week of an instant, microseconds.

@@ -7,6 +7,7 @@ use sqlx::{AssertSqlSafe, PgConnection};
 
 use super::errors::failed;
 use crate::domain::{Result, Score, SigmaM, StoredSample, TargetClass};
+use crate::entities::subtract;
 use crate::geo::Position;
 use crate::rows::samples::{Row, SampleTable, key};
 
@@ -113,23 +114,4 @@ async fn delete_keys(
     )));
     let query = query.bind(camera_key).bind(times_us).bind(targets);
     Ok(query.execute(connection).await.map_err(failed)?.rows_affected())
-}
-
-/// Counts so many samples of a table no more.
-pub(super) async fn subtract(
-    connection: &mut PgConnection,
-    table: SampleTable,
-    camera_key: i64,
-    rows: u64,
-) -> Result<()> {
-    let counter = table.counter();
-    sqlx::query(AssertSqlSafe(format!(
-        "UPDATE sample_counts SET {counter} = GREATEST({counter} - $1, 0) WHERE camera_key = $2"
-    )))
-    .bind(i64::try_from(rows).unwrap_or(i64::MAX))
-    .bind(camera_key)
-    .execute(connection)
-    .await
-    .map_err(failed)?;
-    Ok(())
 }

@@ -102,14 +102,14 @@ async fn workers_of_several_processes_claim_each_run_once() {
         let camera = CameraId::new(&format!("camera-{n}")).expect("a slug");
         stores[0].insert_camera(&NewCamera::named(camera.clone()), at(0)).await.expect("new");
         let run = RunId(Uuid::from_u128(n));
-        stores[0].insert_run(run, &camera, &options(), 100, at(1)).await.expect("queued");
+        stores[0].insert_run(run, &camera, &options(), 100, None, at(1)).await.expect("queued");
     }
     let workers: Vec<_> = (0..12)
         .map(|worker| {
             let store = stores[worker % 3].clone();
             tokio::spawn(async move {
                 let mut claimed = Vec::new();
-                while let Some(claim) = store.claim_run(LEASE, at(2)).await.expect("works") {
+                while let Some(claim) = store.claim_run::<CameraId>(LEASE, at(2)).await.expect("works") {
                     claimed.push(claim.job.id);
                 }
                 claimed
@@ -132,16 +132,24 @@ async fn the_clocks_of_workers_decide_no_lease() {
     let fixture = Fixture::at(database().await).await;
     let store = &fixture.store;
     let run = RunId(Uuid::from_u128(1));
-    store.insert_run(run, &fixture.camera, &options(), 9, at(0)).await.expect("queued");
-    let fence = store.claim_run(LEASE, at(0)).await.expect("works").expect("a run").fence;
+    store.insert_run(run, &fixture.camera, &options(), 9, None, at(0)).await.expect("queued");
+    let fence = store.claim_run::<CameraId>(LEASE, at(0)).await.expect("works").expect("a run").fence;
     for second in [-86_400, -60, -1, 1, 60, 86_400] {
-        assert_eq!(store.claim_run(LEASE, at(second)).await.expect("works"), None, "at {second} s");
-        let beat = store.heartbeat_run(run, fence, &RunProgress::default(), LEASE, at(-second)).await;
+        assert_eq!(
+            store.claim_run::<CameraId>(LEASE, at(second)).await.expect("works"),
+            None,
+            "at {second} s"
+        );
+        let beat =
+            store.heartbeat_run::<CameraId>(run, fence, &RunProgress::default(), LEASE, at(-second)).await;
         assert_eq!(beat.expect("works"), Heartbeat::Continue);
     }
     // One that was taken a moment ago by the database's clock.
     fixture.tamper("UPDATE training_runs SET lease_until_us = lease_until_us - 30000000").await;
-    assert_eq!(store.claim_run(LEASE, at(0)).await.expect("works").map(|claim| claim.fence), Some(fence + 1));
+    assert_eq!(
+        store.claim_run::<CameraId>(LEASE, at(0)).await.expect("works").map(|claim| claim.fence),
+        Some(fence + 1)
+    );
 }
 
 /// The database ends a transaction for a deadlock, or because it cannot be serialised, at whatever statement and call.
@@ -168,7 +176,7 @@ async fn a_transaction_that_the_database_ends_is_made_again() {
     let changed = store.replace_camera(&NewCamera::named(id("a")), None, at(1)).await.expect("changed");
     assert_eq!(changed.revision.0, 2, "once");
     assert_eq!(acquire(&store, "a", node).await, Acquired::Owned { fence: 1, is_takeover: false });
-    store.insert_run(RunId(Uuid::from_u128(1)), &id("a"), &options(), 9, at(1)).await.expect("queued");
+    store.insert_run(RunId(Uuid::from_u128(1)), &id("a"), &options(), 9, None, at(1)).await.expect("queued");
 
     crate::on_backend!(store, store => store.tamper(
         "CREATE OR REPLACE FUNCTION refuse_two_of_three() RETURNS TRIGGER LANGUAGE plpgsql AS $$ BEGIN \

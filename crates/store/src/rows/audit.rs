@@ -6,7 +6,7 @@ use crate::domain::{Actor, AuditAction, AuditEntry, AuditNumber, CameraId, KeyId
 use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// A change, for the audit log.
-pub(crate) struct Change<'a> {
+pub struct Change<'a> {
     pub(crate) action: AuditAction,
     pub(crate) camera: Option<&'a CameraId>,
     pub(crate) subject: Option<String>,
@@ -29,7 +29,7 @@ pub(crate) fn version(number: impl std::fmt::Display) -> String {
     format!("version {number}")
 }
 
-pub(crate) fn read_entry<'r>(row: impl Into<StoredRow<'r>>) -> Result<AuditEntry> {
+pub(crate) fn read_entry(row: &StoredRow) -> Result<AuditEntry> {
     let mut fields = RowDecoder::new("audit_log", row);
     Ok(AuditEntry {
         number: AuditNumber(fields.parse(|number: i64| u64::try_from(number))?),

@@ -51,7 +51,7 @@ pub struct CameraContent {
 }
 
 /// Columns: id, key, revision, active model.
-pub(crate) fn read_version<'r>(row: impl Into<StoredRow<'r>>) -> Result<CameraVersion> {
+pub(crate) fn read_version(row: &StoredRow) -> Result<CameraVersion> {
     let mut fields = RowDecoder::new("cameras", row);
     Ok(CameraVersion {
         id: fields.parse(CameraId::new)?,
@@ -84,7 +84,7 @@ pub(crate) fn check_site(stored: &Camera, wanted: &NewCamera) -> Result<()> {
     }
 }
 
-pub(crate) fn read_camera<'r>(row: impl Into<StoredRow<'r>>) -> Result<Camera> {
+pub(crate) fn read_camera(row: &StoredRow) -> Result<Camera> {
     let mut fields = RowDecoder::new("cameras", row);
     let key = CameraKey(fields.get()?);
     let id = fields.parse(CameraId::new)?;
@@ -134,8 +134,7 @@ struct StoredReceiver {
     receiver_id: String,
     target_id: String,
     clock_offset_us: i64,
-    /// Missing in rows of earlier releases.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     sigma_m: Option<f64>,
 }
 

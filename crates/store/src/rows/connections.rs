@@ -37,7 +37,7 @@ pub(crate) fn check_version(
     expected.map_or(Ok(()), |expected| expected.check("connection", connection.key, connection.revision))
 }
 
-pub(crate) fn read_connection<'r>(row: impl Into<StoredRow<'r>>) -> Result<Connection> {
+pub(crate) fn read_connection(row: &StoredRow) -> Result<Connection> {
     let mut fields = RowDecoder::new("connections", row);
     let key = ConnectionKey(fields.get()?);
     let profile = NewConnection {
@@ -66,12 +66,12 @@ pub(crate) fn read_message(fields: &mut RowDecoder<'_>) -> Result<OutboxMessage>
     })
 }
 
-pub(crate) fn read_dead_letter<'r>(row: impl Into<StoredRow<'r>>) -> Result<DeadLetter> {
+pub(crate) fn read_dead_letter(row: &StoredRow) -> Result<DeadLetter> {
     let mut fields = RowDecoder::new("outbox", row);
     Ok(DeadLetter { message: read_message(&mut fields)?, reason: fields.get()? })
 }
 
-pub(crate) fn read_source_offset<'r>(row: impl Into<StoredRow<'r>>) -> Result<SourceOffset> {
+pub(crate) fn read_source_offset(row: &StoredRow) -> Result<SourceOffset> {
     let mut fields = RowDecoder::new("source_offsets", row);
     Ok(SourceOffset {
         topic: fields.get()?,

@@ -24,7 +24,7 @@ macro_rules! select_evaluations {
     };
 }
 
-pub(crate) fn read_evaluation<'r>(row: impl Into<StoredRow<'r>>) -> Result<EvaluationJob> {
+pub(crate) fn read_evaluation(row: &StoredRow) -> Result<EvaluationJob> {
     let mut fields = RowDecoder::new("evaluations", row);
     Ok(EvaluationJob {
         id: EvaluationId(fields.parse(Uuid::parse_str)?),

@@ -29,7 +29,7 @@ impl KeysVersion {
     }
 }
 
-pub(crate) fn read_key<'r>(row: impl Into<StoredRow<'r>>) -> Result<(ApiKey, SecretDigest)> {
+pub(crate) fn read_key(row: &StoredRow) -> Result<(ApiKey, SecretDigest)> {
     let mut fields = RowDecoder::new("api_keys", row);
     let id = fields.parse(|id: &str| id.parse())?;
     let name = fields.get()?;

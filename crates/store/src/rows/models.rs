@@ -59,7 +59,7 @@ pub struct StoredHeldOutError {
     pub sample: Option<(BoundingBox, Position)>,
 }
 
-pub(crate) fn read_held_out_error<'r>(row: impl Into<StoredRow<'r>>) -> Result<StoredHeldOutError> {
+pub(crate) fn read_held_out_error(row: &StoredRow) -> Result<StoredHeldOutError> {
     let mut fields = RowDecoder::new("held_out_errors", row).skip(1);
     let time = fields.timestamp()?;
     let target_id = fields.parse(TargetId::new)?;
@@ -84,7 +84,7 @@ pub(crate) fn read_held_out_error<'r>(row: impl Into<StoredRow<'r>>) -> Result<S
     Ok(StoredHeldOutError { error, sample: Some((bounding_box, position)) })
 }
 
-pub(crate) fn read_model<'r>(row: impl Into<StoredRow<'r>>) -> Result<ModelVersion> {
+pub(crate) fn read_model(row: &StoredRow) -> Result<ModelVersion> {
     let mut fields = RowDecoder::new("models", row);
     Ok(ModelVersion {
         camera_id: fields.parse(CameraId::new)?,
@@ -98,7 +98,7 @@ pub(crate) fn read_model<'r>(row: impl Into<StoredRow<'r>>) -> Result<ModelVersi
 
 pub(crate) use select_models;
 
-pub(crate) fn read_move<'r>(row: impl Into<StoredRow<'r>>) -> Result<CameraMoved> {
+pub(crate) fn read_move(row: &StoredRow) -> Result<CameraMoved> {
     let mut fields = RowDecoder::new("camera_moves", row).skip(1);
     Ok(CameraMoved {
         model_version: fields.count()?,
@@ -121,7 +121,7 @@ pub(crate) fn write_metadata(metadata: &ModelMetadata) -> Result<String> {
 }
 
 /// Metadata document, weights and checksum of a version, if it was found.
-pub(crate) type StoredContent = Option<(Vec<u8>, Vec<u8>, Option<String>)>;
+pub(crate) type StoredContent = Option<(Vec<u8>, Vec<u8>, String)>;
 
 /// Metadata and weights of a version as they were stored, with the checksum verified.
 pub(crate) fn read_content(
@@ -130,7 +130,7 @@ pub(crate) fn read_content(
     content: StoredContent,
 ) -> Result<(ModelMetadata, Vec<u8>)> {
     let (document, weights, sha256) = content.ok_or_else(|| no_model(camera, number))?;
-    if sha256.is_some_and(|sha256| sha256 != model_sha256(&document, &weights)) {
+    if sha256 != model_sha256(&document, &weights) {
         return Err(unusable(camera, number, "what is stored does not match its checksum"));
     }
     let metadata = serde_json::from_slice(&document)

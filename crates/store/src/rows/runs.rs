@@ -1,13 +1,15 @@
 //! Rows of training runs, and what finishes them.
 
+use sqlx::AssertSqlSafe;
 use uuid::Uuid;
 
 use super::models::NewModel;
 use crate::domain::{
-    CameraId, Error, ErrorKind, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingRun,
+    CameraId, Recipe, Result, RunId, RunProgress, TrainingOptions, TrainingReport, TrainingRun,
+    TrainingSubject,
 };
-use crate::jobs::{JobEnd, read_state};
-use crate::refusals::no_run;
+use crate::jobs::{JobEnd, JobTable, RUNS, job_state, read_state};
+use crate::query::Dialect;
 use crate::row_decoder::{RowDecoder, StoredRow};
 
 /// Lines kept in a run's log; older ones are deleted.
@@ -28,37 +30,90 @@ pub struct RunOutput<'a> {
 /// How a worker finishes a run.
 pub type RunEnd<'a> = JobEnd<RunOutput<'a>>;
 
-macro_rules! select_runs {
-    ($report:literal, $rest:literal) => {
-        concat!(
-            "SELECT runs.id, cameras.id, runs.recipe, runs.seed, runs.epochs, runs.from_us, runs.until_us, \
-             ", $crate::jobs::job_state!("runs"), ", runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
-             runs.reconstruction_error, runs.regression_error, runs.error_scale, runs.remaining_s, \
-             runs.model_version, (SELECT ", $report, " FROM models \
-             WHERE models.camera_key = runs.camera_key AND models.number = runs.model_version), runs.outcome, runs.created_at_us, runs.started_at_us, runs.ended_at_us \
-             FROM training_runs AS runs JOIN cameras ON cameras.key = runs.camera_key ",
-            $rest
+/// How a subject's runs are read.
+pub trait ReadRun: TrainingSubject + Clone + PartialEq + Send + Sync + 'static {
+    /// The table of its runs.
+    #[doc(hidden)]
+    const JOBS: &'static JobTable;
+    /// What messages call it.
+    #[doc(hidden)]
+    const KIND: &'static str;
+    /// Its own table.
+    #[doc(hidden)]
+    const SUBJECTS: &'static str;
+    /// The columns of [`ReadRun::read_options`].
+    #[doc(hidden)]
+    const OPTIONS: &'static str;
+
+    /// Expressions for the model version and the report of a run.
+    #[doc(hidden)]
+    fn results(dialect: Dialect) -> String;
+
+    #[doc(hidden)]
+    fn read_subject(fields: &mut RowDecoder<'_>) -> Result<Self>;
+
+    #[doc(hidden)]
+    fn read_options(fields: &mut RowDecoder<'_>) -> Result<Self::Options>;
+
+    #[doc(hidden)]
+    fn read_report(fields: &mut RowDecoder<'_>) -> Result<Option<Self::Report>>;
+}
+
+impl ReadRun for CameraId {
+    const JOBS: &'static JobTable = &RUNS;
+    const KIND: &'static str = "camera";
+    const SUBJECTS: &'static str = "cameras";
+    const OPTIONS: &'static str = "runs.recipe, runs.seed, runs.epochs, runs.from_us, runs.until_us";
+
+    fn results(dialect: Dialect) -> String {
+        format!(
+            "runs.model_version, (SELECT {} FROM models WHERE models.camera_key = runs.camera_key \
+             AND models.number = runs.model_version)",
+            dialect.training_report()
         )
-    };
-}
+    }
 
-/// The run, if it is one of that camera.
-pub(crate) fn run_of(found: Option<TrainingRun>, camera: &CameraId, run: RunId) -> Result<TrainingRun> {
-    found.filter(|found| found.camera_id == *camera).ok_or_else(|| no_run(run))
-}
+    fn read_subject(fields: &mut RowDecoder<'_>) -> Result<Self> {
+        fields.parse(Self::new)
+    }
 
-pub(crate) fn read_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<TrainingRun> {
-    let mut fields = RowDecoder::new("training_runs", row);
-    Ok(TrainingRun {
-        id: RunId(fields.parse(Uuid::parse_str)?),
-        camera_id: fields.parse(CameraId::new)?,
-        options: TrainingOptions {
+    fn read_options(fields: &mut RowDecoder<'_>) -> Result<TrainingOptions> {
+        Ok(TrainingOptions {
             recipe: fields.parse(|name: &str| name.parse::<Recipe>())?,
             seed: fields.get::<i64>()?.cast_unsigned(),
             epochs: fields.optional_count()?,
             from: fields.optional_timestamp()?,
             until: fields.optional_timestamp()?,
-        },
+        })
+    }
+
+    /// A model whose metadata are damaged is reported where the model is read.
+    fn read_report(fields: &mut RowDecoder<'_>) -> Result<Option<TrainingReport>> {
+        Ok(fields.get::<Option<String>>()?.and_then(|report| serde_json::from_str(&report).ok()))
+    }
+}
+
+/// A statement for [`read_run`].
+pub(crate) fn select_runs<S: ReadRun>(dialect: Dialect, rest: &str) -> AssertSqlSafe<String> {
+    let JobTable { table, owner, .. } = S::JOBS;
+    AssertSqlSafe(format!(
+        "SELECT runs.id, subjects.id, {}, {}, runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, \
+         runs.reconstruction_error, runs.regression_error, runs.error_scale, runs.remaining_s, {}, runs.outcome, \
+         runs.created_at_us, runs.started_at_us, runs.ended_at_us \
+         FROM {table} AS runs JOIN {} AS subjects ON subjects.key = runs.{owner} {rest}",
+        S::OPTIONS,
+        job_state!("runs"),
+        S::results(dialect),
+        S::SUBJECTS
+    ))
+}
+
+pub(crate) fn read_run<S: ReadRun>(row: &StoredRow) -> Result<TrainingRun<S>> {
+    let mut fields = RowDecoder::new(S::JOBS.table, row);
+    Ok(TrainingRun {
+        id: RunId(fields.parse(Uuid::parse_str)?),
+        subject: S::read_subject(&mut fields)?,
+        options: S::read_options(&mut fields)?,
         state: fields.parse(read_state)?,
         attempt: fields.count()?,
         progress: RunProgress {
@@ -71,30 +126,10 @@ pub(crate) fn read_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<TrainingRun>
             remaining_s: fields.get()?,
         },
         model_version: fields.optional_count()?,
-        // A model whose metadata are damaged is reported where the model is read.
-        report: fields.get::<Option<String>>()?.and_then(|report| serde_json::from_str(&report).ok()),
+        report: S::read_report(&mut fields)?,
         outcome: fields.get()?,
         created_at: fields.timestamp()?,
         started_at: fields.optional_timestamp()?,
         ended_at: fields.optional_timestamp()?,
     })
-}
-
-pub(crate) use select_runs;
-
-/// A camera has one live run at most.
-pub(crate) fn check_no_live_run(live: Option<String>) -> Result<()> {
-    let Some(live) = live else { return Ok(()) };
-    let message =
-        format!("the camera has training run {live}, which has not ended; wait for it or cancel it");
-    Err(Error::conflict(ErrorKind::RunLive, live, message))
-}
-
-/// Refuses to cancel a run that has ended.
-pub(crate) fn check_not_ended(run: &TrainingRun) -> Result<()> {
-    if !run.state.has_ended() {
-        return Ok(());
-    }
-    let ended = format!("the training run has ended already: {}", run.state.as_str());
-    Err(Error::refused(ErrorKind::RunEnded, ended))
 }

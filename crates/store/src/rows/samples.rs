@@ -94,8 +94,9 @@ impl SampleTable {
                  latitude_deg, sigma_m, class, score, truth_longitude_deg, truth_latitude_deg"
             }
             Self::WithoutFix => {
-                "camera_key, time_us, target_id, left_px, top_px, width_px, height_px, NULL, NULL, NULL, class, \
-                 score, truth_longitude_deg, truth_latitude_deg"
+                "camera_key, time_us, target_id, left_px, top_px, width_px, height_px, \
+                 CAST(NULL AS DOUBLE PRECISION), CAST(NULL AS DOUBLE PRECISION), CAST(NULL AS DOUBLE PRECISION), \
+                 class, score, truth_longitude_deg, truth_latitude_deg"
             }
         }
     }
@@ -109,9 +110,17 @@ impl SampleTable {
     }
 }
 
+/// The rows of several statements together, each of which is ordered and limited as all of them are.
+pub(crate) fn ordered_union(statements: &[String], order: &str) -> String {
+    if let [one] = statements {
+        return one.clone();
+    }
+    let parts = statements.iter().map(|statement| format!("SELECT * FROM ({statement}) AS part"));
+    format!("{} {order}", parts.collect::<Vec<_>>().join(" UNION ALL "))
+}
+
 /// A row of [`SampleTable::columns`].
-pub(crate) fn read_sample<'r>(row: impl Into<StoredRow<'r>>) -> Result<StoredSample> {
-    let row = row.into();
+pub(crate) fn read_sample(row: &StoredRow) -> Result<StoredSample> {
     let table = if row.is_null(7) { "samples_without_fix" } else { "samples" };
     let mut fields = RowDecoder::new(table, row).skip(1);
     let time = fields.timestamp()?;

@@ -1,15 +1,11 @@
 //! Rows of training runs of sites, and what finishes them.
 
-use uuid::Uuid;
-
 use super::models::NewModel;
-use crate::domain::{
-    CameraId, CameraKey, Error, ErrorKind, Result, RunId, RunProgress, SiteId, SiteTrainingOptions,
-    SiteTrainingReport, SiteTrainingRun,
-};
-use crate::jobs::{JobEnd, read_state};
-use crate::refusals::no_run;
-use crate::row_decoder::{RowDecoder, StoredRow};
+use super::runs::ReadRun;
+use crate::domain::{CameraId, CameraKey, Result, SiteId, SiteTrainingOptions, SiteTrainingReport};
+use crate::jobs::{JobEnd, JobTable, SITE_RUNS};
+use crate::query::Dialect;
+use crate::row_decoder::RowDecoder;
 
 /// The output of a run: a model for each camera, which are activated together or not at all.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,74 +33,31 @@ pub struct SiteCameraOutput<'a> {
 /// How a worker finishes a run of a site.
 pub type SiteRunEnd<'a> = JobEnd<SiteRunOutput<'a>>;
 
-macro_rules! select_site_runs {
-    ($rest:literal) => {
-        concat!(
-            "SELECT runs.id, sites.id, runs.seed, runs.from_us, runs.until_us, ",
-            $crate::jobs::job_state!("runs"),
-            ", runs.attempt, runs.phase, runs.epoch_done, runs.epochs_planned, runs.reconstruction_error, \
-             runs.regression_error, runs.error_scale, runs.remaining_s, runs.outcome, runs.created_at_us, \
-             runs.started_at_us, runs.ended_at_us, runs.report \
-             FROM site_training_runs AS runs JOIN sites ON sites.key = runs.site_key ",
-            $rest
-        )
-    };
-}
+impl ReadRun for SiteId {
+    const JOBS: &'static JobTable = &SITE_RUNS;
+    const KIND: &'static str = "site";
+    const SUBJECTS: &'static str = "sites";
+    const OPTIONS: &'static str = "runs.seed, runs.from_us, runs.until_us";
 
-pub(crate) use select_site_runs;
+    fn results(_: Dialect) -> String {
+        "CAST(NULL AS BIGINT), runs.report".to_owned()
+    }
 
-pub(crate) fn read_site_run<'r>(row: impl Into<StoredRow<'r>>) -> Result<SiteTrainingRun> {
-    let mut fields = RowDecoder::new("site_training_runs", row);
-    Ok(SiteTrainingRun {
-        id: RunId(fields.parse(Uuid::parse_str)?),
-        site_id: fields.parse(SiteId::new)?,
-        options: SiteTrainingOptions {
+    fn read_subject(fields: &mut RowDecoder<'_>) -> Result<Self> {
+        fields.parse(Self::new)
+    }
+
+    fn read_options(fields: &mut RowDecoder<'_>) -> Result<SiteTrainingOptions> {
+        Ok(SiteTrainingOptions {
             seed: fields.get::<i64>()?.cast_unsigned(),
             from: fields.optional_timestamp()?,
             until: fields.optional_timestamp()?,
-        },
-        state: fields.parse(read_state)?,
-        attempt: fields.count()?,
-        progress: RunProgress {
-            phase: fields.get()?,
-            epoch: fields.count()?,
-            epochs: fields.count()?,
-            reconstruction_error: fields.nullable_f64()?,
-            regression_error: fields.nullable_f64()?,
-            error_scale: fields.nullable_f64()?,
-            remaining_s: fields.get()?,
-        },
-        outcome: fields.get()?,
-        created_at: fields.timestamp()?,
-        started_at: fields.optional_timestamp()?,
-        ended_at: fields.optional_timestamp()?,
-        report: fields.parse_optional(serde_json::from_str::<SiteTrainingReport>)?,
-    })
-}
-
-/// The run, if it is one of that site.
-pub(crate) fn site_run_of(
-    found: Option<SiteTrainingRun>,
-    site: &SiteId,
-    run: RunId,
-) -> Result<SiteTrainingRun> {
-    found.filter(|found| found.site_id == *site).ok_or_else(|| no_run(run))
-}
-
-/// A site has one live run at most.
-pub(crate) fn check_no_live_site_run(live: Option<String>) -> Result<()> {
-    let Some(live) = live else { return Ok(()) };
-    let message = format!("the site has training run {live}, which has not ended; wait for it or cancel it");
-    Err(Error::conflict(ErrorKind::RunLive, live, message))
-}
-
-/// Refuses to cancel a run that has ended.
-pub(crate) fn check_site_run_not_ended(run: &SiteTrainingRun) -> Result<()> {
-    if !run.state.has_ended() {
-        return Ok(());
+        })
     }
-    let ended = format!("the training run has ended already: {}", run.state.as_str());
-    Err(Error::refused(ErrorKind::RunEnded, ended))
+
+    fn read_report(fields: &mut RowDecoder<'_>) -> Result<Option<SiteTrainingReport>> {
+        fields.parse_optional(serde_json::from_str)
+    }
 }
 
 /// Why a camera's model cannot be stored with those of the others, if it cannot. `stored` are the keys of the camera's

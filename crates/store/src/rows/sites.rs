@@ -18,7 +18,7 @@ pub(crate) fn check_version(site: &Site, expected: Option<ExpectedVersion<SiteKe
     expected.map_or(Ok(()), |expected| expected.check("site", site.key, site.revision))
 }
 
-pub(crate) fn read_site<'r>(row: impl Into<StoredRow<'r>>) -> Result<Site> {
+pub(crate) fn read_site(row: &StoredRow) -> Result<Site> {
     let mut fields = RowDecoder::new("sites", row);
     let key = SiteKey(fields.get()?);
     let id = fields.parse(SiteId::new)?;

@@ -86,7 +86,7 @@ fn publish(mut copy: NamedTempFile, target: PathBuf, existing: ExistingFile) -> 
 pub struct BackupReport {
     /// What the database in it holds.
     pub report: DatabaseReport,
-    /// Whether it has a digest, as all backups have but those of earlier versions and of other programs.
+    /// Whether it has a digest, as all backups have but those of other programs.
     pub has_digest: bool,
 }
 

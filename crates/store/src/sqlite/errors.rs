@@ -27,7 +27,7 @@ fn is_full(error: &sqlx::Error) -> bool {
 }
 
 /// A failed statement: refused where the caller can do something about it, else a fault.
-pub(super) fn failed(error: sqlx::Error) -> Error {
+pub(crate) fn failed(error: sqlx::Error) -> Error {
     match error {
         sqlx::Error::PoolClosed => closed(),
         sqlx::Error::PoolTimedOut => {

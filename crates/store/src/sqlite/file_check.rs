@@ -165,7 +165,7 @@ async fn damaged_models(connection: &mut SqliteConnection) -> sqlx::Result<Vec<S
     let mut damaged = Vec::new();
     let mut models = sqlx::query_as::<_, (String, i64, Vec<u8>, Vec<u8>, String)>(
         "SELECT cameras.id, number, CAST(metadata AS BLOB), weights, sha256 FROM models \
-         JOIN cameras ON cameras.key = camera_key WHERE sha256 IS NOT NULL",
+         JOIN cameras ON cameras.key = camera_key",
     )
     .fetch(connection);
     while let Some((camera, number, document, weights, sha256)) = models.try_next().await? {

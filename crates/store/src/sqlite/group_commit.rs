@@ -7,14 +7,12 @@ use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use sqlx::SqliteConnection;
 
-use super::audit::record;
 use super::errors::failed;
-use super::idempotency::insert_answer;
-use super::sample_retention::delete_oldest;
 use super::sample_table::{Insert, delete_replaced, delete_stored, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
 use crate::domain::{AuditAction, Durability, Error, Result, SampleOverflow};
+use crate::entities::{delete_oldest, insert_answer, record};
 use crate::group_commit::{
     Committing, Completion, Counting, Failure, Inserted, Known, SampleBatch, SampleWriter, WriteSession,
     admit, as_count, changed_counts, count, must_roll_back, note, outcomes_before, rows_of,

@@ -4,54 +4,36 @@
 //! A change is flushed to the disk before it is acknowledged ([`Durability::Synced`]), except for the progress of
 //! jobs and for samples whose sender asks for less. A transaction is held across nothing but statements.
 
-mod audit;
 mod backup;
 mod backup_digest;
-mod camera_moves;
-mod cameras;
 mod connection;
-mod connections;
 mod copy;
 mod errors;
-mod evaluations;
 mod file_check;
 mod folder;
 mod group_commit;
-mod idempotency;
-mod jobs;
-mod keys;
-mod latest_runs;
-mod models;
 mod occupants;
-mod outbox;
 mod outbox_logs;
 mod reserve;
 mod restore;
-mod retention;
-mod runs;
-mod sample_retention;
 mod sample_table;
-mod samples;
 mod server_lock;
-mod site_runs;
-mod sites;
-mod source_offsets;
 mod space;
 #[cfg(test)]
 mod tests;
-mod training;
 mod writer;
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use sqlx::SqlitePool;
+use sqlx::pool::PoolConnection;
 use sqlx::sqlite::SqlitePoolOptions;
+use sqlx::{Sqlite, SqlitePool};
 
 use super::group_commit::GroupCommit;
 use super::limits::StoreLimits;
 use super::{Sharing, StoreOptions};
-use crate::domain::{Actor, Durability, Error, ErrorKind, Result};
+use crate::domain::{Durability, Error, ErrorKind, Result};
 
 pub use backup::{BackupReport, ExistingFile, back_up, inspect_backup};
 pub use file_check::{DatabaseReport, has_database, inspect};
@@ -60,20 +42,22 @@ pub use reserve::available_bytes as disk_available_bytes;
 pub use restore::{MissingDigest, Restored, restore};
 pub use server_lock::holder as server_of;
 
-use errors::failed;
+pub(crate) use errors::failed;
+pub(crate) use outbox_logs::open_log;
+pub(crate) use space::Deletion;
+pub(crate) use writer::WriterGuard;
+
 use group_commit::GroupWriter;
 use occupants::Presence;
 use reserve::Reserve;
 use server_lock::ServerLock;
 use space::Space;
-use writer::{Growth, Writer, WriterGuard};
+use writer::{Growth, Writer};
 
 /// The store of one data folder.
 #[derive(Clone)]
-pub(super) struct Store {
+pub(crate) struct Store {
     inner: Arc<Inner>,
-    /// On whose behalf changes are recorded in the audit log.
-    actor: Arc<Actor>,
 }
 
 struct Inner {
@@ -98,7 +82,6 @@ impl Store {
     /// not a database, damaged, or written by a newer version.
     pub(super) async fn open_with(folder: &Path, options: StoreOptions) -> Result<Self> {
         let StoreOptions { limits, role, sharing } = options;
-        let actor = Arc::new(Actor::program(&role));
         let path = folder::prepare(folder).await?;
         let space = Space::new(limits, Reserve::new(folder, limits.reserve_bytes));
         // Before the schema is touched: a server of another version may be using it.
@@ -127,13 +110,9 @@ impl Store {
             .connect_lazy_with(readers.connect_options().as_ref().clone());
         let server_lock = Mutex::new(server_lock);
         let inner = Inner { writer, readers, probe, samples, space, presence, server_lock };
-        let store = Self { inner: Arc::new(inner), actor };
+        let store = Self { inner: Arc::new(inner) };
         store.count_all_samples().await?;
         Ok(store)
-    }
-
-    pub(super) fn on_behalf_of(&self, actor: Arc<Actor>) -> Self {
-        Self { inner: Arc::clone(&self.inner), actor }
     }
 
     /// Commits what is queued, copies the log back into the file and closes it. Later calls
@@ -189,7 +168,7 @@ impl Store {
     /// Keeps groups of samples from being stored until it is dropped.
     #[cfg(test)]
     pub(super) async fn hold(&self) -> Box<dyn Send + '_> {
-        Box::new(self.relaxed().await.expect("the writer"))
+        Box::new(self.changing(Durability::Relaxed).await.expect("the writer"))
     }
 
     /// Callers whose batches are still queued.
@@ -201,7 +180,7 @@ impl Store {
     /// Executes statements without the checks of the store.
     #[cfg(test)]
     pub(super) async fn tamper(&self, sql: &'static str) {
-        let mut writer = self.relaxed().await.expect("the writer");
+        let mut writer = self.changing(Durability::Relaxed).await.expect("the writer");
         let mut transaction = writer.begin().await.expect("begins");
         sqlx::raw_sql(sql).execute(&mut *transaction).await.expect("runs");
         transaction.commit().await.expect("commits");
@@ -211,17 +190,21 @@ impl Store {
         &self.inner.readers
     }
 
-    fn limits(&self) -> &StoreLimits {
+    /// The queue of samples that are committed in groups.
+    pub(crate) fn sample_queue(&self) -> &GroupCommit {
+        &self.inner.samples
+    }
+
+    pub(crate) fn limits(&self) -> &StoreLimits {
         &self.inner.space.usage.limits
     }
 
-    /// The writer, for a change that must be on the disk before it is acknowledged.
-    async fn synced(&self) -> Result<WriterGuard<'_>> {
-        self.inner.writer.lock(Durability::Synced, Growth::Headroom).await
+    pub(crate) async fn reader(&self) -> Result<PoolConnection<Sqlite>> {
+        self.readers().acquire().await.map_err(failed)
     }
 
-    /// The writer, for a change that a power cut (not a crash) may undo.
-    async fn relaxed(&self) -> Result<WriterGuard<'_>> {
-        self.inner.writer.lock(Durability::Relaxed, Growth::Headroom).await
+    /// The writer, for a change that also works when the limit of the database's size has been reached.
+    pub(crate) async fn changing(&self, durability: Durability) -> Result<WriterGuard<'_>> {
+        self.inner.writer.lock(durability, Growth::Headroom).await
     }
 }

@@ -4,7 +4,7 @@ use sqlx::SqliteConnection;
 
 use super::Store;
 use super::errors::failed;
-use crate::domain::{ConnectionKey, OutboxLog, Result};
+use crate::domain::{ConnectionKey, Durability, OutboxLog, Result};
 
 impl Store {
     /// A data folder has one server, so logs of others are of servers that have ended.
@@ -18,7 +18,7 @@ impl Store {
         if !has_others {
             return Ok(Vec::new());
         }
-        let mut writer = self.synced().await?;
+        let mut writer = self.changing(Durability::Synced).await?;
         let mut transaction = writer.begin().await?;
         let lost: Vec<i64> =
             sqlx::query_scalar("DELETE FROM outbox_logs WHERE log <> ? RETURNING connection_key")
@@ -29,24 +29,10 @@ impl Store {
         transaction.commit().await.map_err(failed)?;
         Ok(lost.into_iter().map(ConnectionKey).collect())
     }
-
-    pub(crate) async fn close_outbox_logs(&self, own: &OutboxLog, sinks: &[ConnectionKey]) -> Result<()> {
-        let mut writer = self.synced().await?;
-        let mut transaction = writer.begin().await?;
-        for key in sinks {
-            sqlx::query("DELETE FROM outbox_logs WHERE log = ? AND connection_key = ?")
-                .bind(own.id.to_string())
-                .bind(key.0)
-                .execute(&mut *transaction)
-                .await
-                .map_err(failed)?;
-        }
-        transaction.commit().await.map_err(failed)
-    }
 }
 
 /// How far the outbox has come in a log, which is known from then on. `None` for a connection that was deleted.
-pub(super) async fn open_log(
+pub(crate) async fn open_log(
     connection: &mut SqliteConnection,
     key: ConnectionKey,
     log: &OutboxLog,
@@ -60,21 +46,4 @@ pub(super) async fn open_log(
     .fetch_optional(connection)
     .await
     .map_err(failed)
-}
-
-/// Notes that the outbox has come so far in a log.
-pub(super) async fn note_position(
-    connection: &mut SqliteConnection,
-    key: ConnectionKey,
-    log: &OutboxLog,
-    position: i64,
-) -> Result<()> {
-    sqlx::query("UPDATE outbox_logs SET position = ?3 WHERE connection_key = ?1 AND log = ?2")
-        .bind(key.0)
-        .bind(log.id.to_string())
-        .bind(position)
-        .execute(connection)
-        .await
-        .map_err(failed)?;
-    Ok(())
 }

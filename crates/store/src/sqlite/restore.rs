@@ -76,7 +76,7 @@ pub async fn restore(
 
 fn no_digest(backup: &Path) -> Error {
     let message = format!(
-        "{} has no digest, so a changed value in it would not be seen: it was made by an earlier version or another \
+        "{} has no digest, so a changed value in it would not be seen: it was made by another \
          program, or its end is cut off; take another backup, or restore it as it is with --without-digest",
         backup.display()
     );

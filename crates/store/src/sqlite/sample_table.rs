@@ -9,6 +9,7 @@ use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 
 use super::errors::failed;
 use crate::domain::{Error, Result, Score, SigmaM, StoredSample, TargetClass};
+use crate::entities::subtract;
 use crate::geo::Position;
 use crate::rows::samples::{Row, SampleTable, key};
 
@@ -159,23 +160,4 @@ async fn delete_keys(
     )));
     let query = query.bind(camera_key).bind(serde_json::to_string(keys).map_err(Error::fault)?);
     Ok(query.execute(connection).await.map_err(failed)?.rows_affected())
-}
-
-/// Counts so many samples of a table no more.
-pub(super) async fn subtract(
-    connection: &mut SqliteConnection,
-    table: SampleTable,
-    camera_key: i64,
-    rows: u64,
-) -> Result<()> {
-    let counter = table.counter();
-    sqlx::query(AssertSqlSafe(format!(
-        "UPDATE sample_counts SET {counter} = max({counter} - ?, 0) WHERE camera_key = ?"
-    )))
-    .bind(i64::try_from(rows).unwrap_or(i64::MAX))
-    .bind(camera_key)
-    .execute(connection)
-    .await
-    .map_err(failed)?;
-    Ok(())
 }

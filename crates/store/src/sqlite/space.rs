@@ -10,6 +10,7 @@ use super::errors::failed;
 use super::reserve::Reserve;
 use super::writer::{Growth, WriterGuard};
 use crate::domain::{Durability, Error, Result};
+use crate::entities::count_all_samples;
 use crate::limits::{StorageStatus, StoreLimits, Usage};
 
 /// SQLite's own; the files of this store have never had another.
@@ -69,20 +70,20 @@ impl Space {
 
 /// The writer, locked to delete. On a full disk the reserve is released first, so that there is space
 /// for the log of the deletion, and set aside again afterwards.
-pub(super) struct Deletion<'s> {
+pub(crate) struct Deletion<'s> {
     store: &'s Store,
     writer: WriterGuard<'s>,
     was_scarce: bool,
 }
 
 impl Deletion<'_> {
-    pub(super) async fn begin(&mut self) -> Result<Transaction<'_, Sqlite>> {
+    pub(crate) async fn begin(&mut self) -> Result<Transaction<'_, Sqlite>> {
         self.writer.begin().await
     }
 
     /// To be called after the commit: gives the freed space back at once where the disk has none.
     /// What fails here is tried again by [`Store::maintain`].
-    pub(super) async fn reclaim(mut self) {
+    pub(crate) async fn reclaim(mut self) {
         let space = &self.store.inner.space;
         let reclaimed = async {
             if self.was_scarce {
@@ -100,12 +101,12 @@ impl Deletion<'_> {
 
 impl Store {
     /// The writer for a change that lets the database grow.
-    pub(super) async fn growing(&self) -> Result<WriterGuard<'_>> {
+    pub(crate) async fn growing(&self) -> Result<WriterGuard<'_>> {
         self.inner.writer.lock(Durability::Synced, Growth::Limited).await
     }
 
     /// The writer for a deletion.
-    pub(super) async fn deletion(&self) -> Result<Deletion<'_>> {
+    pub(crate) async fn deletion(&self) -> Result<Deletion<'_>> {
         let mut writer = self.inner.writer.lock(Durability::Synced, Growth::Headroom).await?;
         let reserve = &self.inner.space.reserve;
         let was_scarce = reserve.is_disk_scarce().await?;
@@ -150,14 +151,13 @@ impl Store {
         })
     }
 
-    /// Gives some of the free pages back, few enough that nobody waits for long. Does nothing in files
-    /// that were made before free pages could be given back.
+    /// Gives some of the free pages back, few enough that nobody waits for long.
     async fn vacuum(&self) -> Result<()> {
         let (_, free_pages) = self.pages().await?;
         if free_pages <= FREE_PAGES_KEPT {
             return Ok(());
         }
-        let mut writer = self.relaxed().await?;
+        let mut writer = self.changing(Durability::Relaxed).await?;
         writer.execute("PRAGMA incremental_vacuum(4096)").await?;
         // The file becomes shorter when the log is copied back.
         writer.execute("PRAGMA wal_checkpoint(PASSIVE)").await
@@ -174,12 +174,7 @@ impl Store {
     }
 
     pub(super) async fn count_all_samples(&self) -> Result<()> {
-        let samples: i64 =
-            sqlx::query_scalar("SELECT coalesce(sum(samples + without_fix), 0) FROM sample_counts")
-                .fetch_one(self.readers())
-                .await
-                .map_err(failed)?;
-        self.inner.space.usage.counted(samples);
+        self.inner.space.usage.counted(count_all_samples(&mut *self.reader().await?).await?);
         Ok(())
     }
 }

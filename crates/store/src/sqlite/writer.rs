@@ -86,7 +86,7 @@ impl OpenConnection {
 }
 
 /// The writer, locked.
-pub(super) struct WriterGuard<'w> {
+pub(crate) struct WriterGuard<'w> {
     writer: &'w Writer,
     open: MutexGuard<'w, Option<OpenConnection>>,
     mode: ConnectionMode,
@@ -136,7 +136,7 @@ impl WriterGuard<'_> {
     }
 
     /// A transaction that holds the file's write lock from its start; rolled back if dropped.
-    pub(super) async fn begin(&mut self) -> Result<Transaction<'_, Sqlite>> {
+    pub(crate) async fn begin(&mut self) -> Result<Transaction<'_, Sqlite>> {
         let open = self.ready().await?;
         match open.connection.begin_with("BEGIN IMMEDIATE").await {
             Ok(transaction) => Ok(transaction),

@@ -121,7 +121,7 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
         .expect("stored");
     store.insert_model(&camera, &metadata(), b"w", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
-    store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
+    store.insert_run(run_id(1), &camera, &options(), 9, None, at(3)).await.expect("queued");
     assert_eq!(kind(store.delete_camera(&camera, None, at(9)).await), ErrorKind::RunLive);
     store.cancel_run(&camera, run_id(1), at(4)).await.expect("cancelled");
 
@@ -139,19 +139,6 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
     assert_eq!(store.count_samples(&camera, &SampleFilter::default()).await.expect("counted"), 0);
     assert_eq!(kind(store.model(&camera, 1).await), ErrorKind::ModelNotFound);
     assert_eq!(kind(store.roll_back(&camera, at(6)).await), ErrorKind::NoModel);
-}
-
-#[tokio::test]
-async fn a_camera_stored_before_there_were_receivers_has_none() {
-    let fixture = Fixture::new().await;
-    fixture
-        .tamper(
-            "INSERT INTO cameras (id, display_name, recipe, target_classes, labels, revision, created_at_us, \
-             updated_at_us) VALUES ('old', 'old', 'auto', '[]', '{}', 1, 0, 0)",
-        )
-        .await;
-    let old = fixture.store.camera(&id("old")).await.expect("readable");
-    assert!(old.profile.receivers.is_empty());
 }
 
 #[tokio::test]

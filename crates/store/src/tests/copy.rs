@@ -9,13 +9,16 @@ async fn fill(Fixture { store, camera, .. }: &Fixture) {
     let mut samples: Vec<Sample> = (0..1_203).map(|second| sample(second, "ö 'x'")).collect();
     samples[7].truth = Some(Position::new(-179.999_999_9, -1e-300).expect("a place"));
     store.insert_samples(camera, samples, Durability::Synced).await.expect("stored");
-    store.insert_run(run_id(1), camera, &options(), 9, at(1)).await.expect("queued");
-    let claim =
-        store.claim_run(std::time::Duration::from_secs(9), at(2)).await.expect("works").expect("a run");
+    store.insert_run(run_id(1), camera, &options(), 9, None, at(1)).await.expect("queued");
+    let claim = store
+        .claim_run::<CameraId>(std::time::Duration::from_secs(9), at(2))
+        .await
+        .expect("works")
+        .expect("a run");
     let metadata = metadata();
     let model = NewModel { metadata: &metadata, weights: &[0, 1, 255], held_out: &[] };
     let end = RunEnd::Succeeded { output: RunOutput { model, activate: true }, outcome: None };
-    store.finish_run(run_id(1), claim.fence, end, at(3)).await.expect("works").expect("owned");
+    store.finish_run::<CameraId>(run_id(1), claim.fence, end, at(3)).await.expect("works").expect("owned");
 }
 
 fn rows_of(copied: &[CopiedTable], name: &str) -> u64 {

@@ -88,7 +88,10 @@ async fn an_evaluation_goes_from_queue_to_report() {
     assert_eq!((job.state, job.attempt, job.started_at), (JobState::Running, 1, Some(at(2))));
     assert!(!cancel_requested);
     assert!(fixture.store.claim_evaluation(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
-    assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is no training run");
+    assert!(
+        fixture.store.claim_run::<CameraId>(LEASE, at(3)).await.expect("works").is_none(),
+        "it is no training run"
+    );
     assert_eq!(fixture.heartbeat_evaluation(fence, 4).await, Heartbeat::Continue);
     assert_eq!(fixture.store.evaluation(nth(1)).await.expect("known").progress, progress());
     assert_eq!(fixture.report().await, None);

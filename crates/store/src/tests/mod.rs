@@ -18,7 +18,8 @@ use jiff::Timestamp;
 use tempfile::TempDir;
 use uuid::Uuid;
 
-use super::{Backend, DatabaseUrl, Location, Store, StoreOptions, on_backend};
+use super::database::Backend;
+use super::{DatabaseUrl, Location, Store, StoreOptions, on_backend};
 use crate::domain::{
     BoundingBox, CameraId, Durability, ErrorKind, Fix, GnssErrorSource, ModelMetadata, NewCamera, OriginDeg,
     Recipe, Result, RunId, Sample, TargetId, TrainingOptions,
@@ -116,7 +117,7 @@ impl Fixture {
 
     /// As [`Fixture::tamper`], in the words of each backend.
     async fn tamper_each(&self, sqlite: &'static str, postgres: &'static str) {
-        match &self.store.0 {
+        match &self.store.0.backend {
             Backend::Sqlite(store) => store.tamper(sqlite).await,
             Backend::Postgres(store) => store.tamper(postgres).await,
         }
@@ -206,11 +207,11 @@ async fn futures_can_move_between_threads() {
     movable(store.insert_samples(&camera, Vec::<Sample>::new(), Durability::Synced));
     movable(store.samples(&camera, &filter, None, 1));
     movable(store.delete_samples(&camera, &filter, at(9)));
-    movable(store.insert_run(run, &camera, &options(), 1, at(0)));
-    movable(store.claim_run(lease, at(0)));
-    movable(store.heartbeat_run(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
+    movable(store.insert_run(run, &camera, &options(), 1, None, at(0)));
+    movable(store.claim_run::<CameraId>(lease, at(0)));
+    movable(store.heartbeat_run::<CameraId>(run, 1, &crate::domain::RunProgress::default(), lease, at(0)));
     movable(store.append_epochs(run, 1, &[]));
-    movable(store.finish_run(run, 1, super::RunEnd::Cancelled, at(0)));
+    movable(store.finish_run::<CameraId>(run, 1, super::RunEnd::Cancelled, at(0)));
     movable(store.claim_evaluation(lease, at(0)));
     movable(store.roll_back(&camera, at(0)));
 }

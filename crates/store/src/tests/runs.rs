@@ -7,20 +7,23 @@ use crate::{Claim, Heartbeat, NewModel, RunEnd, RunOutput};
 const LEASE: Duration = Duration::from_secs(30);
 
 impl Fixture {
-    async fn queue(&self, n: u128) -> TrainingRun {
-        self.store.insert_run(run_id(n), &self.camera, &options(), 9, at(1)).await.expect("queued")
+    async fn queue(&self, n: u128) -> TrainingRun<CameraId> {
+        self.store.insert_run(run_id(n), &self.camera, &options(), 9, None, at(1)).await.expect("queued")
     }
 
-    async fn claim(&self, second: i64) -> Claim<TrainingRun> {
-        self.store.claim_run(LEASE, at(second)).await.expect("works").expect("a run")
+    async fn claim(&self, second: i64) -> Claim<TrainingRun<CameraId>> {
+        self.store.claim_run::<CameraId>(LEASE, at(second)).await.expect("works").expect("a run")
     }
 
     async fn heartbeat(&self, fence: i64, second: i64) -> Heartbeat {
-        self.store.heartbeat_run(run_id(1), fence, &progress(), LEASE, at(second)).await.expect("works")
+        self.store
+            .heartbeat_run::<CameraId>(run_id(1), fence, &progress(), LEASE, at(second))
+            .await
+            .expect("works")
     }
 
-    async fn finish(&self, fence: i64, end: RunEnd<'_>) -> Option<TrainingRun> {
-        self.store.finish_run(run_id(1), fence, end, at(50)).await.expect("works")
+    async fn finish(&self, fence: i64, end: RunEnd<'_>) -> Option<TrainingRun<CameraId>> {
+        self.store.finish_run::<CameraId>(run_id(1), fence, end, at(50)).await.expect("works")
     }
 }
 
@@ -53,7 +56,7 @@ async fn a_run_goes_from_queue_to_active_model() {
     let Claim { job: run, fence, cancel_requested } = fixture.claim(2).await;
     assert_eq!((run.state, run.attempt, run.started_at), (JobState::Running, 1, Some(at(2))));
     assert!(!cancel_requested);
-    assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
+    assert!(fixture.store.claim_run::<CameraId>(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
     assert_eq!(fixture.heartbeat(fence, 4).await, Heartbeat::Continue);
     let seen = fixture.store.run(&fixture.camera, run_id(1)).await.expect("known");
     assert_eq!(seen.progress, progress());
@@ -75,7 +78,10 @@ async fn a_worker_that_lost_its_lease_can_write_nothing_more() {
     fixture.queue(1).await;
     let old = fixture.claim(2).await;
     fixture.store.append_epochs(run_id(1), old.fence, &[report(1, 9.0)]).await.expect("works");
-    assert!(fixture.store.claim_run(LEASE, at(31)).await.expect("works").is_none(), "the lease holds");
+    assert!(
+        fixture.store.claim_run::<CameraId>(LEASE, at(31)).await.expect("works").is_none(),
+        "the lease holds"
+    );
     fixture.let_leases_expire().await;
     let new = fixture.claim(32).await;
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
@@ -97,17 +103,20 @@ async fn a_worker_that_lost_its_lease_can_write_nothing_more() {
 async fn a_camera_has_one_live_run_and_the_server_a_limit() {
     let fixture = Fixture::new().await;
     fixture.queue(1).await;
-    let again = fixture.store.insert_run(run_id(2), &fixture.camera, &options(), 9, at(1)).await;
+    let again = fixture.store.insert_run(run_id(2), &fixture.camera, &options(), 9, None, at(1)).await;
     assert_eq!(kind(again), ErrorKind::RunLive);
     let other = id("other");
     let store = &fixture.store;
     assert_eq!(
-        kind(store.insert_run(run_id(2), &other, &options(), 9, at(1)).await),
+        kind(store.insert_run(run_id(2), &other, &options(), 9, None, at(1)).await),
         ErrorKind::CameraNotFound
     );
     store.insert_camera(&NewCamera::named(other.clone()), at(0)).await.expect("new");
-    assert_eq!(kind(store.insert_run(run_id(2), &other, &options(), 1, at(1)).await), ErrorKind::Overloaded);
-    store.insert_run(run_id(2), &other, &options(), 2, at(1)).await.expect("queued");
+    assert_eq!(
+        kind(store.insert_run(run_id(2), &other, &options(), 1, None, at(1)).await),
+        ErrorKind::Overloaded
+    );
+    store.insert_run(run_id(2), &other, &options(), 2, None, at(1)).await.expect("queued");
     let (first, second) = (fixture.claim(2).await, fixture.claim(2).await);
     assert_eq!((first.job.id, second.job.id), (run_id(1), run_id(2)), "the oldest first");
     assert_eq!(kind(store.run(&other, run_id(1)).await), ErrorKind::RunNotFound);
@@ -126,7 +135,7 @@ async fn of_claims_at_once_one_gets_the_run() {
     let claims: Vec<_> = (0..8)
         .map(|_| {
             let store = fixture.store.clone();
-            tokio::spawn(async move { store.claim_run(LEASE, at(2)).await.expect("works") })
+            tokio::spawn(async move { store.claim_run::<CameraId>(LEASE, at(2)).await.expect("works") })
         })
         .collect();
     let mut taken = 0;
@@ -142,13 +151,13 @@ async fn runs_of_clients_are_claimed_before_those_of_the_server_and_each_in_thei
     let client =
         Actor { address: Some("192.0.2.7".parse().expect("an address")), ..Actor::program("client") };
     let client = store.on_behalf_of(Arc::new(client));
-    store.insert_run(run_id(1), &camera, &options(), 9, at(1)).await.expect("queued");
+    store.insert_run(run_id(1), &camera, &options(), 9, None, at(1)).await.expect("queued");
     for (n, name) in [(2, "b"), (3, "a")] {
         store.insert_camera(&NewCamera::named(id(name)), at(0)).await.expect("new");
-        client.insert_run(run_id(n), &id(name), &options(), 9, at(1)).await.expect("queued");
+        client.insert_run(run_id(n), &id(name), &options(), 9, None, at(1)).await.expect("queued");
     }
     let mut claimed = Vec::new();
-    while let Some(claim) = store.claim_run(LEASE, at(2)).await.expect("works") {
+    while let Some(claim) = store.claim_run::<CameraId>(LEASE, at(2)).await.expect("works") {
         claimed.push(claim.job.id);
     }
     assert_eq!(claimed, [run_id(2), run_id(3), run_id(1)]);
@@ -163,18 +172,19 @@ async fn a_cancelled_run_stores_no_model() {
     assert_eq!((cancelled.state, cancelled.ended_at), (JobState::Cancelled, Some(at(5))));
     assert_eq!(kind(store.cancel_run(&fixture.camera, run_id(1), at(6)).await), ErrorKind::RunEnded);
     assert_eq!(kind(store.cancel_run(&fixture.camera, run_id(9), at(6)).await), ErrorKind::RunNotFound);
-    assert!(store.claim_run(LEASE, at(7)).await.expect("works").is_none());
+    assert!(store.claim_run::<CameraId>(LEASE, at(7)).await.expect("works").is_none());
 
     fixture.queue(2).await;
     let claim = fixture.claim(8).await;
     let flagged = store.cancel_run(&fixture.camera, run_id(2), at(9)).await.expect("flagged");
     assert_eq!(flagged.state, JobState::Cancelling);
-    let beat = store.heartbeat_run(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
+    let beat = store.heartbeat_run::<CameraId>(run_id(2), claim.fence, &progress(), LEASE, at(10)).await;
     assert_eq!(beat.expect("works"), Heartbeat::CancelRequested);
     fixture.let_leases_expire().await;
     let taken_over = fixture.claim(100).await;
     assert!(taken_over.cancel_requested, "the request outlives the worker");
-    let ended = store.finish_run(run_id(2), taken_over.fence, success(&metadata(), true), at(101)).await;
+    let ended =
+        store.finish_run::<CameraId>(run_id(2), taken_over.fence, success(&metadata(), true), at(101)).await;
     assert_eq!(ended.expect("works").expect("mine").state, JobState::Cancelled);
     assert_eq!(store.models(&fixture.camera, None, 9).await.expect("a page"), []);
 }
@@ -240,7 +250,10 @@ async fn a_lease_that_ends_much_further_ahead_than_its_length_counts_as_expired(
     assert_eq!((now.job.attempt, now.fence), (2, ahead.fence + 1));
     assert_eq!(fixture.heartbeat(ahead.fence, 3).await, Heartbeat::Lost);
     assert_eq!(fixture.heartbeat(now.fence, 3).await, Heartbeat::Continue);
-    assert!(fixture.store.claim_run(LEASE, at(4)).await.expect("works").is_none(), "a sound lease holds");
+    assert!(
+        fixture.store.claim_run::<CameraId>(LEASE, at(4)).await.expect("works").is_none(),
+        "a sound lease holds"
+    );
 }
 
 /// A worker reads its clock before its statement: another one may claim or renew in between, at a later time.
@@ -250,11 +263,11 @@ async fn a_claim_with_an_earlier_time_takes_no_live_lease() {
     fixture.queue(1).await;
     let claim = fixture.claim(10).await;
     for second in [9, 5, -40] {
-        let stolen = fixture.store.claim_run(LEASE, at(second)).await.expect("works");
+        let stolen = fixture.store.claim_run::<CameraId>(LEASE, at(second)).await.expect("works");
         assert_eq!(stolen, None, "at {second} s");
     }
     assert_eq!(fixture.heartbeat(claim.fence, 20).await, Heartbeat::Continue);
-    assert_eq!(fixture.store.claim_run(LEASE, at(19)).await.expect("works"), None);
+    assert_eq!(fixture.store.claim_run::<CameraId>(LEASE, at(19)).await.expect("works"), None);
     let cancelled = fixture.store.cancel_run(&fixture.camera, run_id(1), at(18)).await.expect("flagged");
     assert_eq!(cancelled.state, JobState::Cancelling, "its worker ends it");
 }
@@ -264,8 +277,11 @@ async fn a_worker_with_a_longer_lease_keeps_its_run() {
     let fixture = Fixture::new().await;
     fixture.queue(1).await;
     let hour = Duration::from_secs(3_600);
-    fixture.store.claim_run(hour, at(2)).await.expect("works").expect("a run");
-    assert!(fixture.store.claim_run(LEASE, at(3)).await.expect("works").is_none(), "it is claimed");
+    fixture.store.claim_run::<CameraId>(hour, at(2)).await.expect("works").expect("a run");
+    assert!(
+        fixture.store.claim_run::<CameraId>(LEASE, at(3)).await.expect("works").is_none(),
+        "it is claimed"
+    );
 }
 
 #[tokio::test]

@@ -3,7 +3,7 @@ use std::time::Duration;
 use super::*;
 use crate::domain::{
     Actor, AuditAction, Camera, CameraChange, IdempotencyKey, JobState, NewSite, RequestHasher, RunProgress,
-    SiteCameraFinding, SiteId, SiteTrainingOptions, SiteTrainingReport, SiteTrainingRun,
+    SiteCameraFinding, SiteId, SiteTrainingOptions, SiteTrainingReport, TrainingRun,
 };
 use crate::{Claim, Heartbeat, IdempotencyRecord, NewModel, SiteCameraOutput, SiteRunEnd, SiteRunOutput};
 
@@ -26,17 +26,17 @@ async fn with_site() -> (Fixture, Vec<Camera>) {
 }
 
 impl Fixture {
-    async fn queue_site(&self, n: u128) -> SiteTrainingRun {
+    async fn queue_site(&self, n: u128) -> TrainingRun<SiteId> {
         let options = SiteTrainingOptions { seed: u64::MAX, from: Some(at(1)), until: None };
-        self.store.insert_site_run(run_id(n), &site(), &options, 9, None, at(1)).await.expect("queued")
+        self.store.insert_run(run_id(n), &site(), &options, 9, None, at(1)).await.expect("queued")
     }
 
-    async fn claim_site(&self, second: i64) -> Claim<SiteTrainingRun> {
-        self.store.claim_site_run(LEASE, at(second)).await.expect("works").expect("a run")
+    async fn claim_site(&self, second: i64) -> Claim<TrainingRun<SiteId>> {
+        self.store.claim_run::<SiteId>(LEASE, at(second)).await.expect("works").expect("a run")
     }
 
-    async fn finish_site(&self, fence: i64, end: SiteRunEnd<'_>) -> Option<SiteTrainingRun> {
-        self.store.finish_site_run(run_id(1), fence, end, at(50)).await.expect("works")
+    async fn finish_site(&self, fence: i64, end: SiteRunEnd<'_>) -> Option<TrainingRun<SiteId>> {
+        self.store.finish_run::<SiteId>(run_id(1), fence, end, at(50)).await.expect("works")
     }
 
     async fn active(&self) -> Vec<(CameraId, u32)> {
@@ -81,12 +81,12 @@ async fn the_versions_of_all_cameras_become_active_together() {
     assert_eq!((counts.queued, counts.running), (1, 0));
     let Claim { job: run, fence, .. } = fixture.claim_site(2).await;
     assert_eq!((run.state, run.attempt, run.started_at), (JobState::Running, 1, Some(at(2))));
-    assert!(fixture.store.claim_site_run(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
+    assert!(fixture.store.claim_run::<SiteId>(LEASE, at(3)).await.expect("works").is_none(), "it is taken");
     let progress =
         RunProgress { phase: "final fit".to_owned(), epoch: 1, epochs: 2, ..RunProgress::default() };
-    let beat = fixture.store.heartbeat_site_run(run_id(1), fence, &progress, LEASE, at(4)).await;
+    let beat = fixture.store.heartbeat_run::<SiteId>(run_id(1), fence, &progress, LEASE, at(4)).await;
     assert_eq!(beat.expect("works"), Heartbeat::Continue);
-    assert_eq!(fixture.store.site_run(&site(), run_id(1)).await.expect("known").progress, progress);
+    assert_eq!(fixture.store.run(&site(), run_id(1)).await.expect("known").progress, progress);
 
     let metadata = metadata();
     let ended = fixture.finish_site(fence, success(&cameras, &metadata, true)).await.expect("still mine");
@@ -97,7 +97,7 @@ async fn the_versions_of_all_cameras_become_active_together() {
     assert!(fixture.finish_site(fence, SiteRunEnd::Requeue).await.is_none(), "a run ends once");
     let log = fixture.store.audit_log(Some(&id("west")), None, 9).await.expect("known");
     assert!(log.iter().any(|entry| entry.action == AuditAction::ModelActivated), "{log:?}");
-    let page = fixture.store.site_runs(&site(), None, 9).await.expect("a page");
+    let page = fixture.store.runs(&site(), None, 9).await.expect("a page");
     assert_eq!(page.iter().map(|run| run.id).collect::<Vec<_>>(), [run_id(1)]);
 }
 
@@ -143,12 +143,12 @@ async fn a_worker_that_lost_its_lease_or_was_cancelled_activates_nothing() {
     assert_eq!((new.job.attempt, new.fence), (2, old.fence + 1));
     assert!(fixture.finish_site(old.fence, success(&cameras, &metadata, true)).await.is_none());
     assert!(fixture.active().await.is_empty());
-    let cancelling = fixture.store.cancel_site_run(&site(), run_id(1), at(34)).await.expect("live");
+    let cancelling = fixture.store.cancel_run(&site(), run_id(1), at(34)).await.expect("live");
     assert_eq!(cancelling.state, JobState::Cancelling);
     let ended = fixture.finish_site(new.fence, success(&cameras, &metadata, true)).await.expect("mine");
     assert_eq!(ended.state, JobState::Cancelled);
     assert!(fixture.active().await.is_empty() && ended.report.is_none());
-    let again = fixture.store.cancel_site_run(&site(), run_id(1), at(51)).await;
+    let again = fixture.store.cancel_run(&site(), run_id(1), at(51)).await;
     assert_eq!(kind(again), ErrorKind::RunEnded);
 }
 
@@ -161,20 +161,20 @@ async fn a_site_has_one_live_run_and_a_repeated_request_gets_it() {
     hasher.update(b"the request");
     let key = IdempotencyKey::new("tonight").expect("a key");
     let record = IdempotencyRecord { key, digest: hasher.digest() };
-    let first = store.insert_site_run(run_id(1), &site(), &options, 9, Some(&record), at(1)).await;
-    let again = store.insert_site_run(run_id(2), &site(), &options, 9, Some(&record), at(2)).await;
+    let first = store.insert_run(run_id(1), &site(), &options, 9, Some(&record), at(1)).await;
+    let again = store.insert_run(run_id(2), &site(), &options, 9, Some(&record), at(2)).await;
     assert_eq!(first.expect("queued"), again.expect("the first"));
-    let other = store.insert_site_run(run_id(2), &site(), &options, 9, None, at(2)).await;
+    let other = store.insert_run(run_id(2), &site(), &options, 9, None, at(2)).await;
     assert_eq!(kind(other), ErrorKind::RunLive);
     let nowhere = SiteId::new("nowhere").expect("a slug");
     assert_eq!(
-        kind(store.insert_site_run(run_id(2), &nowhere, &options, 9, None, at(2)).await),
+        kind(store.insert_run(run_id(2), &nowhere, &options, 9, None, at(2)).await),
         ErrorKind::SiteNotFound
     );
-    assert_eq!(kind(store.site_run(&site(), run_id(7)).await), ErrorKind::RunNotFound);
-    store.cancel_site_run(&site(), run_id(1), at(3)).await.expect("queued");
+    assert_eq!(kind(store.run(&site(), run_id(7)).await), ErrorKind::RunNotFound);
+    store.cancel_run(&site(), run_id(1), at(3)).await.expect("queued");
     assert_eq!(
-        kind(store.insert_site_run(run_id(2), &site(), &options, 0, None, at(3)).await),
+        kind(store.insert_run(run_id(2), &site(), &options, 0, None, at(3)).await),
         ErrorKind::Overloaded
     );
 }

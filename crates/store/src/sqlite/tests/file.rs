@@ -32,7 +32,7 @@ async fn a_crash_keeps_all_that_was_acknowledged() {
         .expect("stored");
     store.insert_model(&camera, &metadata(), b"weights", at(1)).await.expect("stored");
     store.activate_model(&camera, 1, at(2)).await.expect("active");
-    store.insert_run(run_id(1), &camera, &options(), 9, at(3)).await.expect("queued");
+    store.insert_run(run_id(1), &camera, &options(), 9, None, at(3)).await.expect("queued");
     let copy = crashed_copy(folder.path());
     drop(store);
     for folder in [copy.path(), folder.path()] {

@@ -8,8 +8,9 @@ use std::sync::Arc;
 use tempfile::TempDir;
 
 use super::Store as FileStore;
+use crate::Store;
+use crate::database::Backend;
 use crate::tests::{Fixture, Home};
-use crate::{Backend, Store};
 
 /// A store in a folder, whatever the cases of both backends run on.
 async fn in_folder() -> (Fixture, Arc<TempDir>) {
@@ -18,7 +19,7 @@ async fn in_folder() -> (Fixture, Arc<TempDir>) {
 }
 
 fn file_store(store: &Store) -> &FileStore {
-    match &store.0 {
+    match &store.0.backend {
         Backend::Sqlite(store) => store,
         Backend::Postgres(_) => panic!("a store in a folder"),
     }

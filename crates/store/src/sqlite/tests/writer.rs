@@ -7,7 +7,7 @@ use crate::tests::{Fixture, at, kind, sample};
 async fn a_dropped_transaction_is_rolled_back_and_releases_the_writer() {
     let (Fixture { store, camera, .. }, _folder) = in_folder().await;
     {
-        let mut writer = file_store(&store).synced().await.expect("the writer");
+        let mut writer = file_store(&store).changing(Durability::Synced).await.expect("the writer");
         let mut transaction = writer.begin().await.expect("begins");
         sqlx::query("DELETE FROM cameras").execute(&mut *transaction).await.expect("deletes");
     }
@@ -63,7 +63,7 @@ async fn a_full_disk_is_reported_and_the_transaction_rolled_back() {
     store.insert_samples(camera, vec![sample(0, "a")], Durability::Synced).await.expect("stored");
     {
         // The limit is the connection's own, so it must be the one that stores the samples.
-        let mut writer = file_store(store).relaxed().await.expect("the writer");
+        let mut writer = file_store(store).changing(Durability::Relaxed).await.expect("the writer");
         let mut transaction = writer.begin().await.expect("begins");
         sqlx::raw_sql("PRAGMA max_page_count = 60").execute(&mut *transaction).await.expect("set");
         transaction.commit().await.expect("commits");

@@ -1,0 +1,69 @@
+//! The audit log, written in the transaction of the change that it records.
+
+use jiff::Timestamp;
+
+use crate::database::Database;
+use crate::domain::{Actor, AuditEntry, AuditNumber, CameraId, Result};
+use crate::limits::StoreLimits;
+use crate::locks::delete_upto;
+use crate::query::{Session, query, query_scalar};
+use crate::rows::audit::{Change, read_entry};
+
+impl Database {
+    /// Records a change of the transaction that is open on the session. The oldest entries beyond the
+    /// limit are deleted.
+    pub(super) async fn record(
+        &self,
+        session: &mut dyn Session,
+        change: Change<'_>,
+        now: Timestamp,
+    ) -> Result<()> {
+        record(session, (&self.actor, self.limits()), change, now).await
+    }
+
+    pub(crate) async fn audit_log(
+        &self,
+        camera: Option<&CameraId>,
+        before: Option<AuditNumber>,
+        limit: u32,
+    ) -> Result<Vec<AuditEntry>> {
+        const COLUMNS: &str =
+            "number, time_us, actor, key_id, address, request_id, action, camera_id, subject";
+        let of_camera = if camera.is_some() { "AND camera_id = $3" } else { "" };
+        let sql = format!(
+            "SELECT {COLUMNS} FROM audit_log WHERE number < $1 {of_camera} ORDER BY number DESC LIMIT $2"
+        );
+        let before = before.map_or(i64::MAX, |before| i64::try_from(before.0).unwrap_or(i64::MAX));
+        let mut query = query(sqlx::AssertSqlSafe(sql)).bind(before).bind(limit);
+        if let Some(camera) = camera {
+            query = query.bind(camera.as_str().to_owned());
+        }
+        let mut reader = self.reader().await?;
+        let rows = query.fetch_all(&mut reader).await?;
+        rows.iter().map(read_entry).collect()
+    }
+}
+
+/// As [`Database::record`].
+pub(crate) async fn record(
+    session: &mut dyn Session,
+    (actor, limits): (&Actor, &StoreLimits),
+    change: Change<'_>,
+    now: Timestamp,
+) -> Result<()> {
+    let number: i64 = query_scalar(
+        "INSERT INTO audit_log (time_us, actor, key_id, address, request_id, action, camera_id, subject) \
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8) RETURNING number",
+    )
+    .bind(now.as_microsecond())
+    .bind(&*actor.name)
+    .bind(actor.key_id.map(|id| id.to_string()))
+    .bind(actor.address.map(|address| address.to_string()))
+    .bind(actor.request_id.as_deref())
+    .bind(change.action.as_str())
+    .bind(change.camera.map(CameraId::as_str))
+    .bind(change.subject)
+    .fetch_one(session)
+    .await?;
+    delete_upto(session, "audit_log", "number", number.saturating_sub(limits.audit_entries.into())).await
+}

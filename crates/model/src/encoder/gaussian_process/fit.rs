@@ -85,9 +85,10 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     let input_scales = InputScales::of_rows(&rows.boxes);
     let inputs: Vec<[f64; 4]> = rows.boxes.iter().map(|sides| input_scales.input(sides)).collect();
     let grouping = groups(&rows.epochs);
+    let edge_px2 = edge_covariance_px2(&all.epochs, &all.boxes);
     let bias = BiasPrior::new(&rows.epochs, settings.bias_sigma_m);
     let Solutions { parameters, receiver, candidates } =
-        solve(&rows, &inputs, mean, settings, &bias, &grouping)?;
+        solve(&rows, &inputs, mean, &edge_px2, settings, &bias, &grouping)?;
 
     let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, settings.seed);
     let kept = without_negligible(&weights);
@@ -101,7 +102,7 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
         .collect::<Option<Vec<PositionMap>>>()?;
     let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise, &bias);
     let stated = Stated {
-        edge_px2: edge_covariance_px2(&all.epochs, &all.boxes),
+        edge_px2,
         shared_bias_m2: bias.shared_m2(&receiver),
         freedom,
         plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes),
@@ -150,6 +151,7 @@ fn solve(
     rows: &MapRows,
     inputs: &[[f64; 4]],
     mean: ProjectiveMean,
+    edge_px2: &[f64; 16],
     settings: &FitSettings,
     bias: &BiasPrior,
     grouping: &Grouping,
@@ -159,7 +161,8 @@ fn solve(
     let white =
         ReceiverWhitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
     let inflation_m2 = white.inflation_m2(&residuals_m);
-    let mut residual = Draft { form: MapForm::Residual, rows, inputs, mean, inflation_m2, upright: None };
+    let mut residual =
+        Draft { form: MapForm::Residual, rows, inputs, edge_px2, mean, inflation_m2, upright: None };
     let mut homography = Draft { form: MapForm::Homography, ..residual.clone() };
     let spread_m = residual.mean.spread_m;
     let mut priors = Priors::new(scatter_m2.sqrt(), settings.white_share, spread_m, interval_s(&rows.epochs));

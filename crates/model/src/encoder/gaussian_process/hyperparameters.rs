@@ -149,7 +149,8 @@ pub(crate) struct LikelihoodRows<'a> {
     /// Tangent of both axes and linearised labels, as columns.
     pub(crate) tangent: &'a DMatrix<f64>,
     pub(crate) labels_m: &'a DMatrix<f64>,
-    pub(crate) inflation_m2: &'a [f64],
+    /// White variance per row beside the receiver's, m2.
+    pub(crate) white_m2: &'a [f64],
     pub(crate) mean: &'a ProjectiveMean,
 }
 
@@ -162,11 +163,8 @@ impl LikelihoodRows<'_> {
     /// Gram matrix of all columns, and the noise's log determinant over both axes.
     pub(crate) fn gram(&self, parameters: &Hyperparameters) -> Option<(Gram, f64)> {
         let (phi, left_out_m2) = self.kernel_columns(parameters)?;
-        let variances: Vec<f64> = left_out_m2
-            .iter()
-            .zip(self.inflation_m2)
-            .map(|(left_out, inflation)| left_out + inflation)
-            .collect();
+        let variances: Vec<f64> =
+            left_out_m2.iter().zip(self.white_m2).map(|(left_out, white)| left_out + white).collect();
         let whitener = ReceiverWhitener::new(self.epochs, &parameters.noise, &variances);
         let columns = join(&[self.tangent, &phi, self.labels_m]);
         Some((Gram::new(columns, &whitener), 2.0 * whitener.log_determinant))

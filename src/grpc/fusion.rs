@@ -89,6 +89,7 @@ impl From<Flag> for proto::Flag {
             Flag::BoxRejected => Self::BoxRejected,
             Flag::FixOutOfRange => Self::FixOutOfRange,
             Flag::BoxFrozen => Self::BoxFrozen,
+            Flag::FootHidden => Self::FootHidden,
         }
     }
 }

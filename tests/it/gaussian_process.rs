@@ -82,6 +82,7 @@ async fn a_run_reports_what_it_found_on_every_way() {
     let text = run["report_text"].as_str().expect("text");
     println!("{text}");
     assert!(text.contains("gaussian_process: ") && text.contains("What would help:\n- "), "{text}");
+    assert!(text.contains("at the median of the scene, and to"), "{text}");
     let request = proto::GetTrainingRunRequest {
         camera_id: "c".to_owned(),
         run_id: run["id"].as_str().expect("an id").to_owned(),

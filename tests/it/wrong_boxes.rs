@@ -148,3 +148,36 @@ async fn a_false_box_is_answered_within_the_scene_by_every_recipe() {
         assert_eq!(silent, 0, "{recipe}");
     }
 }
+
+#[tokio::test]
+async fn a_hidden_foot_is_completed_and_flagged_and_a_whole_one_is_not() {
+    let folder = data_folder();
+    let server = trained(folder.path(), "gaussian_process").await;
+    let hidden_below = |row: &SimulatedRow, visible: f64| {
+        let mut hidden = box_json(row);
+        hidden["height_px"] = json!(visible * hidden["height_px"].as_f64().expect("a height"));
+        hidden
+    };
+    for visible in [1.0, 0.6, 0.4] {
+        let (mut errors, mut flagged) = (Vec::new(), 0);
+        for row in &walk(79, 60) {
+            let observation = json!({"time": row.time, "bounding_box": hidden_below(row, visible)});
+            let body = json!({"observations": [observation]});
+            let answer = server.post("/v1/cameras/c/fusions", &body).await.expect(200).json();
+            let item = &answer["items"][0];
+            let at = position(&item["fused"]["longitude_deg"], &item["fused"]["latitude_deg"]);
+            errors.push((distance_m(at, row.truth), item["r95_m"].as_f64().expect("a radius")));
+            flagged += usize::from(mentions(item, &item["flags"], "foot_hidden"));
+        }
+        let inside = share_inside(&errors);
+        let mean_m = errors.iter().map(|(error_m, _)| error_m).sum::<f64>() / errors.len() as f64;
+        let count = errors.len();
+        println!(
+            "{visible} visible: {mean_m:.2} m, {:.0} % inside, {flagged} of {count} flagged",
+            100.0 * inside
+        );
+        assert!(inside >= 0.88 && mean_m < 3.0, "{visible}: {inside}, {mean_m} m");
+        let is_right = if visible < 1.0 { 10 * flagged >= 9 * count } else { 20 * flagged <= count };
+        assert!(is_right, "{visible}: {flagged} of {count} flagged");
+    }
+}

@@ -1,9 +1,12 @@
 //! Error figures of a method.
 
 use std::collections::BTreeMap;
+use std::f64::consts::TAU;
 
 use serde::Serialize;
 use utoipa::ToSchema;
+
+use crate::statistics::R95_PER_SIGMA;
 
 /// Error bounds, m: the report gives the share of errors within each.
 pub const BOUNDS_M: [f64; 8] = [0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0];
@@ -42,6 +45,13 @@ pub struct ErrorMetrics {
     pub coverage50: Option<f64>,
     /// The same of the 95 % radius.
     pub coverage95: Option<f64>,
+    /// Mean of the stated 95 % radii, m, if the method states them: of two with the same coverage the smaller one says
+    /// more.
+    pub mean_r95_m: Option<f64>,
+    /// Mean negative log likelihood of the true positions (density per m2) under normal distributions with the stated
+    /// 95 % radii. It is a proper score: radii that are too small and radii that are too large both make it larger
+    /// (Gneiting and Raftery 2007).
+    pub negative_log_likelihood: Option<f64>,
     /// Number of scored predictions.
     pub n: usize,
 }
@@ -68,6 +78,8 @@ impl ErrorMetrics {
             share_within: BOUNDS_M.iter().map(|&bound_m| (format!("{bound_m}"), within(bound_m))).collect(),
             coverage50: coverage(predictions, R50_PER_R95),
             coverage95: coverage(predictions, 1.0),
+            mean_r95_m: mean_stated(predictions, |_, r95_m| r95_m),
+            negative_log_likelihood: mean_stated(predictions, negative_log_likelihood),
             n,
         })
     }
@@ -95,6 +107,8 @@ impl ErrorMetrics {
             share_within: shares.collect(),
             coverage50: optional(&|one| one.coverage50),
             coverage95: optional(&|one| one.coverage95),
+            mean_r95_m: optional(&|one| one.mean_r95_m),
+            negative_log_likelihood: optional(&|one| one.negative_log_likelihood),
             n: first.n,
         })
     }
@@ -109,11 +123,19 @@ fn quantile(ascending: &[f64], part: f64) -> f64 {
 }
 
 fn coverage(predictions: &[ScoredPrediction], factor: f64) -> Option<f64> {
-    let inside = predictions.iter().map(|prediction| {
-        prediction.r95_m.map(|r95_m| f64::from(u8::from(prediction.error_m <= factor * r95_m)))
-    });
-    let sum: Option<f64> = inside.sum();
+    mean_stated(predictions, |error_m, r95_m| f64::from(u8::from(error_m <= factor * r95_m)))
+}
+
+/// Mean of a function of error and stated radius, m; `None` unless every prediction states one.
+fn mean_stated(predictions: &[ScoredPrediction], of: impl Fn(f64, f64) -> f64) -> Option<f64> {
+    let values = predictions.iter().map(|one| one.r95_m.map(|r95_m| of(one.error_m, r95_m)));
+    let sum: Option<f64> = values.sum();
     sum.filter(|_| !predictions.is_empty()).map(|sum| sum / predictions.len() as f64)
+}
+
+fn negative_log_likelihood(error_m: f64, r95_m: f64) -> f64 {
+    let sigma_m = r95_m / R95_PER_SIGMA;
+    (TAU * sigma_m * sigma_m).ln() + 0.5 * (error_m / sigma_m).powi(2)
 }
 
 #[cfg(test)]
@@ -154,6 +176,19 @@ mod tests {
         let metrics = ErrorMetrics::of(&predictions).expect("some");
         assert!((metrics.coverage95.expect("stated") - 0.95).abs() < 0.006, "{metrics:?}");
         assert!((metrics.coverage50.expect("stated") - 0.5).abs() < 0.015, "{metrics:?}");
+        assert!(near(metrics.mean_r95_m.expect("stated"), 2.447_746_8));
+        // Of sigma 1 the expectation is ln(tau) + 1; every other radius scores worse.
+        let score = metrics.negative_log_likelihood.expect("stated");
+        assert!((score - TAU.ln() - 1.0).abs() < 0.02, "{score}");
+        for factor in [0.8, 1.25] {
+            let stated = |one: &ScoredPrediction| ScoredPrediction {
+                r95_m: one.r95_m.map(|r95_m| factor * r95_m),
+                ..*one
+            };
+            let other = ErrorMetrics::of(&predictions.iter().map(stated).collect::<Vec<_>>());
+            let other = other.expect("some").negative_log_likelihood.expect("stated");
+            assert!(other > score + 0.02, "{factor}: {other}, {score}");
+        }
     }
 
     #[test]

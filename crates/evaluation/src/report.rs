@@ -65,7 +65,7 @@ impl Report {
     #[must_use]
     pub fn table(&self) -> String {
         let mut text = format!(
-            "{:<22} {:>8} {:>8} {:>8} {:>8} {:>9} {:>8} {:>8} {:>6} {:>6} {:>8} {:>8} {:>6}\n",
+            "{:<22} {:>8} {:>8} {:>8} {:>8} {:>9} {:>8} {:>8} {:>6} {:>6} {:>8} {:>7} {:>8} {:>8} {:>6}\n",
             "method",
             "mean_m",
             "spread_m",
@@ -76,6 +76,8 @@ impl Report {
             "in 5 m",
             "cov50",
             "cov95",
+            "r95_m",
+            "nll",
             "train_s",
             "fuse_us",
             "n"
@@ -87,11 +89,13 @@ impl Report {
             let _ = writeln!(
                 text,
                 "{name:<22} {mean_m:>8.3} {:>8.3} {median_m:>8.3} {p95_m:>8.3} {max_m:>9.3} {rmse_m:>8.3} \
-                 {:>7.1}% {:>6} {:>6} {:>8.2} {:>8.2} {n:>6}",
+                 {:>7.1}% {:>6} {:>6} {:>8} {:>7} {:>8.2} {:>8.2} {n:>6}",
                 one.seed_spread_m(),
                 100.0 * within,
                 percent(one.metrics.coverage50),
                 percent(one.metrics.coverage95),
+                or_dash(one.metrics.mean_r95_m, 3),
+                or_dash(one.metrics.negative_log_likelihood, 2),
                 one.train_cpu_s,
                 one.fuse_us,
             );
@@ -103,8 +107,12 @@ impl Report {
     }
 }
 
-fn percent(share: Option<f64>) -> String {
+pub(crate) fn percent(share: Option<f64>) -> String {
     share.map_or_else(|| "-".to_owned(), |share| format!("{:.1}%", 100.0 * share))
+}
+
+pub(crate) fn or_dash(figure: Option<f64>, digits: usize) -> String {
+    figure.map_or_else(|| "-".to_owned(), |figure| format!("{figure:.digits$}"))
 }
 
 #[cfg(test)]
@@ -136,6 +144,8 @@ mod tests {
             "seed_means_m",
             "coverage50",
             "coverage95",
+            "mean_r95_m",
+            "negative_log_likelihood",
             "train_cpu_s",
             "fuse_us",
             "n",

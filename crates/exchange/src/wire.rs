@@ -378,6 +378,9 @@ pub enum Flag {
     /// The target's boxes have been the same to the pixel for longer than a standing target shows: the
     /// picture or the detector stands still. Live answers alone have it.
     BoxFrozen,
+    /// Something hides the target's lower part, more probably than not: its box is too short for its width and
+    /// place. The position is that of the completed box.
+    FootHidden,
 }
 
 /// Flags by their names.

@@ -64,6 +64,8 @@ pub struct ObservedBox {
     pub is_unusual: bool,
     /// Whether its error is as large as the scene: it says no more than that a target is in view.
     pub is_vague: bool,
+    /// Whether something hides the lower part of the target, more probably than not.
+    pub is_foot_hidden: bool,
     /// For how long the target's boxes have been the same to the pixel, s.
     pub repeated_s: f64,
     /// Whether that is longer than a standing target shows: the picture or the detector stands still, and the target may
@@ -115,10 +117,13 @@ impl ObservedBox {
         image_size: Option<ImageSize>,
         recent: Option<&mut RecentBoxes>,
     ) -> Self {
-        let independent = match recent {
+        let hidden = regressor.hidden_foot(bounding_box);
+        let is_foot_hidden = hidden.is_some_and(|hidden| hidden.probability >= 0.5);
+        let seen = match recent.filter(|_| !is_foot_hidden) {
             Some(recent) => regressor.regress_next(bounding_box, None, recent),
             None => regressor.regress(bounding_box, None),
         };
+        let independent = hidden.map_or(seen, |hidden| regressor.with_hidden_foot(seen, &hidden));
         let with_fix = fix.filter(|_| regressor.uses_fix());
         let one_step = with_fix.map(|fix| regressor.regress(bounding_box, Some(fix)));
         let is_usable = is_usable(&independent) && one_step.as_ref().is_none_or(is_usable);
@@ -129,6 +134,7 @@ impl ObservedBox {
             is_usable,
             is_unusual: independent.outside_training || bounding_box.touches_border(image_size),
             is_vague: regressor.is_vague(&independent),
+            is_foot_hidden,
             repeated_s: 0.0,
             is_frozen: false,
         }

@@ -81,6 +81,9 @@ pub fn fuse_observed(
     if regressed.independent.outside_training {
         flags.push(Flag::OutsideTraining);
     }
+    if regressed.is_foot_hidden {
+        flags.push(Flag::FootHidden);
+    }
     if regressed.is_frozen {
         flags.push(Flag::BoxFrozen);
     }

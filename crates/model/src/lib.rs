@@ -43,7 +43,7 @@ mod view_area;
 
 pub use crate::statistics::R95_PER_SIGMA;
 pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackNoiseModel};
-pub use encoder::gaussian_process::{GroundCamera, GroundPoint, RecentBoxes};
+pub use encoder::gaussian_process::{GroundCamera, GroundPoint, HiddenFoot, RecentBoxes};
 pub use encoder::projection::Projection;
 pub use encoder::projection_fit::fit_foot_points;
 pub use fitting::{

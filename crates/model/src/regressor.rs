@@ -3,7 +3,7 @@
 use super::artifact::{ModelParts, TrackNoiseModel};
 use super::encoder::Encoder;
 use super::encoder::features::{Encoded, reconstruction_error};
-use super::encoder::gaussian_process::RecentBoxes;
+use super::encoder::gaussian_process::{HiddenFoot, RecentBoxes};
 use super::site::JointMap;
 use super::uncertainty::error_model::{BoxError, ErrorModel};
 use super::uncertainty::scene::{Limited, Scene};
@@ -81,6 +81,33 @@ impl Regression {
     #[must_use]
     pub fn normal_scale(&self) -> f64 {
         (self.r95_m() / self.covariance.r95_m()).powi(2)
+    }
+
+    /// The moments of a mixture of answers, whose weights sum to 1; what has no moments is that of the heaviest.
+    fn mixture(parts: &[(f64, Self)], heaviest: Self) -> Self {
+        let origin = heaviest.regressed;
+        let from_origin = |it: &Self| it.regressed.minus(origin);
+        let (mut east_m, mut north_m) = (0.0, 0.0);
+        for (weight, it) in parts {
+            east_m += weight * from_origin(it).east_m;
+            north_m += weight * from_origin(it).north_m;
+        }
+        let mut covariance = PlaneCovariance::default();
+        let mut scale = 0.0_f64;
+        for (weight, it) in parts {
+            let moved = from_origin(it);
+            let spread = PlaneCovariance::outer(moved.east_m - east_m, moved.north_m - north_m);
+            covariance = covariance.plus(it.covariance.plus(spread).scaled(*weight));
+            scale = scale.max(it.normal_scale());
+        }
+        let e_regression_m2 = covariance.per_axis_m2();
+        Self {
+            regressed: EastNorth { east_m: origin.east_m + east_m, north_m: origin.north_m + north_m },
+            e_regression_m2,
+            covariance,
+            r95_scale: covariance.scaled(scale).r95_m() / e_regression_m2.sqrt(),
+            ..heaviest
+        }
     }
 
     /// Covariance, m2, of the normal distribution that has the stated 95 % radius.
@@ -262,6 +289,28 @@ impl Regressor {
         recent: &mut RecentBoxes,
     ) -> Regression {
         self.regress_with(bounding_box, fix, Some(recent))
+    }
+
+    /// Whether something hides the lower part of a box, as far as the model knows how tall its targets are: only one of
+    /// the recipe `gaussian_process` does.
+    #[must_use]
+    #[inline]
+    pub fn hidden_foot(&self, bounding_box: &BoundingBox) -> Option<HiddenFoot> {
+        match &self.encoder {
+            Encoder::GaussianProcess(map) => HiddenFoot::of(bounding_box, &map.predictor.plausibility),
+            Encoder::Paper(_) | Encoder::Hybrid(_) | Encoder::Projective(_) => None,
+        }
+    }
+
+    /// The answer for a box whose foot may be hidden: the mixture of `seen`, the answer for the box as it is, with those
+    /// for its completions.
+    #[must_use]
+    pub fn with_hidden_foot(&self, seen: Regression, hidden: &HiddenFoot) -> Regression {
+        let HiddenFoot { probability, completed } = hidden;
+        let of = |(weight, whole): &(f64, BoundingBox)| (probability * weight, self.regress(whole, None));
+        let [middle, lower, upper] = completed.each_ref().map(of);
+        let heaviest = if *probability < 0.5 { seen } else { middle.1 };
+        Regression::mixture(&[(1.0 - probability, seen), middle, lower, upper], heaviest)
     }
 
     #[inline]

@@ -51,6 +51,12 @@ pub struct GaussMarkovNoise {
 }
 
 impl GaussMarkovNoise {
+    /// The error of a phone in the open, of which nothing else is known: 2.6 m per axis, most of it over half a minute.
+    pub const PHONE: Self = Self {
+        variance_m2: 2.61 * 2.61,
+        correlation: NoiseCorrelation { white_share: 0.083, time_constant_s: 30.0 },
+    };
+
     /// Noise of a standard deviation per axis (m) and its correlation.
     #[must_use]
     pub fn new(sigma_m: f64, correlation: NoiseCorrelation) -> Self {

@@ -206,6 +206,9 @@ pub enum Flag {
     /// The target's boxes have been the same to the pixel for longer than a standing target shows: the picture or the
     /// detector stands still.
     BoxFrozen,
+    /// Something hides the target's lower part, more probably than not: its box is too short for its width and place.
+    /// The position is that of the completed box.
+    FootHidden,
 }
 
 impl Flag {

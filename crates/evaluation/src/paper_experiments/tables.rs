@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use super::scores::CaseScore;
 use crate::ErrorMetrics;
+use crate::report::{or_dash, percent};
 
 /// Epochs whose Es is listed.
 const SHOWN_EPOCHS: [u32; 8] = [1, 2, 5, 10, 20, 50, 100, 200];
@@ -28,7 +29,8 @@ pub(super) fn tables(stem: &str, command: &str, scores: &[CaseScore]) -> String 
 
 const READING: &str = "\
 Errors are horizontal and geodesic (WGS 84), in metres. `cov50` and `cov95` are the shares of true positions inside the
-stated 50 % and 95 % radius. `spread` is the standard deviation of the worlds' means, and in the section on training seeds
+stated 50 % and 95 % radius, `r95` is the mean of the latter, and `NLL` the mean negative log likelihood of the true
+positions under normal distributions with these radii: the smaller, the better. `spread` is the standard deviation of the worlds' means, and in the section on training seeds
 that of the seeds'. A method that gives a position without a box (from the fix, or from earlier rows) is evaluated on
 more rows than one that does not; the main table counts rows with a box only. Times are CPU seconds of training and
 microseconds per position.
@@ -53,7 +55,7 @@ fn section(page: &mut String, score: &CaseScore) {
     let _ = writeln!(
         page,
         "| method | mean | spread | median | p95 | max | variance | RMSE | in 1 m | in 5 m | cov50 | cov95 | \
-         train s | us | n |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+         r95 | NLL | train s | us | n |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
     );
     for method in &score.methods {
         let one = &method.report;
@@ -62,13 +64,15 @@ fn section(page: &mut String, score: &CaseScore) {
         let _ = writeln!(
             page,
             "| `{}` | {mean_m:.3} | {:.3} | {median_m:.3} | {p95_m:.3} | {max_m:.2} | {variance_m2:.3} | \
-             {rmse_m:.3} | {} | {} | {} | {} | {:.2} | {:.2} | {n} |",
+             {rmse_m:.3} | {} | {} | {} | {} | {} | {} | {:.2} | {:.2} | {n} |",
             method.name,
             one.seed_spread_m(),
             within("1"),
             within("5"),
             percent(one.metrics.coverage50),
             percent(one.metrics.coverage95),
+            or_dash(one.metrics.mean_r95_m, 2),
+            or_dash(one.metrics.negative_log_likelihood, 2),
             one.train_cpu_s,
             one.fuse_us,
         );
@@ -100,8 +104,4 @@ fn curves(page: &mut String, score: &CaseScore) {
         page.push('\n');
     }
     page.push('\n');
-}
-
-fn percent(share: Option<f64>) -> String {
-    share.map_or_else(|| "-".to_owned(), |share| format!("{:.1}%", 100.0 * share))
 }

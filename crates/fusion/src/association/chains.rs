@@ -176,7 +176,7 @@ impl PieceTable {
         let ratio = own.ratio.extended(residuals, model);
         let covered_s = residuals.last()?.fix.time_s - residuals.first()?.fix.time_s;
         let log_prior = own.log_prior + step + settings.seen_per_s * covered_s;
-        let log_weight = ratio.log_ratio + log_prior;
+        let log_weight = ratio.log_ratio() + log_prior;
         // A piece that contradicts the others so much is no part of the chain.
         (log_weight > own.log_weight - MAX_LOSS).then(|| {
             let mut pieces = own.pieces.clone();

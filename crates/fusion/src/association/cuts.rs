@@ -59,7 +59,7 @@ fn find_cuts(residuals: &[Residual], model: &EvidenceModel, settings: &ChainSett
     let whole = prefix.last().copied().unwrap_or(0.0);
     let best = (least..=residuals.len() - least)
         .map(|at| {
-            let rest = LikelihoodRatio::new().extended(&residuals[at..], model).log_ratio;
+            let rest = LikelihoodRatio::new().extended(&residuals[at..], model).log_ratio();
             // The better part is the receiver's, the other one somebody else's.
             (at, prefix[at - 1].max(rest))
         })
@@ -78,7 +78,7 @@ fn prefix_ratios(residuals: &[Residual], model: &EvidenceModel) -> Vec<f64> {
         .iter()
         .map(|residual| {
             ratio.step(residual, model);
-            ratio.log_ratio
+            ratio.log_ratio()
         })
         .collect()
 }

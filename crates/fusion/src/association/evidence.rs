@@ -7,6 +7,10 @@
 //! receiver error. Both likelihoods are products of the innovations' densities of a Kalman filter, which
 //! marginalises bias, map error and motion exactly. Axes are independent and alike, so both share one
 //! covariance.
+//!
+//! No two receivers are equally good, and the error that a model states is that of those it was trained with. So the
+//! covariances are known up to a factor with an inverse gamma prior of [`FREEDOM`] degrees of freedom. Without it n fixes
+//! have the likelihood of a multivariate t distribution (O'Hagan and Forster 2004, 11.8).
 
 use std::f64::consts::TAU;
 
@@ -21,6 +25,8 @@ const VELOCITY_TIME_CONSTANT_S: f64 = 8.0;
 const OUTLIER_SHARE: f64 = 0.01;
 /// Standard deviation of a gross error in that of the innovation.
 const OUTLIER_SCALE: f64 = 10.0;
+/// Degrees of freedom of the prior of a receiver's variance: its standard deviation is known within a third.
+const FREEDOM: f64 = 4.0;
 /// After so long a gap between fixes the motion of somebody else starts again, s.
 const MAX_GAP_S: f64 = 60.0;
 
@@ -40,6 +46,34 @@ impl EvidenceModel {
     }
 }
 
+/// Sums over the innovations of fixes, each of two axes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Innovations {
+    fixes: f64,
+    /// Of the logarithms of the variances of both axes.
+    log_determinant: f64,
+    /// Of the normalised squares, those of outliers bounded.
+    squares: f64,
+}
+
+impl Innovations {
+    fn add(&mut self, other: Self) {
+        self.fixes += other.fixes;
+        self.log_determinant += other.log_determinant;
+        self.squares += other.squares;
+    }
+
+    /// Log density if the covariance is known.
+    fn normal_log_density(&self) -> f64 {
+        -0.5 * (self.log_determinant + self.squares) - self.fixes * TAU.ln()
+    }
+
+    /// Log density if it is known up to a factor, beside a term that is the same for all of as many fixes.
+    fn log_density(&self) -> f64 {
+        -0.5 * (self.log_determinant + (FREEDOM + 2.0 * self.fixes) * (self.squares / FREEDOM).ln_1p())
+    }
+}
+
 /// A filter of `N` states, alike for both axes: means by axis, common covariance.
 #[derive(Debug, Clone, Copy)]
 struct AxisFilter<const N: usize> {
@@ -48,9 +82,9 @@ struct AxisFilter<const N: usize> {
 }
 
 impl<const N: usize> AxisFilter<N> {
-    /// Log density of a measurement of the sum of the states that `observed` marks, in both axes; updates
+    /// Evidence of a measurement of the sum of the states that `observed` marks, in both axes; updates
     /// the states unless it is an outlier.
-    fn update(&mut self, measured: [f64; 2], observed: [bool; N], noise_m2: f64) -> f64 {
+    fn update(&mut self, measured: [f64; 2], observed: [bool; N], noise_m2: f64) -> Innovations {
         let rows: [f64; N] = std::array::from_fn(|row| {
             (0..N).filter(|at| observed[*at]).map(|at| self.covariance[row][at]).sum()
         });
@@ -73,7 +107,8 @@ impl<const N: usize> AxisFilter<N> {
                 }
             }
         }
-        (nominal + outlier).max(1e-300).ln() - (TAU * variance_m2).ln()
+        let squares = -2.0 * (nominal + outlier).max(1e-300).ln();
+        Innovations { fixes: 1.0, log_determinant: 2.0 * variance_m2.ln(), squares }
     }
 
     /// Multiplies the states by factors and adds variances.
@@ -104,8 +139,8 @@ impl FreeMotion {
         Self { filter: AxisFilter { means: [[0.0; 3]; 2], covariance: [[0.0; 3]; 3] }, last_s: None }
     }
 
-    /// Log density of a fix given those before.
-    fn step(&mut self, fix: &TimedFix, model: &EvidenceModel) -> f64 {
+    /// Evidence of a fix given those before.
+    fn step(&mut self, fix: &TimedFix, model: &EvidenceModel) -> Innovations {
         let (bias_m2, white_m2) = (model.bias_m2(fix), model.gnss.white_variance_m2());
         let position = [fix.position.east_m, fix.position.north_m];
         let elapsed_s = self.last_s.map(|last_s| (fix.time_s - last_s).max(0.0));
@@ -119,8 +154,14 @@ impl FreeMotion {
         }
     }
 
-    /// Returns the log density of a fix anywhere in the scene: the mean of a normal log density.
-    fn start(&mut self, position: [f64; 2], bias_m2: f64, white_m2: f64, model: &EvidenceModel) -> f64 {
+    /// Returns the evidence of a fix anywhere in the scene: its square is the mean of such squares.
+    fn start(
+        &mut self,
+        position: [f64; 2],
+        bias_m2: f64,
+        white_m2: f64,
+        model: &EvidenceModel,
+    ) -> Innovations {
         let SceneMotion { spread_m, speed_m_s } = model.motion;
         self.filter = AxisFilter {
             means: position.map(|axis| [axis, 0.0, 0.0]),
@@ -130,7 +171,8 @@ impl FreeMotion {
                 [-bias_m2, 0.0, bias_m2],
             ],
         };
-        -(TAU * (spread_m * spread_m + bias_m2 + white_m2)).ln() - 1.0
+        let variance_m2 = spread_m * spread_m + bias_m2 + white_m2;
+        Innovations { fixes: 1.0, log_determinant: 2.0 * variance_m2.ln(), squares: 2.0 }
     }
 
     fn predict(&mut self, elapsed_s: f64, bias_m2: f64, model: &EvidenceModel) {
@@ -164,8 +206,9 @@ impl FreeMotion {
 
 /// Log-likelihood of fixes (in order of time) of somebody who is not seen.
 pub(super) fn free_log_likelihood(fixes: &[TimedFix], model: &EvidenceModel) -> f64 {
-    let mut motion = FreeMotion::new();
-    fixes.iter().map(|fix| motion.step(fix, model)).sum()
+    let (mut motion, mut sum) = (FreeMotion::new(), Innovations::default());
+    fixes.iter().for_each(|fix| sum.add(motion.step(fix, model)));
+    sum.normal_log_density()
 }
 
 /// Both hypotheses after the residuals so far.
@@ -174,16 +217,28 @@ pub(super) struct LikelihoodRatio {
     /// Bias and map error.
     carried: AxisFilter<2>,
     free: FreeMotion,
-    /// Fixes so far.
-    pub(super) fixes: u32,
-    /// Log-likelihood ratio.
-    pub(super) log_ratio: f64,
+    /// Evidence of both.
+    innovations: [Innovations; 2],
 }
 
 impl LikelihoodRatio {
     pub(super) const fn new() -> Self {
         let carried = AxisFilter { means: [[0.0; 2]; 2], covariance: [[0.0; 2]; 2] };
-        Self { carried, free: FreeMotion::new(), fixes: 0, log_ratio: 0.0 }
+        let none = Innovations { fixes: 0.0, log_determinant: 0.0, squares: 0.0 };
+        Self { carried, free: FreeMotion::new(), innovations: [none; 2] }
+    }
+
+    /// Logarithm of the ratio.
+    pub(super) fn log_ratio(&self) -> f64 {
+        let [carried, free] = self.innovations.map(|own| own.log_density());
+        carried - free
+    }
+
+    /// The same if the covariances are known.
+    #[cfg(test)]
+    pub(super) fn normal_log_ratio(&self) -> f64 {
+        let [carried, free] = self.innovations.map(|own| own.normal_log_density());
+        carried - free
     }
 
     /// The ratio after more residuals, in order of time.
@@ -207,8 +262,7 @@ impl LikelihoodRatio {
             }
         }
         let noise_m2 = model.gnss.white_variance_m2() + residual.box_variance_m2;
-        self.log_ratio += self.carried.update(residual.difference_m, [true; 2], noise_m2);
-        self.log_ratio -= self.free.step(fix, model);
-        self.fixes += 1;
+        self.innovations[0].add(self.carried.update(residual.difference_m, [true; 2], noise_m2));
+        self.innovations[1].add(self.free.step(fix, model));
     }
 }

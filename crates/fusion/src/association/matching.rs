@@ -13,8 +13,8 @@ use super::evidence::EvidenceModel;
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, Tracklet};
 use crate::domain::{
-    ClockOffset, Detection, Error, ErrorKind, GaussMarkovNoise, NoiseCorrelation, ReceivedFix, Receiver,
-    ReceiverId, Receivers, Result, TargetId,
+    ClockOffset, Detection, Error, ErrorKind, GaussMarkovNoise, ReceivedFix, Receiver, ReceiverId, Receivers,
+    Result, TargetId,
 };
 use crate::model::Regressor;
 
@@ -25,8 +25,6 @@ const LEAST_PROBABILITY: f64 = 0.01;
 /// White error per axis that every receiver has at least, m: differences of its fixes are not trusted
 /// further.
 const LEAST_WHITE_SIGMA_M: f64 = 0.5;
-/// Error of a receiver of which nothing is known: that of a phone.
-const PHONE: (f64, NoiseCorrelation) = (2.61, NoiseCorrelation { white_share: 0.083, time_constant_s: 30.0 });
 
 /// How tracklets are matched with receivers.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -181,14 +179,11 @@ pub(super) fn match_scene(
 
 /// The error of the receivers by a model; without one, that of a phone.
 pub(super) fn receiver_noise(regressor: Option<&Regressor>) -> GaussMarkovNoise {
-    let (sigma_m, correlation) = PHONE;
     let noise = regressor.and_then(|regressor| {
         let correlation = regressor.track_noise()?.gnss;
         Some(GaussMarkovNoise { variance_m2: regressor.e_gnss_m2(), correlation })
     });
-    noise
-        .unwrap_or_else(|| GaussMarkovNoise::new(sigma_m, correlation))
-        .with_white_at_least(LEAST_WHITE_SIGMA_M * LEAST_WHITE_SIGMA_M)
+    noise.unwrap_or(GaussMarkovNoise::PHONE).with_white_at_least(LEAST_WHITE_SIGMA_M * LEAST_WHITE_SIGMA_M)
 }
 
 pub(super) fn check_size(scene: &Scene<'_>, settings: &MatchSettings) -> Result<()> {

@@ -64,7 +64,8 @@ fn the_recursive_ratio_is_that_of_the_dense_covariance() {
     for seed in 1..=3 {
         // The quadratic form takes at most 40 fixes without thinning.
         let fixes: Vec<TimedFix> = carried(&track, seed).into_iter().take(40).collect();
-        let recursive = LikelihoodRatio::new().extended(&track.residuals(&fixes, 0.0, 2.5), &MODEL).log_ratio;
+        let recursive = LikelihoodRatio::new().extended(&track.residuals(&fixes, 0.0, 2.5), &MODEL);
+        let recursive = recursive.normal_log_ratio();
         let dense = PlacementSearch::new(
             std::slice::from_ref(&track),
             std::slice::from_ref(&fixes),
@@ -79,12 +80,31 @@ fn the_recursive_ratio_is_that_of_the_dense_covariance() {
 }
 
 #[test]
+fn fixes_that_differ_more_than_the_model_says_are_still_of_the_carrier() {
+    let track = walk([1.0, 2.0], 1.5);
+    for seed in 1..=3 {
+        // A receiver of twice the error that the model was trained with.
+        let mut fixes = carried(&track, seed);
+        for (fix, point) in fixes.iter_mut().zip(track.points.iter().step_by(2)) {
+            let EastNorth { east_m, north_m } = point.position;
+            fix.position = EastNorth {
+                east_m: 2.0 * fix.position.east_m - east_m,
+                north_m: 2.0 * fix.position.north_m - north_m,
+            };
+        }
+        let ratio = LikelihoodRatio::new().extended(&track.residuals(&fixes, 0.0, 2.5), &MODEL);
+        assert!(ratio.log_ratio() > 0.0, "{seed}: {}, {}", ratio.log_ratio(), ratio.normal_log_ratio());
+        assert!(ratio.log_ratio() > ratio.normal_log_ratio(), "{seed}: {}", ratio.normal_log_ratio());
+    }
+}
+
+#[test]
 fn the_carrier_has_the_largest_ratio() {
     let tracks = [walk([0.0, 0.0], 1.5), walk([2.0, -3.0], -1.0), walk([-4.0, 6.0], 2.5)];
     for seed in 1..=5 {
         let fixes = carried(&tracks[0], seed);
         let ratios = tracks.each_ref().map(|track| {
-            LikelihoodRatio::new().extended(&track.residuals(&fixes, 0.0, 2.5), &MODEL).log_ratio
+            LikelihoodRatio::new().extended(&track.residuals(&fixes, 0.0, 2.5), &MODEL).log_ratio()
         });
         assert!(ratios[0] > 3.0 && ratios[0] > ratios[1] + 3.0 && ratios[0] > ratios[2] + 3.0, "{ratios:?}");
     }

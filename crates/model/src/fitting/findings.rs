@@ -2,10 +2,14 @@
 //! make the model surer.
 
 use super::candidates::Candidate;
+use super::walked_line::is_one_line;
 use crate::artifact::ModelParts;
 use crate::domain::{CandidateFinding, CandidateReport, HeldOutError, ImageSize, TrainingReport};
+use crate::geo::Position;
+use crate::regressor::Regressor;
 use crate::samples::mirroring::{FootPosition, is_mirrored};
-use crate::samples::rows::TrainingRows;
+use crate::samples::rows::{TrainingRow, TrainingRows};
+use crate::statistics::{R95_PER_SIGMA, median};
 
 /// Below this share of held-out fixes inside the stated radius the report says so.
 const LEAST_COVERAGE: f64 = 0.9;
@@ -13,6 +17,12 @@ const LEAST_COVERAGE: f64 = 0.9;
 const FEW_TRAVERSES: u32 = 8;
 /// Sessions disagree if their bias per axis exceeds this share of the receiver's standard deviation.
 const DISAGREEMENT: f64 = 0.5;
+
+/// Below this share of a fix's 95 % radius the map's own error at the median of the scene needs no more walks.
+const SMALL_MAP_ERROR: f64 = 0.5;
+
+/// Rows at which the map's own error is looked at.
+const MAP_ERROR_ROWS: usize = 512;
 
 /// Rows that are compared with a mirror image.
 const MIRROR_ROWS: usize = 512;
@@ -27,6 +37,40 @@ pub(super) struct Selection<'a> {
     pub(super) chosen: usize,
 }
 
+/// What a model states of its own error over the training positions: 95 % radii of one box alone, m.
+struct MapError {
+    median_m: f64,
+    worst_m: f64,
+    worst_at: Position,
+}
+
+impl MapError {
+    /// `None` for a model that cannot be loaded, or without rows.
+    fn of(rows: &TrainingRows, parts: &ModelParts) -> Option<Self> {
+        let regressor = Regressor::build(parts.clone()).ok()?;
+        let step = rows.rows.len().div_ceil(MAP_ERROR_ROWS).max(1);
+        let radius_m = |row: &TrainingRow| regressor.regress(&row.bounding_box, None).r95_m();
+        let radii: Vec<(f64, Position)> =
+            rows.rows.iter().step_by(step).map(|row| (radius_m(row), row.position)).collect();
+        let (worst_m, worst_at) = *radii.iter().max_by(|one, other| one.0.total_cmp(&other.0))?;
+        Some(Self {
+            median_m: median(radii.iter().map(|(radius_m, _)| *radius_m).collect()),
+            worst_m,
+            worst_at,
+        })
+    }
+
+    fn text(&self) -> String {
+        let Self { median_m, worst_m, worst_at } = self;
+        format!(
+            "; a box alone tells the position to {median_m:.1} m (95 %) at the median of the scene, and to {worst_m:.1} m \
+             where it is worst, at longitude {:.6}, latitude {:.6}",
+            worst_at.longitude_deg(),
+            worst_at.latitude_deg()
+        )
+    }
+}
+
 /// The report of a run. `held_out` is the chosen candidate's error after its calibration.
 pub(super) fn training_report(
     selection: &Selection<'_>,
@@ -36,6 +80,11 @@ pub(super) fn training_report(
     image_size: Option<ImageSize>,
 ) -> TrainingReport {
     let Selection { candidates, reports, chosen, .. } = *selection;
+    let map_error = MapError::of(rows, parts);
+    let reason_to_keep = || {
+        let of_map = map_error.as_ref().map(MapError::text).unwrap_or_default();
+        format!("{}{of_map}", reason_to_keep(selection, parts))
+    };
     let finding = |at: usize| {
         let is_chosen = at == chosen;
         let HeldOutError { mean_to_fix_m, coverage95_of_fixes, .. } =
@@ -45,12 +94,12 @@ pub(super) fn training_report(
             weight: if is_chosen { 1.0 } else { 0.0 },
             held_out_miss_m: *mean_to_fix_m,
             coverage95_of_fixes: *coverage95_of_fixes,
-            summary: if is_chosen { reason_to_keep(selection, parts) } else { reason_to_drop(selection, at) },
+            summary: if is_chosen { reason_to_keep() } else { reason_to_drop(selection, at) },
         }
     };
     TrainingReport {
         candidates: (0..candidates.len()).map(finding).collect(),
-        advice: advice(held_out, rows, parts, image_size),
+        advice: advice(held_out, rows, parts, image_size, map_error.as_ref()),
     }
 }
 
@@ -65,9 +114,9 @@ fn reason_to_keep(selection: &Selection<'_>, parts: &ModelParts) -> String {
     let mixture = if maps.is_empty() { String::new() } else { format!("; mixture of {}", maps.join(", ")) };
     match selection.chosen {
         _ if selection.candidates.len() == 1 => format!("kept, the only candidate{mixture}"),
-        0 => format!("kept, no other candidate is better by more than a standard error{mixture}"),
+        0 => format!("kept, no other candidate is better by more than two standard errors{mixture}"),
         chosen => format!(
-            "kept, its squared misses are {:.1} % smaller than those of {}, by more than a standard error{mixture}",
+            "kept, its squared misses are {:.1} % smaller than those of {}, by more than two standard errors{mixture}",
             100.0 * (1.0 - selection.scores[chosen] / selection.scores[0]),
             selection.candidates[0].name
         ),
@@ -82,7 +131,7 @@ fn reason_to_drop(selection: &Selection<'_>, at: usize) -> String {
         format!("not kept, its squared misses are {larger:.1} % larger than those of {kept}")
     } else {
         format!(
-            "not kept, its squared misses are {:.1} % smaller than those of {kept}, within a standard error",
+            "not kept, its squared misses are {:.1} % smaller than those of {kept}, within two standard errors",
             -larger
         )
     }
@@ -116,13 +165,27 @@ fn swapped_columns(rows: &TrainingRows) -> Option<String> {
     })
 }
 
+/// Whether the map is still the larger part of what the answers may be wrong by.
+fn more_walks(map_error: &MapError, parts: &ModelParts) -> Option<String> {
+    let fix_m = R95_PER_SIGMA * parts.e_gnss_m2.sqrt();
+    (map_error.median_m > SMALL_MAP_ERROR * fix_m).then(|| {
+        format!(
+            "walk on: a box alone tells the position to {:.1} m, a fix to {fix_m:.1} m; more walks help until the former is \
+             below half of the latter",
+            map_error.median_m
+        )
+    })
+}
+
 fn advice(
     held_out: &HeldOutError,
     rows: &TrainingRows,
     parts: &ModelParts,
     image_size: Option<ImageSize>,
+    map_error: Option<&MapError>,
 ) -> Vec<String> {
     let mut advice: Vec<String> = swapped_columns(rows).into_iter().collect();
+    advice.extend(map_error.and_then(|own| more_walks(own, parts)));
     if rows.targets == 1 {
         advice.push(
             "let a second receiver walk: all fixes are of one receiver, and its lasting bias cannot be seen; \
@@ -144,6 +207,12 @@ fn advice(
             "walk once more on another day: the {sessions} sessions disagree by {:.1} m",
             2.0 * between_m
         ));
+    }
+    if is_one_line(rows) {
+        advice.push(
+            "cross the line on which all walks were: positions beside it rest on the heights of boxes alone"
+                .to_owned(),
+        );
     }
     if rows.traverses < FEW_TRAVERSES {
         advice.push(format!(

@@ -2,7 +2,7 @@
 //!
 //! The errors of neighbouring rows are correlated, so whole targets or contiguous blocks are held out, never
 //! random rows. A
-//! more complex candidate is chosen only where its error is smaller by more than a standard error. Neither
+//! more complex candidate is chosen only where its error is smaller by more than two standard errors. Neither
 //! test rows nor true positions are read.
 
 use rand::SeedableRng;
@@ -14,6 +14,8 @@ use crate::regressor::Regressor;
 use crate::samples::rows::{TrainingRows, traverses};
 use crate::statistics::median;
 
+/// A more complex candidate must be better by this many standard errors: with one, chance prefers one of six now and then.
+const MARGIN: f64 = 2.0;
 /// A squared residual counts at most this many times the median of the simplest candidate's.
 const LARGEST_SQUARE_RATIO: f64 = 10.0;
 
@@ -58,7 +60,7 @@ pub(super) fn cross_validate(
 }
 
 /// Index of the candidate to use, and the score of each: the mean squared residual per axis, m2, with every
-/// square bounded. A candidate replaces a simpler one if its score is smaller by more than the standard error
+/// square bounded. A candidate replaces a simpler one if its score is smaller by more than two standard errors
 /// of the difference, in which the rows of one traverse are taken as fully correlated.
 pub(super) fn choose(rows: &TrainingRows, residuals: &[&[[f64; 2]]]) -> (usize, Vec<f64>) {
     let Some(simplest) = residuals.first() else { return (0, Vec::new()) };
@@ -80,7 +82,7 @@ pub(super) fn choose(rows: &TrainingRows, residuals: &[&[[f64; 2]]]) -> (usize, 
             variance += (sum / count).powi(2);
             from += traverse.len();
         }
-        if gain > variance.sqrt() {
+        if gain > MARGIN * variance.sqrt() {
             chosen = at;
         }
     }

@@ -10,6 +10,7 @@ mod pipeline;
 mod report;
 mod site;
 mod track_noise;
+mod walked_line;
 mod widening;
 
 pub use self::gnss_noise::{TimedResidual, estimate_gnss_noise};

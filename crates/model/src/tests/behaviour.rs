@@ -198,6 +198,33 @@ fn a_report_names_the_candidates_and_what_would_help() {
 }
 
 #[test]
+fn walks_on_one_line_are_reported_and_those_over_the_square_are_not() {
+    let advice = |samples: &[Sample]| {
+        let artifact = fit(samples, &options(Recipe::GaussianProcess), &mut silent).expect("fits");
+        artifact.metadata.report.expect("a report").advice.join("; ")
+    };
+    let line = "cross the line on which all walks were";
+    let one_pass: Vec<Sample> = walk(1, 60, 2.0, 72);
+    assert!(advice(&one_pass).contains(line), "{}", advice(&one_pass));
+    let square = advice(&walk(6, 40, 2.0, 72));
+    assert!(!square.contains(line), "{square}");
+}
+
+#[test]
+fn the_fixes_of_one_short_walk_are_not_taken_as_better_than_a_phones() {
+    let mut sigmas_m: Vec<f64> = (0..8)
+        .map(|seed| {
+            let samples = walk(1, 25, 2.6, 300 + seed);
+            let options = FitOptions { gnss_error: GnssError::Unknown, ..options(Recipe::GaussianProcess) };
+            fit(&samples, &options, &mut silent).expect("fits").metadata.e_gnss_m2.sqrt()
+        })
+        .collect();
+    sigmas_m.sort_by(f64::total_cmp);
+    println!("{sigmas_m:.2?} m");
+    assert!(sigmas_m[1] > 1.5 && sigmas_m[6] < 5.0, "{sigmas_m:?}");
+}
+
+#[test]
 fn thinning_keeps_neighbours_together_and_counts_all_traverses() {
     use crate::samples::rows::TrainingRows;
     let rows = TrainingRows::new(&walk(10, 40, 2.0, 73)).expect("usable");

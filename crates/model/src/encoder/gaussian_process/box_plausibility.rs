@@ -5,6 +5,8 @@
 //! its covariance, has a squared Mahalanobis length with two degrees of freedom; so has the mean deviation
 //! over a target's recent boxes. Only the sides are tested, so a target at a new place is no bad box.
 
+use std::f64::consts::TAU;
+
 use nalgebra::{Matrix2, Matrix3, Matrix3x2, Vector2, Vector3};
 
 use super::kernel::nearest;
@@ -62,6 +64,8 @@ pub(crate) struct Deviation {
     pub(crate) normalized: [f64; 2],
     /// Weight of the cell's box, 0 for a normal box to 1.
     pub(crate) weight: f64,
+    /// Factor on the normalised deviation by what the cell's coefficients are uncertain.
+    widen: f64,
 }
 
 /// The running mean of how a target's boxes deviate from those of training: one per target, kept by the
@@ -159,7 +163,15 @@ impl BoxPlausibility {
         let normalized = whiten(&cell.whitening, &[log_width - predicted[0], log_height - predicted[1]])
             .map(|value| value * widen);
         let weight = share_beyond(square(&normalized), self.normal[0]);
-        Deviation { cell: best.1, foot, normalized, weight }
+        Deviation { cell: best.1, foot, normalized, weight, widen }
+    }
+
+    /// Density of log width and log height at a deviation.
+    #[inline]
+    pub(crate) fn density(&self, deviation: &Deviation) -> f64 {
+        let [first, _, second] = self.cells[deviation.cell].whitening;
+        let peak = first * second * deviation.widen * deviation.widen / TAU;
+        peak * (-0.5 * square(&deviation.normalized)).exp()
     }
 
     /// How far a box, and the recent boxes of its target with it, deviate; `recent` takes the box in.

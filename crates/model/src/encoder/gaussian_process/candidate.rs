@@ -2,6 +2,7 @@
 
 use nalgebra::{DMatrix, DVector, SVector};
 
+use super::edge_noise::{by_edge, position_noise_m2};
 use super::groups::Grouping;
 use super::hyperparameters::{Hyperparameters, LikelihoodRows, Priors, join, kernel_columns};
 use super::kernel::inducing_points;
@@ -51,6 +52,8 @@ pub(crate) struct Draft<'a> {
     pub(crate) form: MapForm,
     pub(crate) rows: &'a MapRows,
     pub(crate) inputs: &'a [[f64; 4]],
+    /// Covariance of left, top, right and bottom, px2.
+    pub(crate) edge_px2: &'a [f64; 16],
     pub(crate) mean: ProjectiveMean,
     pub(crate) inflation_m2: Vec<f64>,
     /// The camera whose geometry is the foot's prior, and where it is linearised.
@@ -104,7 +107,7 @@ impl<'a> Draft<'a> {
             draft.relinearize(parameters)?;
             let columns = draft.columns(&[], parameters)?;
             let all: Vec<usize> = (0..self.inputs.len()).collect();
-            let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.inflation_m2);
+            let gram = columns.gram(&all, &self.rows.epochs, parameters, &draft.white_m2());
             let at = draft.upright.as_ref()?.1;
             let score = gram.misfit_at(&DVector::from_column_slice(&draft.mean.coefficients))
                 + 2.0 * camera.evidence(&at)?.misfit;
@@ -164,17 +167,34 @@ impl<'a> Draft<'a> {
         let rows = self.rows.picked(&picked);
         let (tangent, labels_m) = linearize(&rows, &self.mean);
         let inputs: Vec<[f64; 4]> = picked.iter().map(|row| self.inputs[*row]).collect();
-        let inflation_m2: Vec<f64> = picked.iter().map(|row| self.inflation_m2[*row]).collect();
+        let white_m2 = self.white_m2();
+        let white_m2: Vec<f64> = picked.iter().map(|row| white_m2[*row]).collect();
         LikelihoodRows {
             epochs: &rows.epochs,
             inputs: &inputs,
             inducing: &self.inducing(MAX_LIKELIHOOD_INDUCING),
             tangent: &tangent,
             labels_m: &labels_m,
-            inflation_m2: &inflation_m2,
+            white_m2: &white_m2,
             mean: &self.mean,
         }
         .maximize(start, priors, noise_frozen)
+    }
+
+    /// Variance per axis of each row's position by the noise of its box: the box is an input with errors (the effective
+    /// variance of Orear 1982), m2.
+    fn box_noise_m2(&self) -> Vec<f64> {
+        let of_box = |sides: &Box4| {
+            let slopes = self.mean.jacobian(&self.mean.evaluate(sides)).map(by_edge);
+            let [east_m2, _, north_m2] = position_noise_m2(&slopes, self.edge_px2);
+            0.5 * (east_m2 + north_m2)
+        };
+        self.rows.boxes.iter().map(of_box).collect()
+    }
+
+    /// White variance per row beside the receiver's: that of its box, and what a gross error has cost it, m2.
+    fn white_m2(&self) -> Vec<f64> {
+        self.box_noise_m2().iter().zip(&self.inflation_m2).map(|(own, inflation)| own + inflation).collect()
     }
 
     fn prior(&self, parameters: &Hyperparameters) -> Option<TangentPrior> {
@@ -202,7 +222,7 @@ impl<'a> Draft<'a> {
         for _ in 0..self.form.relinearizations() {
             let columns = self.columns(&inducing, parameters)?;
             let all: Vec<usize> = (0..self.inputs.len()).collect();
-            let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.inflation_m2);
+            let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.white_m2());
             let posterior = Posterior::new(&gram, &self.prior(parameters)?)?;
             self.move_to(&posterior.tangent)?;
             let kernel_m = posterior.kernel.each_ref().map(|weights| &columns.phi * weights);
@@ -213,8 +233,11 @@ impl<'a> Draft<'a> {
                 .enumerate()
                 .map(|(row, miss_m)| [miss_m[0] - kernel_m[0][row], miss_m[1] - kernel_m[1][row]])
                 .collect();
-            let whitener = ReceiverWhitener::new(&self.rows.epochs, &parameters.noise, &self.inflation_m2);
-            self.inflation_m2 = whitener.inflation_m2(&residuals_m);
+            let of_box = self.box_noise_m2();
+            let whitener = ReceiverWhitener::new(&self.rows.epochs, &parameters.noise, &self.white_m2());
+            let inflation_m2 = whitener.inflation_m2(&residuals_m);
+            self.inflation_m2 =
+                inflation_m2.iter().zip(&of_box).map(|(all, of_box)| (all - of_box).max(0.0)).collect();
         }
         Some(())
     }
@@ -227,7 +250,8 @@ impl<'a> Draft<'a> {
         let inducing = self.inducing(MAX_INDUCING);
         let columns = self.columns(&inducing, parameters)?;
         let prior = self.prior(parameters)?;
-        let of = |rows: &[usize]| columns.gram(rows, &self.rows.epochs, parameters, &self.inflation_m2);
+        let white_m2 = self.white_m2();
+        let of = |rows: &[usize]| columns.gram(rows, &self.rows.epochs, parameters, &white_m2);
         let total = of(&(0..self.inputs.len()).collect::<Vec<_>>());
         let posterior = Posterior::new(&total, &prior)?;
         let groups: Vec<Gram> = grouping.members().iter().map(|rows| of(rows)).collect();
@@ -250,16 +274,9 @@ impl<'a> Draft<'a> {
 
 impl Columns {
     /// Gram matrix of some rows, in their order.
-    fn gram(
-        &self,
-        rows: &[usize],
-        epochs: &[Epoch],
-        parameters: &Hyperparameters,
-        inflation_m2: &[f64],
-    ) -> Gram {
+    fn gram(&self, rows: &[usize], epochs: &[Epoch], parameters: &Hyperparameters, white_m2: &[f64]) -> Gram {
         let own: Vec<Epoch> = rows.iter().map(|row| epochs[*row]).collect();
-        let variances: Vec<f64> =
-            rows.iter().map(|row| self.left_out_m2[*row] + inflation_m2[*row]).collect();
+        let variances: Vec<f64> = rows.iter().map(|row| self.left_out_m2[*row] + white_m2[*row]).collect();
         let columns = join(&[&self.tangent, &self.phi, &self.labels_m]);
         let columns = if rows.len() == epochs.len() { columns } else { columns.select_rows(rows) };
         Gram::new(columns, &ReceiverWhitener::new(&own, &parameters.noise, &variances))

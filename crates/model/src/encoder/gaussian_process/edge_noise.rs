@@ -25,8 +25,34 @@ pub(crate) fn edges_px(sides: &Box4) -> Vector4<f64> {
     Vector4::new(u - 0.5 * width, v - height, u + 0.5 * width, v)
 }
 
+/// Derivatives by left, top, right and bottom from those by foot u, foot v, width and height.
+#[inline]
+pub(crate) fn by_edge([u, v, width, height]: [f64; 4]) -> [f64; 4] {
+    [0.5 * u - width, -height, 0.5 * u + width, v + height]
+}
+
+/// J E J^T: covariance (east, cross, north) of a position by that of the edges, m2.
+#[inline]
+pub(crate) fn position_noise_m2(by_edge: &[[f64; 4]; 2], edge_px2: &[f64; 16]) -> [f64; 3] {
+    let product = |one: usize, other: usize| {
+        let mut sum = 0.0;
+        for row in 0..4 {
+            for column in 0..4 {
+                sum += by_edge[one][row] * edge_px2[row * 4 + column] * by_edge[other][column];
+            }
+        }
+        sum
+    };
+    [product(0, 0), product(0, 1), product(1, 1)]
+}
+
 /// Covariance of left, top, right and bottom, px2.
-pub(crate) fn edge_covariance_px2(epochs: &[Epoch], boxes: &[Box4]) -> Matrix4<f64> {
+pub(crate) fn edge_covariance_px2(epochs: &[Epoch], boxes: &[Box4]) -> [f64; 16] {
+    let covariance = robust_covariance_px2(epochs, boxes);
+    std::array::from_fn(|at| covariance.as_slice()[at])
+}
+
+fn robust_covariance_px2(epochs: &[Epoch], boxes: &[Box4]) -> Matrix4<f64> {
     let differences: Vec<Vector4<f64>> = (1..epochs.len().saturating_sub(1))
         .filter(|at| {
             let (first_s, second_s) =

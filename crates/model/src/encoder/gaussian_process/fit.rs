@@ -13,6 +13,7 @@ use super::predictor::{PositionMap, Predictor, Stated};
 use super::projective_mean::{Box4, ProjectiveMean};
 use super::sessions::SessionBiases;
 use super::upright_camera::UprightCamera;
+use crate::domain::GaussMarkovNoise;
 use crate::samples::rows::SESSION_GAP_S;
 use crate::statistics::median;
 
@@ -26,10 +27,14 @@ pub(crate) const SHARED_BIAS_SHARE: f64 = 0.1;
 /// Degrees of freedom that the prior of the slow part is worth: a logarithm with a standard deviation of 0.5
 /// has about the tails of an inverse chi-square with four.
 const PRIOR_FREEDOM: f64 = 4.0;
+/// Coefficients of a homography per axis, which as many independent fixes determine.
+const MAP_COEFFICIENTS: f64 = 4.0;
 /// Of the normal distribution.
 const MIN_INVERSE_FREEDOM: f64 = 1e-6;
-/// Share by which the miss to the own rows may exceed that to left-out ones: what few rows differ by.
+/// Share by which the miss to the own rows may exceed that to left-out ones, and standard errors of the mean square of
+/// independent fixes beside it.
 const OWN_MISS_TOLERANCE: f64 = 0.05;
+const OWN_MISS_ERRORS: f64 = 2.0;
 /// Least variance of the fixes about the homography, m2.
 const MIN_SCATTER_M2: f64 = 1e-6;
 
@@ -69,6 +74,8 @@ pub(crate) struct FitSettings {
     pub(crate) bias_sigma_m: Option<f64>,
     /// White share of the variance of the fixes about a geometric map.
     pub(crate) white_share: f64,
+    /// Error variance per axis of the receivers, m2, where it is known.
+    pub(crate) receiver_m2: Option<f64>,
     /// Of the bootstrap that weighs the candidates.
     pub(crate) seed: u64,
     /// Geometry by the heights of boxes, if the image size is known.
@@ -85,9 +92,10 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     let input_scales = InputScales::of_rows(&rows.boxes);
     let inputs: Vec<[f64; 4]> = rows.boxes.iter().map(|sides| input_scales.input(sides)).collect();
     let grouping = groups(&rows.epochs);
+    let edge_px2 = edge_covariance_px2(&all.epochs, &all.boxes);
     let bias = BiasPrior::new(&rows.epochs, settings.bias_sigma_m);
     let Solutions { parameters, receiver, candidates } =
-        solve(&rows, &inputs, mean, settings, &bias, &grouping)?;
+        solve(&rows, &inputs, mean, &edge_px2, settings, &bias, &grouping)?;
 
     let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, settings.seed);
     let kept = without_negligible(&weights);
@@ -101,7 +109,7 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
         .collect::<Option<Vec<PositionMap>>>()?;
     let freedom = degrees_of_freedom(&rows.epochs, &parameters.noise, &bias);
     let stated = Stated {
-        edge_px2: edge_covariance_px2(&all.epochs, &all.boxes),
+        edge_px2,
         shared_bias_m2: bias.shared_m2(&receiver),
         freedom,
         plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes),
@@ -115,7 +123,8 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     let receiver_m2 = parameters.noise.variance_m2();
     // Rows that a fit has seen are missed by less than those that it has not: else it is no solution.
     let own_m2 = own_miss_m2(&predictor, &rows, receiver_m2);
-    (own_m2 <= (1.0 + OWN_MISS_TOLERANCE) * calibration.miss_m2).then_some(())?;
+    let by_chance = OWN_MISS_ERRORS / independent_fixes(&rows.epochs, &parameters.noise).sqrt();
+    (own_m2 <= (1.0 + OWN_MISS_TOLERANCE + by_chance) * calibration.miss_m2).then_some(())?;
     let of_candidate = |((candidate, weight), miss_m2): ((&MapCandidate, &f64), &f64)| {
         (candidate.form.as_str(), *weight, *miss_m2)
     };
@@ -150,6 +159,7 @@ fn solve(
     rows: &MapRows,
     inputs: &[[f64; 4]],
     mean: ProjectiveMean,
+    edge_px2: &[f64; 16],
     settings: &FitSettings,
     bias: &BiasPrior,
     grouping: &Grouping,
@@ -159,10 +169,11 @@ fn solve(
     let white =
         ReceiverWhitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
     let inflation_m2 = white.inflation_m2(&residuals_m);
-    let mut residual = Draft { form: MapForm::Residual, rows, inputs, mean, inflation_m2, upright: None };
+    let mut residual =
+        Draft { form: MapForm::Residual, rows, inputs, edge_px2, mean, inflation_m2, upright: None };
     let mut homography = Draft { form: MapForm::Homography, ..residual.clone() };
     let spread_m = residual.mean.spread_m;
-    let mut priors = Priors::new(scatter_m2.sqrt(), settings.white_share, spread_m, interval_s(&rows.epochs));
+    let mut priors = priors(rows, scatter_m2, spread_m, settings);
     if let BiasPrior::OfSession { sigma_m } = bias {
         priors = priors.with_session(*sigma_m);
     }
@@ -174,6 +185,37 @@ fn solve(
     candidates.extend(upright.and_then(|draft| draft.solve(&parameters, grouping)));
     candidates.push(residual.solve(&parameters, grouping)?);
     Some(Solutions { parameters, receiver, candidates })
+}
+
+/// The priors of the noise. The rows of a short walk are few independent fixes, which a map follows, so they scatter about
+/// it by less than their error: the error of a phone, or the one that is stated, counts for [`PRIOR_FREEDOM`] fixes beside
+/// those that are left of the map's coefficients.
+fn priors(rows: &MapRows, scatter_m2: f64, spread_m: f64, settings: &FitSettings) -> Priors {
+    let FitSettings { white_share, receiver_m2, .. } = *settings;
+    let phone = GaussMarkovNoise::PHONE;
+    let known_m2 = receiver_m2.unwrap_or(phone.variance_m2);
+    let interval_s = interval_s(&rows.epochs);
+    if scatter_m2 >= known_m2 {
+        return Priors::new(scatter_m2.sqrt(), white_share, spread_m, interval_s);
+    }
+    let left = independent_fixes(&rows.epochs, &ReceiverNoise::of_gauss_markov(&phone)) - MAP_COEFFICIENTS;
+    let known = PRIOR_FREEDOM / (PRIOR_FREEDOM + left.max(0.0));
+    let blend = |own: f64, of_phones: f64| (1.0 - known) * own + known * of_phones;
+    let scatter_m = blend(scatter_m2, known_m2).sqrt();
+    let white_share = blend(white_share, phone.correlation.white_share);
+    Priors::new(scatter_m, white_share, spread_m, interval_s).with_receiver(known_m2.sqrt(), known)
+}
+
+/// Fixes that would tell a mean as well if their errors were independent.
+fn independent_fixes(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
+    noise.variance_m2() * information(epochs, noise)
+}
+
+/// Inverse variance of a mean of fixes, per m2.
+fn information(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
+    let mut ones = vec![1.0; epochs.len()];
+    ReceiverWhitener::new(epochs, noise, &vec![0.0; epochs.len()]).apply(&mut ones);
+    ones.iter().map(|one| one * one).sum()
 }
 
 /// Weights that add up to 1, without the negligible ones.
@@ -259,13 +301,8 @@ fn independent_biases(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
 /// sessions has those of its prior and two per independent bias beyond the first, what differs within them
 /// two per independent fix. A stated bias is known, not estimated.
 fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise, bias: &BiasPrior) -> f64 {
-    let information = |noise: &ReceiverNoise| {
-        let mut ones = vec![1.0; epochs.len()];
-        ReceiverWhitener::new(epochs, noise, &vec![0.0; epochs.len()]).apply(&mut ones);
-        ones.iter().map(|one| one * one).sum::<f64>()
-    };
     let within = ReceiverNoise { session_m2: 0.0, ..*noise };
-    let (of_all, of_within) = (information(noise), information(&within));
+    let (of_all, of_within) = (information(epochs, noise), information(epochs, &within));
     let between_share = (1.0 - of_all / of_within).clamp(0.0, 1.0);
     let between = match bias {
         BiasPrior::OfSession { .. } => f64::INFINITY,

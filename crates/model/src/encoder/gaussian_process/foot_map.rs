@@ -1,6 +1,6 @@
 //! A homography of the foot point that was fitted elsewhere as a model of this recipe: a mean without a residual.
 
-use nalgebra::{Matrix4, SMatrix, Vector4};
+use nalgebra::SMatrix;
 
 use super::box_plausibility::BoxPlausibility;
 use super::companion;
@@ -74,7 +74,11 @@ impl FittedFootMap {
         let foot_px2 = self.foot_sigma_px * self.foot_sigma_px;
         let stated = Stated {
             // The foot is in the middle of the lower edge: the mean of left and right.
-            edge_px2: Matrix4::from_diagonal(&Vector4::new(2.0, 1.0, 2.0, 1.0)) * foot_px2,
+            edge_px2: std::array::from_fn(|at| match at {
+                0 | 10 => 2.0 * foot_px2,
+                5 | 15 => foot_px2,
+                _ => 0.0,
+            }),
             shared_bias_m2: self.shared_bias_m2,
             freedom: self.freedom,
             plausibility: BoxPlausibility::fit(&rows.epochs, &rows.boxes),

@@ -22,6 +22,9 @@ const SESSION_SHARE: f64 = 0.5;
 const WHITE_SHARES: [f64; 2] = [0.02, 0.999];
 /// Standard deviation of the logarithm of a slow part that is stated from outside.
 const STATED_SESSION_SIGMA: f64 = 0.02;
+/// Scale and degrees of freedom of the logarithm of a receiver's standard deviation about what is known of such receivers.
+const RECEIVER_SIGMA: f64 = 0.3;
+const RECEIVER_FREEDOM: f64 = 3.0;
 const MAX_ITERATIONS: usize = 12;
 const DIFFERENCE: f64 = 0.02;
 const CONVERGED: f64 = 0.02;
@@ -87,6 +90,8 @@ pub(crate) struct Priors {
     interval_s: f64,
     /// Whether the slow part is stated from outside, not derived from the short one.
     session_is_stated: bool,
+    /// Standard deviation of white and short part together by what is known of such receivers, m, and the weight of that.
+    receiver: (f64, f64),
 }
 
 impl Priors {
@@ -112,7 +117,13 @@ impl Priors {
             sigmas: Logs::from_column_slice(&[1.0, 1.0, 0.5, 0.4, 1.0, 1.2, 0.7, 0.7, 1.2]),
             interval_s,
             session_is_stated: false,
+            receiver: (scatter_m, 0.0),
         }
+    }
+
+    /// The same with a weight of what is known of such receivers: their standard deviation per axis, m.
+    pub(crate) fn with_receiver(self, sigma_m: f64, weight: f64) -> Self {
+        Self { receiver: (sigma_m, weight), ..self }
     }
 
     /// The same with a slow part of that standard deviation, m, which samples hardly change.
@@ -136,7 +147,15 @@ impl Priors {
             let visible = -0.5 * self.interval_s / logs[3].exp();
             centre[2] = SESSION_SHARE.ln() + logs[1] + visible + 0.5 * (logs[3] - self.medians[3]).min(0.0);
         }
-        (logs - centre).component_div(&self.sigmas).norm_squared()
+        (logs - centre).component_div(&self.sigmas).norm_squared() + self.receiver_penalty(logs)
+    }
+
+    /// Of a logarithm with a t distribution: it holds phones together, and lets go of a much better receiver.
+    fn receiver_penalty(&self, logs: &Logs) -> f64 {
+        let (sigma_m, weight) = self.receiver;
+        let stated_m = logs[0].exp().hypot(logs[1].exp());
+        let apart = (stated_m / sigma_m).ln() / RECEIVER_SIGMA;
+        weight * (RECEIVER_FREEDOM + 1.0) * (apart * apart / RECEIVER_FREEDOM).ln_1p()
     }
 }
 
@@ -149,7 +168,8 @@ pub(crate) struct LikelihoodRows<'a> {
     /// Tangent of both axes and linearised labels, as columns.
     pub(crate) tangent: &'a DMatrix<f64>,
     pub(crate) labels_m: &'a DMatrix<f64>,
-    pub(crate) inflation_m2: &'a [f64],
+    /// White variance per row beside the receiver's, m2.
+    pub(crate) white_m2: &'a [f64],
     pub(crate) mean: &'a ProjectiveMean,
 }
 
@@ -162,11 +182,8 @@ impl LikelihoodRows<'_> {
     /// Gram matrix of all columns, and the noise's log determinant over both axes.
     pub(crate) fn gram(&self, parameters: &Hyperparameters) -> Option<(Gram, f64)> {
         let (phi, left_out_m2) = self.kernel_columns(parameters)?;
-        let variances: Vec<f64> = left_out_m2
-            .iter()
-            .zip(self.inflation_m2)
-            .map(|(left_out, inflation)| left_out + inflation)
-            .collect();
+        let variances: Vec<f64> =
+            left_out_m2.iter().zip(self.white_m2).map(|(left_out, white)| left_out + white).collect();
         let whitener = ReceiverWhitener::new(self.epochs, &parameters.noise, &variances);
         let columns = join(&[self.tangent, &phi, self.labels_m]);
         Some((Gram::new(columns, &whitener), 2.0 * whitener.log_determinant))

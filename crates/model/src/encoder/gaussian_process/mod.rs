@@ -3,7 +3,7 @@
 //!
 //! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
 //! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
-//! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`;
+//! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`, `hidden_foot`;
 //! `recipe` and `stored` connect both to the rest of the module; `foot_map` takes the map of another fit, and `upright_geometry` gives it a prior. Random starts have a seed of their own.
 
 pub(crate) mod box_plausibility;
@@ -15,6 +15,7 @@ mod fit;
 mod foot_map;
 mod ground_camera;
 mod groups;
+mod hidden_foot;
 mod hyperparameters;
 pub(crate) mod kernel;
 mod leave_out;
@@ -34,6 +35,7 @@ pub(crate) use companion::EPOCHS;
 pub(crate) use fit::SHARED_BIAS_SHARE;
 pub(crate) use foot_map::{FittedFootMap, FootCovariance, widen_map};
 pub use ground_camera::{GroundCamera, GroundPoint};
+pub use hidden_foot::HiddenFoot;
 pub(crate) use leave_out::{SequenceMean, widening};
 pub(crate) use noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, receiver_correlation, target_height_m};

@@ -4,11 +4,11 @@
 //! q = U_r^T L^-1 k(x), with U the eigenvectors of Phi^T Phi. Directions that are left out of q keep their prior,
 //! which never makes the variance smaller. The mean has all weights.
 
-use nalgebra::{DMatrix, DVector, Matrix4, SymmetricEigen};
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 use super::box_plausibility::{BoxPlausibility, Deviation, RecentBoxes};
 use super::candidate::MapCandidate;
-use super::edge_noise::edges_px;
+use super::edge_noise::{by_edge, edges_px, position_noise_m2};
 use super::f_distribution::f_quantile;
 use super::kernel::{InputScales, LengthScales};
 use super::projective_mean::{Box4, COEFFICIENTS, EvaluatedMean, ProjectiveMean};
@@ -26,7 +26,7 @@ pub(crate) const UNEXPLAINED_SHARE: f64 = 0.2;
 
 /// What is stated beside the maps.
 pub(crate) struct Stated {
-    pub(crate) edge_px2: Matrix4<f64>,
+    pub(crate) edge_px2: [f64; 16],
     pub(crate) shared_bias_m2: f64,
     pub(crate) freedom: f64,
     pub(crate) plausibility: BoxPlausibility,
@@ -281,7 +281,7 @@ impl Predictor {
         Self {
             maps,
             input_scales,
-            edge_px2: std::array::from_fn(|at| stated.edge_px2.as_slice()[at]),
+            edge_px2: stated.edge_px2,
             widening: 1.0,
             shared_bias_m2: stated.shared_bias_m2,
             quantiles: std::array::from_fn(|at| {
@@ -295,7 +295,7 @@ impl Predictor {
     pub(crate) fn predict(&self, sides: &Box4, recent: Option<&mut RecentBoxes>) -> MapPrediction {
         let mixture = self.mix(sides, true);
         let mut position_m = mixture.position_m;
-        let noise_m2 = quadratic(&mixture.by_edge, &self.edge_px2);
+        let noise_m2 = position_noise_m2(&mixture.by_edge, &self.edge_px2);
         let mut covariance_m2: [f64; 3] =
             std::array::from_fn(|at| self.widening * mixture.map_m2[at] + noise_m2[at]);
         covariance_m2[0] += self.shared_bias_m2;
@@ -368,9 +368,11 @@ impl Predictor {
         }
         add_outer(&mut second_m2, mean_m, -1.0);
         let origin_m = first_m.unwrap_or_default();
-        let by_edge =
-            jacobian.map(|[u, v, width, height]| [0.5 * u - width, -height, 0.5 * u + width, v + height]);
-        Mixture { position_m: [origin_m[0] + mean_m[0], origin_m[1] + mean_m[1]], map_m2: second_m2, by_edge }
+        Mixture {
+            position_m: [origin_m[0] + mean_m[0], origin_m[1] + mean_m[1]],
+            map_m2: second_m2,
+            by_edge: jacobian.map(by_edge),
+        }
     }
 
     /// Squared radius of 95 %: the trace times the quantile of F at the eigenvalues' own degrees of freedom
@@ -405,21 +407,6 @@ fn determined_directions(candidate: &MapCandidate) -> (DMatrix<f64>, Vec<f64>) {
     let directions =
         DMatrix::from_fn(count, order.len(), |row, column| eigen.eigenvectors[(row, order[column])]);
     (directions, order.into_iter().map(share).collect())
-}
-
-/// J E J^T.
-#[inline]
-fn quadratic(by_edge: &[[f64; 4]; 2], covariance: &[f64; 16]) -> [f64; 3] {
-    let product = |one: usize, other: usize| {
-        let mut sum = 0.0;
-        for row in 0..4 {
-            for column in 0..4 {
-                sum += by_edge[one][row] * covariance[row * 4 + column] * by_edge[other][column];
-            }
-        }
-        sum
-    };
-    [product(0, 0), product(0, 1), product(1, 1)]
 }
 
 #[inline]

@@ -81,8 +81,13 @@ pub(crate) fn fit(
         UprightCamera::new(&boxes, size_px, settings.target_height_m)
     });
     let bias_sigma_m = settings.gnss_bias_sigma_m;
-    let map_settings =
-        FitSettings { bias_sigma_m, white_share: settings.white_share, seed: settings.seed, upright };
+    let map_settings = FitSettings {
+        bias_sigma_m,
+        white_share: settings.white_share,
+        receiver_m2: (!settings.e_gnss_is_estimated).then_some(settings.e_gnss_m2),
+        seed: settings.seed,
+        upright,
+    };
     let fitted = fit_map(&map_rows, &map_settings);
     let Some((predictor, report)) = fitted else {
         return Err(FitError::Unusable(Error::field(

@@ -65,7 +65,7 @@ fn fitted(rows: &MapRows) -> (Predictor, FitReport) {
 }
 
 fn settings(upright: Option<UprightCamera>) -> FitSettings {
-    FitSettings { bias_sigma_m: None, white_share: 0.15, seed: 1, upright }
+    FitSettings { bias_sigma_m: None, white_share: 0.15, receiver_m2: None, seed: 1, upright }
 }
 
 /// Mean error, m, and share of the truths inside the stated radius.

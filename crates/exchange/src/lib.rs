@@ -47,13 +47,14 @@ mod rows;
 #[cfg(test)]
 mod tests;
 mod track_files;
+mod unix_time;
 pub mod wire;
 mod write;
 
 pub use address::{Address, Scheme, SerialLine};
 pub use connection::{
-    CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, SaslMechanism, Secrets, SinkSettings,
-    SourceSettings,
+    CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, ReceiverFrom, SaslMechanism, Secrets,
+    SinkSettings, SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
@@ -61,7 +62,8 @@ pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
 pub use messages::{
-    DetectedBox, MessageContext, MessageDecoder, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
+    BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,
+    NamedDetection, Reading, decoder, source_decoder,
 };
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use rows::{

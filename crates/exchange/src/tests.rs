@@ -1,6 +1,8 @@
 //! Readers and writers through their public interface.
 
 mod fixes;
+mod messages;
+mod phones;
 
 use std::fs::File;
 use std::path::PathBuf;

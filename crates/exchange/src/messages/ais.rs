@@ -8,10 +8,11 @@ use std::collections::VecDeque;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::MessageContext;
-use crate::domain::{ReceivedFix, ReceiverId, Result, SigmaM};
+use super::nmea::Tagged;
+use super::{MessageContext, ReportedFix};
+use crate::domain::ReceivedFix;
 use crate::fix_quality::sigma_of_radius_95;
-use crate::wire;
+use crate::unix_time::unix_time;
 
 /// Messages of which not all sentences have come; beyond, the oldest is dropped.
 const MAX_PARTIAL: usize = 64;
@@ -51,8 +52,8 @@ impl Ais {
     /// The position of a sentence, if it is an AIS sentence that completes a message with one.
     pub(super) fn sentence(
         &mut self,
-        line: &str,
-        context: &MessageContext,
+        line: &Tagged<'_>,
+        context: &MessageContext<'_>,
     ) -> Result<Option<ReceivedFix>, String> {
         let Some(sentence) = parse_sentence(line)? else { return Ok(None) };
         let received_at = sentence.tagged_at.unwrap_or(context.received_at);
@@ -97,13 +98,10 @@ impl Ais {
     }
 }
 
-/// A `VDM` sentence; `None` for any other line.
-fn parse_sentence(line: &str) -> Result<Option<Sentence<'_>>, String> {
-    let (tags, sentence) = match line.strip_prefix('\\').and_then(|rest| rest.split_once('\\')) {
-        Some((tags, sentence)) => (Some(tags), sentence),
-        None => (None, line),
-    };
-    let Some(body) = sentence.strip_prefix('!').filter(|body| body.get(2..6) == Some("VDM,")) else {
+/// A `VDM` or `VDO` sentence; `None` for any other line.
+fn parse_sentence<'a>(line: &Tagged<'a>) -> Result<Option<Sentence<'a>>, String> {
+    let is_ais = |body: &&str| matches!(body.get(2..6), Some("VDM," | "VDO,"));
+    let Some(body) = line.sentence.strip_prefix('!').filter(is_ais) else {
         return Ok(None);
     };
     let (body, checksum) = body.split_once('*').ok_or("the sentence has no checksum")?;
@@ -113,11 +111,11 @@ fn parse_sentence(line: &str) -> Result<Option<Sentence<'_>>, String> {
     }
     let fields: Vec<&str> = body.split(',').collect();
     let [_, count, number, sequence, channel, payload, fill_bits] = fields[..] else {
-        return Err("is not a VDM sentence of seven fields".to_owned());
+        return Err("is not a VDM or VDO sentence of seven fields".to_owned());
     };
     let small = |text: &str, range: std::ops::RangeInclusive<usize>| {
         let number = text.parse().ok().filter(|number| range.contains(number));
-        number.ok_or_else(|| format!("`{text}` is out of range in a VDM sentence"))
+        number.ok_or_else(|| format!("`{text}` is out of range in a VDM or VDO sentence"))
     };
     let count = small(count, 1..=MAX_PARTS)?;
     Ok(Some(Sentence {
@@ -127,17 +125,8 @@ fn parse_sentence(line: &str) -> Result<Option<Sentence<'_>>, String> {
         channel,
         payload,
         fill_bits: small(fill_bits, 0..=5)?,
-        tagged_at: tags.and_then(tagged_time),
+        tagged_at: line.tag("c:").and_then(|time| unix_time(time.parse().ok()?).ok()),
     }))
-}
-
-/// The time of a tag block: seconds, or milliseconds, since 1970.
-fn tagged_time(tags: &str) -> Option<Timestamp> {
-    let tags = tags.split('*').next()?;
-    let time: i64 = tags.split(',').find_map(|tag| tag.strip_prefix("c:"))?.parse().ok()?;
-    let result =
-        if time > 100_000_000_000 { Timestamp::from_millisecond(time) } else { Timestamp::from_second(time) };
-    result.ok()
 }
 
 /// The position report in a payload; `None` for other messages, and for a report without a position.
@@ -145,7 +134,7 @@ fn position(
     payload: &str,
     fill_bits: usize,
     received_at: Timestamp,
-    context: &MessageContext,
+    context: &MessageContext<'_>,
 ) -> Result<Option<ReceivedFix>, String> {
     let bits = Bits::of(payload, fill_bits)?;
     let kind = bits.unsigned(0, 6)?;
@@ -171,19 +160,15 @@ fn position(
             );
         }
     };
-    let fix = wire::Fix {
+    let receiver = format!("{:09}", bits.unsigned(8, 30)?);
+    let fix = ReportedFix {
+        time,
+        receiver: Some(&receiver),
         longitude_deg: longitude as f64 / DEGREE as f64,
         latitude_deg: latitude as f64 / DEGREE as f64,
-        sigma_m: sigma_of_radius_95(RADIUS_95_M[bits.unsigned(accuracy_at, 1)? as usize]).map(SigmaM::metres),
+        sigma: sigma_of_radius_95(RADIUS_95_M[bits.unsigned(accuracy_at, 1)? as usize]),
     };
-    let checked = || -> Result<ReceivedFix> {
-        Ok(ReceivedFix {
-            time: context.time_bounds.check(time)?,
-            receiver_id: Some(ReceiverId::new(&format!("{:09}", bits.unsigned(8, 30).unwrap_or_default()))?),
-            fix: fix.to_domain()?,
-        })
-    };
-    checked().map(Some).map_err(|error| error.to_string())
+    fix.checked(context).map(Some)
 }
 
 /// How far a transmitter's clock may be ahead of the server's, s.

@@ -7,6 +7,7 @@
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
+use super::xml::{attribute, numbers};
 use super::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, class, score,
 };
@@ -48,7 +49,7 @@ struct Frames {
 }
 
 impl MessageDecoder for Onvif {
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
         let mut xml = Reader::from_reader(payload);
         let mut buffer = Vec::new();
         let mut frames = Frames::default();
@@ -110,7 +111,7 @@ impl Frames {
         Ok(())
     }
 
-    fn close(&mut self, name: &str, context: &MessageContext, reading: &mut Reading) {
+    fn close(&mut self, name: &str, context: &MessageContext<'_>, reading: &mut Reading) {
         match name {
             "Type" => self.reads_class = false,
             "Object" => {
@@ -124,7 +125,7 @@ impl Frames {
         }
     }
 
-    fn detection(&self, object: Object, context: &MessageContext) -> Result<NamedDetection, String> {
+    fn detection(&self, object: Object, context: &MessageContext<'_>) -> Result<NamedDetection, String> {
         let [left, top, right, bottom] =
             object.edges.ok_or_else(|| format!("object {} has no box", object.id))?;
         let Transformation { translation, scale } = self.transformation;
@@ -149,19 +150,4 @@ impl Frames {
             score: score(object.score),
         })
     }
-}
-
-fn attribute(element: &BytesStart<'_>, name: &str) -> Result<Option<String>, String> {
-    let found = element.try_get_attribute(name).map_err(|error| format!("is not XML: {error}"))?;
-    Ok(found.map(|attribute| attribute.value.into_owned()))
-}
-
-fn numbers<const N: usize>(element: &BytesStart<'_>, names: [&str; N]) -> Result<[f64; N], String> {
-    let mut values = [0.0; N];
-    for (value, name) in values.iter_mut().zip(names) {
-        let text = attribute(element, name)?.unwrap_or_default();
-        let number = text.trim().parse().ok().filter(|number: &f64| number.is_finite());
-        *value = number.ok_or_else(|| format!("the attribute {name} is `{text}`, which is not a number"))?;
-    }
-    Ok(values)
 }

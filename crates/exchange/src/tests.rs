@@ -1,8 +1,11 @@
 //! Readers and writers through their public interface.
 
 mod fixes;
+mod mapped;
 mod messages;
+mod onvif;
 mod phones;
+mod receivers;
 
 use std::fs::File;
 use std::path::PathBuf;

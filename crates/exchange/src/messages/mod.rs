@@ -6,6 +6,7 @@
 
 mod adsb;
 mod ais;
+mod ais_report;
 mod cot;
 mod deepstream;
 mod filter;

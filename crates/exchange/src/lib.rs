@@ -34,6 +34,7 @@ mod fix_row;
 mod fixes;
 mod format;
 mod formula_guard;
+mod frame_files;
 mod gpsd;
 mod gpx;
 mod json_errors;
@@ -61,6 +62,7 @@ pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
+pub use frame_files::{FrameClock, FrameFileFormat, read_frame_file};
 pub use messages::{
     BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,
     NamedDetection, Reading, decoder, source_decoder,

@@ -1,6 +1,7 @@
 //! Readers and writers through their public interface.
 
 mod fixes;
+mod frame_files;
 mod mapped;
 mod messages;
 mod onvif;

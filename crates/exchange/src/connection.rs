@@ -117,7 +117,8 @@ impl ReceiverFrom {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SourceSettings {
-    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]` and `kafkas://HOST[:9093]` subscribe; `tcp://`,
+    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]` and `kafkas://HOST[:9093]` subscribe, Kafka to a
+    /// cluster of several hosts with commas between them; `tcp://`,
     /// `tls://` and `gpsd://HOST[:2947]` connect and read lines; `serial:///dev/DEVICE?baud=4800` reads lines of a serial
     /// device of the server's machine; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
     /// `POST /v1/connections/{connection}/messages`.
@@ -334,18 +335,19 @@ impl ConnectionSettings {
         Ok(())
     }
 
-    /// Whether the peer is the same as by other settings: direction, scheme, host and port.
+    /// Whether the peer is the same as by other settings: direction, scheme, hosts and ports.
     #[must_use]
     pub fn has_peer_of(&self, other: &Self) -> bool {
         self.peer().is_some_and(|peer| other.peer() == Some(peer))
     }
 
-    fn peer(&self) -> Option<(bool, Scheme, String, u16)> {
+    /// Direction, and the address without its path.
+    fn peer(&self) -> Option<(bool, Address)> {
         let address = match (&self.source, &self.sink) {
             (Some(source), _) => source.address(),
             (None, sink) => sink.as_ref()?.address(),
         };
-        address.ok().map(|it| (self.source.is_some(), it.scheme, it.host, it.port))
+        address.ok().map(|it| (self.source.is_some(), Address { path: String::new(), ..it }))
     }
 }
 

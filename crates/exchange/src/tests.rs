@@ -1,5 +1,6 @@
 //! Readers and writers through their public interface.
 
+mod addresses;
 mod fixes;
 mod frame_files;
 mod mapped;

@@ -93,7 +93,8 @@ fn cases() -> Vec<(&'static str, MessageFormat, String, Parse)> {
 
 fn decode_in_turn(case: &str, format: MessageFormat, message: &str, parse: Parse) {
     let received_at: Timestamp = "2026-06-01T12:00:20.5Z".parse().expect("a time");
-    let context = MessageContext { received_at, time_bounds: TimeBounds::live_at(received_at, 5) };
+    let context =
+        MessageContext { subject: "", received_at, time_bounds: TimeBounds::live_at(received_at, 5) };
     let mut decoder = decoder(format);
     let items = decoder.decode(message.as_bytes(), &context).expect("a message").items.len();
     assert!(items > 0, "{case} brings something");

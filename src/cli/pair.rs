@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use clap::Args;
+use jiff::Timestamp;
 
 use super::files::{self, Output};
 use super::import::image_size;
@@ -18,13 +19,19 @@ use crate::app::{
 use crate::clock::Clock;
 use crate::config::Limits;
 use crate::domain::{
-    CameraId, ClockOffset, ImageSize, Receiver, ReceiverId, Receivers, TargetId, TimeBounds,
+    CameraId, ClockOffset, Detection, ImageSize, Receiver, ReceiverId, Receivers, TargetId, TimeBounds,
+    parse_time,
 };
-use crate::exchange::{self, FixFormat, MatchedSampleWriter, RowRules};
+use crate::exchange::{
+    self, FixFormat, FrameClock, FrameFileFormat, LaidOut, MatchedSampleWriter, RowError, RowRules,
+};
 use crate::fusion::association::{Cancellation, MatchLimits, MatchSettings};
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
 use crate::model::{Artifact, Regressor};
+
+/// A box of a file, or why its row is invalid.
+type BoxRow = crate::domain::Result<Result<Detection, RowError>>;
 
 /// Pair detections and fixes that were recorded separately into samples
 #[derive(Args)]
@@ -33,6 +40,15 @@ pub(super) struct Pair {
     /// .gz or .zst; - is standard input
     #[arg(long, value_name = "FILE")]
     detections: PathBuf,
+    /// Format of boxes by the number of their frame: mot (MOTChallenge) or kitti (tracking labels)
+    #[arg(long, value_name = "FORMAT", requires_all = ["frame_rate", "start_time"])]
+    detections_format: Option<FrameFileFormat>,
+    /// Frames per second of such a file
+    #[arg(long, value_name = "PER_S", requires = "detections_format")]
+    frame_rate: Option<f64>,
+    /// Time of the first frame of such a file, such as 2026-06-01T12:00:00Z
+    #[arg(long, value_name = "TIME", value_parser = parse_time, requires = "detections_format")]
+    start_time: Option<Timestamp>,
     /// Fixes as CSV, NMEA, GPX or gpsd reports (.json), by file extension, which may be followed by .gz or .zst; - is standard
     /// input
     #[arg(long, value_name = "FILE")]
@@ -221,18 +237,26 @@ impl Pair {
             image_size: self.matching.image_size,
         };
         let layout = self.layout.to_layout();
-        let (detections, fixes) = (files::open_input(&self.detections)?, files::open_input(&self.fixes)?);
-        let boxes = exchange::read_detections(
-            detections,
-            (files::format_of(&self.detections, None)?, &layout),
-            &rules,
-            self.target_id.clone(),
-        )
-        .map_err(|error| of_part(Part::Detections, error))?;
+        let boxes = self.boxes(rules)?;
+        let fixes = files::open_input(&self.fixes)?;
         let fixes = exchange::read_received_fixes(fixes, (format, &layout), rules.time_bounds)
             .map_err(|error| of_part(Part::Fixes, error))?;
         let limits = RecordingLimits { rows: usize::MAX, rejected_rows: Limits::default().rejected_rows };
         Ok((Recording::read(boxes, fixes, limits)?, format))
+    }
+
+    fn boxes(&self, rules: RowRules) -> anyhow::Result<Box<dyn Iterator<Item = BoxRow>>> {
+        let input = files::open_input(&self.detections)?;
+        if let (Some(format), Some(start), Some(rate)) =
+            (self.detections_format, self.start_time, self.frame_rate)
+        {
+            let clock = FrameClock::new(start, rate).context("--frame-rate")?;
+            return Ok(Box::new(exchange::read_frame_file(input, format, clock, rules)));
+        }
+        let format = files::format_of(&self.detections, None)?;
+        let laid_out = LaidOut::from((format, &self.layout.to_layout()));
+        let boxes = exchange::read_detections(input, laid_out, &rules, self.target_id.clone());
+        Ok(Box::new(boxes.map_err(|error| of_part(Part::Detections, error))?))
     }
 
     /// The receivers of both flags.

@@ -16,7 +16,7 @@ use crate::domain::{
 };
 use crate::exchange::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, SourceSettings,
-    decoder,
+    source_decoder,
 };
 
 /// How long a source waits for a camera that another node has, and how often it looks. Meanwhile it reads nothing, so that
@@ -103,7 +103,7 @@ impl Intake {
             live,
             routing: Routing::of(settings)?,
             durability: settings.store_samples.then_some(Durability::Synced),
-            decoder: decoder(settings.format),
+            decoder: source_decoder(settings),
             streams: HashMap::new(),
             pending: VecDeque::new(),
         })
@@ -120,7 +120,8 @@ impl Intake {
     /// What failed is not the message's fault, so it must come again.
     pub(super) async fn take(&mut self, message: Message) -> Result<(), PeerError> {
         let now = self.app.clock.now();
-        let context = MessageContext { received_at: now, time_bounds: self.app.live_time_bounds(now) };
+        let time_bounds = self.app.live_time_bounds(now);
+        let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
         let read = if message.size_bytes > self.app.limits.connection_message_bytes {
             Err(format!("is larger than {} bytes", self.app.limits.connection_message_bytes))
         } else {

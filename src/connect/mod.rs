@@ -21,6 +21,7 @@ mod line_reader;
 mod lines;
 mod listener;
 mod mqtt;
+mod mqtt_client;
 mod nats;
 mod open;
 mod peer;

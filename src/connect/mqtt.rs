@@ -1,4 +1,4 @@
-//! MQTT 5: a source of topics, and a sink.
+//! MQTT: a source of topics, and a sink. A broker is asked for MQTT 5, and if it does not know that, for 3.1.1.
 //!
 //! A source subscribes with QoS 1 in a session that the broker keeps for a day, and acknowledges a message when what
 //! was to be stored of it is stored; what it has not acknowledged comes again after a reconnect. Its receive maximum
@@ -10,16 +10,9 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
-use rumqttc::v5::mqttbytes::QoS;
-use rumqttc::v5::mqttbytes::v5::{
-    ConnectReturnCode, Filter, Packet, PubAckReason, Publish, PublishProperties, SubscribeReasonCode,
-};
-use rumqttc::v5::{AsyncClient, ConnectionError, Event, EventLoop, MqttOptions};
-use rumqttc::{Outgoing, Transport};
 use tempfile::TempDir;
 use tokio::net::UnixListener;
 use tokio::time::Instant;
@@ -27,6 +20,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::credentials::{Credentials, PeerError};
 use super::inbox::{HeldBytes, Inlet, Outlet, inbox};
+use super::mqtt_client::{Client, Connection, Incoming, Place, Promise, Report, Version, Wishes, client};
 use super::peer::{OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
 use super::source::{Message, Settled, Source, SourceIdentity};
@@ -35,33 +29,19 @@ use crate::config::Limits;
 use crate::domain::OutboxMessage;
 use crate::exchange::{Address, Scheme};
 
-const KEEP_ALIVE: Duration = Duration::from_secs(20);
-/// How long a broker keeps the messages of a source that is away.
-const SESSION_EXPIRY_S: u32 = 86_400;
 /// What a PUBLISH packet has besides its payload, at most: topic and properties.
 const PACKET_OVERHEAD_BYTES: usize = 66_000;
 /// Messages that a sink may have under way; fewer where the broker states so.
 const PUBLISH_QUEUE: usize = 128;
 /// What a broker may send to a sink, which subscribes to nothing, bytes.
 const SINK_BYTES: usize = 64 << 10;
+/// Largest packet of a sink, bytes.
+const SINK_PACKET_BYTES: usize = 1 << 20;
 
 /// Of a broker that never answers a subscription.
 const UNCONFIRMED: &str = "the broker has not confirmed the subscription within 10 s";
 
-const NEEDS_MQTT_5: &str = "connections need MQTT 5: a broker that speaks MQTT 3.1.1 alone has to be updated, or \
-                            bridged by one that speaks both";
-
-/// What the task of a connection reports.
-enum Report {
-    Subscribed(Result<(), String>),
-    Connected,
-    Message(Publish),
-    /// A message was sent under this packet id. They are sent in the order in which they were given.
-    Sent(u16),
-    /// The broker has taken, or refused, the message of this packet id.
-    Published(u16, Result<(), String>),
-    Failed(String),
-}
+const NEEDS_MQTT: &str = "connections need MQTT 5 or 3.1.1";
 
 /// An encrypted connection that a Unix socket leads to.
 struct Bridge {
@@ -91,12 +71,11 @@ impl Bridge {
     }
 }
 
-/// The options of a connection, and the bridge that it needs, if any.
-async fn prepare(
+/// Where the broker is, and the bridge that leads to it, if any.
+async fn place(
     address: &Address,
-    client_id: &str,
     credentials: &Credentials<'_>,
-) -> Result<(MqttOptions, Option<Bridge>), PeerError> {
+) -> Result<(Place, Option<Bridge>), PeerError> {
     let bridge = match address.scheme {
         Scheme::Mqtts => Some(Bridge::open(address, credentials).await?),
         _ => None,
@@ -106,80 +85,19 @@ async fn prepare(
         None if address.host.contains(':') => format!("[{}]", address.host),
         None => address.host.clone(),
     };
-    let mut options = MqttOptions::new(client_id, host, address.port);
-    options.set_keep_alive(KEEP_ALIVE).set_connection_timeout(OPEN_TIME.as_secs());
-    if bridge.is_some() {
-        options.set_transport(Transport::unix());
-    }
-    if let Some(username) = credentials.username {
-        options.set_credentials(username, credentials.secrets.get("password").unwrap_or_default());
-    }
-    Ok((options, bridge))
-}
-
-/// Whether a broker may have failed to answer because it does not know MQTT 5: it says so, ends the connection, or
-/// sends the answer of MQTT 3.1.1, which is two bytes shorter than a packet of MQTT 5 can be.
-const fn may_lack_mqtt_5(error: &ConnectionError) -> bool {
-    use ConnectReturnCode::{RefusedProtocolVersion, UnsupportedProtocolVersion};
-    matches!(
-        error,
-        ConnectionError::MqttState(_)
-            | ConnectionError::Timeout(_)
-            | ConnectionError::ConnectionRefused(RefusedProtocolVersion | UnsupportedProtocolVersion)
-    )
-}
-
-impl Report {
-    /// Bytes that it takes up.
-    fn bytes(&self) -> usize {
-        match self {
-            Self::Message(publish) => publish.payload.len() + publish.topic.len(),
-            _ => 0,
-        }
-    }
+    Ok((Place { host, port: address.port, is_socket: bridge.is_some() }, bridge))
 }
 
 /// Drives a connection until it fails or nobody takes its reports any more. It waits while these have too many bytes, so
 /// that the broker waits, too.
-async fn drive(mut connection: EventLoop, reports: Inlet<Report>, live: Option<Arc<LiveConnection>>) {
+async fn drive(mut connection: Connection, reports: Inlet<Report>, live: Option<Arc<LiveConnection>>) {
     let mut is_connected = false;
     loop {
-        let report = match connection.poll().await {
-            Ok(Event::Incoming(Packet::Publish(publish))) => {
-                // Nothing of them is used, and they may be as large as the packet.
-                Report::Message(Publish { properties: None, ..publish })
-            }
-            Ok(Event::Incoming(Packet::ConnAck(_))) => {
-                is_connected = true;
-                Report::Connected
-            }
-            Ok(Event::Incoming(Packet::PubAck(ack))) => {
-                let is_taken =
-                    matches!(ack.reason, PubAckReason::Success | PubAckReason::NoMatchingSubscribers);
-                let refused = || format!("the broker refuses the message: {:?}", ack.reason);
-                Report::Published(ack.pkid, if is_taken { Ok(()) } else { Err(refused()) })
-            }
-            Ok(Event::Outgoing(Outgoing::Publish(id))) => Report::Sent(id),
-            Ok(Event::Incoming(Packet::SubAck(answer))) => {
-                let refused = answer
-                    .return_codes
-                    .iter()
-                    .find(|code| !matches!(code, SubscribeReasonCode::Success(_)))
-                    .map(|code| format!("the broker refuses a topic: {code:?}"));
-                Report::Subscribed(refused.map_or(Ok(()), Err))
-            }
-            Ok(Event::Incoming(Packet::Disconnect(reason))) => {
-                Report::Failed(format!("the broker ends the connection: {:?}", reason.reason_code))
-            }
-            Ok(_) => continue,
-            Err(error) if !is_connected && may_lack_mqtt_5(&error) => {
-                Report::Failed(format!("{error}; {NEEDS_MQTT_5}"))
-            }
-            Err(error) => Report::Failed(error.to_string()),
-        };
-        let has_failed = matches!(report, Report::Failed(_));
+        let Some(report) = connection.next(is_connected).await else { continue };
+        is_connected |= matches!(report, Report::Connected);
+        let is_end = report.is_end();
         // Messages of QoS 0 are bounded by nothing: those beyond the queue are lost, as QoS 0 allows.
-        let may_be_lost = matches!(&report, Report::Message(publish) if publish.qos == QoS::AtMostOnce);
+        let may_be_lost = matches!(&report, Report::Message(message) if message.promise.is_none());
         let bytes = report.bytes();
         if may_be_lost {
             if !reports.try_put(report, bytes)
@@ -187,7 +105,7 @@ async fn drive(mut connection: EventLoop, reports: Inlet<Report>, live: Option<A
             {
                 live.update(|status| status.lost += 1);
             }
-        } else if !reports.put(report, bytes).await || has_failed {
+        } else if !reports.put(report, bytes).await || is_end {
             return;
         }
     }
@@ -195,27 +113,54 @@ async fn drive(mut connection: EventLoop, reports: Inlet<Report>, live: Option<A
 
 /// An open connection to a broker.
 struct Link {
-    client: AsyncClient,
+    client: Client,
     reports: Outlet<Report>,
     _driving: AbortOnDropHandle<()>,
     _bridge: Option<Bridge>,
 }
 
 impl Link {
-    /// With at most `queue` messages and `bytes` of them that nobody has taken yet.
+    /// With at most as many messages as are wished, and `bytes` of them, that nobody has taken yet.
     async fn open(
-        (options, bridge): (MqttOptions, Option<Bridge>),
-        (queue, bytes): (usize, usize),
-        live: Option<Arc<LiveConnection>>,
+        address: &Address,
+        credentials: &Credentials<'_>,
+        wishes: &Wishes,
+        bytes: usize,
+        live: Option<&Arc<LiveConnection>>,
     ) -> Result<Self, PeerError> {
-        let (client, connection) = AsyncClient::new(options, queue);
+        let mut unknown = Vec::new();
+        for version in [Version::Five, Version::ThreeOneOne] {
+            let open = Self::open_version(version, address, credentials, wishes, bytes, live);
+            match within(OPEN_TIME, open).await {
+                Ok(Ok(link)) => return Ok(link),
+                Ok(Err(reason)) => unknown.push(reason),
+                Err(error) if unknown.is_empty() => return Err(error),
+                Err(PeerError(reason)) => unknown.push(reason),
+            }
+        }
+        Err(PeerError(format!("{}; {NEEDS_MQTT}", unknown.join("; then: "))))
+    }
+
+    /// The inner error is that of a broker that does not know the version.
+    async fn open_version(
+        version: Version,
+        address: &Address,
+        credentials: &Credentials<'_>,
+        wishes: &Wishes,
+        bytes: usize,
+        live: Option<&Arc<LiveConnection>>,
+    ) -> Result<Result<Self, String>, PeerError> {
+        let (place, bridge) = place(address, credentials).await?;
+        let (client, connection) = client(version, &place, wishes, credentials);
         // Acknowledgements of subscriptions and of the connection come besides the messages.
-        let (reports_in, reports) = inbox(2 * queue + 16, bytes);
-        let driving = AbortOnDropHandle::new(tokio::spawn(drive(connection, reports_in, live)));
+        let (reports_in, reports) = inbox(2 * wishes.queue + 16, bytes);
+        let driving = AbortOnDropHandle::new(tokio::spawn(drive(connection, reports_in, live.cloned())));
         let mut link = Self { client, reports, _driving: driving, _bridge: bridge };
         loop {
-            if let (Report::Connected, _) = link.report().await? {
-                return Ok(link);
+            match link.report().await?.0 {
+                Report::Connected => return Ok(Ok(link)),
+                Report::UnknownVersion(reason) => return Ok(Err(reason)),
+                _ => {}
             }
         }
     }
@@ -233,10 +178,10 @@ impl Link {
 pub(super) struct MqttSource {
     link: Link,
     /// Messages that came before the subscription was confirmed, from the session that the broker has kept.
-    early: VecDeque<(Publish, HeldBytes)>,
+    early: VecDeque<(Incoming, HeldBytes)>,
     /// Until when the subscription must be confirmed; `None` once it is.
     confirmed_by: Option<Instant>,
-    unsettled: HashMap<u64, Publish>,
+    unsettled: HashMap<u64, Promise>,
     last_receipt: u64,
 }
 
@@ -248,21 +193,18 @@ impl MqttSource {
         identity: &SourceIdentity,
         (limits, live): (&Limits, &Arc<LiveConnection>),
     ) -> Result<Self, PeerError> {
-        let (mut options, bridge) = prepare(address, &identity.client_id, credentials).await?;
         let queue = limits.connection_queue.min(usize::from(u16::MAX));
-        let packet_bytes = limits.connection_message_bytes.saturating_add(PACKET_OVERHEAD_BYTES);
-        options
-            .set_manual_acks(true)
-            .set_clean_start(!identity.is_lasting)
-            .set_session_expiry_interval(identity.is_lasting.then_some(SESSION_EXPIRY_S))
-            .set_receive_maximum(u16::try_from(queue).ok())
-            .set_max_packet_size(u32::try_from(packet_bytes).ok());
-        let filters: Vec<Filter> =
-            topics.iter().map(|topic| Filter::new(topic.as_str(), QoS::AtLeastOnce)).collect();
+        let wishes = Wishes {
+            client_id: identity.client_id.clone(),
+            is_kept: identity.is_lasting,
+            receive_maximum: u16::try_from(queue).ok(),
+            max_packet_bytes: limits.connection_message_bytes.saturating_add(PACKET_OVERHEAD_BYTES),
+            queue,
+        };
+        let bytes = limits.connection_queue_bytes;
+        let link = Link::open(address, credentials, &wishes, bytes, Some(live)).await?;
         let open = async {
-            let bytes = limits.connection_queue_bytes;
-            let link = Link::open((options, bridge), (queue, bytes), Some(live.clone())).await?;
-            link.client.subscribe_many(filters).await.map_err(|error| PeerError(error.to_string()))?;
+            link.client.subscribe(topics).await?;
             let mut source = Self {
                 link,
                 early: VecDeque::new(),
@@ -292,9 +234,9 @@ impl MqttSource {
     }
 
     /// What the broker sends next, if it is a message.
-    async fn message(&mut self) -> Result<Option<(Publish, HeldBytes)>, PeerError> {
+    async fn message(&mut self) -> Result<Option<(Incoming, HeldBytes)>, PeerError> {
         match self.link.report().await? {
-            (Report::Message(publish), held) => return Ok(Some((publish, held))),
+            (Report::Message(message), held) => return Ok(Some((message, held))),
             (Report::Subscribed(confirmed), _) => {
                 confirmed.map_err(PeerError)?;
                 self.confirmed_by = None;
@@ -304,7 +246,7 @@ impl MqttSource {
         Ok(None)
     }
 
-    async fn next_message(&mut self) -> Result<(Publish, HeldBytes), PeerError> {
+    async fn next_message(&mut self) -> Result<(Incoming, HeldBytes), PeerError> {
         if let Some(early) = self.early.pop_front() {
             return Ok(early);
         }
@@ -332,23 +274,18 @@ impl MqttSource {
 impl Source for MqttSource {
     fn next(&mut self) -> BoxFuture<'_, Result<Message, PeerError>> {
         Box::pin(async {
-            let (mut publish, _held) = self.next_message().await?;
+            let (Incoming { topic, payload, promise }, _held) = self.next_message().await?;
             self.last_receipt += 1;
-            let (payload, topic) = (std::mem::take(&mut publish.payload), std::mem::take(&mut publish.topic));
-            let subject = String::from_utf8_lossy(&topic).into_owned();
-            if publish.qos != QoS::AtMostOnce {
-                // Its number alone is acknowledged.
-                self.unsettled.insert(self.last_receipt, publish);
-            }
-            Ok(Message::new(self.last_receipt, subject, payload))
+            self.unsettled.extend(promise.map(|promise| (self.last_receipt, promise)));
+            Ok(Message::new(self.last_receipt, topic, payload))
         })
     }
 
     fn settle(&mut self, settled: Vec<Settled>) -> BoxFuture<'_, Result<(), PeerError>> {
         Box::pin(async move {
             for Settled { receipt, .. } in settled {
-                if let Some(publish) = self.unsettled.remove(&receipt) {
-                    self.link.client.ack(&publish).await.map_err(|error| PeerError(error.to_string()))?;
+                if let Some(promise) = self.unsettled.remove(&receipt) {
+                    self.link.client.acknowledge(&promise).await?;
                 }
             }
             Ok(())
@@ -369,25 +306,21 @@ impl MqttSink {
         client_id: &str,
         media_type: &'static str,
     ) -> Result<Self, PeerError> {
-        let (mut options, bridge) = prepare(address, client_id, credentials).await?;
-        options.set_clean_start(true);
-        let link =
-            within(OPEN_TIME, Link::open((options, bridge), (PUBLISH_QUEUE, SINK_BYTES), None)).await?;
+        let wishes = Wishes {
+            client_id: client_id.to_owned(),
+            is_kept: false,
+            receive_maximum: None,
+            max_packet_bytes: SINK_PACKET_BYTES,
+            queue: PUBLISH_QUEUE,
+        };
+        let link = Link::open(address, credentials, &wishes, SINK_BYTES, None).await?;
         Ok(Self { link, media_type })
     }
 
     async fn publish(&self, message: &OutboxMessage) -> Result<(), PeerError> {
-        let properties = PublishProperties {
-            content_type: Some(self.media_type.to_owned()),
-            user_properties: vec![("message-id".to_owned(), message.message_id.clone())],
-            ..PublishProperties::default()
-        };
         let payload = Bytes::copy_from_slice(&message.payload);
-        self.link
-            .client
-            .publish_with_properties(&message.subject, QoS::AtLeastOnce, false, payload, properties)
-            .await
-            .map_err(|error| PeerError(error.to_string()))
+        let OutboxMessage { subject, message_id, .. } = message;
+        self.link.client.publish(subject, payload, self.media_type, message_id).await
     }
 }
 

@@ -10,7 +10,9 @@ use super::sink::Outcomes;
 use super::source::{Settled, SourceIdentity};
 use crate::app::{App, ConnectionState, LastMessage, connection_settings};
 use crate::domain::{CameraId, Connection, OutboxMessage, Result, TargetId};
-use crate::exchange::{MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, decoder};
+use crate::exchange::{
+    MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, source_decoder,
+};
 use crate::geo::{PlaneCovariance, Position};
 
 /// How often the status of a running source is looked at.
@@ -86,8 +88,9 @@ async fn try_source(
     let mut source = open::source(app, connection, settings, secrets, &identity, &live).await?;
     let message = source.next().await?;
     let now = app.clock.now();
-    let context = MessageContext { received_at: now, time_bounds: app.live_time_bounds(now) };
-    let reading = match decoder(settings.format).decode(&message.payload, &context) {
+    let time_bounds = app.live_time_bounds(now);
+    let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
+    let reading = match source_decoder(settings).decode(&message.payload, &context) {
         Ok(read) => {
             let skipped = read.skipped.iter().map(|reason| format!("skipped: {reason}"));
             read.items.iter().map(describe).chain(skipped).take(32).collect()

@@ -23,7 +23,8 @@ use crate::app::access::{Caller, Permission, RoutePermission};
 use crate::domain::{Error, Result};
 use crate::telemetry::{MatchedRoute, Route};
 
-/// The query parameters of the operations, as the description names them.
+/// The query parameters of the operations, as the description names them. Missing are operations that take any: those
+/// with a parameter that is exploded.
 struct QueryParameters(HashMap<(String, String), HashSet<String>>);
 
 impl QueryParameters {
@@ -39,13 +40,15 @@ impl QueryParameters {
             ];
             for (method, operation) in operations {
                 let Some(operation) = operation else { continue };
-                let names = operation.parameters.iter().flatten().filter_map(|parameter| match parameter {
-                    RefOr::T(parameter) if parameter.parameter_in == ParameterIn::Query => {
-                        Some(parameter.name.clone())
-                    }
+                let known = operation.parameters.iter().flatten().filter_map(|parameter| match parameter {
+                    RefOr::T(parameter) if parameter.parameter_in == ParameterIn::Query => Some(parameter),
                     _ => None,
                 });
-                parameters.insert((template.clone(), method.to_owned()), names.collect());
+                let known: Vec<_> = known.collect();
+                if known.iter().all(|parameter| parameter.explode.is_none()) {
+                    let names = known.into_iter().map(|parameter| parameter.name.clone()).collect();
+                    parameters.insert((template.clone(), method.to_owned()), names);
+                }
             }
         }
         Self(parameters)

@@ -19,7 +19,7 @@ use super::etag::{self, unless_known, with_etag};
 use super::extract::{ConnectionPath, JsonBody, Params};
 use super::merge_patch::{self, JsonObject};
 use super::problem::{ApiError, ApiResult, Problem};
-use super::wire::{created, empty, json};
+use super::wire::{created, empty, json, json_text};
 use crate::app::{App, ConnectionRequest, ConnectionState, connection_settings};
 use crate::connect::try_connection;
 use crate::domain::{self, Error, Result};
@@ -37,7 +37,8 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(create_connection, list_connections))
         .routes(routes!(get_connection, change_connection, delete_connection))
         .routes(routes!(test_connection))
-        .routes(routes!(push_message))
+        .routes(routes!(push_message, push_query))
+        .routes(routes!(push_message_with_key, push_query_with_key))
         .routes(routes!(list_dead_letters, delete_dead_letters))
         .routes(routes!(retry_dead_letters))
 }
@@ -467,41 +468,121 @@ async fn test_connection(
     Ok(json(&Trial { message: tried.message.map(Into::into), error: tried.error })?)
 }
 
-/// A message of any type, up to the limit of messages.
-struct MessageBody(Bytes);
+/// A message of any type, up to the limit of messages: the body, or the query of a request without one.
+struct PushedBody(Bytes);
 
-impl FromRequest<Rest> for MessageBody {
+impl FromRequest<Rest> for PushedBody {
     type Rejection = ApiError;
 
     async fn from_request(request: Request, rest: &Rest) -> ApiResult<Self> {
         let (parts, content) = request.into_parts();
         let limit = rest.app.limits.connection_message_bytes;
-        Ok(Self(body::whole(&parts.headers, content, limit).await?))
+        let content = body::whole(&parts.headers, content, limit).await?;
+        Ok(Self(match parts.uri.query() {
+            Some(query) if content.is_empty() => Bytes::copy_from_slice(query.as_bytes()),
+            _ => content,
+        }))
     }
+}
+
+/// Hands a message in, and answers as its application expects.
+async fn taken(
+    CallerApp(app): CallerApp,
+    ConnectionPath(id): ConnectionPath,
+    PushedBody(message): PushedBody,
+) -> ApiResult {
+    let answer = app.push_message(&id, message).await?;
+    Ok(answer.map_or_else(empty, json_text))
 }
 
 /// Hand a message to a source
 ///
-/// For a source whose address is `push:`, such as the target of Traccar's forwarder. The body is one message of the
+/// For a source whose address is `push:`, such as the target of Traccar's forwarder or of a phone. The body is one message of the
 /// source's format, whatever its content type; the answer comes when what was to be stored of it is stored. A key of
 /// the role `edge` must be for all cameras that the connection names.
 #[utoipa::path(
     post, path = "/v1/connections/{connection}/messages", tag = "connections",
-    params(("connection" = String, Path, description = "The connection's id")),
+    params(
+        ("connection" = String, Path, description = "The connection's id"),
+        ("parameters" = HashMap<String, String>, Query, style = Form, explode, nullable,
+            description = "The message itself, of any names, where there is no body"),
+    ),
     request_body(content = String, description = "A message of the source's format", content_type = "*/*"),
     responses(
+        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
         (status = 204, description = "It was taken"),
         (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn push_message(
-    CallerApp(app): CallerApp,
-    ConnectionPath(id): ConnectionPath,
-    MessageBody(payload): MessageBody,
-) -> ApiResult {
-    app.push_message(&id, payload).await?;
-    Ok(empty())
+async fn push_message(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
+    taken(app, id, message).await
+}
+
+/// Hand the message of a query to a source
+///
+/// For applications that can do nothing but fetch an address: the query is the message, such as `lat=30.6&lon=103.9`.
+#[utoipa::path(
+    get, path = "/v1/connections/{connection}/messages", tag = "connections",
+    params(
+        ("connection" = String, Path, description = "The connection's id"),
+        ("parameters" = HashMap<String, String>, Query, style = Form, explode, nullable,
+            description = "The message itself, of any names, such as `lat` and `lon`"),
+    ),
+    responses(
+        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
+        (status = 204, description = "It was taken"),
+        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn push_query(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
+    taken(app, id, message).await
+}
+
+/// Hand a message to a source, with the key in the path
+///
+/// For applications that cannot set headers. The log and the metrics of the server do not show the key; those of a proxy may.
+#[utoipa::path(
+    post, path = "/v1/connections/{connection}/messages/{key}", tag = "connections",
+    params(
+        ("connection" = String, Path, description = "The connection's id"),
+        ("key" = String, Path, description = "The secret of a key"),
+        ("parameters" = HashMap<String, String>, Query, style = Form, explode, nullable,
+            description = "The message itself, of any names, where there is no body"),
+    ),
+    request_body(content = String, description = "A message of the source's format", content_type = "*/*"),
+    responses(
+        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
+        (status = 204, description = "It was taken"),
+        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn push_message_with_key(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
+    taken(app, id, message).await
+}
+
+/// Hand the message of a query to a source, with the key in the path
+///
+/// For applications that can do nothing but fetch an address.
+#[utoipa::path(
+    get, path = "/v1/connections/{connection}/messages/{key}", tag = "connections",
+    params(
+        ("connection" = String, Path, description = "The connection's id"),
+        ("key" = String, Path, description = "The secret of a key"),
+        ("parameters" = HashMap<String, String>, Query, style = Form, explode, nullable,
+            description = "The message itself, of any names, such as `lat` and `lon`"),
+    ),
+    responses(
+        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
+        (status = 204, description = "It was taken"),
+        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn push_query_with_key(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
+    taken(app, id, message).await
 }
 
 /// List the messages of a sink that are not tried any more

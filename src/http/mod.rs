@@ -49,6 +49,7 @@ mod training_runs;
 mod wire;
 mod world_tracks;
 
+use std::borrow::Cow;
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 
@@ -192,6 +193,23 @@ pub fn class(method: &Method, path: &str) -> RequestClass {
             _ => RequestClass::Other,
         },
         _ => RequestClass::Other,
+    }
+}
+
+/// The key at the end of a path, of clients that cannot set headers: `/v1/connections/{connection}/messages/{key}`.
+#[must_use]
+pub fn path_key(path: &str) -> Option<&str> {
+    let (messages, key) = path.rsplit_once('/')?;
+    let connection = messages.strip_prefix("/v1/connections/")?.strip_suffix("/messages")?;
+    (!connection.contains('/') && !key.is_empty()).then_some(key)
+}
+
+/// A path as it may be shown: without its key.
+#[must_use]
+pub fn shown_path(path: &str) -> Cow<'_, str> {
+    match path_key(path).and_then(|key| path.strip_suffix(key)) {
+        Some(before) => format!("{before}{{key}}").into(),
+        None => path.into(),
     }
 }
 

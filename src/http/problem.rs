@@ -15,6 +15,7 @@ use hyper::{Method, StatusCode, Uri};
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::shown_path;
 use crate::domain::{Error, ErrorKind, Refusal};
 use crate::status;
 use crate::telemetry::RequestId;
@@ -164,7 +165,7 @@ impl Refused {
         };
         let error = if self.uri.path().starts_with(FEATURES) { as_query_error(&error) } else { error };
         let id = self.id.unwrap_or_else(|| RequestId::new(HeaderValue::from_static("none")));
-        let mut problem = response(&error, &id, Some(self.uri.path()));
+        let mut problem = response(&error, &id, Some(&shown_path(self.uri.path())));
         if let Some(location) = location(&error, &self.uri) {
             problem.headers_mut().insert(LOCATION, location);
         }

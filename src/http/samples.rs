@@ -17,12 +17,12 @@ use super::access::CallerApp;
 use super::extract::{CameraPath, Params, layout_of, media_type, negotiate, not_read};
 use super::idempotency::idempotent;
 use super::problem::{ApiResult, Problem};
-use super::wire::{BoxForm, BoxUnit, Durability, OnConflict, json};
+use super::wire::{Durability, OnConflict, json};
 use super::{Rest, body};
 use crate::app::{App, ImportOptions, ImportReport};
 use crate::domain::{self, CameraId, Error, Result, StoredSample, TargetId, TimeRange};
 use crate::exchange::wire;
-use crate::exchange::{CsvLayout, Format, SampleWriter, write_cursor};
+use crate::exchange::{BoxForm, BoxUnit, CsvLayout, Format, SampleWriter, write_cursor};
 use crate::store::{SampleFilter, SampleKey};
 
 /// Samples read from the store at once for an export.

@@ -94,30 +94,6 @@ pub(super) enum OnConflict {
     Replace,
 }
 
-/// What the columns of a box hold in a CSV file.
-#[derive(ToSchema)]
-#[schema(rename_all = "snake_case")]
-#[expect(dead_code, reason = "the values of a parameter, for the description alone")]
-pub(super) enum BoxForm {
-    /// Left, top, width, height.
-    LeftTop,
-    /// Centre x, centre y, width, height.
-    Centre,
-    /// Left, top, right, bottom.
-    Corners,
-}
-
-/// Unit of the sides of boxes in a CSV file.
-#[derive(ToSchema)]
-#[schema(rename_all = "snake_case")]
-#[expect(dead_code, reason = "the values of a parameter, for the description alone")]
-pub(super) enum BoxUnit {
-    /// Pixels.
-    Px,
-    /// Shares of the image's width and height.
-    Share,
-}
-
 /// When stored samples are acknowledged.
 #[derive(Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -200,6 +176,13 @@ fn insert(response: &mut Response, name: impl IntoHeaderName, value: &str) -> Re
     let value = HeaderValue::from_str(value).map_err(Error::fault)?;
     response.headers_mut().insert(name, value);
     Ok(())
+}
+
+/// An answer of JSON that is written already.
+pub(super) fn json_text(text: &'static str) -> Response {
+    let mut response = Response::new(Body::from(text));
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
+    response
 }
 
 /// An answer without a body.

@@ -1,10 +1,12 @@
 //! What a request presents: a key, a browser's session, or the certificate of its connection.
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use hyper::Request;
 use hyper::header::AUTHORIZATION;
 
 use crate::app::access::{CertificateHolder, Credential};
-use crate::http::session_token;
+use crate::http::{path_key, session_token};
 
 /// The credential of a request. A key is stronger than a session, and a session than a certificate, so that
 /// what the request names explicitly identifies the caller.
@@ -16,18 +18,30 @@ pub(super) fn credential<'r, B>(
 ) -> Credential<'r> {
     let mut headers = request.headers().get_all(AUTHORIZATION).iter();
     if let Some(header) = headers.next() {
-        let parts = header.to_str().ok().and_then(|text| text.split_once(' '));
-        return match parts {
-            Some((scheme, key)) if scheme.eq_ignore_ascii_case("bearer") && headers.next().is_none() => {
-                Credential::Key(key.trim())
+        let parts = header.to_str().ok().filter(|_| headers.next().is_none());
+        return match parts.and_then(|text| text.split_once(' ')) {
+            Some((scheme, key)) if scheme.eq_ignore_ascii_case("bearer") => {
+                Credential::Key(key.trim().into())
+            }
+            Some((scheme, encoded)) if scheme.eq_ignore_ascii_case("basic") => {
+                password(encoded.trim()).map_or(Credential::Unreadable, |key| Credential::Key(key.into()))
             }
             _ => Credential::Unreadable,
         };
+    }
+    if !is_grpc && let Some(key) = path_key(request.uri().path()) {
+        return Credential::Key(key.into());
     }
     if !is_grpc && let Some(token) = session_token(request.headers(), is_tls) {
         return Credential::Session(token);
     }
     certificate.map_or(Credential::None, Credential::Certificate)
+}
+
+/// The password of Basic authentication (RFC 7617): the key, of clients that can send nothing else.
+fn password(encoded: &str) -> Option<String> {
+    let pair = String::from_utf8(STANDARD.decode(encoded).ok()?).ok()?;
+    pair.split_once(':').map(|(_, password)| password.to_owned())
 }
 
 #[cfg(test)]
@@ -70,7 +84,10 @@ mod tests {
         assert_eq!(shown_over(&[own], true, false), "session t1");
         assert_eq!(shown_over(&[cookie], true, false), "Certificate", "another host can set it");
         assert_eq!(shown(&[cookie, ("authorization", "bearer  k")], false), "key k");
-        assert_eq!(shown(&[("authorization", "Basic eDp5")], false), "Unreadable");
+        assert_eq!(shown(&[("authorization", "Basic eDp5")], false), "key y", "x:y");
+        for wrong in ["Basic eA==", "Basic =", "Digest eDp5"] {
+            assert_eq!(shown(&[("authorization", wrong)], false), "Unreadable", "{wrong}");
+        }
         assert_eq!(
             shown(&[("authorization", "Bearer a"), ("authorization", "Bearer b")], true),
             "Unreadable"

@@ -145,7 +145,7 @@ impl RequestPipeline {
         let id = self.request_id(&request);
         let counted = self.begin_count(&request);
         let span = tracing::debug_span!(
-            target: REQUESTS, "request", id = %id, method = %request.method(), path = request.uri().path(), key = Empty
+            target: REQUESTS, "request", id = %id, method = %request.method(), path = &*http::shown_path(request.uri().path()), key = Empty
         );
         #[cfg(feature = "otel")]
         crate::telemetry::continue_trace(&span, request.headers());

@@ -7,6 +7,7 @@ mod files;
 mod kafka;
 mod messages;
 pub(crate) mod peers;
+mod phones;
 mod receivers;
 mod resource;
 mod sinks;

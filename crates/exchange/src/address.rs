@@ -114,6 +114,8 @@ pub struct Address {
     pub host: String,
     /// Its port.
     pub port: u16,
+    /// Further machines of a cluster of Kafka, each with its port.
+    pub others: Vec<(String, u16)>,
     /// Path and query, from `/` on, of a webhook or a serial device.
     pub path: String,
 }
@@ -128,7 +130,7 @@ impl Address {
         check_text("address", text, MAX_ADDRESS_BYTES)?;
         let mut bare = Scheme::BARE.into_iter().filter(|scheme| schemes.contains(scheme));
         if let Some(scheme) = bare.find(|scheme| text == format!("{}:", scheme.as_str())) {
-            return Ok(Self { scheme, host: String::new(), port: 0, path: String::new() });
+            return Ok(Self::without_host(scheme, String::new()));
         }
         let named = text.split_once("://").and_then(|(name, rest)| {
             Some((
@@ -141,7 +143,7 @@ impl Address {
             return Err(invalid(format!("must begin with one of {}", known.join(", "))));
         };
         if scheme == Scheme::Serial {
-            let address = Self { scheme, host: String::new(), port: 0, path: rest.to_owned() };
+            let address = Self::without_host(scheme, rest.to_owned());
             return address.serial_line().map(|_| address);
         }
         let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
@@ -155,25 +157,18 @@ impl Address {
         if path.contains(|it: char| it.is_whitespace() || !it.is_ascii()) {
             return Err(invalid("must be ASCII without spaces".to_owned()));
         }
-        let (host, port) = match authority.rsplit_once(':') {
-            Some((host, port)) if !port.ends_with(']') => {
-                let port = port.parse().ok().filter(|port| *port > 0);
-                (host, Some(port.ok_or_else(|| invalid("has no port from 1 to 65535".to_owned()))?))
-            }
-            _ => (authority, None),
-        };
-        let host = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
-        let is_host = |byte: u8| byte.is_ascii_alphanumeric() || b".-_:".contains(&byte);
-        if host.is_empty() || !host.bytes().all(is_host) {
-            return Err(invalid("has no host".to_owned()));
+        let mut hosts = authority.split(',').map(|authority| host_and_port(authority, scheme));
+        let (host, port) = hosts.next().ok_or_else(|| invalid("has no host".to_owned()))??;
+        let others = hosts.collect::<Result<Vec<_>>>()?;
+        if !others.is_empty() && !scheme.is_kafka() {
+            return Err(invalid("may name several hosts for Kafka alone".to_owned()));
         }
-        let port = port.or(scheme.default_port());
-        Ok(Self {
-            scheme,
-            host: host.to_owned(),
-            port: port.ok_or_else(|| invalid("must name a port, as in HOST:PORT".to_owned()))?,
-            path: if path.is_empty() { "/".to_owned() } else { path.to_owned() },
-        })
+        let path = if path.is_empty() { "/".to_owned() } else { path.to_owned() };
+        Ok(Self { scheme, host, port, others, path })
+    }
+
+    const fn without_host(scheme: Scheme, path: String) -> Self {
+        Self { scheme, host: String::new(), port: 0, others: Vec::new(), path }
     }
 
     /// The serial device of an address such as `serial:///dev/ttyUSB0?baud=4800`.
@@ -201,6 +196,25 @@ impl Address {
         })?;
         Ok(SerialLine { path: path.into(), baud })
     }
+}
+
+/// A host without the brackets of IPv6, and its port or that of the scheme.
+fn host_and_port(authority: &str, scheme: Scheme) -> Result<(String, u16)> {
+    let invalid = |message: &str| Error::invalid("address", message);
+    let (host, port) = match authority.rsplit_once(':') {
+        Some((host, port)) if !port.ends_with(']') => {
+            let port = port.parse().ok().filter(|port| *port > 0);
+            (host, Some(port.ok_or_else(|| invalid("has no port from 1 to 65535"))?))
+        }
+        _ => (authority, None),
+    };
+    let host = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
+    let is_host = |byte: u8| byte.is_ascii_alphanumeric() || b".-_:".contains(&byte);
+    if host.is_empty() || !host.bytes().all(is_host) {
+        return Err(invalid("has no host"));
+    }
+    let port = port.or(scheme.default_port());
+    Ok((host.to_owned(), port.ok_or_else(|| invalid("must name a port, as in HOST:PORT"))?))
 }
 
 /// A serial device with the speed of its line.

@@ -9,12 +9,16 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::address::{Address, Scheme};
-use super::messages::MessageFormat;
+use super::messages::{JsonMapping, MessageFormat};
 use super::track_files::TrackFileFormat;
-use crate::domain::{CameraId, Error, ImageSize, ReceiverId, Result, TargetId, check_text};
+use crate::domain::{
+    CameraId, Error, ImageSize, ReceiverId, Result, Score, TargetClass, TargetId, check_text,
+};
 
 /// Cameras that a connection may name.
 const MAX_CAMERAS: usize = 1_024;
+/// Classes that a source may take.
+const MAX_CLASSES: usize = 64;
 /// Topics that a source may subscribe to.
 const MAX_TOPICS: usize = 64;
 
@@ -89,11 +93,32 @@ pub enum SaslMechanism {
     ScramSha512,
 }
 
+/// What names the receiver of fixes whose messages name none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ReceiverFrom {
+    /// The setting `receiver_id`.
+    #[default]
+    Connection,
+    /// The sender: the address without its port, the topic, or the name of the key.
+    Sender,
+    /// The two letters at the beginning of an NMEA sentence, such as `GP`.
+    Talker,
+}
+
+impl ReceiverFrom {
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+    const fn is_connection(&self) -> bool {
+        matches!(self, Self::Connection)
+    }
+}
+
 /// Where detections or fixes come from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SourceSettings {
-    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]` and `kafkas://HOST[:9093]` subscribe; `tcp://`,
+    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]` and `kafkas://HOST[:9093]` subscribe, Kafka to a
+    /// cluster of several hosts with commas between them; `tcp://`,
     /// `tls://` and `gpsd://HOST[:2947]` connect and read lines; `serial:///dev/DEVICE?baud=4800` reads lines of a serial
     /// device of the server's machine; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
     /// `POST /v1/connections/{connection}/messages`.
@@ -125,6 +150,20 @@ pub struct SourceSettings {
     /// The receiver of fixes whose messages name none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub receiver_id: Option<String>,
+    /// What names the receiver of fixes whose messages name none.
+    #[serde(default, skip_serializing_if = "ReceiverFrom::is_connection")]
+    pub receiver_from: ReceiverFrom,
+    /// Where the values of messages of the format `json` are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mapping: Option<JsonMapping>,
+    /// Classes of detections that are taken, in either case; all if empty. One without a class is taken.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schema(max_items = 64, example = json!(["person"]))]
+    pub classes: Vec<String>,
+    /// Least score of detections that are taken. One without a score is taken.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.0, maximum = 1.0)]
+    pub least_score: Option<f64>,
     /// Whether boxes and fixes are paired and stored as samples. The peer's messages are acknowledged when that is done.
     #[serde(default)]
     pub store_samples: bool,
@@ -296,18 +335,19 @@ impl ConnectionSettings {
         Ok(())
     }
 
-    /// Whether the peer is the same as by other settings: direction, scheme, host and port.
+    /// Whether the peer is the same as by other settings: direction, scheme, hosts and ports.
     #[must_use]
     pub fn has_peer_of(&self, other: &Self) -> bool {
         self.peer().is_some_and(|peer| other.peer() == Some(peer))
     }
 
-    fn peer(&self) -> Option<(bool, Scheme, String, u16)> {
+    /// Direction, and the address without its path.
+    fn peer(&self) -> Option<(bool, Address)> {
         let address = match (&self.source, &self.sink) {
             (Some(source), _) => source.address(),
             (None, sink) => sink.as_ref()?.address(),
         };
-        address.ok().map(|it| (self.source.is_some(), it.scheme, it.host, it.port))
+        address.ok().map(|it| (self.source.is_some(), Address { path: String::new(), ..it }))
     }
 }
 
@@ -334,7 +374,8 @@ impl SourceSettings {
         }
         check_username(self.username.as_deref())?;
         check_sasl(self.sasl_mechanism, address.scheme, self.username.as_deref())?;
-        if self.format.brings_fixes() && self.camera_ids.is_empty() {
+        self.check_items()?;
+        if self.brings_fixes() && self.camera_ids.is_empty() {
             return Err(Error::invalid("camera_ids", "must name the cameras that the fixes are for"));
         }
         if address.scheme == Scheme::Gpsd && self.format != MessageFormat::Gpsd {
@@ -355,10 +396,35 @@ impl SourceSettings {
         Ok(())
     }
 
+    /// Whether its messages contain fixes, not detections.
+    fn brings_fixes(&self) -> bool {
+        self.mapping.as_ref().map_or_else(|| self.format.brings_fixes(), JsonMapping::brings_fixes)
+    }
+
+    /// Checks what is read of messages and what is taken of that.
+    fn check_items(&self) -> Result<()> {
+        if (self.format == MessageFormat::Json) != self.mapping.is_some() {
+            return Err(Error::invalid("mapping", "is required for the format json, and for no other"));
+        }
+        let mapped = self.mapping.as_ref().map_or(Ok(()), JsonMapping::check);
+        mapped.map_err(|error| error.under("mapping"))?;
+        if self.receiver_from == ReceiverFrom::Talker && self.format != MessageFormat::Nmea {
+            return Err(Error::invalid("receiver_from", "can be talker for the format nmea alone"));
+        }
+        if self.classes.len() > MAX_CLASSES {
+            return Err(Error::invalid("classes", "must be at most 64"));
+        }
+        for class in &self.classes {
+            TargetClass::new(class).map_err(|error| error.at("classes"))?;
+        }
+        self.least_score.map(Score::new).transpose().map_err(|error| error.at("least_score"))?;
+        Ok(())
+    }
+
     /// Whether a message may name a camera that the settings do not: then the name is the id of a camera.
     #[must_use]
     pub fn names_any_camera(&self) -> bool {
-        !self.format.brings_fixes() && !self.cameras.contains_key("*")
+        !self.brings_fixes() && !self.cameras.contains_key("*")
     }
 
     /// The cameras that fixes are for.

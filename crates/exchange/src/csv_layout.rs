@@ -4,7 +4,9 @@
 use std::collections::HashMap;
 use std::sync::LazyLock;
 
+use serde::{Deserialize, Serialize};
 use strum::{EnumString, IntoStaticStr};
+use utoipa::ToSchema;
 
 use super::columns::{COLUMNS, LEFT, WIDTH, index_of};
 use crate::domain::{Error, ImageSize, Result, TargetId};
@@ -14,7 +16,7 @@ use crate::domain::{Error, ImageSize, Result, TargetId};
 ///
 /// With other columns than the documented ones, the separator is that of `;`, tab, `,` and `|` that the header
 /// has most of, numbers may have a decimal comma where it is not the separator, a time that is a bare number
-/// is Unix time (in seconds below 1e11, else in milliseconds), and columns that nothing asks for are ignored.
+/// is Unix time (in seconds, milliseconds, microseconds or nanoseconds, by its size), and columns that nothing asks for are ignored.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CsvLayout {
     /// Which columns hold the values.
@@ -40,7 +42,8 @@ pub enum ColumnNames {
 }
 
 /// What the four columns of a box hold.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_box_form)]
 pub enum BoxForm {
     /// Left, top, width, height.
@@ -52,7 +55,10 @@ pub enum BoxForm {
 }
 
 /// The unit of a box's sides.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, EnumString, IntoStaticStr)]
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Eq, EnumString, IntoStaticStr, Serialize, Deserialize, ToSchema,
+)]
+#[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_box_unit)]
 pub enum BoxUnit {
     /// Pixels.

@@ -5,8 +5,6 @@
 
 use std::io::Read;
 
-use jiff::Timestamp;
-
 use super::columns::{
     CLASS, COUNT, HEIGHT, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA, TARGET_ID, TIME,
     TOP, TRUTH_LATITUDE, TRUTH_LONGITUDE, WIDTH,
@@ -16,6 +14,7 @@ use super::csv_layout::{BoxForm, CsvLayout};
 use super::file_row::{FileRow, RowError};
 use super::formula_guard::unguarded;
 use super::lines::{Line, Lines};
+use super::unix_time::unix_time;
 use super::wire::{self, Text};
 use crate::domain::{Error, ErrorKind, ImageSize, Result};
 
@@ -211,9 +210,7 @@ impl<'a> CsvCells<'a> {
             && cell.bytes().all(|byte| byte.is_ascii_digit() || b".,".contains(&byte));
         if is_unix {
             let value = self.number(TIME)?.unwrap_or_default();
-            let time_s = if value < 1e11 { value } else { value / 1e3 };
-            let time = Timestamp::from_microsecond((time_s * 1e6).round() as i64);
-            let time = time.map_err(|_| (TIME, format!("`{cell}` is no Unix time")))?;
+            let time = unix_time(value).map_err(|reason| (TIME, reason))?;
             return Ok(Some(Text::from(time.to_string())));
         }
         Ok((!cell.is_empty()).then(|| Text::from(cell)))

@@ -34,6 +34,7 @@ mod fix_row;
 mod fixes;
 mod format;
 mod formula_guard;
+mod frame_files;
 mod gpsd;
 mod gpx;
 mod json_errors;
@@ -47,21 +48,24 @@ mod rows;
 #[cfg(test)]
 mod tests;
 mod track_files;
+mod unix_time;
 pub mod wire;
 mod write;
 
 pub use address::{Address, Scheme, SerialLine};
 pub use connection::{
-    CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, SaslMechanism, Secrets, SinkSettings,
-    SourceSettings,
+    CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, ReceiverFrom, SaslMechanism, Secrets,
+    SinkSettings, SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
+pub use frame_files::{FrameClock, FrameFileFormat, read_frame_file};
 pub use messages::{
-    DetectedBox, MessageContext, MessageDecoder, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
+    BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,
+    NamedDetection, Reading, decoder, source_decoder,
 };
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use rows::{

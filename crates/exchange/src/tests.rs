@@ -1,6 +1,13 @@
 //! Readers and writers through their public interface.
 
+mod addresses;
 mod fixes;
+mod frame_files;
+mod mapped;
+mod messages;
+mod onvif;
+mod phones;
+mod receivers;
 
 use std::fs::File;
 use std::path::PathBuf;

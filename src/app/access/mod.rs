@@ -11,6 +11,7 @@ mod sessions;
 mod sign_in_log;
 mod signed_in_user;
 
+use std::borrow::Cow;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -33,12 +34,12 @@ pub use sessions::{SESSION_TIME, SessionToken};
 pub use signed_in_user::SignedInUser;
 
 /// What a client presents.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub enum Credential<'a> {
     /// Nothing.
     None,
     /// A key's secret.
-    Key(&'a str),
+    Key(Cow<'a, str>),
     /// The token of a browser's session.
     Session(&'a str),
     /// A client certificate that was verified.
@@ -108,7 +109,7 @@ impl Access {
             Credential::None => Ok(Principal::Anonymous),
             Credential::Certificate(holder) => Ok(Principal::Certificate(holder.clone())),
             Credential::Key(secret) => {
-                let digest = KeySecret::parse(secret)?.digest();
+                let digest = KeySecret::parse(&secret)?.digest();
                 self.keys.use_key(&digest, now).map(Principal::Key)
             }
             // A page whose session has ended must be able to sign in again.
@@ -121,7 +122,7 @@ impl Access {
             }
             Credential::Unreadable => Err(Error::refused(
                 ErrorKind::Unauthenticated,
-                "the header authorization must be `Bearer sf_...`, once",
+                "the header authorization must be `Bearer sf_...`, or `Basic ...` with the key as password, once",
             )),
         }
     }
@@ -145,7 +146,7 @@ impl Access {
         now: Timestamp,
         limits: &Limits,
     ) -> Result<Principal> {
-        let key = self.keys.use_key(&KeySecret::parse(secret)?.digest(), now)?;
+        let key = self.keys.use_key(&KeySecret::parse(&secret)?.digest(), now)?;
         self.sessions.start_for_key(token, key.clone(), now, limits)?;
         Ok(Principal::Key(key))
     }

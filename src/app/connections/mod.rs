@@ -19,7 +19,9 @@ use crate::domain::{
     Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
     OutboxCounts, Result, check_text,
 };
-use crate::exchange::{Address, ConnectionDraft, ConnectionSettings, Scheme, Secrets, SerialLine};
+use crate::exchange::{
+    Address, ConnectionDraft, ConnectionSettings, Scheme, Secrets, SerialLine, SourceSettings,
+};
 
 pub use groups::connection_groups;
 pub use reports::{ConnectionNode, ReportedStatuses};
@@ -258,24 +260,28 @@ impl App {
         self.store.delete_dead_letters(&connection, self.clock.now()).await
     }
 
-    /// Hands a message to a source that takes them by HTTP; returns when what was to be stored is stored.
+    /// Hands a message to a source that takes them by HTTP; returns when what was to be stored is stored, with the JSON
+    /// document that the sender expects as its answer, if any.
     ///
     /// # Errors
     /// `PermissionDenied` for a key that is restricted to other cameras than the source names;
     /// `ConnectionNotFound`; `ConnectionNotReceiving` if it is paused or has another kind of address; `Overloaded`
     /// while its queue is full; `MalformedBody` for a message that cannot be read; `CameraOnOtherNode`,
     /// `CameraBetweenNodes` where another node runs the source.
-    pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<()> {
+    pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<Option<&'static str>> {
         let connection = self.store.connection(id).await?;
-        self.authorize_source(&connection)?;
+        let (settings, _) = connection_settings(&connection)?;
+        let source = settings.source.ok_or_else(|| not_receiving(id))?;
+        self.authorize_source(&source)?;
         let inlet = self.inlet(&connection).await?;
         let (settled, settlement) = oneshot::channel();
         let sender = self.caller().actor().name.to_string();
-        inlet.try_send(PushedMessage { sender, payload, settled }).map_err(|_| {
+        let message = PushedMessage { sender, payload: payload.clone(), settled };
+        inlet.try_send(message).map_err(|_| {
             Error::refused(ErrorKind::Overloaded, format!("connection {id} has too many messages to do"))
         })?;
         match settlement.await {
-            Ok(Ok(())) => Ok(()),
+            Ok(Ok(())) => Ok(source.format.answer(&payload)),
             Ok(Err(reason)) => Err(Error::refused(ErrorKind::MalformedBody, reason)),
             Err(_) => {
                 self.check_receiving(&connection).await?;
@@ -305,14 +311,12 @@ impl App {
     }
 
     /// Checks that the caller may reach every camera that a source feeds.
-    fn authorize_source(&self, connection: &Connection) -> Result<()> {
+    fn authorize_source(&self, source: &SourceSettings) -> Result<()> {
         let is_restricted =
             self.caller().principal().scope().is_some_and(|scope| !scope.cameras().is_empty());
         if !is_restricted {
             return Ok(());
         }
-        let (settings, _) = connection_settings(connection)?;
-        let Some(source) = settings.source else { return Ok(()) };
         if source.names_any_camera() {
             let message = "the key is restricted to cameras, and the connection's messages may name any";
             return Err(Error::refused(ErrorKind::PermissionDenied, message));

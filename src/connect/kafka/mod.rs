@@ -51,8 +51,12 @@ impl Brokers {
         credentials: &Credentials<'_>,
         client_id: &str,
     ) -> Result<Self, PeerError> {
-        let host =
-            if address.host.contains(':') { format!("[{}]", address.host) } else { address.host.clone() };
+        let first = (&address.host, &address.port);
+        let hosts = std::iter::once(first).chain(address.others.iter().map(|(host, port)| (host, port)));
+        let hosts = hosts.map(|(host, port)| match host.contains(':') {
+            true => format!("[{host}]:{port}"),
+            false => format!("{host}:{port}"),
+        });
         // The connection as a whole is opened again with growing pauses; here only changes of leaders are waited for.
         let backoff = BackoffConfig {
             init_backoff: Duration::from_millis(100),
@@ -60,7 +64,7 @@ impl Brokers {
             base: 2.0,
             deadline: Some(Duration::from_secs(1)),
         };
-        let mut builder = ClientBuilder::new(vec![format!("{host}:{}", address.port)])
+        let mut builder = ClientBuilder::new(hosts.collect())
             .client_id(client_id)
             .max_message_size(MAX_ANSWER_BYTES)
             .backoff_config(backoff);

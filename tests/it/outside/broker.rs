@@ -258,3 +258,71 @@ async fn positions_are_published_to_a_nats_broker_also_those_of_its_absence() {
     broker.kill().expect("it can be killed");
     broker.wait().expect("it is gone");
 }
+
+/// A nats-server, which speaks MQTT 3.1.1 alone; killed when dropped.
+struct Mqtt3(std::process::Child);
+
+impl Mqtt3 {
+    fn start(folder: &std::path::Path, port: u16) -> Self {
+        let settings = format!(
+            "server_name: mqtt\nport: -1\njetstream {{ store_dir: \"{}\" }}\nmqtt {{ host: 127.0.0.1, port: {port} }}\n",
+            folder.display()
+        );
+        let path = folder.join("nats.conf");
+        std::fs::write(&path, settings).expect("a file can be written");
+        let mut command = std::process::Command::new("nats-server");
+        command.arg("-c").arg(&path).stdout(std::process::Stdio::null()).stderr(std::process::Stdio::null());
+        let process = command.spawn().expect("nats-server is installed");
+        while std::net::TcpStream::connect(("127.0.0.1", port)).is_err() {
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        Self(process)
+    }
+}
+
+impl Drop for Mqtt3 {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[tokio::test]
+#[ignore = "needs nats-server and mosquitto-clients"]
+async fn a_broker_of_mqtt_3_1_1_brings_phones_and_takes_positions() {
+    let (folder, port) = (data_folder(), own_address().port());
+    let _broker = Mqtt3::start(folder.path(), port);
+    let data = data_folder();
+    let server = TestServer::start(data.path());
+    create_gate(&server).await;
+    let address = format!("mqtt://127.0.0.1:{port}");
+    let source = json!({"id": "phones", "source": {
+        "address": address, "format": "phone", "topics": ["owntracks/+/+"], "camera_ids": ["gate"],
+    }});
+    let sink = json!({"id": "positions", "sink": {"address": address, "camera_ids": ["gate"], "topic": "positions"}});
+    server.post("/v1/connections", &source).await.expect(201);
+    server.post("/v1/connections", &sink).await.expect(201);
+    for id in ["phones", "positions"] {
+        connection_when(&server, id, |status| status["state"] == "running").await;
+    }
+    let client = |program: &str| {
+        let mut command = std::process::Command::new(program);
+        command.args(["-V", "mqttv311", "-h", "127.0.0.1", "-q", "1", "-p", &port.to_string()]);
+        command
+    };
+    let mut subscriber = client("mosquitto_sub");
+    subscriber.args(["-t", "positions", "-C", "1", "-W", "60"]).stdout(std::process::Stdio::piped());
+    let subscriber = subscriber.spawn().expect("mosquitto-clients is installed");
+    tokio::time::sleep(std::time::Duration::from_secs(1)).await;
+    for _ in 0..2 {
+        let location = json!({"_type": "location", "lat": 30.628, "lon": 103.98678, "acc": 5, "tst": now().as_second(), "tid": "ja"});
+        let mut publisher = client("mosquitto_pub");
+        publisher.args(["-t", "owntracks/jane/phone", "-m", &location.to_string()]);
+        assert!(publisher.status().expect("mosquitto-clients is installed").success());
+        tokio::time::sleep(std::time::Duration::from_millis(1_100)).await;
+    }
+    let position = subscriber.wait_with_output().expect("it ends").stdout;
+    let position: Value = serde_json::from_slice(&position).expect("a position");
+    assert_eq!(position["target_id"], "jane/phone", "{position}");
+    connection_when(&server, "phones", |status| status["acknowledged"] == 2).await;
+}

@@ -7,9 +7,9 @@ use sightfix::exchange::{
     read_received_fixes,
 };
 
-fn context() -> MessageContext {
+fn context() -> MessageContext<'static> {
     let received_at: Timestamp = "2026-06-01T12:00:20.5Z".parse().expect("a time");
-    MessageContext { received_at, time_bounds: TimeBounds::live_at(received_at, 5) }
+    MessageContext { subject: "", received_at, time_bounds: TimeBounds::live_at(received_at, 5) }
 }
 
 fn read(format: MessageFormat, message: &str) -> Reading {

@@ -223,8 +223,8 @@ async fn an_authorization_that_is_no_header_is_refused_when_it_is_set() {
     patch(&server, "hook", &change).await.expect(422);
 }
 
-/// Answers CONNECT as a broker of MQTT 3.1.1 does that knows no other version: return code 1, then the end.
-async fn answer_as_mqtt_3(listener: TcpListener) {
+/// Answers CONNECT as a broker does that knows neither version: return code 1, then the end.
+async fn answer_as_mqtt_3_1(listener: TcpListener) {
     while let Ok((mut stream, _)) = listener.accept().await {
         let mut begin = [0; 64];
         let _ = stream.read(&mut begin).await;
@@ -233,10 +233,10 @@ async fn answer_as_mqtt_3(listener: TcpListener) {
 }
 
 #[tokio::test]
-async fn a_broker_of_mqtt_3_is_named_as_the_reason() {
+async fn a_broker_of_no_known_version_is_named_as_the_reason() {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let address = listener.local_addr().expect("an address");
-    tokio::spawn(answer_as_mqtt_3(listener));
+    tokio::spawn(answer_as_mqtt_3_1(listener));
     let folder = data_folder();
     let server = TestServer::start(folder.path());
     create_gate(&server).await;

@@ -65,7 +65,7 @@ struct Corners {
 }
 
 impl MessageDecoder for DeepStream {
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
         let mut reading = Reading::default();
         let (camera, timestamp, objects) = match parse(payload)? {
             Payload::Minimal(minimal) => {

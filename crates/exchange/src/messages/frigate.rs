@@ -9,9 +9,9 @@ use serde::Deserialize;
 
 use super::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, class, parse, score,
-    unix_seconds,
 };
 use crate::domain::TargetId;
+use crate::unix_time::unix_time;
 
 pub(super) struct Frigate;
 
@@ -37,7 +37,7 @@ struct TrackedObject {
 }
 
 impl MessageDecoder for Frigate {
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
         let event: Event = parse(payload)?;
         let mut reading = Reading::default();
         let Some(object) = event.after else {
@@ -52,7 +52,7 @@ impl MessageDecoder for Frigate {
             reading.skip(format!("{} has no box", object.id));
             return Ok(reading);
         };
-        let time = unix_seconds(object.frame_time)?;
+        let time = unix_time(object.frame_time)?;
         reading.items.push(MessageItem::Detection(NamedDetection {
             time: context.time_bounds.check(time).map_err(|error| error.to_string())?,
             camera: object.camera,

@@ -8,7 +8,7 @@ use crate::gpsd::Reports;
 pub(super) struct Gpsd(Reports);
 
 impl MessageDecoder for Gpsd {
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
         let text = std::str::from_utf8(payload).map_err(|_| "is not UTF-8".to_owned())?;
         let mut reading = Reading::default();
         for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {

@@ -1,21 +1,33 @@
 //! Messages of other systems, read one by one as they come: detections and fixes.
 //!
 //! A decoder is a value that may remember earlier messages, such as the first part of an AIS sentence. What it cannot
-//! read is an error of that message alone. A new format is a file here and a line in [`decoder`].
+//! read is an error of that message alone. A new format is a file here, a variant of
+//! [`MessageFormat`] and a line in [`decoder`].
 
+mod adsb;
 mod ais;
+mod ais_report;
+mod cot;
 mod deepstream;
+mod filter;
 mod frigate;
 mod gpsd;
+mod mapped;
 mod nmea;
 mod onvif;
+mod phone;
 mod traccar;
+mod xml;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::domain::{ReceivedFix, Score, TargetClass, TargetId, TimeBounds};
+use crate::connection::{ReceiverFrom, SourceSettings};
+use crate::domain::{Fix, ReceivedFix, ReceiverId, Score, SigmaM, TargetClass, TargetId, TimeBounds};
+use crate::wire;
+
+pub use mapped::{BoxMapping, JsonMapping};
 
 /// Format of a source's messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -33,19 +45,41 @@ pub enum MessageFormat {
     Gpsd,
     /// Positions as Traccar forwards them (JSON).
     Traccar,
+    /// Positions of a phone's application: OwnTracks, Traccar Client, Overland, GPSLogger, Sensor Logger, Home Assistant.
+    Phone,
+    /// Positions of aircraft: lines of a BaseStation port, or JSON of dump1090 and readsb.
+    Adsb,
+    /// Cursor on Target events of TAK's applications (XML).
+    Cot,
+    /// JSON of any program, by the source's `mapping`.
+    Json,
 }
 
 impl MessageFormat {
-    /// Whether its messages contain fixes, not detections.
+    /// Whether its messages contain fixes, not detections; those of `json` contain what their mapping says.
     #[must_use]
     pub const fn brings_fixes(self) -> bool {
-        matches!(self, Self::Nmea | Self::Gpsd | Self::Traccar)
+        match self {
+            Self::Frigate | Self::Deepstream | Self::Onvif | Self::Json => false,
+            Self::Nmea | Self::Gpsd | Self::Traccar | Self::Phone | Self::Adsb | Self::Cot => true,
+        }
+    }
+
+    /// The JSON document that the sender of a message expects as the answer to its request; most expect none.
+    #[must_use]
+    pub fn answer(self, payload: &[u8]) -> Option<&'static str> {
+        match self {
+            Self::Phone => phone::answer(payload),
+            _ => None,
+        }
     }
 }
 
-/// When a message came, and which times it may have.
+/// When and whence a message came, and which times it may have.
 #[derive(Debug, Clone, Copy)]
-pub struct MessageContext {
+pub struct MessageContext<'a> {
+    /// Its topic, the address of its sender, or the name of the key that handed it in.
+    pub subject: &'a str,
     /// Time of the server at which it came.
     pub received_at: Timestamp,
     /// The bounds of its times.
@@ -97,11 +131,46 @@ pub struct Reading {
 }
 
 impl Reading {
+    /// Takes an item, or the reason why it cannot be taken.
+    fn take(&mut self, item: Result<MessageItem, String>) {
+        match item {
+            Ok(item) => self.items.push(item),
+            Err(reason) => self.skip(reason),
+        }
+    }
+
     fn skip(&mut self, reason: impl Into<String>) {
         // One message of a hostile sender must not fill the memory with reasons.
         if self.skipped.len() < 16 {
             self.skipped.push(reason.into());
         }
+    }
+}
+
+/// A position as its receiver reports it, not yet checked.
+struct ReportedFix<'a> {
+    time: Timestamp,
+    /// The receiver, where the message names it.
+    receiver: Option<&'a str>,
+    longitude_deg: f64,
+    latitude_deg: f64,
+    sigma: Option<SigmaM>,
+}
+
+impl ReportedFix<'_> {
+    fn checked(self, context: &MessageContext<'_>) -> Result<ReceivedFix, String> {
+        let Self { time, receiver, longitude_deg, latitude_deg, sigma } = self;
+        let checked = || -> crate::domain::Result<ReceivedFix> {
+            Ok(ReceivedFix {
+                time: context.time_bounds.check(time)?,
+                receiver_id: receiver.map(ReceiverId::new).transpose()?,
+                fix: Fix {
+                    position: wire::Position { longitude_deg, latitude_deg }.to_domain()?,
+                    sigma_m: sigma,
+                },
+            })
+        };
+        checked().map_err(|error| error.to_string())
     }
 }
 
@@ -111,32 +180,40 @@ pub trait MessageDecoder: Send {
     ///
     /// # Errors
     /// Why it cannot be read.
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String>;
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String>;
 }
 
-/// A decoder of messages of a format.
+/// A decoder of a source's messages, with the source's mapping, names of receivers and filter.
+#[must_use]
+pub fn source_decoder(settings: &SourceSettings) -> Box<dyn MessageDecoder> {
+    let decoder: Box<dyn MessageDecoder> = match (settings.format, settings.receiver_from) {
+        (MessageFormat::Json, _) => Box::new(mapped::Mapped(settings.mapping.clone().unwrap_or_default())),
+        (MessageFormat::Nmea, ReceiverFrom::Talker) => Box::new(nmea::Nmea::new(nmea::Telling::Talkers)),
+        (format, _) => decoder(format),
+    };
+    Box::new(filter::Filtered::new(decoder, settings))
+}
+
+/// A decoder of messages of a format alone; of `json` it has no mapping.
 #[must_use]
 pub fn decoder(format: MessageFormat) -> Box<dyn MessageDecoder> {
     match format {
         MessageFormat::Frigate => Box::new(frigate::Frigate),
         MessageFormat::Deepstream => Box::new(deepstream::DeepStream),
         MessageFormat::Onvif => Box::new(onvif::Onvif),
-        MessageFormat::Nmea => Box::new(nmea::Nmea::default()),
+        MessageFormat::Nmea => Box::new(nmea::Nmea::new(nmea::Telling::Senders)),
         MessageFormat::Gpsd => Box::new(gpsd::Gpsd::default()),
         MessageFormat::Traccar => Box::new(traccar::Traccar),
+        MessageFormat::Phone => Box::new(phone::Phone),
+        MessageFormat::Adsb => Box::new(adsb::Adsb),
+        MessageFormat::Cot => Box::new(cot::Cot),
+        MessageFormat::Json => Box::new(mapped::Mapped(JsonMapping::default())),
     }
 }
 
 /// A JSON document of another program, which may have fields that are not known here.
 fn parse<'a, T: Deserialize<'a>>(payload: &'a [u8]) -> Result<T, String> {
     serde_json::from_slice(payload).map_err(|error| format!("is not the JSON of this format: {error}"))
-}
-
-/// Seconds since 1970 as an instant.
-fn unix_seconds(seconds: f64) -> Result<Timestamp, String> {
-    // The cast saturates, and NaN becomes 0; neither is within the bounds of valid times.
-    Timestamp::from_microsecond((seconds * 1e6).round() as i64)
-        .map_err(|_| format!("{seconds} s since 1970 is not a time"))
 }
 
 /// A class by a detector's name of it; one that is not printable is left out.

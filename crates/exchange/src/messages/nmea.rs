@@ -1,24 +1,67 @@
-//! NMEA 0183 sentences as they come: GGA of a receiver, dated by its RMC and ZDA, with the standard deviations of its
-//! GST, and AIS.
+//! NMEA 0183 sentences as they come: positions of receivers, dated by their RMC and ZDA, with the standard deviations of
+//! their GST, and AIS.
+//!
+//! Each sender has its own date and deviations, and so has each talker where talkers are told apart. The source of a tag
+//! block (`s:`) names the receiver.
 
-use jiff::Timestamp;
+use std::collections::HashMap;
+
+use jiff::{SignedDuration, Timestamp};
 
 use super::ais::Ais;
+use super::filter::sender;
 use super::{MessageContext, MessageDecoder, MessageItem, Reading};
-use crate::domain::ReceivedFix;
+use crate::domain::{ReceivedFix, ReceiverId};
 use crate::nmea_fixes::{SentenceContent, Sentences, nearest_instant};
 
+/// Receivers that are told apart; beyond, all are forgotten, and known again by their next sentences.
+const MAX_RECEIVERS: usize = 1_024;
+/// Weeks after which the week number of GPS begins again.
+const ROLLOVER_S: i64 = 1_024 * 7 * 86_400;
+
+/// What tells receivers apart.
+#[derive(PartialEq, Eq)]
+pub(super) enum Telling {
+    Senders,
+    Talkers,
+}
+
 /// Reads sentences of one line each.
-#[derive(Default)]
 pub(super) struct Nmea {
-    /// The latest instant with a date.
-    dated_instant: Option<Timestamp>,
-    sentences: Sentences,
+    telling: Telling,
+    receivers: HashMap<String, Receiver>,
     ais: Ais,
 }
 
+#[derive(Default)]
+struct Receiver {
+    /// The latest instant with a date.
+    dated_instant: Option<Timestamp>,
+    sentences: Sentences,
+}
+
+/// A line without its tag block.
+pub(super) struct Tagged<'a> {
+    tags: &'a str,
+    pub(super) sentence: &'a str,
+}
+
+impl<'a> Tagged<'a> {
+    pub(super) fn of(line: &'a str) -> Self {
+        match line.strip_prefix('\\').and_then(|rest| rest.split_once('\\')) {
+            Some((tags, sentence)) => Self { tags: tags.split('*').next().unwrap_or_default(), sentence },
+            None => Self { tags: "", sentence: line },
+        }
+    }
+
+    /// The value of a tag, such as `c:`.
+    pub(super) fn tag(&self, name: &str) -> Option<&'a str> {
+        self.tags.split(',').find_map(|tag| tag.strip_prefix(name))
+    }
+}
+
 impl MessageDecoder for Nmea {
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
         let text = std::str::from_utf8(payload).map_err(|_| "is not UTF-8".to_owned())?;
         let mut reading = Reading::default();
         for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
@@ -31,28 +74,58 @@ impl MessageDecoder for Nmea {
 }
 
 impl Nmea {
+    pub(super) fn new(telling: Telling) -> Self {
+        Self { telling, receivers: HashMap::new(), ais: Ais::default() }
+    }
+
     fn sentence(
         &mut self,
         line: &str,
-        context: &MessageContext,
+        context: &MessageContext<'_>,
         reading: &mut Reading,
     ) -> Result<(), String> {
-        if let Some(fix) = self.ais.sentence(line, context)? {
+        let tagged = Tagged::of(line);
+        if let Some(fix) = self.ais.sentence(&tagged, context)? {
             reading.items.push(MessageItem::Fix(fix));
             return Ok(());
         }
-        match self.sentences.content_of(line)? {
-            SentenceContent::None => {}
-            SentenceContent::Date(instant) => self.dated_instant = Some(instant),
-            SentenceContent::Fix(time_of_day, fix) => {
-                let time_of_day = time_of_day.ok_or("the sentence has no time")?;
-                // A receiver that sends no date is at most seconds away from the server.
-                let dated = self.dated_instant.unwrap_or(context.received_at);
-                let time = nearest_instant(time_of_day, dated).ok_or("the time is no instant")?;
-                let time = context.time_bounds.check(time).map_err(|error| error.to_string())?;
-                reading.items.push(MessageItem::Fix(ReceivedFix { time, receiver_id: None, fix }));
-            }
+        let talker = tagged.sentence.get(1..3).filter(|_| self.telling == Telling::Talkers);
+        let name = tagged.tag("s:").or(talker);
+        let receiver = self.receiver(&format!("{} {}", sender(context.subject), name.unwrap_or_default()));
+        let SentenceContent { date, fixes } = receiver.sentences.content_of(tagged.sentence)?;
+        if let Some(date) = date {
+            check_rollover(date, context.received_at)?;
+            receiver.dated_instant = Some(date);
+        }
+        // A receiver that sends no date is at most seconds away from the server.
+        let dated = receiver.dated_instant.unwrap_or(context.received_at);
+        for (time_of_day, fix) in fixes {
+            let time_of_day = time_of_day.ok_or("the sentence has no time")?;
+            let time = nearest_instant(time_of_day, dated).ok_or("the time is no instant")?;
+            let time = context.time_bounds.check(time).map_err(|error| error.to_string())?;
+            let receiver_id = name.map(ReceiverId::new).transpose().map_err(|error| error.to_string())?;
+            reading.items.push(MessageItem::Fix(ReceivedFix { time, receiver_id, fix }));
         }
         Ok(())
     }
+
+    fn receiver(&mut self, key: &str) -> &mut Receiver {
+        if self.receivers.len() >= MAX_RECEIVERS && !self.receivers.contains_key(key) {
+            self.receivers.clear();
+        }
+        self.receivers.entry(key.to_owned()).or_default()
+    }
+}
+
+/// Refuses a date that is a whole number of rollovers of GPS weeks ago: old firmware takes one for another.
+fn check_rollover(date: Timestamp, received_at: Timestamp) -> Result<(), String> {
+    let age_s = received_at.duration_since(date).as_secs();
+    let distance_s = (age_s + ROLLOVER_S / 2).rem_euclid(ROLLOVER_S) - ROLLOVER_S / 2;
+    if age_s < ROLLOVER_S / 2 || distance_s.abs() > SignedDuration::from_hours(24).as_secs() {
+        return Ok(());
+    }
+    Err(format!(
+        "the receiver's date, {date:.0}, is {} times 1024 weeks ago: its count of GPS weeks has begun again; update its firmware",
+        (age_s + ROLLOVER_S / 2) / ROLLOVER_S
+    ))
 }

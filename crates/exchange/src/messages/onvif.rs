@@ -2,11 +2,15 @@
 //!
 //! A shape is in coordinates of its own, which the frame's `Transformation` maps to the normalised image: x to the
 //! right and y up, both from -1 to 1. Cameras differ in the sign of the scale of y, so the edges are ordered after the
-//! transformation. Frames without objects commonly have a scale of 0.
+//! transformation. An appearance may have a transformation of its own, which is applied before that of its frame. Without
+//! any, edges beyond 1 are those of cameras that count the image from its upper left corner to 8191 (Dahua). An object that
+//! is part of another one (`Parent`), such as a face or a number plate (Hanwha), is no target. Frames without objects
+//! commonly have a scale of 0.
 
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
+use super::xml::{attribute, numbers};
 use super::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, class, score,
 };
@@ -21,9 +25,14 @@ struct Transformation {
     scale: [f64; 2],
 }
 
-impl Default for Transformation {
-    fn default() -> Self {
-        Self { translation: [0.0; 2], scale: [1.0; 2] }
+impl Transformation {
+    const IDENTITY: Self = Self { translation: [0.0; 2], scale: [1.0; 2] };
+    /// From 0 to 8191 with y down.
+    const OF_8192: Self = Self { translation: [-1.0, 1.0], scale: [2.0 / 8191.0, -2.0 / 8191.0] };
+
+    /// The point that it maps a point to.
+    fn apply(self, [x, y]: [f64; 2]) -> [f64; 2] {
+        [self.scale[0] * x + self.translation[0], self.scale[1] * y + self.translation[1]]
     }
 }
 
@@ -31,6 +40,9 @@ impl Default for Transformation {
 #[derive(Default)]
 struct Object {
     id: String,
+    /// The object that it is a part of.
+    parent: Option<String>,
+    transformation: Option<Transformation>,
     edges: Option<[f64; 4]>,
     class: Option<String>,
     score: Option<f64>,
@@ -39,7 +51,7 @@ struct Object {
 #[derive(Default)]
 struct Frames {
     time: Option<String>,
-    transformation: Transformation,
+    transformation: Option<Transformation>,
     object: Option<Object>,
     /// Whether the text of the element that is open is the object's class.
     reads_class: bool,
@@ -48,7 +60,7 @@ struct Frames {
 }
 
 impl MessageDecoder for Onvif {
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
         let mut xml = Reader::from_reader(payload);
         let mut buffer = Vec::new();
         let mut frames = Frames::default();
@@ -79,16 +91,17 @@ impl Frames {
         match element.local_name().as_ref() {
             "Frame" => {
                 self.time = attribute(element, "UtcTime")?;
-                self.transformation = Transformation::default();
+                self.transformation = None;
                 if let Some(source) = attribute(element, "Source")? {
                     self.source = source;
                 }
             }
-            "Translate" => self.transformation.translation = numbers(element, ["x", "y"])?,
-            "Scale" => self.transformation.scale = numbers(element, ["x", "y"])?,
+            "Translate" => self.open_transformation().translation = numbers(element, ["x", "y"])?,
+            "Scale" => self.open_transformation().scale = numbers(element, ["x", "y"])?,
             "Object" => {
                 let id = attribute(element, "ObjectId")?.unwrap_or_default();
-                self.object = Some(Object { id, ..Object::default() });
+                let parent = attribute(element, "Parent")?.filter(|parent| !parent.is_empty());
+                self.object = Some(Object { id, parent, ..Object::default() });
             }
             "BoundingBox" => {
                 let edges = numbers(element, ["left", "top", "right", "bottom"])?;
@@ -110,7 +123,16 @@ impl Frames {
         Ok(())
     }
 
-    fn close(&mut self, name: &str, context: &MessageContext, reading: &mut Reading) {
+    /// The transformation that is being read: of the object, or of the frame before its objects.
+    fn open_transformation(&mut self) -> &mut Transformation {
+        let open = match &mut self.object {
+            Some(object) => &mut object.transformation,
+            None => &mut self.transformation,
+        };
+        open.get_or_insert(Transformation::IDENTITY)
+    }
+
+    fn close(&mut self, name: &str, context: &MessageContext<'_>, reading: &mut Reading) {
         match name {
             "Type" => self.reads_class = false,
             "Object" => {
@@ -124,22 +146,27 @@ impl Frames {
         }
     }
 
-    fn detection(&self, object: Object, context: &MessageContext) -> Result<NamedDetection, String> {
+    fn detection(&self, object: Object, context: &MessageContext<'_>) -> Result<NamedDetection, String> {
+        if let Some(parent) = &object.parent {
+            return Err(format!("object {} is a part of object {parent}", object.id));
+        }
         let [left, top, right, bottom] =
             object.edges.ok_or_else(|| format!("object {} has no box", object.id))?;
-        let Transformation { translation, scale } = self.transformation;
-        if scale.contains(&0.0) {
+        let transformations = match (object.transformation, self.transformation) {
+            (None, None) if [left, top, right, bottom].iter().any(|edge| edge.abs() > 1.0) => {
+                [Transformation::IDENTITY, Transformation::OF_8192]
+            }
+            (own, of_frame) => [own, of_frame].map(|it| it.unwrap_or(Transformation::IDENTITY)),
+        };
+        if transformations.iter().any(|it| it.scale.contains(&0.0)) {
             return Err(format!("the frame of object {} has a scale of 0", object.id));
         }
+        let normalised = |point| transformations.iter().fold(point, |point, it| it.apply(point));
         let time = self.time.as_deref().ok_or("the frame has no UtcTime")?;
-        // The attribute is in UTC by its name; some cameras leave the letter out.
-        let zoned =
-            if time.ends_with('Z') || time.contains('+') { time.to_owned() } else { format!("{time}Z") };
-        let time = parse_time(&zoned).and_then(|time| context.time_bounds.check(time));
+        let time = parse_time(&zoned(time)).and_then(|time| context.time_bounds.check(time));
         // From -1..1 with y up to fractions of the image with y down.
-        let across = |x: f64| (scale[0] * x + translation[0] + 1.0) / 2.0;
-        let down = |y: f64| (1.0 - (scale[1] * y + translation[1])) / 2.0;
-        let ((x1, x2), (y1, y2)) = ((across(left), across(right)), (down(top), down(bottom)));
+        let corners = [[left, top], [right, bottom]].map(normalised);
+        let [[x1, y1], [x2, y2]] = corners.map(|[x, y]| [(x + 1.0) / 2.0, (1.0 - y) / 2.0]);
         Ok(NamedDetection {
             camera: self.source.clone(),
             time: time.map_err(|error| error.to_string())?,
@@ -151,17 +178,8 @@ impl Frames {
     }
 }
 
-fn attribute(element: &BytesStart<'_>, name: &str) -> Result<Option<String>, String> {
-    let found = element.try_get_attribute(name).map_err(|error| format!("is not XML: {error}"))?;
-    Ok(found.map(|attribute| attribute.value.into_owned()))
-}
-
-fn numbers<const N: usize>(element: &BytesStart<'_>, names: [&str; N]) -> Result<[f64; N], String> {
-    let mut values = [0.0; N];
-    for (value, name) in values.iter_mut().zip(names) {
-        let text = attribute(element, name)?.unwrap_or_default();
-        let number = text.trim().parse().ok().filter(|number: &f64| number.is_finite());
-        *value = number.ok_or_else(|| format!("the attribute {name} is `{text}`, which is not a number"))?;
-    }
-    Ok(values)
+/// A time with its offset. The attribute is in UTC by its name; some cameras leave the letter out.
+fn zoned(time: &str) -> String {
+    let of_day = time.split_once('T').map_or("", |(_, of_day)| of_day);
+    if of_day.contains(['Z', '+', '-']) { time.to_owned() } else { format!("{time}Z") }
 }

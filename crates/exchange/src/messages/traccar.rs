@@ -5,10 +5,9 @@
 
 use serde::Deserialize;
 
-use super::{MessageContext, MessageDecoder, MessageItem, Reading, parse};
-use crate::domain::{ReceivedFix, ReceiverId, SigmaM, parse_time};
+use super::{MessageContext, MessageDecoder, MessageItem, Reading, ReportedFix, parse};
+use crate::domain::{SigmaM, parse_time};
 use crate::fix_quality::{Solution, sigma_of_radius_68};
-use crate::wire;
 
 pub(super) struct Traccar;
 
@@ -58,7 +57,7 @@ const fn yes() -> bool {
 }
 
 impl MessageDecoder for Traccar {
-    fn decode(&mut self, payload: &[u8], context: &MessageContext) -> Result<Reading, String> {
+    fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
         let Forwarded { position, device } = parse(payload)?;
         let mut reading = Reading::default();
         if !position.valid || position.outdated {
@@ -69,19 +68,14 @@ impl MessageDecoder for Traccar {
         let named = device.and_then(|device| device.unique_id);
         let named = named.or_else(|| position.device_id.map(|id| id.to_string()));
         let time = position.fix_time.ok_or("position.fixTime is missing")?;
-        let read = || -> crate::domain::Result<ReceivedFix> {
-            let fix = wire::Fix {
-                longitude_deg: position.longitude,
-                latitude_deg: position.latitude,
-                sigma_m: sigma.map(SigmaM::metres),
-            };
-            Ok(ReceivedFix {
-                time: context.time_bounds.check(parse_time(&time)?)?,
-                receiver_id: named.as_deref().map(ReceiverId::new).transpose()?,
-                fix: fix.to_domain()?,
-            })
+        let fix = ReportedFix {
+            time: parse_time(&time).map_err(|error| error.to_string())?,
+            receiver: named.as_deref(),
+            longitude_deg: position.longitude,
+            latitude_deg: position.latitude,
+            sigma,
         };
-        reading.items.push(MessageItem::Fix(read().map_err(|error| error.to_string())?));
+        reading.items.push(MessageItem::Fix(fix.checked(context)?));
         Ok(reading)
     }
 }

@@ -12,7 +12,7 @@ use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
 use crate::domain::{
     BoundingBox, CameraId, ConnectionId, Durability, Error, ErrorKind, ImageSize, LiveItem, ReceivedFix,
-    ReceiverId, Result,
+    ReceiverId, Result, TargetId, TrackerId,
 };
 use crate::exchange::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, SourceSettings,
@@ -31,6 +31,7 @@ pub(super) struct Routing {
     cameras: HashMap<String, (CameraId, Option<ImageSize>)>,
     fix_cameras: Vec<CameraId>,
     receiver: Option<ReceiverId>,
+    ids_name_targets: bool,
 }
 
 impl Routing {
@@ -43,6 +44,7 @@ impl Routing {
             cameras: cameras.collect::<Result<_>>()?,
             fix_cameras: settings.fix_cameras()?,
             receiver: settings.receiver()?,
+            ids_name_targets: settings.ids_name_targets,
         })
     }
 
@@ -53,6 +55,15 @@ impl Routing {
             None => CameraId::new(name).map(|id| (id, None)).map_err(|_| {
                 Error::invalid("cameras", format!("names no camera for the sender's camera `{name}`"))
             }),
+        }
+    }
+
+    /// The target and the tracker's id of a detection; one of both.
+    fn identity(&self, detection: &NamedDetection) -> Result<(Option<TargetId>, Option<TrackerId>)> {
+        if self.ids_name_targets {
+            Ok((Some(detection.target_id.clone()), None))
+        } else {
+            Ok((None, Some(TrackerId::new(detection.target_id.as_str())?)))
         }
     }
 
@@ -207,9 +218,9 @@ impl Intake {
     /// Gives an item to the camera's stream; its seq there.
     async fn follow(&mut self, camera: &CameraId, source: LiveSource) -> Result<u64> {
         let now = self.app.clock.now();
+        let active = self.stream(camera).await?.stream.current_camera()?;
+        let item = source.item(&active, &self.routing)?;
         let known = self.stream(camera).await?;
-        let active = known.stream.current_camera()?;
-        let item = source.item(&active)?;
         let seq = known.last_seq + 1;
         known.stream.check_seq(seq)?;
         known.last_seq = seq;
@@ -289,18 +300,19 @@ impl LiveSource {
         }
     }
 
-    fn item(self, camera: &ActiveCamera) -> Result<LiveItem> {
+    fn item(self, camera: &ActiveCamera, routing: &Routing) -> Result<LiveItem> {
         Ok(match self {
             Self::Detection(detection, stream_size) => {
+                let (target_id, tracker_id) = routing.identity(&detection)?;
                 let image_size = camera.image_size;
                 let bounding_box = box_in(image_size, detection.detected_box, stream_size)?;
                 let bounding_box =
                     image_size.map_or(Ok(bounding_box), |image_size| bounding_box.within(image_size))?;
                 LiveItem {
                     time: detection.time,
-                    target_id: Some(detection.target_id),
+                    target_id,
                     receiver_id: None,
-                    tracker_id: None,
+                    tracker_id,
                     bounding_box: Some(bounding_box),
                     fix: None,
                     class: detection.class,
@@ -413,7 +425,7 @@ pub(super) fn describe(item: &MessageItem) -> String {
                 DetectedBox::Fractions(edges) => ("of the image", edges),
             };
             format!(
-                "target {} of `{}` at {}: box {left}, {top} to {right}, {bottom} {name}",
+                "object {} of `{}` at {}: box {left}, {top} to {right}, {bottom} {name}",
                 detection.target_id, detection.camera, detection.time
             )
         }

@@ -125,6 +125,10 @@ pub struct SourceSettings {
     /// The receiver of fixes whose messages name none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub receiver_id: Option<String>,
+    /// Whether the ids of detected objects are names of targets, which receivers know, too. They are numbers of a tracker if
+    /// left out, and boxes are then matched with receivers by where they are.
+    #[serde(default)]
+    pub ids_name_targets: bool,
     /// Whether boxes and fixes are paired and stored as samples. The peer's messages are acknowledged when that is done.
     #[serde(default)]
     pub store_samples: bool,
@@ -334,8 +338,15 @@ impl SourceSettings {
         }
         check_username(self.username.as_deref())?;
         check_sasl(self.sasl_mechanism, address.scheme, self.username.as_deref())?;
-        if self.format.brings_fixes() && self.camera_ids.is_empty() {
-            return Err(Error::invalid("camera_ids", "must name the cameras that the fixes are for"));
+        if self.format.brings_fixes() {
+            if self.camera_ids.is_empty() {
+                return Err(Error::invalid("camera_ids", "must name the cameras that the fixes are for"));
+            }
+            if self.ids_name_targets {
+                let rule =
+                    "is for detections; whose a receiver is stands in the profile of the camera (receivers)";
+                return Err(Error::invalid("ids_name_targets", rule));
+            }
         }
         if address.scheme == Scheme::Gpsd && self.format != MessageFormat::Gpsd {
             return Err(Error::invalid("format", "must be gpsd for an address of gpsd:"));

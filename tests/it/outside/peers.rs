@@ -134,9 +134,20 @@ pub(crate) async fn send_fix(
     longitude_deg: f64,
     stores: bool,
 ) {
-    let fix = json!({"observations": [{
-        "time": time, "target_id": target, "fix": {"longitude_deg": longitude_deg, "latitude_deg": 30.628, "sigma_m": 1.5},
-    }]});
+    send_fix_of(server, json!({"target_id": target}), time, longitude_deg, stores).await;
+}
+
+/// The same of a target or a receiver.
+pub(crate) async fn send_fix_of(
+    server: &TestServer,
+    mut fix: Value,
+    time: &str,
+    longitude_deg: f64,
+    stores: bool,
+) {
+    fix["time"] = json!(time);
+    fix["fix"] = json!({"longitude_deg": longitude_deg, "latitude_deg": 30.628, "sigma_m": 1.5});
+    let fix = json!({"observations": [fix]});
     let path = format!("/v1/cameras/gate/tracks?store_samples={stores}");
     server.post(&path, &fix).await.expect(200);
 }

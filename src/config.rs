@@ -283,6 +283,9 @@ pub struct Limits {
     pub connection_message_bytes: usize,
     /// Messages of one source that are not settled yet; beyond, no more are read.
     pub connection_queue: usize,
+    /// Messages of one source, or boxes and fixes of them, that wait until what is to be stored is stored; beyond, no more
+    /// are read.
+    pub connection_unsettled: usize,
     /// Bytes that one source holds of messages that were read and not taken yet; beyond, no more are read.
     pub connection_queue_bytes: usize,
     /// Clients that may be connected to one listening source.
@@ -438,6 +441,7 @@ impl Default for Limits {
             outside_connections: 256,
             connection_message_bytes: 1 << 20,
             connection_queue: 1_024,
+            connection_unsettled: 32_768,
             connection_queue_bytes: 8 << 20,
             connection_clients: 64,
             outbox_messages: 100_000,

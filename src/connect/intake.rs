@@ -89,6 +89,12 @@ struct PendingMessage {
     outcome: Result<(), String>,
 }
 
+impl PendingMessage {
+    fn size(&self) -> usize {
+        self.items.len().max(1)
+    }
+}
+
 /// Takes the messages of one source.
 pub(super) struct Intake {
     app: App,
@@ -99,6 +105,8 @@ pub(super) struct Intake {
     decoder: Box<dyn MessageDecoder>,
     streams: HashMap<CameraId, CameraStream>,
     pending: VecDeque<PendingMessage>,
+    /// Items of the pending messages; a message without any counts as one.
+    pending_items: usize,
 }
 
 impl Intake {
@@ -117,12 +125,13 @@ impl Intake {
             decoder: decoder(settings.format),
             streams: HashMap::new(),
             pending: VecDeque::new(),
+            pending_items: 0,
         })
     }
 
-    /// Messages that are not settled.
-    pub(super) fn pending(&self) -> usize {
-        self.pending.len()
+    /// Boxes, fixes, and messages without either, that are not settled.
+    pub(super) const fn pending(&self) -> usize {
+        self.pending_items
     }
 
     /// Takes a message. What is wrong with it, or with one of its items, is counted and shown in the status.
@@ -150,7 +159,9 @@ impl Intake {
             Err(reason) => Err(reason),
         };
         account.report(&self.live, &message, &outcome);
-        self.pending.push_back(PendingMessage { receipt: message.receipt, items, outcome });
+        let pending = PendingMessage { receipt: message.receipt, items, outcome };
+        self.pending_items += pending.size();
+        self.pending.push_back(pending);
         Ok(())
     }
 
@@ -249,6 +260,7 @@ impl Intake {
                 }
             }
             if let Some(message) = self.pending.pop_front() {
+                self.pending_items -= message.size();
                 settled.push(Settled { receipt: message.receipt, outcome: message.outcome });
             }
         }

@@ -202,13 +202,14 @@ struct Link {
 }
 
 impl Link {
-    /// With at most `queue` messages and `bytes` of them that nobody has taken yet.
+    /// With at most `queue` messages and `bytes` of them that nobody has taken yet, and as many `requests` to the broker
+    /// that are not sent: one for each message that may be acknowledged at once, or both sides would wait for each other.
     async fn open(
         (options, bridge): (MqttOptions, Option<Bridge>),
-        (queue, bytes): (usize, usize),
+        (queue, bytes, requests): (usize, usize, usize),
         live: Option<Arc<LiveConnection>>,
     ) -> Result<Self, PeerError> {
-        let (client, connection) = AsyncClient::new(options, queue);
+        let (client, connection) = AsyncClient::new(options, requests);
         // Acknowledgements of subscriptions and of the connection come besides the messages.
         let (reports_in, reports) = inbox(2 * queue + 16, bytes);
         let driving = AbortOnDropHandle::new(tokio::spawn(drive(connection, reports_in, live)));
@@ -249,19 +250,21 @@ impl MqttSource {
         (limits, live): (&Limits, &Arc<LiveConnection>),
     ) -> Result<Self, PeerError> {
         let (mut options, bridge) = prepare(address, &identity.client_id, credentials).await?;
-        let queue = limits.connection_queue.min(usize::from(u16::MAX));
+        let (queue, unsettled) = (limits.connection_queue, limits.connection_unsettled);
+        let receive_maximum = u16::try_from(unsettled).unwrap_or(u16::MAX);
         let packet_bytes = limits.connection_message_bytes.saturating_add(PACKET_OVERHEAD_BYTES);
         options
             .set_manual_acks(true)
             .set_clean_start(!identity.is_lasting)
             .set_session_expiry_interval(identity.is_lasting.then_some(SESSION_EXPIRY_S))
-            .set_receive_maximum(u16::try_from(queue).ok())
+            .set_receive_maximum(Some(receive_maximum))
             .set_max_packet_size(u32::try_from(packet_bytes).ok());
         let filters: Vec<Filter> =
             topics.iter().map(|topic| Filter::new(topic.as_str(), QoS::AtLeastOnce)).collect();
         let open = async {
             let bytes = limits.connection_queue_bytes;
-            let link = Link::open((options, bridge), (queue, bytes), Some(live.clone())).await?;
+            let link =
+                Link::open((options, bridge), (queue, bytes, unsettled + queue), Some(live.clone())).await?;
             link.client.subscribe_many(filters).await.map_err(|error| PeerError(error.to_string()))?;
             let mut source = Self {
                 link,
@@ -371,8 +374,11 @@ impl MqttSink {
     ) -> Result<Self, PeerError> {
         let (mut options, bridge) = prepare(address, client_id, credentials).await?;
         options.set_clean_start(true);
-        let link =
-            within(OPEN_TIME, Link::open((options, bridge), (PUBLISH_QUEUE, SINK_BYTES), None)).await?;
+        let link = within(
+            OPEN_TIME,
+            Link::open((options, bridge), (PUBLISH_QUEUE, SINK_BYTES, PUBLISH_QUEUE), None),
+        )
+        .await?;
         Ok(Self { link, media_type })
     }
 

@@ -354,7 +354,7 @@ async fn run_source(
     live.update(|status| status.connects += 1);
     loop {
         tokio::select! {
-            message = source.next(), if intake.pending() < app.limits.connection_queue => {
+            message = source.next(), if intake.pending() < app.limits.connection_unsettled => {
                 intake.take(message?).await?;
                 progressed.store(true, Ordering::Relaxed);
             }

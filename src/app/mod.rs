@@ -48,8 +48,8 @@ use crate::telemetry::Metrics;
 pub use camera_statuses::CameraStatus;
 pub use cluster::{CameraLease, Cluster, ConnectionLease, DatabaseHistory, NodeSettings, NodeStatus, Watch};
 pub use connections::{
-    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage,
-    LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
+    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
+    LastMessage, LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};

@@ -371,11 +371,18 @@ fn box_in(
     BoundingBox::new(left * across, top * down, (right - left) * across, (bottom - top) * down)
 }
 
+/// What is said of a message that could be read and says nothing.
+const EMPTY_READING: &str = "the message contains no detection and no fix";
+/// Bytes of a message that was not taken which are kept as an example.
+const EXAMPLE_BYTES: usize = 200;
+
 /// What became of the items of one message.
 #[derive(Default)]
 struct Account {
     now: Timestamp,
     lines: Vec<String>,
+    /// Why items were skipped, and the items in words.
+    reasons: Vec<(String, String)>,
     taken: u64,
     skipped: u64,
     latest: Option<Timestamp>,
@@ -400,22 +407,32 @@ impl Account {
     fn skip(&mut self, description: &str, error: &Error) -> Result<(), PeerError> {
         self.skipped += 1;
         self.line(format!("skipped: {description}: {error}"));
+        self.reasons.push((error.to_string(), description.to_owned()));
         Ok(())
     }
 
     fn skip_all(&mut self, reasons: Vec<String>) {
         self.skipped += reasons.len() as u64;
-        reasons.into_iter().for_each(|reason| self.line(format!("skipped: {reason}")));
+        for reason in reasons {
+            self.line(format!("skipped: {reason}"));
+            self.reasons.push((reason.clone(), reason));
+        }
     }
 
     fn report(mut self, live: &LiveConnection, message: &Message, outcome: &Result<(), String>) {
-        if let Err(reason) = outcome {
-            self.line(format!("rejected: {reason}"));
+        let is_empty = self.taken == 0 && self.skipped == 0;
+        let untaken = outcome.as_ref().err().map(|reason| format!("rejected: {reason}"));
+        let untaken = untaken.or_else(|| is_empty.then(|| EMPTY_READING.to_owned()));
+        if let Some(reason) = untaken {
+            let shown = &message.payload[..message.payload.len().min(EXAMPLE_BYTES)];
+            self.reasons.push((reason.clone(), String::from_utf8_lossy(shown).into_owned()));
+            self.line(reason);
         }
         let lag = self.latest.map(|latest| self.now.duration_since(latest).as_secs_f64());
-        let Self { now, lines, taken, skipped, .. } = self;
+        let Self { now, lines, reasons, taken, skipped, .. } = self;
         let last = LastMessage::new(now, message.subject.clone(), &message.payload, lines);
         live.update(|status| {
+            reasons.iter().for_each(|(reason, example)| status.count_reason(now, reason, example));
             status.messages += 1;
             status.items += taken;
             status.skipped += skipped;

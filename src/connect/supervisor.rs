@@ -361,6 +361,8 @@ async fn run_source(
             () = tokio::time::sleep(SETTLE_EVERY), if intake.pending() > 0 => {}
         }
         let settled = intake.settled()?;
+        let unsettled = intake.pending() as u64;
+        live.update(|status| status.unsettled = unsettled);
         if settled.is_empty() {
             continue;
         }

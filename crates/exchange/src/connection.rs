@@ -300,6 +300,26 @@ impl ConnectionSettings {
         Ok(())
     }
 
+    /// The cameras that it names, each with the field that does.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field of one that is no id.
+    pub fn named_cameras(&self) -> Result<Vec<(String, CameraId)>> {
+        let mut named = Vec::new();
+        if let Some(source) = &self.source {
+            for (name, mapping) in &source.cameras {
+                named.push((format!("source.cameras.{name}.camera_id"), mapping.camera()?));
+            }
+            let cameras = source.fix_cameras()?.into_iter();
+            named.extend(cameras.map(|camera| ("source.camera_ids".to_owned(), camera)));
+        }
+        if let Some(sink) = &self.sink {
+            let cameras = sink.cameras()?.into_iter();
+            named.extend(cameras.map(|camera| ("sink.camera_ids".to_owned(), camera)));
+        }
+        Ok(named)
+    }
+
     /// Whether the peer is the same as by other settings: direction, scheme, host and port.
     #[must_use]
     pub fn has_peer_of(&self, other: &Self) -> bool {

@@ -113,6 +113,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
         labels: profile.labels.into_iter().collect(),
         receivers: receivers(&profile.receivers)?,
         retrain_when_moved: profile.retrain_when_moved.unwrap_or(named.retrain_when_moved),
+        learn_automatically: profile.learn_automatically.unwrap_or(named.learn_automatically),
         site: profile.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
         id: named.id,
     })
@@ -183,6 +184,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         ("labels", !profile.labels.is_empty()),
         ("receivers", !profile.receivers.is_empty()),
         ("retrain_when_moved", profile.retrain_when_moved.is_some()),
+        ("learn_automatically", profile.learn_automatically.is_some()),
         ("site", profile.site.is_some()),
     ];
     has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
@@ -223,6 +225,7 @@ impl From<NewCamera> for proto::CameraProfile {
             labels: profile.labels.into_iter().collect(),
             receivers: profile.receivers.iter().map(Into::into).collect(),
             retrain_when_moved: Some(profile.retrain_when_moved),
+            learn_automatically: Some(profile.learn_automatically),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             site: profile.site.map(|site| site.as_str().to_owned()),
         }

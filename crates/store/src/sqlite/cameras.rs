@@ -25,8 +25,8 @@ impl Store {
         let mut transaction = writer.begin().await?;
         let insert = sqlx::query(concat!(
             "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, \
-             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, site_key, \
-             updated_at_us, id, created_at_us, revision) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, \
+             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, learn_automatically, \
+             site_key, updated_at_us, id, created_at_us, revision) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, \
              (SELECT key FROM sites WHERE id = ?), ?, ?, ?, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
@@ -115,7 +115,7 @@ impl Store {
         let update = sqlx::query(concat!(
             "UPDATE cameras SET display_name = ?, image_width_px = ?, image_height_px = ?, \
              gnss_sigma_m = ?, gnss_bias_sigma_m = ?, recipe = ?, target_classes = ?, labels = ?, receivers = ?, \
-             retrain_when_moved = ?, site_key = (SELECT key FROM sites WHERE id = ?), updated_at_us = ?, \
+             retrain_when_moved = ?, learn_automatically = ?, site_key = (SELECT key FROM sites WHERE id = ?), updated_at_us = ?, \
              revision = revision + 1 WHERE id = ? RETURNING ",
             columns!()
         ));
@@ -208,6 +208,7 @@ fn bind_profile(query: Query, profile: &NewCamera, now: Timestamp) -> Result<Que
         .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
         .bind(write_receivers(&profile.receivers)?)
         .bind(profile.retrain_when_moved)
+        .bind(profile.learn_automatically)
         .bind(profile.site.as_ref().map(|site| site.as_str().to_owned()))
         .bind(now.as_microsecond()))
 }

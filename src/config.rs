@@ -281,7 +281,7 @@ pub struct Limits {
     pub outside_connections: u32,
     /// Bytes of one message of a connection; a larger one is skipped.
     pub connection_message_bytes: usize,
-    /// Messages of one source that are not settled yet; beyond, no more are read.
+    /// Messages of one source that were read and not taken yet; beyond, no more are read.
     pub connection_queue: usize,
     /// Messages of one source, or boxes and fixes of them, that wait until what is to be stored is stored; beyond, no more
     /// are read.
@@ -308,6 +308,12 @@ pub struct Limits {
     pub tracks_per_site: usize,
     /// Events of one site that a reader may continue after; a slower one loses the oldest.
     pub site_events: usize,
+    /// Boxes and fixes that a camera without a model records to learn from; beyond, the oldest are deleted.
+    pub recording_rows: u64,
+    /// Bytes of that recording; beyond, the oldest rows are deleted.
+    pub recording_bytes: u64,
+    /// Hours that it is kept.
+    pub recording_hours: u32,
     /// Samples of one camera.
     pub samples_per_camera: u64,
     /// Days that samples are kept, by their times; 0 is without end.
@@ -453,6 +459,9 @@ impl Default for Limits {
             site_wait_ms: 300,
             tracks_per_site: 1_024,
             site_events: 4_096,
+            recording_rows: 100_000,
+            recording_bytes: 16 << 20,
+            recording_hours: 24,
             samples_per_camera: 10_000_000,
             sample_days: 0,
             sample_overflow: SampleOverflow::Refuse,

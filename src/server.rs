@@ -189,6 +189,7 @@ impl Server {
         shutdown.spawn(retention_loop(app.clone(), shutdown.clone()));
         shutdown.spawn(app.clone().keep_registered(shutdown.clone()));
         if config.role.answers_clients() {
+            shutdown.spawn(worker::learn(app.clone(), shutdown.clone()));
             shutdown.spawn(connect::Supervisor::start(app.clone()).await.run(shutdown.clone()));
         }
         let mut allowed_hosts = config.allowed_hosts.clone();

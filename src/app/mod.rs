@@ -16,6 +16,7 @@ mod fusion;
 mod idempotency;
 mod inference;
 mod keys;
+mod learning;
 mod live;
 mod matching;
 mod models;
@@ -53,6 +54,7 @@ pub use connections::{
 };
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
+pub use learning::{Learning, LearningState};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SinkFeed, SinkFeeds,

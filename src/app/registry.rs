@@ -138,6 +138,11 @@ impl Registry {
         self.cameras.load().values().filter(|camera| rule(camera)).cloned().collect()
     }
 
+    /// The first camera that a rule selects; it is asked of no camera after that.
+    pub(super) fn find(&self, rule: impl Fn(&ActiveCamera) -> bool) -> Option<Arc<ActiveCamera>> {
+        self.cameras.load().values().find(|camera| rule(camera)).cloned()
+    }
+
     /// Brings one camera up to date with the store.
     ///
     /// # Errors

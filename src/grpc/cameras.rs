@@ -6,7 +6,7 @@ use super::pages;
 use super::proto;
 use super::proto::camera_service_server::CameraService;
 use super::statuses::{Reply, answer};
-use crate::app::App;
+use crate::app::{App, Learning, LearningState};
 use crate::domain::{
     Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, NewCamera,
     Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, TargetClass, TargetId,
@@ -90,6 +90,17 @@ impl CameraService for Cameras {
             let id = camera_id(&asked.camera_id)?;
             app.delete_camera(&id, asked.expected_revision.map(|revision| Revision(revision).into())).await?;
             Ok(proto::DeleteCameraResponse {})
+        })
+        .await
+    }
+
+    async fn get_learning(
+        &self,
+        request: tonic::Request<proto::GetLearningRequest>,
+    ) -> Reply<proto::GetLearningResponse> {
+        answer(&self.app, request, |app, asked| async move {
+            let learning = app.learning(&camera_id(&asked.camera_id)?).await?;
+            Ok(proto::GetLearningResponse { learning: Some(learning.into()) })
         })
         .await
     }
@@ -228,6 +239,31 @@ impl From<NewCamera> for proto::CameraProfile {
             learn_automatically: Some(profile.learn_automatically),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             site: profile.site.map(|site| site.as_str().to_owned()),
+        }
+    }
+}
+
+impl From<Learning> for proto::Learning {
+    fn from(learning: Learning) -> Self {
+        let state = match learning.state {
+            LearningState::Off => proto::LearningState::Off,
+            LearningState::Recording => proto::LearningState::Recording,
+            LearningState::Matching => proto::LearningState::Matching,
+            LearningState::Training => proto::LearningState::Training,
+            LearningState::Learned => proto::LearningState::Learned,
+        };
+        let (attempted_at, attempt_outcome) = learning.last_attempt.unzip();
+        Self {
+            state: state.into(),
+            message: learning.message,
+            recorded_s: learning.recorded_s,
+            needed_s: learning.needed_s,
+            boxes: learning.boxes,
+            fixes: learning.fixes,
+            receivers: learning.receivers,
+            attempted_at: attempted_at.map(timestamp),
+            attempt_outcome,
+            training_run: learning.training_run.map(|run| run.to_string()),
         }
     }
 }

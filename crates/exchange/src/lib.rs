@@ -43,6 +43,7 @@ mod messages;
 mod nmea_fixes;
 mod objects_only;
 mod outgoing;
+mod recording;
 mod rows;
 #[cfg(test)]
 mod tests;
@@ -64,6 +65,7 @@ pub use messages::{
     DetectedBox, MessageContext, MessageDecoder, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
 };
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
+pub use recording::{read_recording, write_recording};
 pub use rows::{
     ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
 };

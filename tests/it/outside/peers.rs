@@ -75,6 +75,20 @@ impl Broker {
         assert!(process.wait().expect("it ends").success());
     }
 
+    /// Publishes each line as a message with QoS 1, in their order.
+    pub(crate) fn publish_lines(&self, topic: &str, lines: impl Iterator<Item = String>) {
+        let mut command = Command::new("mosquitto_pub");
+        command.args(&self.client_arguments);
+        command.args(["-p", &self.port.to_string(), "-q", "1", "-t", topic, "-l"]);
+        let mut process = command.stdin(Stdio::piped()).spawn().expect("mosquitto-clients is installed");
+        let mut input = process.stdin.take().expect("piped");
+        for line in lines {
+            writeln!(input, "{line}").expect("it reads");
+        }
+        drop(input);
+        assert!(process.wait().expect("it ends").success());
+    }
+
     fn subscriber(&self, topic: &str) -> Command {
         let mut command = Command::new("mosquitto_sub");
         command.args(&self.client_arguments);

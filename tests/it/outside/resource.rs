@@ -62,7 +62,8 @@ async fn a_connection_is_created_read_changed_and_deleted_and_its_secrets_are_ne
             "connection-changed",
             "connection-changed",
             "connection-changed",
-            "connection-created"
+            "connection-created",
+            "camera-created"
         ]
     );
     let listed = server.get("/v1/connections").await.expect(200);

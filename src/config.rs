@@ -281,8 +281,11 @@ pub struct Limits {
     pub outside_connections: u32,
     /// Bytes of one message of a connection; a larger one is skipped.
     pub connection_message_bytes: usize,
-    /// Messages of one source that are not settled yet; beyond, no more are read.
+    /// Messages of one source that were read and not taken yet; beyond, no more are read.
     pub connection_queue: usize,
+    /// Messages of one source, or boxes and fixes of them, that wait until what is to be stored is stored; beyond, no more
+    /// are read.
+    pub connection_unsettled: usize,
     /// Bytes that one source holds of messages that were read and not taken yet; beyond, no more are read.
     pub connection_queue_bytes: usize,
     /// Clients that may be connected to one listening source.
@@ -305,6 +308,12 @@ pub struct Limits {
     pub tracks_per_site: usize,
     /// Events of one site that a reader may continue after; a slower one loses the oldest.
     pub site_events: usize,
+    /// Boxes and fixes that a camera without a model records to learn from; beyond, the oldest are deleted.
+    pub recording_rows: u64,
+    /// Bytes of that recording; beyond, the oldest rows are deleted.
+    pub recording_bytes: u64,
+    /// Hours that it is kept.
+    pub recording_hours: u32,
     /// Samples of one camera.
     pub samples_per_camera: u64,
     /// Days that samples are kept, by their times; 0 is without end.
@@ -438,6 +447,7 @@ impl Default for Limits {
             outside_connections: 256,
             connection_message_bytes: 1 << 20,
             connection_queue: 1_024,
+            connection_unsettled: 32_768,
             connection_queue_bytes: 8 << 20,
             connection_clients: 64,
             outbox_messages: 100_000,
@@ -449,6 +459,9 @@ impl Default for Limits {
             site_wait_ms: 300,
             tracks_per_site: 1_024,
             site_events: 4_096,
+            recording_rows: 100_000,
+            recording_bytes: 16 << 20,
+            recording_hours: 24,
             samples_per_camera: 10_000_000,
             sample_days: 0,
             sample_overflow: SampleOverflow::Refuse,

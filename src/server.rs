@@ -189,6 +189,7 @@ impl Server {
         shutdown.spawn(retention_loop(app.clone(), shutdown.clone()));
         shutdown.spawn(app.clone().keep_registered(shutdown.clone()));
         if config.role.answers_clients() {
+            shutdown.spawn(worker::learn(app.clone(), shutdown.clone()));
             shutdown.spawn(connect::Supervisor::start(app.clone()).await.run(shutdown.clone()));
         }
         let mut allowed_hosts = config.allowed_hosts.clone();
@@ -276,6 +277,8 @@ async fn prepare_access(app: &App, config: &Config) -> anyhow::Result<()> {
 
 /// Time between writes of when keys were used last, in rounds of the maintenance.
 const STORE_USES_EVERY: u32 = 30;
+/// Time between looks at the connections with other systems, in rounds of the maintenance.
+const FIGURES_EVERY: u32 = 5;
 
 async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown) {
     let app = &reloader.app;
@@ -298,6 +301,12 @@ async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown
             tracing::error!(%error, "cannot look for changed keys");
         }
         round = (round + 1) % STORE_USES_EVERY;
+        if round % FIGURES_EVERY == 1 {
+            match app.connection_figures().await {
+                Ok(figures) => app.metrics.outside_connections(&figures),
+                Err(error) => tracing::error!(%error, "the outboxes cannot be counted"),
+            }
+        }
         if round == 0
             && let Err(error) = app.access.store_last_uses(&app.store).await
         {

@@ -33,6 +33,7 @@ CREATE TABLE cameras (
     labels             TEXT    NOT NULL,
     receivers          TEXT    NOT NULL,
     retrain_when_moved INTEGER NOT NULL,
+    learn_automatically INTEGER NOT NULL,
     revision           INTEGER NOT NULL,
     created_at_us      INTEGER NOT NULL,
     updated_at_us      INTEGER NOT NULL,
@@ -373,3 +374,13 @@ CREATE TABLE source_offsets (
     next_offset      INTEGER NOT NULL,
     PRIMARY KEY (connection_key, topic, partition_number)
 ) STRICT, WITHOUT ROWID;
+
+-- What cameras have recorded that learn automatically: parts of a few seconds, the oldest of which give way.
+CREATE TABLE recording_parts (
+    number         INTEGER PRIMARY KEY AUTOINCREMENT,
+    camera_key     INTEGER NOT NULL REFERENCES cameras (key) ON DELETE CASCADE,
+    recorded_at_us INTEGER NOT NULL,
+    row_count      INTEGER NOT NULL,
+    content        BLOB NOT NULL
+) STRICT;
+CREATE INDEX recording_parts_by_camera ON recording_parts (camera_key, number);

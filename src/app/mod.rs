@@ -16,6 +16,7 @@ mod fusion;
 mod idempotency;
 mod inference;
 mod keys;
+mod learning;
 mod live;
 mod matching;
 mod models;
@@ -48,11 +49,12 @@ use crate::telemetry::Metrics;
 pub use camera_statuses::CameraStatus;
 pub use cluster::{CameraLease, Cluster, ConnectionLease, DatabaseHistory, NodeSettings, NodeStatus, Watch};
 pub use connections::{
-    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, LastMessage,
-    LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
+    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
+    LastMessage, LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
+pub use learning::{Learning, LearningState};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SinkFeed, SinkFeeds,

@@ -122,7 +122,7 @@ impl App {
         Ok(report)
     }
 
-    async fn store_paired(
+    pub(super) async fn store_paired(
         &self,
         id: &CameraId,
         mut samples: Vec<StoredSample>,

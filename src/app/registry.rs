@@ -46,6 +46,8 @@ pub struct ActiveCamera {
     pub receivers: Receivers,
     /// Whether to train again by itself after the camera was moved.
     pub retrain_when_moved: bool,
+    /// Whether to learn automatically while there is no model.
+    pub learn_automatically: bool,
     /// The site whose tracks the camera contributes to.
     pub site: Option<SiteId>,
     /// What the drift detector found with that model.
@@ -134,6 +136,11 @@ impl Registry {
     /// The cameras that a rule selects.
     pub(super) fn select(&self, rule: impl Fn(&ActiveCamera) -> bool) -> Vec<Arc<ActiveCamera>> {
         self.cameras.load().values().filter(|camera| rule(camera)).cloned().collect()
+    }
+
+    /// The first camera that a rule selects; it is asked of no camera after that.
+    pub(super) fn find(&self, rule: impl Fn(&ActiveCamera) -> bool) -> Option<Arc<ActiveCamera>> {
+        self.cameras.load().values().find(|camera| rule(camera)).cloned()
     }
 
     /// Brings one camera up to date with the store.
@@ -347,6 +354,7 @@ impl Registry {
             live: same
                 .map_or_else(|| CameraLive::new(self.event_log(camera.key)), |known| known.live.clone()),
             retrain_when_moved: camera.profile.retrain_when_moved,
+            learn_automatically: camera.profile.learn_automatically,
             site: camera.profile.site,
             receivers: camera.profile.receivers,
             model,

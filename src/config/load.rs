@@ -157,6 +157,7 @@ impl Config {
         for (name, limit) in [
             ("connection_message_bytes", limits.connection_message_bytes),
             ("connection_queue", limits.connection_queue),
+            ("connection_unsettled", limits.connection_unsettled),
             ("connection_queue_bytes", limits.connection_queue_bytes),
             ("connection_clients", limits.connection_clients),
             ("export_files", limits.export_files),

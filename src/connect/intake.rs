@@ -12,7 +12,7 @@ use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
 use crate::domain::{
     BoundingBox, CameraId, ConnectionId, Durability, Error, ErrorKind, ImageSize, LiveItem, ReceivedFix,
-    ReceiverId, Result,
+    ReceiverId, Result, TargetId, TrackerId,
 };
 use crate::exchange::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, SourceSettings,
@@ -31,6 +31,7 @@ pub(super) struct Routing {
     cameras: HashMap<String, (CameraId, Option<ImageSize>)>,
     fix_cameras: Vec<CameraId>,
     receiver: Option<ReceiverId>,
+    ids_name_targets: bool,
 }
 
 impl Routing {
@@ -43,6 +44,7 @@ impl Routing {
             cameras: cameras.collect::<Result<_>>()?,
             fix_cameras: settings.fix_cameras()?,
             receiver: settings.receiver()?,
+            ids_name_targets: settings.ids_name_targets,
         })
     }
 
@@ -53,6 +55,15 @@ impl Routing {
             None => CameraId::new(name).map(|id| (id, None)).map_err(|_| {
                 Error::invalid("cameras", format!("names no camera for the sender's camera `{name}`"))
             }),
+        }
+    }
+
+    /// The target and the tracker's id of a detection; one of both.
+    fn identity(&self, detection: &NamedDetection) -> Result<(Option<TargetId>, Option<TrackerId>)> {
+        if self.ids_name_targets {
+            Ok((Some(detection.target_id.clone()), None))
+        } else {
+            Ok((None, Some(TrackerId::new(detection.target_id.as_str())?)))
         }
     }
 
@@ -78,6 +89,12 @@ struct PendingMessage {
     outcome: Result<(), String>,
 }
 
+impl PendingMessage {
+    fn size(&self) -> usize {
+        self.items.len().max(1)
+    }
+}
+
 /// Takes the messages of one source.
 pub(super) struct Intake {
     app: App,
@@ -88,6 +105,8 @@ pub(super) struct Intake {
     decoder: Box<dyn MessageDecoder>,
     streams: HashMap<CameraId, CameraStream>,
     pending: VecDeque<PendingMessage>,
+    /// Items of the pending messages; a message without any counts as one.
+    pending_items: usize,
 }
 
 impl Intake {
@@ -106,12 +125,13 @@ impl Intake {
             decoder: source_decoder(settings),
             streams: HashMap::new(),
             pending: VecDeque::new(),
+            pending_items: 0,
         })
     }
 
-    /// Messages that are not settled.
-    pub(super) fn pending(&self) -> usize {
-        self.pending.len()
+    /// Boxes, fixes, and messages without either, that are not settled.
+    pub(super) const fn pending(&self) -> usize {
+        self.pending_items
     }
 
     /// Takes a message. What is wrong with it, or with one of its items, is counted and shown in the status.
@@ -140,7 +160,9 @@ impl Intake {
             Err(reason) => Err(reason),
         };
         account.report(&self.live, &message, &outcome);
-        self.pending.push_back(PendingMessage { receipt: message.receipt, items, outcome });
+        let pending = PendingMessage { receipt: message.receipt, items, outcome };
+        self.pending_items += pending.size();
+        self.pending.push_back(pending);
         Ok(())
     }
 
@@ -208,9 +230,9 @@ impl Intake {
     /// Gives an item to the camera's stream; its seq there.
     async fn follow(&mut self, camera: &CameraId, source: LiveSource) -> Result<u64> {
         let now = self.app.clock.now();
+        let active = self.stream(camera).await?.stream.current_camera()?;
+        let item = source.item(&active, &self.routing)?;
         let known = self.stream(camera).await?;
-        let active = known.stream.current_camera()?;
-        let item = source.item(&active)?;
         let seq = known.last_seq + 1;
         known.stream.check_seq(seq)?;
         known.last_seq = seq;
@@ -239,6 +261,7 @@ impl Intake {
                 }
             }
             if let Some(message) = self.pending.pop_front() {
+                self.pending_items -= message.size();
                 settled.push(Settled { receipt: message.receipt, outcome: message.outcome });
             }
         }
@@ -290,18 +313,19 @@ impl LiveSource {
         }
     }
 
-    fn item(self, camera: &ActiveCamera) -> Result<LiveItem> {
+    fn item(self, camera: &ActiveCamera, routing: &Routing) -> Result<LiveItem> {
         Ok(match self {
             Self::Detection(detection, stream_size) => {
+                let (target_id, tracker_id) = routing.identity(&detection)?;
                 let image_size = camera.image_size;
                 let bounding_box = box_in(image_size, detection.detected_box, stream_size)?;
                 let bounding_box =
                     image_size.map_or(Ok(bounding_box), |image_size| bounding_box.within(image_size))?;
                 LiveItem {
                     time: detection.time,
-                    target_id: Some(detection.target_id),
+                    target_id,
                     receiver_id: None,
-                    tracker_id: None,
+                    tracker_id,
                     bounding_box: Some(bounding_box),
                     fix: None,
                     class: detection.class,
@@ -348,11 +372,18 @@ fn box_in(
     BoundingBox::new(left * across, top * down, (right - left) * across, (bottom - top) * down)
 }
 
+/// What is said of a message that could be read and says nothing.
+const EMPTY_READING: &str = "the message contains no detection and no fix";
+/// Bytes of a message that was not taken which are kept as an example.
+const EXAMPLE_BYTES: usize = 200;
+
 /// What became of the items of one message.
 #[derive(Default)]
 struct Account {
     now: Timestamp,
     lines: Vec<String>,
+    /// Why items were skipped, and the items in words.
+    reasons: Vec<(String, String)>,
     taken: u64,
     skipped: u64,
     latest: Option<Timestamp>,
@@ -377,22 +408,32 @@ impl Account {
     fn skip(&mut self, description: &str, error: &Error) -> Result<(), PeerError> {
         self.skipped += 1;
         self.line(format!("skipped: {description}: {error}"));
+        self.reasons.push((error.to_string(), description.to_owned()));
         Ok(())
     }
 
     fn skip_all(&mut self, reasons: Vec<String>) {
         self.skipped += reasons.len() as u64;
-        reasons.into_iter().for_each(|reason| self.line(format!("skipped: {reason}")));
+        for reason in reasons {
+            self.line(format!("skipped: {reason}"));
+            self.reasons.push((reason.clone(), reason));
+        }
     }
 
     fn report(mut self, live: &LiveConnection, message: &Message, outcome: &Result<(), String>) {
-        if let Err(reason) = outcome {
-            self.line(format!("rejected: {reason}"));
+        let is_empty = self.taken == 0 && self.skipped == 0;
+        let untaken = outcome.as_ref().err().map(|reason| format!("rejected: {reason}"));
+        let untaken = untaken.or_else(|| is_empty.then(|| EMPTY_READING.to_owned()));
+        if let Some(reason) = untaken {
+            let shown = &message.payload[..message.payload.len().min(EXAMPLE_BYTES)];
+            self.reasons.push((reason.clone(), String::from_utf8_lossy(shown).into_owned()));
+            self.line(reason);
         }
         let lag = self.latest.map(|latest| self.now.duration_since(latest).as_secs_f64());
-        let Self { now, lines, taken, skipped, .. } = self;
+        let Self { now, lines, reasons, taken, skipped, .. } = self;
         let last = LastMessage::new(now, message.subject.clone(), &message.payload, lines);
         live.update(|status| {
+            reasons.iter().for_each(|(reason, example)| status.count_reason(now, reason, example));
             status.messages += 1;
             status.items += taken;
             status.skipped += skipped;
@@ -414,7 +455,7 @@ pub(super) fn describe(item: &MessageItem) -> String {
                 DetectedBox::Fractions(edges) => ("of the image", edges),
             };
             format!(
-                "target {} of `{}` at {}: box {left}, {top} to {right}, {bottom} {name}",
+                "object {} of `{}` at {}: box {left}, {top} to {right}, {bottom} {name}",
                 detection.target_id, detection.camera, detection.time
             )
         }

@@ -193,13 +193,14 @@ impl MqttSource {
         identity: &SourceIdentity,
         (limits, live): (&Limits, &Arc<LiveConnection>),
     ) -> Result<Self, PeerError> {
-        let queue = limits.connection_queue.min(usize::from(u16::MAX));
+        let (queue, unsettled) = (limits.connection_queue, limits.connection_unsettled);
         let wishes = Wishes {
             client_id: identity.client_id.clone(),
             is_kept: identity.is_lasting,
-            receive_maximum: u16::try_from(queue).ok(),
+            receive_maximum: Some(u16::try_from(unsettled).unwrap_or(u16::MAX)),
             max_packet_bytes: limits.connection_message_bytes.saturating_add(PACKET_OVERHEAD_BYTES),
             queue,
+            requests: unsettled + queue,
         };
         let bytes = limits.connection_queue_bytes;
         let link = Link::open(address, credentials, &wishes, bytes, Some(live)).await?;
@@ -312,6 +313,7 @@ impl MqttSink {
             receive_maximum: None,
             max_packet_bytes: SINK_PACKET_BYTES,
             queue: PUBLISH_QUEUE,
+            requests: PUBLISH_QUEUE,
         };
         let link = Link::open(address, credentials, &wishes, SINK_BYTES, None).await?;
         Ok(Self { link, media_type })

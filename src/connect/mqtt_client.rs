@@ -29,8 +29,11 @@ pub(super) struct Wishes {
     /// Messages that the broker may send before they are acknowledged; as many as it likes if `None`.
     pub(super) receive_maximum: Option<u16>,
     pub(super) max_packet_bytes: usize,
-    /// Messages that may wait to be sent.
+    /// Messages that nobody has taken yet.
     pub(super) queue: usize,
+    /// Requests to the broker that are not sent: one for each message that may be acknowledged at once, or both sides
+    /// would wait for each other.
+    pub(super) requests: usize,
 }
 
 /// Where a broker is reached: a host, or the path of a Unix socket.
@@ -121,7 +124,7 @@ pub(super) fn client(
             if let Some((name, password)) = login {
                 options.set_credentials(name, password);
             }
-            let (client, connection) = v5::AsyncClient::new(options, wishes.queue);
+            let (client, connection) = v5::AsyncClient::new(options, wishes.requests);
             (Client::Five(client), Connection::Five(Box::new(connection)))
         }
         Version::ThreeOneOne => {
@@ -137,7 +140,7 @@ pub(super) fn client(
             if let Some((name, password)) = login {
                 options.set_credentials(name, password);
             }
-            let (client, mut connection) = rumqttc::AsyncClient::new(options, wishes.queue);
+            let (client, mut connection) = rumqttc::AsyncClient::new(options, wishes.requests);
             connection.network_options.set_connection_timeout(OPEN_TIME.as_secs());
             (Client::ThreeOneOne(client), Connection::ThreeOneOne(Box::new(connection)))
         }

@@ -354,13 +354,15 @@ async fn run_source(
     live.update(|status| status.connects += 1);
     loop {
         tokio::select! {
-            message = source.next(), if intake.pending() < app.limits.connection_queue => {
+            message = source.next(), if intake.pending() < app.limits.connection_unsettled => {
                 intake.take(message?).await?;
                 progressed.store(true, Ordering::Relaxed);
             }
             () = tokio::time::sleep(SETTLE_EVERY), if intake.pending() > 0 => {}
         }
         let settled = intake.settled()?;
+        let unsettled = intake.pending() as u64;
+        live.update(|status| status.unsettled = unsettled);
         if settled.is_empty() {
             continue;
         }

@@ -6,7 +6,7 @@ use super::pages;
 use super::proto;
 use super::proto::camera_service_server::CameraService;
 use super::statuses::{Reply, answer};
-use crate::app::App;
+use crate::app::{App, Learning, LearningState};
 use crate::domain::{
     Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, NewCamera,
     Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, TargetClass, TargetId,
@@ -93,6 +93,17 @@ impl CameraService for Cameras {
         })
         .await
     }
+
+    async fn get_learning(
+        &self,
+        request: tonic::Request<proto::GetLearningRequest>,
+    ) -> Reply<proto::GetLearningResponse> {
+        answer(&self.app, request, |app, asked| async move {
+            let learning = app.learning(&camera_id(&asked.camera_id)?).await?;
+            Ok(proto::GetLearningResponse { learning: Some(learning.into()) })
+        })
+        .await
+    }
 }
 
 /// A profile of which everything may be left out.
@@ -113,6 +124,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
         labels: profile.labels.into_iter().collect(),
         receivers: receivers(&profile.receivers)?,
         retrain_when_moved: profile.retrain_when_moved.unwrap_or(named.retrain_when_moved),
+        learn_automatically: profile.learn_automatically.unwrap_or(named.learn_automatically),
         site: profile.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
         id: named.id,
     })
@@ -183,6 +195,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         ("labels", !profile.labels.is_empty()),
         ("receivers", !profile.receivers.is_empty()),
         ("retrain_when_moved", profile.retrain_when_moved.is_some()),
+        ("learn_automatically", profile.learn_automatically.is_some()),
         ("site", profile.site.is_some()),
     ];
     has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
@@ -223,8 +236,34 @@ impl From<NewCamera> for proto::CameraProfile {
             labels: profile.labels.into_iter().collect(),
             receivers: profile.receivers.iter().map(Into::into).collect(),
             retrain_when_moved: Some(profile.retrain_when_moved),
+            learn_automatically: Some(profile.learn_automatically),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             site: profile.site.map(|site| site.as_str().to_owned()),
+        }
+    }
+}
+
+impl From<Learning> for proto::Learning {
+    fn from(learning: Learning) -> Self {
+        let state = match learning.state {
+            LearningState::Off => proto::LearningState::Off,
+            LearningState::Recording => proto::LearningState::Recording,
+            LearningState::Matching => proto::LearningState::Matching,
+            LearningState::Training => proto::LearningState::Training,
+            LearningState::Learned => proto::LearningState::Learned,
+        };
+        let (attempted_at, attempt_outcome) = learning.last_attempt.unzip();
+        Self {
+            state: state.into(),
+            message: learning.message,
+            recorded_s: learning.recorded_s,
+            needed_s: learning.needed_s,
+            boxes: learning.boxes,
+            fixes: learning.fixes,
+            receivers: learning.receivers,
+            attempted_at: attempted_at.map(timestamp),
+            attempt_outcome,
+            training_run: learning.training_run.map(|run| run.to_string()),
         }
     }
 }

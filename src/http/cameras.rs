@@ -113,6 +113,9 @@ struct CameraDraft {
     /// Whether a training run is started by itself once the camera is found to have moved.
     #[serde(default)]
     retrain_when_moved: bool,
+    /// Whether the camera, while it has no model, records boxes of trackers and fixes of receivers, and is trained on those
+    /// that belong together beyond doubt (`GET .../learning`); true if left out.
+    learn_automatically: Option<bool>,
     /// The site whose world tracks the camera contributes to; it must exist.
     #[schema(example = "harbour")]
     site: Option<String>,
@@ -131,6 +134,7 @@ impl CameraDraft {
             labels: self.labels,
             receivers: receivers(&self.receivers)?,
             retrain_when_moved: self.retrain_when_moved,
+            learn_automatically: self.learn_automatically.unwrap_or(blank.learn_automatically),
             site: self.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
             id: blank.id,
         })
@@ -174,6 +178,8 @@ struct CameraChange {
     receivers: Option<Vec<Receiver>>,
     /// Whether to start a training run once the camera is found to have moved; null is not to.
     retrain_when_moved: Option<bool>,
+    /// Whether to record and learn while there is no model; null is to.
+    learn_automatically: Option<bool>,
     /// New site; null removes the camera from its site.
     site: Option<String>,
 }
@@ -211,6 +217,8 @@ pub(super) struct Camera {
     receivers: Vec<Receiver>,
     /// Whether a training run is started by itself once the camera is found to have moved.
     retrain_when_moved: bool,
+    /// Whether the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on them.
+    learn_automatically: bool,
     /// The site whose world tracks the camera contributes to, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
@@ -259,6 +267,7 @@ impl Camera {
             labels: profile.labels,
             receivers: shown(&profile.receivers),
             retrain_when_moved: profile.retrain_when_moved,
+            learn_automatically: profile.learn_automatically,
             site: profile.site.map(|site| site.as_str().to_owned()),
             revision: revision.0,
             created_at,

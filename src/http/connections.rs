@@ -107,6 +107,27 @@ impl From<crate::app::LastMessage> for LastMessage {
     }
 }
 
+/// Why messages, or parts of them, were not taken.
+#[derive(Serialize, ToSchema)]
+struct CountedReason {
+    /// The reason, of the latest of them.
+    reason: String,
+    /// How many there were; reasons that differ in numbers alone are one.
+    count: u64,
+    /// The latest of them: an item in words, or the beginning of a message.
+    example: String,
+    /// When that came.
+    #[schema(value_type = String, format = DateTime)]
+    last_at: Timestamp,
+}
+
+impl From<crate::app::CountedReason> for CountedReason {
+    fn from(counted: crate::app::CountedReason) -> Self {
+        let crate::app::CountedReason { reason, count, example, last_at } = counted;
+        Self { reason, count, example, last_at }
+    }
+}
+
 /// What failed.
 #[derive(Serialize, ToSchema)]
 struct LastError {
@@ -170,6 +191,11 @@ struct ConnectionStatus {
     queued: u64,
     /// Messages of a sink that are not tried any more.
     dead_letters: u64,
+    /// Boxes and fixes of a source, and messages without any, that wait until what is to be stored is stored. The peer gets
+    /// no acknowledgement of their messages before; positions do not wait.
+    unsettled: u64,
+    /// Why messages, or parts of them, were not taken: at most 17 reasons.
+    reasons: Vec<CountedReason>,
     /// Age of the last item when it came, s; of the oldest waiting message of a sink.
     #[serde(skip_serializing_if = "Option::is_none")]
     lag_s: Option<f64>,
@@ -245,6 +271,8 @@ impl Connection {
             refused_clients: status.refused_clients,
             queued: outbox.queued,
             dead_letters: outbox.dead,
+            unsettled: status.unsettled,
+            reasons: status.reasons.into_iter().map(Into::into).collect(),
             lag_s: status.lag_s,
         };
         Ok(Self { status: Some(status), ..Self::of(connection)? })

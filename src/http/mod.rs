@@ -26,6 +26,7 @@ mod gnss_error;
 mod idempotency;
 mod inference;
 mod keys;
+mod learning;
 mod merge_patch;
 mod models;
 mod moving_features;
@@ -244,6 +245,7 @@ fn described() -> OpenApiRouter<Rest> {
         .merge(inference::routes())
         .merge(features::routes())
         .merge(keys::routes())
+        .merge(learning::routes())
         .merge(audit::routes())
         .merge(session::routes())
         .merge(openid::routes())

@@ -5,11 +5,13 @@ mod cluster;
 mod connections;
 mod jobs;
 mod live;
+mod outside;
 mod storage;
 
 use std::sync::Arc;
 use std::time::Duration;
 
+use arc_swap::ArcSwap;
 use metrics::{Counter, Gauge};
 use metrics_exporter_prometheus::PrometheusHandle;
 
@@ -30,6 +32,7 @@ use crate::store::{JobCounts, StorageStatus};
 pub use self::connections::{CloseReason, OpenConnection};
 pub use self::jobs::JobMetrics;
 pub use self::live::SiteItemOutcome;
+pub use self::outside::OutsideFigures;
 
 /// Everything that is counted and timed.
 #[derive(Clone)]
@@ -42,6 +45,8 @@ pub struct Metrics {
     /// Evaluations.
     pub evaluations: JobMetrics,
     connections: ConnectionMetrics,
+    /// Metrics of connections with other systems, as text.
+    outside: Arc<ArcSwap<String>>,
     requests: RequestMetrics,
     requests_refused: Counter,
     live: LiveMetrics,
@@ -81,6 +86,7 @@ impl Metrics {
                 ["sightfix_evaluation_duration_seconds", "Time of an evaluation"],
             ),
             connections: ConnectionMetrics::register(&registry),
+            outside: Arc::new(ArcSwap::from_pointee(outside::rendered(&[]))),
             requests: RequestMetrics::new(&registry),
             requests_refused: registry.counter(
                 "sightfix_requests_refused_total",
@@ -115,7 +121,7 @@ impl Metrics {
     /// The text that `/metrics` gives: these metrics, and the figures of the process at this moment.
     #[must_use]
     pub fn render(&self) -> String {
-        self.handle.render() + &process::render()
+        self.handle.render() + self.outside.load().as_str() + &process::render()
     }
 
     /// Gathers recorded times into their buckets. They pile up until then, so this must run every
@@ -277,6 +283,11 @@ impl Metrics {
     /// How many cameras have an active model that cannot be used.
     pub fn models_unusable(&self, cameras: usize) {
         self.models_unusable.set(cameras as f64);
+    }
+
+    /// What connections with other systems do.
+    pub fn outside_connections(&self, connections: &[OutsideFigures]) {
+        self.outside.store(Arc::new(outside::rendered(connections)));
     }
 
     /// A REST request was answered.

@@ -8,6 +8,7 @@
 mod camera_training;
 mod evaluation;
 mod job_thread;
+mod learning;
 mod promotion;
 mod site_training;
 mod training;
@@ -27,6 +28,8 @@ use crate::domain::{
 use crate::shutdown::Shutdown;
 use crate::store::{Claim, Heartbeat, SampleFilter};
 use crate::telemetry::{JobMetrics, Metrics};
+
+pub use learning::learn;
 
 use job_thread::{JobProgress, JobThread, ProgressSink};
 

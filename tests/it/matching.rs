@@ -2,6 +2,7 @@
 //! and over REST.
 
 mod crowd;
+mod learning;
 mod live;
 mod plaza;
 mod ships;

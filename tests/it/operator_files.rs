@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
 
-use crate::harness::{TestServer, data_folder};
+use crate::harness::{TestServer, data_folder, now};
 
 const ALERTS: &str = include_str!("../../deploy/alerts.yml");
 const DASHBOARD: &str = include_str!("../../deploy/grafana-dashboard.json");
@@ -39,7 +39,18 @@ async fn metrics_of_a_server_at_work() -> String {
         let observation = json!({"time": time, "target_id": "p", "fix": fix});
         server.post("/v1/cameras/c/tracks", &observation).await.expect(200);
     }
-    server.get("/metrics").await.expect(200).text()
+    let source = json!({"address": "push:", "format": "traccar", "camera_ids": ["c"], "receiver_id": "phone"});
+    server.post("/v1/connections", &json!({"id": "phone", "source": source})).await.expect(201);
+    let position = json!({"position": {"fixTime": now(), "latitude": 48.0, "longitude": 11.0}});
+    server.post("/v1/connections/phone/messages", &position).await.expect(204);
+    // The figures of connections are gathered every ten seconds.
+    loop {
+        let metrics = server.get("/metrics").await.expect(200).text();
+        if is_printed(&metrics, "sightfix_outside_connection_lag_seconds") {
+            return metrics;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(200)).await;
+    }
 }
 
 #[tokio::test]

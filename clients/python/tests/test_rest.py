@@ -81,6 +81,7 @@ def test_from_an_empty_server_to_a_report(
     client.evaluations.delete(evaluation.id)
     assert list(client.evaluations.list()) == []
     assert [it.camera.id for it in client.cameras.statuses()] == ["square"]
+    assert client.cameras.learning("square").state == "learned"
     assert client.server().limits["batch_observations"] == 1000
 
 

@@ -75,6 +75,7 @@ async function cameras(): Promise<void> {
   body(await client.GET("/v1/cameras/{camera}", { params: { path } }));
   expect(body(await client.GET("/v1/cameras", { params: { query: { limit: 1 } } })).items.length === 1, "one camera");
   body(await client.GET("/v1/camera-statuses"));
+  body(await client.GET("/v1/cameras/{camera}/learning", { params: { path } }));
 }
 
 async function samples(): Promise<void> {

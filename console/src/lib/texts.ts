@@ -431,6 +431,7 @@ const table = {
   'profile.receivers': ['Receivers: whose they are, and how far their clocks are off', 'Empfänger: wem sie gehören und wie weit ihre Uhren abweichen'],
   'profile.reload': ['Read again', 'Neu lesen'],
   'profile.retrain': ['Start a training run when the camera is found to have moved', 'Training starten, wenn die Kamera bewegt wurde'],
+  'profile.learn': ['Record and learn by itself while there is no model', 'Ohne Modell von selbst aufzeichnen und lernen'],
   'profile.revision': ['revision {n}', 'Revision {n}'],
   'profile.saved': ['Saved', 'Gespeichert'],
 

@@ -53,6 +53,7 @@ export interface Camera {
   /** Whose world tracks the camera contributes to. */
   site?: string;
   retrain_when_moved: boolean;
+  learn_automatically: boolean;
   revision: number;
   created_at: string;
   updated_at: string;
@@ -63,6 +64,13 @@ export interface Camera {
   model_fault?: string;
   moved?: CameraMoved;
   warnings: string[];
+}
+/** How far a camera has come on its way to a model. */
+export interface Learning {
+  state: 'off' | 'recording' | 'matching' | 'training' | 'learned';
+  message: string;
+  recorded_s: number;
+  needed_s: number;
 }
 export interface CameraStatus {
   camera: Camera;

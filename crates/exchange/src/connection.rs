@@ -164,6 +164,10 @@ pub struct SourceSettings {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.0, maximum = 1.0)]
     pub least_score: Option<f64>,
+    /// Whether the ids of detected objects are names of targets, which receivers know, too. They are numbers of a tracker if
+    /// left out, and boxes are then matched with receivers by where they are.
+    #[serde(default)]
+    pub ids_name_targets: bool,
     /// Whether boxes and fixes are paired and stored as samples. The peer's messages are acknowledged when that is done.
     #[serde(default)]
     pub store_samples: bool,
@@ -335,6 +339,26 @@ impl ConnectionSettings {
         Ok(())
     }
 
+    /// The cameras that it names, each with the field that does.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field of one that is no id.
+    pub fn named_cameras(&self) -> Result<Vec<(String, CameraId)>> {
+        let mut named = Vec::new();
+        if let Some(source) = &self.source {
+            for (name, mapping) in &source.cameras {
+                named.push((format!("source.cameras.{name}.camera_id"), mapping.camera()?));
+            }
+            let cameras = source.fix_cameras()?.into_iter();
+            named.extend(cameras.map(|camera| ("source.camera_ids".to_owned(), camera)));
+        }
+        if let Some(sink) = &self.sink {
+            let cameras = sink.cameras()?.into_iter();
+            named.extend(cameras.map(|camera| ("sink.camera_ids".to_owned(), camera)));
+        }
+        Ok(named)
+    }
+
     /// Whether the peer is the same as by other settings: direction, scheme, hosts and ports.
     #[must_use]
     pub fn has_peer_of(&self, other: &Self) -> bool {
@@ -375,8 +399,15 @@ impl SourceSettings {
         check_username(self.username.as_deref())?;
         check_sasl(self.sasl_mechanism, address.scheme, self.username.as_deref())?;
         self.check_items()?;
-        if self.brings_fixes() && self.camera_ids.is_empty() {
-            return Err(Error::invalid("camera_ids", "must name the cameras that the fixes are for"));
+        if self.brings_fixes() {
+            if self.camera_ids.is_empty() {
+                return Err(Error::invalid("camera_ids", "must name the cameras that the fixes are for"));
+            }
+            if self.ids_name_targets {
+                let rule =
+                    "is for detections; whose a receiver is stands in the profile of the camera (receivers)";
+                return Err(Error::invalid("ids_name_targets", rule));
+            }
         }
         if address.scheme == Scheme::Gpsd && self.format != MessageFormat::Gpsd {
             return Err(Error::invalid("format", "must be gpsd for an address of gpsd:"));

@@ -44,6 +44,7 @@ mod messages;
 mod nmea_fixes;
 mod objects_only;
 mod outgoing;
+mod recording;
 mod rows;
 #[cfg(test)]
 mod tests;
@@ -68,6 +69,7 @@ pub use messages::{
     NamedDetection, Reading, decoder, source_decoder,
 };
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
+pub use recording::{read_recording, write_recording};
 pub use rows::{
     ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
 };

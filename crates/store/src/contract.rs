@@ -15,11 +15,7 @@ use super::{
 #[cfg(doc)]
 use crate::domain::ErrorKind;
 use crate::domain::{
-    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraMoved, Connection, ConnectionId, ConnectionKey,
-    DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
-    EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
-    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Result, Revision,
-    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SourceOffset, StoredSample, TrainingRun,
+    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId, ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, RecordingBounds, RecordingPart, Result, Revision, RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SourceOffset, StoredSample, TrainingRun,
 };
 use crate::geo::Position;
 
@@ -499,6 +495,26 @@ contract! {
     /// # Errors
     /// [`ErrorKind::Overloaded`] while others use what is to be dropped. The next call goes on.
     fn retain_samples(&self, since: Option<Timestamp>, now: Timestamp) -> Result<u64>;
+
+    /// Appends to the recording of a camera, and deletes its oldest parts beyond the bounds. Appends nothing to a camera that
+    /// was deleted.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InsufficientStorage`].
+    fn append_recording(&self, camera: CameraKey, part: &RecordingPart, bounds: RecordingBounds) -> Result<()>;
+
+    /// The contents of a camera's recording, oldest part first.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn recording(&self, camera: CameraKey) -> Result<Vec<Vec<u8>>>;
+
+    /// Deletes what was recorded before an instant, and all of cameras that have a model or do not learn automatically; the
+    /// number of parts.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn retain_recordings(&self, since: Timestamp) -> Result<u64>;
 
     /// Stores a new connection with revision 1.
     ///

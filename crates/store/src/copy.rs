@@ -26,6 +26,7 @@ pub(super) const TABLES: &[Table] = &[
     Table { name: "activations", key: "camera_key, position" },
     Table { name: "held_out_errors", key: "camera_key, model_number, time_us, target_id" },
     Table { name: "camera_moves", key: "camera_key, model_number" },
+    Table { name: "recording_parts", key: "number" },
     Table { name: "samples", key: "camera_key, time_us, target_id" },
     Table { name: "samples_without_fix", key: "camera_key, time_us, target_id" },
     Table { name: "sample_counts", key: "camera_key" },
@@ -49,6 +50,7 @@ const NUMBERED: &[(&str, &str)] = &[
     ("audit_log", "number"),
     ("idempotency_keys", "number"),
     ("connections", "key"),
+    ("recording_parts", "number"),
     ("outbox", "number"),
 ];
 

@@ -98,6 +98,7 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Read, "GET /v1/cameras/{camera}", "sightfix.v1.CameraService/GetCamera"),
     operation(Operate, "PATCH /v1/cameras/{camera}", "sightfix.v1.CameraService/UpdateCamera"),
     operation(Operate, "DELETE /v1/cameras/{camera}", "sightfix.v1.CameraService/DeleteCamera"),
+    operation(Read, "GET /v1/cameras/{camera}/learning", "sightfix.v1.CameraService/GetLearning"),
     operation(Operate, "POST /v1/sites", "sightfix.v1.SiteService/CreateSite"),
     operation(Read, "GET /v1/sites", "sightfix.v1.SiteService/ListSites"),
     operation(Read, "GET /v1/sites/{site}", "sightfix.v1.SiteService/GetSite"),

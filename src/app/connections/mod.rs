@@ -2,6 +2,7 @@
 //!
 //! Here they are created, changed and watched; `connect` runs them.
 
+mod figures;
 mod groups;
 mod outbox;
 mod reports;
@@ -26,7 +27,8 @@ use crate::exchange::{
 pub use groups::connection_groups;
 pub use reports::{ConnectionNode, ReportedStatuses};
 pub use status::{
-    ConnectionBoard, ConnectionState, ConnectionStatus, LastMessage, LiveConnection, PushedMessage,
+    ConnectionBoard, ConnectionState, ConnectionStatus, CountedReason, LastMessage, LiveConnection,
+    PushedMessage,
 };
 
 /// A source that was created or resumed begins beside the answer; a message that comes before it waits for at most so long.
@@ -98,7 +100,9 @@ impl App {
     /// `ConnectionExists`; `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
     pub async fn create_connection(&self, request: ConnectionRequest) -> Result<Connection> {
         self.check_device(&request)?;
+        let settings = request.settings.clone();
         let profile = request.into_profile(Secrets::default())?;
+        self.check_cameras(&settings).await?;
         let connection = self.store.insert_connection(&profile, self.clock.now()).await?;
         self.connection_board.notify();
         Ok(connection)
@@ -122,6 +126,20 @@ impl App {
             }
             Err(error) => Err(error),
         }
+    }
+
+    /// Checks that the cameras exist that settings name.
+    async fn check_cameras(&self, settings: &ConnectionSettings) -> Result<()> {
+        for (field, camera) in settings.named_cameras()? {
+            match self.active_camera(&camera).await {
+                Err(error) if error.kind() == ErrorKind::CameraNotFound => {
+                    let message = format!("there is no camera {camera}; create it first");
+                    return Err(Error::invalid(field, message));
+                }
+                known => drop(known?),
+            }
+        }
+        Ok(())
     }
 
     /// Checks that a connection that is not paused may read its serial device, if it has one.
@@ -184,7 +202,12 @@ impl App {
         let (settings, secrets) = connection_settings(&stored)?;
         self.check_device(&request)?;
         let kept = if settings.has_peer_of(&request.settings) { secrets } else { Secrets::default() };
+        let wanted = request.settings.clone();
         let profile = request.into_profile(kept)?;
+        // One whose camera was deleted since can still be paused.
+        if wanted != settings {
+            self.check_cameras(&wanted).await?;
+        }
         let connection = self.store.replace_connection(&profile, Some(expected), self.clock.now()).await?;
         self.connection_board.notify();
         Ok(connection)

@@ -53,6 +53,30 @@ impl LastMessage {
     }
 }
 
+/// Why messages, or parts of them, were not taken.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CountedReason {
+    /// The reason, of the latest of them.
+    pub reason: String,
+    /// How many there were.
+    pub count: u64,
+    /// What the latest of them was: an item in words, or the beginning of a message.
+    pub example: String,
+    /// When that came.
+    pub last_at: Timestamp,
+}
+
+/// Reasons that are told apart; more are counted together.
+const MAX_REASONS: usize = 16;
+/// Characters of a reason, and of an example.
+const REASON_CHARACTERS: usize = 200;
+const OTHER_REASONS: &str = "other reasons";
+
+/// A reason without its numbers, which differ from message to message.
+fn without_numbers(reason: &str) -> impl Iterator<Item = char> {
+    reason.chars().filter(|own| !own.is_ascii_digit())
+}
+
 /// What a connection does.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default)]
@@ -85,11 +109,37 @@ pub struct ConnectionStatus {
     pub clients: u64,
     /// Clients that were refused or closed because there were too many.
     pub refused_clients: u64,
+    /// Boxes and fixes of a source, and messages without any, that wait until what is to be stored is stored.
+    pub unsettled: u64,
+    /// Why messages, or parts of them, were not taken.
+    pub reasons: Vec<CountedReason>,
     /// Age of the last item when it came, s; of the oldest waiting message of a sink.
     pub lag_s: Option<f64>,
 }
 
 impl ConnectionStatus {
+    /// Counts what was not taken, under its reason. Reasons that differ in numbers alone are one.
+    pub fn count_reason(&mut self, now: Timestamp, reason: &str, example: &str) {
+        let cut = |text: &str| text.chars().take(REASON_CHARACTERS).collect::<String>();
+        let is_same =
+            |known: &CountedReason| without_numbers(&known.reason).eq(without_numbers(&cut(reason)));
+        let at = self.reasons.iter().position(is_same).or_else(|| {
+            let is_full = self.reasons.len() >= MAX_REASONS;
+            is_full.then(|| self.reasons.iter().position(|known| known.reason == OTHER_REASONS)).flatten()
+        });
+        let reason = match self.reasons.len() {
+            0..MAX_REASONS => reason,
+            _ if at.is_some_and(|at| self.reasons[at].reason != OTHER_REASONS) => reason,
+            _ => OTHER_REASONS,
+        };
+        let count = at.map_or(0, |at| self.reasons[at].count) + 1;
+        let counted = CountedReason { reason: cut(reason), count, example: cut(example), last_at: now };
+        match at {
+            Some(at) => self.reasons[at] = counted,
+            None => self.reasons.push(counted),
+        }
+    }
+
     /// Makes the counts the sums of what several nodes have counted.
     pub(super) fn set_counts<'a>(&mut self, all: impl Iterator<Item = &'a Self> + Clone) {
         let sum = |count: fn(&Self) -> u64| -> u64 { all.clone().map(count).sum() };
@@ -188,6 +238,12 @@ impl ConnectionBoard {
         }
     }
 
+    /// All that are known, with what they do.
+    pub(super) fn all(&self) -> Vec<(ConnectionId, ConnectionKey, ConnectionStatus)> {
+        let live = lock(&self.live);
+        live.iter().map(|(id, (key, connection))| (id.clone(), *key, connection.status())).collect()
+    }
+
     /// What is known of each.
     pub(super) fn statuses(&self) -> HashMap<ConnectionKey, ConnectionStatus> {
         lock(&self.live).values().map(|(key, connection)| (*key, connection.status())).collect()
@@ -210,4 +266,30 @@ impl ConnectionBoard {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reasons_are_counted_with_their_latest_example() {
+        let (mut status, at) = (ConnectionStatus::default(), Timestamp::from_second);
+        for second in [1, 2, 3] {
+            let now = at(second).expect("a time");
+            status.count_reason(now, &format!("{second} s since 1970 is too old"), &format!("fix {second}"));
+        }
+        let now = at(4).expect("a time");
+        status.count_reason(now, "is not JSON", "<xml>");
+        let [old, json] = &status.reasons[..] else { panic!("two reasons: {status:?}") };
+        assert_eq!((&*old.reason, old.count, &*old.example), ("3 s since 1970 is too old", 3, "fix 3"));
+        assert_eq!((json.count, json.last_at), (1, now));
+        // A sender that finds ever new reasons fills nothing.
+        for letter in ('a'..='z').chain('A'..='Z') {
+            status.count_reason(now, &format!("reason {letter}"), &"long ".repeat(100));
+        }
+        assert_eq!(status.reasons.len(), MAX_REASONS + 1);
+        assert!(status.reasons.iter().all(|known| known.example.len() <= REASON_CHARACTERS));
+        assert_eq!(status.reasons.iter().map(|known| known.count).sum::<u64>(), 3 + 1 + 52);
+    }
 }

@@ -10,6 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::camera_events::CameraEventLog;
 use super::drift::DriftMonitor;
+use super::learning::LiveLearning;
 use super::matching::LiveMatching;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
@@ -50,6 +51,7 @@ pub(in crate::app) struct CameraLive {
     pub(super) tracks: Tracks,
     pub(super) drift: DriftMonitor,
     pub(super) matching: LiveMatching,
+    pub(in crate::app) learning: LiveLearning,
     pub(super) events: CameraEventLog<CameraEvent>,
     pub(super) moved: watch::Sender<Option<Arc<CameraMoved>>>,
     pub(super) recorder: Mutex<Weak<SampleRecorder>>,
@@ -68,6 +70,7 @@ impl CameraLive {
             tracks: Tracks::default(),
             drift: DriftMonitor::default(),
             matching: LiveMatching::default(),
+            learning: LiveLearning::default(),
             events: CameraEventLog::new(event_log),
             moved: watch::channel(None).0,
             recorder: Mutex::new(Weak::new()),

@@ -8,7 +8,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use crate::app::App;
 use crate::app::registry::ActiveCamera;
 use crate::clock::Clock;
-use crate::domain::{Observation, ReceiverMatch, TargetId};
+use crate::domain::{Observation, ReceiverMatch, TargetClass, TargetId};
 
 /// Rounds of all cameras: one at a time. A camera that finds another's round under way tries again with its next box.
 pub(in crate::app) struct MatchingSlot(Arc<Semaphore>);
@@ -55,8 +55,16 @@ impl Drop for Round {
 
 impl App {
     /// Gives a box that has only a tracker's id the target of the receiver that it was matched with, and takes boxes and
-    /// fixes into the matching. Without a model nothing is matched.
-    pub(super) fn identify(&self, camera: &Arc<ActiveCamera>, observation: Observation) -> Identified {
+    /// fixes into the matching. Without a model nothing is matched, and a camera that learns records both.
+    pub(super) fn identify(
+        &self,
+        camera: &Arc<ActiveCamera>,
+        observation: Observation,
+        class: Option<&TargetClass>,
+    ) -> Identified {
+        if camera.is_learning() {
+            camera.live.learning.observe(&observation, class);
+        }
         let matching = &camera.live.matching;
         let receiver_match = camera.model().and_then(|_| matching.observe(&observation));
         let Some(tracker_id) = observation.tracker_id() else {

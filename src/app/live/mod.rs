@@ -13,6 +13,7 @@ mod drift;
 mod event_log;
 mod history;
 mod identification;
+mod learning;
 mod matching;
 mod retraining;
 mod sample_committer;
@@ -48,6 +49,7 @@ pub(super) use alarms::{ResidualQueue, residual_queue};
 pub use camera::{CameraEvent, TargetUpdate};
 pub use camera_events::{EventId, LostEvents};
 pub(super) use identification::MatchingSlot;
+pub(super) use learning::LearningProgress;
 pub(super) use retraining::RetrainSchedule;
 pub use sink_feeds::{SinkFeed, SinkFeeds, SinkPosition, WantedPositions};
 pub use site::{
@@ -137,7 +139,7 @@ impl App {
         // A time that no track takes must not move the matching either.
         let now = self.clock.now();
         self.live_time_bounds(now).check(observation.time())?;
-        let identified = self.identify(camera, observation);
+        let identified = self.identify(camera, observation, None);
         self.follow_identified((camera, lease), identified, now)
     }
 
@@ -237,7 +239,7 @@ impl App {
     }
 
     /// A camera whose live state is read.
-    async fn readable_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
+    pub(super) async fn readable_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
         let camera = self.active_camera(id).await?;
         self.check_readable(&camera).await?;
         Ok(camera)

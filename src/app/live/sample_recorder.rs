@@ -18,8 +18,9 @@ use super::sync::lock;
 use crate::domain::{Detection, Error, ErrorKind, Fix, Result, Sample, TargetId};
 use crate::fusion::pairing::{ItemOutcome, PairedItems, Pairer, PairingSettings, Released};
 
-/// Decisions that wait for their commit; streams beyond wait.
-const QUEUE: usize = 256;
+/// Decisions that wait for their commit; streams beyond wait. At 2,000 items a second a disk may take 4 s for a flush before
+/// positions wait for it.
+const QUEUE: usize = 8_192;
 /// Items of one camera that may wait for their decision; beyond, all of them are decided early.
 const MOST_PENDING: usize = 16_384;
 

@@ -275,7 +275,7 @@ impl LiveStream {
             Observation::new(time, target_id, item.bounding_box, fix)?.with_tracker_id(item.tracker_id)?;
         // A time that no track takes must not move the pairing either.
         self.app.live_time_bounds(now).check(time)?;
-        let identified = self.app.identify(camera, observation);
+        let identified = self.app.identify(camera, observation, item.class.as_ref());
         if identified.is_sure {
             self.record(seq, &identified.observation, item.class, item.score).await?;
         } else {

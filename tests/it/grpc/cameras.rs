@@ -15,6 +15,7 @@ fn yard() -> proto::CameraProfile {
         labels: [("site".to_owned(), "north".to_owned())].into(),
         receivers: vec![receiver("phone-7", "person-1", -18.35), receiver("tag", "tag", 0.0)],
         retrain_when_moved: Some(true),
+        learn_automatically: Some(false),
         site: None,
         gnss_bias_sigma_m: Some(1.5),
     }

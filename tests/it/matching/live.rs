@@ -19,15 +19,15 @@ const LIVE: Crowd =
 const SENT_FIRST_S: f64 = 100.0;
 
 /// A row of a recording: a box with its walker, or a fix.
-struct Row {
-    time: Timestamp,
-    id: String,
-    walker: Option<usize>,
-    numbers: Vec<f64>,
+pub(super) struct Row {
+    pub(super) time: Timestamp,
+    pub(super) id: String,
+    pub(super) walker: Option<usize>,
+    pub(super) numbers: Vec<f64>,
 }
 
 /// Boxes and fixes in the order of their times.
-fn rows(recorded: &Recorded) -> Vec<Row> {
+pub(super) fn rows(recorded: &Recorded) -> Vec<Row> {
     let row = |line: &str, walker: Option<usize>| {
         let cells: Vec<&str> = line.split(',').collect();
         let numbers = cells[2..].iter().filter_map(|cell| cell.parse().ok()).collect();

@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::TcpStream;
 
-use super::peers::{Broker, connection_when, create_gate, patch, send_fix};
+use super::peers::{Broker, connection_when, create_gate, patch, send_fix, send_fix_of};
 use crate::harness::{TestServer, data_folder, now, own_address};
 use crate::tls::Authority;
 
@@ -35,7 +35,12 @@ async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
     let folder = data_folder();
     let server = TestServer::start(folder.path());
     create_gate(&server).await;
-    server.post("/v1/connections", &frigate(&broker)).await.expect(201);
+    let receivers = json!({"receivers": [{"receiver_id": "anna's phone", "target_id": TARGET}]});
+    let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
+    server.send("PATCH", "/v1/cameras/gate", &headers, receivers.to_string()).await.expect(200);
+    let mut source = frigate(&broker);
+    source["source"]["ids_name_targets"] = json!(true);
+    server.post("/v1/connections", &source).await.expect(201);
     connection_when(&server, "frigate", |status| status["state"] == "running").await;
     let time = now();
     broker.publish("frigate/events", &frigate_update(time));
@@ -45,7 +50,7 @@ async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
 
     let server = TestServer::start(folder.path());
     connection_when(&server, "frigate", |status| status["items"] == 1).await;
-    send_fix(&server, TARGET, &time.to_string(), 103.98678, true).await;
+    send_fix_of(&server, json!({"receiver_id": "anna's phone"}), &time.to_string(), 103.98678, true).await;
     connection_when(&server, "frigate", |status| status["acknowledged"] == 1).await;
     let samples = server.get("/v1/cameras/gate/samples").await.expect(200).json();
     let sample = &samples["items"][0];
@@ -62,6 +67,7 @@ async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
     let status =
         connection_when(&server, "frigate", |status| status["messages"] == 1).await["status"].clone();
     assert_eq!((&status["items"], &status["rejected"]), (&json!(0), &json!(1)), "{status}");
+    assert_eq!((&status["reasons"][0]["count"], &status["reasons"][0]["example"]), (&json!(1), &json!("not JSON")));
     connection_when(&server, "frigate", |status| status["acknowledged"] == 1).await;
     assert_eq!(server.get("/v1/cameras/gate/samples/count").await.expect(200).json()["count"], 1);
 }

@@ -96,11 +96,11 @@ fn detection(time: jiff::Timestamp, target: &str) -> String {
     .to_string()
 }
 
-/// Detections of a topic for the camera `gate`, stored with the fixes of their targets.
+/// Detections of a topic for the camera `gate`, whose detector knows its targets, stored with the fixes of these.
 fn source(cluster: &Cluster) -> Value {
     json!({"id": "detector", "source": {
         "address": format!("kafka://{}", cluster.address), "format": "deepstream", "topics": [TOPIC],
-        "cameras": {"*": {"camera_id": "gate"}}, "store_samples": true,
+        "cameras": {"*": {"camera_id": "gate"}}, "ids_name_targets": true, "store_samples": true,
     }})
 }
 
@@ -198,7 +198,7 @@ async fn a_paused_source_of_a_kafka_broker_can_be_tried() {
     };
     assert_eq!(tried["message"]["subject"], TOPIC);
     let reading = tried["message"]["reading"][0].as_str().expect("text");
-    assert!(reading.contains("target 9"), "{reading}");
+    assert!(reading.contains("object 9"), "{reading}");
 }
 
 #[tokio::test]

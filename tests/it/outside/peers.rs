@@ -75,6 +75,20 @@ impl Broker {
         assert!(process.wait().expect("it ends").success());
     }
 
+    /// Publishes each line as a message with QoS 1, in their order.
+    pub(crate) fn publish_lines(&self, topic: &str, lines: impl Iterator<Item = String>) {
+        let mut command = Command::new("mosquitto_pub");
+        command.args(&self.client_arguments);
+        command.args(["-p", &self.port.to_string(), "-q", "1", "-t", topic, "-l"]);
+        let mut process = command.stdin(Stdio::piped()).spawn().expect("mosquitto-clients is installed");
+        let mut input = process.stdin.take().expect("piped");
+        for line in lines {
+            writeln!(input, "{line}").expect("it reads");
+        }
+        drop(input);
+        assert!(process.wait().expect("it ends").success());
+    }
+
     fn subscriber(&self, topic: &str) -> Command {
         let mut command = Command::new("mosquitto_sub");
         command.args(&self.client_arguments);
@@ -134,9 +148,20 @@ pub(crate) async fn send_fix(
     longitude_deg: f64,
     stores: bool,
 ) {
-    let fix = json!({"observations": [{
-        "time": time, "target_id": target, "fix": {"longitude_deg": longitude_deg, "latitude_deg": 30.628, "sigma_m": 1.5},
-    }]});
+    send_fix_of(server, json!({"target_id": target}), time, longitude_deg, stores).await;
+}
+
+/// The same of a target or a receiver.
+pub(crate) async fn send_fix_of(
+    server: &TestServer,
+    mut fix: Value,
+    time: &str,
+    longitude_deg: f64,
+    stores: bool,
+) {
+    fix["time"] = json!(time);
+    fix["fix"] = json!({"longitude_deg": longitude_deg, "latitude_deg": 30.628, "sigma_m": 1.5});
+    let fix = json!({"observations": [fix]});
     let path = format!("/v1/cameras/gate/tracks?store_samples={stores}");
     server.post(&path, &fix).await.expect(200);
 }

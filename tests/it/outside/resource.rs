@@ -18,6 +18,9 @@ fn webhook(id: &str) -> Value {
 async fn a_connection_is_created_read_changed_and_deleted_and_its_secrets_are_never_shown() {
     let folder = data_folder();
     let server = TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__OUTSIDE_CONNECTIONS", "2")]);
+    let refused = server.post("/v1/connections", &webhook("hook")).await.expect(422).text();
+    assert!(refused.contains("sink.camera_ids") && refused.contains("there is no camera gate"), "{refused}");
+    create_gate(&server).await;
     let created = server.post("/v1/connections", &webhook("hook")).await.expect(201);
     assert_eq!(created.header("location"), "/v1/connections/hook");
     assert!(!created.text().contains(SECRET));
@@ -59,7 +62,8 @@ async fn a_connection_is_created_read_changed_and_deleted_and_its_secrets_are_ne
             "connection-changed",
             "connection-changed",
             "connection-changed",
-            "connection-created"
+            "connection-created",
+            "camera-created"
         ]
     );
     let listed = server.get("/v1/connections").await.expect(200);

@@ -39,6 +39,9 @@ pub struct NewCamera {
     pub receivers: Receivers,
     /// Whether a training run starts automatically after the camera has moved.
     pub retrain_when_moved: bool,
+    /// Whether the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on those
+    /// that belong together beyond doubt.
+    pub learn_automatically: bool,
     /// The site whose tracks the camera contributes to.
     pub site: Option<SiteId>,
 }
@@ -58,6 +61,7 @@ impl NewCamera {
             labels: BTreeMap::new(),
             receivers: Receivers::default(),
             retrain_when_moved: false,
+            learn_automatically: true,
             site: None,
         }
     }
@@ -125,13 +129,15 @@ pub struct CameraChange {
     pub receivers: Option<Receivers>,
     /// Whether to retrain automatically.
     pub retrain_when_moved: Option<bool>,
+    /// Whether to learn automatically while there is no model.
+    pub learn_automatically: Option<bool>,
     /// New site; `Some(None)` removes the camera from its site.
     pub site: Option<Option<SiteId>>,
 }
 
 impl CameraChange {
     /// Names of the fields that can be changed, on both transports.
-    pub const FIELDS: [&str; 10] = [
+    pub const FIELDS: [&str; 11] = [
         "display_name",
         "image_size",
         "gnss_error",
@@ -141,6 +147,7 @@ impl CameraChange {
         "labels",
         "receivers",
         "retrain_when_moved",
+        "learn_automatically",
         "site",
     ];
 
@@ -157,6 +164,7 @@ impl CameraChange {
             labels: is_named("labels").then_some(profile.labels),
             receivers: is_named("receivers").then_some(profile.receivers),
             retrain_when_moved: is_named("retrain_when_moved").then_some(profile.retrain_when_moved),
+            learn_automatically: is_named("learn_automatically").then_some(profile.learn_automatically),
             site: is_named("site").then_some(profile.site),
         }
     }
@@ -177,6 +185,7 @@ impl CameraChange {
             labels: self.labels.unwrap_or(profile.labels),
             receivers: self.receivers.unwrap_or(profile.receivers),
             retrain_when_moved: self.retrain_when_moved.unwrap_or(profile.retrain_when_moved),
+            learn_automatically: self.learn_automatically.unwrap_or(profile.learn_automatically),
             site: self.site.unwrap_or(profile.site),
         }
         .check()

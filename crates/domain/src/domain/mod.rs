@@ -28,6 +28,7 @@ mod observation;
 mod on_conflict;
 mod receiver;
 mod recipe;
+mod recording_part;
 mod sample;
 mod sample_filter;
 mod sample_overflow;
@@ -65,6 +66,7 @@ pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Obs
 pub use on_conflict::OnConflict;
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
+pub use recording_part::{RecordingBounds, RecordingPart};
 pub use sample::{Association, Sample, SampleCount, StoredSample};
 pub use sample_filter::{SampleFilter, SampleKey};
 pub use sample_overflow::SampleOverflow;

@@ -102,7 +102,7 @@ pub struct NamedDetection {
     pub camera: String,
     /// Time of the frame.
     pub time: Timestamp,
-    /// The target.
+    /// The sender's id of the object: a tracker's number, unless the connection says that it names a target.
     pub target_id: TargetId,
     /// The rectangle.
     pub detected_box: DetectedBox,

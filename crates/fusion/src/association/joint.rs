@@ -447,6 +447,17 @@ fn motion_of_receivers(fixes: &[Vec<TimedFix>]) -> SceneMotion {
     SceneMotion::of(&tracks)
 }
 
+/// How boxes that were matched without a model are paired with the fixes of their receivers.
+#[must_use]
+pub fn joint_pairing() -> PairingSettings {
+    PairingSettings {
+        rule: PairingRule::Interpolated,
+        // Ships report every few seconds and move straight in between.
+        longest_gap: SignedDuration::from_secs(10),
+        ..PairingSettings::default()
+    }
+}
+
 /// Samples of the sure boxes, under their receivers' ids, and all other boxes.
 fn training_samples(
     scene: &Scene<'_>,
@@ -463,14 +474,8 @@ fn training_samples(
             sure.push(Detection { target_id, ..detections[*at].clone() });
         }
     }
-    let settings = PairingSettings {
-        rule: PairingRule::Interpolated,
-        // Ships report every few seconds and move straight in between.
-        longest_gap: SignedDuration::from_secs(10),
-        ..PairingSettings::default()
-    };
     let receivers = matching.receivers_of(scene.received, scene.receivers);
-    let samples = pair(sure, scene.received.to_vec(), &receivers, &settings).samples;
+    let samples = pair(sure, scene.received.to_vec(), &receivers, &joint_pairing()).samples;
     let others = detections.iter().zip(&is_sure).filter(|(_, is_sure)| !**is_sure);
     (samples, others.map(|(own, _)| own.clone()).collect())
 }

@@ -22,7 +22,7 @@ mod tracklet;
 
 pub use self::cancellation::Cancellation;
 pub use self::chains::ChainSettings;
-pub use self::joint::{JointMatch, WorldScores, match_without_model};
+pub use self::joint::{JointMatch, WorldScores, joint_pairing, match_without_model};
 pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};
 pub use self::matching::{MatchLimits, MatchSettings, MatchedPiece, Matching, match_with_model};
 

@@ -24,9 +24,9 @@ impl Database {
         lock_limit(&mut transaction, Limit::Cameras).await?;
         let insert = query(concat!(
             "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, \
-             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, site_key, \
-             updated_at_us, id, created_at_us, revision) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, \
-             (SELECT key FROM sites WHERE id = $11), $12, $13, $14, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
+             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, learn_automatically, \
+             site_key, updated_at_us, id, created_at_us, revision) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, \
+             $11, (SELECT key FROM sites WHERE id = $12), $13, $14, $15, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
         let row = bind_profile(insert, profile, now)?
@@ -86,8 +86,9 @@ impl Database {
         let update = query(concat!(
             "UPDATE cameras SET display_name = $1, image_width_px = $2, image_height_px = $3, \
              gnss_sigma_m = $4, gnss_bias_sigma_m = $5, recipe = $6, target_classes = $7, labels = $8, receivers = $9, \
-             retrain_when_moved = $10, site_key = (SELECT key FROM sites WHERE id = $11), updated_at_us = $12, \
-             revision = revision + 1 WHERE id = $13 RETURNING ",
+             retrain_when_moved = $10, learn_automatically = $11, \
+             site_key = (SELECT key FROM sites WHERE id = $12), updated_at_us = $13, \
+             revision = revision + 1 WHERE id = $14 RETURNING ",
             columns!()
         ));
         let row = bind_profile(update, profile, now)?
@@ -185,6 +186,7 @@ fn bind_profile(query: Query<StoredRow>, profile: &NewCamera, now: Timestamp) ->
         .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
         .bind(write_receivers(&profile.receivers)?)
         .bind(profile.retrain_when_moved)
+        .bind(profile.learn_automatically)
         .bind(profile.site.as_ref().map(|site| site.as_str().to_owned()))
         .bind(now.as_microsecond()))
 }

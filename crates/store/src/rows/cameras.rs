@@ -65,8 +65,8 @@ pub(crate) fn read_version(row: &StoredRow) -> Result<CameraVersion> {
 macro_rules! camera_columns {
     () => {
         "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, gnss_bias_sigma_m, recipe, \
-         target_classes, labels, receivers, retrain_when_moved, revision, created_at_us, updated_at_us, \
-         active_model, (SELECT samples FROM sample_counts WHERE camera_key = key) AS samples_with_fix, \
+         target_classes, labels, receivers, retrain_when_moved, learn_automatically, revision, created_at_us, \
+         updated_at_us, active_model, (SELECT samples FROM sample_counts WHERE camera_key = key) AS samples_with_fix, \
          (SELECT without_fix FROM sample_counts WHERE camera_key = key) AS samples_without_fix, \
          (SELECT sites.id FROM sites WHERE sites.key = site_key) AS site"
     };
@@ -100,6 +100,7 @@ pub(crate) fn read_camera(row: &StoredRow) -> Result<Camera> {
     let labels = fields.parse(serde_json::from_str::<BTreeMap<String, String>>)?;
     let receivers = fields.parse(read_receivers)?;
     let retrain_when_moved = fields.get()?;
+    let learn_automatically = fields.get()?;
     let revision = fields.revision()?;
     let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
     let active_model = fields.optional_count()?;
@@ -118,6 +119,7 @@ pub(crate) fn read_camera(row: &StoredRow) -> Result<Camera> {
         labels,
         receivers,
         retrain_when_moved,
+        learn_automatically,
         site,
     };
     Ok(Camera { key, profile, revision, created_at, updated_at, active_model, samples })

@@ -32,6 +32,7 @@ fn full(name: &str) -> NewCamera {
         ])
         .expect("two receivers"),
         retrain_when_moved: true,
+        learn_automatically: false,
         site: None,
     }
 }

@@ -6,7 +6,7 @@ from typing import Unpack
 from sightfix._async.transport import Transport
 from sightfix._json import request_json, to_json
 from sightfix._request import delete, get, path, with_json
-from sightfix.models import Camera, CameraChange, CameraDraft, CameraStatus, Estimate, Fix
+from sightfix.models import Camera, CameraChange, CameraDraft, CameraStatus, Estimate, Fix, Learning
 
 
 class Cameras:
@@ -49,6 +49,10 @@ class Cameras:
     async def delete(self, camera_id: str) -> None:
         """Deletes a camera with its samples, runs and models."""
         await self._transport.send(delete(path("cameras", camera_id)))
+
+    async def learning(self, camera_id: str) -> Learning:
+        """What a camera without a model has recorded to learn from, and what is missing."""
+        return await self._transport.json(get(path("cameras", camera_id, "learning")), Learning)
 
     async def estimate_gnss_error(self, camera_id: str, fixes: Iterable[Fix]) -> Estimate:
         """Estimates a receiver's error from at least ten fixes at one fixed point. Nothing is stored."""

@@ -1,0 +1,227 @@
+//! From a detector's tracker and a phone, each with ids of its own, to a model and live positions, over a real mosquitto.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use serde_json::{Value, json};
+
+use super::ONE_AMONG_TEN;
+use super::crowd::{Crowd, Recorded};
+use super::live::{Row, rows};
+use crate::harness::{TestServer, data_folder, now};
+use crate::outside::peers::{Broker, connection_when};
+
+/// Recorded time after which the camera must have its model, s.
+const LEARNT_FROM_S: f64 = 600.0;
+/// Positions of the phone that are looked at: its fixes of the time after give more.
+const RECEIVED: u32 = 100;
+/// Time of messages that are published at once, s.
+const SLICE_S: f64 = 20.0;
+
+/// An event of Frigate with the state after a change.
+fn frigate_event(camera: &str, row: &Row, shift: SignedDuration) -> String {
+    let [left, top, width, height] = row.numbers[..] else { panic!("a box") };
+    json!({"type": "update", "before": {}, "after": {
+        "id": format!("1607123955.475377-{}", row.id), "camera": camera, "label": "person", "false_positive": false,
+        "frame_time": (row.time + shift).as_microsecond() as f64 * 1e-6, "score": 0.88,
+        "box": [left, top, left + width, top + height],
+    }})
+    .to_string()
+}
+
+/// A position as Traccar forwards it.
+fn traccar_position(row: &Row, shift: SignedDuration) -> String {
+    let [longitude, latitude] = row.numbers[..] else { panic!("a fix") };
+    json!({
+        "position": {"deviceId": 1, "fixTime": (row.time + shift).to_string(), "valid": true,
+            "longitude": longitude, "latitude": latitude, "accuracy": 4.0},
+        "device": {"uniqueId": row.id},
+    })
+    .to_string()
+}
+
+/// A square of a broker: its camera, the detector's and the phone's connection.
+struct Square<'a> {
+    server: &'a TestServer,
+    broker: &'a Broker,
+    camera: String,
+    recorded: Recorded,
+    rows: Vec<Row>,
+    /// From the times of the recording to those of the messages.
+    shift: SignedDuration,
+}
+
+impl<'a> Square<'a> {
+    async fn new(server: &'a TestServer, broker: &'a Broker, crowd: Crowd) -> Self {
+        let camera = format!("square-{}", crowd.seed);
+        let draft = json!({"id": camera, "image_size": {"width_px": 1920, "height_px": 1080}});
+        server.post("/v1/cameras", &draft).await.expect(201);
+        let address = format!("mqtt://127.0.0.1:{}", broker.port);
+        let detector = json!({"id": format!("frigate-{camera}"), "source": {
+            "address": address, "format": "frigate", "topics": [format!("{camera}/events")],
+            "cameras": {"front_door": {"camera_id": camera}}, "store_samples": true,
+        }});
+        let phone = json!({"id": format!("phones-{camera}"), "source": {
+            "address": address, "format": "traccar", "topics": [format!("{camera}/positions")],
+            "camera_ids": [camera], "store_samples": true,
+        }});
+        for draft in [&detector, &phone] {
+            server.post("/v1/connections", draft).await.expect(201);
+            let id = draft["id"].as_str().expect("text");
+            connection_when(server, id, |status| status["state"] == "running").await;
+        }
+        let recorded = crowd.recorded();
+        let rows = rows(&recorded);
+        let shift = now().duration_since(rows.last().expect("rows").time);
+        Self { server, broker, camera, recorded, rows, shift }
+    }
+
+    fn since_start_s(&self, row: &Row) -> f64 {
+        row.time.duration_since(self.rows[0].time).as_secs_f64()
+    }
+
+    /// Publishes what was recorded from a time up to another, s, boxes and fixes under topics of their own.
+    fn publish(&self, from_s: f64, until_s: f64) {
+        let is_within = |row: &&Row| (from_s..until_s).contains(&self.since_start_s(row));
+        let (boxes, fixes): (Vec<&Row>, Vec<&Row>) =
+            self.rows.iter().filter(is_within).partition(|row| row.walker.is_some());
+        let events = boxes.iter().map(|row| frigate_event("front_door", row, self.shift));
+        self.broker.publish_lines(&format!("{}/events", self.camera), events);
+        let positions = fixes.iter().map(|row| traccar_position(row, self.shift));
+        self.broker.publish_lines(&format!("{}/positions", self.camera), positions);
+    }
+
+    /// The same in slices, with a pause after each.
+    async fn publish_slices(&self, from_s: f64, until_s: f64, slice_s: f64, pause: Duration) {
+        let mut at_s = from_s;
+        while at_s < until_s {
+            self.publish(at_s, until_s.min(at_s + slice_s));
+            tokio::time::sleep(pause).await;
+            at_s += slice_s;
+        }
+    }
+
+    async fn learning(&self) -> Value {
+        self.server.get(&format!("/v1/cameras/{}/learning", self.camera)).await.expect(200).json()
+    }
+
+    /// What the camera says once it has learnt, or has tried to.
+    async fn learnt(&self) -> Value {
+        let mut learning = Value::Null;
+        for _ in 0..3_000 {
+            learning = self.learning().await;
+            let has_tried = learning["state"] == "recording" && learning["last_attempt"].is_object();
+            if has_tried || learning["state"] == "learned" {
+                return learning;
+            }
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+        panic!("the camera does not try to learn: {learning}")
+    }
+
+    /// Samples of phones: those of the boxes of their carriers, and all.
+    async fn samples(&self) -> (usize, usize) {
+        let path = format!("/v1/cameras/{}/samples", self.camera);
+        let csv = self.server.send("GET", &path, &[("accept", "text/csv")], "").await.expect(200).text();
+        let carriers = self.walkers();
+        let mut reader = csv::Reader::from_reader(csv.as_bytes());
+        let header = reader.headers().expect("a header").clone();
+        let column = |name: &str| header.iter().position(|given| given == name).expect("the column");
+        let columns = ["time", "target_id", "left"].map(column);
+        let samples = reader.records().map(|row| row.expect("a row"));
+        let of_phones: Vec<_> = samples.filter(|row| row[columns[1]].starts_with("phone-")).collect();
+        let is_right = |row: &&csv::StringRecord| {
+            let [time, target, left] = columns.map(|at| &row[at]);
+            let left: f64 = left.parse().expect("px");
+            let time: Timestamp = time.parse().expect("a time");
+            let walker = carriers.get(&(time.as_millisecond(), (left * 100.0).round() as i64));
+            walker.is_some_and(|walker| target == format!("phone-{walker}"))
+        };
+        (of_phones.iter().filter(is_right).count(), of_phones.len())
+    }
+
+    /// Walkers by the time of their box, ms, and its left edge, 0.01 px.
+    fn walkers(&self) -> BTreeMap<(i64, i64), usize> {
+        let boxes = self.rows.iter().filter_map(|row| Some((row, row.walker?)));
+        boxes
+            .map(|(row, walker)| {
+                let time_ms = (row.time + self.shift).as_millisecond();
+                ((time_ms, (row.numbers[0] * 100.0).round() as i64), walker)
+            })
+            .collect()
+    }
+}
+
+/// The story of a detector and a phone that know nothing of each other: eleven people, of whom one carries the phone.
+#[tokio::test]
+#[ignore = "needs mosquitto"]
+async fn a_camera_of_a_broker_learns_by_itself_whose_phone_it_sees() {
+    let broker = Broker::start();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    let square = Square::new(&server, &broker, Crowd { seconds: 720, ..ONE_AMONG_TEN }).await;
+    assert_eq!(square.recorded.walkers.iter().max(), Some(&10));
+    let learning = square.learning().await;
+    assert_eq!(learning["state"], "recording", "{learning}");
+    assert!(learning["message"].as_str().is_some_and(|text| text.contains("no box")), "{learning}");
+
+    square.publish_slices(0.0, 240.0, SLICE_S, Duration::ZERO).await;
+    let phones = format!("phones-{}", square.camera);
+    connection_when(&server, &phones, |status| status["items"].as_u64() >= Some(230)).await;
+    let learning = square.learning().await;
+    let message = learning["message"].as_str().expect("text");
+    assert!(message.contains("of about 8 minutes"), "{learning}");
+
+    square.publish_slices(240.0, LEARNT_FROM_S, SLICE_S, Duration::ZERO).await;
+    let learning = square.learnt().await;
+    assert_eq!(learning["state"], "learned", "{learning}");
+    let (right, all) = square.samples().await;
+    println!("{right} of {all} samples right: {learning}");
+    assert!(all > 200 && right * 100 >= all * 95, "{right} of {all}");
+
+    // From now on boxes are matched as they come, and positions go out.
+    let topic = format!("sightfix/{}/phone-0", square.camera);
+    broker.subscribe(&topic);
+    let sink = json!({"id": "positions", "sink": {
+        "address": format!("mqtt://127.0.0.1:{}", broker.port), "camera_ids": [square.camera], "min_interval_s": 0,
+    }});
+    server.post("/v1/connections", &sink).await.expect(201);
+    connection_when(&server, "positions", |status| status["state"] == "running").await;
+    square.publish_slices(LEARNT_FROM_S, 720.0, 2.0, Duration::from_millis(300)).await;
+    let received = broker.received(&topic, RECEIVED);
+    let times: Vec<Timestamp> = received
+        .lines()
+        .filter_map(|line| serde_json::from_str::<Value>(line.split_once(' ')?.1).ok())
+        .map(|message| message["time"].as_str().expect("a time").parse().expect("a time"))
+        .collect();
+    // Fixes have times of their own, between the frames.
+    let frames: Vec<i64> = square.walkers().into_keys().map(|(time_ms, _)| time_ms).collect();
+    let of_boxes = times.iter().filter(|time| frames.binary_search(&time.as_millisecond()).is_ok()).count();
+    println!("{of_boxes} of {} positions of the phone are of boxes", times.len());
+    assert!(of_boxes * 3 > times.len(), "{received}");
+    let (right, all_with_live) = square.samples().await;
+    assert!(all_with_live > all && right * 100 >= all_with_live * 95, "{right} of {all_with_live}");
+}
+
+/// Ten worlds, each with a camera and connections of its own.
+#[tokio::test]
+#[ignore = "takes minutes: needs mosquitto, and is a mark of docs/association.md"]
+async fn marks_of_cameras_that_learn_by_themselves() {
+    let (broker, folder) = (Broker::start(), data_folder());
+    let server = TestServer::start(folder.path());
+    let (mut learnt, mut wrong) = (0, 0);
+    for seed in 1..=10 {
+        let square = Square::new(&server, &broker, Crowd { seed, ..ONE_AMONG_TEN }).await;
+        square.publish_slices(0.0, LEARNT_FROM_S, SLICE_S, Duration::ZERO).await;
+        let learning = square.learnt().await;
+        let (right, all) = square.samples().await;
+        let is_right = right * 100 >= all * 95;
+        let has_learnt = learning["state"] == "learned";
+        learnt += usize::from(has_learnt && is_right);
+        wrong += usize::from(!is_right);
+        println!("world {seed}: {right} of {all} samples right; {}", learning["message"]);
+    }
+    println!("right in {learnt} of 10 worlds, wrong in {wrong}");
+    assert!(learnt >= 9 && wrong == 0);
+}

@@ -7,7 +7,6 @@ export interface EastNorth {
 }
 
 const METRES_PER_DEGREE = 111_319.490793; // of longitude at the equator, WGS 84
-export const R95_PER_SIGMA = 2.447746830680816;
 
 /** Equirectangular projection about a reference. */
 export function toPlane(reference: Position, position: Position): EastNorth {
@@ -72,4 +71,10 @@ export function roundLength(most: number): number {
   const power = 10 ** Math.floor(Math.log10(most));
   const factor = most / power;
   return (factor >= 5 ? 5 : factor >= 2 ? 2 : 1) * power;
+}
+
+/** A round length of a scale bar, from centimetres to thousands of kilometres. */
+export function roundLengthText(length_m: number): string {
+  if (length_m < 1) return `${Math.round(length_m * 100)} cm`;
+  return length_m < 1000 ? `${Math.round(length_m)} m` : `${Math.round(length_m / 1000)} km`;
 }

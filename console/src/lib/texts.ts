@@ -2,6 +2,7 @@
 
 const table = {
   loading: ['Loading …', 'Wird geladen …'],
+  'connection.incomplete': ['A part of this page could not be loaded.', 'Ein Teil dieser Seite ließ sich nicht laden.'],
   'connection.lost': ['The server cannot be reached. Trying again …', 'Der Server ist nicht erreichbar. Neuer Versuch …'],
   'connection.unreachable': ['The server cannot be reached.', 'Der Server ist nicht erreichbar.'],
 
@@ -13,6 +14,7 @@ const table = {
   'action.delete': ['Delete', 'Löschen'],
   'action.download': ['Download', 'Herunterladen'],
   'action.label': ['Actions', 'Aktionen'],
+  'action.reload': ['Load the page again', 'Seite neu laden'],
   'action.remove': ['Remove', 'Entfernen'],
   'action.save': ['Save', 'Speichern'],
   'action.stop': ['Stop', 'Anhalten'],
@@ -20,6 +22,19 @@ const table = {
   'age.ago': ['{time} ago', 'vor {time}'],
   'age.never': ['never', 'nie'],
   'age.now': ['now', 'jetzt'],
+
+  // What the flags of a position mean, by their name.
+  'flag.gnss_denied': ['No fix came with the box: the position is from the box alone.', 'Zur Box kam kein Fix: Die Position stammt nur aus der Box.'],
+  'flag.box_missing': ['No box came with the fix: the position is the fix.', 'Zum Fix kam keine Box: Die Position ist der Fix.'],
+  'flag.box_at_border': ['The border of the image cuts the box, so its foot may be hidden.', 'Der Bildrand schneidet die Box, ihr Fuß ist vielleicht verdeckt.'],
+  'flag.outside_training': ['The box is unlike those of the training: the model extrapolates.', 'Die Box gleicht keiner des Trainings: Das Modell extrapoliert.'],
+  'flag.no_model': ['The camera has no model: fixes pass through as they are.', 'Die Kamera hat kein Modell: Fixe gehen unverändert durch.'],
+  'flag.camera_moved': ['The camera was moved since the training. Train it again.', 'Die Kamera wurde seit dem Training bewegt. Neu trainieren.'],
+  'flag.sources_disagree': ['Box and fix contradict each other beyond their errors.', 'Box und Fix widersprechen sich stärker, als ihre Fehler erklären.'],
+  'flag.fix_rejected': ['The fix was not used: it contradicts the box, or is out of range.', 'Der Fix wurde nicht benutzt: Er widerspricht der Box oder liegt außerhalb.'],
+  'flag.box_rejected': ['The box was not used: it contradicts the fix, or the model has no position for it.', 'Die Box wurde nicht benutzt: Sie widerspricht dem Fix, oder das Modell kennt keine Position dazu.'],
+  'flag.fix_out_of_range': ['The fix is more than 20 km from the camera’s scene.', 'Der Fix liegt mehr als 20 km von der Szene der Kamera entfernt.'],
+  'flag.box_frozen': ['The boxes have not changed by a pixel for long: the picture or the detector stands still.', 'Die Boxen sind seit Langem bis auf den Pixel gleich: Bild oder Detektor steht still.'],
 
   'nav.breadcrumb': ['Where you are', 'Standort'],
   'nav.cameras': ['Cameras', 'Kameras'],
@@ -131,7 +146,7 @@ const table = {
   'camera.name.example': ['North gate', 'Nordtor'],
   'camera.new': ['New camera', 'Neue Kamera'],
   'camera.new.help': ['The image size lets the model recognise boxes that the right or lower border cuts. All of this can be changed later.', 'Mit der Bildgröße erkennt das Modell Boxen, die der rechte oder untere Rand abschneidet. Alles ist später änderbar.'],
-  'camera.r95': ['Median radius', 'Mittlerer Radius'],
+  'camera.r95': ['Median radius', 'Median des Radius'],
   'camera.r95.meaning': ['Median over the trained area of the radius that holds the true position with 95 % probability, from a box alone.', 'Median über den trainierten Bereich: Radius, der die wahre Position mit 95 % Wahrscheinlichkeit enthält, allein aus der Box.'],
   'camera.sigma': ['Receiver sigma, m', 'Sigma des Empfängers, m'],
   'camera.sigma.unknown': ['estimated', 'geschätzt'],
@@ -153,13 +168,13 @@ const table = {
   'source.fused': ['Fused', 'Fusioniert'],
   'source.gnss': ['GNSS fix', 'GNSS-Fix'],
 
-  'field.from': ['From', 'Von'],
+  'field.from': ['From ({zone})', 'Von ({zone})'],
   'field.latitude': ['Latitude, deg', 'Breite, Grad'],
   'field.longitude': ['Longitude, deg', 'Länge, Grad'],
   'field.r95': ['95 % radius', '95-%-Radius'],
   'field.target': ['Target', 'Ziel'],
   'field.time': ['Time', 'Zeit'],
-  'field.until': ['Until', 'Bis'],
+  'field.until': ['Until ({zone})', 'Bis ({zone})'],
   'field.weights': ['Weights (box / fix)', 'Gewichte (Box / Fix)'],
 
   'scene.allThirds': ['Every ninth of the image is covered.', 'Jedes Neuntel des Bildes ist abgedeckt.'],
@@ -207,7 +222,7 @@ const table = {
   'live.lost': ['Connection lost. What is shown is old. Reconnecting …', 'Verbindung verloren. Die Anzeige ist veraltet. Neuer Versuch …'],
   'live.lostEvents': ['{n} events were skipped: this browser is too slow', '{n} Ereignisse übersprungen: Dieser Browser ist zu langsam'],
   'live.map.label': ['Map with tracks of targets', 'Karte mit Spuren der Ziele'],
-  'live.none': ['No target is tracked now. Replay a recording as a camera would send it:', 'Zurzeit wird kein Ziel verfolgt. Eine Aufnahme so abspielen, wie eine Kamera sie sendet:'],
+  'live.none': ['No target is tracked now. Replay the stored samples as a camera would send them, with the times shifted to now:', 'Zurzeit wird kein Ziel verfolgt. Die gespeicherten Messpaare so abspielen, wie eine Kamera sie sendet, mit Zeiten bis jetzt:'],
   'live.open': ['Live', 'Live'],
   'live.speed': ['Speed', 'Tempo'],
   'live.still': ['stationary', 'steht'],
@@ -628,7 +643,7 @@ const table = {
   'walk.help': ['Keep the screen on. Positions go to the camera as fixes of this receiver. Boxes that reach the camera at the same time become samples with them. Without a network positions wait here; those that come late are not paired: save them as CSV to import them with the camera’s detections.', 'Bildschirm eingeschaltet lassen. Positionen gehen als Fixe dieses Empfängers an die Kamera. Boxen, die zur selben Zeit eintreffen, werden mit ihnen zu Messpaaren. Ohne Netz warten Positionen hier; verspätete werden nicht gepaart: als CSV sichern, um sie mit den Detektionen der Kamera zu importieren.'],
   'walk.keyCreated': ['The code contains a key for this camera that expires in a day.', 'Der Code enthält einen Schlüssel für diese Kamera, der in einem Tag abläuft.'],
   'walk.latest': ['Latest position', 'Letzte Position'],
-  'walk.needsHttps': ['Positions are given to pages over HTTPS only.', 'Positionen gibt es nur für Seiten über HTTPS.'],
+  'walk.needsHttps': ['Phones give positions to pages over HTTPS only. Ask whoever runs the server for its https:// address; docs/operations.md says how to get one.', 'Telefone geben Positionen nur an Seiten über HTTPS. Beim Betreiber nach der https://-Adresse fragen; docs/operations.md beschreibt, wie man sie einrichtet.'],
   'walk.noKeys': ['This server asks for no key.', 'Dieser Server verlangt keinen Schlüssel.'],
   'walk.noPosition': ['No position yet. Go outdoors, away from walls.', 'Noch keine Position. Ins Freie gehen, weg von Wänden.'],
   'walk.offline': ['No connection: positions wait on this phone.', 'Keine Verbindung: Positionen warten auf diesem Telefon.'],

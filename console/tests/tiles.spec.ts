@@ -45,7 +45,7 @@ test.describe('a server with a file of tiles', () => {
   });
 });
 
-test('without a file nothing of it is loaded, and the map is a plain plane', async ({ console: page, server }) => {
+test('without a file nothing of it is loaded, and the map shows the outlines of the world', async ({ console: page, server }) => {
   const paths: string[] = [];
   page.on('request', (request) => paths.push(new URL(request.url()).pathname));
   await page.goto('about:blank');
@@ -53,5 +53,14 @@ test('without a file nothing of it is loaded, and the map is a plain plane', asy
   await expect(page.getByRole('application')).toBeVisible();
   await expect.poll(() => paths.some((path) => path.includes('leaflet-src'))).toBe(true);
   await expect(page.locator('.plane-canvas')).toBeAttached();
+  const landShare = (): Promise<number> =>
+    page.locator('.world-canvas').evaluate((element) => {
+      const canvas = element as HTMLCanvasElement;
+      const { data } = canvas.getContext('2d')!.getImageData(0, 0, canvas.width, canvas.height);
+      return data.filter((value, at) => at % 4 === 3 && value > 0).length / (data.length / 4);
+    });
+  // Land is three tenths of the earth, and more of a Mercator map, which shows the north larger.
+  await expect.poll(landShare).toBeGreaterThan(0.2);
+  expect(await landShare()).toBeLessThan(0.6);
   expect(paths.filter((path) => /tile_layer|\/v1\/tiles/.test(path))).toEqual([]);
 });

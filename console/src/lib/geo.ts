@@ -8,6 +8,9 @@ export interface EastNorth {
 
 const METRES_PER_DEGREE = 111_319.490793; // of longitude at the equator, WGS 84
 
+/** Outlines of the world are off by a kilometre or two, which is seen beyond this zoom. */
+export const CLOSEST_OUTLINES_ZOOM = 11;
+
 /** Equirectangular projection about a reference. */
 export function toPlane(reference: Position, position: Position): EastNorth {
   const scale = Math.cos((reference.latitude_deg * Math.PI) / 180);
@@ -52,6 +55,12 @@ export function boundsOf(positions: Iterable<Position>): Bounds | undefined {
     bounds.north = Math.max(bounds.north, y);
   }
   return bounds;
+}
+
+/** The longer side of a rectangle, m. */
+export function sideOf({ west, south, east, north }: Bounds): number {
+  const corner = toPlane({ longitude_deg: west, latitude_deg: south }, { longitude_deg: east, latitude_deg: north });
+  return Math.max(corner.east_m, corner.north_m);
 }
 
 export function centroid(positions: Position[]): Position | undefined {

@@ -356,6 +356,7 @@ impl RequestPipeline {
             // Spooled, or read message by message, each with limits of its own.
             RequestClass::Import | RequestClass::ImportStream | RequestClass::LiveStream => 0,
             _ if is_grpc => limits.message_bytes,
+            _ if request.uri().path().ends_with("/picture") => limits.picture_bytes,
             _ => limits.body_bytes,
         };
         let ticket = Ticket::open(&self.app, class, client, held_bytes)?;

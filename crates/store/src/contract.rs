@@ -20,8 +20,8 @@ use crate::domain::{
     ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraMoved, Connection, ConnectionId, ConnectionKey,
     DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan,
     EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion,
-    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Result, Revision,
-    RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
+    NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Picture, Result,
+    Revision, RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SiteTrainingOptions, SiteTrainingRun,
     SourceOffset, StoredSample, TrainingOptions, TrainingRun,
 };
 use crate::geo::Position;
@@ -296,6 +296,18 @@ contract! {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
     fn model(&self, camera: &CameraId, number: u32) -> Result<ModelVersion>;
+
+    /// The picture of what a camera sees; `None` if nobody has set one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn picture(&self, camera: &CameraId) -> Result<Option<Picture>>;
+
+    /// Sets the picture of what a camera sees, or removes it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`]; [`ErrorKind::InsufficientStorage`].
+    fn set_picture(&self, camera: &CameraId, picture: Option<&Picture>, now: Timestamp) -> Result<()>;
 
     /// Metadata and weights of one version, as they were stored.
     ///

@@ -26,6 +26,7 @@ mod models;
 mod nodes;
 mod outbox;
 mod outbox_logs;
+mod pictures;
 mod retention;
 mod runs;
 mod sample_partitions;

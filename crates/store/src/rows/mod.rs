@@ -8,6 +8,7 @@ pub(super) mod evaluations;
 pub(super) mod idempotency;
 pub(super) mod keys;
 pub(super) mod models;
+pub(super) mod pictures;
 pub(super) mod runs;
 pub(super) mod samples;
 pub(super) mod site_runs;

@@ -25,6 +25,7 @@ mod models;
 mod occupants;
 mod outbox;
 mod outbox_logs;
+mod pictures;
 mod reserve;
 mod restore;
 mod retention;

@@ -64,3 +64,32 @@ test('without a file nothing of it is loaded, and the map shows the outlines of 
   expect(await landShare()).toBeLessThan(0.6);
   expect(paths.filter((path) => /tile_layer|\/v1\/tiles/.test(path))).toEqual([]);
 });
+
+test.describe('tiles of another server', () => {
+  test.use({ allowed: /foreign request: https:\/\/tile\.openstreetmap\.org\// });
+
+  test('are asked for once the user agrees, and no more once the map is switched off', async ({ console: page, server }) => {
+    let asked = 0;
+    await page.route('https://tile.openstreetmap.org/**', (route) => {
+      asked += 1;
+      expect(new URL(route.request().headers().referer ?? 'http://none').origin).toBe(server.url);
+      return route.fulfill({ path: 'node_modules/leaflet/dist/images/marker-icon.png' });
+    });
+    const button = page.getByRole('button', { name: 'Map of OpenStreetMap' });
+    await expect(button).toBeVisible();
+    page.once('dialog', (dialog) => void dialog.dismiss());
+    await button.click();
+    expect(asked).toBe(0);
+    page.once('dialog', (dialog) => void dialog.accept());
+    await button.click();
+    await expect(page.getByText('OpenStreetMap contributors')).toBeVisible();
+    await expect.poll(() => asked).toBeGreaterThan(0);
+    await button.click();
+    await page.reload();
+    await expect(button).toHaveAttribute('aria-pressed', 'false');
+    asked = 0;
+    await page.getByRole('button', { name: 'Zoom in' }).click();
+    await expect(page.locator('.world-canvas')).toBeAttached();
+    expect(asked).toBe(0);
+  });
+});

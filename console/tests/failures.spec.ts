@@ -323,3 +323,18 @@ test.describe('the phone page', () => {
     expect(samples.items.map(({ target_id, fix }) => [target_id, fix.longitude_deg])).toEqual([['walker', 11.0001]]);
   });
 });
+
+test.describe('a part of the page is gone', () => {
+  test.use({ allowed: /Failed to (load resource|fetch dynamically)|uncaught|Unable to preload/ });
+
+  test('after an upgrade the page loads itself again, and shows the view', async ({ console: page, server }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate' });
+    let loads = 0;
+    page.on('load', () => (loads += 1));
+    // The files of the page that is open are those of the release before.
+    await page.route('**/assets/Camera-*', (route) => (loads === 0 ? route.fulfill({ status: 404 }) : route.fallback()));
+    await page.evaluate(() => (location.hash = '#/cameras/gate/data'));
+    await expect(page.getByRole('heading', { name: 'Recording guide' })).toBeVisible();
+    expect(loads).toBe(1);
+  });
+});

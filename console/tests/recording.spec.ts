@@ -85,3 +85,27 @@ test('the code for a phone holds a key for this camera alone', async ({ console:
   expect(await send('gate')).toBe(200);
   expect(await send('other')).toBe(403);
 });
+
+test.describe('the phone page', () => {
+  test.use({ allowed: /ERR_INTERNET_DISCONNECTED|ERR_FAILED/ });
+
+  test('opens again without a network', async ({ console: page, server, context }) => {
+    await page.goto(`${server.url}/walk#camera=gate`);
+    await expect(page.getByRole('button', { name: 'Start recording' })).toBeVisible();
+    await expect.poll(() => page.evaluate(async () => (await (await caches.open('sightfix-walk')).keys()).length)).toBeGreaterThan(3);
+    await page.evaluate(() => navigator.serviceWorker.ready);
+    await context.setOffline(true);
+    await page.reload();
+    await expect(page.getByRole('button', { name: 'Start recording' })).toBeVisible();
+    await context.setOffline(false);
+  });
+
+  test('records nothing while it may not read the position', async ({ console: page, server, context }) => {
+    await context.clearPermissions();
+    await page.goto(`${server.url}/walk#camera=gate`);
+    await page.getByRole('button', { name: 'Start recording' }).click();
+    await expect(page.getByRole('alert')).toContainText('may not read the position');
+    await expect(page.getByText('stopped')).toBeVisible();
+    await expect(page.getByRole('button', { name: 'Start recording' })).toBeVisible();
+  });
+});

@@ -1,7 +1,7 @@
 """Writes the generated modules before a wheel is built or the package is installed for development.
 
-With `SIGHTFIX_BINARY` the wheel also brings that program, as the command `sightfix`; it is then for one platform, whose
-tag is `SIGHTFIX_WHEEL_PLATFORM` or, if that is not set, the one of this machine.
+With `WHEEL_BINARY` the wheel also brings that program, as the command `sightfix`; it is then for one platform, whose
+tag is `WHEEL_PLATFORM` or, if that is not set, the one of this machine.
 """
 
 import os
@@ -23,9 +23,9 @@ class GenerateModules(BuildHookInterface[Any]):
         from codegen import write_modules  # noqa: PLC0415, only importable from here
 
         write_modules(root)
-        binary = os.environ.get("SIGHTFIX_BINARY")
+        binary = os.environ.get("WHEEL_BINARY")
         if binary:
             machine = sysconfig.get_platform().replace("-", "_").replace(".", "_")
             build_data["shared_scripts"][binary] = "sightfix"
-            build_data["tag"] = f"py3-none-{os.environ.get('SIGHTFIX_WHEEL_PLATFORM', machine)}"
+            build_data["tag"] = f"py3-none-{os.environ.get('WHEEL_PLATFORM', machine)}"
             build_data["pure_python"] = False

@@ -159,6 +159,8 @@ pub struct Workers {
 pub struct Limits {
     /// Bytes of a request body, other than an import.
     pub body_bytes: usize,
+    /// Bytes of a camera's picture.
+    pub picture_bytes: usize,
     /// Bytes of an import's body.
     pub import_bytes: usize,
     /// Bytes of an import held in memory before it goes to a temporary file.
@@ -388,6 +390,7 @@ impl Default for Limits {
     fn default() -> Self {
         Self {
             body_bytes: 1 << 20,
+            picture_bytes: 2 << 20,
             import_bytes: 64 << 20,
             import_memory_bytes: 4 << 20,
             spool_memory_bytes: 128 << 20,

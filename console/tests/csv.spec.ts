@@ -1,6 +1,6 @@
 // Files as people have them.
 import { expect, test } from '@playwright/test';
-import { guessMapping, isRejected, mapRow, missingFields, outputColumns, parseTable, toCsv, type BoxForm, type MappedRow } from '../src/lib/csv';
+import { guessMapping, isRejected, mapRow, hasLocalTimes, documentedHeader, missingFields, outputColumns, parseTable, type BoxForm, type MappedRow } from '../src/lib/csv';
 import { curlLine, grpcurlLine } from '../src/lib/request_lines';
 import { sigmaOf, walkCsv } from '../src/walk/queue';
 import cases from '../../tests/cases/column_mapping.json' with { type: 'json' };
@@ -22,7 +22,8 @@ function mapped(text: string, image?: { width_px: number; height_px: number }): 
   const mapping = guessMapping(table);
   expect(missingFields(mapping)).toEqual([]);
   const rows = table.rows.map((row) => mapRow(row, mapping, image));
-  return toCsv(outputColumns(mapping), rows.filter((row): row is MappedRow => !isRejected(row)));
+  const cells = rows.filter((row): row is MappedRow => !isRejected(row)).map((row) => row.cells);
+  return [outputColumns(mapping), ...cells].map((row) => `${row.join(',')}\n`).join('');
 }
 
 test('the documented columns pass as they are', () => {
@@ -40,6 +41,16 @@ test('corners, centres and normalised boxes become left, top, width, height', ()
   expect(mapped('time,id,cx,cy,w,h\n2026-01-01T00:00:00Z,a,10,20,4,6\n')).toContain(',a,8,17,4,6\n');
   const normalised = 'time,id,x_center,y_center,w,h\n2026-01-01T00:00:00Z,a,0.5,0.5,0.1,0.2\n';
   expect(mapped(normalised, { width_px: 1000, height_px: 500 })).toContain(',a,450,200,100,100\n');
+});
+
+test('the header gets the documented names, and times without an offset are found', () => {
+  const table = parseTable('Zeit;Spur;"x;1";Y1;X2;Y2\n2026-01-01 10:00:00;a;1;2;3;4\n');
+  const mapping = { ...guessMapping(table), columns: { time: 0, target_id: 1, left: 2, top: 3, width: 4, height: -1 } };
+  expect(documentedHeader(table, mapping)).toBe('time;target_id;left;top;width;unused_6');
+  expect(hasLocalTimes(table, mapping)).toBe(true);
+  for (const time of ['2026-01-01T10:00:00Z', '2026-01-01 10:00:00+0100', '1767225600.5']) {
+    expect(hasLocalTimes(parseTable(`time;id;x;y;w;h\n${time};a;1;2;3;4\n`), mapping), time).toBe(false);
+  }
 });
 
 test('Unix times and a file without targets', () => {

@@ -1,8 +1,8 @@
 // What the drawing functions draw, by what they ask of a canvas.
 import { expect, test } from '@playwright/test';
-import { drawEllipse, drawPolygon, drawTrail, ellipseOf, rampColor, type Palette } from '../src/lib/draw';
+import { drawEllipse, drawPolygon, drawTrail, ellipseOf, r95Of, rampColor, type Palette } from '../src/lib/draw';
 import { drawScatter } from '../src/lib/scatter';
-import { roundLength, toPlane, toPosition } from '../src/lib/geo';
+import { roundLength, roundLengthText, toPlane, toPosition } from '../src/lib/geo';
 import { coverageOf, emptyNinths, footOf, imageSizeOf } from '../src/lib/image';
 import { drawVectorTile } from '../src/lib/vector_tile';
 import { recorder } from './recorder';
@@ -59,6 +59,20 @@ test('the plane and round lengths', () => {
   expect(back.east_m).toBeCloseTo(12, 6);
   expect(back.north_m).toBeCloseTo(-7, 6);
   expect([0.9, 1, 3, 7, 49, 50].map(roundLength)).toEqual([0.5, 1, 2, 5, 20, 50]);
+});
+
+test('the radius of a covariance holds 95 % of its errors', () => {
+  // Isotropic, on a line, and between: sqrt(-2 ln 0.05) and the normal quantile 1.96.
+  expect(r95Of({ east_m2: 4, north_m2: 4, east_north_m2: 0 })).toBeCloseTo(2 * 2.4477, 3);
+  expect(r95Of({ east_m2: 9, north_m2: 0, east_north_m2: 0 })).toBeCloseTo(3 * 1.96, 2);
+  const [along, across] = [r95Of({ east_m2: 1, north_m2: 0.25, east_north_m2: 0 }), r95Of({ east_m2: 0.625, north_m2: 0.625, east_north_m2: 0.375 })];
+  expect(along).toBeCloseTo(across, 6);
+  // As the server has it.
+  expect(along).toBeCloseTo(2.0359, 3);
+});
+
+test('lengths of the scale bar have the unit that fits', () => {
+  expect([0.2, 5, 500, 5000, 2_000_000].map(roundLengthText)).toEqual(['20 cm', '5 m', '500 m', '5 km', '2000 km']);
 });
 
 test('the ramp goes from cold to hot and stays inside', () => {

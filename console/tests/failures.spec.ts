@@ -76,6 +76,30 @@ test('bad rows are named with their lines, and can be downloaded', async ({ cons
   expect(saved[2]).toMatch(/^"","4","latitude/);
 });
 
+test('a file of more than a part is sent as it is, and its rows keep their lines', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/cameras', { id: 'gate' });
+  await page.goto(`${server.url}/#/cameras/gate/data`);
+  const count = 80_000;
+  const rows = Array.from({ length: count }, (_, at) => {
+    const time = new Date(Date.UTC(2026, 0, 1) + 1000 * at).toISOString().slice(0, 19).replace('T', ' ');
+    return `${time};walker;${10 + (at % 900)};20;30;${at === 78_000 ? 'high' : 40};11,5;48,25`;
+  });
+  const csv = [`Time;Id;X;Y;W;H;Lon;Lat`, ...rows].join('\r\n');
+  const parts: number[] = [];
+  page.on('request', (request) => {
+    if (request.method() === 'POST' && request.url().includes('/samples?')) parts.push(Number(new URL(request.url()).searchParams.get('timezone') === 'Asia/Tokyo'));
+  });
+  await page.locator('input[type=file]').setInputFiles({ name: 'long.csv', mimeType: 'text/csv', buffer: Buffer.from(csv) });
+  await page.getByLabel('Time zone of the times without an offset').selectOption('Asia/Tokyo');
+  await page.getByRole('button', { name: 'Import', exact: true }).click();
+  await expect(page.getByText('79,999 samples stored, 0 stored before, 1 rows rejected.')).toBeVisible({ timeout: 60_000 });
+  expect(parts).toEqual(new Array(Math.ceil(csv.length / (4 << 20))).fill(1));
+  // After the header, counted from 1.
+  await expect(page.locator('table').last().locator('tbody tr td:first-child')).toHaveText(['78002']);
+  const { items } = await server.request<{ items: { time: string; fix: { longitude_deg: number } }[] }>('GET', '/v1/cameras/gate/samples?limit=1');
+  expect([items[0]!.time, items[0]!.fix.longitude_deg]).toEqual(['2025-12-31T15:00:00Z', 11.5]);
+});
+
 test.describe('an import whose answer is lost', () => {
   test.use({ allowed: /ERR_FAILED/ });
 
@@ -83,7 +107,7 @@ test.describe('an import whose answer is lost', () => {
     await server.request('POST', '/v1/cameras', { id: 'gate' });
     await page.goto(`${server.url}/#/cameras/gate/data`);
     const keys: string[] = [];
-    await page.route('**/v1/cameras/gate/samples', async (route) => {
+    await page.route('**/v1/cameras/gate/samples?*', async (route) => {
       if (route.request().method() !== 'POST') return route.fallback();
       keys.push(route.request().headers()['idempotency-key']!);
       if (keys.length > 1) return route.fallback();
@@ -297,5 +321,20 @@ test.describe('the phone page', () => {
     await Promise.all(sending);
     const samples = await server.request<{ items: { target_id: string; fix: { longitude_deg: number } }[] }>('GET', '/v1/cameras/gate/samples');
     expect(samples.items.map(({ target_id, fix }) => [target_id, fix.longitude_deg])).toEqual([['walker', 11.0001]]);
+  });
+});
+
+test.describe('a part of the page is gone', () => {
+  test.use({ allowed: /Failed to (load resource|fetch dynamically)|uncaught|Unable to preload/ });
+
+  test('after an upgrade the page loads itself again, and shows the view', async ({ console: page, server }) => {
+    await server.request('POST', '/v1/cameras', { id: 'gate' });
+    let loads = 0;
+    page.on('load', () => (loads += 1));
+    // The files of the page that is open are those of the release before.
+    await page.route('**/assets/Camera-*', (route) => (loads === 0 ? route.fulfill({ status: 404 }) : route.fallback()));
+    await page.evaluate(() => (location.hash = '#/cameras/gate/data'));
+    await expect(page.getByRole('heading', { name: 'Recording guide' })).toBeVisible();
+    expect(loads).toBe(1);
   });
 });

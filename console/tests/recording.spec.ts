@@ -27,7 +27,7 @@ test('the guide follows the walk, says what is missing, and when it is enough', 
   await expect(guide.getByText(open > 0 ? 'Training is possible' : 'Enough for a good model')).toBeVisible();
 });
 
-test('a still image that is dropped on the image plane stays in the browser', async ({ console: page, server }) => {
+test('a picture that is dropped on the image plane is kept by the server', async ({ console: page, server }) => {
   await server.request('POST', '/v1/cameras', { id: 'gate', image_size: SIZE });
   await server.request('POST', '/v1/cameras/gate/samples', simulate(8, [0, 0], 60).csv, 'text/csv');
   await page.goto(`${server.url}/#/cameras/gate/scene`);
@@ -45,7 +45,7 @@ test('a still image that is dropped on the image plane stays in the browser', as
     return transfer;
   });
   await plane.dispatchEvent('drop', { dataTransfer: dropped });
-  await expect(page.getByText('The image stays in this browser.')).toBeVisible();
+  await expect(page.getByText('Everybody who may see this camera sees it.')).toBeVisible();
   const redness = (): Promise<number> =>
     plane.locator('canvas').evaluate((element) => {
       const canvas = element as HTMLCanvasElement;
@@ -56,7 +56,9 @@ test('a still image that is dropped on the image plane stays in the browser', as
   await expect.poll(redness).toBeGreaterThan(80);
   await page.reload();
   await expect.poll(redness).toBeGreaterThan(80);
-  await page.getByRole('button', { name: 'Remove background' }).click();
+  const picture = await fetch(`${server.url}/v1/cameras/gate/picture`);
+  expect([picture.status, picture.headers.get('content-type')]).toEqual([200, 'image/jpeg']);
+  await page.getByRole('button', { name: 'Remove picture' }).click();
   await expect.poll(redness).toBeLessThan(20);
 });
 
@@ -82,4 +84,28 @@ test('the code for a phone holds a key for this camera alone', async ({ console:
   };
   expect(await send('gate')).toBe(200);
   expect(await send('other')).toBe(403);
+});
+
+test.describe('the phone page', () => {
+  test.use({ allowed: /ERR_INTERNET_DISCONNECTED|ERR_FAILED/ });
+
+  test('opens again without a network', async ({ console: page, server, context }) => {
+    await page.goto(`${server.url}/walk#camera=gate`);
+    await expect(page.getByRole('button', { name: 'Start recording' })).toBeVisible();
+    await expect.poll(() => page.evaluate(async () => (await (await caches.open('sightfix-walk')).keys()).length)).toBeGreaterThan(3);
+    await page.evaluate(() => navigator.serviceWorker.ready);
+    await context.setOffline(true);
+    await page.reload();
+    await expect(page.getByRole('button', { name: 'Start recording' })).toBeVisible();
+    await context.setOffline(false);
+  });
+
+  test('records nothing while it may not read the position', async ({ console: page, server, context }) => {
+    await context.clearPermissions();
+    await page.goto(`${server.url}/walk#camera=gate`);
+    await page.getByRole('button', { name: 'Start recording' }).click();
+    await expect(page.getByRole('alert')).toContainText('may not read the position');
+    await expect(page.getByText('stopped')).toBeVisible();
+    await expect(page.getByRole('button', { name: 'Start recording' })).toBeVisible();
+  });
 });

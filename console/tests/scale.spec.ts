@@ -2,6 +2,7 @@
 import type { Locator, Page } from '@playwright/test';
 import type { CameraStatus, Page as ApiPage } from '../src/lib/types';
 import { expect, test } from './fixtures';
+import { addCamera, simulate, walk } from './world';
 
 const CAMERAS = 2000;
 const ROW_PX = 54;
@@ -145,4 +146,80 @@ test('two thousand cameras scroll with work for the rows that come alone, and th
   await page.getByLabel('Filter by label').selectOption('site=s3');
   await expect(page.getByText('Camera 0003')).toBeVisible();
   await expect(page.getByText('Camera 0004')).toBeHidden();
+});
+
+test('ten thousand cameras are drawn as clusters, whose numbers make ten thousand', async ({ console: page, server }) => {
+  const many = 10_000;
+  await server.request('POST', '/v1/cameras', { id: 'camera' });
+  const { items } = await server.request<ApiPage<CameraStatus>>('GET', '/v1/camera-statuses');
+  await page.route('**/v1/camera-statuses?*', async (route) => {
+    const from = Number(new URL(route.request().url()).searchParams.get('cursor') ?? 0);
+    const camera = (n: number): CameraStatus => {
+      // Over a country of 4 by 4 degrees.
+      const [west, south] = [9 + ((n * 37) % 1009) / 252, 47 + ((n * 61) % 997) / 249];
+      const view_area = [[0, 0], [0.0009, 0], [0.0009, 0.0006], [0, 0.0006]].map(([east, north]) => ({ longitude_deg: west + east!, latitude_deg: south + north! }));
+      return { ...items[0]!, model: { median_r95_m: 3, view_area }, camera: { ...items[0]!.camera, id: `camera-${n}`, display_name: `Camera ${n}`, active_model: 1 } };
+    };
+    const answer = { items: Array.from({ length: 1000 }, (_, at) => camera(from + at)), ...(from + 1000 < many ? { next_cursor: String(from + 1000) } : {}) };
+    await route.fulfill({ json: answer });
+  });
+  await page.evaluate(() => {
+    const { fillText } = CanvasRenderingContext2D.prototype;
+    const { clearRect } = CanvasRenderingContext2D.prototype;
+    const drawn: string[] = [];
+    Object.assign(window, { drawn });
+    CanvasRenderingContext2D.prototype.clearRect = function (...area) {
+      if (this.canvas.classList.contains('plane-canvas')) drawn.length = 0;
+      clearRect.apply(this, area);
+    };
+    CanvasRenderingContext2D.prototype.fillText = function (...text) {
+      if (this.canvas.classList.contains('plane-canvas')) drawn.push(text[0]);
+      fillText.apply(this, text);
+    };
+  });
+  await page.evaluate(() => (location.hash = '#/settings/keys'));
+  await page.evaluate(() => (location.hash = '#/cameras'));
+  await expect(page.getByRole('heading', { name: 'Cameras 10,000' })).toBeVisible();
+  const drawn = (): Promise<string[]> => page.evaluate(() => (window as unknown as { drawn: string[] }).drawn);
+  const inClusters = (texts: string[]): number => texts.reduce((sum, text) => sum + (/^[\d,]+$/.test(text) ? Number(text.replace(',', '')) : 1), 0);
+  await expect.poll(async () => inClusters(await drawn())).toBe(many);
+  expect((await drawn()).length).toBeLessThan(1000);
+
+  // Frames while the map is dragged, for information: this machine may be busy.
+  const area = (await page.getByRole('application').boundingBox())!;
+  await page.mouse.move(area.x + area.width / 2, area.y + area.height / 2);
+  await page.mouse.down();
+  const frames_ms = await page.evaluate(() => {
+    const frames: number[] = [];
+    Object.assign(window, { frames });
+    const measure = (before_ms: number) => (now_ms: number) => {
+      frames.push(now_ms - before_ms);
+      requestAnimationFrame(measure(now_ms));
+    };
+    requestAnimationFrame(measure(performance.now()));
+    return frames.length;
+  });
+  for (let step = 1; step <= 60; step++) {
+    await page.mouse.move(area.x + area.width / 2 + 3 * step, area.y + area.height / 2 + step);
+    await page.evaluate(() => new Promise(requestAnimationFrame));
+  }
+  await page.mouse.up();
+  const taken = (await page.evaluate(() => (window as unknown as { frames: number[] }).frames)).slice(frames_ms).sort((a, b) => a - b);
+  const total_ms = taken.reduce((sum, frame) => sum + frame, 0);
+  console.log(`frames while the map of ${many} cameras is dragged: ${((1000 * taken.length) / total_ms).toFixed(0)} a second, longest ${taken.at(-1)!.toFixed(0)} ms`);
+});
+
+test('targets of a live camera are on the map of all cameras', async ({ console: page, server }) => {
+  const world = simulate(5, [0, 0], 300);
+  await addCamera(server, 'gate', 'Gate', world);
+  const stop = walk(server, 'gate', world.live);
+  await page.reload();
+  // Dots of targets are the only thing on the canvas above the map while nothing is pointed at.
+  const marked = (): Promise<boolean> =>
+    page.locator('.mark-canvas').evaluate((element) => {
+      const canvas = element as HTMLCanvasElement;
+      return canvas.getContext('2d')!.getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value > 0);
+    });
+  await expect.poll(marked).toBe(true);
+  stop();
 });

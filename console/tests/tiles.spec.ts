@@ -45,7 +45,7 @@ test.describe('a server with a file of tiles', () => {
   });
 });
 
-test('without a file nothing of it is loaded, and the map is a plain plane', async ({ console: page, server }) => {
+test('without a file nothing of it is loaded, and the map shows the outlines of the world', async ({ console: page, server }) => {
   const paths: string[] = [];
   page.on('request', (request) => paths.push(new URL(request.url()).pathname));
   await page.goto('about:blank');
@@ -53,5 +53,43 @@ test('without a file nothing of it is loaded, and the map is a plain plane', asy
   await expect(page.getByRole('application')).toBeVisible();
   await expect.poll(() => paths.some((path) => path.includes('leaflet-src'))).toBe(true);
   await expect(page.locator('.plane-canvas')).toBeAttached();
+  const landShare = (): Promise<number> =>
+    page.locator('.world-canvas').evaluate((element) => {
+      const canvas = element as HTMLCanvasElement;
+      const { data } = canvas.getContext('2d')!.getImageData(0, 0, canvas.width, canvas.height);
+      return data.filter((value, at) => at % 4 === 3 && value > 0).length / (data.length / 4);
+    });
+  // Land is three tenths of the earth, and more of a Mercator map, which shows the north larger.
+  await expect.poll(landShare).toBeGreaterThan(0.2);
+  expect(await landShare()).toBeLessThan(0.6);
   expect(paths.filter((path) => /tile_layer|\/v1\/tiles/.test(path))).toEqual([]);
+});
+
+test.describe('tiles of another server', () => {
+  test.use({ allowed: /foreign request: https:\/\/tile\.openstreetmap\.org\// });
+
+  test('are asked for once the user agrees, and no more once the map is switched off', async ({ console: page, server }) => {
+    let asked = 0;
+    await page.route('https://tile.openstreetmap.org/**', (route) => {
+      asked += 1;
+      expect(new URL(route.request().headers().referer ?? 'http://none').origin).toBe(server.url);
+      return route.fulfill({ path: 'node_modules/leaflet/dist/images/marker-icon.png' });
+    });
+    const button = page.getByRole('button', { name: 'Map of OpenStreetMap' });
+    await expect(button).toBeVisible();
+    page.once('dialog', (dialog) => void dialog.dismiss());
+    await button.click();
+    expect(asked).toBe(0);
+    page.once('dialog', (dialog) => void dialog.accept());
+    await button.click();
+    await expect(page.getByText('OpenStreetMap contributors')).toBeVisible();
+    await expect.poll(() => asked).toBeGreaterThan(0);
+    await button.click();
+    await page.reload();
+    await expect(button).toHaveAttribute('aria-pressed', 'false');
+    asked = 0;
+    await page.getByRole('button', { name: 'Zoom in' }).click();
+    await expect(page.locator('.world-canvas')).toBeAttached();
+    expect(asked).toBe(0);
+  });
 });

@@ -80,7 +80,7 @@ async function setStill(page: Page, server: Server, { csv }: SimulatedCamera): P
   const buffer = await stillOf(page, rowsOf(csv), { width_px: 1280, height_px: 720 });
   await page.goto(`${server.url}/#/cameras/north-gate/scene`);
   await page.locator('.still input').setInputFiles({ name: 'still.png', mimeType: 'image/png', buffer });
-  await expect(page.getByText('The image stays in this browser.')).toBeVisible();
+  await expect(page.getByText('Everybody who may see this camera sees it.')).toBeVisible();
 }
 
 type Theme = 'dark' | 'light';

@@ -481,3 +481,11 @@ CREATE TABLE recording_parts (
     content        BYTEA NOT NULL
 );
 CREATE INDEX recording_parts_by_camera ON recording_parts (camera_key, number);
+
+-- What a camera sees, as one still picture: JPEG or PNG, as `media_type` says.
+CREATE TABLE camera_pictures (
+    camera_key    BIGINT PRIMARY KEY REFERENCES cameras (key) ON DELETE CASCADE,
+    media_type    TEXT NOT NULL,
+    content       BYTEA NOT NULL,
+    updated_at_us BIGINT NOT NULL
+);

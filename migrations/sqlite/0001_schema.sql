@@ -384,3 +384,11 @@ CREATE TABLE recording_parts (
     content        BLOB NOT NULL
 ) STRICT;
 CREATE INDEX recording_parts_by_camera ON recording_parts (camera_key, number);
+
+-- What a camera sees, as one still picture: JPEG or PNG, as `media_type` says.
+CREATE TABLE camera_pictures (
+    camera_key    INTEGER PRIMARY KEY REFERENCES cameras (key) ON DELETE CASCADE,
+    media_type    TEXT NOT NULL,
+    content       BLOB NOT NULL,
+    updated_at_us INTEGER NOT NULL
+) STRICT;

@@ -21,6 +21,7 @@ mod live;
 mod matching;
 mod models;
 mod paired_import;
+mod pictures;
 mod recording;
 mod registry;
 mod retention;

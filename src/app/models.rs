@@ -1,6 +1,7 @@
 //! Model versions: list, activate, roll back, download, import; the receiver's error.
 
 use bytes::Bytes;
+use jiff::Timestamp;
 
 use super::registry::{ModelFault, load_model, unusable};
 use super::{App, Page, page_of};
@@ -39,17 +40,21 @@ impl GnssErrorEstimate {
     /// Estimates from fixes taken while the receiver stood still. Memory does not grow with them.
     ///
     /// # Errors
-    /// `InvalidArgument` naming `fixes` if there are fewer than ten, or all are the same; a file that
+    /// `InvalidArgument` naming `fixes` if there are fewer than ten, all are the same, or their times show that the
+    /// receiver moved; a file that
     /// cannot be read.
     pub fn from_rows(
         rows: impl Iterator<Item = Result<std::result::Result<TimedFix, RowError>>>,
         reported_rows: usize,
     ) -> Result<Self> {
-        let mut moments = PlaneMoments::default();
+        let (mut moments, mut movement) = (PlaneMoments::default(), Movement::default());
         let (mut rejected, mut rejected_rows) = (0, Vec::new());
         for row in rows {
             match row? {
-                Ok(row) => moments.add(row.fix.position),
+                Ok(row) => {
+                    let point = moments.add(row.fix.position);
+                    movement.extend(row.time.map(|time| (time, point)));
+                }
                 Err(row) => {
                     rejected += 1;
                     if rejected_rows.len() < reported_rows {
@@ -68,6 +73,11 @@ impl GnssErrorEstimate {
                 format!("are {count}, at least {FEWEST_FIXES} from one fixed point are needed{first}"),
             ));
         };
+        if movement.is_walking() {
+            let message =
+                "were taken while the receiver moved; its error shows while it stands at one fixed point";
+            return Err(Error::invalid("fixes", message));
+        }
         let [east_variance_m2, north_variance_m2] = moments.variances_m2();
         let e_gnss_m2 = 0.5 * (east_variance_m2 + north_variance_m2);
         if e_gnss_m2 <= 0.0 {
@@ -100,7 +110,8 @@ struct PlaneMoments {
 }
 
 impl PlaneMoments {
-    fn add(&mut self, position: Position) {
+    /// Adds a position; returns where it is in the plane.
+    fn add(&mut self, position: Position) -> EastNorth {
         let point = self.plane.get_or_insert_with(|| LocalPlane::new(position)).to_plane(position);
         self.count += 1;
         for (axis, value_m) in [point.east_m, point.north_m].into_iter().enumerate() {
@@ -108,6 +119,7 @@ impl PlaneMoments {
             self.mean_m[axis] += before_m / self.count as f64;
             self.squares_m2[axis] += before_m * (value_m - self.mean_m[axis]);
         }
+        point
     }
 
     fn mean_position(&self) -> Option<Position> {
@@ -119,6 +131,61 @@ impl PlaneMoments {
     fn variances_m2(&self) -> [f64; 2] {
         self.squares_m2.map(|sum_m2| sum_m2 / (self.count - 1) as f64)
     }
+}
+
+/// Whether a receiver moved, by the mean positions of successive intervals. The noise of fixes averages out over an
+/// interval, and the slow error of a receiver that stands drifts by far less than somebody walks.
+#[derive(Default)]
+struct Movement {
+    current: Option<Interval>,
+    /// Mean position of the interval before, and its middle.
+    previous: Option<(Timestamp, [f64; 2])>,
+    slow_steps: u64,
+    fast_steps: u64,
+}
+
+struct Interval {
+    began_at: Timestamp,
+    count: f64,
+    mean_m: [f64; 2],
+}
+
+impl Movement {
+    const INTERVAL_S: f64 = 10.0;
+    /// Half of a slow walk.
+    const WALKING_M_S: f64 = 0.4;
+
+    fn extend(&mut self, fix: Option<(Timestamp, EastNorth)>) {
+        let Some((time, EastNorth { east_m, north_m })) = fix else { return };
+        let is_next = |interval: &Interval| seconds(interval.began_at, time).abs() >= Self::INTERVAL_S;
+        if self.current.as_ref().is_some_and(is_next) {
+            self.close_interval();
+        }
+        let interval = self.current.get_or_insert(Interval { began_at: time, count: 0.0, mean_m: [0.0; 2] });
+        interval.count += 1.0;
+        for (mean_m, value_m) in interval.mean_m.iter_mut().zip([east_m, north_m]) {
+            *mean_m += (value_m - *mean_m) / interval.count;
+        }
+    }
+
+    fn close_interval(&mut self) {
+        let Some(Interval { began_at, mean_m: [east_m, north_m], .. }) = self.current.take() else { return };
+        if let Some((before, [before_east_m, before_north_m])) = self.previous {
+            let distance_m = (east_m - before_east_m).hypot(north_m - before_north_m);
+            let is_fast = distance_m > Self::WALKING_M_S * seconds(before, began_at).abs();
+            *(if is_fast { &mut self.fast_steps } else { &mut self.slow_steps }) += 1;
+        }
+        self.previous = Some((began_at, [east_m, north_m]));
+    }
+
+    /// Whether most steps between intervals were fast.
+    const fn is_walking(&self) -> bool {
+        self.fast_steps > self.slow_steps
+    }
+}
+
+fn seconds(from: Timestamp, to: Timestamp) -> f64 {
+    to.duration_since(from).as_secs_f64()
 }
 
 impl App {
@@ -241,6 +308,30 @@ mod tests {
         // Standard error of a variance from 4,000 is 2.2 %: five of them.
         assert!((estimate.east_variance_m2 / 4.0 - 1.0).abs() < 0.11, "{estimate:?}");
         assert!((estimate.north_variance_m2 / 9.0 - 1.0).abs() < 0.11, "{estimate:?}");
+    }
+
+    /// Fixes of 2 m noise once a second from a receiver that moves east.
+    fn moving(speed_m_s: f64) -> Result<GnssErrorEstimate> {
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(2);
+        let plane = LocalPlane::new(Position::new(103.9, 30.6).expect("valid"));
+        let fixes: Vec<_> = (0..300_i32)
+            .map(|second| {
+                let east_m = speed_m_s * f64::from(second) + 2.0 * standard_normal(&mut random);
+                let point = EastNorth { east_m, north_m: 2.0 * standard_normal(&mut random) };
+                let time = Timestamp::from_second(1_700_000_000 + i64::from(second)).ok();
+                TimedFix { time, ..at(plane.to_position(point)) }
+            })
+            .collect();
+        GnssErrorEstimate::from_rows(fixes.into_iter().map(|row| Ok(Ok(row))), 0)
+    }
+
+    #[test]
+    fn a_receiver_that_walks_is_refused_and_one_that_drifts_is_not() {
+        let refused = moving(1.0).expect_err("a walk").to_string();
+        assert!(refused.contains("while the receiver moved"), "{refused}");
+        assert!(moving(0.0).is_ok());
+        // The slow error of a receiver that stands: metres in minutes.
+        assert!(moving(0.05).is_ok());
     }
 
     fn at(position: Position) -> TimedFix {

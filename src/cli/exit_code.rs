@@ -10,9 +10,20 @@ const IN_USE: u8 = 3;
 /// The data folder cannot be used until somebody does something about it.
 const UNUSABLE: u8 = 4;
 
-/// The exit code for an error: 3 and 4 for a data folder, else 1.
+/// Rows were imported, but more of them were rejected than the caller accepts.
+const REJECTED: u8 = 5;
+
+/// Why an import that stored rows is not a success; for people.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(super) struct TooManyRejected(pub(super) String);
+
+/// The exit code for an error: 3 and 4 for a data folder, 5 for too many rejected rows, else 1.
 #[must_use]
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
+    if error.is::<TooManyRejected>() {
+        return ExitCode::from(REJECTED);
+    }
     let fault = error.downcast_ref::<Error>().and_then(|error| match error {
         Error::Fault(fault) => fault.cause::<FolderFault>(),
         Error::Refused(_) => None,

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
+use super::exit_code::TooManyRejected;
 use super::layout::LayoutFlags;
 use super::progress::Progress;
 use super::summary::{Summary, SummaryFlags};
@@ -48,6 +49,9 @@ pub(super) struct Import {
     /// Format of the file if its ending does not name it: csv, ndjson or json [default: csv for -]
     #[arg(long, value_name = "FORMAT", value_parser = files::format)]
     format: Option<Format>,
+    /// Largest share of rejected rows that counts as success; with more, the accepted rows stay and the exit code is 5
+    #[arg(long, value_name = "SHARE", default_value_t = 0.05, value_parser = share)]
+    max_rejected: f64,
     #[command(flatten)]
     summary: SummaryFlags,
     #[command(flatten)]
@@ -82,6 +86,14 @@ impl Import {
             report.accepted + report.duplicate > 0 || report.rejected == 0,
             "every row was rejected"
         );
+        let rows = (report.accepted + report.duplicate + report.rejected).max(1);
+        let share = report.rejected as f64 / rows as f64;
+        if share > self.max_rejected {
+            let (rejected, percent) = (report.rejected, 100.0 * share);
+            let message =
+                format!("{rejected} of {rows} rows ({percent:.0} %) were rejected; the others are stored");
+            return Err(TooManyRejected(message).into());
+        }
         Ok(())
     }
 }
@@ -151,6 +163,12 @@ fn print(report: &ImportReport, summary: &Summary) -> anyhow::Result<()> {
         summary.line(&format_args!("warning: {warning}"))?;
     }
     Ok(())
+}
+
+/// A share from 0 to 1.
+fn share(text: &str) -> Result<f64, String> {
+    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
+    share.ok_or_else(|| "must be a share from 0 to 1".to_owned())
 }
 
 /// A size as `1920x1080`.

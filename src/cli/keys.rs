@@ -97,7 +97,14 @@ impl Create {
             app.close().await;
             let (key, secret) = created?;
             print_note(format_args!("key {} for {}; its secret is not shown again:", key.id, key.name));
-            print_line(&secret.reveal())
+            print_line(&secret.reveal())?;
+            let scheme = if settings.tls.certificate.is_some() { "https" } else { "http" };
+            let secret = secret.reveal();
+            print_note(format_args!(
+                "try it: curl -H 'authorization: Bearer {secret}' {scheme}://{}/v1/cameras",
+                settings.listen
+            ));
+            Ok(())
         })
     }
 }

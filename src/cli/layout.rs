@@ -1,7 +1,9 @@
 //! Flags for the layout of CSV files.
 
 use clap::Args;
+use jiff::tz::TimeZone;
 
+use crate::domain::parse_time_zone;
 use crate::exchange::{BoxForm, BoxUnit, ColumnNames, CsvLayout};
 
 /// How CSV files name their columns and write their boxes.
@@ -19,11 +21,16 @@ pub(super) struct LayoutFlags {
     /// Unit of the sides of boxes: px, or share (of the image's width and height) [default: px]
     #[arg(long, value_name = "UNIT")]
     box_unit: Option<BoxUnit>,
+    /// IANA time zone (such as Europe/Berlin) whose local times are the times of CSV files without an offset
+    /// [default: such rows are rejected]
+    #[arg(long, value_name = "ZONE", value_parser = parse_time_zone)]
+    timezone: Option<TimeZone>,
 }
 
 impl LayoutFlags {
     /// The layout that the flags say.
     pub(super) fn to_layout(&self) -> CsvLayout {
-        CsvLayout::new(self.columns.clone(), self.box_form, self.box_unit)
+        let layout = CsvLayout::new(self.columns.clone(), self.box_form, self.box_unit);
+        CsvLayout { timezone: self.timezone.clone(), ..layout }
     }
 }

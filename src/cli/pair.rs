@@ -60,6 +60,9 @@ pub(super) struct Pair {
     /// .zst; - is standard output
     #[arg(long, value_name = "FILE", required_unless_present = "estimate_offset")]
     out: Option<PathBuf>,
+    /// Replace the output file if it exists
+    #[arg(long, requires = "out")]
+    overwrite: bool,
     /// Pairing method: nearest (each is the other's nearest within the window) or interpolate (between
     /// the fixes before and after the box)
     #[arg(long, value_name = "METHOD", default_value = "nearest")]
@@ -231,6 +234,12 @@ impl Pair {
         })?;
         if let Some(out) = &self.out {
             files::format_of(out, None)?; // fail early
+            let exists = !files::is_standard(out) && out.exists();
+            anyhow::ensure!(
+                self.overwrite || !exists,
+                "{} exists; name another file or give --overwrite",
+                out.display()
+            );
         }
         let rules = RowRules {
             time_bounds: TimeBounds::at(Clock::system().now()),

@@ -158,13 +158,18 @@ impl Replay {
             attempts: self.delivery.attempts,
             response_timeout: Duration::from_secs(self.delivery.response_timeout_s),
         };
+        let server = &self.destination.server;
         let report = runtime()?.block_on(replay_with_progress(recording, options))?;
         if self.json {
             print_line(&format_args!("{}", serde_json::to_string_pretty(&report)?))?;
         } else {
             print_line(&format_args!("{}", report.to_string().trim_end()))?;
         }
-        anyhow::ensure!(report.is_complete(), "not every item was answered and acknowledged");
+        anyhow::ensure!(
+            report.streams > 0,
+            "no stream could be opened at {server}: is a server running there?"
+        );
+        anyhow::ensure!(report.is_complete(), "not every item was answered and acknowledged by {server}");
         Ok(())
     }
 
@@ -239,7 +244,7 @@ async fn replay_with_progress(
     options: ReplayOptions,
 ) -> anyhow::Result<ReplayReport> {
     let items = recording.len() as u64 * options.repetitions.get() * options.cameras as u64;
-    let (started, duration) = (Instant::now(), options.duration);
+    let (started, duration, server) = (Instant::now(), options.duration, options.server.clone());
     let (counters, stop) = (Arc::new(Counters::default()), CancellationToken::new());
     let mut progress = Progress::new("{bar:40} {msg}");
     let replaying = replay(Arc::new(recording), Arc::new(options), counters.clone(), stop.clone());
@@ -258,7 +263,10 @@ async fn replay_with_progress(
             () = tokio::time::sleep(PROGRESS_INTERVAL) => {
                 let [sent, answered, streams] =
                     [&counters.items, &counters.answered, &counters.streams].map(|count| count.load(Ordering::Relaxed));
-                let message = format!("items, {sent} sent, {answered} answered, {streams} streams");
+                let message = match counters.fault() {
+                    None => format!("items, {sent} sent, {answered} answered, {streams} streams"),
+                    Some(fault) => format!("items, {answered} answered; trying {server} again: {fault}"),
+                };
                 match duration {
                     None => progress.set(answered, items, &message),
                     Some(total) => progress.set(started.elapsed().as_secs(), total.as_secs(), &format!("s, {message}")),

@@ -76,10 +76,17 @@ impl Serve {
             if let Some(monitoring) = server.monitoring_address() {
                 tracing::info!(%monitoring, "serving probes and metrics, without keys");
             }
+            let has_tls = server.has_tls();
             let serving = tokio::spawn(server.run());
             let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
             if shown.is_err() {
                 shutdown.drain();
+            } else if self.demo && !has_tls && app.access.is_open() {
+                tokio::spawn(async move {
+                    if let Err(error) = demo::walk(address, Clock::system().now()).await {
+                        tracing::error!(%error, "the demonstration does not move");
+                    }
+                });
             }
             serving.await.context("the server task panicked")??;
             log.close();

@@ -11,8 +11,11 @@ use super::origin::tile_origin;
 /// How a PMTiles file of version 3 begins.
 const PMTILES_MAGIC: &[u8; 8] = b"PMTiles\x03";
 
+/// Tiles of the OpenStreetMap Foundation.
+const OPENSTREETMAP: &str = "https://tile.openstreetmap.org/{z}/{x}/{y}.png";
+
 /// What the operator's console shows beside the server's own values.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Console {
     /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
@@ -22,6 +25,15 @@ pub struct Console {
     pub tile_file: Option<PathBuf>,
     /// What the provider of the tiles asks to be shown on the map.
     pub tile_attribution: Option<String>,
+    /// Whether the page offers the map of OpenStreetMap, whose server browsers ask once their user has agreed. Only without
+    /// tiles of these settings.
+    pub offer_openstreetmap: bool,
+}
+
+impl Default for Console {
+    fn default() -> Self {
+        Self { tile_url: None, tile_file: None, tile_attribution: None, offer_openstreetmap: true }
+    }
 }
 
 impl Console {
@@ -46,10 +58,19 @@ impl Console {
         Ok(())
     }
 
+    /// The tiles that the page offers its user: URL and what their provider asks to be shown. `None` where the settings
+    /// name tiles, or forbid it.
+    #[must_use]
+    pub fn offered_tiles(&self) -> Option<(&'static str, &'static str)> {
+        let has_tiles = self.tile_url.is_some() || self.tile_file.is_some();
+        (self.offer_openstreetmap && !has_tiles).then_some((OPENSTREETMAP, "© OpenStreetMap contributors"))
+    }
+
     /// The origin of the tiles' server (`https://tiles.example.org`), for the console's security policy;
     /// `None` for tiles of this server.
     #[must_use]
     pub fn tile_origin(&self) -> Option<&str> {
-        self.tile_url.as_deref().and_then(tile_origin).filter(|origin| !origin.is_empty())
+        let url = self.tile_url.as_deref().or(self.offered_tiles().map(|(url, _)| url));
+        url.and_then(tile_origin).filter(|origin| !origin.is_empty())
     }
 }

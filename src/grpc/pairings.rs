@@ -11,7 +11,9 @@ use crate::app::{
     App, ImportOptions, MatchReport, PairedImport, PairedReport, PairingCounts, Part, Spool, Spooled,
 };
 use crate::config::Limits;
-use crate::domain::{self, Durability, Error, ErrorKind, IdempotentRequest, ReceiverId, Result, TargetId};
+use crate::domain::{
+    self, Durability, Error, ErrorKind, IdempotentRequest, ReceiverId, Result, TargetId, parse_time_zone,
+};
 use crate::exchange::{BoxForm, BoxUnit, CsvLayout, FixFormat, Format, RowError};
 use crate::fusion::association::MatchSettings;
 use crate::fusion::clock_offset::OffsetEstimate;
@@ -151,7 +153,11 @@ fn layout(layout: proto::CsvLayout) -> Result<CsvLayout> {
         Ok(proto::BoxUnit::Share) => Some(BoxUnit::Share),
         Err(_) => return Err(unknown("layout.box_unit", layout.box_unit)),
     };
-    Ok(CsvLayout::new(columns.map_err(|error: Error| error.under("layout"))?, box_form, box_unit))
+    let timezone = Some(layout.timezone).filter(|name| !name.is_empty());
+    let timezone = timezone.map(|name| parse_time_zone(&name)).transpose();
+    let under = |error: Error| error.under("layout");
+    let layout = CsvLayout::new(columns.map_err(under)?, box_form, box_unit);
+    Ok(CsvLayout { timezone: timezone.map_err(under)?, ..layout })
 }
 
 fn matching(options: proto::MatchOptions, limits: &Limits) -> Result<MatchSettings> {

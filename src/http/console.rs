@@ -64,8 +64,8 @@ fn route_of(path: &str) -> String {
     }
 }
 
-/// The console runs its own scripts and styles and asks its own server. Images are its own, a still image
-/// that the operator dropped in (`blob:`), and map tiles where they are set.
+/// The console runs its own scripts and styles and asks its own server. Images are its own, a picture that the
+/// operator drops in (`blob:`), and map tiles where they are set, or offered to a user who agrees.
 fn content_policy(tile_origin: Option<&str>) -> String {
     let tiles = tile_origin.map(|origin| format!(" {origin}")).unwrap_or_default();
     format!(
@@ -136,6 +136,7 @@ fn content_type(path: &str) -> &'static str {
         "css" => "text/css; charset=utf-8",
         "svg" => "image/svg+xml",
         "png" => "image/png",
+        "json" => "application/json",
         "woff2" => "font/woff2",
         "webmanifest" => "application/manifest+json",
         "txt" => "text/plain; charset=utf-8",

@@ -15,7 +15,7 @@ use super::problem::{ApiError, ApiResult, no_route};
 use crate::admission::ClientId;
 use crate::domain::{
     CameraId, ConnectionId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId,
-    SiteId, TargetId, parse_time,
+    SiteId, TargetId, parse_time, parse_time_zone,
 };
 use crate::exchange::{CsvLayout, Cursor, Format, read_cursor, wire};
 
@@ -300,12 +300,13 @@ impl Params {
         Ok(self.take("on_conflict", str::parse)?.unwrap_or_default())
     }
 
-    /// `columns`, `box_form` and `box_unit`: the layout of a CSV file.
+    /// `columns`, `box_form`, `box_unit` and `timezone`: the layout of a CSV file.
     pub(super) fn csv_layout(&mut self) -> Result<CsvLayout> {
         let columns = self.take("columns", str::parse)?;
         let box_form = self.take("box_form", str::parse)?;
         let box_unit = self.take("box_unit", str::parse)?;
-        Ok(CsvLayout::new(columns, box_form, box_unit))
+        let timezone = self.take("timezone", parse_time_zone)?;
+        Ok(CsvLayout { timezone, ..CsvLayout::new(columns, box_form, box_unit) })
     }
 
     /// # Errors
@@ -331,7 +332,7 @@ pub(super) fn layout_of(format: Format, layout: &CsvLayout) -> Result<()> {
     if format == Format::Csv || *layout == CsvLayout::default() {
         return Ok(());
     }
-    Err(Error::invalid("columns", "columns, box_form, box_unit and target_id are for CSV alone"))
+    Err(Error::invalid("columns", "columns, box_form, box_unit, timezone and target_id are for CSV alone"))
 }
 
 /// A body of JSON, not yet read.

@@ -34,6 +34,7 @@ mod nodes;
 mod openid;
 mod pairings;
 mod parts;
+mod pictures;
 mod problem;
 mod receivers;
 mod samples;
@@ -230,6 +231,7 @@ fn described() -> OpenApiRouter<Rest> {
     let mut router = OpenApiRouter::with_openapi(description::head())
         .merge(cameras::routes())
         .merge(camera_statuses::routes())
+        .merge(pictures::routes())
         .merge(sites::routes())
         .merge(site_training_runs::routes())
         .merge(world_tracks::routes())

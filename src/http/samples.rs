@@ -144,6 +144,7 @@ struct DeletedSamples {
         ("columns" = Option<String>, Query, description = "The columns of a CSV file: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` (such as `time:Timestamp,left:x1`) names them; other columns are ignored"),
         ("box_form" = inline(Option<BoxForm>), Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV file hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
         ("box_unit" = inline(Option<BoxUnit>), Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
+        ("timezone" = Option<String>, Query, description = "The IANA time zone (such as `Europe/Berlin`) whose local times are the times of a CSV file without an offset; such times are refused if left out"),
         ("target_id" = Option<String>, Query, description = "The target of rows of a CSV file that name none"),
         ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters: an import that is sent again under the same key gets the answer of the first; for a day"),
     ),

@@ -32,6 +32,9 @@ struct Server {
     /// Map tiles that the operator's console may show, if they are set.
     #[serde(skip_serializing_if = "Option::is_none")]
     tiles: Option<Tiles>,
+    /// Map tiles of another server that the console offers to its user, who must agree first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    offered_tiles: Option<Tiles>,
 }
 
 /// How map tiles are stored.
@@ -65,7 +68,13 @@ async fn get_server(State(rest): State<Rest>) -> ApiResult {
     let mut limits: BTreeMap<String, Value> = limits.map_err(Error::fault)?;
     // The others are policies, such as `sample_overflow`.
     limits.retain(|_, value| value.is_number());
-    Ok(json(&Server { version: env!("CARGO_PKG_VERSION"), limits, tiles: tiles_of(&rest.console) })?)
+    let offered_tiles = rest.console.offered_tiles().map(|(url, attribution)| Tiles {
+        url: url.to_owned(),
+        format: TileFormat::Images,
+        attribution: attribution.to_owned(),
+    });
+    let (version, tiles) = (env!("CARGO_PKG_VERSION"), tiles_of(&rest.console));
+    Ok(json(&Server { version, limits, tiles, offered_tiles })?)
 }
 
 fn tiles_of(settings: &Console) -> Option<Tiles> {

@@ -20,6 +20,7 @@ pub(super) struct Counts {
     pub(super) resent: u64,
     pub(super) answered: u64,
     pub(super) refused: BTreeMap<String, u64>,
+    pub(super) too_late: u64,
     pub(super) lost_answers: u64,
     pub(super) unanswered: u64,
     pub(super) acknowledged: u64,
@@ -46,6 +47,7 @@ impl Counts {
         self.resent += other.resent;
         self.answered += other.answered;
         add_each(&mut self.refused, other.refused);
+        self.too_late += other.too_late;
         self.lost_answers += other.lost_answers;
         self.unanswered += other.unanswered;
         self.acknowledged += other.acknowledged;
@@ -99,6 +101,8 @@ pub struct ReplayReport {
     pub answered: u64,
     /// Items refused, by reason.
     pub refused: BTreeMap<String, u64>,
+    /// Of these, items that are older than what their track takes, so that it did not move.
+    pub too_late: u64,
     /// Items whose answer the server dropped because this client read too slowly.
     pub lost_answers: u64,
     /// Items without an answer.
@@ -181,6 +185,7 @@ impl ReplayReport {
             resent: counts.resent,
             answers_per_s: (counts.answered + refused) as f64 / elapsed_s.max(1e-9),
             answered: counts.answered,
+            too_late: counts.too_late,
             lost_answers: counts.lost_answers,
             unanswered: counts.unanswered,
             acknowledged: must_acknowledge.then_some(counts.acknowledged),
@@ -227,6 +232,14 @@ impl fmt::Display for ReplayReport {
             self.answered, self.lost_answers, self.unanswered
         )?;
         each(out, "refused", &self.refused)?;
+        if self.too_late > 0 {
+            writeln!(
+                out,
+                "too late for their track {}: the server has later items of these targets; --shift-to-now replays a \
+                 recording as if it were of now",
+                self.too_late
+            )?;
+        }
         if let (Some(acknowledged), Some(unacknowledged)) = (self.acknowledged, self.unacknowledged) {
             writeln!(out, "acknowledged {acknowledged}, unacknowledged {unacknowledged}")?;
         }

@@ -16,8 +16,9 @@ use super::resend_buffer::{Answered, ResendBuffer};
 use crate::backoff::Backoff;
 use crate::domain::{LiveItem, ReceiverId, TargetId};
 use crate::grpc::client::{ClientError, Connection, Event, Events, ItemSender, Opening, SendPermit};
-use crate::grpc::proto::StreamAnswer;
 use crate::grpc::proto::stream_answer::Outcome;
+use crate::grpc::proto::track_rejection::Reason;
+use crate::grpc::proto::{StreamAnswer, TrackRejection};
 
 /// What several cameras share.
 pub(super) struct Link {
@@ -134,6 +135,7 @@ impl SimulatedCamera {
             }
             if !is_redirected {
                 *self.counts.broken.entry(error.reason.clone()).or_default() += 1;
+                self.link.counters.set_fault(Some(error.to_string()));
                 self.broken_at.get_or_insert_with(Instant::now);
             }
             let delay = if error.retryable { self.backoff.next_delay() } else { None };
@@ -171,6 +173,7 @@ impl SimulatedCamera {
         self.counts.streams += 1;
         self.counts.reconnects += u64::from(self.counts.streams > 1);
         Counters::add(&self.link.counters.streams, 1);
+        self.link.counters.set_fault(None);
         let end = self.run_stream(sender, &mut events, stop).await;
         Counters::subtract(&self.link.counters.streams, 1);
         end
@@ -318,7 +321,13 @@ impl SimulatedCamera {
             Some(Outcome::Error(error)) => {
                 *self.counts.refused.entry(error.reason.clone()).or_default() += 1;
             }
-            _ => self.counts.answered += 1,
+            _ => {
+                self.counts.answered += 1;
+                let rejections = answer.track.iter().flat_map(|track| &track.rejections);
+                let is_too_late =
+                    rejections.map(TrackRejection::reason).any(|reason| reason == Reason::TooLate);
+                self.counts.too_late += u64::from(is_too_late);
+            }
         }
     }
 

@@ -255,6 +255,13 @@ impl RequestPipeline {
         let is_grpc = counted.is_grpc();
         let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
         let has_body = !request.body().is_end_stream();
+        let presented = credential(&request, peer.certificate.as_ref(), peer.is_tls, is_grpc);
+        let (access, clock) = (&self.app.access, &self.app.clock);
+        if access.is_worth_refresh(presented, clock.monotonic())
+            && let Err(error) = access.refresh(&self.app.store, clock).await
+        {
+            tracing::warn!(%error, "cannot look for a new key");
+        }
         let granted = match self.grant(&request, class, is_grpc, peer, id) {
             Ok(granted) if has_body => self.wait_for_refused(class, granted).await,
             Ok(granted) => Ok(granted),
@@ -356,6 +363,7 @@ impl RequestPipeline {
             // Spooled, or read message by message, each with limits of its own.
             RequestClass::Import | RequestClass::ImportStream | RequestClass::LiveStream => 0,
             _ if is_grpc => limits.message_bytes,
+            _ if request.uri().path().ends_with("/picture") => limits.picture_bytes,
             _ => limits.body_bytes,
         };
         let ticket = Ticket::open(&self.app, class, client, held_bytes)?;

@@ -320,6 +320,23 @@ async fn revoking_a_key_ends_what_is_open_at_once() {
     assert!(shown["secret"].is_null(), "{shown}");
 }
 
+/// The command line creates a key in the folder of a running server; its first request is answered.
+#[tokio::test]
+async fn a_key_of_another_process_works_at_once() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    let admin = server.post("/v1/keys", &json!({"name": "first", "role": "admin"})).await.expect(201);
+    let admin = admin.json()["secret"].as_str().expect("a secret").to_owned();
+    for name in ["a", "b"] {
+        let data = folder.path().to_str().expect("UTF-8");
+        let secret = run(&["keys", "create", "--name", name, "--role", "viewer", "--data", data]);
+        send(&server, "GET", "/v1/cameras", secret.trim(), "").await.expect(200);
+        // The store is asked ten times a second at most.
+        tokio::time::sleep(std::time::Duration::from_millis(150)).await;
+    }
+    send(&server, "GET", "/v1/keys", &admin, "").await.expect(200);
+}
+
 #[tokio::test]
 async fn a_server_without_keys_is_open_until_there_is_one() {
     let folder = data_folder();

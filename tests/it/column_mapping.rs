@@ -203,3 +203,26 @@ async fn a_server_splits_the_lines_of_each_case() {
         server.send("DELETE", &format!("{SAMPLES}?target_id=a"), &[], "").await.expect(200);
     }
 }
+
+#[tokio::test]
+async fn times_without_an_offset_are_local_times_of_the_zone_that_is_given() {
+    let (_folder, server) = with_camera().await;
+    let csv = "time,target_id,left,top,width,height,longitude,latitude\n\
+               2026-07-01 10:00:00,a,1,2,30,40,11,48\n2026-10-25 02:30:00,a,1,2,30,40,11,48\n";
+    let refused = server.send("POST", SAMPLES, &CSV, csv).await.expect(200).json();
+    assert_eq!(refused["rejected"], 2, "{refused}");
+    let path = format!("{SAMPLES}?timezone=Europe/Berlin");
+    let report = server.send("POST", &path, &CSV, csv).await.expect(200).json();
+    assert_eq!(
+        (&report["accepted"], &report["rejected_rows"][0]["line"]),
+        (&json!(1), &json!(3)),
+        "{report}"
+    );
+    let reason = report["rejected_rows"][0]["reason"].as_str().expect("a reason");
+    assert!(reason.contains("has it twice"), "{reason}");
+    let stored = server.get(SAMPLES).await.expect(200).json();
+    assert_eq!(stored["items"][0]["time"], "2026-07-01T08:00:00Z");
+    let path = format!("{SAMPLES}?timezone=Mars");
+    let problem = server.send("POST", &path, &CSV, csv).await.expect(422).json();
+    assert_eq!(problem["violations"][0]["field"], "timezone");
+}

@@ -252,3 +252,48 @@ fn only_one_file_can_be_standard_input() {
     assert_eq!(refused.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&refused.stderr).contains("only one of"));
 }
+
+#[test]
+fn pair_replaces_a_file_only_when_told() {
+    let folder = data_folder();
+    let file = |name: &str| path(folder.path(), name);
+    let (boxes, fixes) = (file("boxes.csv"), file("fixes.csv"));
+    std::fs::write(&boxes, "time,target_id,left,top,width,height\n2026-01-01T00:00:00Z,a,1,2,30,40\n")
+        .expect("written");
+    std::fs::write(&fixes, "time,longitude,latitude\n2026-01-01T00:00:00Z,11,48\n").expect("written");
+    let before = std::fs::read(&boxes).expect("a file");
+    let pair = |out: &str, flags: &[&str]| {
+        piped(&[&["pair", "--detections", &boxes, "--fixes", &fixes, "--out", out], flags].concat(), b"")
+    };
+    let refused = pair(&boxes, &[]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("exists"));
+    assert_eq!(std::fs::read(&boxes).expect("a file"), before);
+    succeeded(pair(&file("samples.csv"), &[]));
+    succeeded(pair(&file("samples.csv"), &["--overwrite"]));
+}
+
+#[test]
+fn an_import_of_too_many_bad_rows_is_told_from_a_success() {
+    let folder = data_folder();
+    let (data, csv) = (path(folder.path(), "data"), path(folder.path(), "rows.csv"));
+    let row = |at: usize| {
+        format!("2026-01-01 10:00:{:02}{},a,1,2,30,40,11,48\n", at, if at < 24 { "" } else { "Z" })
+    };
+    std::fs::write(&csv, HEADER.to_owned() + &(0..60).map(row).collect::<String>()).expect("written");
+    let import = |flags: &[&str]| {
+        piped(&[&["import", &csv, "--data", &data, "--camera", "c", "--create"], flags].concat(), b"")
+    };
+    let rejected = import(&[]);
+    assert_eq!(rejected.status.code(), Some(5));
+    let told = String::from_utf8_lossy(&rejected.stderr).into_owned();
+    assert!(told.contains("24 of 60 rows (40 %) were rejected"), "{told}");
+    succeeded(import(&["--max-rejected", "0.5"]));
+    // The times without an offset are those of a zone.
+    let (summary, _) = succeeded(import(&["--timezone", "Europe/Berlin"]));
+    assert!(summary.contains("accepted 24 (without a fix 0), duplicate 36, rejected 0"), "{summary}");
+    let refused = import(&["--timezone", "Mars/Olympus"]);
+    assert_eq!(refused.status.code(), Some(2));
+    let unknown = piped(&["import", "-", "--data", &data, "--camera", "c"], b"Zeit;left\n1;2\n");
+    assert!(String::from_utf8_lossy(&unknown.stderr).contains("with `columns` as `auto`"));
+}

@@ -119,6 +119,7 @@ async fn tiles_are_shown_only_from_the_set_server() {
     assert!(policy.contains("img-src 'self' data: blob: https://tiles.example.org;"), "{policy}");
     let info = server.get("/v1/server").await.expect(200).json();
     assert_eq!(info["tiles"]["url"], settings[0].1, "{info}");
+    assert!(info["offered_tiles"].is_null(), "{info}");
     assert_eq!(info["limits"]["page_items"], 1_000, "{info}");
 
     for url in ["tiles/{z}/{x}/{y}", "https://tiles.example.org/{z}", "https://a;script-src *;/{z}/{x}/{y}"] {
@@ -126,6 +127,26 @@ async fn tiles_are_shown_only_from_the_set_server() {
         let output = output.expect("the binary runs");
         assert!(!output.status.success(), "{url} was taken");
         assert!(String::from_utf8_lossy(&output.stderr).contains("console.tile_url"));
+    }
+}
+
+#[tokio::test]
+async fn tiles_are_offered_unless_the_settings_forbid_it_or_name_others() {
+    let none = json!(null);
+    for (value, origin, offered) in [
+        ("true", " https://tile.openstreetmap.org;", "https://tile.openstreetmap.org/{z}/{x}/{y}.png"),
+        ("false", ";", ""),
+    ] {
+        let folder = data_folder();
+        let server =
+            TestServer::start_with(folder.path(), &[("SIGHTFIX_CONSOLE__OFFER_OPENSTREETMAP", value)]);
+        let policy = asset(&server, "/", &[]).await.expect(200).header("content-security-policy").to_owned();
+        assert!(policy.contains(&format!("img-src 'self' data: blob:{origin}")), "{policy}");
+        let info = server.get("/v1/server").await.expect(200).json();
+        assert_eq!(
+            (&info["tiles"], info["offered_tiles"]["url"].as_str().unwrap_or_default()),
+            (&none, offered)
+        );
     }
 }
 

@@ -172,6 +172,19 @@ async fn the_demonstration_prints_requests_that_work() {
     let fused = server.post("/v1/cameras/demo/fusions", &observation).await.expect(200).json();
     assert!(fused["items"][0]["r95_m"].as_f64().is_some_and(|r95_m| r95_m > 0.0), "{fused}");
     assert!(printed.contains("grpcurl -plaintext") && printed.contains("/docs"), "{printed}");
+    // Targets of the demonstration walk: what is tracked moves.
+    let position = async || -> Value {
+        let tracks = server.get("/v1/cameras/demo/tracks").await.expect(200).json();
+        tracks["features"][0]["geometry"]["coordinates"].clone()
+    };
+    let mut first = position().await;
+    while first.is_null() {
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        first = position().await;
+    }
+    while position().await == first {
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
 }
 
 /// A model file of an earlier format loads, and is more accurate than the receiver alone.

@@ -186,6 +186,16 @@ def test_changes_are_based_on_a_revision(client: Client) -> None:
     assert client.cameras.update("yard", display_name="again").revision == 3
 
 
+def test_a_picture_is_set_and_removed(client: Client) -> None:
+    client.cameras.create(id="seen")
+    assert client.cameras.picture("seen") is None
+    for picture in (b"\xff\xd8\xff rest", b"\x89PNG\r\n\x1a\n rest"):
+        client.cameras.set_picture("seen", picture)
+        assert client.cameras.picture("seen") == picture
+    client.cameras.delete_picture("seen")
+    assert client.cameras.picture("seen") is None
+
+
 def test_models_are_copied_activated_and_rolled_back(trained: ServerProcess, client: Client) -> None:
     with Client(trained.url) as source:
         file = source.models.download("square", 1)

@@ -26,7 +26,8 @@ def test_a_frame_is_fused_as_its_rows_are(trained: ServerProcess, recording: tup
         arrays = client.fusions.fuse_arrays("square", columns)
     assert list(fused.index) == list(frame.index)
     assert list(fused["longitude_deg"]) == [it.fused.longitude_deg for it in expected]
-    assert fused.loc[1003, "flags"] == " ".join(expected[3].flags)
+    assert fused.position_flags.loc[1003] == " ".join(expected[3].flags)
+    assert fused.covariance_east_north_m2.loc[1003] == expected[3].covariance.east_north_m2
     assert "gnss_denied" in expected[3].flags
     assert np.isnan(arrays["e_gnss_m2"][3])
     np.testing.assert_array_equal(arrays["latitude_deg"], fused["latitude_deg"].to_numpy())

@@ -93,6 +93,17 @@ export async function put<T>(path: string, body: unknown): Promise<T> {
   return (await send('PUT', path, { body })).json() as Promise<T>;
 }
 
+/** Puts a file, under its own type. */
+export async function putFile(path: string, file: Blob): Promise<void> {
+  await send('PUT', path, { body: file, headers: { 'content-type': file.type } });
+}
+
+/** A file; undefined where there is none (204). */
+export async function blob(path: string): Promise<Blob | undefined> {
+  const response = await send('GET', path, { accept: '*/*' });
+  return response.status === 204 ? undefined : response.blob();
+}
+
 export async function patch<T>(path: string, body: unknown, revision: number): Promise<T> {
   const headers = { 'if-match': `"${revision}"`, 'content-type': 'application/merge-patch+json' };
   return (await send('PATCH', path, { body: JSON.stringify(body), headers })).json() as Promise<T>;

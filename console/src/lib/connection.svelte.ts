@@ -1,7 +1,13 @@
 // Whether the server answers, and whether it asks for a key.
 
+/** When this page last loaded itself again, ms since 1970. */
+const RELOADED_AT = 'sightfix.reloaded_at';
+const RELOAD_AGAIN_AFTER_MS = 60_000;
+
 class Connection {
   lost = $state(false);
+  /** Whether a part of the page could not be loaded: the line broke, or the server has a newer release. */
+  isIncomplete = $state(false);
   #timer: ReturnType<typeof setTimeout> | undefined;
 
   /** Called by every request that found no server; asks until it is back. */
@@ -14,6 +20,21 @@ class Connection {
     this.lost = false;
     clearTimeout(this.#timer);
     this.#timer = undefined;
+    if (this.isIncomplete) this.#reload();
+  }
+
+  /** Called when a part of the page could not be loaded: loads the page again once the server answers. */
+  missPart(): void {
+    this.isIncomplete = true;
+    this.#timer ??= setTimeout(() => void this.#probe(), 0);
+  }
+
+  /** Once: if that did not help, the operator decides. */
+  #reload(): void {
+    const last_ms = Number(sessionStorage.getItem(RELOADED_AT) ?? 0);
+    if (Date.now() - last_ms < RELOAD_AGAIN_AFTER_MS) return;
+    sessionStorage.setItem(RELOADED_AT, String(Date.now()));
+    location.reload();
   }
 
   async #probe(): Promise<void> {

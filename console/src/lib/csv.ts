@@ -1,11 +1,10 @@
-// Files of rows as people have them: any separator, any column names, any convention of boxes. Mapped here to the
-// columns that the importer documents.
+// Files of rows as people have them: any separator, any column names, any convention of boxes. The importer reads them;
+// here is what it needs to be told, and a preview of what it will read.
 import columnNames from '../../../crates/exchange/src/column_names.json' with { type: 'json' };
 import type { ImageSize, RejectedRow } from './types';
 
 export type FileKind = 'samples' | 'detections' | 'fixes';
 export type BoxForm = 'left_top' | 'centre' | 'corners';
-export type TimeForm = 'rfc3339' | 'unix_s' | 'unix_ms';
 
 export interface TableRow {
   /** Number of its line in the file, from 1. */
@@ -17,6 +16,8 @@ export interface TableRow {
 
 export interface Table {
   header: string[];
+  /** Number of the header's line in the file, from 1. */
+  headerLine: number;
   separator: string;
   rows: TableRow[];
 }
@@ -27,7 +28,7 @@ export interface Mapping {
   columns: Record<string, number>;
   boxForm: BoxForm;
   normalised: boolean;
-  timeForm: TimeForm;
+  /** Whether numbers may have a decimal comma: where it is not the separator. */
   decimalComma: boolean;
   /** Used where there is no column of the target. */
   targetId: string;
@@ -48,7 +49,7 @@ export function parseTable(text: string): Table {
     const cells = rowOf(line, separator, header.length);
     return [typeof cells === 'string' ? { line: at + 1, cells: [], problem: cells } : { line: at + 1, cells }];
   });
-  return { header, separator, rows };
+  return { header, headerLine: first + 1, separator, rows };
 }
 
 /** The cells of a line, or why it has not those that the header names. */
@@ -122,17 +123,13 @@ export function guessMapping(table: Table): Mapping {
   const at = (field: string): string => names[columns[field]!] ?? '';
   const boxForm: BoxForm = /^(x2|xmax|right)$/.test(at('width')) ? 'corners' : /^(cx|.*cent.*)$/.test(at('left')) ? 'centre' : 'left_top';
   const cells = (field: string): string[] => table.rows.slice(0, 200).map((row) => row.cells[columns[field]!] ?? '');
-  const decimalComma = table.separator !== ',' && [...cells('left'), ...cells('longitude')].some((it) => /^-?\d+,\d+$/.test(it));
   const numbers = ['left', 'top', 'width', 'height'].flatMap((field) => cells(field).map((it) => Number(it.replace(',', '.'))));
-  const times = cells('time').filter(Boolean);
-  const timeForm: TimeForm = times.length > 0 && times.every((it) => /^\d+([.,]\d+)?$/.test(it)) ? (Number(times[0]!.replace(',', '.')) > 1e11 ? 'unix_ms' : 'unix_s') : 'rfc3339';
   return {
     kind,
     columns,
     boxForm,
     normalised: has('left') && numbers.length > 0 && numbers.every((it) => it >= 0 && it <= 1),
-    timeForm,
-    decimalComma,
+    decimalComma: table.separator !== ',',
     targetId: has('target_id') ? '' : 'target-1',
   };
 }
@@ -155,6 +152,22 @@ export function missingFields(mapping: Mapping): string[] {
   );
 }
 
+const UNIX_TIME = /^\d[\d.,]*$/;
+/** Unix times below are seconds, others milliseconds. */
+const FEWEST_UNIX_MS = 1e11;
+
+/** Whether a file has times without an offset, which are the local times of a zone. */
+export function hasLocalTimes({ rows }: Table, { columns }: Mapping): boolean {
+  const times = rows.slice(0, 200).map(({ cells }) => cells[columns.time ?? -1] ?? '');
+  return times.some((time) => time !== '' && !UNIX_TIME.test(time) && !/(Z|[+-]\d\d:?\d\d)$/i.test(time));
+}
+
+/** The header with the names that the importer documents, and others for the columns that it shall ignore. */
+export function documentedHeader({ header, separator }: Table, { kind, columns }: Mapping): string {
+  const fields = [...REQUIRED[kind], ...OPTIONAL[kind]];
+  return header.map((_, at) => fields.find((field) => columns[field] === at) ?? `unused_${at + 1}`).join(separator);
+}
+
 /** One row in the importer's columns, or why it cannot be. */
 export function mapRow(row: TableRow, mapping: Mapping, image: ImageSize | undefined): MappedRow | RejectedRow {
   const raw = (field: string): string => row.cells[mapping.columns[field] ?? -1] ?? '';
@@ -165,12 +178,13 @@ export function mapRow(row: TableRow, mapping: Mapping, image: ImageSize | undef
     return text === '' ? NaN : Number(text);
   };
   const values: Record<string, string> = {};
-  if (mapping.timeForm === 'rfc3339') values.time = raw('time').replace(/^(\d{4}-\d\d-\d\d) (\d\d:)/, '$1T$2');
-  else {
-    const time_ms = numeric('time') * (mapping.timeForm === 'unix_s' ? 1000 : 1);
-    if (!Number.isFinite(time_ms) || Math.abs(time_ms) > 8.64e15) return reject('time', `\`${raw('time').slice(0, 40)}\` is no Unix time`);
+  const time = raw('time');
+  if (UNIX_TIME.test(time)) {
+    const unix = numeric('time');
+    const time_ms = unix < FEWEST_UNIX_MS ? unix * 1000 : unix;
+    if (time_ms > 8.64e15) return reject('time', `\`${time.slice(0, 40)}\` is no Unix time`);
     values.time = new Date(time_ms).toISOString();
-  }
+  } else values.time = time.replace(/^(\d{4}-\d\d-\d\d) (\d\d:)/, '$1T$2');
   values.target_id = raw('target_id') || mapping.targetId;
   if (mapping.kind !== 'fixes') {
     const sides = ['left', 'top', 'width', 'height'].map(numeric);
@@ -196,9 +210,4 @@ export function mapRow(row: TableRow, mapping: Mapping, image: ImageSize | undef
 
 export function isRejected(row: MappedRow | RejectedRow): row is RejectedRow {
   return 'reason' in row;
-}
-
-export function toCsv(columns: string[], rows: MappedRow[]): string {
-  const cell = (text: string): string => (/[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
-  return [columns, ...rows.map((row) => row.cells)].map((cells) => cells.map(cell).join(',')).join('\n') + '\n';
 }

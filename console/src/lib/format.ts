@@ -26,13 +26,15 @@ export function bytes(value: number): string {
   return `${number(value, value < 10 && at > 0 ? 1 : 0)} ${units[at]}`;
 }
 
+/** Date, time and zone. */
 export function dateTime(text: string | undefined): string {
   if (!text) return '–';
-  return new Date(text).toLocaleString(i18n.locale, { dateStyle: 'medium', timeStyle: 'medium' });
+  return new Date(text).toLocaleString(i18n.locale, { year: 'numeric', month: 'short', day: 'numeric', hour: '2-digit', minute: '2-digit', second: '2-digit', timeZoneName: 'short' });
 }
 
-export function clockTime(text: string): string {
-  return new Date(text).toLocaleTimeString(i18n.locale);
+/** Name of the time zone in which this browser shows and reads times, such as `Europe/Berlin`. */
+export function zoneName(): string {
+  return Intl.DateTimeFormat().resolvedOptions().timeZone;
 }
 
 export function duration(seconds: number | undefined | null): string {

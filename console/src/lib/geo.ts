@@ -7,7 +7,9 @@ export interface EastNorth {
 }
 
 const METRES_PER_DEGREE = 111_319.490793; // of longitude at the equator, WGS 84
-export const R95_PER_SIGMA = 2.447746830680816;
+
+/** Outlines of the world are off by a kilometre or two, which is seen beyond this zoom. */
+export const CLOSEST_OUTLINES_ZOOM = 11;
 
 /** Equirectangular projection about a reference. */
 export function toPlane(reference: Position, position: Position): EastNorth {
@@ -55,6 +57,12 @@ export function boundsOf(positions: Iterable<Position>): Bounds | undefined {
   return bounds;
 }
 
+/** The longer side of a rectangle, m. */
+export function sideOf({ west, south, east, north }: Bounds): number {
+  const corner = toPlane({ longitude_deg: west, latitude_deg: south }, { longitude_deg: east, latitude_deg: north });
+  return Math.max(corner.east_m, corner.north_m);
+}
+
 export function centroid(positions: Position[]): Position | undefined {
   if (positions.length === 0) return undefined;
   const sum = positions.reduce((a, b) => ({
@@ -72,4 +80,10 @@ export function roundLength(most: number): number {
   const power = 10 ** Math.floor(Math.log10(most));
   const factor = most / power;
   return (factor >= 5 ? 5 : factor >= 2 ? 2 : 1) * power;
+}
+
+/** A round length of a scale bar, from centimetres to thousands of kilometres. */
+export function roundLengthText(length_m: number): string {
+  if (length_m < 1) return `${Math.round(length_m * 100)} cm`;
+  return length_m < 1000 ? `${Math.round(length_m)} m` : `${Math.round(length_m / 1000)} km`;
 }

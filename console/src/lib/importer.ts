@@ -1,13 +1,17 @@
-// Sends mapped files to the importer in parts, so that there is progress and one bad row costs nothing.
+// Sends files to the importer, which reads them: whole, or in parts as they come from the disk, so that their size neither
+// fills this browser's memory nor the importer's limit.
 import { cameraPath, postOnce } from './api';
-import { isRejected, mapRow, outputColumns, toCsv, type MappedRow, type Mapping, type Table } from './csv';
-import type { ImageSize, Imported, PairedSamples, RejectedRow } from './types';
+import { documentedHeader, parseTable, type Mapping, type Table } from './csv';
+import type { Imported, PairedSamples, RejectedRow } from './types';
 
-const ROWS_PER_PART = 2_000;
+/** Enough of a file to map its columns. */
+const HEAD_BYTES = 256 * 1024;
+const PART_BYTES = 4 * 1024 * 1024;
+const NEWLINE = 10;
 
 export interface SourceFile {
   file: File;
-  /** Missing for NMEA and GPX, which the server reads itself. */
+  /** Its first rows. Missing for NMEA and GPX, which the server reads itself. */
   table?: Table;
   mapping: Mapping;
 }
@@ -22,49 +26,60 @@ export interface ImportOutcome {
   pairing?: PairedSamples['pairing'];
 }
 
-function mapAll(source: SourceFile, image: ImageSize | undefined): { rows: MappedRow[]; rejected: RejectedRow[] } {
-  const rows: MappedRow[] = [];
-  const rejected: RejectedRow[] = [];
-  for (const row of source.table?.rows ?? []) {
-    const mapped = mapRow(row, source.mapping, image);
-    if (isRejected(mapped)) rejected.push(mapped);
-    else rows.push(mapped);
-  }
-  return { rows, rejected };
+/** The first rows of a file. */
+export async function tableOf(file: File): Promise<Table> {
+  const head = new Uint8Array(await file.slice(0, HEAD_BYTES).arrayBuffer());
+  const end = file.size > HEAD_BYTES ? head.lastIndexOf(NEWLINE) + 1 : head.length;
+  return parseTable(new TextDecoder().decode(head.subarray(0, end)));
 }
 
-/** The line of the original file instead of that of the part that was sent. */
-function atOriginalLines(reported: RejectedRow[], rows: MappedRow[]): RejectedRow[] {
-  return reported.map((row) => ({ ...row, line: rows[row.line - 2]?.line ?? row.line }));
+/** Where the rows of a file begin, in bytes. */
+async function rowsFrom({ file, table }: SourceFile): Promise<number> {
+  const head = new Uint8Array(await file.slice(0, HEAD_BYTES).arrayBuffer());
+  let from = 0;
+  for (let line = 0; line < table!.headerLine; line++) from = head.indexOf(NEWLINE, from) + 1;
+  return from;
 }
 
-/** Imports samples; `progress` gets the share that is done. */
+/** What the importer is told of a file. */
+function layoutOf({ boxForm, normalised, targetId }: Mapping, timezone: string | undefined): URLSearchParams {
+  const layout = new URLSearchParams({ columns: 'auto', box_form: boxForm, box_unit: normalised ? 'share' : 'px' });
+  if (timezone) layout.set('timezone', timezone);
+  if (targetId.trim()) layout.set('target_id', targetId.trim());
+  return layout;
+}
+
+/** Imports samples; `progress` gets the share that is done. Times without an offset are local times of `timezone`. */
 export async function importSamples(
   camera: string,
   source: SourceFile,
-  image: ImageSize | undefined,
+  timezone: string | undefined,
   progress: (share: number) => void,
   signal: AbortSignal,
 ): Promise<ImportOutcome> {
-  const { rows, rejected } = mapAll(source, image);
-  const outcome: ImportOutcome = { accepted: 0, withoutFix: 0, duplicate: 0, rejected: rejected.length, rejectedRows: rejected, warnings: [] };
-  const columns = outputColumns(source.mapping);
-  for (let from = 0; from < rows.length; from += ROWS_PER_PART) {
-    const part = rows.slice(from, from + ROWS_PER_PART);
-    const report = await postOnce<Imported>(cameraPath(camera, 'samples'), toCsv(columns, part), {
-      headers: { 'content-type': 'text/csv' },
-      signal,
-    });
+  const { file, table, mapping } = source;
+  const outcome: ImportOutcome = { accepted: 0, withoutFix: 0, duplicate: 0, rejected: 0, rejectedRows: [], warnings: [] };
+  const path = `${cameraPath(camera, 'samples')}?${layoutOf(mapping, timezone)}`;
+  const header = `${documentedHeader(table!, mapping)}\n`;
+  let linesBefore = table!.headerLine;
+  for (let from = await rowsFrom(source); from < file.size; ) {
+    const read = new Uint8Array(await file.slice(from, from + PART_BYTES).arrayBuffer());
+    const isLast = from + read.length === file.size;
+    // A row longer than a part is refused by the importer in either of its halves.
+    const part = isLast ? read : read.subarray(0, read.lastIndexOf(NEWLINE) + 1 || read.length);
+    const report = await postOnce<Imported>(path, new Blob([header, part]), { headers: { 'content-type': 'text/csv' }, signal });
     outcome.accepted += report.accepted;
     outcome.withoutFix += report.accepted_without_fix;
     outcome.duplicate += report.duplicate;
     outcome.rejected += report.rejected;
-    outcome.rejectedRows.push(...atOriginalLines(report.rejected_rows, part));
+    // The line of the file instead of that of the part, whose first is the header.
+    for (const row of report.rejected_rows) outcome.rejectedRows.push({ ...row, line: linesBefore + row.line - 1 });
     // Parts of one file have the same fault.
     if (outcome.warnings.length === 0) outcome.warnings = report.warnings;
-    progress(Math.min(1, (from + part.length) / rows.length));
+    linesBefore += part.reduce((count, byte) => count + (byte === NEWLINE ? 1 : 0), 0);
+    from += part.length;
+    progress(from / file.size);
   }
-  outcome.rejectedRows.sort((a, b) => a.line - b.line);
   return outcome;
 }
 
@@ -73,32 +88,31 @@ export async function importPair(
   camera: string,
   detections: SourceFile,
   fixes: SourceFile,
-  image: ImageSize | undefined,
+  timezone: string | undefined,
   keepUnpaired: boolean,
   signal: AbortSignal,
 ): Promise<ImportOutcome> {
   const form = new FormData();
-  const rejected: RejectedRow[] = [];
-  const mappedRows: Record<string, MappedRow[]> = {};
+  const linesBefore: Record<string, number> = {};
   for (const [part, source] of [['detections', detections], ['fixes', fixes]] as const) {
-    if (!source.table) {
-      form.append(part, source.file, source.file.name);
+    const { file, table, mapping } = source;
+    if (!table) {
+      form.append(part, file, file.name);
       continue;
     }
-    const mapped = mapAll(source, image);
-    mappedRows[part] = mapped.rows;
-    rejected.push(...mapped.rejected.map((row) => ({ ...row, part })));
-    const csv = toCsv(outputColumns(source.mapping), mapped.rows);
-    form.append(part, new Blob([csv], { type: 'text/csv' }), `${part}.csv`);
+    linesBefore[part] = table.headerLine - 1;
+    const rows = file.slice(await rowsFrom(source));
+    form.append(part, new Blob([documentedHeader(table, mapping), '\n', rows], { type: 'text/csv' }), `${part}.csv`);
   }
-  const report = await postOnce<PairedSamples>(`${cameraPath(camera, 'samples', 'pairings')}?keep_unpaired=${keepUnpaired}`, form, { signal });
-  const reported = report.rejected_rows.flatMap((row) => atOriginalLines([row], mappedRows[row.part ?? ''] ?? []));
+  const params = layoutOf(detections.mapping, timezone);
+  params.set('keep_unpaired', String(keepUnpaired));
+  const report = await postOnce<PairedSamples>(`${cameraPath(camera, 'samples', 'pairings')}?${params}`, form, { signal });
   return {
     accepted: report.accepted,
     withoutFix: report.accepted_without_fix,
     duplicate: report.duplicate,
-    rejected: report.rejected + rejected.length,
-    rejectedRows: [...rejected, ...reported],
+    rejected: report.rejected,
+    rejectedRows: report.rejected_rows.map((row) => ({ ...row, line: row.line + (linesBefore[row.part ?? ''] ?? 0) })),
     warnings: report.warnings,
     pairing: report.pairing,
   };

@@ -12,6 +12,8 @@ export interface PlaneView {
   width: number;
   height: number;
   at: (position: Position) => Pixel;
+  /** The square of the web's Mercator projection, of which the view shows a part. */
+  world: { left_px: number; top_px: number; size_px: number };
 }
 
 export type Draw = (view: PlaneView) => void;
@@ -71,14 +73,15 @@ export class PlaneLayer {
     const at = ({ longitude_deg, latitude_deg }: Position): Pixel =>
       this.#map.latLngToContainerPoint([latitude_deg, longitude_deg]);
     const px_per_m = 1 / this.metresPerPixel();
-    if (this.#hasGrid) this.#grid(context, colors, px_per_m, width, height);
-    this.#draw({ context, colors, px_per_m, width, height, at });
+    const origin = this.#map.project(this.#map.getCenter()).subtract([width / 2, height / 2]);
+    const world = { left_px: -origin.x, top_px: -origin.y, size_px: 256 * 2 ** this.#map.getZoom() };
+    if (this.#hasGrid) this.#grid(context, colors, px_per_m, width, height, origin);
+    this.#draw({ context, colors, px_per_m, width, height, at, world });
   }
 
   /** Lines of a round distance, counted from a corner that does not move with the view. */
-  #grid(context: Context, colors: Palette, px_per_m: number, width: number, height: number): void {
+  #grid(context: Context, colors: Palette, px_per_m: number, width: number, height: number, origin: Pixel): void {
     const step_px = roundLength((GRID_TARGET_PX * 1.6) / px_per_m) * px_per_m;
-    const origin = this.#map.project(this.#map.getCenter()).subtract([width / 2, height / 2]);
     for (const [offset, length, vertical] of [
       [origin.x, width, true],
       [origin.y, height, false],

@@ -24,3 +24,10 @@ export function grpcurlLine(origin: string, camera: string, observation: TriedOb
   const host = url.port ? url.host : `${url.host}:${url.protocol === 'http:' ? 80 : 443}`;
   return `grpcurl ${plain}${needsKey ? KEY : ''}-d ${quoted({ camera_id: camera, observations: [observation] })} ${host} sightfix.v1.FusionService/Fuse`;
 }
+
+/** Saves the camera's samples and replays them to it, with their times shifted to now. */
+export function replayLines(origin: string, camera: string, needsKey: boolean): string {
+  const save = `curl -s ${needsKey ? KEY : ''}-H 'accept: text/csv' ${origin}/v1/cameras/${camera}/samples -o ${camera}.csv`;
+  const key = needsKey ? 'SIGHTFIX_API_KEY="$SIGHTFIX_KEY" ' : '';
+  return `${save}\n${key}sightfix replay ${camera}.csv --server ${origin} --camera ${camera} --shift-to-now`;
+}

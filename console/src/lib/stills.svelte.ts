@@ -1,46 +1,36 @@
-// Still images behind the image planes. They stay in this browser.
-const DATABASE = 'sightfix';
-const STORE = 'stills';
+// Pictures of what cameras see, which the server keeps: boxes are drawn on them.
+import { blob, cameraPath, del, putFile } from './api';
 
-function open(): Promise<IDBDatabase> {
-  return new Promise((resolve, reject) => {
-    const request = indexedDB.open(DATABASE, 1);
-    request.onupgradeneeded = () => request.result.createObjectStore(STORE);
-    request.onsuccess = () => resolve(request.result);
-    request.onerror = () => reject(request.error);
-  });
-}
-
-function done<T>(request: IDBRequest<T>): Promise<T> {
-  return new Promise((resolve, reject) => {
-    request.onsuccess = () => resolve(request.result);
-    request.onerror = () => reject(request.error);
-  });
-}
+/** Longer side of a picture that is sent: enough to see who stands where. */
+const LONGEST_SIDE_PX = 1920;
+const JPEG_QUALITY = 0.85;
 
 class Stills {
   images = $state.raw<Record<string, ImageBitmap>>({});
 
   async load(camera: string): Promise<void> {
-    if (this.images[camera]) return;
-    const database = await open();
-    const blob = await done<Blob | undefined>(database.transaction(STORE).objectStore(STORE).get(camera));
-    if (blob) this.images = { ...this.images, [camera]: await createImageBitmap(blob) };
+    const picture = await blob(cameraPath(camera, 'picture'));
+    if (picture) this.#show(camera, await createImageBitmap(picture));
   }
 
-  async set(camera: string, file: Blob): Promise<ImageBitmap> {
+  /** Sends any image that the browser can read, as a JPEG within the server's limit. */
+  async set(camera: string, file: Blob): Promise<void> {
     const image = await createImageBitmap(file);
-    const database = await open();
-    await done(database.transaction(STORE, 'readwrite').objectStore(STORE).put(file, camera));
-    this.images = { ...this.images, [camera]: image };
-    return image;
+    const scale = Math.min(1, LONGEST_SIDE_PX / Math.max(image.width, image.height));
+    const canvas = new OffscreenCanvas(Math.round(image.width * scale), Math.round(image.height * scale));
+    canvas.getContext('2d')!.drawImage(image, 0, 0, canvas.width, canvas.height);
+    await putFile(cameraPath(camera, 'picture'), await canvas.convertToBlob({ type: 'image/jpeg', quality: JPEG_QUALITY }));
+    this.#show(camera, image);
   }
 
   async remove(camera: string): Promise<void> {
-    const database = await open();
-    await done(database.transaction(STORE, 'readwrite').objectStore(STORE).delete(camera));
+    await del(cameraPath(camera, 'picture'));
     const { [camera]: _, ...others } = this.images;
     this.images = others;
+  }
+
+  #show(camera: string, image: ImageBitmap): void {
+    this.images = { ...this.images, [camera]: image };
   }
 }
 

@@ -296,7 +296,14 @@ export interface EvaluationReport {
 export interface ServerInfo {
   version: string;
   limits: Record<string, number>;
-  tiles?: { url: string; format: 'images' | 'pmtiles'; attribution: string };
+  tiles?: Tiles;
+  /** Tiles of another server, which is asked once the user agrees. */
+  offered_tiles?: Tiles;
+}
+export interface Tiles {
+  url: string;
+  format: 'images' | 'pmtiles';
+  attribution: string;
 }
 export type Role = 'viewer' | 'edge' | 'operator' | 'admin';
 export interface Session {

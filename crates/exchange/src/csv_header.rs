@@ -10,6 +10,10 @@ use crate::domain::{Error, ErrorKind, Result};
 const GROUPS: [&[usize]; 3] =
     [&[LEFT, LEFT + 1, LEFT + 2, HEIGHT], &[LONGITUDE, LATITUDE], &[TRUTH_LONGITUDE, TRUTH_LATITUDE]];
 
+/// What helps with a file of other columns than the documented ones.
+const AUTO_HINT: &str =
+    "; with `columns` as `auto` the usual names of columns are found, and other columns are ignored";
+
 /// The fields of a file's columns, and the names that the file uses.
 pub(super) struct Header {
     /// The field of each column of the file.
@@ -45,21 +49,23 @@ impl Header {
             header.fields[position] = Some(index);
             header.names[index] = name;
         }
-        header.check(required)?;
+        header.check(required, layout)?;
         Ok(header)
     }
 
-    fn check(&self, required: &[usize]) -> Result<()> {
+    fn check(&self, required: &[usize], layout: &CsvLayout) -> Result<()> {
+        let hint = if layout.is_documented() { AUTO_HINT } else { "" };
         if let Some(&index) = required.iter().find(|&&index| !self.has(index)) {
             let name = COLUMNS[index].plain;
-            return Err(refused(name, format!("the file has no column `{name}`, which is required")));
+            return Err(refused(name, format!("the file has no column `{name}`, which is required{hint}")));
         }
         for group in GROUPS {
             let missing = group.iter().find(|&&index| !self.has(index));
             if let (true, Some(&index)) = (group.iter().any(|&index| self.has(index)), missing) {
                 let name = COLUMNS[index].plain;
-                let reason =
-                    format!("the file has no column `{name}`, which must accompany the columns of its group");
+                let reason = format!(
+                    "the file has no column `{name}`, which must accompany the columns of its group{hint}"
+                );
                 return Err(refused(name, reason));
             }
         }
@@ -106,7 +112,10 @@ fn documented(name: &str, known: usize) -> Result<usize> {
 fn unknown(name: &str, known: &[Column]) -> Error {
     let known = known.iter().map(|column| column.plain).collect::<Vec<_>>().join(", ");
     let shown: String = name.chars().take(60).collect();
-    refused(&shown, format!("unknown column `{shown}`; columns, separated by commas, may be {known}"))
+    refused(
+        &shown,
+        format!("unknown column `{shown}`; columns, separated by commas, may be {known}{AUTO_HINT}"),
+    )
 }
 
 fn refused(field: &str, message: String) -> Error {

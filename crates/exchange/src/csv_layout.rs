@@ -4,6 +4,7 @@
 use std::collections::HashMap;
 use std::sync::LazyLock;
 
+use jiff::tz::TimeZone;
 use serde::{Deserialize, Serialize};
 use strum::{EnumString, IntoStaticStr};
 use utoipa::ToSchema;
@@ -27,6 +28,8 @@ pub struct CsvLayout {
     pub box_unit: BoxUnit,
     /// The target of a file that names none.
     pub target_id: Option<TargetId>,
+    /// The zone of times without an offset, which are refused if it is `None`.
+    pub timezone: Option<TimeZone>,
 }
 
 /// Which columns hold the values.
@@ -108,7 +111,7 @@ impl CsvLayout {
         let is_documented = box_form.is_none() && box_unit.is_none();
         let assumed = if is_documented { ColumnNames::Documented } else { ColumnNames::Guessed };
         let columns = columns.unwrap_or(assumed);
-        Self { columns, box_form, box_unit: box_unit.unwrap_or_default(), target_id: None }
+        Self { columns, box_form, box_unit: box_unit.unwrap_or_default(), ..Self::default() }
     }
 
     /// Whether the file is as documented.

@@ -5,6 +5,8 @@
 
 use std::io::Read;
 
+use jiff::tz::TimeZone;
+
 use super::columns::{
     CLASS, COUNT, HEIGHT, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA, TARGET_ID, TIME,
     TOP, TRUTH_LATITUDE, TRUTH_LONGITUDE, WIDTH,
@@ -16,7 +18,7 @@ use super::formula_guard::unguarded;
 use super::lines::{Line, Lines};
 use super::unix_time::unix_time;
 use super::wire::{self, Text};
-use crate::domain::{Error, ErrorKind, ImageSize, Result};
+use crate::domain::{Error, ErrorKind, ImageSize, Result, parse_time_in};
 
 /// Reads a CSV file's rows.
 pub(super) struct CsvRows<R> {
@@ -33,6 +35,7 @@ struct ValueRules {
     box_form: BoxForm,
     /// What the sides of boxes are multiplied by, in x and y.
     scale_px: [f64; 2],
+    timezone: Option<TimeZone>,
 }
 
 impl<R: Read> CsvRows<R> {
@@ -84,6 +87,7 @@ impl<R: Read> CsvRows<R> {
             has_decimal_comma: fields.separator != ',',
             box_form: layout.form(name),
             scale_px,
+            timezone: layout.timezone.clone(),
         };
         Ok(Self { lines, header, fields, values })
     }
@@ -213,7 +217,15 @@ impl<'a> CsvCells<'a> {
             let time = unix_time(value).map_err(|reason| (TIME, reason))?;
             return Ok(Some(Text::from(time.to_string())));
         }
-        Ok((!cell.is_empty()).then(|| Text::from(cell)))
+        match &self.values.timezone {
+            Some(zone) if !cell.is_empty() => {
+                let time = parse_time_in(cell, zone).map_err(|error| {
+                    (TIME, RowError::of(0, error).map_or_else(|fault| fault.to_string(), |row| row.reason))
+                })?;
+                Ok(Some(Text::from(time.to_string())))
+            }
+            _ => Ok((!cell.is_empty()).then(|| Text::from(cell))),
+        }
     }
 
     /// A name, without the guard that keeps spreadsheets from running it as a formula.

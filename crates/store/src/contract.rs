@@ -15,7 +15,7 @@ use super::{
 #[cfg(doc)]
 use crate::domain::ErrorKind;
 use crate::domain::{
-    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId, ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, RecordingBounds, RecordingPart, Result, Revision, RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SourceOffset, StoredSample, TrainingRun,
+    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId, ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Picture, RecordingBounds, RecordingPart, Result, Revision, RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SourceOffset, StoredSample, TrainingRun,
 };
 use crate::geo::Position;
 
@@ -284,6 +284,18 @@ contract! {
     /// # Errors
     /// [`ErrorKind::CameraNotFound`], [`ErrorKind::ModelNotFound`].
     fn model(&self, camera: &CameraId, number: u32) -> Result<ModelVersion>;
+
+    /// The picture of what a camera sees; `None` if nobody has set one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`].
+    fn picture(&self, camera: &CameraId) -> Result<Option<Picture>>;
+
+    /// Sets the picture of what a camera sees, or removes it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::CameraNotFound`]; [`ErrorKind::InsufficientStorage`].
+    fn set_picture(&self, camera: &CameraId, picture: Option<&Picture>, now: Timestamp) -> Result<()>;
 
     /// Metadata and weights of one version, as they were stored.
     ///

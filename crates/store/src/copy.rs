@@ -17,11 +17,14 @@ pub(super) struct Table {
     pub(super) key: &'static str,
 }
 
+const PICTURES: &str = "camera_pictures";
+
 /// All tables, each after those that it refers to. A camera and its active model refer to each other, which both
 /// backends check at the end of the transaction.
 pub(super) const TABLES: &[Table] = &[
     Table { name: "sites", key: "key" },
     Table { name: "cameras", key: "key" },
+    Table { name: PICTURES, key: "camera_key" },
     Table { name: "models", key: "camera_key, number" },
     Table { name: "activations", key: "camera_key, position" },
     Table { name: "held_out_errors", key: "camera_key, model_number, time_us, target_id" },
@@ -54,8 +57,12 @@ const NUMBERED: &[(&str, &str)] = &[
     ("outbox", "number"),
 ];
 
-/// Rows that are read or written at a time.
-pub(super) const ROWS_AT_A_TIME: usize = 500;
+impl Table {
+    /// Rows that are read or written at a time: a picture may have megabytes.
+    pub(super) fn rows_at_a_time(&self) -> usize {
+        if self.name == PICTURES { 8 } else { 500 }
+    }
+}
 
 /// A table that was copied.
 #[derive(Debug, Clone, PartialEq, Eq)]

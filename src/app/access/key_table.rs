@@ -13,6 +13,9 @@ use tokio_util::sync::CancellationToken;
 use crate::domain::{ApiKey, Error, ErrorKind, KeyId, Result, SecretDigest};
 use crate::store::{KeysVersion, Store};
 
+/// Shortest time between two looks for unknown keys, whoever presents them.
+const LOOK_PAUSE: Duration = Duration::from_millis(100);
+
 /// A key that works, until it is revoked or expires.
 pub struct ActiveKey {
     key: ApiKey,
@@ -106,6 +109,8 @@ pub(super) struct KeyTable {
     lease: OnceLock<Duration>,
     /// When that was.
     confirmed_at_ns: AtomicU64,
+    /// When the store was last asked for a key that is not in the table.
+    looked_at_ns: AtomicU64,
     /// How often what was read had to be forgotten.
     distrusted: AtomicU64,
     /// Held from reading the store to replacing the table.
@@ -157,6 +162,20 @@ impl KeyTable {
         let bucket = keys.by_bucket.get(&digest.bucket()).map_or(&[][..], Vec::as_slice);
         let key = bucket.iter().find(|key| key.digest == *digest && key.use_at(now));
         key.cloned().ok_or_else(does_not_work)
+    }
+
+    /// Whether a key of that digest is in the table.
+    pub(super) fn has(&self, digest: &SecretDigest) -> bool {
+        let keys = self.keys.load();
+        keys.by_bucket.get(&digest.bucket()).is_some_and(|keys| keys.iter().any(|key| key.digest == *digest))
+    }
+
+    /// Whether so long has gone by since the latest call that it was worth a look at the store.
+    pub(super) fn may_look(&self, at: Duration) -> bool {
+        let (at_ns, pause_ns) = (as_ns(at), as_ns(LOOK_PAUSE));
+        let looks =
+            |latest_ns: u64| (at_ns >= latest_ns + pause_ns || latest_ns == 0).then_some(at_ns.max(1));
+        self.looked_at_ns.fetch_update(Ordering::AcqRel, Ordering::Acquire, looks).is_ok()
     }
 
     /// Lets nobody in until the keys were read again, whatever version they have.

@@ -186,6 +186,14 @@ impl Access {
         self.keys.refresh(store, now, began_at).await
     }
 
+    /// Whether the keys should be read again for a credential, at a reading of the monotonic clock: it is an unknown key, which
+    /// another process may have created a moment ago. So ten times a second at most, whatever clients present.
+    pub fn is_worth_refresh(&self, credential: Credential<'_>, monotonic: Duration) -> bool {
+        let Credential::Key(secret) = credential else { return false };
+        let Ok(secret) = KeySecret::parse(secret) else { return false };
+        !self.is_open() && !self.keys.has(&secret.digest()) && self.keys.may_look(monotonic)
+    }
+
     /// Lets keys count for a time only after each look at the store: other processes may revoke them there.
     pub(super) fn set_lease(&self, lease: Duration) {
         self.keys.set_lease(lease);

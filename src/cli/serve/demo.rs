@@ -1,17 +1,35 @@
-//! The demonstration: a simulated camera, created and trained like a real one.
+//! The demonstration: a simulated camera, created and trained like a real one, that then streams what it sees through the
+//! server's own port.
 
 use std::io::Write as _;
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::num::NonZeroU64;
+use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context as _;
 use futures_util::StreamExt as _;
+use jiff::Timestamp;
+use tokio_util::sync::CancellationToken;
 
 use crate::app::{App, RunRequest};
 use crate::cli::progress::Progress;
-use crate::domain::{CameraId, Durability, GnssError, JobState, NewCamera, SigmaM};
+use crate::domain::{CameraId, Durability, GnssError, JobState, NewCamera, Observation, SigmaM};
+use crate::exchange::ObservedRow;
+use crate::replay::{Counters, FaultShares, Pace, RecordedStream, ReplayOptions, replay};
 use crate::simulation::{Options, SimulatedRow, simulate};
 
 const CAMERA: &str = "demo";
+
+/// Targets that walk through the view while the server runs.
+const TARGETS: usize = 8;
+/// Rows of the walk, which then begins again.
+const ROWS: usize = 20_000;
+/// Of the targets, those that carry a phone.
+const PHONES: usize = 2;
+/// Every so often one phone loses GNSS, and its track goes on by the boxes alone.
+const GNSS_LOSS_EVERY_S: i64 = 60;
+const GNSS_LOSS_S: i64 = 20;
 
 /// Fills the data folder if it is empty, trains the camera, and prints requests to try.
 pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
@@ -59,6 +77,54 @@ async fn train(app: &App, id: &CameraId) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Streams simulated targets to the server in real time, until it ends or its camera is deleted.
+///
+/// # Errors
+/// A recording that is empty, or an address that is none.
+pub(super) async fn walk(address: SocketAddr, now: Timestamp) -> anyhow::Result<()> {
+    let world = simulate(&Options { targets: TARGETS, ..Options::demo().test(ROWS) });
+    let first = world.rows.first().context("the simulation has no rows")?.time;
+    let recording = RecordedStream::from_rows(world.rows.iter().filter_map(|row| observed(row, first)))?;
+    let options = ReplayOptions {
+        server: format!("http://{}", reachable(address)),
+        key: None,
+        camera_ids: vec![CameraId::new(CAMERA)?],
+        cameras: 1,
+        client_name: "demonstration".to_owned(),
+        pace: Pace::Recorded { speed: 1.0 },
+        repetitions: NonZeroU64::MAX,
+        duration: None,
+        shift: now.duration_since(first),
+        in_flight: 64,
+        resend_buffer: 1_024,
+        store_samples: false,
+        faults: FaultShares::NONE,
+        seed: 1,
+        attempts: 12,
+        response_timeout: Duration::from_secs(30),
+    };
+    let (counters, stop) = (Arc::new(Counters::default()), CancellationToken::new());
+    replay(Arc::new(recording), Arc::new(options), counters, stop).await?;
+    Ok(())
+}
+
+/// The address by which this machine reaches itself.
+fn reachable(mut address: SocketAddr) -> SocketAddr {
+    if address.ip().is_unspecified() {
+        address.set_ip(Ipv4Addr::LOCALHOST.into());
+    }
+    address
+}
+
+/// What camera and phones give of a row; `None` if nothing.
+fn observed(row: &SimulatedRow, first: Timestamp) -> Option<ObservedRow> {
+    let elapsed_s = row.time.duration_since(first).as_secs();
+    let is_denied = row.target == 0 && elapsed_s % GNSS_LOSS_EVERY_S >= GNSS_LOSS_EVERY_S - GNSS_LOSS_S;
+    let fix = row.fix.filter(|_| row.target < PHONES && !is_denied);
+    let observation = Observation::new(row.time, Some(row.target_id.clone()), row.bounding_box, fix).ok()?;
+    Some(ObservedRow { observation, class: Some(row.class.clone()), score: None, truth: None })
+}
+
 fn requests_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
     let (Some(bounding_box), Some(fix)) = (row.bounding_box, row.fix) else { return String::new() };
     let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
@@ -75,7 +141,7 @@ fn requests_to_try(address: SocketAddr, row: &SimulatedRow) -> String {
          2. The same over gRPC:\n\n   \
          grpcurl -plaintext -d '{{\"camera_id\":\"{CAMERA}\",\"observations\":[{observation}]}}' {address} \
          sightfix.v1.FusionService/Fuse\n\n\
-         3. Open the operator's console, and the description of the whole interface, in a browser:\n\n   \
+         3. See its targets move in the operator's console, and the description of the whole interface, in a browser:\n\n   \
          http://{address}/\n   \
          http://{address}/docs\n"
     )

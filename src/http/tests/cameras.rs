@@ -218,3 +218,35 @@ async fn a_receivers_error_is_told_from_fixes_at_one_point() {
     let nmea = rest.send("POST", path, &[("content-type", "text/plain")], "$GPGGA,x\n").await;
     assert_eq!(nmea.problem(422, "invalid-argument"), ["fixes"]);
 }
+
+#[tokio::test]
+async fn a_picture_is_set_shown_and_removed() {
+    let rest = Rest::with_camera().await;
+    let path = "/v1/cameras/c/picture";
+    assert!(rest.get(path).await.expect(204).body.is_empty());
+    let jpeg = [b"\xff\xd8\xff".as_slice(), &[7; 1_000]].concat();
+    let put = |media_type: &'static str, content: Vec<u8>| {
+        let rest = &rest;
+        async move { rest.send("PUT", path, &[("content-type", media_type)], content).await }
+    };
+    put("image/jpeg", jpeg.clone()).await.expect(204);
+    let shown = rest.get(path).await.expect(200);
+    assert_eq!((shown.header("content-type"), &shown.body[..]), ("image/jpeg", &jpeg[..]));
+    let png = b"\x89PNG\r\n\x1a\n rest".to_vec();
+    put("image/png", png.clone()).await.expect(204);
+    assert_eq!(rest.get(path).await.expect(200).body[..], png[..]);
+
+    put("image/png", jpeg.clone()).await.problem(400, "malformed-body");
+    put("image/webp", jpeg.clone()).await.problem(415, "unsupported-media-type");
+    let most = crate::config::Limits::default().picture_bytes;
+    put("image/jpeg", [&jpeg[..3], &vec![0; most - 3]].concat()).await.expect(204);
+    put("image/jpeg", [&jpeg[..3], &vec![0; most - 2]].concat()).await.problem(413, "too-large");
+    rest.send("PUT", "/v1/cameras/none/picture", &[("content-type", "image/jpeg")], jpeg)
+        .await
+        .problem(404, "camera-not-found");
+
+    assert!(rest.send("DELETE", path, &[], Body::empty()).await.expect(204).body.is_empty());
+    rest.get(path).await.expect(204);
+    let audit = rest.get("/v1/audit").await.expect(200).json();
+    assert_eq!(audit["items"][0]["subject"], "picture removed", "{audit}");
+}

@@ -209,3 +209,38 @@ async fn a_replay_that_cannot_succeed_reports_why_and_fails() {
     let wrong = start(server.address, &[file, "--lose", "1.5"]).wait_with_output().expect("it ends");
     assert!(!wrong.status.success());
 }
+
+/// The track of a recording that ended takes nothing of its beginning.
+#[tokio::test]
+async fn a_recording_that_is_replayed_again_is_told_to_be_too_late() {
+    let (data, files) = (data_folder(), data_folder());
+    let server = TestServer::start(data.path());
+    create_camera(&server).await;
+    let csv = files.path().join("fixes.csv");
+    let row = |second: u32| format!("2026-01-01T00:{:02}:{:02}Z,a,11,48\n", second / 60, second % 60);
+    let rows: String = (0..200).map(row).collect();
+    std::fs::write(&csv, format!("time,target_id,longitude,latitude\n{rows}")).expect("written");
+    let csv = csv.to_str().expect("UTF-8");
+    let first = report(start(server.address, &[csv, "--speed", "max"]));
+    assert_eq!((&first["answered"], &first["too_late"]), (&json!(200), &json!(0)), "{first}");
+    let again = report(start(server.address, &[csv, "--speed", "max"]));
+    assert_eq!(again["answered"], 200, "{again}");
+    assert!(again["too_late"].as_u64().expect("a number") > 150, "{again}");
+    let shifted = report(start(server.address, &[csv, "--speed", "max", "--shift-to-now"]));
+    assert_eq!(shifted["too_late"], 0, "{shifted}");
+}
+
+#[test]
+fn a_server_that_is_not_there_is_named() {
+    let files = data_folder();
+    let csv = files.path().join("fixes.csv");
+    std::fs::write(&csv, "time,target_id,longitude,latitude\n2026-01-01T00:00:00Z,a,11,48\n")
+        .expect("written");
+    // A port that was free a moment ago.
+    let address = std::net::TcpListener::bind("127.0.0.1:0").and_then(|it| it.local_addr()).expect("a port");
+    let output =
+        start(address, &[csv.to_str().expect("UTF-8"), "--attempts", "1"]).wait_with_output().expect("ends");
+    assert_eq!(output.status.code(), Some(1));
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(told.contains(&format!("no stream could be opened at http://{address}")), "{told}");
+}

@@ -27,6 +27,7 @@ class Table(Protocol):
 
 BOX = ("left_px", "top_px", "width_px", "height_px")
 FIX = ("longitude_deg", "latitude_deg", "sigma_m")
+COVARIANCE = ("east_m2", "north_m2", "east_north_m2")
 TRUTH = {"truth_longitude_deg": "longitude_deg", "truth_latitude_deg": "latitude_deg"}
 SAMPLE_COLUMNS = ("time", "target_id", *BOX, *FIX, "class", "score", *TRUTH)
 ALIASES = {
@@ -159,15 +160,17 @@ def fusion_columns(fusions: list[FusedFix]) -> dict[str, list[Any]]:
         "longitude_deg": [it.fused.longitude_deg for it in fusions],
         "latitude_deg": [it.fused.latitude_deg for it in fusions],
         "r95_m": [it.r95_m for it in fusions],
+        **{f"covariance_{name}": [getattr(it.covariance, name) for it in fusions] for name in COVARIANCE},
         "regressed_longitude_deg": [getattr(it.regressed, "longitude_deg", None) for it in fusions],
         "regressed_latitude_deg": [getattr(it.regressed, "latitude_deg", None) for it in fusions],
         **{name: [getattr(it, name) for it in fusions] for name in direct},
         "model_version": [it.model_version for it in fusions],
-        "flags": [" ".join(it.flags) for it in fusions],
+        # Not `flags`, which a frame has as an attribute of its own.
+        "position_flags": [" ".join(it.flags) for it in fusions],
     }
 
 
-TEXTS = ("target_id", "class", "flags")
+TEXTS = ("target_id", "class", "position_flags")
 
 
 def to_arrays(columns: Mapping[str, list[Any]]) -> dict[str, np.ndarray[Any, Any]]:

@@ -26,6 +26,7 @@ mod node;
 mod noise;
 mod observation;
 mod on_conflict;
+mod picture;
 mod receiver;
 mod recipe;
 mod recording_part;
@@ -64,6 +65,7 @@ pub use node::{Node, NodeId, NodeProfile};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation, SessionBias};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;
+pub use picture::{Picture, PictureFormat};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use recording_part::{RecordingBounds, RecordingPart};
@@ -73,7 +75,7 @@ pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport};
-pub use time::{TimeBounds, parse_time};
+pub use time::{TimeBounds, parse_time, parse_time_in, parse_time_zone};
 pub use training::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
     HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,

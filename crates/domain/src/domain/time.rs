@@ -1,6 +1,7 @@
 //! Valid times of samples and observations, and their text format.
 
 use jiff::civil::DateTime;
+use jiff::tz::TimeZone;
 use jiff::{SignedDuration, Timestamp};
 
 use super::error::{Error, Result};
@@ -67,8 +68,7 @@ impl TimeBounds {
 /// outside of the years that can be represented.
 pub fn parse_time(text: &str) -> Result<Timestamp> {
     let invalid = |message| Err(Error::invalid("time", message));
-    // The library takes a leap second for the second before it.
-    if text.get(16..19) == Some(":60") {
+    if names_leap_second(text) {
         return invalid("has the second 60; a leap second is the second 59 or the next 0");
     }
     if text.len() > 19 && offset_hours(text).is_some_and(|hours| hours > 23) {
@@ -87,10 +87,45 @@ pub fn parse_time(text: &str) -> Result<Timestamp> {
     }
 }
 
+/// A zone of the IANA time zone database, such as `Europe/Berlin`, or `UTC`.
+///
+/// # Errors
+/// Names the field `timezone` for a name that the database does not have.
+pub fn parse_time_zone(name: &str) -> Result<TimeZone> {
+    TimeZone::get(name).map_err(|_| {
+        let shown: String = name.chars().take(60).collect();
+        Error::invalid("timezone", format!("`{shown}` is no IANA time zone, such as Europe/Berlin or UTC"))
+    })
+}
+
+/// Parses text as [`parse_time`] does, and text without an offset (`2020-12-14 14:41:48`) as the local time of a zone.
+///
+/// # Errors
+/// As [`parse_time`]; names the field `time` for a local time that the zone skips or has twice.
+pub fn parse_time_in(text: &str, zone: &TimeZone) -> Result<Timestamp> {
+    parse_time(text).or_else(|error| {
+        let is_local = !has_offset(text) && !names_leap_second(text);
+        let Some(civil) = is_local.then(|| text.parse::<DateTime>().ok()).flatten() else {
+            return Err(error);
+        };
+        zone.to_ambiguous_timestamp(civil).unambiguous().map_err(|_| {
+            let zone = zone.iana_name().unwrap_or("its time zone");
+            let message =
+                format!("{zone} skips this local time or has it twice; write the offset, such as +02:00");
+            Error::invalid("time", message)
+        })
+    })
+}
+
 /// The hours of an offset at the end, such as `+08:00`.
 fn offset_hours(text: &str) -> Option<u32> {
     let offset = text.get(text.len().checked_sub(6)?..)?;
     offset.strip_prefix(['+', '-'])?.get(..2)?.parse().ok()
+}
+
+/// The library takes a leap second for the second before it.
+fn names_leap_second(text: &str) -> bool {
+    text.get(16..19) == Some(":60")
 }
 
 fn has_offset(text: &str) -> bool {
@@ -100,6 +135,22 @@ fn has_offset(text: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn local_times_are_those_of_their_zone() {
+        let zone = parse_time_zone("Europe/Berlin").expect("a zone");
+        let at = |text: &str| parse_time_in(text, &zone).map(|time| time.to_string());
+        assert_eq!(at("2026-01-01 10:00:00").expect("winter"), "2026-01-01T09:00:00Z");
+        assert_eq!(at("2026-07-01T10:00:00.5").expect("summer"), "2026-07-01T08:00:00.5Z");
+        for offset in ["+05:00", "+0500", "+05"] {
+            let time = at(&format!("2026-07-01T10:00:00{offset}"));
+            assert_eq!(time.expect("an offset"), "2026-07-01T05:00:00Z");
+        }
+        for text in ["2026-03-29 02:30:00", "2026-10-25 02:30:00", "2026-12-31 23:59:60", "yesterday"] {
+            at(text).expect_err(text);
+        }
+        parse_time_zone("Mars/Olympus").expect_err("no zone");
+    }
 
     #[test]
     fn times_that_do_not_exist_are_refused_and_named() {

@@ -14,6 +14,7 @@ mod keys;
 mod latest_runs;
 mod models;
 mod outbox;
+mod pictures;
 mod recordings;
 mod retention;
 mod runs;

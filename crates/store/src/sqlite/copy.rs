@@ -8,7 +8,7 @@ use tokio::sync::mpsc;
 
 use super::Store;
 use super::errors::failed;
-use crate::copy::{Column, CopyTransaction, Kind, ROWS_AT_A_TIME, Rows, Table, Value, names_of};
+use crate::copy::{Column, CopyTransaction, Kind, Rows, Table, Value, names_of};
 use crate::domain::{Error, Result};
 
 impl Store {
@@ -74,7 +74,9 @@ impl CopyTransaction for Copying {
             let mut rows = Rows::new();
             while let Some(row) = stored.try_next().await.map_err(failed)? {
                 rows.push(values(&row, columns)?);
-                if rows.len() == ROWS_AT_A_TIME && batches.send(std::mem::take(&mut rows)).await.is_err() {
+                if rows.len() == table.rows_at_a_time()
+                    && batches.send(std::mem::take(&mut rows)).await.is_err()
+                {
                     return Ok(());
                 }
             }

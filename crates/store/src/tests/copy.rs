@@ -1,4 +1,5 @@
 use super::*;
+use crate::domain::{Picture, PictureFormat};
 use crate::{CopiedTable, NewModel, RunEnd, RunOutput, SampleFilter};
 
 /// Fills a store with rows of most tables, some of them with extreme values.
@@ -19,6 +20,11 @@ async fn fill(Fixture { store, camera, .. }: &Fixture) {
     let model = NewModel { metadata: &metadata, weights: &[0, 1, 255], held_out: &[] };
     let end = RunEnd::Succeeded { output: RunOutput { model, activate: true }, outcome: None };
     store.finish_run::<CameraId>(run_id(1), claim.fence, end, at(3)).await.expect("works").expect("owned");
+    store.set_picture(camera, Some(&picture()), at(4)).await.expect("stored");
+}
+
+fn picture() -> Picture {
+    Picture::new(PictureFormat::Jpeg, vec![0xff, 0xd8, 0xff, 0, 1]).expect("a picture")
 }
 
 fn rows_of(copied: &[CopiedTable], name: &str) -> u64 {
@@ -40,6 +46,7 @@ pub(crate) async fn copy_and_compare(fixture: &Fixture, target: &Home) {
         copy.samples(camera, &all, None, page).await.expect("read"),
         store.samples(camera, &all, None, page).await.expect("read")
     );
+    assert_eq!(copy.picture(camera).await.expect("read"), Some(picture()));
     assert_eq!(copy.camera(camera).await.expect("known"), store.camera(camera).await.expect("known"));
     assert_eq!(copy.model_content(camera, 1).await.expect("sound").1, [0, 1, 255]);
     assert_eq!(kind(store.copy_to(&copy).await), ErrorKind::InvalidArgument, "the target is not empty");

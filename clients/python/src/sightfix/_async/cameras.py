@@ -5,8 +5,10 @@ from typing import Unpack
 
 from sightfix._async.transport import Transport
 from sightfix._json import request_json, to_json
-from sightfix._request import delete, get, path, with_json
+from sightfix._request import Request, delete, get, path, with_json
 from sightfix.models import Camera, CameraChange, CameraDraft, CameraStatus, Estimate, Fix, Learning
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 class Cameras:
@@ -53,6 +55,27 @@ class Cameras:
     async def learning(self, camera_id: str) -> Learning:
         """What a camera without a model has recorded to learn from, and what is missing."""
         return await self._transport.json(get(path("cameras", camera_id, "learning")), Learning)
+
+    async def picture(self, camera_id: str) -> bytes | None:
+        """The picture of what a camera sees, a JPEG or PNG; None if nobody has set one."""
+        response = await self._transport.send(get(path("cameras", camera_id, "picture")))
+        return response.content or None
+
+    async def set_picture(self, camera_id: str, picture: bytes) -> None:
+        """Sets the picture of what a camera sees: a JPEG or PNG of at most 2 MiB, as the server is configured."""
+        media_type = "image/png" if picture.startswith(PNG_SIGNATURE) else "image/jpeg"
+        request = Request(
+            method="PUT",
+            path=path("cameras", camera_id, "picture"),
+            headers={"content-type": media_type},
+            body=picture,
+            is_idempotent=True,
+        )
+        await self._transport.send(request)
+
+    async def delete_picture(self, camera_id: str) -> None:
+        """Removes the picture of what a camera sees."""
+        await self._transport.send(delete(path("cameras", camera_id, "picture")))
 
     async def estimate_gnss_error(self, camera_id: str, fixes: Iterable[Fix]) -> Estimate:
         """Estimates a receiver's error from at least ten fixes at one fixed point. Nothing is stored."""

@@ -38,9 +38,10 @@ class Fusions:
 
         Needs the extra `numpy`. Columns in: `time`, optional `target_id`, `left_px`, `top_px`, `width_px`, `height_px`,
         `longitude_deg`, `latitude_deg`, `sigma_m`; NaN where an observation has no box or no fix. Columns out:
-        `longitude_deg`, `latitude_deg`, `r95_m`, `regressed_longitude_deg`, `regressed_latitude_deg`,
-        `confidence_regression`, `confidence_gnss`, `e_regression_m2`, `e_gnss_m2`, `reconstruction_error`,
-        `model_version` and `flags` (separated by spaces).
+        `longitude_deg`, `latitude_deg`, `r95_m`, `covariance_east_m2`, `covariance_north_m2`,
+        `covariance_east_north_m2`, `regressed_longitude_deg`, `regressed_latitude_deg`, `confidence_regression`,
+        `confidence_gnss`, `e_regression_m2`, `e_gnss_m2`, `reconstruction_error`, `model_version` and
+        `position_flags` (separated by spaces).
 
         Raises:
             ValueError: A column is unknown, or a time has no UTC offset.

@@ -1,0 +1,18 @@
+// Whether this browser may ask another server for map tiles.
+const STORED = 'sightfix.tile_consent';
+
+class TileConsent {
+  isGiven = $state(localStorage.getItem(STORED) === 'given');
+
+  give(): void {
+    localStorage.setItem(STORED, 'given');
+    this.isGiven = true;
+  }
+
+  withdraw(): void {
+    localStorage.removeItem(STORED);
+    this.isGiven = false;
+  }
+}
+
+export const consent = new TileConsent();

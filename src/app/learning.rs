@@ -152,9 +152,13 @@ impl App {
     ///
     /// # Errors
     /// As an import of samples, and as [`App::start_run`].
-    pub async fn train_on_matched(&self, id: &CameraId, samples: Vec<StoredSample>) -> Result<TrainingRun> {
+    pub async fn train_on_matched(
+        &self,
+        id: &CameraId,
+        samples: Vec<StoredSample>,
+    ) -> Result<TrainingRun<CameraId>> {
         self.store_paired(id, samples, ImportOptions::default()).await?;
-        self.start_run(id, RunRequest::default()).await
+        self.start_run(id, RunRequest::default(), None).await
     }
 
     /// Reads what an earlier run of the server, or another node, has recorded.
@@ -182,7 +186,7 @@ impl ActiveCamera {
 fn described(
     camera: &ActiveCamera,
     progress: &LearningProgress,
-    run: Option<&TrainingRun>,
+    run: Option<&TrainingRun<CameraId>>,
 ) -> (LearningState, String) {
     if let Some((_, version)) = &camera.model {
         let message = format!("model version {version} answers, and matches boxes with receivers");
@@ -206,7 +210,11 @@ fn described(
 }
 
 /// What a camera that records is waiting for.
-fn missing(camera: &ActiveCamera, progress: &LearningProgress, run: Option<&TrainingRun>) -> String {
+fn missing(
+    camera: &ActiveCamera,
+    progress: &LearningProgress,
+    run: Option<&TrainingRun<CameraId>>,
+) -> String {
     let extent = &progress.extent;
     if camera.image_size.is_none() {
         return "image_size is missing in the profile of the camera".to_owned();

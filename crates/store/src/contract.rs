@@ -15,7 +15,12 @@ use super::{
 #[cfg(doc)]
 use crate::domain::ErrorKind;
 use crate::domain::{
-    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId, ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob, EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata, ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Picture, RecordingBounds, RecordingPart, Result, Revision, RunId, RunProgress, SecretDigest, Site, SiteId, SiteKey, SourceOffset, StoredSample, TrainingRun,
+    ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId,
+    ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob,
+    EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata,
+    ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Picture,
+    RecordingBounds, RecordingPart, Result, Revision, RunId, RunProgress, SecretDigest, Site, SiteId,
+    SiteKey, SourceOffset, StoredSample, TrainingRun,
 };
 use crate::geo::Position;
 

@@ -190,7 +190,7 @@ impl Access {
     /// another process may have created a moment ago. So ten times a second at most, whatever clients present.
     pub fn is_worth_refresh(&self, credential: Credential<'_>, monotonic: Duration) -> bool {
         let Credential::Key(secret) = credential else { return false };
-        let Ok(secret) = KeySecret::parse(secret) else { return false };
+        let Ok(secret) = KeySecret::parse(&secret) else { return false };
         !self.is_open() && !self.keys.has(&secret.digest()) && self.keys.may_look(monotonic)
     }
 

@@ -29,7 +29,10 @@ impl Database {
         let mut writer = self.growing().await?;
         let mut transaction = writer.begin().await?;
         let key = lock_camera(&mut transaction, camera).await?;
-        query("DELETE FROM camera_pictures WHERE camera_key = $1").bind(key).execute(&mut transaction).await?;
+        query("DELETE FROM camera_pictures WHERE camera_key = $1")
+            .bind(key)
+            .execute(&mut transaction)
+            .await?;
         if let Some(picture) = picture {
             query(
                 "INSERT INTO camera_pictures (camera_key, media_type, content, updated_at_us) VALUES ($1, $2, $3, $4)",

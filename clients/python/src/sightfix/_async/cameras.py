@@ -82,14 +82,3 @@ class Cameras:
         body = {"fixes": [to_json(fix) for fix in fixes]}
         request = with_json("POST", path("cameras", camera_id, "gnss-error"), body, is_idempotent=True)
         return await self._transport.json(request, Estimate)
-
-    async def put_picture(self, camera_id: str, picture: bytes, *, media_type: str = "image/jpeg") -> None:
-        """Stores a picture of what the camera sees: JPEG or PNG."""
-        request = Request(
-            method="PUT",
-            path=path("cameras", camera_id, "picture"),
-            headers={"content-type": media_type},
-            body=picture,
-            is_idempotent=True,
-        )
-        await self._transport.send(request)

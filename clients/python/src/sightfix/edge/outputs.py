@@ -236,7 +236,7 @@ class Stills:
 
     def _send(self, image: Image) -> None:
         try:
-            self._client.cameras.put_picture(self._camera_id, jpeg_within(image, LARGEST_STILL_BYTES))
+            self._client.cameras.set_picture(self._camera_id, jpeg_within(image, LARGEST_STILL_BYTES))
         except ProblemError as error:
             if error.problem.status == METHOD_NOT_ALLOWED or is_unknown_route(error):
                 self._is_supported = False

@@ -39,7 +39,8 @@ async fn metrics_of_a_server_at_work() -> String {
         let observation = json!({"time": time, "target_id": "p", "fix": fix});
         server.post("/v1/cameras/c/tracks", &observation).await.expect(200);
     }
-    let source = json!({"address": "push:", "format": "traccar", "camera_ids": ["c"], "receiver_id": "phone"});
+    let source =
+        json!({"address": "push:", "format": "traccar", "camera_ids": ["c"], "receiver_id": "phone"});
     server.post("/v1/connections", &json!({"id": "phone", "source": source})).await.expect(201);
     let position = json!({"position": {"fixTime": now(), "latitude": 48.0, "longitude": 11.0}});
     server.post("/v1/connections/phone/messages", &position).await.expect(204);

@@ -67,7 +67,10 @@ async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
     let status =
         connection_when(&server, "frigate", |status| status["messages"] == 1).await["status"].clone();
     assert_eq!((&status["items"], &status["rejected"]), (&json!(0), &json!(1)), "{status}");
-    assert_eq!((&status["reasons"][0]["count"], &status["reasons"][0]["example"]), (&json!(1), &json!("not JSON")));
+    assert_eq!(
+        (&status["reasons"][0]["count"], &status["reasons"][0]["example"]),
+        (&json!(1), &json!("not JSON"))
+    );
     connection_when(&server, "frigate", |status| status["acknowledged"] == 1).await;
     assert_eq!(server.get("/v1/cameras/gate/samples/count").await.expect(200).json()["count"], 1);
 }

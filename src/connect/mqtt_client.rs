@@ -53,8 +53,8 @@ pub(super) struct Incoming {
 
 /// The number of a message that the broker sends again until it is acknowledged.
 pub(super) enum Promise {
-    Five(v5::mqttbytes::v5::Publish),
-    ThreeOneOne(rumqttc::Publish),
+    Five(Box<v5::mqttbytes::v5::Publish>),
+    ThreeOneOne(Box<rumqttc::Publish>),
 }
 
 /// What the task of a connection reports.
@@ -246,7 +246,7 @@ fn of_five(event: v5::Event) -> Option<Report> {
             Report::Message(Incoming {
                 topic,
                 payload,
-                promise: is_promised.then_some(Promise::Five(publish)),
+                promise: is_promised.then(|| Promise::Five(Box::new(publish))),
             })
         }
         v5::Event::Incoming(Packet::ConnAck(_)) => Report::Connected,
@@ -278,7 +278,7 @@ fn of_three_one_one(event: rumqttc::Event) -> Option<Report> {
             let topic = std::mem::take(&mut publish.topic);
             let payload = std::mem::take(&mut publish.payload);
             let is_promised = publish.qos != rumqttc::QoS::AtMostOnce;
-            let promise = is_promised.then_some(Promise::ThreeOneOne(publish));
+            let promise = is_promised.then(|| Promise::ThreeOneOne(Box::new(publish)));
             Report::Message(Incoming { topic, payload, promise })
         }
         rumqttc::Event::Incoming(Packet::ConnAck(_)) => Report::Connected,

@@ -146,7 +146,7 @@ impl Access {
         now: Timestamp,
         limits: &Limits,
     ) -> Result<Principal> {
-        let key = self.keys.use_key(&KeySecret::parse(&secret)?.digest(), now)?;
+        let key = self.keys.use_key(&KeySecret::parse(secret)?.digest(), now)?;
         self.sessions.start_for_key(token, key.clone(), now, limits)?;
         Ok(Principal::Key(key))
     }

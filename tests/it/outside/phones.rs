@@ -76,8 +76,8 @@ async fn phones_present_their_key_as_they_can_and_read_the_answer_that_they_expe
 async fn what_a_phone_sends_wrongly_is_refused_with_the_reason() {
     let (server, _folder, admin, edge) = start(&[]).await;
     let bearer = format!("Bearer {edge}");
-    let send =
-        |body: &'static str| server.send("POST", MESSAGES, &[("authorization", bearer.as_str())], body);
+    let headers = [("authorization", bearer.as_str())];
+    let send = |body: &'static str| server.send("POST", MESSAGES, &headers, body);
     for (body, reason) in [
         (r#"{"_type":"encrypted","data":"SL7ubL6Z"}"#, "encryption key"),
         (r#"{"_type":"location","lat":30.6,"lon":103.9}"#, "tst is missing"),

@@ -330,7 +330,7 @@ test.describe('a part of the page is gone', () => {
   test('after an upgrade the page loads itself again, and shows the view', async ({ console: page, server }) => {
     await server.request('POST', '/v1/cameras', { id: 'gate' });
     let loads = 0;
-    page.on('load', () => (loads += 1));
+    page.on('request', (request) => (loads += request.isNavigationRequest() ? 1 : 0));
     // The files of the page that is open are those of the release before.
     await page.route('**/assets/Camera-*', (route) => (loads === 0 ? route.fulfill({ status: 404 }) : route.fallback()));
     await page.evaluate(() => (location.hash = '#/cameras/gate/data'));

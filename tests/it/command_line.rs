@@ -263,7 +263,8 @@ fn pair_replaces_a_file_only_when_told() {
     std::fs::write(&fixes, "time,longitude,latitude\n2026-01-01T00:00:00Z,11,48\n").expect("written");
     let before = std::fs::read(&boxes).expect("a file");
     let pair = |out: &str, flags: &[&str]| {
-        piped(&[&["pair", "--detections", &boxes, "--fixes", &fixes, "--out", out], flags].concat(), b"")
+        let files = ["pair", "--detections", &boxes, "--fixes", &fixes, "--out", out];
+        piped(&[&files[..], flags].concat(), b"")
     };
     let refused = pair(&boxes, &[]);
     assert_eq!(refused.status.code(), Some(1));
@@ -282,7 +283,8 @@ fn an_import_of_too_many_bad_rows_is_told_from_a_success() {
     };
     std::fs::write(&csv, HEADER.to_owned() + &(0..60).map(row).collect::<String>()).expect("written");
     let import = |flags: &[&str]| {
-        piped(&[&["import", &csv, "--data", &data, "--camera", "c", "--create"], flags].concat(), b"")
+        let arguments = ["import", &csv, "--data", &data, "--camera", "c", "--create"];
+        piped(&[&arguments[..], flags].concat(), b"")
     };
     let rejected = import(&[]);
     assert_eq!(rejected.status.code(), Some(5));

@@ -152,6 +152,7 @@ export function missingFields(mapping: Mapping): string[] {
   );
 }
 
+const LOCAL_TIME = /^\d{4}-\d\d-\d\d[T ]\d\d:\d\d[\d:.]*$/i;
 const UNIX_TIME = /^\d[\d.,]*$/;
 /** Unix times below are seconds, others milliseconds. */
 const FEWEST_UNIX_MS = 1e11;
@@ -159,7 +160,7 @@ const FEWEST_UNIX_MS = 1e11;
 /** Whether a file has times without an offset, which are the local times of a zone. */
 export function hasLocalTimes({ rows }: Table, { columns }: Mapping): boolean {
   const times = rows.slice(0, 200).map(({ cells }) => cells[columns.time ?? -1] ?? '');
-  return times.some((time) => time !== '' && !UNIX_TIME.test(time) && !/(Z|[+-]\d\d:?\d\d)$/i.test(time));
+  return times.some((time) => LOCAL_TIME.test(time));
 }
 
 /** The header with the names that the importer documents, and others for the columns that it shall ignore. */

@@ -12,7 +12,7 @@ import pytest
 
 from sightfix import BoundingBox, Client, Fix, ImageSize, Observation, Sample
 from sightfix.edge.clock_offset import estimate_offset
-from sightfix.edge.fixes import FixesError, TimedFix, read_gpx
+from sightfix.edge.fixes import FixesError, TimedFix, read_track
 from sightfix.edge.learn import Collector, LearnError, learn
 from sightfix.edge.values import Box, TrackedBox
 from tests.conftest import ServerProcess
@@ -167,7 +167,7 @@ def test_among_several_people_the_server_finds_who_has_the_phone(tmp_path: Path,
     for camera_id in ("square", "yard"):
         client.cameras.create(id=camera_id, image_size=ImageSize(width_px=WIDTH_PX, height_px=HEIGHT_PX))
 
-    learnt = learn(client, "square", collected, read_gpx(tmp_path / "walk.gpx"), clock_window_s=5)
+    learnt = learn(client, "square", collected, read_track(tmp_path / "walk.gpx"), clock_window_s=5)
     print(learnt.lines())
     assert learnt.is_active
     assert learnt.paired.matching is not None
@@ -176,7 +176,7 @@ def test_among_several_people_the_server_finds_who_has_the_phone(tmp_path: Path,
 
     collected.boxes = collected.boxes[:200]
     with pytest.raises(LearnError, match="several people"):
-        learn(client, "yard", collected, read_gpx(tmp_path / "walk.gpx"), clock_window_s=5)
+        learn(client, "yard", collected, read_track(tmp_path / "walk.gpx"), clock_window_s=5)
 
 
 def test_learning_says_what_is_missing(
@@ -207,8 +207,22 @@ def test_tracks_of_a_gpx_file_are_read(tmp_path: Path) -> None:
         "</trkseg></trk></gpx>"
     )
     start = datetime(2026, 5, 1, 12, tzinfo=UTC)
-    assert read_gpx(file).fixes == [TimedFix(start, 24.1, 59.0), TimedFix(start + timedelta(seconds=1), 24.2, 59.1)]
-    for text in ("no XML", "<gpx/>", '<!DOCTYPE a [<!ENTITY b "c">]><gpx>&b;</gpx>'):
+    assert read_track(file).fixes == [TimedFix(start, 24.1, 59.0), TimedFix(start + timedelta(seconds=1), 24.2, 59.1)]
+    for text in ("no XML", "<gpx><trk>", "<gpx/>", '<!DOCTYPE a [<!ENTITY b "c">]><gpx>&b;</gpx>'):
         file.write_text(text)
         with pytest.raises(FixesError):
-            read_gpx(file)
+            read_track(file)
+
+
+def test_files_of_the_page_walk_are_read(tmp_path: Path) -> None:
+    file, header = tmp_path / "walk-phone-7.csv", "time,receiver_id,longitude,latitude,sigma_m\n"
+    file.write_text(f"{header}2026-05-01T12:00:00.000Z,phone-7,24.10000000,59.00000000,2.5\n")
+    track = read_track(file)
+    assert track.receiver_id == "phone-7"
+    assert track.fixes == [TimedFix(datetime(2026, 5, 1, 12, tzinfo=UTC), 24.1, 59.0)]
+    first, second = (f"2026-05-01T12:00:00Z,phone-{number},24.1,59.0,\n" for number in (1, 2))
+    faults = {first + second: "several receivers", "2026-05-01T12:00:00,a,24.1,59.0,\n": "UTC offset", "": "no fixes"}
+    for rows, fault in faults.items():
+        file.write_text(header + rows)
+        with pytest.raises(FixesError, match=fault):
+            read_track(file)

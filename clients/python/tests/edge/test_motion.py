@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sightfix.edge.motion import CAMERA_MOVES, CROWDED, SPECKLED, MotionDetector, MotionOptions
+from sightfix.edge.motion import CAMERA_MOVES, CROWDED, SPECKLED, VIEW_CHANGES, MotionDetector, MotionOptions
 from sightfix.edge.values import Box, Image
 from tests.edge.conftest import seeds
 from tests.edge.scene import Renderer, Row, TrueBox, Video, render, simulated_rows
@@ -175,6 +175,9 @@ def test_it_says_when_its_boxes_are_not_to_be_relied_on() -> None:
     random = np.random.default_rng(1)
     shaken = [np.roll(image, tuple(random.integers(-9, 10, 2)), axis=(0, 1)) for image in walk]
     assert warned(shaken) == CAMERA_MOVES
+
+    covered = [image if number % 14 < 12 else np.full_like(image, 250) for number, image in enumerate(walk)]
+    assert warned(covered) == VIEW_CHANGES
 
     rain = [with_drops(image, random) for image in walk]
     assert warned(rain) == SPECKLED

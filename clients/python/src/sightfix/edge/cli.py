@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import resource
 import secrets
 import signal
 import sys
@@ -24,7 +23,7 @@ import cv2
 
 from sightfix import Client, SightfixError
 from sightfix._settings import DEFAULT_SERVER
-from sightfix.edge.fixes import FixesError, read_gpx
+from sightfix.edge.fixes import FixesError, read_track
 from sightfix.edge.latest import LatestFrames
 from sightfix.edge.layouts import LAYOUTS
 from sightfix.edge.learn import Collector, LearnError, learn
@@ -42,8 +41,6 @@ LOG = logging.getLogger("sightfix.edge")
 AnyOutput = TypeVar("AnyOutput", bound=Output)
 
 SOURCE_VARIABLE = "SIGHTFIX_EDGE_SOURCE"
-MEBIBYTE = 1024
-"""In kibibytes, the unit of the largest memory of a process."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -99,7 +96,9 @@ def learning_parser() -> argparse.ArgumentParser:
         prog="sightfix-edge learn", description="Trains a camera from a video and the GPX file of who walks in it."
     )
     parser.add_argument("--video", dest="source", required=True, help="file")
-    parser.add_argument("--fixes", type=Path, required=True, help="GPX file of the walker's receiver")
+    parser.add_argument(
+        "--fixes", type=Path, required=True, help="GPX file of the walker's receiver, or CSV file of the page /walk"
+    )
     parser.add_argument("--camera", required=True, help="id of the camera; it is created if there is none")
     parser.add_argument("--clock-window-s", type=positive, default=120.0, help="the clocks differ by at most this")
     parser.add_argument("--record", type=Path, metavar="FILE", help="write the boxes to a CSV file")
@@ -289,14 +288,19 @@ def run_benchmark(options: argparse.Namespace) -> int:
     for stage in ("decode", "detect", "track", "all"):
         wall_ms, processor_ms = pipeline.times.per_frame_ms(stage, pipeline.frames)
         print(f"{stage:<7}{wall_ms:8.2f} ms per frame, {processor_ms:.2f} ms of the processor")
-    memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MEBIBYTE
-    print(f"{1000 / wall_ms:.0f} frames per second; at most {memory_mib:.0f} MiB")
+    print(f"{1000 / wall_ms:.0f} frames per second; at most {largest_memory_kib() / 1024:.0f} MiB")
     return 0
+
+
+def largest_memory_kib() -> int:
+    """The most memory that this process has had, of its own: `getrusage` counts that of the process that started it."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0])
 
 
 def run_learn(options: argparse.Namespace) -> int:
     """Trains a camera from a video and fixes."""
-    track = read_gpx(options.fixes)
+    track = read_track(options.fixes)
     collected = Collector()
     outputs: list[Output] = [collected]
     with ExitStack() as stack:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sightfix import Client, InvalidRequestError
 from sightfix.edge.clock_offset import ClockOffset, estimate_offset, shifted
-from sightfix.edge.fixes import GpxTrack
+from sightfix.edge.fixes import Track
 from sightfix.edge.outputs import Recorder
 from sightfix.edge.values import Frame, TrackedBox
 from sightfix.models import ModelVersion, PairedSamples, TrainingRun
@@ -25,7 +25,6 @@ ALONE_SHARE = 0.98
 """Of the frames with boxes, those with a single one, from which on one walker is taken to be in the video."""
 LARGEST_MATCH_WINDOW_S = 30.0
 """Of the server's search for whose boxes are whose, where several people are in view."""
-WALKER = "walker"
 WALK_AGAIN = (
     "walk again: stop for some 15 s at two places, turn at corners, and cross the view near and far from the camera"
 )
@@ -77,7 +76,7 @@ class Collector:
         """Nothing is left to do."""
 
 
-def learn(client: Client, camera_id: str, collected: Collector, track: GpxTrack, *, clock_window_s: float) -> Learnt:
+def learn(client: Client, camera_id: str, collected: Collector, track: Track, *, clock_window_s: float) -> Learnt:
     """Pairs the boxes of a video with fixes, and trains the camera.
 
     Args:
@@ -110,7 +109,7 @@ def shows_one_walker(boxes: Sequence[TimedBox]) -> bool:
 
 
 def pair_walker(
-    client: Client, camera_id: str, collected: Collector, track: GpxTrack, clock_window_s: float
+    client: Client, camera_id: str, collected: Collector, track: Track, clock_window_s: float
 ) -> PairedSamples:
     """Pairs the boxes of the only walker with the fixes, by the receiver's clock.
 
@@ -123,10 +122,10 @@ def pair_walker(
     LOG.info("%s", offset_text(offset))
     if not offset.is_sure:
         raise LearnError(f"the offset between the clocks is not sure: {offset_text(offset)}; {WALK_AGAIN}")
-    boxes = ((shifted(time, offset), TrackedBox(it.box, WALKER)) for time, it in collected.boxes)
+    boxes = ((shifted(time, offset), TrackedBox(it.box, track.receiver_id)) for time, it in collected.boxes)
     with tempfile.TemporaryDirectory() as folder:
         detections = record(boxes, Path(folder))
-        return client.samples.pair_files(camera_id, detections, track.path, receiver_id=WALKER)
+        return client.samples.pair_files(camera_id, detections, track.path, receiver_id=track.receiver_id)
 
 
 def offset_text(offset: ClockOffset) -> str:
@@ -140,7 +139,7 @@ def offset_text(offset: ClockOffset) -> str:
 
 
 def match_walkers(
-    client: Client, camera_id: str, boxes: Iterable[TimedBox], track: GpxTrack, clock_window_s: float
+    client: Client, camera_id: str, boxes: Iterable[TimedBox], track: Track, clock_window_s: float
 ) -> PairedSamples:
     """Lets the server find out which boxes show the carriers of the receivers, and how far their clocks are off.
 
@@ -154,7 +153,7 @@ def match_walkers(
                 camera_id,
                 detections,
                 track.path,
-                receiver_id=WALKER,
+                receiver_id=track.receiver_id,
                 match=True,
                 clock_window_s=min(clock_window_s, LARGEST_MATCH_WINDOW_S),
                 estimate_offset=True,

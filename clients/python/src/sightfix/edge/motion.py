@@ -35,10 +35,13 @@ CHANGED_SHARE = 0.3
 LEARNING_INTERVAL = 5
 """Frames from one learning of the background to the next."""
 THUMBNAIL_PX = (320, 180)
+"""Width and height of the image from which shifts of the view are found."""
 MOVED_SHARE = 0.0025
 """Shift of the view, as a share of its width, from which the camera has moved: 3 px of 1280."""
 RESTING_FACTOR = 6
+"""A box that stays where it is for so many times the history belongs to the background."""
 MIN_REACH_PX = 16.0
+"""Least width from which the reach of a box at rest is taken."""
 
 CAMERA_MOVES = "the camera shakes or turns: fix it"
 VIEW_CHANGES = "the view changes as a whole: the light changes, or something covers the camera"
@@ -114,6 +117,8 @@ class MotionDetector:
         if self._frames <= self._options.warm_up_frames:
             self._learnt = small
             self._background.apply(small, learningRate=1 / self._frames)
+            if self._signs and self._signs[-1] == VIEW_CHANGES:
+                self._signs.append(VIEW_CHANGES)
             return []
         mask = self._background.apply(small, learningRate=0)
         moving = np.where(mask == FOREGROUND, np.uint8(FOREGROUND), np.uint8(0))

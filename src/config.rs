@@ -27,7 +27,7 @@ pub use tls::TlsSettings;
 pub struct Config {
     /// Folder of the database, created at the first start.
     pub data: PathBuf,
-    /// URL of a PostgreSQL database that takes the place of the folder, such as
+    /// URL of a PostgreSQL database that replaces the folder, such as
     /// `postgres://user:password@host/sightfix?sslmode=verify-full`; none by default.
     pub database: Option<Secret>,
     /// What this process does of the work that all processes with one database share.

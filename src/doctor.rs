@@ -1,6 +1,6 @@
 //! What may keep a server from working on this machine: a list of checks, each with its remedy.
 //!
-//! What never happens here: a repair, a change of settings, an older schema brought up to date.
+//! Never here: a repair, a change of settings, an older schema brought up to date.
 
 mod database;
 mod folder;

@@ -60,7 +60,7 @@ CREATE TABLE samples (
     PRIMARY KEY (camera_key, time_us, target_id)
 ) PARTITION BY RANGE (time_us);
 
--- Boxes that no receiver has a fix for. A key is in one of the two tables only; a sample with a fix takes the place of
+-- Boxes that no receiver has a fix for. A key is in one of the two tables only; a sample with a fix replaces
 -- one without.
 CREATE TABLE samples_without_fix (
     camera_key          BIGINT NOT NULL REFERENCES cameras (key) ON DELETE CASCADE,

@@ -67,7 +67,7 @@ CREATE TABLE samples (
 
 -- Boxes that no receiver has a fix for. A table of their own, since the columns of the fix in
 -- samples are NOT NULL. A key is in one of the two tables only; a sample with a
--- fix takes the place of one without.
+-- fix replaces one without.
 CREATE TABLE samples_without_fix (
     camera_key          INTEGER NOT NULL REFERENCES cameras (key) ON DELETE CASCADE,
     time_us             INTEGER NOT NULL,

@@ -1,6 +1,6 @@
 //! Recorded detections and fixes that come apart, made into samples.
 //!
-//! What never happens here: files opened, pairing rules (they are [`crate::fusion::pairing`]'s).
+//! Never here: files opened, pairing rules (they are [`crate::fusion::pairing`]'s).
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -42,7 +42,7 @@ pub struct ImportReport {
     pub without_fix: u64,
     /// The same camera, target and time were stored before, or stand twice in the import.
     pub duplicate: u64,
-    /// Of the accepted ones, those that took the place of a stored sample on request.
+    /// Of the accepted ones, those that replaced a stored sample on request.
     pub replaced: u64,
     /// Not stored for a fault of their own.
     pub rejected: u64,

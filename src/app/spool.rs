@@ -1,6 +1,6 @@
 //! What clients send in pieces and blocking code reads whole: in memory up to a size, in a temporary file beyond.
 //!
-//! What never happens here: memory or disk beyond the quotas of all imports.
+//! Never here: memory or disk beyond the quotas of all imports.
 
 use std::collections::VecDeque;
 use std::fs::File;

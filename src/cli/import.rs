@@ -40,7 +40,7 @@ pub(super) struct Import {
     /// Site of the camera, for --create; it is created, too, if it does not exist
     #[arg(long, value_name = "ID", value_parser = site_id, requires = "create")]
     site: Option<SiteId>,
-    /// Let each sample take the place of a stored one of the same target and time
+    /// Let each sample replace a stored one of the same target and time
     #[arg(long)]
     replace: bool,
     /// The target of rows that name none

@@ -1,7 +1,7 @@
 //! The command line: one file per subcommand. A subcommand reads its flags, calls the layers below, and
 //! prints the result.
 //!
-//! What never happens here: rules of the domain.
+//! Never here: rules of the domain.
 
 mod backup;
 mod config;

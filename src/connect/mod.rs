@@ -5,7 +5,7 @@
 //! What a source took is acknowledged to its peer when what was to be stored is stored; what a sink is to deliver is
 //! stored first and deleted when its receiver has it.
 //!
-//! What never happens here: formats of messages (they are in `exchange`), rules of tracks (they are in `app`), a
+//! Never here: formats of messages (they are in `exchange`), rules of tracks (they are in `app`), a
 //! queue without a limit.
 
 // What other systems send reaches this module: nothing in it may end the process.

@@ -87,7 +87,7 @@ impl Outbox {
         self.0.put(|_| {});
     }
 
-    /// An acknowledgement takes the place of those before it.
+    /// An acknowledgement replaces those before it.
     pub(super) fn acknowledge(&self, acknowledgement: StreamAcknowledgement) {
         self.0.put(|waiting| waiting.acknowledged = Some(acknowledgement));
     }

@@ -2,7 +2,7 @@
 //!
 //! A body is decoded as it is read, so its reader applies the limit: of one that decodes to more,
 //! no more than the limit is ever held. How much is decoded at most follows from how much has come, and other
-//! requests have their turn in between. What never happens here: a body decoded at once or before its sender may use
+//! requests have their turn in between. Never here: a body decoded at once or before its sender may use
 //! the route, an event stream or what is compressed already compressed.
 
 use std::convert::Infallible;

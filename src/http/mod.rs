@@ -1,6 +1,6 @@
 //! The REST transport over [`crate::app`]: routes, conversion of JSON, problems, OpenAPI.
 //!
-//! Route and description are declared together, a file per resource. What never happens here:
+//! Route and description are declared together, a file per resource. Never here:
 //! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
 //! done by the constructors of [`crate::domain`]), a body without a limit.
 

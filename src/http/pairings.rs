@@ -59,7 +59,7 @@ struct PairedSamples {
     accepted_without_fix: u64,
     /// Samples of which the same camera, target and time were stored before.
     duplicate: u64,
-    /// Of the accepted ones, those that took the place of a stored sample (`on_conflict=replace`).
+    /// Of the accepted ones, those that replaced a stored sample (`on_conflict=replace`).
     replaced: u64,
     /// Rows of both parts that are none.
     rejected: u64,

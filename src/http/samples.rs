@@ -43,7 +43,7 @@ pub(super) struct Imported {
     accepted_without_fix: u64,
     /// The same camera, target and time were stored before, or appear twice in the import.
     duplicate: u64,
-    /// Of the accepted ones, those that took the place of a stored sample (`on_conflict=replace`).
+    /// Of the accepted ones, those that replaced a stored sample (`on_conflict=replace`).
     replaced: u64,
     /// Not stored for a fault of their own.
     rejected: u64,
@@ -130,8 +130,8 @@ struct DeletedSamples {
 /// fix. Training uses its box for the geometry of the camera. One of the two alone is rejected.
 ///
 /// One bad row never loses the others. Samples that are stored already are counted, not stored again, so an
-/// import that broke off can be sent again as it is; but a sample with a fix takes the place of one without.
-/// With `on_conflict=replace`, which is for operators, each sample takes the place of the stored one.
+/// import that broke off can be sent again as it is; but a sample with a fix replaces one without.
+/// With `on_conflict=replace`, which is for operators, each sample replaces the stored one.
 ///
 /// With `columns`, `box_form` or `box_unit` a CSV file may have any separator, decimal commas, Unix times and
 /// columns that nothing asks for.

@@ -88,7 +88,7 @@ impl<'de> Visitor<'de> for LabelsVisitor {
 #[schema(rename_all = "snake_case")]
 #[expect(dead_code, reason = "the values of a parameter, for the description alone")]
 pub(super) enum OnConflict {
-    /// It is counted as a duplicate; but a sample with a fix takes the place of one without.
+    /// It is counted as a duplicate; but a sample with a fix replaces one without.
     Keep,
     /// The new one takes its place.
     Replace,

@@ -1,6 +1,6 @@
 //! A calibrated pinhole camera with radial distortion. No estimation method uses it.
 //!
-//! What never happens here: noise.
+//! Never here: noise.
 
 use crate::domain::ImageSize;
 use crate::geo::EastNorth;

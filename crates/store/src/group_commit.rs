@@ -2,7 +2,7 @@
 //!
 //! A commit costs much more than a row, so every batch that is queued when a transaction begins joins
 //! it. Nothing is acknowledged before its commit, and a caller's batch is stored atomically.
-//! What never happens here: a caller waits for more callers to come, the queue grows without bound, a
+//! Never here: a caller waits for more callers to come, the queue grows without bound, a
 //! cancelled caller disturbs the others.
 
 use std::collections::HashMap;
@@ -37,7 +37,7 @@ pub struct Inserted {
     pub duplicate: u64,
     /// Of the accepted ones, those without a fix.
     pub without_fix: u64,
-    /// Of the accepted ones, those that took the place of a stored sample on request.
+    /// Of the accepted ones, those that replaced a stored sample on request.
     pub replaced: u64,
 }
 

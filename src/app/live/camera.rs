@@ -93,7 +93,7 @@ impl CameraLive {
         before == 0 || before + 1 == fence
     }
 
-    /// Ends the readers of a state that another one takes the place of.
+    /// Ends the readers of a state that another one replaces.
     pub(in crate::app) fn replace(&self) {
         self.replaced.cancel();
     }

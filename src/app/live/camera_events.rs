@@ -1,7 +1,7 @@
 //! The latest events of one camera, for readers that come back.
 //!
 //! Events are kept while somebody listens, and for some time after, so that a reader whose connection broke misses
-//! none. What never happens here: a writer waits for readers, memory grows with the time that a reader is away.
+//! none. Never here: a writer waits for readers, memory grows with the time that a reader is away.
 
 use std::fmt;
 use std::str::FromStr;

@@ -8,11 +8,11 @@ use super::error::Error;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Display, EnumString, IntoStaticStr)]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_choice)]
 pub enum OnConflict {
-    /// It is counted as a duplicate and the stored one stays; but a sample with a fix takes the place of one
+    /// It is counted as a duplicate and the stored one stays; but a sample with a fix replaces one
     /// without.
     #[default]
     Keep,
-    /// It takes the place of the stored one.
+    /// It replaces the stored one.
     Replace,
 }
 

@@ -3,7 +3,7 @@
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/association.md` has the formulas and figures. The files in the order of their imports:
 //! `cancellation`, `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`.
-//! What never happens here: I/O, clocks, randomness that is not handed in.
+//! Never here: I/O, clocks, randomness that is not handed in.
 
 mod assignment;
 mod cancellation;

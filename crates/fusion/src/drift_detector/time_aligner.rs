@@ -1,7 +1,7 @@
 //! Interpolates the regressed positions of one target to the times of its fixes, where boxes and fixes
 //! come at different instants.
 //!
-//! What never happens here: interpolation across a gap, or a second sample for the same fix.
+//! Never here: interpolation across a gap, or a second sample for the same fix.
 
 use std::collections::VecDeque;
 

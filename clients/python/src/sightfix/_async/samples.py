@@ -64,7 +64,7 @@ class Samples:
             camera_id: The camera.
             file: The file.
             durability: When the samples are acknowledged.
-            on_conflict: Whether a sample takes the place of a stored one of the same target and time.
+            on_conflict: Whether a sample replaces a stored one of the same target and time.
             layout: Columns of a CSV file; the documented ones by default.
             target_id: The target of a CSV file that names none.
             idempotency_key: The same import under the same key gets the answer of the first, for a day.
@@ -158,7 +158,7 @@ class Samples:
             min_probability: Leave out samples whose match is less probable.
             clock_window_s: The receivers' clocks are off by at most this, for `match`.
             durability: When the samples are acknowledged.
-            on_conflict: Whether a sample takes the place of a stored one of the same target and time.
+            on_conflict: Whether a sample replaces a stored one of the same target and time.
             layout: Columns of CSV files; the documented ones by default.
             idempotency_key: The same import under the same key gets the answer of the first, for a day.
         """

@@ -216,8 +216,8 @@ impl Store {
     /// Stores samples of a camera and returns after their commit, and with [`Durability::Synced`] after
     /// they have been flushed to the disk; all of them are stored, or none. A sample whose camera, target
     /// and time are stored already is left as it is and counted as a duplicate, but a sample with a fix
-    /// replaces one without, and with [`OnConflict::Replace`](crate::domain::OnConflict) each takes
-    /// the place of a stored one. Many callers at once share a transaction; a caller who goes away
+    /// replaces one without, and with [`OnConflict::Replace`](crate::domain::OnConflict) each replaces
+    /// a stored one. Many callers at once share a transaction; a caller who goes away
     /// does not stop it.
     ///
     /// # Errors

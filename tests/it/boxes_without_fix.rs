@@ -256,7 +256,7 @@ async fn boxes_that_find_no_fix_are_kept_on_request() {
     let folder = data_folder();
     let [detections, fixes] = recording(folder.path());
     let out = folder.path().join("paired.csv").to_str().expect("UTF-8").to_owned();
-    let arguments = ["pair", "--detections", &detections, "--fixes", &fixes, "--out", &out];
+    let arguments = ["pair", "--detections", &detections, "--fixes", &fixes, "--out", &out, "--overwrite"];
     run(&arguments);
     assert_eq!(std::fs::read_to_string(&out).expect("written").lines().count(), 1 + 10);
     let printed = run(&[&arguments[..], &["--keep-unpaired"]].concat());

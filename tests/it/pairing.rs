@@ -88,7 +88,8 @@ impl Recording {
 fn pair(detections: &Path, fixes: &Path, out: &Path, flags: &[&str]) -> (String, Vec<Row>) {
     let text = |path: &Path| path.to_str().expect("UTF-8").to_owned();
     let files = [text(detections), text(fixes), text(out)];
-    let mut arguments = vec!["pair", "--detections", &files[0], "--fixes", &files[1], "--out", &files[2]];
+    let mut arguments =
+        vec!["pair", "--detections", &files[0], "--fixes", &files[1], "--out", &files[2], "--overwrite"];
     arguments.extend_from_slice(flags);
     let printed = run(&arguments);
     (printed, rows(&std::fs::read_to_string(out).expect("written")))

@@ -43,7 +43,7 @@ fn the_best_of_a_receivers_sentences_is_read_and_none_twice() {
         (texts(&["10", "11"]), 2),
         "RMC says more than GLL"
     );
-    assert_eq!(of(&[gll(10), gll(11)]), (texts(&["10", "11"]), 2), "GLL alone");
+    assert_eq!(of(&[gll(10), gll(11)]), (texts(&["10", "11"]), 0), "GLL alone, which has no date");
     assert_eq!(
         of(&[gga(10), rmc(10), rmc(11), rmc(12)]),
         (texts(&["10", "10", "11", "12"]), 4),

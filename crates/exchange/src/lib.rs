@@ -46,6 +46,7 @@ mod objects_only;
 mod outgoing;
 mod recording;
 mod rows;
+mod source_decoder;
 #[cfg(test)]
 mod tests;
 mod track_files;
@@ -66,13 +67,14 @@ pub use format::{FixFormat, Format};
 pub use frame_files::{FrameClock, FrameFileFormat, read_frame_file};
 pub use messages::{
     BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,
-    NamedDetection, Reading, decoder, source_decoder,
+    NamedDetection, Reading, decoder,
 };
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use recording::{read_recording, write_recording};
 pub use rows::{
     ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
 };
+pub use source_decoder::source_decoder;
 pub use track_files::{TrackFile, TrackFileFormat};
 pub use write::{FusedWriter, MatchedSampleWriter, SampleWriter, write_fused, write_samples};
 

@@ -8,7 +8,7 @@ use jiff::Timestamp;
 
 use super::MessageContext;
 use super::ais_report::Ships;
-use super::nmea::Tagged;
+use super::tagged::Tagged;
 use crate::domain::ReceivedFix;
 use crate::unix_time::unix_time;
 

@@ -9,21 +9,22 @@ mod ais;
 mod ais_report;
 mod cot;
 mod deepstream;
-mod filter;
 mod frigate;
 mod gpsd;
 mod mapped;
 mod nmea;
 mod onvif;
 mod phone;
+mod tagged;
 mod traccar;
 mod xml;
+
+use std::net::SocketAddr;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::connection::{ReceiverFrom, SourceSettings};
 use crate::domain::{Fix, ReceivedFix, ReceiverId, Score, SigmaM, TargetClass, TargetId, TimeBounds};
 use crate::wire;
 
@@ -139,7 +140,7 @@ impl Reading {
         }
     }
 
-    fn skip(&mut self, reason: impl Into<String>) {
+    pub(super) fn skip(&mut self, reason: impl Into<String>) {
         // One message of a hostile sender must not fill the memory with reasons.
         if self.skipped.len() < 16 {
             self.skipped.push(reason.into());
@@ -183,15 +184,14 @@ pub trait MessageDecoder: Send {
     fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String>;
 }
 
-/// A decoder of a source's messages, with the source's mapping, names of receivers and filter.
-#[must_use]
-pub fn source_decoder(settings: &SourceSettings) -> Box<dyn MessageDecoder> {
-    let decoder: Box<dyn MessageDecoder> = match (settings.format, settings.receiver_from) {
-        (MessageFormat::Json, _) => Box::new(mapped::Mapped(settings.mapping.clone().unwrap_or_default())),
-        (MessageFormat::Nmea, ReceiverFrom::Talker) => Box::new(nmea::Nmea::new(nmea::Telling::Talkers)),
-        (format, _) => decoder(format),
-    };
-    Box::new(filter::Filtered::new(decoder, settings))
+/// A decoder of JSON by a mapping.
+pub(super) fn mapped_decoder(mapping: JsonMapping) -> Box<dyn MessageDecoder> {
+    Box::new(mapped::Mapped(mapping))
+}
+
+/// A decoder of NMEA sentences that tells receivers apart by their talkers.
+pub(super) fn talker_decoder() -> Box<dyn MessageDecoder> {
+    Box::new(nmea::Nmea::new(nmea::Telling::Talkers))
 }
 
 /// A decoder of messages of a format alone; of `json` it has no mapping.
@@ -207,7 +207,7 @@ pub fn decoder(format: MessageFormat) -> Box<dyn MessageDecoder> {
         MessageFormat::Phone => Box::new(phone::Phone),
         MessageFormat::Adsb => Box::new(adsb::Adsb),
         MessageFormat::Cot => Box::new(cot::Cot),
-        MessageFormat::Json => Box::new(mapped::Mapped(JsonMapping::default())),
+        MessageFormat::Json => mapped_decoder(JsonMapping::default()),
     }
 }
 
@@ -224,4 +224,12 @@ fn class(name: &str) -> Option<TargetClass> {
 /// A score; one that is not from 0 to 1 is left out.
 fn score(value: Option<f64>) -> Option<Score> {
     Score::new(value?).ok()
+}
+
+/// Who sent a message: its topic or key, or its address without the port, which changes with every connection.
+pub(super) fn sender(subject: &str) -> String {
+    match subject.parse::<SocketAddr>() {
+        Ok(address) => address.ip().to_canonical().to_string(),
+        Err(_) => subject.to_owned(),
+    }
 }

@@ -9,8 +9,8 @@ use std::collections::HashMap;
 use jiff::{SignedDuration, Timestamp};
 
 use super::ais::Ais;
-use super::filter::sender;
-use super::{MessageContext, MessageDecoder, MessageItem, Reading};
+use super::tagged::Tagged;
+use super::{MessageContext, MessageDecoder, MessageItem, Reading, sender};
 use crate::domain::{ReceivedFix, ReceiverId};
 use crate::nmea_fixes::{SentenceContent, Sentences, nearest_instant};
 
@@ -38,26 +38,6 @@ struct Receiver {
     /// The latest instant with a date.
     dated_instant: Option<Timestamp>,
     sentences: Sentences,
-}
-
-/// A line without its tag block.
-pub(super) struct Tagged<'a> {
-    tags: &'a str,
-    pub(super) sentence: &'a str,
-}
-
-impl<'a> Tagged<'a> {
-    pub(super) fn of(line: &'a str) -> Self {
-        match line.strip_prefix('\\').and_then(|rest| rest.split_once('\\')) {
-            Some((tags, sentence)) => Self { tags: tags.split('*').next().unwrap_or_default(), sentence },
-            None => Self { tags: "", sentence: line },
-        }
-    }
-
-    /// The value of a tag, such as `c:`.
-    pub(super) fn tag(&self, name: &str) -> Option<&'a str> {
-        self.tags.split(',').find_map(|tag| tag.strip_prefix(name))
-    }
 }
 
 impl MessageDecoder for Nmea {

@@ -17,7 +17,7 @@ fn shown(text: &str, format: FrameFileFormat) -> Vec<String> {
         .collect()
 }
 
-/// Lines of the description of the MOT challenge's results (motchallenge.net/instructions), and wrong ones.
+/// Lines in the form of the MOT challenge's results, and wrong ones.
 #[test]
 fn motchallenge_counts_frames_and_pixels_from_1() {
     let text = "1, 3, 794.27, 247.59, 71.245, 174.88, -1, -1, -1, -1\n11,6,1648.1,119.61,66.504,163.24,0.9,-1,-1,-1\n\n\
@@ -31,7 +31,7 @@ fn motchallenge_counts_frames_and_pixels_from_1() {
     assert!(rows[5].starts_with("line 7: bounding_box.width_px"), "{}", rows[5]);
 }
 
-/// Lines of the first sequence of KITTI's tracking labels.
+/// Lines in the form of KITTI's tracking labels.
 #[test]
 fn kitti_counts_frames_and_pixels_from_0() {
     let text = "0 -1 DontCare -1 -1 -10.000000 219.310000 188.490000 245.500000 218.560000 -1000 -1000 -1000 -10 -1 -1 -1\n\

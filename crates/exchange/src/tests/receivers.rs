@@ -43,7 +43,7 @@ fn the_best_of_a_receivers_sentences_is_read_and_none_twice() {
         (texts(&["10", "11"]), 2),
         "RMC says more than GLL"
     );
-    assert_eq!(of(&[gll(10), gll(11)]), (texts(&["10", "11"]), 2), "GLL alone");
+    assert_eq!(of(&[gll(10), gll(11)]), (texts(&["10", "11"]), 0), "GLL alone, which has no date");
     assert_eq!(
         of(&[gga(10), rmc(10), rmc(11), rmc(12)]),
         (texts(&["10", "10", "11", "12"]), 4),
@@ -52,7 +52,7 @@ fn the_best_of_a_receivers_sentences_is_read_and_none_twice() {
     assert_eq!(of(&[rmc(10)]), (Vec::new(), 1), "the only one of a file");
 }
 
-/// The sentence of NMEA Revealed (gpsd), and one of a receiver of six systems.
+/// Sentences in the form that NMEA 0183 gives them, of receivers of one to six systems.
 #[test]
 fn gns_states_a_mode_per_system() {
     let gns = |modes: &str| {
@@ -132,8 +132,7 @@ fn a_date_of_an_earlier_count_of_gps_weeks_is_refused() {
     assert_eq!(dated("010626").items.len(), 2);
 }
 
-/// Lines of the description of the BaseStation port (woodair.net, sbs/article/barebones42_socket_data), and of the JSON of
-/// readsb (README-json.md) with its names.
+/// Lines in the form of a BaseStation port, and a document with the names of readsb's README-json.md.
 #[test]
 fn aircraft_are_named_by_their_address() {
     let lines = "SEL,,496,2286,4CA4E5,27215,2026/06/01,12:00:18.100,2026/06/01,12:00:18.200,RYR1427\r\n\
@@ -164,7 +163,7 @@ fn aircraft_are_named_by_their_address() {
     assert!(decoder(MessageFormat::Adsb).decode(b"{", &context()).is_err());
 }
 
-/// An event as ATAK sends its own position, of the wiki of FreeTAKServer, shortened.
+/// An event in the form in which ATAK sends its own position.
 #[test]
 fn events_of_tak_are_fixes_of_their_uid() {
     let event = r#"<?xml version="1.0" encoding="UTF-8" standalone="yes"?><event version="2.0" uid="ANDROID-359975090666199"

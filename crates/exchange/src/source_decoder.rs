@@ -1,13 +1,25 @@
 //! What a source takes of its messages, and how it names receivers that they do not name.
 
-use std::net::SocketAddr;
-
-use super::{MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading};
 use crate::connection::{ReceiverFrom, SourceSettings};
 use crate::domain::{ReceiverId, Score, TargetClass};
+use crate::messages::{
+    MessageContext, MessageDecoder, MessageFormat, MessageItem, NamedDetection, Reading, decoder,
+    mapped_decoder, sender, talker_decoder,
+};
+
+/// A decoder of a source's messages, with the source's mapping, names of receivers and filter.
+#[must_use]
+pub fn source_decoder(settings: &SourceSettings) -> Box<dyn MessageDecoder> {
+    let decoder = match (settings.format, settings.receiver_from) {
+        (MessageFormat::Json, _) => mapped_decoder(settings.mapping.clone().unwrap_or_default()),
+        (MessageFormat::Nmea, ReceiverFrom::Talker) => talker_decoder(),
+        (format, _) => decoder(format),
+    };
+    Box::new(Filtered::new(decoder, settings))
+}
 
 /// A decoder with the choices of its source.
-pub(super) struct Filtered {
+struct Filtered {
     decoder: Box<dyn MessageDecoder>,
     classes: Vec<String>,
     least_score: f64,
@@ -15,7 +27,7 @@ pub(super) struct Filtered {
 }
 
 impl Filtered {
-    pub(super) fn new(decoder: Box<dyn MessageDecoder>, settings: &SourceSettings) -> Self {
+    fn new(decoder: Box<dyn MessageDecoder>, settings: &SourceSettings) -> Self {
         Self {
             decoder,
             classes: settings.classes.clone(),
@@ -58,13 +70,5 @@ impl MessageDecoder for Filtered {
             }
         }
         Ok(reading)
-    }
-}
-
-/// Who sent a message: its topic or key, or its address without the port, which changes with every connection.
-pub(super) fn sender(subject: &str) -> String {
-    match subject.parse::<SocketAddr>() {
-        Ok(address) => address.ip().to_canonical().to_string(),
-        Err(_) => subject.to_owned(),
     }
 }

@@ -2,7 +2,7 @@
 //! and from GNSS fixes.
 //!
 //! This crate has the transports, the use cases, the connections and the command line; what they work with is in the
-//! crates below `crates/`, which are re-exported here as modules. `docs/architecture.md` describes both.
+//! crates below `crates/`, which are re-exported here as modules. `docs/explanation/architecture.md` describes both.
 
 // They panic where the output is closed or its device is full.
 #![warn(clippy::print_stdout, clippy::print_stderr)]

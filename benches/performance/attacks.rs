@@ -1,5 +1,5 @@
 //! What a well-behaved client keeps beside an attack, what a refusal costs, and what an idle connection costs:
-//! the second part of docs/reliability.md.
+//! the second part of docs/explanation/reliability.md.
 //!
 //! Attackers and the measured client share the machine with the server, so what attackers cost the processor
 //! counts against the server.

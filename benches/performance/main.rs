@@ -1,4 +1,4 @@
-//! The tables of docs/performance.md. Every row is a ratio of two things measured in turn in this
+//! The tables of docs/explanation/performance.md. Every row is a ratio of two things measured in turn in this
 //! one run, since machines differ and are shared.
 //!
 //! `cargo bench` runs all parts; `cargo bench -- fuse http` some of them.

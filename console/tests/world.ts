@@ -63,7 +63,7 @@ export function simulateSite(walkers: number, duration_s: number): Record<string
   const scene = ['--cameras', '2', '--walkers', String(walkers), '--vehicles', '0', '--receivers', '1', '--duration-s', String(duration_s)];
   execFileSync(BINARY, ['simulate', 'site', '--out', folder, ...scene], { stdio: 'ignore' });
   const cells = (name: string): string[][] => readFileSync(join(folder, name), 'utf8').trim().split(/\r?\n/).slice(1).map((line) => line.split(','));
-  // The columns of each file are in docs/world-tracks.md; `phone-3` is carried by `person-3`.
+  // The columns of each file are in docs/explanation/world-tracks.md; `phone-3` is carried by `person-3`.
   const people = new Map(cells('identity.csv').map(([camera, id, person]) => [`${camera} ${id}`, person!]));
   const fixes = new Map(cells('fixes.csv').map(([time, receiver, ...position]) => [`${time} ${receiver!.replace('phone', 'person')}`, position]));
   const samplesOf = (camera: string): string => {

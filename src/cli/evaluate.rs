@@ -91,7 +91,7 @@ pub(super) struct Evaluate {
     #[arg(long, value_name = "N", requires = "site", default_value_t = 1)]
     first_redraw: u64,
     /// Write the page to this file, for --paper
-    #[arg(long, value_name = "FILE", requires = "paper", default_value = "docs/accuracy.md")]
+    #[arg(long, value_name = "FILE", requires = "paper", default_value = "docs/explanation/accuracy.md")]
     out: PathBuf,
 }
 

@@ -24,7 +24,7 @@ pub(super) async fn check(config: &Config, clock: &Clock) -> (Vec<Check>, Option
     let report = match store::inspect(&config.data).await {
         Ok(report) => report,
         Err(error) => {
-            let remedy = "docs/operations.md, Exit codes, says what to do";
+            let remedy = "docs/howto/run.md, Exit codes, says what to do";
             return (vec![Check::failed(DATABASE, error.to_string(), remedy)], None);
         }
     };

@@ -33,7 +33,7 @@ pub(super) fn writable(config: &Config) -> Check {
 
 pub(super) fn space(config: &Config) -> Check {
     const NAME: &str = "space";
-    let remedy = "free space on the disk, or delete samples (docs/operations.md, Full disk)";
+    let remedy = "free space on the disk, or delete samples (docs/howto/storage.md, Full disk)";
     // Where the folder will be made.
     let folder = if config.data.exists() { config.data.as_path() } else { Path::new(".") };
     match store::disk_available_bytes(folder) {

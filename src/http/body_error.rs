@@ -46,7 +46,7 @@ impl fmt::Display for BodyError {
             Self::Broken => "the body broke off",
             Self::Undecodable => "the body is not of its content-encoding, or is cut off",
             Self::TooDense => {
-                "the body decodes to more than its length allows (docs/operations.md, limits); send it without \
+                "the body decodes to more than its length allows (docs/reference/limits.md); send it without \
                  a content-encoding"
             }
         })

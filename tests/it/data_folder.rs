@@ -15,7 +15,7 @@ use crate::harness::{Answer, TestServer, data_folder, sightfix, simulated_csv};
 const MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/demo-square.safetensors");
 const CSV: [(&str, &str); 1] = [("content-type", "text/csv")];
 const PAGE_BYTES: u64 = 4_096;
-/// Exit codes of docs/operations.md.
+/// Exit codes of docs/howto/run.md.
 const IN_USE: Option<i32> = Some(3);
 const UNUSABLE: Option<i32> = Some(4);
 

@@ -1,5 +1,5 @@
 //! Error of the recipe `gaussian_process` against the number of receivers, with and without boxes that have
-//! no fix: the table of docs/method.md. One walk is one receiver on one way through the picture.
+//! no fix: the table of docs/explanation/method.md. One walk is one receiver on one way through the picture.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;

@@ -211,7 +211,7 @@ async fn a_fix_hours_ahead_in_a_recording_loses_no_samples() {
     );
 }
 
-/// One input of the table in docs/method.md.
+/// One input of the table in docs/explanation/method.md.
 struct Case {
     name: &'static str,
     bounding_box: Value,
@@ -251,7 +251,7 @@ fn cases(rows: &[SimulatedRow], origin: Position) -> Vec<Case> {
     ]
 }
 
-/// Prints the table of docs/method.md.
+/// Prints the table of docs/explanation/method.md.
 #[tokio::test]
 async fn sources_that_contradict_each_other_are_flagged_and_the_radius_holds_the_truth() {
     let folder = data_folder();

@@ -118,7 +118,7 @@ fn a_short_recording_is_refused_with_what_to_record() {
 }
 
 #[test]
-#[ignore = "takes minutes: the marks of docs/association.md"]
+#[ignore = "takes minutes: the marks of docs/explanation/association.md"]
 fn marks_of_one_phone_among_ten_walkers() {
     let folder = data_folder();
     let (mut identified, mut wrong) = (0, 0);
@@ -152,7 +152,7 @@ fn share_right(crowd: Crowd, seeds: std::ops::RangeInclusive<u64>) -> (f64, usiz
 }
 
 #[test]
-#[ignore = "takes minutes: the marks of docs/association.md"]
+#[ignore = "takes minutes: the marks of docs/explanation/association.md"]
 fn marks_of_ids_that_swap() {
     let crowd = Crowd { walkers: 15, phones: 6, seconds: 240, ..ONE_AMONG_TEN };
     let (steady, steady_worlds) = share_right(crowd, 1..=4);

@@ -12,7 +12,7 @@ use crate::harness::{TestServer, data_folder, now};
 
 const ALERTS: &str = include_str!("../../deploy/alerts.yml");
 const DASHBOARD: &str = include_str!("../../deploy/grafana-dashboard.json");
-const OPERATIONS: &str = include_str!("../../docs/operations.md");
+const MONITORING: &str = include_str!("../../docs/howto/monitoring.md");
 const UNIT: &str = include_str!("../../deploy/sightfix.service");
 
 /// The metrics that a text names.
@@ -75,9 +75,9 @@ fn every_alert_has_its_section() {
     let runbooks: Vec<_> = values("runbook:").collect();
     assert!(alerts.len() > 10 && alerts.len() == runbooks.len(), "{alerts:?} {runbooks:?}");
     for (alert, runbook) in alerts.iter().zip(runbooks) {
-        assert_eq!(runbook, format!("docs/operations.md#{}", alert.to_lowercase()));
+        assert_eq!(runbook, format!("docs/howto/monitoring.md#{}", alert.to_lowercase()));
         let heading = format!("\n### {alert}\n");
-        let section = OPERATIONS.split_once(&heading).unwrap_or_else(|| panic!("no section {alert}")).1;
+        let section = MONITORING.split_once(&heading).unwrap_or_else(|| panic!("no section {alert}")).1;
         let text = section.split("\n#").next().unwrap_or_default().trim();
         assert!(text.len() > 80, "the section {alert} says what to do: {text}");
     }

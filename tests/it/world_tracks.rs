@@ -108,7 +108,7 @@ fn shared_plaza_is_tracked_over_three_cameras() {
     assert!(figure(oracle, "idf1") - figure(together, "idf1") <= 0.03, "{oracle}");
     assert!(figure(degraded, "identity_f1_by_boxes") >= 0.9, "{degraded}");
     let redrawn = evaluate(&plaza, "1920x1080", &["--redraws", "20"]);
-    // The goals are 0.97, 0.92 and at most 0.02 less than by true identities (docs/world-tracks.md).
+    // The goals are 0.97, 0.92 and at most 0.02 less than by true identities (docs/explanation/world-tracks.md).
     assert!(figure(&redrawn[0], "identity_f1_by_boxes") >= 0.965, "{}", redrawn[0]);
     assert!(figure(&redrawn[2], "identity_f1_by_boxes") >= 0.915, "{}", redrawn[2]);
     assert!(figure(&redrawn[1], "idf1") - figure(&redrawn[0], "idf1") <= 0.02, "{}", redrawn[0]);

@@ -1,4 +1,4 @@
-"""docs/proto.md: the reference of the gRPC interface, from the descriptors of proto/ and their comments.
+"""docs/reference/proto.md: the reference of the gRPC interface, from the descriptors of proto/ and their comments.
 
 `python -m codegen.proto_reference` writes it; with `--check` it fails if the file is not current.
 """
@@ -20,7 +20,7 @@ from google.protobuf.descriptor_pb2 import (
 from codegen.stubs import run_protoc
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-PAGE = REPOSITORY / "docs" / "proto.md"
+PAGE = REPOSITORY / "docs" / "reference" / "proto.md"
 INTRODUCTION = """\
 # gRPC interface
 
@@ -137,9 +137,9 @@ def main() -> None:
     if "--check" not in sys.argv[1:]:
         PAGE.write_text(text)
     elif PAGE.read_text() != text:
-        sys.exit("docs/proto.md is not current: run `python -m codegen.proto_reference` in clients/python")
+        sys.exit("docs/reference/proto.md is not current: run `python -m codegen.proto_reference` in clients/python")
     else:
-        print("docs/proto.md is what proto/ says")
+        print("docs/reference/proto.md is what proto/ says")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@
 //! | [`baselines`] | what a method is compared with: a homography, a linear regression |
 //! | [`plots()`] | charts of a report as SVG |
 //! | [`site`] | the figures of world tracks |
-//! | [`paper_experiments`] | the cases of docs/accuracy.md, their marks, tables and pictures; imports from all others |
+//! | [`paper_experiments`] | the cases of docs/explanation/accuracy.md, their marks, tables and pictures; imports from all others |
 //!
 //! Nothing here does input or output. The CPU time of a fit is measured by a function that is handed in.
 

@@ -1,5 +1,5 @@
 //! Error and coverage over many simulated worlds where little or something wrong is known: the first minutes of a camera,
-//! hidden feet, boxes that are wrong. Each test prints the figures of docs/method.md and holds the marks.
+//! hidden feet, boxes that are wrong. Each test prints the figures of docs/explanation/method.md and holds the marks.
 //!
 //! `cargo test -p sightfix-evaluation --test marks -- --ignored --nocapture`
 

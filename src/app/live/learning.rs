@@ -22,7 +22,7 @@ const REMEMBERED: usize = 8_192;
 /// Rows that wait for their storage; more are dropped, and counted.
 const PENDING_ROWS: usize = 20_000;
 /// Time with boxes and fixes that is recorded before the first attempt to match them, s. In simulated squares with one
-/// phone among eleven walkers it is enough (docs/association.md).
+/// phone among eleven walkers it is enough (docs/explanation/association.md).
 const FIRST_NEEDED_S: u64 = 480;
 /// An attempt that failed is repeated with this much more, s, or a quarter more.
 const MORE_NEEDED_S: u64 = 120;

@@ -206,7 +206,7 @@ async fn a_camera_of_a_broker_learns_by_itself_whose_phone_it_sees() {
 
 /// Ten worlds, each with a camera and connections of its own.
 #[tokio::test]
-#[ignore = "takes minutes: needs mosquitto, and is a mark of docs/association.md"]
+#[ignore = "takes minutes: needs mosquitto, and is a mark of docs/explanation/association.md"]
 async fn marks_of_cameras_that_learn_by_themselves() {
     let (broker, folder) = (Broker::start(), data_folder());
     let server = TestServer::start(folder.path());

@@ -327,7 +327,7 @@ fn shared_plaza_pairs_with_a_known_model() {
     unbroken.print("all cameras, ids that never break");
     all.print("all cameras");
     assert!(all.precision() >= 0.95);
-    // The goal for the share found is 0.6 (docs/association.md).
+    // The goal for the share found is 0.6 (docs/explanation/association.md).
     assert!(all.found as f64 >= 0.35 * all.all as f64);
     assert!((all.stated() - all.precision()).abs() <= 0.05, "stated {}", all.stated());
 }

@@ -4,7 +4,7 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::error::Error;
 
-/// A way to train a camera's model; `docs/method.md` describes each.
+/// A way to train a camera's model; `docs/explanation/method.md` describes each.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Display, EnumString, IntoStaticStr, VariantArray,
 )]

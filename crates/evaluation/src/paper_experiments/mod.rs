@@ -1,5 +1,5 @@
-//! The experiments of the paper, and further ones of this project, as pages of results: docs/accuracy.md with
-//! its pictures, and docs/accuracy-tables.md behind it.
+//! The experiments of the paper, and further ones of this project, as pages of results: docs/explanation/accuracy.md with
+//! its pictures, and docs/explanation/accuracy-tables.md behind it.
 //!
 //! All models are fitted on training rows with the recipes unchanged; nothing is selected by test
 //! results.

@@ -1,7 +1,7 @@
 //! How well a site is tracked: the maps of its cameras trained together or apart, the world tracks over all
 //! cameras or one, against the true targets.
 //!
-//! Definitions are in docs/world-tracks.md, with their sources.
+//! Definitions are in docs/explanation/world-tracks.md, with their sources.
 
 mod box_figures;
 mod degradation;

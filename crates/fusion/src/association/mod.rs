@@ -1,7 +1,7 @@
 //! Whose fix is it: anonymous tracklets matched with the receivers that their targets carry.
 //!
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
-//! too. `docs/association.md` has the formulas and figures. The files in the order of their imports:
+//! too. `docs/explanation/association.md` has the formulas and figures. The files in the order of their imports:
 //! `cancellation`, `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`.
 //! Never here: I/O, clocks, randomness that is not handed in.
 

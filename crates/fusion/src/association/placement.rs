@@ -7,7 +7,7 @@
 //! constant time per pair. Placements that single pairs suggest, and a grid of yaws, are refined by
 //! expectation-maximisation: soft assignment of receivers to tracklets, then the least-squares (w, t) in
 //! closed form. Where the scale is unknown, the likelihood is that of the ground points given the fixes: `|w|^2` for
-//! each point. `docs/association.md` has the formulas.
+//! each point. `docs/explanation/association.md` has the formulas.
 
 use std::cmp::Ordering;
 

@@ -3,7 +3,7 @@
 //! Inputs are raw pixels and standardised degrees `(deg - offset) * 1e4`. Two auto-encoders, 6-h-2-h-6
 //! with the fix and 4-h-2-h-4 without, are trained with L = 1 eX + 2000 eZ and Adam at 0.005; Es follows
 //! (4) from the last epoch. A network that has the fix among its inputs learns to reproduce it; none of
-//! the remedies in `docs/method.md` applies here.
+//! the remedies in `docs/explanation/method.md` applies here.
 
 use std::sync::Arc;
 

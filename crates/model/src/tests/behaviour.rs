@@ -263,7 +263,7 @@ fn fitted_candidate(
     Fitted { regressor: artifact.expect("fits").load().expect("loads"), misses_m2 }
 }
 
-/// The comparison behind docs/method.md: choosing one candidate against averaging all by the shares of a
+/// The comparison behind docs/explanation/method.md: choosing one candidate against averaging all by the shares of a
 /// Bayesian bootstrap.
 #[test]
 #[ignore = "a measurement of minutes"]

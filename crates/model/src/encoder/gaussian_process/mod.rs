@@ -1,7 +1,7 @@
 //! Recipe `gaussian_process`: a projective mean with a Gaussian-process residual under coloured noise per
 //! receiver, whose stated error counts receivers, not rows.
 //!
-//! `docs/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
+//! `docs/explanation/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
 //! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
 //! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`, `hidden_foot`;
 //! `recipe` and `stored` connect both to the rest of the module; `foot_map` takes the map of another fit, and `upright_geometry` gives it a prior. Random starts have a seed of their own.

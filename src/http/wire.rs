@@ -68,7 +68,7 @@ impl<'de> Visitor<'de> for LabelsVisitor {
     type Value = BTreeMap<String, String>;
 
     fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str("an object of texts")
+        out.write_str("a map")
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut items: A) -> std::result::Result<Self::Value, A::Error> {

@@ -33,6 +33,7 @@ mod refusals;
 mod row_decoder;
 mod rows;
 mod sqlite;
+mod statements;
 #[cfg(test)]
 mod tests;
 

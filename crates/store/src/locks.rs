@@ -4,10 +4,10 @@
 use sqlx::AssertSqlSafe;
 
 use crate::domain::Result;
-use crate::postgres;
+use crate::postgres::locks as postgres;
 use crate::query::{AnyConnection, Session, query};
 
-pub(crate) use crate::postgres::Limit;
+pub(crate) use crate::postgres::locks::Limit;
 
 /// Waits until no other transaction may change how far a limit is used.
 pub(crate) async fn lock_limit(session: &mut dyn Session, limit: Limit) -> Result<()> {

@@ -3,17 +3,16 @@
 //! A [`Query`] collects its values and is executed on a [`Session`]; a database error becomes an error of the domain
 //! there. The few words that differ between the dialects of SQL are in [`Dialect`].
 
-use sqlx::postgres::PgRow;
-use sqlx::sqlite::SqliteRow;
 use sqlx::{
-    AssertSqlSafe, Database, Encode, FromRow, IntoArguments, PgConnection, Postgres, SqlSafeStr, SqlStr,
-    Sqlite, SqliteConnection, Type,
+    AssertSqlSafe, Database, Encode, IntoArguments, PgConnection, Postgres, SqlSafeStr, SqlStr, Sqlite,
+    SqliteConnection, Type,
 };
 
 use crate::domain::Result;
-use crate::postgres::{DATABASE_NOW_US, failed as postgres_failed};
-use crate::row_decoder::StoredRow;
-use crate::sqlite::failed as sqlite_failed;
+use crate::postgres::connection::DATABASE_NOW_US;
+use crate::postgres::errors::failed as postgres_failed;
+use crate::row_decoder::{Columns, StoredRow};
+use crate::sqlite::errors::failed as sqlite_failed;
 
 /// A connection to either database.
 pub enum AnyConnection<'c> {
@@ -157,11 +156,6 @@ pub struct Query<T> {
     values: Vec<Value>,
     read: fn(StoredRow) -> sqlx::Result<T>,
 }
-
-/// Columns that either database can decode.
-pub(crate) trait Columns: for<'r> FromRow<'r, SqliteRow> + for<'r> FromRow<'r, PgRow> {}
-
-impl<T> Columns for T where T: for<'r> FromRow<'r, SqliteRow> + for<'r> FromRow<'r, PgRow> {}
 
 /// A statement whose rows are read by a [`crate::row_decoder::RowDecoder`], if it has any.
 pub(crate) fn query(sql: impl SqlSafeStr) -> Query<StoredRow> {

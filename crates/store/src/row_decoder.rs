@@ -5,11 +5,15 @@ use std::fmt::Display;
 use jiff::Timestamp;
 use sqlx::postgres::PgRow;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Column, Decode, Postgres, Row as _, Sqlite, Type, ValueRef};
+use sqlx::{Column, Decode, FromRow, Postgres, Row as _, Sqlite, Type, ValueRef};
 
-use super::query::Columns;
 use super::refusals::Corrupt;
 use crate::domain::{Error, Result, Revision};
+
+/// Columns that either database can decode.
+pub(crate) trait Columns: for<'r> FromRow<'r, SqliteRow> + for<'r> FromRow<'r, PgRow> {}
+
+impl<T> Columns for T where T: for<'r> FromRow<'r, SqliteRow> + for<'r> FromRow<'r, PgRow> {}
 
 /// A row of either backend.
 pub enum StoredRow {

@@ -19,11 +19,12 @@ fn read(rest: &Value, message: &str) -> Result<Reading, String> {
 }
 
 fn detections(reading: &Reading) -> Vec<&NamedDetection> {
-    let detection = |item| match item {
-        &MessageItem::Detection(ref detection) => detection,
+    let items = reading.items.iter();
+    let detections = items.map(|item| match item {
+        MessageItem::Detection(detection) => detection,
         other => panic!("{other:?}"),
-    };
-    reading.items.iter().map(detection).collect()
+    });
+    detections.collect()
 }
 
 /// The example of Axis' Message Broker, topic com.axis.analytics_scene_description.v0.beta, without its images.

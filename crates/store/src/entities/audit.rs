@@ -3,11 +3,10 @@
 use jiff::Timestamp;
 
 use crate::database::Database;
-use crate::domain::{Actor, AuditEntry, AuditNumber, CameraId, Result};
-use crate::limits::StoreLimits;
-use crate::locks::delete_upto;
-use crate::query::{Session, query, query_scalar};
+use crate::domain::{AuditEntry, AuditNumber, CameraId, Result};
+use crate::query::{Session, query};
 use crate::rows::audit::{Change, read_entry};
+use crate::statements::audit;
 
 impl Database {
     /// Records a change of the transaction that is open on the session. The oldest entries beyond the
@@ -18,7 +17,7 @@ impl Database {
         change: Change<'_>,
         now: Timestamp,
     ) -> Result<()> {
-        record(session, (&self.actor, self.limits()), change, now).await
+        audit::record(session, (&self.actor, self.limits()), change, now).await
     }
 
     pub(crate) async fn audit_log(
@@ -42,28 +41,4 @@ impl Database {
         let rows = query.fetch_all(&mut reader).await?;
         rows.iter().map(read_entry).collect()
     }
-}
-
-/// As [`Database::record`].
-pub(crate) async fn record(
-    session: &mut dyn Session,
-    (actor, limits): (&Actor, &StoreLimits),
-    change: Change<'_>,
-    now: Timestamp,
-) -> Result<()> {
-    let number: i64 = query_scalar(
-        "INSERT INTO audit_log (time_us, actor, key_id, address, request_id, action, camera_id, subject) \
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8) RETURNING number",
-    )
-    .bind(now.as_microsecond())
-    .bind(&*actor.name)
-    .bind(actor.key_id.map(|id| id.to_string()))
-    .bind(actor.address.map(|address| address.to_string()))
-    .bind(actor.request_id.as_deref())
-    .bind(change.action.as_str())
-    .bind(change.camera.map(CameraId::as_str))
-    .bind(change.subject)
-    .fetch_one(session)
-    .await?;
-    delete_upto(session, "audit_log", "number", number.saturating_sub(limits.audit_entries.into())).await
 }

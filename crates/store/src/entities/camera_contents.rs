@@ -2,8 +2,8 @@
 
 use crate::database::{Backend, Database};
 use crate::domain::{CameraId, Result};
-use crate::query::{Session, query};
-use crate::rows::cameras::{CameraContent, CameraVersion, CameraVersions, ChangeMark, read_version};
+use crate::rows::cameras::{CameraContent, CameraVersions, ChangeMark};
+use crate::statements::versions::all_versions;
 
 impl Database {
     pub(crate) async fn camera_versions(&self, since: Option<ChangeMark>) -> Result<CameraVersions> {
@@ -34,9 +34,4 @@ impl Database {
         let moved = self.camera_move(id, active).await?;
         Ok(CameraContent { camera, moved, model: Some(self.model_content(id, active).await) })
     }
-}
-
-pub(crate) async fn all_versions(session: &mut dyn Session) -> Result<Vec<CameraVersion>> {
-    let rows = query("SELECT id, key, revision, active_model FROM cameras").fetch_all(session).await?;
-    rows.iter().map(read_version).collect()
 }

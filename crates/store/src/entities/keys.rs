@@ -5,10 +5,11 @@ use jiff::Timestamp;
 use crate::database::Database;
 use crate::domain::{ApiKey, AuditAction, CameraId, Error, KeyId, NewKey, Result, SecretDigest};
 use crate::locks::{Limit, lock_limit};
-use crate::query::{Session, query, query_as, query_scalar};
+use crate::query::{Session, query, query_scalar};
 use crate::refusals::no_key;
 use crate::rows::audit::Change;
 use crate::rows::keys::{KeysVersion, check_limit, read_key, select_keys as select};
+use crate::statements::versions::keys_version;
 
 impl Database {
     pub(crate) async fn insert_key(
@@ -115,13 +116,6 @@ impl Database {
         }
         transaction.commit().await
     }
-}
-
-/// What tells whether keys have changed.
-pub(crate) async fn keys_version(session: &mut dyn Session) -> Result<KeysVersion> {
-    let (rows, revoked, latest) =
-        query_as("SELECT count(*), count(revoked_at_us), max(id) FROM api_keys").fetch_one(session).await?;
-    Ok(KeysVersion { rows, revoked, latest })
 }
 
 async fn find_by_digest(session: &mut dyn Session, digest: &SecretDigest) -> Result<Option<ApiKey>> {

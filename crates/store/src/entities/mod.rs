@@ -18,7 +18,6 @@ mod pictures;
 mod recordings;
 mod retention;
 mod runs;
-mod sample_counts;
 mod sample_retention;
 mod samples;
 mod site_runs;
@@ -26,10 +25,4 @@ mod sites;
 mod source_offsets;
 mod training;
 
-pub(crate) use audit::record;
-pub(crate) use camera_contents::all_versions;
-pub(crate) use idempotency::insert_answer;
-pub(crate) use keys::keys_version;
 pub use runs::RunSubject;
-pub(crate) use sample_counts::{count_all_samples, subtract};
-pub(crate) use sample_retention::delete_oldest;

@@ -5,7 +5,6 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use jiff::Timestamp;
 
-use super::idempotency::{find_answer, insert_answer, lock_key};
 use super::jobs::Jobs;
 use crate::database::Database;
 use crate::domain::{
@@ -18,6 +17,7 @@ use crate::row_decoder::StoredRow;
 use crate::rows::audit::Change;
 use crate::rows::idempotency::IdempotencyRecord;
 use crate::rows::runs::{ReadRun, read_run, select_runs};
+use crate::statements::idempotency::{find_answer, insert_answer, lock_key};
 
 /// A subject whose training runs are stored: [`CameraId`](crate::domain::CameraId) or
 /// [`SiteId`](crate::domain::SiteId).

@@ -6,7 +6,6 @@ use jiff::Timestamp;
 use sqlx::AssertSqlSafe;
 
 use super::cameras::{camera_key, lock_camera};
-use super::sample_counts::subtract;
 use crate::database::Database;
 use crate::domain::{
     AuditAction, CameraId, CameraKey, Detection, Result, SampleFilter, SampleKey, StoredSample,
@@ -18,6 +17,7 @@ use crate::row_decoder::RowDecoder;
 use crate::row_decoder::StoredRow;
 use crate::rows::audit::Change;
 use crate::rows::samples::{SampleTable, ordered_union, read_sample};
+use crate::statements::sample_counts::subtract;
 
 impl Database {
     pub(crate) async fn insert_samples(

@@ -6,9 +6,9 @@
 use super::Store;
 use super::errors::failed;
 use crate::domain::{CameraId, CameraKey, Error, Result};
-use crate::entities::all_versions;
 use crate::row_decoder::{RowDecoder, StoredRow};
 use crate::rows::cameras::{CameraVersion, CameraVersions, ChangeMark, read_version};
+use crate::statements::versions::all_versions;
 
 impl Store {
     pub(crate) async fn camera_versions(&self, since: Option<ChangeMark>) -> Result<CameraVersions> {

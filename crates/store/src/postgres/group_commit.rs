@@ -12,7 +12,6 @@ use super::connection::begin_write_statement;
 use super::errors::{Attempts, failed};
 use super::sample_table::{delete_replaced, delete_stored, insert};
 use crate::domain::{AuditAction, Durability, Error, Result, SampleOverflow};
-use crate::entities::{delete_oldest, insert_answer, record};
 use crate::group_commit::{
     Committing, Completion, Counting, Failure, Inserted, Known, SampleBatch, SampleWriter, WriteSession,
     admit, as_count, changed_counts, count, must_roll_back, note, outcomes_before, rows_of,
@@ -20,6 +19,9 @@ use crate::group_commit::{
 use crate::limits::Usage;
 use crate::rows::audit::Change;
 use crate::rows::samples::{Row, SampleTable};
+use crate::statements::audit::record;
+use crate::statements::idempotency::insert_answer;
+use crate::statements::sample_retention::delete_oldest;
 
 /// Stores samples through the pool.
 pub(super) struct GroupWriter {

@@ -6,13 +6,13 @@
 
 mod camera_changes;
 mod camera_contents;
-mod connection;
+pub(crate) mod connection;
 mod connection_owners;
 mod copy;
-mod errors;
+pub(crate) mod errors;
 mod group_commit;
 mod history;
-mod locks;
+pub(crate) mod locks;
 mod nodes;
 mod outbox_logs;
 mod sample_partitions;
@@ -29,12 +29,11 @@ use super::group_commit::GroupCommit;
 use super::limits::{StorageStatus, StoreLimits, Usage};
 use super::location::DatabaseUrl;
 use crate::domain::{Durability, Error, ErrorKind, Result};
-use crate::entities::count_all_samples;
+use crate::statements::sample_counts::count_all_samples;
 
 pub(crate) use connection::{DATABASE_NOW_US, begin_write};
 pub(crate) use errors::failed;
 pub(super) use errors::{Attempts, repeated};
-pub(crate) use locks::{Limit, lock_limit};
 pub(crate) use outbox_logs::lock_log;
 pub(crate) use sample_partitions::start_of_week;
 

@@ -16,8 +16,8 @@ use super::connection::{DATABASE_NOW_US, begin_read, begin_write};
 use super::errors::{failed, repeated};
 use super::history::{self, HistoryMark};
 use crate::domain::{CameraKey, Durability, Error, ErrorKind, Node, NodeId, NodeProfile, Result, SiteKey};
-use crate::entities::keys_version;
 use crate::rows::keys::KeysVersion;
+use crate::statements::versions::keys_version;
 
 /// The registrations and ownerships of the nodes of one database.
 #[derive(Clone)]

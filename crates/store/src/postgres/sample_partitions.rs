@@ -10,9 +10,9 @@ use super::Store;
 use super::errors::failed;
 use super::locks::{Limit, try_lock_limit};
 use crate::domain::{Actor, AuditAction, Error, Result};
-use crate::entities::record;
 use crate::rows::audit::Change;
 use crate::rows::samples::SampleTable;
+use crate::statements::audit::record;
 
 const WEEK_US: i64 = 7 * 86_400 * 1_000_000;
 /// Weeks after the present one that have a partition already.

@@ -7,9 +7,9 @@ use sqlx::{AssertSqlSafe, PgConnection};
 
 use super::errors::failed;
 use crate::domain::{Result, Score, SigmaM, StoredSample, TargetClass};
-use crate::entities::subtract;
 use crate::geo::Position;
 use crate::rows::samples::{Row, SampleTable, key};
+use crate::statements::sample_counts::subtract;
 
 const INSERT_WITH_FIX: &str = "INSERT INTO samples (camera_key, time_us, target_id, left_px, top_px, width_px, height_px, class, score, \
      truth_longitude_deg, truth_latitude_deg, longitude_deg, latitude_deg, sigma_m) \

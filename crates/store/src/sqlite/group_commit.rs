@@ -12,13 +12,15 @@ use super::sample_table::{Insert, delete_replaced, delete_stored, statements};
 use super::space::Space;
 use super::writer::{Growth, Writer, WriterGuard};
 use crate::domain::{AuditAction, Durability, Error, Result, SampleOverflow};
-use crate::entities::{delete_oldest, insert_answer, record};
 use crate::group_commit::{
     Committing, Completion, Counting, Failure, Inserted, Known, SampleBatch, SampleWriter, WriteSession,
     admit, as_count, changed_counts, count, must_roll_back, note, outcomes_before, rows_of,
 };
 use crate::rows::audit::Change;
 use crate::rows::samples::{Row, SampleTable};
+use crate::statements::audit::record;
+use crate::statements::idempotency::insert_answer;
+use crate::statements::sample_retention::delete_oldest;
 
 /// Stores samples through the one writing connection.
 pub(super) struct GroupWriter {

@@ -8,7 +8,7 @@ mod backup;
 mod backup_digest;
 mod connection;
 mod copy;
-mod errors;
+pub(crate) mod errors;
 mod file_check;
 mod folder;
 mod group_commit;

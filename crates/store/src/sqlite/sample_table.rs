@@ -9,9 +9,9 @@ use sqlx::{Arguments, AssertSqlSafe, SqliteConnection};
 
 use super::errors::failed;
 use crate::domain::{Error, Result, Score, SigmaM, StoredSample, TargetClass};
-use crate::entities::subtract;
 use crate::geo::Position;
 use crate::rows::samples::{Row, SampleTable, key};
+use crate::statements::sample_counts::subtract;
 
 /// Columns bound per row.
 const fn width(table: SampleTable) -> usize {

@@ -10,8 +10,8 @@ use super::errors::failed;
 use super::reserve::Reserve;
 use super::writer::{Growth, WriterGuard};
 use crate::domain::{Durability, Error, Result};
-use crate::entities::count_all_samples;
 use crate::limits::{StorageStatus, StoreLimits, Usage};
+use crate::statements::sample_counts::count_all_samples;
 
 /// SQLite's own; the files of this store have never had another.
 pub(super) const PAGE_BYTES: u64 = 4_096;

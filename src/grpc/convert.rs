@@ -72,6 +72,19 @@ impl From<geo::PlaneCovariance> for proto::PlaneCovariance {
     }
 }
 
+impl From<domain::Motion> for proto::Motion {
+    fn from(motion: domain::Motion) -> Self {
+        let interval = |[low, high]: [f64; 2]| proto::Interval { low, high };
+        Self {
+            speed_mps: motion.speed_mps,
+            speed_interval_mps: Some(interval(motion.speed_interval_mps)),
+            course_deg: motion.course.map(|course| course.deg),
+            course_interval_deg: motion.course.map(|course| interval(course.interval_deg)),
+            stationary_probability: motion.stationary_probability,
+        }
+    }
+}
+
 /// What becomes of samples that are stored already.
 pub(super) fn on_conflict(on_conflict: i32) -> Result<domain::OnConflict> {
     match proto::OnConflict::try_from(on_conflict) {

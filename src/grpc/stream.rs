@@ -351,7 +351,7 @@ impl From<&TrackPoint> for proto::TrackPoint {
             velocity_north_m_s: state.velocity.north_m_s,
             r95_m: state.r95_m,
             covariance: Some(state.normal_covariance().into()),
-            still: state.stationary_probability,
+            motion: Some(state.motion().into()),
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
             restarted: state.reinitialized,

@@ -129,8 +129,9 @@ impl From<&WorldTrackPoint> for proto::WorldTrackPoint {
             time: Some(timestamp(point.time)),
             started_at: Some(timestamp(point.started_at)),
             position: Some(point.position.into()),
-            velocity_east_m_s: point.velocity_east_m_s,
-            velocity_north_m_s: point.velocity_north_m_s,
+            velocity_east_m_s: point.velocity.east_m_s,
+            velocity_north_m_s: point.velocity.north_m_s,
+            motion: Some(point.motion.into()),
             covariance: Some(point.covariance_m2.into()),
             r95_m: point.r95_m(),
             sightings: point

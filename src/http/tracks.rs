@@ -126,12 +126,12 @@ struct TrackState {
     velocity_east_m_s: f64,
     /// Velocity towards north, m/s.
     velocity_north_m_s: f64,
+    #[serde(flatten)]
+    motion: wire::Motion,
     /// Radius about the position that holds the true one with 95 % probability, m.
     r95_m: f64,
     /// Covariance of the normal distribution about the position that has this radius: its 95 % ellipse.
     covariance: wire::PlaneCovariance,
-    /// Probability that the target is stationary, 0 to 1.
-    still: f64,
     /// Normalised innovation squared of what was used; 2 on average for each of box and fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     nis: Option<f64>,
@@ -152,9 +152,9 @@ impl From<&TrackPoint> for TrackState {
             time: state.time,
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
+            motion: state.motion().into(),
             r95_m: state.r95_m,
             covariance: state.normal_covariance().into(),
-            still: state.stationary_probability,
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
             restarted: state.reinitialized,

@@ -25,7 +25,7 @@ use super::tracks::{KEEP_ALIVE, PointGeometry, event_of};
 use super::wire::json;
 use crate::app::{LostSiteEvents, SiteEventKind, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{Error, LiveId, Result, TargetId};
-use crate::exchange::wire::{PlaneCovariance, Position};
+use crate::exchange::wire::{Motion, PlaneCovariance, Position};
 
 /// Header and query parameter that name the event to continue after.
 const LAST_EVENT_HEADER: &str = "last-event-id";
@@ -72,6 +72,8 @@ struct WorldTrackState {
     velocity_east_m_s: f64,
     /// Velocity towards north, m/s.
     velocity_north_m_s: f64,
+    #[serde(flatten)]
+    motion: Motion,
     /// Covariance of the position's error.
     covariance: PlaneCovariance,
     /// Radius about the position that holds the true one with 95 % probability, m.
@@ -87,8 +89,9 @@ impl From<&WorldTrackPoint> for WorldTrackState {
             target_id: point.target_id.as_ref().map(TargetId::to_string),
             time: point.time,
             started_at: point.started_at,
-            velocity_east_m_s: point.velocity_east_m_s,
-            velocity_north_m_s: point.velocity_north_m_s,
+            velocity_east_m_s: point.velocity.east_m_s,
+            velocity_north_m_s: point.velocity.north_m_s,
+            motion: point.motion.into(),
             covariance: point.covariance_m2.into(),
             r95_m: point.r95_m(),
             sightings: point

@@ -416,6 +416,50 @@ async fn evaluations_are_the_same_and_refused_alike() {
     );
 }
 
+/// The course is in both or in neither.
+pub fn same_motion(rest: &Value, grpc: Option<&proto::Motion>) {
+    let grpc = grpc.expect("a motion");
+    let interval = |name: &str| Some([rest[name][0].as_f64()?, rest[name][1].as_f64()?]);
+    let bounds = |interval: proto::Interval| [interval.low, interval.high];
+    assert_eq!(rest["speed_mps"].as_f64(), Some(grpc.speed_mps));
+    assert_eq!(interval("speed_interval_mps"), grpc.speed_interval_mps.map(bounds));
+    assert_eq!(rest["course_deg"].as_f64(), grpc.course_deg);
+    assert_eq!(interval("course_interval_deg"), grpc.course_interval_deg.map(bounds));
+    assert_eq!(rest["stationary_probability"].as_f64(), Some(grpc.stationary_probability));
+}
+
+/// A receiver that goes north at 20 m/s, then stands.
+#[tokio::test]
+async fn speed_and_course_are_the_same_and_those_of_the_target() {
+    let both = Both::start(&[]).await;
+    let latest = |seconds: std::ops::Range<u32>| {
+        let both = &both;
+        async move {
+            for second in seconds {
+                let north_m = 20.0 * f64::from(second.min(40));
+                let fix = json!({"longitude_deg": 103.9, "latitude_deg": 30.6 + north_m / 110_850.0, "sigma_m": 1.0});
+                let time = format!("2026-01-01T00:{:02}:{:02}Z", second / 60, second % 60);
+                let observations = json!({"observations": [{"time": time, "target_id": "a", "fix": fix}]});
+                both.server.post("/v1/cameras/c/tracks", &observations).await.expect(200);
+            }
+            let rest = both.server.get("/v1/cameras/c/tracks").await.expect(200).json();
+            let request = proto::ListTracksRequest { camera_id: "c".to_owned() };
+            let listed = TrackServiceClient::new(both.channel.clone()).list_tracks(request).await;
+            let motion = listed.expect("tracks").into_inner().tracks[0].motion.expect("a motion");
+            same_motion(&rest["features"][0]["properties"], Some(&motion));
+            motion
+        }
+    };
+    let moving = latest(0..40).await;
+    let speed = moving.speed_interval_mps.expect("an interval");
+    assert!(speed.low < 20.0 && 20.0 < speed.high && speed.high - speed.low < 4.0, "{moving:?}");
+    let course_deg = moving.course_deg.expect("it moves");
+    assert!(course_deg.min(360.0 - course_deg) < 2.0 && moving.stationary_probability < 0.01, "{moving:?}");
+    let standing = latest(40..100).await;
+    assert_eq!(standing.speed_interval_mps.expect("an interval").low, 0.0);
+    assert!(standing.course_deg.is_none() && standing.stationary_probability > 0.9, "{standing:?}");
+}
+
 #[tokio::test]
 async fn tracks_and_events_are_the_same() {
     let both = Both::start(&[]).await;
@@ -437,6 +481,7 @@ async fn tracks_and_events_are_the_same() {
         assert_eq!(number("r95_m"), Some(grpc.r95_m));
         assert_eq!(number("velocity_north_m_s"), Some(grpc.velocity_north_m_s));
         assert_eq!(rest["properties"]["target_id"], grpc.target_id);
+        same_motion(&rest["properties"], grpc.motion.as_ref());
     };
     let rest = both.server.get("/v1/cameras/c/tracks").await.expect(200).json();
     let request = proto::ListTracksRequest { camera_id: "c".to_owned() };

@@ -1,9 +1,16 @@
 // Numbers, lengths and times for people.
 import { i18n, t } from './i18n.svelte';
+import type { Motion } from './types';
 
 export function number(value: number | undefined | null, digits = 0): string {
   if (value === undefined || value === null || !Number.isFinite(value)) return '–';
   return value.toLocaleString(i18n.locale, { minimumFractionDigits: digits, maximumFractionDigits: digits });
+}
+
+/** A speed with half the width of its 95 % interval. */
+export function speed({ speed_mps, speed_interval_mps: [low, high], stationary_probability }: Motion): string {
+  if (stationary_probability > 0.5) return t('live.still');
+  return `${number(speed_mps, 1)} ± ${number((high - low) / 2, 1)} m/s`;
 }
 
 export function metres(value: number | undefined | null): string {

@@ -237,16 +237,23 @@ export interface FusedFix {
   model_version?: number;
   flags: string[];
 }
+/** Speed and course; intervals of 95 %. */
+export interface Motion {
+  speed_mps: number;
+  speed_interval_mps: [number, number];
+  course_deg?: number;
+  course_interval_deg?: [number, number];
+  stationary_probability: number;
+}
 export interface TrackFeature {
   geometry: { coordinates: [number, number] };
-  properties: {
+  properties: Motion & {
     target_id: string;
     time: string;
     velocity_east_m_s: number;
     velocity_north_m_s: number;
     r95_m: number;
     covariance: Covariance;
-    still: number;
     nis?: number;
     rejections: { source: string; reason: string; nis?: number }[];
     restarted: boolean;
@@ -393,7 +400,7 @@ export interface Site {
   cameras: number;
 }
 /** A target of a site, over all of its cameras. */
-export interface WorldTrack {
+export interface WorldTrack extends Motion {
   id: string;
   /** Once a receiver is known. */
   target_id?: string;

@@ -26,6 +26,8 @@ pub const GROSS_SIGMAS: f64 = 7.0;
 /// axis: `sqrt(-2 ln 0.05)`.
 pub const R95_PER_SIGMA: f64 = 2.447_746_830_680_816;
 
+/// Half the width of the interval that holds 95 % of a normal distribution, in standard deviations.
+pub const NORMAL_95: f64 = 1.959_964;
 /// Quantiles of chi-square with 2 degrees of freedom: 95 %, -2 ln(0.05), and 99.9 %.
 pub const CHI_SQUARE_95: f64 = 5.991;
 /// See [`CHI_SQUARE_95`].

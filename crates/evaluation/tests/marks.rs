@@ -9,14 +9,14 @@ use std::ops::{ControlFlow, Range};
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use sightfix_domain::domain::{
-    BoundingBox, Fix, Flag, GnssError, ImageSize, Observation, Recipe, SigmaM, TargetId,
+    BoundingBox, Fix, Flag, GnssError, ImageSize, Motion, Observation, Recipe, SigmaM, TargetId,
 };
 use sightfix_domain::geo::{EastNorth, LocalPlane, Position, distance_m};
 use sightfix_fusion::target_track::TargetTrack;
 use sightfix_fusion::track::TrackSettings;
 use sightfix_fusion::two_step::fuse_observed;
 use sightfix_model::{FitOptions, R95_PER_SIGMA, Regressor, fit};
-use sightfix_simulation::{Options, Scene, SimulatedRow, World, simulate_split};
+use sightfix_simulation::{Options, Route, Scene, SimulatedRow, World, simulate_split};
 
 /// Worlds on which nothing was chosen.
 const WORLDS: Range<u64> = 201..209;
@@ -245,6 +245,124 @@ fn boxes_that_are_wrong() {
         for case in ["none", "frozen", "25 % false", "all false"] {
             let (fused, tracked) = &cases[case];
             assert!(fused.inside() >= 0.85 && tracked.inside() >= 0.85, "{scene:?}, {case}");
+        }
+    }
+}
+
+/// Speeds with their stated intervals, beside differences of two-step positions.
+#[derive(Default)]
+struct Speeds {
+    /// Relative errors.
+    tracked: Vec<f64>,
+    differences: Vec<f64>,
+    /// Half of the intervals' widths, relative to the true speeds.
+    half_widths: Vec<f64>,
+    speeds_inside: usize,
+    courses_inside: usize,
+    courses: usize,
+    positions: Errors,
+}
+
+impl Speeds {
+    fn add(&mut self, motion: Motion, difference_m_s: f64, true_speed_m_s: f64, true_course_deg: f64) {
+        let [low_mps, high_mps] = motion.speed_interval_mps;
+        let of_truth = |speed_m_s: f64| (speed_m_s - true_speed_m_s).abs() / true_speed_m_s;
+        self.tracked.push(of_truth(motion.speed_mps));
+        self.differences.push(of_truth(difference_m_s));
+        self.half_widths.push(0.5 * (high_mps - low_mps) / true_speed_m_s);
+        self.speeds_inside += usize::from((low_mps..=high_mps).contains(&true_speed_m_s));
+        if let Some(course) = motion.course {
+            let [from_deg, to_deg] = course.interval_deg;
+            let after = |deg: f64| (deg - from_deg).rem_euclid(360.0);
+            self.courses += 1;
+            self.courses_inside += usize::from(after(true_course_deg) <= after(to_deg));
+        }
+    }
+
+    fn coverage(&self) -> f64 {
+        self.speeds_inside as f64 / self.tracked.len() as f64
+    }
+
+    fn text(&mut self) -> String {
+        let (coverage, courses) = (self.coverage(), self.courses_inside as f64 / self.courses as f64);
+        let [tracked, differences, half_width] =
+            [&mut self.tracked, &mut self.differences, &mut self.half_widths].map(median);
+        format!(
+            "{:.1} %, differences {:.1} %; +- {:.1} %, {coverage:.3} inside; course {courses:.3} inside; position {}",
+            100.0 * tracked,
+            100.0 * differences,
+            100.0 * half_width,
+            self.positions.text(),
+        )
+    }
+}
+
+fn median(values: &mut Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// The true speed, m/s, and course, degrees, at the middle of three rows, each a second after the one before.
+fn true_motion(rows: [&SimulatedRow; 3]) -> Option<(f64, f64)> {
+    let [before, _, after] = rows;
+    let seconds = after.time.duration_since(before.time).as_secs_f64();
+    let moved = LocalPlane::new(before.truth).to_plane(after.truth);
+    let speed_m_s = moved.east_m.hypot(moved.north_m) / seconds;
+    (seconds <= 2.0 && speed_m_s > 0.1).then(|| (speed_m_s, moved.east_m.atan2(moved.north_m).to_degrees()))
+}
+
+/// Adds the speeds of a world's rows after its target was tracked over a distance.
+fn add_speeds(world: &World, camera: &Camera, after_m: f64, speeds: &mut Speeds) {
+    let mut track = TargetTrack::default();
+    let (mut tracked_m, mut previous): (f64, Option<Position>) = (0.0, None);
+    let rows: Vec<_> = complete(world).collect();
+    for three in rows.windows(3) {
+        let [(before, ..), (row, bounding_box, fix), (after, ..)] = three else { continue };
+        let observation = Observation::new(row.time, None, Some(*bounding_box), Some(*fix)).expect("a box");
+        let observed = track.observe(&observation, Some(&camera.model), Some(camera.image_size), None);
+        let model = Some((&camera.model, 1));
+        let fused = fuse_observed(&observation, &observed, model, Some(camera.image_size)).expect("a model");
+        let state = track.update(&observed, || TrackSettings::from_model(&camera.model));
+        let step_s = row.time.duration_since(before.time).as_secs_f64();
+        let last = previous.replace(fused.fused).filter(|_| step_s <= 1.0);
+        tracked_m = if last.is_some() { tracked_m + distance_m(before.truth, row.truth) } else { 0.0 };
+        if let (Some(last), Some(state), Some((speed_m_s, course_deg))) =
+            (last, state, true_motion([before, row, after]))
+            && tracked_m >= after_m
+        {
+            speeds.positions.add(state.position, row, state.state.r95_m);
+            speeds.add(state.state.motion(), distance_m(last, fused.fused) / step_s, speed_m_s, course_deg);
+        }
+    }
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn speeds_of_walkers_and_vehicles() {
+    for (scene, after_m, speeds_m_s) in
+        [(Scene::Square, 5.0, &[1.0, 1.5, 2.0][..]), (Scene::Airport, 30.0, &[5.0, 10.0, 20.0, 40.0])]
+    {
+        let motions = speeds_m_s.iter().flat_map(|speed_m_s| [0.01, 0.05].map(|unrest| (*speed_m_s, unrest)));
+        let mut cases: Vec<_> = motions.map(|motion| (motion, Speeds::default())).collect();
+        for seed in WORLDS {
+            let area = Options { route: Route::Area, ..Options::new(scene) };
+            let options = Options { seed, camera_seed: seed, samples: 1_500, ..area };
+            let (training, _) = simulate_split(&options, 1);
+            let camera = Camera::trained(&training, Some(options.gnss_sigma_m));
+            for ((speed_m_s, speed_unrest), speeds) in &mut cases {
+                let moving = Options {
+                    mean_speed_m_s: Some(*speed_m_s),
+                    speed_unrest: *speed_unrest,
+                    ..options.clone()
+                };
+                let (_, test) = simulate_split(&moving, 600);
+                add_speeds(&test, &camera, after_m, speeds);
+            }
+        }
+        for ((speed_m_s, unrest), speeds) in &mut cases {
+            println!("{scene:?}, {speed_m_s} m/s +- {:.0} %: {}", 100.0 * *unrest, speeds.text());
+            assert!(speeds.coverage() >= 0.85, "{scene:?}, {speed_m_s} m/s");
+            assert!(scene == Scene::Square || median(&mut speeds.tracked) <= 0.05, "{speed_m_s} m/s");
         }
     }
 }

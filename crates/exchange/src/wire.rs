@@ -138,6 +138,37 @@ impl From<geo::PlaneCovariance> for PlaneCovariance {
     }
 }
 
+/// Speed and course of a target.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, ToSchema)]
+pub struct Motion {
+    /// Speed, m/s.
+    pub speed_mps: f64,
+    /// Bounds that hold the true speed with 95 % probability, m/s.
+    pub speed_interval_mps: [f64; 2],
+    /// Course over ground, clockwise from north, 0 to 360. Missing where the speed's interval holds 0, or the course may
+    /// be any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub course_deg: Option<f64>,
+    /// Bounds that hold the true course with 95 % probability, clockwise from the first to the second: `[350, 10]`
+    /// is 20 degrees wide. Missing with the course.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub course_interval_deg: Option<[f64; 2]>,
+    /// Probability that the target is stationary, 0 to 1.
+    pub stationary_probability: f64,
+}
+
+impl From<domain::Motion> for Motion {
+    fn from(motion: domain::Motion) -> Self {
+        Self {
+            speed_mps: motion.speed_mps,
+            speed_interval_mps: motion.speed_interval_mps,
+            course_deg: motion.course.map(|course| course.deg),
+            course_interval_deg: motion.course.map(|course| course.interval_deg),
+            stationary_probability: motion.stationary_probability,
+        }
+    }
+}
+
 /// A box around a target, in pixels from the image's upper left corner.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]

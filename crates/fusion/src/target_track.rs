@@ -8,17 +8,19 @@ use std::collections::VecDeque;
 
 use jiff::Timestamp;
 
-use super::observed::ObservedPositions;
+use super::observed::{ObservedBox, ObservedPositions};
 use super::track::{
     MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason, Track, TrackSettings,
     TrackState,
 };
 use crate::domain::{BoundingBox, ImageSize, Observation};
-use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::geo::{EastNorth, LocalPlane, PlaneCovariance, Position};
 use crate::model::{RecentBoxes, Regression, Regressor};
 
 /// Latest fixes of a target without a model that decide by majority where its plane belongs.
 const RECENT_FIXES: usize = 5;
+/// Distance over which the map's error is compared, m: well above the noise of boxes, and within what a speed is of.
+const STRAIN_LENGTH_M: f64 = 4.0;
 /// Measurements in a row from before the track's time to live, after which the track restarts at theirs:
 /// one instant far ahead, or a recording that is played again, must not reject all that follows.
 const REWIND_AFTER: u32 = 3;
@@ -34,6 +36,7 @@ pub struct TargetTrack {
     recent_boxes: RecentBoxes,
     same_box: Repetition<BoundingBox>,
     same_fix: Repetition<Position>,
+    map_strain: MapStrain,
 }
 
 /// For how long a target's measurements have been the same to the last digit.
@@ -52,6 +55,35 @@ impl<T: Copy + PartialEq> Repetition<T> {
         let since = self.0.filter(|(latest, _)| *latest == value).map_or(time, |(_, since)| since);
         self.0 = Some((value, since));
         time.duration_since(since).as_secs_f64().max(0.0)
+    }
+}
+
+/// The error of the map in a distance, where the target went lately.
+#[derive(Debug, Clone, Copy, Default)]
+struct MapStrain {
+    /// Per squared metre travelled, without a unit: the variance of the map's scale along the way and of its rotation
+    /// across. 0 before the target has moved.
+    covariance: PlaneCovariance,
+    /// The box that the next one is compared with, and its position.
+    since: Option<(BoundingBox, EastNorth)>,
+}
+
+impl MapStrain {
+    /// Takes in a box whose stated error rests on training.
+    fn observe(&mut self, bounding_box: BoundingBox, seen: &ObservedBox, regressor: &Regressor) {
+        if !seen.is_usable || seen.is_unusual || seen.is_foot_hidden {
+            return;
+        }
+        let position = seen.independent.regressed;
+        let (from, start) = *self.since.get_or_insert((bounding_box, position));
+        let distance_m = start.distance_m(position);
+        if distance_m < STRAIN_LENGTH_M {
+            return;
+        }
+        self.since = Some((bounding_box, position));
+        if let Some(covariance) = regressor.displacement_covariance([&from, &bounding_box]) {
+            self.covariance = covariance.scaled(seen.independent.normal_scale() / distance_m.powi(2));
+        }
     }
 }
 
@@ -86,6 +118,7 @@ impl TargetTrack {
             (&mut observed.regressed, observation.bounding_box(), regressor)
         {
             seen.repeated_for(self.same_box.lasting_s(bounding_box, observed.time), regressor);
+            self.map_strain.observe(bounding_box, seen, regressor);
         }
         if let Some(fix) = &mut observed.fix {
             fix.repeated_s = self.same_fix.lasting_s(fix.position, observed.time);
@@ -119,7 +152,7 @@ impl TargetTrack {
             }
         };
         state.rejected.extend(rejected);
-        Some(TrackEstimate { position: plane.to_position(state.position), state })
+        Some(self.estimate(&plane, state))
     }
 
     /// The state at an instant, predicted beyond the latest measurement; `None` before the first one and
@@ -128,8 +161,15 @@ impl TargetTrack {
     pub fn at(&self, time: Timestamp) -> Option<TrackEstimate> {
         let ActiveTrack { plane, track } =
             self.active.as_ref().filter(|active| !active.track.is_expired(time))?;
-        let state = track.state_at(time);
-        Some(TrackEstimate { position: plane.to_position(state.position), state })
+        Some(self.estimate(plane, track.state_at(time)))
+    }
+
+    /// With the map's scale in the velocity's error: the filter takes the map's errors for independent over some metres.
+    fn estimate(&self, plane: &LocalPlane, mut state: TrackState) -> TrackEstimate {
+        let squared_m2_s2 = state.velocity.speed_m_s().powi(2);
+        let by_map = self.map_strain.covariance.scaled(squared_m2_s2);
+        state.velocity_covariance = state.velocity_covariance.plus(by_map);
+        TrackEstimate { position: plane.to_position(state.position), state }
     }
 
     /// The instant measured last.
@@ -153,6 +193,7 @@ impl TargetTrack {
             self.recent_boxes = RecentBoxes::default();
             self.same_box = Repetition::default();
             self.same_fix = Repetition::default();
+            self.map_strain = MapStrain::default();
         }
     }
 
@@ -266,10 +307,14 @@ fn withdraw_contradicting(
 
 #[cfg(test)]
 mod tests {
+    use std::ops::ControlFlow;
+
     use jiff::SignedDuration;
 
     use super::*;
-    use crate::domain::Fix;
+    use crate::domain::{Fix, GnssError, Recipe};
+    use crate::model::{FitOptions, fit};
+    use crate::simulation::{Options, simulate};
 
     fn fix_at(seconds: i64, longitude_deg: f64, latitude_deg: f64) -> Observation {
         let position = Position::new(longitude_deg, latitude_deg).expect("valid");
@@ -323,5 +368,39 @@ mod tests {
             })
             .collect();
         assert_eq!(accepted, [false, false, true, true, true]);
+    }
+
+    #[test]
+    fn the_error_of_the_map_s_scale_is_in_that_of_the_velocity() {
+        let world = simulate(&Options { samples: 400, ..Options::demo() });
+        let options = FitOptions {
+            recipe: Recipe::GaussianProcess,
+            seed: 1,
+            epochs: None,
+            image_size: Some(world.image_size),
+            gnss_error: GnssError::Unknown,
+            gnss_bias_sigma_m: None,
+        };
+        let fitted = fit(&world.training_samples(), &options, &mut |_| ControlFlow::Continue(()));
+        let model = fitted.expect("usable samples").load().expect("a model");
+        let mut track = TargetTrack::default();
+        let mut strained = 0;
+        for observation in world.rows.iter().filter(|row| row.target == 0).filter_map(|row| row.observation())
+        {
+            let observed = track.observe(&observation, Some(&model), Some(world.image_size), None);
+            let stated =
+                track.update(&observed, || TrackSettings::from_model(&model)).expect("a position").state;
+            let filtered = track.active.as_ref().expect("active").track.state_at(stated.time);
+            let by_map =
+                stated.velocity_covariance.per_axis_m2() - filtered.velocity_covariance.per_axis_m2();
+            let scale_sigma = track.map_strain.covariance.per_axis_m2().sqrt();
+            let speed_m_s = stated.velocity.speed_m_s();
+            assert!(
+                (by_map.max(0.0).sqrt() - scale_sigma * speed_m_s).abs() < 1e-6,
+                "{by_map} {scale_sigma}"
+            );
+            strained += usize::from(scale_sigma > 0.005 && scale_sigma < 0.5);
+        }
+        assert!(strained > 50, "{strained}");
     }
 }

@@ -291,6 +291,17 @@ impl Regressor {
         self.regress_with(bounding_box, fix, Some(recent))
     }
 
+    /// Covariance of the error that the map makes in the distance between the positions of two boxes, m2: a map that is
+    /// stretched makes every speed wrong by the same share. `None` where the recipe does not state how its errors at two
+    /// places are correlated; only `gaussian_process` does.
+    #[must_use]
+    pub fn displacement_covariance(&self, boxes: [&BoundingBox; 2]) -> Option<PlaneCovariance> {
+        match &self.encoder {
+            Encoder::GaussianProcess(map) => Some(map.displacement_covariance(boxes)),
+            Encoder::Paper(_) | Encoder::Hybrid(_) | Encoder::Projective(_) => None,
+        }
+    }
+
     /// Whether something hides the lower part of a box, as far as the model knows how tall its targets are: only one of
     /// the recipe `gaussian_process` does.
     #[must_use]

@@ -36,6 +36,10 @@ pub struct Options {
     pub route: Route,
     /// Offset of [`Route::NewLine`] to the left of the lines, m; `None` for that of the scene.
     pub new_line_offset_m: Option<f64>,
+    /// Mean speed of the targets, m/s; `None` for that of the scene.
+    pub mean_speed_m_s: Option<f64>,
+    /// Standard deviation of a target's speed from one second to the next, relative to its mean.
+    pub speed_unrest: f64,
     /// Number of targets, each with its own receiver and size; their rows are interleaved by time.
     pub targets: usize,
     /// Number of sessions into which the rows are divided, each a day after the previous one, with other
@@ -86,6 +90,8 @@ impl Options {
             samples: 10_000,
             route: Route::Lines,
             new_line_offset_m: None,
+            mean_speed_m_s: None,
+            speed_unrest: 0.05,
             targets: 1,
             sessions: 1,
             target_shape: None,

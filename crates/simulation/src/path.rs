@@ -26,6 +26,8 @@ pub(super) struct MotionProfile {
     pub(super) speed_m_s: f64,
     /// Standard deviation of a traverse's speed.
     pub(super) speed_sigma_m_s: f64,
+    /// Standard deviation of the speed from one second to the next, relative to the traverse's speed.
+    pub(super) speed_unrest: f64,
     /// Standard deviation of the lateral distance to the path, m.
     pub(super) lateral_deviation_m: f64,
     /// Longest halt in a traverse, s; 0 for none.
@@ -90,7 +92,7 @@ impl Polyline {
             if halting {
                 remaining_halt_s -= 1.0;
             } else {
-                along_m += speed_m_s * (1.0 + 0.05 * standard_normal(random)).max(0.2);
+                along_m += speed_m_s * (1.0 + motion.speed_unrest * standard_normal(random)).max(0.2);
             }
         }
         poses
@@ -149,6 +151,7 @@ mod tests {
         let motion = MotionProfile {
             speed_m_s: 1.2,
             speed_sigma_m_s: 0.0,
+            speed_unrest: 0.05,
             lateral_deviation_m: 0.0,
             halt_s: 40.0,
             both_ways: true,

@@ -100,6 +100,7 @@ impl Scene {
             Self::Airport => MotionProfile {
                 speed_m_s: 9.0,
                 speed_sigma_m_s: 1.5,
+                speed_unrest: 0.05,
                 lateral_deviation_m: 1.0,
                 halt_s: 0.0,
                 both_ways: false,
@@ -107,6 +108,7 @@ impl Scene {
             Self::Square => MotionProfile {
                 speed_m_s: 1.25,
                 speed_sigma_m_s: 0.12,
+                speed_unrest: 0.05,
                 lateral_deviation_m: 0.3,
                 halt_s: 40.0,
                 both_ways: true,

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use super::camera::PinholeCamera;
 use super::noise::{Episodes, SimulatedReceiver, standard_normal, stream};
 use super::options::{Options, Route};
-use super::path::{Polyline, Pose};
+use super::path::{MotionProfile, Polyline, Pose};
 use super::row::SimulatedRow;
 use super::shape::TargetShape;
 use crate::domain::{BoundingBox, Fix, TargetClass, TargetId};
@@ -108,6 +108,8 @@ impl<'a> SimulatedTarget<'a> {
         }
         let scene = self.options.scene;
         let motion = scene.motion();
+        let speed_m_s = self.options.mean_speed_m_s.unwrap_or(motion.speed_m_s);
+        let motion = MotionProfile { speed_m_s, speed_unrest: self.options.speed_unrest, ..motion };
         if self.options.route == Route::Area {
             let path = scene.area_path(self.camera.pan_deg, &mut self.area);
             return path.traverse(&motion, false, &mut self.motion);

@@ -13,6 +13,7 @@ use sightfix::grpc::proto::watch_tracks_response::Event;
 use super::two_cameras::{CAMERAS, Crossing, Noise, box_json, create, plane};
 use crate::harness::{TestServer, data_folder};
 use crate::live_client::channel;
+use crate::parity::same_motion;
 
 /// An event stream of a site.
 pub(super) struct Events {
@@ -181,6 +182,7 @@ async fn resumes_alike(server: &TestServer, events: &[SiteEvent]) {
             Event::Track(point) => {
                 assert_eq!(expected.data["properties"]["id"], point.id);
                 assert_eq!(expected.data["properties"]["r95_m"], point.r95_m);
+                same_motion(&expected.data["properties"], point.motion.as_ref());
                 "track"
             }
             Event::Started(_) => "track_started",

@@ -21,6 +21,7 @@ mod job;
 mod live_id;
 mod method;
 mod model_format;
+mod motion;
 mod names;
 mod node;
 mod noise;
@@ -57,6 +58,7 @@ pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
 pub use model_format::ModelFormat;
+pub use motion::{Course, Motion, Velocity};
 pub use names::{
     CameraId, ConnectionId, MAX_LABELS, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels,
     check_text,

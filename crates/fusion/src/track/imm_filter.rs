@@ -15,7 +15,8 @@ use super::mode_filter::{
     Transition, VELOCITY, mix,
 };
 use super::settings::{MotionModel, TrackSettings};
-use super::state::{TrackState, Velocity};
+use super::state::TrackState;
+use crate::domain::Velocity;
 use crate::geo::EastNorth;
 use crate::geo::PlaneCovariance;
 
@@ -412,31 +413,14 @@ impl ImmFilter {
 
     /// The moment-matched estimate over the modes, without anything about the latest measurement.
     pub(super) fn track_state(&self) -> TrackState {
-        let mut mean = [0.0; 4];
-        for (mode, probability) in self.modes.iter().zip(self.mode_probabilities) {
-            for (value, component) in mean.iter_mut().zip(mode.mean.iter()) {
-                *value += probability * component;
-            }
-        }
-        let (mut covariance, mut lasting) = (PlaneCovariance::default(), PlaneCovariance::default());
-        for (mode, probability) in self.modes.iter().zip(self.mode_probabilities) {
-            let deviation =
-                PlaneCovariance::outer(mode.mean[POSITION] - mean[0], mode.mean[POSITION + 1] - mean[1]);
-            let stated =
-                mode.position_covariance().plus(mode.camera_share().scaled(self.camera.stated_scale - 1.0));
-            lasting = lasting.plus(mode.lasting_error().scaled(probability));
-            covariance = covariance.plus(stated.plus(deviation).scaled(probability));
-        }
-        let [stated_m2, lasting_m2] = [covariance, lasting].map(|it| it.east_m2 + it.north_m2);
-        // No average over boxes is stated to be better than a box, for a model's errors at two places may be one.
-        if lasting_m2 > stated_m2 {
-            covariance = covariance.plus(lasting.scaled(1.0 - stated_m2 / lasting_m2));
-        }
+        let ([east_m, north_m], covariance) = self.moments(POSITION);
+        let ([east_m_s, north_m_s], velocity_covariance) = self.moments(VELOCITY);
         TrackState {
             time: self.time,
-            position: EastNorth { east_m: mean[0], north_m: mean[1] },
-            velocity: Velocity { east_m_s: mean[2], north_m_s: mean[3] },
+            position: EastNorth { east_m, north_m },
+            velocity: Velocity { east_m_s, north_m_s },
             covariance,
+            velocity_covariance,
             r95_m: self.agreement.radius_m(covariance.r95_m()),
             stationary_probability: self.mode_probabilities[STATIONARY],
             nis: None,
@@ -445,6 +429,27 @@ impl ImmFilter {
             reinitialized: false,
             sources_disagree: self.agreement.verdict().disagrees,
         }
+    }
+
+    /// Mean and stated covariance of a pair of components, position or velocity, over the modes.
+    fn moments(&self, pair: usize) -> ([f64; 2], PlaneCovariance) {
+        let modes = || self.modes.iter().zip(self.mode_probabilities);
+        let mean = [pair, pair + 1]
+            .map(|state| modes().map(|(mode, probability)| probability * mode.mean[state]).sum::<f64>());
+        let (mut covariance, mut lasting) = (PlaneCovariance::default(), PlaneCovariance::default());
+        for (mode, probability) in modes() {
+            let deviation = PlaneCovariance::outer(mode.mean[pair] - mean[0], mode.mean[pair + 1] - mean[1]);
+            let by_camera = mode.camera_share(pair).scaled(self.camera.stated_scale - 1.0);
+            let stated = mode.covariance_of(pair).plus(by_camera);
+            lasting = lasting.plus(mode.lasting_error(pair).scaled(probability));
+            covariance = covariance.plus(stated.plus(deviation).scaled(probability));
+        }
+        let [stated, shared] = [covariance, lasting].map(|it| it.east_m2 + it.north_m2);
+        // No average over boxes is stated to be better than a box, for a model's errors at two places may be one.
+        if shared > stated {
+            covariance = covariance.plus(lasting.scaled(1.0 - stated / shared));
+        }
+        (mean, covariance)
     }
 }
 

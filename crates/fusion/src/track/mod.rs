@@ -26,7 +26,7 @@ use jiff::Timestamp;
 
 pub use measurement::{MeasuredPosition, Measurement, MeasurementSource, Rejection, RejectionReason};
 pub use settings::{MotionModel, RegressionNoise, TrackSettings};
-pub use state::{Innovation, TrackState, Velocity};
+pub use state::{Innovation, TrackState};
 
 use self::gate::GateOutcome;
 use self::imm_filter::ImmFilter;

@@ -347,25 +347,25 @@ impl ModeFilter {
         }
     }
 
-    /// Covariance of the position, m2.
-    pub(super) fn position_covariance(&self) -> PlaneCovariance {
+    /// Covariance of the pair of components that begins at `pair`: of the position in m2, of the velocity in m2/s2.
+    pub(super) fn covariance_of(&self, pair: usize) -> PlaneCovariance {
         PlaneCovariance {
-            east_m2: self.covariance[POSITION][POSITION],
-            north_m2: self.covariance[POSITION + 1][POSITION + 1],
-            east_north_m2: self.covariance[POSITION][POSITION + 1],
+            east_m2: self.covariance[pair][pair],
+            north_m2: self.covariance[pair + 1][pair + 1],
+            east_north_m2: self.covariance[pair][pair + 1],
         }
     }
 
-    /// The part of the position's covariance that the camera's bias causes, m2, `P_pc P_pc'`: the error of an estimate
-    /// that is linear in the measurements has the covariance `P_pc` with a bias of variance 1.
-    pub(super) fn camera_share(&self) -> PlaneCovariance {
-        spanned_by([&self.covariance[CAMERA_BIAS], &self.covariance[CAMERA_BIAS + 1]])
+    /// The part of a pair's covariance that the camera's bias causes, for the position `P_pc P_pc'`: the error of an
+    /// estimate that is linear in the measurements has the covariance `P_pc` with a bias of variance 1.
+    pub(super) fn camera_share(&self, pair: usize) -> PlaneCovariance {
+        spanned_by(pair, [&self.covariance[CAMERA_BIAS], &self.covariance[CAMERA_BIAS + 1]])
     }
 
-    /// Covariance of the position, m2, if all boxes shared one error: `M_p M_p'`.
-    pub(super) fn lasting_error(&self) -> PlaneCovariance {
+    /// Covariance of a pair if all boxes shared one error, for the position `M_p M_p'`.
+    pub(super) fn lasting_error(&self, pair: usize) -> PlaneCovariance {
         let [first, second] = &self.response;
-        spanned_by([first, second])
+        spanned_by(pair, [first, second])
     }
 
     /// Innovation, its covariance `S = H P H' + white` and `P H'`, with `H = [I 0 .. L ..]`.
@@ -463,10 +463,9 @@ const fn rows([east, north, east_north]: [f64; 3]) -> [[f64; 2]; 2] {
     [[east, east_north], [east_north, north]]
 }
 
-/// `A A'` of the positions of two vectors, the columns of A.
-fn spanned_by(vectors: [&Vector; 2]) -> PlaneCovariance {
-    let [first, second] =
-        vectors.map(|vector| PlaneCovariance::outer(vector[POSITION], vector[POSITION + 1]));
+/// `A A'` of one pair of components of two vectors, the columns of A.
+fn spanned_by(pair: usize, vectors: [&Vector; 2]) -> PlaneCovariance {
+    let [first, second] = vectors.map(|vector| PlaneCovariance::outer(vector[pair], vector[pair + 1]));
     first.plus(second)
 }
 

@@ -58,12 +58,12 @@ impl Default for MotionModel {
         Self {
             stationary_m2_s: 1e-4,
             steady_m2_s3: 0.05,
-            steady_time_constant_s: 60.0,
+            steady_time_constant_s: 1_000.0,
             agile_time_constant_s: 5.0,
             min_speed_m_s: 1.5,
             speed_half_life_s: 120.0,
             sojourn_s: [30.0, 20.0, 5.0],
-            initial_speed_sigma_m_s: 10.0,
+            initial_speed_sigma_m_s: 20.0,
         }
     }
 }

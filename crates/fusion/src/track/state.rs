@@ -3,6 +3,7 @@
 use jiff::Timestamp;
 
 use super::measurement::{MeasurementSource, Rejection};
+use crate::domain::{Motion, Velocity};
 use crate::geo::EastNorth;
 use crate::geo::PlaneCovariance;
 
@@ -18,23 +19,6 @@ pub struct Innovation {
     pub nis: f64,
 }
 
-/// A velocity in the camera's local plane.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Velocity {
-    /// Component towards east, m/s.
-    pub east_m_s: f64,
-    /// Component towards north, m/s.
-    pub north_m_s: f64,
-}
-
-impl Velocity {
-    /// Magnitude, m/s.
-    #[must_use]
-    pub fn speed_m_s(self) -> f64 {
-        self.east_m_s.hypot(self.north_m_s)
-    }
-}
-
 /// The estimated state of a target at one instant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackState {
@@ -46,6 +30,8 @@ pub struct TrackState {
     pub velocity: Velocity,
     /// Covariance of the position's error, m2.
     pub covariance: PlaneCovariance,
+    /// Covariance of the velocity's error, m2/s2.
+    pub velocity_covariance: PlaneCovariance,
     /// Radius about `position` that contains the true position with 95 % probability, m.
     pub r95_m: f64,
     /// Probability of the stationary motion mode, 0 to 1.
@@ -70,5 +56,11 @@ impl TrackState {
     #[must_use]
     pub fn normal_covariance(&self) -> PlaneCovariance {
         self.covariance.with_r95_m(self.r95_m)
+    }
+
+    /// Speed and course with their intervals.
+    #[must_use]
+    pub fn motion(&self) -> Motion {
+        Motion::of(self.velocity, self.velocity_covariance, self.stationary_probability)
     }
 }

@@ -5,6 +5,7 @@
 use nalgebra::{Matrix2, Matrix4, Matrix4x2, Vector2, Vector4};
 
 use super::settings::WorldTrackSettings;
+use crate::domain::Velocity;
 use crate::geo::{EastNorth, PlaneCovariance};
 
 /// Probability below which a mode is not left, so that it can be entered again.
@@ -22,6 +23,8 @@ struct Gaussian {
 pub(super) struct ConstantVelocityFilter {
     modes: [Gaussian; 2],
     mode_probabilities: [f64; 2],
+    /// Standard deviation per axis of the velocity before anything is known, m/s.
+    prior_speed_sigma_m_s: f64,
 }
 
 impl ConstantVelocityFilter {
@@ -32,7 +35,11 @@ impl ConstantVelocityFilter {
         covariance[(2, 2)] = speed_sigma_m_s * speed_sigma_m_s;
         covariance[(3, 3)] = speed_sigma_m_s * speed_sigma_m_s;
         let mean = Vector4::new(position.east_m, position.north_m, 0.0, 0.0);
-        Self { modes: [Gaussian { mean, covariance }; 2], mode_probabilities: [0.5; 2] }
+        Self {
+            modes: [Gaussian { mean, covariance }; 2],
+            mode_probabilities: [0.5; 2],
+            prior_speed_sigma_m_s: speed_sigma_m_s,
+        }
     }
 
     /// Predicts over an interval (s).
@@ -85,16 +92,35 @@ impl ConstantVelocityFilter {
         EastNorth { east_m, north_m }
     }
 
-    /// East and north velocity of the moment-matched state, m/s.
-    pub(super) fn velocity_m_s(&self) -> [f64; 2] {
+    /// Velocity of the moment-matched state.
+    pub(super) fn velocity(&self) -> Velocity {
         let [.., east_m_s, north_m_s] = self.mean();
-        [east_m_s, north_m_s]
+        Velocity { east_m_s, north_m_s }
     }
 
     /// Covariance of the moment-matched position, m2.
     pub(super) fn position_covariance(&self) -> PlaneCovariance {
+        self.covariance_of(0)
+    }
+
+    /// Covariance of the moment-matched velocity, m2/s2.
+    pub(super) fn velocity_covariance(&self) -> PlaneCovariance {
+        self.covariance_of(2)
+    }
+
+    /// Probability that the target is stationary, 0 to 1.
+    pub(super) fn stationary_probability(&self) -> f64 {
+        self.velocity().stationary_probability(self.velocity_covariance(), self.prior_speed_sigma_m_s)
+    }
+
+    fn covariance_of(&self, first: usize) -> PlaneCovariance {
         let c = moment_match(&self.modes, self.mode_probabilities).covariance;
-        PlaneCovariance { east_m2: c[(0, 0)], north_m2: c[(1, 1)], east_north_m2: c[(0, 1)] }
+        let second = first + 1;
+        PlaneCovariance {
+            east_m2: c[(first, first)],
+            north_m2: c[(second, second)],
+            east_north_m2: c[(first, second)],
+        }
     }
 
     fn mean(&self) -> [f64; 4] {

@@ -74,7 +74,7 @@ fn a_walker_keeps_the_track_from_camera_to_camera() {
     assert_eq!(handed_over, [(a, b)]);
     let state = tracker.track(ids[0]).expect("live").state();
     assert!(state.position.distance_m(at(1.3 * 19.5, 0.0)) < 0.5, "{state:?}");
-    assert!((state.velocity_m_s[0] - 1.3).abs() < 0.3, "{state:?}");
+    assert!((state.velocity.east_m_s - 1.3).abs() < 0.3, "{state:?}");
     // The common part of the error is in the output: no filtering removes it.
     assert!(state.covariance_m2.east_m2 > 0.25, "{state:?}");
 }

@@ -7,6 +7,7 @@ use super::constant_velocity::ConstantVelocityFilter;
 use super::frame::{CameraFrame, WorldDetection, WorldTrackId};
 use super::settings::WorldTrackSettings;
 use crate::domain::{CameraId, ReceiverId, TargetId};
+use crate::domain::{Motion, Velocity};
 use crate::geo::{EastNorth, PlaneCovariance};
 
 /// Whether a track is reported.
@@ -38,10 +39,22 @@ pub struct Sighting {
 pub struct WorldState {
     /// Position in the site's plane, m.
     pub position: EastNorth,
-    /// East and north velocity, m/s.
-    pub velocity_m_s: [f64; 2],
+    /// Velocity in that plane.
+    pub velocity: Velocity,
+    /// Covariance of its error, m2/s2.
+    pub velocity_covariance: PlaneCovariance,
+    /// Probability that the target is stationary, 0 to 1.
+    pub stationary_probability: f64,
     /// Covariance of the position's error, with the part that all cameras have in common, m2.
     pub covariance_m2: PlaneCovariance,
+}
+
+impl WorldState {
+    /// Speed and course with their intervals.
+    #[must_use]
+    pub fn motion(&self) -> Motion {
+        Motion::of(self.velocity, self.velocity_covariance, self.stationary_probability)
+    }
 }
 
 /// A track of the world.
@@ -198,7 +211,9 @@ impl WorldTrack {
         let lasting_m2 = self.offset_covariance_m2.plus(self.common_covariance_m2);
         WorldState {
             position: self.filter.position(),
-            velocity_m_s: self.filter.velocity_m_s(),
+            velocity: self.filter.velocity(),
+            velocity_covariance: self.filter.velocity_covariance(),
+            stationary_probability: self.filter.stationary_probability(),
             covariance_m2: self.filter.position_covariance().plus(lasting_m2),
         }
     }
@@ -262,7 +277,7 @@ impl WorldTrack {
     /// A position measured before the state's time, moved on with the estimated velocity.
     pub(super) fn moved_to_state_time(&self, position: EastNorth, time: Timestamp) -> EastNorth {
         let late_s = seconds_from(time, self.time).max(0.0);
-        let [east_m_s, north_m_s] = self.filter.velocity_m_s();
+        let Velocity { east_m_s, north_m_s } = self.filter.velocity();
         position.plus(EastNorth { east_m: late_s * east_m_s, north_m: late_s * north_m_s })
     }
 

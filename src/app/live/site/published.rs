@@ -6,7 +6,7 @@ use std::sync::Arc;
 use jiff::{SignedDuration, Timestamp};
 
 use crate::app::live::history::History;
-use crate::domain::{CameraId, LiveId, TargetId};
+use crate::domain::{CameraId, LiveId, Motion, TargetId, Velocity};
 use crate::geo::{PlaneCovariance, Position};
 
 /// A camera is taken to see a target until this long after its latest detection.
@@ -25,10 +25,10 @@ pub struct WorldTrackPoint {
     pub started_at: Timestamp,
     /// Where.
     pub position: Position,
-    /// Velocity towards east, m/s.
-    pub velocity_east_m_s: f64,
-    /// Velocity towards north, m/s.
-    pub velocity_north_m_s: f64,
+    /// Velocity.
+    pub velocity: Velocity,
+    /// Speed and course.
+    pub motion: Motion,
     /// Covariance of the position's error, m2.
     pub covariance_m2: PlaneCovariance,
     /// The cameras that see the target at the instant.
@@ -144,8 +144,8 @@ mod tests {
             time,
             started_at: time,
             position: Position::new(8.0, 47.0).expect("valid"),
-            velocity_east_m_s: 0.0,
-            velocity_north_m_s: 0.0,
+            velocity: Velocity::default(),
+            motion: Motion::of(Velocity::default(), PlaneCovariance::isotropic(1.0), 0.5),
             covariance_m2: PlaneCovariance::isotropic(1.0),
             sightings: seen_as.iter().map(sighting).collect(),
         })

@@ -332,7 +332,6 @@ impl SiteTracker {
 
     fn point_of(&self, track: &WorldTrack, plane: &LocalPlane) -> WorldTrackPoint {
         let state = track.state();
-        let [velocity_east_m_s, velocity_north_m_s] = state.velocity_m_s;
         let current = track
             .sightings()
             .iter()
@@ -343,8 +342,8 @@ impl SiteTracker {
             time: track.last_seen(),
             started_at: track.born(),
             position: plane.to_position(state.position),
-            velocity_east_m_s,
-            velocity_north_m_s,
+            velocity: state.velocity,
+            motion: state.motion(),
             covariance_m2: state.covariance_m2,
             sightings: current
                 .map(|sighting| WorldSighting {

@@ -108,6 +108,15 @@ struct MapTerms {
     jacobian: [[f64; 4]; 2],
 }
 
+/// What the map's covariance depends on.
+struct Directions {
+    /// Of the residual, m2.
+    prior_m2: f64,
+    q: [f64; MAX_RANK],
+    /// Derivatives of east and north by the coefficients.
+    tangent: [[f64; COEFFICIENTS]; 2],
+}
+
 /// What all maps say of one box.
 pub(super) struct Mixture {
     pub(super) position_m: [f64; 2],
@@ -220,19 +229,37 @@ impl PositionMap {
         MapTerms { evaluation, q, position_m, jacobian }
     }
 
+    /// Where a box is among the directions that are uncertain.
+    #[inline]
+    fn directions(&self, terms: &MapTerms) -> Directions {
+        Directions { prior_m2: self.residual_m2, q: terms.q, tangent: terms.evaluation.tangent() }
+    }
+
+    /// The same of the difference between the answers to two boxes, with the kernel's inputs of both.
+    fn directions_between(&self, [from, to]: [(&MapTerms, &[f64; 4]); 2]) -> Directions {
+        let [one, other] = [from, to].map(|(terms, _)| self.directions(terms));
+        let (correlation, _) = self.lengths.matern(from.1, to.1);
+        Directions {
+            prior_m2: 2.0 * (1.0 - correlation) * self.residual_m2,
+            q: std::array::from_fn(|at| other.q[at] - one.q[at]),
+            tangent: std::array::from_fn(|axis| {
+                std::array::from_fn(|at| other.tangent[axis][at] - one.tangent[axis][at])
+            }),
+        }
+    }
+
     /// Covariance of the map: the residual's, the tangent's, and the jackknife's, m2.
     #[inline]
-    fn covariance_m2(&self, terms: &MapTerms) -> [f64; 3] {
-        let mut own_m2 = self.residual_m2;
-        for (q, determined) in terms.q.iter().zip(&self.determined) {
+    fn covariance_m2(&self, Directions { prior_m2, q, tangent }: &Directions) -> [f64; 3] {
+        let mut own_m2 = *prior_m2;
+        for (q, determined) in q.iter().zip(&self.determined) {
             own_m2 -= determined * q * q;
         }
         let own_m2 = own_m2.max(0.0);
-        let tangent = terms.evaluation.tangent();
         let mut whitened = [[0.0; COEFFICIENTS]; 2];
         for axis in 0..2 {
             let mut left = tangent[axis];
-            for (direction, q) in terms.q.iter().enumerate().take(self.rank) {
+            for (direction, q) in q.iter().enumerate().take(self.rank) {
                 let absorbed = &self.absorbed[axis][direction * COEFFICIENTS..(direction + 1) * COEFFICIENTS];
                 for (left, absorbed) in left.iter_mut().zip(absorbed) {
                     *left -= q * absorbed;
@@ -245,7 +272,7 @@ impl PositionMap {
                 }
             }
         }
-        let mut sum = self.jackknife_m2(terms);
+        let mut sum = self.jackknife_m2(q, tangent);
         sum[0] += own_m2;
         sum[2] += own_m2;
         let [east, north] = whitened;
@@ -256,18 +283,14 @@ impl PositionMap {
     }
 
     #[inline]
-    fn jackknife_m2(&self, terms: &MapTerms) -> [f64; 3] {
+    fn jackknife_m2(&self, q: &[f64; MAX_RANK], tangent: &[[f64; COEFFICIENTS]; 2]) -> [f64; 3] {
         let mut sum = [0.0; 3];
-        if self.deviations.is_empty() {
-            return sum;
-        }
-        let tangent = terms.evaluation.tangent();
         for deviation in &self.deviations {
             let moved_m = [0, 1].map(|axis| {
                 let by_tangent: f64 =
                     tangent[axis].iter().zip(&deviation.tangent).map(|(one, other)| one * other).sum();
                 let by_kernel: f64 =
-                    terms.q.iter().zip(&deviation.kernel[axis]).map(|(one, other)| one * other).sum();
+                    q.iter().zip(&deviation.kernel[axis]).map(|(one, other)| one * other).sum();
                 by_tangent + by_kernel
             });
             add_outer(&mut sum, moved_m, 1.0);
@@ -337,10 +360,32 @@ impl Predictor {
     pub(crate) fn jackknife_m2(&self, sides: &Box4) -> f64 {
         let (input, by_px) = (self.input_scales.input(sides), self.input_scales.slopes(sides));
         let of = |map: &PositionMap| {
-            let [east_m2, _, north_m2] = map.jackknife_m2(&map.terms(sides, &input, &by_px));
+            let Directions { q, tangent, .. } = map.directions(&map.terms(sides, &input, &by_px));
+            let [east_m2, _, north_m2] = map.jackknife_m2(&q, &tangent);
             0.5 * map.weight * (east_m2 + north_m2)
         };
         self.maps.iter().map(of).sum()
+    }
+
+    /// Covariance of the error that the maps make in the distance between two boxes: east, cross, north, m2. An error that
+    /// both boxes share, as that of all receivers, is not part of it.
+    pub(crate) fn displacement_m2(&self, boxes: [&Box4; 2]) -> [f64; 3] {
+        let (mut mean_m, mut second_m2) = ([0.0; 2], [0.0; 3]);
+        for map in &self.maps {
+            let inputs = boxes.map(|sides| self.input_scales.input(sides));
+            let [from, to] =
+                [0, 1].map(|at| map.terms(boxes[at], &inputs[at], &self.input_scales.slopes(boxes[at])));
+            let covariance_m2 =
+                map.covariance_m2(&map.directions_between([(&from, &inputs[0]), (&to, &inputs[1])]));
+            for (sum, own) in second_m2.iter_mut().zip(covariance_m2) {
+                *sum += map.weight * own;
+            }
+            let moved_m = [0, 1].map(|axis| to.position_m[axis] - from.position_m[axis]);
+            mean_m = [0, 1].map(|axis| mean_m[axis] + map.weight * moved_m[axis]);
+            add_outer(&mut second_m2, moved_m, map.weight);
+        }
+        add_outer(&mut second_m2, mean_m, -1.0);
+        second_m2.map(|own| self.widening * own)
     }
 
     #[inline]
@@ -356,7 +401,7 @@ impl Predictor {
             let from_first_m = [terms.position_m[0] - origin_m[0], terms.position_m[1] - origin_m[1]];
             mean_m = [0, 1].map(|axis| mean_m[axis] + map.weight * from_first_m[axis]);
             if with_error {
-                let covariance_m2 = map.covariance_m2(&terms);
+                let covariance_m2 = map.covariance_m2(&map.directions(&terms));
                 for (sum, own) in second_m2.iter_mut().zip(covariance_m2) {
                     *sum += map.weight * own;
                 }

@@ -254,6 +254,12 @@ impl GaussianProcessEncoder {
             r95_scale: prediction.r95_scale,
         }
     }
+
+    /// Covariance of the error that the map makes in the distance between two boxes, m2.
+    pub(crate) fn displacement_covariance(&self, boxes: [&BoundingBox; 2]) -> PlaneCovariance {
+        let [from, to] = boxes.map(features_of);
+        plane_covariance(self.predictor.displacement_m2([&from, &to]))
+    }
 }
 
 /// From east, cross, north, m2.

@@ -200,6 +200,29 @@ fn a_stored_model_answers_as_the_fitted_one_and_is_the_same_for_the_same_rows() 
     }
 }
 
+/// What two answers share is no part of the error of their distance.
+#[test]
+fn the_error_of_a_distance_vanishes_with_the_distance_and_is_bounded_by_those_of_its_ends() {
+    let (rows, tests) = walkers(4001, 8, 90, 1.0);
+    let (predictor, _) = fitted(&rows);
+    let trace_m2 = |[east_m2, _, north_m2]: [f64; 3]| east_m2 + north_m2;
+    let error_m2 = |from: usize, to: usize| {
+        let [from, to] = [from, to].map(|at| &tests[at].0);
+        trace_m2(predictor.displacement_m2([from, to]))
+    };
+    let map_m2 = |at: usize| predictor.widening * trace_m2(predictor.mix(&tests[at].0, true).map_m2);
+    let mut below_independent = 0;
+    for at in 0..tests.len() - 1 {
+        let (one_m2, other_m2) = (map_m2(at), map_m2(at + 1));
+        let between_m2 = error_m2(at, at + 1);
+        // Cauchy-Schwarz.
+        assert!(between_m2.sqrt() <= one_m2.sqrt() + other_m2.sqrt() + 1e-9, "{at}");
+        below_independent += usize::from(between_m2 < one_m2 + other_m2);
+        assert!(error_m2(at, at).abs() < 1e-12);
+    }
+    assert!(2 * below_independent > tests.len(), "errors of neighbours are alike");
+}
+
 #[test]
 fn a_loaded_model_misses_its_own_rows_as_the_fit_has_reported() {
     for (seed, targets) in [(4002, 1), (4003, 2), (4004, 8)] {

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
+import av
 import cv2
 import httpx
 import numpy as np
@@ -176,7 +177,7 @@ def test_a_camera_that_does_not_exist_and_wrong_arguments_are_reported(
     assert edge("--source", "x.mp4", "--start", "2026-05-01T12:00:00", "--camera", "gate").wait() == 2
 
 
-def test_a_file_is_streamed_to_its_end(
+def test_a_file_is_streamed_to_its_end_with_a_picture_of_the_view(
     client: Client, server: ServerProcess, edge: Callable[..., EdgeProcess], walk: tuple[Video, list[Row]]
 ) -> None:
     process = edge(
@@ -186,3 +187,8 @@ def test_a_file_is_streamed_to_its_end(
     assert process.wait(60) == 0, process.log
     assert "0 of them refused" in process.log
     assert client.cameras.get("gate").image_size == ImageSize(width_px=1280, height_px=720)
+    picture = client.cameras.picture("gate")
+    assert picture is not None
+    with av.open(str(walk[0].path)) as video:
+        first = next(video.decode(video=0)).to_ndarray(format="bgr24")
+    assert np.abs(decoded(picture).astype(int) - first).mean() < 2.0, "the picture is the first frame"

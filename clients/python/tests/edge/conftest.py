@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -81,8 +82,19 @@ def edge(tmp_path: Path) -> Iterator[Callable[..., EdgeProcess]]:
 
 
 @pytest.fixture(scope="session")
-def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Video, list[Row]]:
-    """A minute of one walker."""
+def walk_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], tuple[Video, list[Row]]]:
+    """Two minutes of one walker, by seed."""
     folder = tmp_path_factory.mktemp("walk")
-    rows = simulated_rows(folder, seed=3, samples=50)
-    return render(rows, folder / "walk.mp4", seed=3), rows
+
+    @cache
+    def rendered(seed: int) -> tuple[Video, list[Row]]:
+        rows = simulated_rows(folder, seed=seed, samples=120)
+        return render(rows, folder / f"{seed}.mp4", seed=seed, frames_per_s=5), rows
+
+    return rendered
+
+
+@pytest.fixture(scope="session")
+def walk(walk_of: Callable[[int], tuple[Video, list[Row]]]) -> tuple[Video, list[Row]]:
+    """The walk that most tests show."""
+    return walk_of(11)

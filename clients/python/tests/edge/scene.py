@@ -1,7 +1,7 @@
-"""Videos of the simulated square, with truth: walkers with limbs, vehicles, shadows, ground, noise, H.264.
+"""Videos of the simulated square and site, with truth: walkers with limbs, vehicles, shadows, ground, noise, H.264.
 
-Boxes of `sightfix simulate square` say where each walker stands and how tall it appears, once a second; between two of
-them the walker moves on a straight line. What is drawn is the truth: a box is the extent of the drawn silhouette.
+Boxes of `sightfix simulate` say where each target stands and how large it appears, once a second; between two of
+them the target moves on a straight line. What is drawn is the truth: a box is the extent of the drawn silhouette.
 """
 
 from __future__ import annotations
@@ -28,13 +28,15 @@ Mask = npt.NDArray[np.float32]
 WIDTH_PX, HEIGHT_PX = 1280, 720
 NOISE_SIGMA = 2.5
 SHADOW_FACTOR = 0.6
+VEHICLE_WIDTH = 2.8
+"""Of a vehicle as `vehicle` draws it, in heights."""
 STANDING_PX = 3.0
 """Who moves by less in a second stands."""
 
 
 @dataclass(frozen=True)
 class TrueBox:
-    """A walker as drawn: left, top, right and bottom of the silhouette, px."""
+    """A target as drawn: left, top, right and bottom of the silhouette, px."""
 
     target_id: str
     sides_px: tuple[float, float, float, float]
@@ -53,11 +55,12 @@ class Video:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the simulation: foot and height in the image, the phone's fix, the true position."""
+    """A row of the simulation: foot point, width and height in the image, the phone's fix, the true position."""
 
     time: datetime
     target_id: str
     foot_px: tuple[float, float]
+    width_px: float
     height_px: float
     fix_deg: tuple[float, float]
     truth_deg: tuple[float, float]
@@ -72,6 +75,36 @@ def simulated_rows(folder: Path, *options: str, seed: int, samples: int) -> list
         return [to_row(row) for row in csv.DictReader(opened)]
 
 
+def simulated_site(folder: Path, *, seed: int, duration_s: int) -> dict[str, list[Row]]:
+    """Rows of `sightfix simulate site` by camera, of walkers and vehicles that the border of the view does not cut."""
+    command = [str(BINARY), "simulate", "site", "--out", str(folder), "--seed", str(seed), "--cameras", "2"]
+    scene = ["--walkers", "4", "--vehicles", "2", "--receivers", "1", "--frame-interval-s", "1", "--box-noise-px", "0"]
+    subprocess.run([*command, *scene, "--duration-s", str(duration_s), "--quiet"], check=True)
+
+    def rows_of(name: str) -> list[dict[str, str]]:
+        with (folder / f"{name}.csv").open(newline="") as file:
+            return list(csv.DictReader(file))
+
+    targets = {(it["camera"], it["target_id"]): it["person"] for it in rows_of("identity")}
+    truths = {(it["time"], it["person"]): it for it in rows_of("truth")}
+    # The receiver `phone-3` is that of `person-3` or `vehicle-3`.
+    fixes = {(it["time"], it["receiver_id"].rpartition("-")[2]): it for it in rows_of("fixes")}
+
+    def row_of(camera: str, box: dict[str, str]) -> Row:
+        target_id = targets[camera, box["target_id"]]
+        truth, fix = truths[box["time"], target_id], fixes[box["time"], target_id.rpartition("-")[2]]
+        place = {f"truth_{name}": truth[name] for name in ("longitude", "latitude")}
+        return to_row(fix | place | box | {"target_id": target_id})
+
+    def is_whole(row: Row) -> bool:
+        return row.width_px / 2 < row.foot_px[0] < WIDTH_PX - row.width_px / 2
+
+    return {
+        camera: [row for box in rows_of(f"detections_{camera}") if is_whole(row := row_of(camera, box))]
+        for camera in ("c1", "c2")
+    }
+
+
 def to_row(row: dict[str, str]) -> Row:
     """A row of the CSV file."""
     left, top, width, height = (float(row[name]) for name in ("left", "top", "width", "height"))
@@ -79,6 +112,7 @@ def to_row(row: dict[str, str]) -> Row:
         time=datetime.fromisoformat(row["time"]),
         target_id=row["target_id"],
         foot_px=(left + width / 2, top + height),
+        width_px=width,
         height_px=height,
         fix_deg=(float(row["longitude"]), float(row["latitude"])),
         truth_deg=(float(row["truth_longitude"]), float(row["truth_latitude"])),
@@ -101,9 +135,10 @@ def write_gpx(rows: list[Row], path: Path, *, clock_offset_s: float = 0.0) -> No
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a walker stands in the image, how tall it appears, and how far its limbs are out, -1 to 1."""
+    """Where a target stands in the image, how large it appears, and how far a walker's limbs are out, -1 to 1."""
 
     foot_px: tuple[float, float]
+    width_px: float
     height_px: float
     swing: float
 
@@ -129,18 +164,22 @@ class Walker:
         is_walking = np.hypot(next_x - x, next_y - y) > STANDING_PX
         # 1.8 steps a second.
         swing = np.sin(self._phase + 2 * np.pi * 0.9 * (time.timestamp() % 3600.0)) if is_walking else 0.3
+        width_px = first.width_px + share * (second.width_px - first.width_px)
         height_px = first.height_px + share * (second.height_px - first.height_px)
-        return Pose((x + share * (next_x - x), y + share * (next_y - y)), height_px, float(swing))
+        return Pose((x + share * (next_x - x), y + share * (next_y - y)), width_px, height_px, float(swing))
 
     def silhouette(self, pose: Pose) -> tuple[Image, Mask, tuple[float, float]]:
         """Colours and coverage of a patch, and the foot's place in it, px."""
         height_px = pose.height_px
-        height, width = int(np.ceil(height_px)) + 8, int(np.ceil((3.2 if self._is_vehicle else 1.0) * height_px)) + 8
+        # A vehicle that turns appears shorter.
+        unit_px = pose.width_px / VEHICLE_WIDTH if self._is_vehicle else height_px
+        height = int(np.ceil(height_px)) + 8
+        width = int(np.ceil(pose.width_px if self._is_vehicle else height_px)) + 8
         foot = (width / 2, height - 4.0)
         colour = np.zeros((height, width, 3), np.uint8)
         mask = np.zeros((height, width), np.uint8)
         for part_colour, points, thickness in vehicle() if self._is_vehicle else limbs(pose.swing):
-            pixels = np.array([[foot[0] + x * height_px, foot[1] - y * height_px] for x, y in points]) * 16
+            pixels = np.array([[foot[0] + x * unit_px, foot[1] - y * height_px] for x, y in points]) * 16
             line_px = max(1, round(thickness * height_px))
             for canvas, value in ((colour, self._colours[part_colour]), (mask, (255,))):
                 cv2.polylines(canvas, [np.round(pixels).astype(np.int32)], False, value, line_px, cv2.LINE_AA, 4)
@@ -236,17 +275,19 @@ class Renderer:
         self._ground = textured_ground(random)
         names = sorted({row.target_id for row in rows})
         self._walkers = [Walker([row for row in rows if row.target_id == name], random) for name in names]
-        self._noise = [random.normal(0, NOISE_SIGMA, self._ground.shape).round().astype(np.int16) for _ in range(4)]
+        noise = random.normal(0, NOISE_SIGMA, (HEIGHT_PX, 2 * WIDTH_PX, 3))
+        self._noise = noise.round().astype(np.int16)
 
     def frame(self, time: datetime) -> tuple[Image, list[TrueBox]]:
         """The image at an instant, and the walkers in it, the farthest first."""
         image = self._ground.copy()
         placed = [(pose.foot_px[1], it) for it in self._walkers if (pose := it.at(time)) is not None]
         boxes = [paint(image, walker, time) for _, walker in sorted(placed, key=lambda pair: pair[0])]
-        noise = np.roll(self._noise[self._random.integers(4)], int(self._random.integers(WIDTH_PX)), axis=1)
+        first = int(self._random.integers(WIDTH_PX))
         gain = 1 + 0.01 * np.sin(time.timestamp() % 3600 / 11)
-        noisy = np.clip(cv2.convertScaleAbs(image, alpha=gain).astype(np.int16) + noise, 0, 255).astype(np.uint8)
-        return noisy, [box for box in boxes if box is not None]
+        bright = cv2.convertScaleAbs(image, alpha=gain)
+        noisy = cv2.add(bright, self._noise[:, first : first + WIDTH_PX], dtype=cv2.CV_8U)
+        return np.asarray(noisy, np.uint8), [box for box in boxes if box is not None]
 
 
 class VideoFile:

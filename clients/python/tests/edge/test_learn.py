@@ -21,7 +21,7 @@ from tests.edge.scene import HEIGHT_PX, WIDTH_PX, Row, Video, render, simulated_
 
 CLOCK_OFFSET_S = 42.5
 """How much more the phone's clock shows than the video's."""
-TRAINING_ROWS, TEST_ROWS = 120, 45
+TEST_ROWS = 45
 FRAMES_PER_S = 5
 
 
@@ -94,10 +94,13 @@ def train_on_truth(client: Client, camera_id: str, video: Video, rows: list[Row]
 
 @pytest.mark.parametrize("seed", seeds(11))
 def test_positions_are_nearly_as_good_as_with_true_boxes(
-    tmp_path: Path, server: ServerProcess, edge: Callable[..., EdgeProcess], seed: int
+    tmp_path: Path,
+    server: ServerProcess,
+    edge: Callable[..., EdgeProcess],
+    walk_of: Callable[[int], tuple[Video, list[Row]]],
+    seed: int,
 ) -> None:
-    rows = simulated_rows(tmp_path, seed=seed, samples=TRAINING_ROWS)
-    video = render(rows, tmp_path / "walk.mp4", seed=seed, frames_per_s=FRAMES_PER_S)
+    video, rows = walk_of(seed)
     write_gpx(rows, tmp_path / "walk.gpx", clock_offset_s=CLOCK_OFFSET_S)
     learning = edge(
         "learn", "--video", str(video.path), "--start", video.start.isoformat(), "--fixes", str(tmp_path / "walk.gpx"),

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import urllib.request
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
+import av
 import cv2
-import httpx
 import numpy as np
 import pytest
 
@@ -83,44 +82,36 @@ def test_the_command_waits_for_a_server(
         server.stop()
 
 
-def server_that(answer: Callable[[httpx.Request], httpx.Response]) -> Client:
-    """A client of a server that answers so."""
-    return Client("http://server", transport=httpx.MockTransport(answer))
+def send_still(stills: Stills, brightness: int) -> None:
+    """Has a grey picture sent, if it is time for one."""
+    stills.take(Frame(np.full_like(IMAGE, brightness), FRAME.time), [])
+    stills.close()
 
 
-@pytest.mark.parametrize("status", [404, 405])
-def test_a_server_without_pictures_is_asked_once(status: int, caplog: pytest.LogCaptureFixture) -> None:
-    requests: list[httpx.Request] = []
-
-    def answer(request: httpx.Request) -> httpx.Response:
-        requests.append(request)
-        return httpx.Response(status)
-
-    with server_that(answer) as client:
-        stills = Stills(client, "gate", interval_s=0)
-        for _ in range(3):
-            stills.take(FRAME, [])
-            stills.close()
-    assert [(it.method, it.url.path) for it in requests] == [("PUT", "/v1/cameras/gate/picture")]
-    assert requests[0].headers["content-type"] == "image/jpeg"
-    assert decoded(requests[0].content).shape == IMAGE.shape
-    assert caplog.text.count("takes no pictures") == 1
+def stored_brightness(client: Client, camera_id: str) -> int:
+    picture = client.cameras.picture(camera_id)
+    assert picture is not None
+    return round(float(decoded(picture).mean()))
 
 
-def test_stills_are_sent_again_after_the_interval() -> None:
-    sent = threading.Semaphore(0)
+def test_the_picture_is_replaced_after_the_interval(client: Client) -> None:
+    client.cameras.create(id="gate")
+    rare, frequent = Stills(client, "gate", interval_s=3600), Stills(client, "gate", interval_s=0)
+    send_still(rare, 90)
+    send_still(rare, 150)
+    assert stored_brightness(client, "gate") == 90
+    send_still(frequent, 120)
+    send_still(frequent, 150)
+    assert stored_brightness(client, "gate") == 150
 
-    def answer(request: httpx.Request) -> httpx.Response:
-        sent.release()
-        return httpx.Response(204)
 
-    with server_that(answer) as client:
-        rare, frequent = Stills(client, "gate", interval_s=3600), Stills(client, "gate", interval_s=0)
-        for stills in (rare, frequent):
-            for _ in range(3):
-                stills.take(FRAME, [])
-                stills.close()
-    assert [sent.acquire(blocking=False) for _ in range(5)] == [True] * 4 + [False]
+def test_a_refused_picture_is_reported_and_the_next_one_sent(client: Client, caplog: pytest.LogCaptureFixture) -> None:
+    stills = Stills(client, "gate", interval_s=0)
+    send_still(stills, 90)
+    assert "a picture could not be sent: " in caplog.text
+    client.cameras.create(id="gate")
+    send_still(stills, 120)
+    assert stored_brightness(client, "gate") == 120
 
 
 def test_a_still_is_within_the_limit_of_the_server() -> None:
@@ -176,7 +167,7 @@ def test_a_camera_that_does_not_exist_and_wrong_arguments_are_reported(
     assert edge("--source", "x.mp4", "--start", "2026-05-01T12:00:00", "--camera", "gate").wait() == 2
 
 
-def test_a_file_is_streamed_to_its_end(
+def test_a_file_is_streamed_to_its_end_with_a_picture_of_the_view(
     client: Client, server: ServerProcess, edge: Callable[..., EdgeProcess], walk: tuple[Video, list[Row]]
 ) -> None:
     process = edge(
@@ -186,3 +177,8 @@ def test_a_file_is_streamed_to_its_end(
     assert process.wait(60) == 0, process.log
     assert "0 of them refused" in process.log
     assert client.cameras.get("gate").image_size == ImageSize(width_px=1280, height_px=720)
+    picture = client.cameras.picture("gate")
+    assert picture is not None
+    with av.open(str(walk[0].path)) as video:
+        first = next(video.decode(video=0)).to_ndarray(format="bgr24")
+    assert np.abs(decoded(picture).astype(int) - first).mean() < 2.0, "the picture is the first frame"

@@ -106,6 +106,25 @@ def test_pictures_are_requested_again_after_any_failure(pictures: tuple[str, lis
     assert answers == []
 
 
+def test_a_clock_that_is_set_back_does_not_stop_the_frames(pictures: tuple[str, list[tuple[int, bytes]]]) -> None:
+    address, answers = pictures
+    jpeg = cv2.imencode(".jpg", np.zeros((90, 160, 3), np.uint8))[1].tobytes()
+    answers += [(200, jpeg)] * 4
+    now, slept_s = Now(), list[float]()
+
+    def sleep(seconds: float) -> None:
+        slept_s.append(seconds)
+        now.sleep(seconds)
+
+    read = frames(SourceOptions(address=address, max_frames_per_s=2), now, sleep)
+    times = [next(read).time for _ in range(2)]
+    now.time -= timedelta(hours=1)
+    times += [next(read).time for _ in range(2)]
+    assert times[0] < times[1]
+    assert times[1] - timedelta(hours=1) < times[2] < times[3] < times[1]
+    assert max(slept_s) <= 0.5
+
+
 def test_a_source_that_is_no_longer_wanted_is_not_opened_again() -> None:
     options = SourceOptions(address="http://127.0.0.1:1/stream", retry=SHORT_RETRY)
     assert list(frames(options, Now(), lambda _seconds: True)) == []
@@ -152,11 +171,16 @@ def test_a_wrong_clock_of_the_sender_is_not_used(caplog: pytest.LogCaptureFixtur
     assert times.of(right) == right.wall_clock
 
 
-def test_times_increase_whatever_the_source_says() -> None:
-    image = np.zeros((2, 2, 3), np.uint8)
-    seconds = [0.0, 1.0, 1.0, 0.5, 1.05, 2.0]
-    given = [Frame(image, START + timedelta(seconds=it)) for it in seconds]
-    assert [(frame.time - START).total_seconds() for frame in thinned(given, 10)] == [0.0, 1.0, 2.0]
+@pytest.mark.parametrize(
+    ("given_s", "taken_s"),
+    [
+        ([0.0, 1.0, 1.0, 0.5, 1.05, 2.0, -7.0], [0.0, 1.0, 2.0]),
+        ([0.0, 1.0, -60.0, -60.0, -59.0], [0.0, 1.0, -60.0, -59.0]),
+    ],
+)
+def test_times_increase_unless_the_clock_is_set_back(given_s: list[float], taken_s: list[float]) -> None:
+    given = [Frame(np.zeros((2, 2, 3), np.uint8), START + timedelta(seconds=it)) for it in given_s]
+    assert [(frame.time - START).total_seconds() for frame in thinned(given, 10)] == taken_s
 
 
 def test_frames_are_dropped_instead_of_waiting() -> None:

@@ -45,7 +45,7 @@ class Walk:
 def test_ids_last_over_occlusions_of_a_second() -> None:
     same = occlusions = 0
     for seed in range(12):
-        tracker, walk = Tracker("a-"), Walk(np.random.default_rng(seed))
+        tracker, walk = Tracker(lambda: "a-"), Walk(np.random.default_rng(seed))
         ids: dict[int, dict[int, str]] = defaultdict(dict)
         for number in range(20 * FRAMES_PER_S):
             boxes = walk.boxes(number / FRAMES_PER_S)
@@ -66,7 +66,7 @@ def test_ids_last_over_occlusions_of_a_second() -> None:
 
 
 def test_a_box_of_one_frame_has_no_id_and_ids_begin_with_the_prefix() -> None:
-    tracker, box = Tracker("run-"), Box(100, 100, 20, 60, "person", 1.0)
+    tracker, box = Tracker(lambda: "run-"), Box(100, 100, 20, 60, "person", 1.0)
     assert tracker.update([box], START) == []
     (tracked,) = tracker.update([box], START + timedelta(seconds=0.1))
     assert tracked.tracker_id.startswith("run-")
@@ -74,7 +74,7 @@ def test_a_box_of_one_frame_has_no_id_and_ids_begin_with_the_prefix() -> None:
 
 
 def test_a_target_that_is_away_for_long_comes_back_with_a_new_id() -> None:
-    tracker, box = Tracker("", longest_occlusion_s=2.0), Box(100, 100, 20, 60, "person", 1.0)
+    tracker, box = Tracker(lambda: "", longest_occlusion_s=2.0), Box(100, 100, 20, 60, "person", 1.0)
 
     def id_after(since_s: float) -> str:
         times = [START + timedelta(seconds=since_s + number / FRAMES_PER_S) for number in range(4)]
@@ -83,3 +83,11 @@ def test_a_target_that_is_away_for_long_comes_back_with_a_new_id() -> None:
     first = id_after(0.0)
     assert id_after(1.5) == first
     assert id_after(5.0) != first
+
+
+def test_after_a_clock_that_was_set_back_targets_have_new_ids() -> None:
+    prefixes, box = iter(("a-", "b-")), Box(100, 100, 20, 60, "person", 1.0)
+    tracker = Tracker(lambda: next(prefixes))
+    times = [START + timedelta(seconds=seconds) for seconds in (0.0, 0.1, -60.0, -59.9)]
+    ids = [[it.tracker_id for it in tracker.update([box], time)] for time in times]
+    assert ids == [[], ["a-0"], [], ["b-0"]]

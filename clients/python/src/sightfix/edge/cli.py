@@ -182,7 +182,7 @@ def now() -> datetime:
 
 
 def new_prefix() -> str:
-    """Begins the tracker ids of this run: those of another run are of other targets."""
+    """Begins the ids of a tracker: those of another one are of other targets."""
     return f"{secrets.token_hex(3)}-"
 
 
@@ -203,7 +203,7 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
         return 0 if stopped.is_set() else 1
     with ExitStack() as stack:
         outputs = list(outputs_of(options, first, stopped, stack))
-        pipeline = Pipeline(detector, Tracker(new_prefix()), outputs)
+        pipeline = Pipeline(detector, Tracker(new_prefix), outputs)
         pipeline.run(chain([first], remaining))
     summarise(pipeline, outputs, latest)
     return 0
@@ -278,7 +278,7 @@ def run_benchmark(options: argparse.Namespace) -> int:
     """
     source = source_of(options)
     outputs: list[Output] = []
-    pipeline = Pipeline(detector_of(options), Tracker(new_prefix()), outputs)
+    pipeline = Pipeline(detector_of(options), Tracker(new_prefix), outputs)
     read = frames(source, now, clocks.sleep)
     measured = (frame for frame, _ in zip(read, range(options.benchmark), strict=False))
     pipeline.run(measured)
@@ -306,7 +306,7 @@ def run_learn(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         if options.record is not None:
             outputs.append(closing(stack, Recorder(options.record)))
-        pipeline = Pipeline(detector_of(options), Tracker(new_prefix()), outputs)
+        pipeline = Pipeline(detector_of(options), Tracker(new_prefix), outputs)
         source = source_of(options)
         read = frames(source, now, clocks.sleep)
         first = next(read, None)

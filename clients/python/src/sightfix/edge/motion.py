@@ -24,8 +24,10 @@ SHADOW_THRESHOLD = 0.5
 """A pixel of the same colour is shadow if it has at least this share of the brightness."""
 MIN_VARIANCE = 12.0
 """Least variance of a pixel of the background: noise that compression left out at times."""
-JOINING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 7))
+JOINING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 5))
 """Gaps of this size are closed."""
+PART_WIDTH_SHARE = 0.3
+"""Width of a part of a target, as a share of its widest part's; only a short part may be narrower."""
 LEAST_AREA_PX2 = 24
 """Smaller regions are noise."""
 SPECKLED_SHARE = 0.004
@@ -210,9 +212,12 @@ def is_part(box: Box, other: Box) -> bool:
     """Whether a smaller box belongs to a box: nearly below or above it, or overlapping it."""
     overlap_px = min(box.right_px, other.right_px) - max(box.left_px, other.left_px)
     gap_px = max(box.top_px, other.top_px) - min(box.bottom_px, other.bottom_px)
-    narrower_px = min(box.width_px, other.width_px)
+    narrow, wide = sorted((box, other), key=lambda it: it.width_px)
     tall_px = max(box.height_px, other.height_px)
-    return overlap_px > 0.4 * narrower_px and gap_px < 0.2 * tall_px
+    if overlap_px <= 0.4 * narrow.width_px or gap_px >= 0.2 * tall_px:
+        return False
+    # A person beside a vehicle is narrow and tall.
+    return gap_px <= 0 or narrow.width_px >= PART_WIDTH_SHARE * wide.width_px or narrow.height_px < wide.height_px / 2
 
 
 def union(one: Box, other: Box) -> Box:

@@ -21,7 +21,6 @@ from sightfix import (
     ImageSize,
     LiveItem,
     NotFoundError,
-    ProblemError,
     RetryPolicy,
     SightfixError,
     UnavailableError,
@@ -37,7 +36,6 @@ LONGEST_SILENCE_S = 10.0
 """Of the server at the end of a stream, after which its answers are no longer waited for."""
 LARGEST_STILL_BYTES = 2 * 2**20
 STILL_QUALITIES = (90, 75, 50, 25)
-METHOD_NOT_ALLOWED = 405
 
 
 class Output(Protocol):
@@ -217,13 +215,12 @@ class Stills:
         self._interval_s = interval_s
         self._next_s = 0.0
         self._thread: threading.Thread | None = None
-        self._is_supported = True
 
     def take(self, frame: Frame, boxes: list[TrackedBox]) -> None:
         """Sends the frame if it is time for one; does not wait for the server."""
         now_s = clocks.monotonic()
         is_sending = self._thread is not None and self._thread.is_alive()
-        if not self._is_supported or is_sending or now_s < self._next_s:
+        if is_sending or now_s < self._next_s:
             return
         self._next_s = now_s + self._interval_s
         self._thread = threading.Thread(target=self._send, args=(frame.image,), name="still", daemon=True)
@@ -237,19 +234,8 @@ class Stills:
     def _send(self, image: Image) -> None:
         try:
             self._client.cameras.set_picture(self._camera_id, jpeg_within(image, LARGEST_STILL_BYTES))
-        except ProblemError as error:
-            if error.problem.status == METHOD_NOT_ALLOWED or is_unknown_route(error):
-                self._is_supported = False
-                LOG.warning("the server takes no pictures of cameras; no more are sent")
-            else:
-                LOG.warning("the server refused a picture: %s", error)
         except SightfixError as error:
             LOG.warning("a picture could not be sent: %s", error)
-
-
-def is_unknown_route(error: ProblemError) -> bool:
-    """Whether there is no such resource on the server, other than no such camera."""
-    return isinstance(error, NotFoundError) and error.kind != "camera-not-found"
 
 
 def jpeg_within(image: Image, limit_bytes: int) -> bytes:

@@ -26,7 +26,7 @@ SOURCE_RETRY = RetryPolicy(attempts=2**31, initial_delay_s=0.5, max_delay_s=30.0
 PICTURE_ENDINGS = (".jpg", ".jpeg", ".png")
 LARGEST_PICTURE_BYTES = 32 * 2**20
 LARGEST_CLOCK_DIFFERENCE_S = 10.0
-"""A sender's clock that is farther from this machine's is wrong."""
+"""A sender's clock that is farther from this machine's is wrong; a clock that goes back by more was set."""
 EPOCH = datetime.fromtimestamp(0, UTC)
 EARLIEST_FRAME_SHARE = 0.9
 """Frames that come up to a tenth of the interval early are taken."""
@@ -71,7 +71,7 @@ class SourceOptions:
 
 
 def frames(options: SourceOptions, clock: Callable[[], datetime], sleep: Sleep) -> Iterator[Frame]:
-    """The frames of a source at most `max_frames_per_s`, with increasing times. A live source is opened again for ever.
+    """The frames of a source at most `max_frames_per_s`, as `thinned`. A live source is opened again for ever.
 
     Raises:
         SourceError: A file cannot be read, or says nothing of its time.
@@ -104,13 +104,17 @@ def reopened(opened: Callable[[], Iterator[Frame]], retry: RetryPolicy, sleep: S
 
 
 def thinned(frames: Iterable[Frame], max_frames_per_s: float) -> Iterator[Frame]:
-    """Frames with increasing times, at most so many per second."""
-    interval = timedelta(seconds=EARLIEST_FRAME_SHARE / max_frames_per_s)
+    """Frames with increasing times, at most so many per second; times go back only after a clock that was set."""
+    interval_s = EARLIEST_FRAME_SHARE / max_frames_per_s
     latest: datetime | None = None
     for frame in frames:
-        if latest is None or frame.time >= latest + interval:
-            latest = frame.time
-            yield frame
+        step_s = interval_s if latest is None else (frame.time - latest).total_seconds()
+        if step_s < -LARGEST_CLOCK_DIFFERENCE_S:
+            LOG.warning("the clock was set back: times of frames go on %.0f s earlier", -step_s)
+        elif step_s < interval_s:
+            continue
+        latest = frame.time
+        yield frame
 
 
 def video_frames(options: SourceOptions, clock: Callable[[], datetime]) -> Iterator[Frame]:
@@ -215,7 +219,9 @@ def picture_frames(options: SourceOptions, clock: Callable[[], datetime], sleep:
             if image is None:
                 raise SourceError(f"{options.shown} is no picture")
             yield Frame(np.asarray(image, np.uint8), arrived - timedelta(seconds=options.delay_s))
-            sleep(max(0.0, interval_s - (clock() - requested).total_seconds()))
+            remaining_s = interval_s - (clock() - requested).total_seconds()
+            # The clock may have been set meanwhile, in either direction.
+            sleep(min(max(0.0, remaining_s), interval_s))
 
 
 def read_at_most(client: httpx.Client, options: SourceOptions, limit_bytes: int) -> bytes:

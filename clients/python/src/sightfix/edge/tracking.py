@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import datetime
 
 import numpy as np
@@ -21,14 +22,22 @@ class Tracker:
     """Ids of boxes over time, which last over occlusions.
 
     Args:
-        prefix: Begins every id, so that those of two runs of the program differ.
+        new_prefix: Draws what begins the ids, so that those of two runs of the program differ, and those before and
+            after a clock that was set back.
         longest_occlusion_s: After this time without a box a target gets a new id.
     """
 
-    def __init__(self, prefix: str, *, longest_occlusion_s: float = 2.0) -> None:
-        self._prefix = prefix
+    def __init__(self, new_prefix: Callable[[], str], *, longest_occlusion_s: float = 2.0) -> None:
+        self._new_prefix = new_prefix
+        self._longest_occlusion_s = longest_occlusion_s
+        self._latest: datetime | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begins without targets."""
+        self._prefix = self._new_prefix()
         self._tracker = OCSORTTracker(
-            lost_track_buffer=round(longest_occlusion_s * FRAME_RATE),
+            lost_track_buffer=round(self._longest_occlusion_s * FRAME_RATE),
             frame_rate=FRAME_RATE,
             minimum_consecutive_frames=2,
             minimum_iou_threshold=LEAST_DISTANCE_IOU,
@@ -38,6 +47,9 @@ class Tracker:
 
     def update(self, boxes: list[Box], time: datetime) -> list[TrackedBox]:
         """The boxes of a frame with their ids; without those that have been seen in fewer than two frames."""
+        if self._latest is not None and time < self._latest:
+            self._begin()
+        self._latest = time
         sides = [(box.left_px, box.top_px, box.right_px, box.bottom_px) for box in boxes]
         detections = sv.Detections(
             xyxy=np.array(sides, dtype=np.float64).reshape(-1, 4),

@@ -417,7 +417,7 @@ async fn evaluations_are_the_same_and_refused_alike() {
 }
 
 /// The course is in both or in neither.
-pub fn same_motion(rest: &Value, grpc: Option<&proto::Motion>) {
+pub(crate) fn same_motion(rest: &Value, grpc: Option<&proto::Motion>) {
     let grpc = grpc.expect("a motion");
     let interval = |name: &str| Some([rest[name][0].as_f64()?, rest[name][1].as_f64()?]);
     let bounds = |interval: proto::Interval| [interval.low, interval.high];

@@ -24,9 +24,9 @@ PAGE = REPOSITORY / "docs" / "reference" / "proto.md"
 INTRODUCTION = """\
 # gRPC interface
 
-Generated from [proto/sightfix/v1](../../proto/sightfix/v1) by `python -m codegen.proto_reference` in `clients/python`; do
-not edit. The server has reflection and health checks enabled; errors carry `google.rpc.ErrorInfo`, whose reason is the
-last part of the problem's `type` in REST, and `google.rpc.BadRequest` with the fields at fault. Fields marked
+Generated from [proto/sightfix/v1](../../proto/sightfix/v1) by `python -m codegen.proto_reference` in `clients/python`;
+do not edit. The server has reflection and health checks enabled; errors carry `google.rpc.ErrorInfo`, whose reason is
+the last part of the problem's `type` in REST, and `google.rpc.BadRequest` with the fields at fault. Fields marked
 *optional* tell a missing value from a default one.
 """
 

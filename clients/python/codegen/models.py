@@ -81,9 +81,14 @@ def reference(schema: Schema) -> str:
 def in_order_of_definition(schemas: dict[str, Schema]) -> list[tuple[str, Schema]]:
     """The schemas by name; those that extend others after these, aliases and unions last."""
 
-    def order(item: tuple[str, Schema]) -> tuple[int, str]:
+    def order(item: tuple[str, Schema]) -> tuple[bool, int, str]:
         name, schema = item
-        return (1 if "allOf" in schema else 0 if "properties" in schema else 2, name)
+        is_class = "allOf" in schema or "properties" in schema
+        return (not is_class, bases(schema), name)
+
+    def bases(schema: Schema) -> int:
+        """How many schemas it extends, one after another."""
+        return 1 + bases(schemas[reference(schema["allOf"][0])]) if "allOf" in schema else 0
 
     return sorted(schemas.items(), key=order)
 

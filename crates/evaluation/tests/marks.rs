@@ -286,7 +286,7 @@ impl Speeds {
     fn text(&mut self) -> String {
         let (coverage, courses) = (self.coverage(), self.courses_inside as f64 / self.courses as f64);
         let [tracked, differences, half_width] =
-            [&mut self.tracked, &mut self.differences, &mut self.half_widths].map(median);
+            [&mut self.tracked, &mut self.differences, &mut self.half_widths].map(|values| median(values));
         format!(
             "{:.1} %, differences {:.1} %; +- {:.1} %, {coverage:.3} inside; course {courses:.3} inside; position {}",
             100.0 * tracked,
@@ -297,7 +297,7 @@ impl Speeds {
     }
 }
 
-fn median(values: &mut Vec<f64>) -> f64 {
+fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
 }

@@ -85,7 +85,15 @@ async fn a_status_shows_samples_run_model_and_activity() {
     let rows = csv.lines().count() - 1;
     server.send("POST", "/v1/cameras/a/samples", &headers, csv).await.expect(200);
     let run = server.train("a", &json!({"recipe": "projective", "epochs": 5})).await;
-    let trained = status().await;
+    let mut trained = status().await;
+    // The end of a run is stored a moment before its model answers.
+    for _ in 0..100 {
+        if trained["model"]["view_area"].is_array() {
+            break;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        trained = status().await;
+    }
     assert_eq!(
         (&trained["camera"]["samples"], &trained["latest_run"]["id"]),
         (&json!(rows), &run["id"]),

@@ -27,7 +27,7 @@ use super::source::{Message, Settled, Source, SourceIdentity};
 use crate::app::LiveConnection;
 use crate::config::Limits;
 use crate::domain::OutboxMessage;
-use crate::exchange::{Address, Scheme};
+use crate::exchange::{Address, Scheme, bracketed};
 
 /// What a PUBLISH packet has besides its payload, at most: topic and properties.
 const PACKET_OVERHEAD_BYTES: usize = 66_000;
@@ -82,8 +82,7 @@ async fn place(
     };
     let host = match &bridge {
         Some(bridge) => bridge.socket(),
-        None if address.host.contains(':') => format!("[{}]", address.host),
-        None => address.host.clone(),
+        None => bracketed(&address.host).into_owned(),
     };
     Ok((Place { host, port: address.port, is_socket: bridge.is_some() }, bridge))
 }

@@ -22,7 +22,7 @@ use super::peer::{OPEN_TIME, connect, within};
 use super::sink::{Outcomes, Sink};
 use crate::clock::Clock;
 use crate::domain::OutboxMessage;
-use crate::exchange::{Address, Scheme};
+use crate::exchange::{Address, Scheme, bracketed};
 
 /// Bytes of an answer that are read, so that the connection can be used again.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
@@ -48,11 +48,7 @@ impl Webhook {
     ) -> Result<Self, PeerError> {
         let signing_key = credentials.secrets.get("signing_key").map(signing_key).transpose()?;
         let authorization = credentials.secrets.get("authorization").map(header).transpose()?;
-        let host = if address.host.contains(':') {
-            format!("[{}]:{}", address.host, address.port)
-        } else {
-            format!("{}:{}", address.host, address.port)
-        };
+        let host = format!("{}:{}", bracketed(&address.host), address.port);
         let stream = connect(address, address.scheme == Scheme::Https, credentials).await?;
         let (sender, connection) =
             http1::handshake(TokioIo::new(stream)).await.map_err(|error| PeerError(error.to_string()))?;

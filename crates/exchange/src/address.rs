@@ -1,5 +1,7 @@
 //! Addresses of connections: what is reached, and how.
 
+use std::borrow::Cow;
+
 use crate::domain::{Error, Result, check_text};
 
 /// Longest address, bytes.
@@ -118,6 +120,12 @@ pub struct Address {
     pub others: Vec<(String, u16)>,
     /// Path and query, from `/` on, of a webhook or a serial device.
     pub path: String,
+}
+
+/// A host as it stands before a port: IPv6 in brackets.
+#[must_use]
+pub fn bracketed(host: &str) -> Cow<'_, str> {
+    if host.contains(':') { Cow::Owned(format!("[{host}]")) } else { Cow::Borrowed(host) }
 }
 
 impl Address {

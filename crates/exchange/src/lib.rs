@@ -54,7 +54,7 @@ mod unix_time;
 pub mod wire;
 mod write;
 
-pub use address::{Address, Scheme, SerialLine};
+pub use address::{Address, Scheme, SerialLine, bracketed};
 pub use connection::{
     CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, ReceiverFrom, SaslMechanism, Secrets,
     SinkSettings, SourceSettings,

@@ -19,7 +19,7 @@ use rskafka::client::{Client, ClientBuilder, Credentials as UserAndPassword, Sas
 use super::credentials::{Credentials, PeerError};
 use super::peer::{OPEN_TIME, within};
 use super::tls;
-use crate::exchange::{Address, SaslMechanism, Scheme};
+use crate::exchange::{Address, SaslMechanism, Scheme, bracketed};
 
 pub(super) use sink::KafkaSink;
 pub(super) use source::SourceReader;
@@ -53,10 +53,7 @@ impl Brokers {
     ) -> Result<Self, PeerError> {
         let first = (&address.host, &address.port);
         let hosts = std::iter::once(first).chain(address.others.iter().map(|(host, port)| (host, port)));
-        let hosts = hosts.map(|(host, port)| match host.contains(':') {
-            true => format!("[{host}]:{port}"),
-            false => format!("{host}:{port}"),
-        });
+        let hosts = hosts.map(|(host, port)| format!("{}:{port}", bracketed(host)));
         // The connection as a whole is opened again with growing pauses; here only changes of leaders are waited for.
         let backoff = BackoffConfig {
             init_backoff: Duration::from_millis(100),

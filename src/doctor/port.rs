@@ -40,19 +40,25 @@ fn check_blocking(address: SocketAddr) -> Check {
     }
 }
 
-/// Asks a server for `/livez`; the first bytes of its answer, which for one that is alive begin with
-/// `HTTP/1.1 200`.
-///
-/// # Errors
-/// Nobody answers within two seconds.
-pub fn request_liveness(mut address: SocketAddr) -> io::Result<String> {
+/// The address by which this machine reaches a server of its own that listens on another one.
+#[must_use]
+pub fn reachable(mut address: SocketAddr) -> SocketAddr {
     if address.ip().is_unspecified() {
         address.set_ip(match address.ip() {
             IpAddr::V4(_) => Ipv4Addr::LOCALHOST.into(),
             IpAddr::V6(_) => Ipv6Addr::LOCALHOST.into(),
         });
     }
-    let mut stream = TcpStream::connect_timeout(&address, TIMEOUT)?;
+    address
+}
+
+/// Asks a server for `/livez`; the first bytes of its answer, which for one that is alive begin with
+/// `HTTP/1.1 200`.
+///
+/// # Errors
+/// Nobody answers within two seconds.
+pub fn request_liveness(address: SocketAddr) -> io::Result<String> {
+    let mut stream = TcpStream::connect_timeout(&reachable(address), TIMEOUT)?;
     stream.set_read_timeout(Some(TIMEOUT))?;
     stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n")?;
     let mut first = [0; 15];

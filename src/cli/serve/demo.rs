@@ -2,7 +2,7 @@
 //! server's own port.
 
 use std::io::Write as _;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::num::NonZeroU64;
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,6 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::app::{App, RunRequest};
 use crate::cli::progress::Progress;
+use crate::doctor::reachable;
 use crate::domain::{CameraId, Durability, GnssError, JobState, NewCamera, Observation, SigmaM};
 use crate::exchange::ObservedRow;
 use crate::replay::{Counters, FaultShares, Pace, RecordedStream, ReplayOptions, replay};
@@ -106,14 +107,6 @@ pub(super) async fn walk(address: SocketAddr, now: Timestamp) -> anyhow::Result<
     let (counters, stop) = (Arc::new(Counters::default()), CancellationToken::new());
     replay(Arc::new(recording), Arc::new(options), counters, stop).await?;
     Ok(())
-}
-
-/// The address by which this machine reaches itself.
-fn reachable(mut address: SocketAddr) -> SocketAddr {
-    if address.ip().is_unspecified() {
-        address.set_ip(Ipv4Addr::LOCALHOST.into());
-    }
-    address
 }
 
 /// What camera and phones give of a row; `None` if nothing.

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use hyper::{HeaderMap, StatusCode, Uri};
 use jiff::Timestamp;
 use serde::Serialize;
-use utoipa::ToSchema;
+use utoipa::{IntoResponses, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -513,6 +513,24 @@ impl FromRequest<Rest> for PushedBody {
     }
 }
 
+/// The answers to a message that is handed in.
+#[derive(IntoResponses)]
+#[expect(dead_code, reason = "for the description alone")]
+enum PushAnswers {
+    /// It was taken; the answer that its application expects
+    #[response(status = 200, content_type = "application/json")]
+    Answered(String),
+    /// It was taken
+    #[response(status = 204)]
+    Taken,
+    /// Another node runs the source; `location` is the same at that node
+    #[response(status = 307, content_type = "application/problem+json")]
+    AtOtherNode(Problem<'static>),
+    /// The connection is paused, or takes no messages by HTTP
+    #[response(status = 409, content_type = "application/problem+json")]
+    NotTaken(Problem<'static>),
+}
+
 /// Hands a message in, and answers as its application expects.
 async fn taken(
     CallerApp(app): CallerApp,
@@ -536,12 +554,7 @@ async fn taken(
             description = "The message itself, of any names, where there is no body"),
     ),
     request_body(content = String, description = "A message of the source's format", content_type = "*/*"),
-    responses(
-        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
-        (status = 204, description = "It was taken"),
-        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
-        (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
-    )
+    responses(PushAnswers)
 )]
 async fn push_message(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
     taken(app, id, message).await
@@ -557,12 +570,7 @@ async fn push_message(app: CallerApp, id: ConnectionPath, message: PushedBody) -
         ("parameters" = HashMap<String, String>, Query, style = Form, explode, nullable,
             description = "The message itself, of any names, such as `lat` and `lon`"),
     ),
-    responses(
-        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
-        (status = 204, description = "It was taken"),
-        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
-        (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
-    )
+    responses(PushAnswers)
 )]
 async fn push_query(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
     taken(app, id, message).await
@@ -580,12 +588,7 @@ async fn push_query(app: CallerApp, id: ConnectionPath, message: PushedBody) -> 
             description = "The message itself, of any names, where there is no body"),
     ),
     request_body(content = String, description = "A message of the source's format", content_type = "*/*"),
-    responses(
-        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
-        (status = 204, description = "It was taken"),
-        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
-        (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
-    )
+    responses(PushAnswers)
 )]
 async fn push_message_with_key(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
     taken(app, id, message).await
@@ -602,12 +605,7 @@ async fn push_message_with_key(app: CallerApp, id: ConnectionPath, message: Push
         ("parameters" = HashMap<String, String>, Query, style = Form, explode, nullable,
             description = "The message itself, of any names, such as `lat` and `lon`"),
     ),
-    responses(
-        (status = 200, description = "It was taken; the answer that its application expects", body = String, content_type = "application/json"),
-        (status = 204, description = "It was taken"),
-        (status = 307, description = "Another node runs the source; `location` is the same at that node", body = Problem, content_type = "application/problem+json"),
-        (status = 409, description = "The connection is paused, or takes no messages by HTTP", body = Problem, content_type = "application/problem+json"),
-    )
+    responses(PushAnswers)
 )]
 async fn push_query_with_key(app: CallerApp, id: ConnectionPath, message: PushedBody) -> ApiResult {
     taken(app, id, message).await

@@ -3,8 +3,9 @@
 //!
 //! Each simulated camera is one task with one stream. It takes items from its [`PacedFeed`] when they
 //! are due and holds them in its [`ResendBuffer`] until they are done; after a failure it waits
-//! ([`Backoff`]), opens another stream, at the node that the server names if it names one, and resumes after the last acknowledgement. What never happens
-//! here: files, flags, unbounded memory, randomness without a seed.
+//! ([`Backoff`]), opens another stream, at the node that the server names if it names one, and resumes after the
+//! last acknowledgement.
+//! Never here: files, flags, unbounded memory, randomness without a seed.
 
 mod fault_injection;
 mod latency_histogram;

@@ -127,7 +127,7 @@ pub struct Regressor {
     track_noise: Option<TrackNoiseModel>,
     /// Added to every error variance, m2 per axis.
     added_m2: f64,
-    /// Models of earlier formats have none.
+    /// `None` while the model is fitted.
     pub(super) scene: Option<Scene>,
     frozen_after_s: f64,
     pub(super) error_model: ErrorModel,
@@ -196,7 +196,7 @@ impl Regressor {
     }
 
     /// Radius about the plane's origin, the centre of the training positions, that holds these: three of their
-    /// standard deviations per axis, m. Infinite for a model of an earlier format.
+    /// standard deviations per axis, m. Infinite while the model is fitted.
     #[must_use]
     pub fn scene_radius_m(&self) -> f64 {
         self.track_noise.map_or(f64::INFINITY, |noise| noise.regression_length_m)

@@ -138,7 +138,7 @@ impl LocalBoxModel {
         tensors.put_f32("cells", &[self.regions.len(), NUMBERS], numbers);
     }
 
-    /// The stored regions; none in an earlier format.
+    /// The stored regions; none where the calibration has none.
     ///
     /// # Errors
     /// Names `weights` if the numbers are not those of regions.

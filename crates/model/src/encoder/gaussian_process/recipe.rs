@@ -210,7 +210,7 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
 #[derive(Debug, Clone)]
 pub(crate) struct GaussianProcessEncoder {
     pub(crate) predictor: Predictor,
-    /// Models of earlier releases have none.
+    /// Fits of parts of the rows have none.
     pub(crate) auto_encoder: Option<AutoEncoder>,
 }
 

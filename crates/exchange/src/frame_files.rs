@@ -60,7 +60,7 @@ impl FrameClock {
 /// The boxes of a file, in its order.
 ///
 /// # Errors
-/// Of an item: the file cannot be read further; nothing follows. The inner error: that line is invalid.
+/// An item is an error if the file cannot be read further; nothing follows. The inner error: that line is invalid.
 pub fn read_frame_file<R: Read>(
     reader: R,
     format: FrameFileFormat,

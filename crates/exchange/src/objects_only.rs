@@ -27,9 +27,9 @@ pub(super) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
 /// Any part of a deserializer, so that nested values are parsed by the same rule.
 struct ObjectsOnly<'b, T> {
     inner: T,
-    /// What may still be taken for elements, bytes.
+    /// Memory left for elements, bytes.
     left_bytes: &'b Cell<usize>,
-    /// Whether the keys of an object are entries of a map, and not fields of a struct.
+    /// True if the keys of an object are entries of a map, and not fields of a struct.
     is_map: bool,
 }
 

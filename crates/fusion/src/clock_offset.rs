@@ -49,7 +49,7 @@ pub struct OffsetEstimate {
     pub explained: f64,
     /// R^2 at offset 0.
     pub explained_at_zero: f64,
-    /// Displacements used.
+    /// Number of displacements used.
     pub rows: usize,
 }
 
@@ -137,7 +137,7 @@ fn feature_differences(boxes: &[(f64, SVector<f64, FEATURES>)], baseline_s: f64)
 
 /// How well the boxes explain the motion of the fixes.
 struct Explained {
-    /// R^2.
+    /// Share of the variance that is explained, R^2.
     share: f64,
     rows: usize,
     /// Time covered, without gaps.

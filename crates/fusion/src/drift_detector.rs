@@ -34,7 +34,7 @@ use crate::geo::EastNorth;
 const MAX_ARCHIVED_CELLS: usize = 1_024;
 /// Independent epochs, and cells of ground, that the only target of a camera must cover.
 const MIN_SINGLE_TARGET_EPOCHS: u32 = 3;
-/// The variance of the archived offset is at least that of the slow errors of so many epochs: a day.
+/// The variance of the archived offset is at least that of the slow errors of this number of epochs: a day.
 const MAX_ARCHIVED_EPOCHS: f64 = 24.0;
 
 /// The camera's pose has changed.

@@ -13,7 +13,7 @@ pub struct SampleFilter {
     pub from: Option<Timestamp>,
     /// Before this instant.
     pub until: Option<Timestamp>,
-    /// Of this target alone.
+    /// Only samples of this target.
     pub target_id: Option<TargetId>,
     /// Only samples that have a fix, or only those that have none.
     pub has_fix: Option<bool>,

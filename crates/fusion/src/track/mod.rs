@@ -88,7 +88,7 @@ impl Track {
         self.current.time
     }
 
-    /// Whether the target has not been measured for longer than `time_to_live_s`.
+    /// True if the target has not been measured for longer than `time_to_live_s`.
     #[must_use]
     pub fn is_expired(&self, at: Timestamp) -> bool {
         at.duration_since(self.current.time).as_secs_f64() > self.settings.time_to_live_s

@@ -1,4 +1,4 @@
-//! What only PostgreSQL has: several processes, connections that end, migrations at once.
+//! Tests of PostgreSQL alone: several processes, connections that end, migrations at once.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;

@@ -1,5 +1,5 @@
-//! What both backends promise. Every case has a file of its own, or, where `SIGHTFIX_TEST_POSTGRES` is the URL of a
-//! server's database, a database of its own on that server (`.ci/postgres`).
+//! Tests of what both backends promise. Every case has a file of its own, or, where `SIGHTFIX_TEST_POSTGRES` is the URL
+//! of a server's database, a database of its own on that server (`.ci/postgres`).
 
 mod cameras;
 mod connections;

@@ -200,7 +200,7 @@ fn a_stored_model_answers_as_the_fitted_one_and_is_the_same_for_the_same_rows() 
     }
 }
 
-/// What two answers share is no part of the error of their distance.
+/// Errors that two answers share are no part of the error of their distance.
 #[test]
 fn the_error_of_a_distance_vanishes_with_the_distance_and_is_bounded_by_those_of_its_ends() {
     let (rows, tests) = walkers(4001, 8, 90, 1.0);

@@ -160,7 +160,7 @@ impl Server {
         Reloader { app: self.app.clone(), tls: self.tls.clone() }
     }
 
-    /// Whether it speaks TLS.
+    /// True if it speaks TLS.
     #[must_use]
     pub const fn has_tls(&self) -> bool {
         self.tls.is_some()

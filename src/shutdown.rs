@@ -34,7 +34,7 @@ impl Shutdown {
         self.0.draining.cancel();
     }
 
-    /// Whether the drain has started.
+    /// True if the drain has started.
     #[must_use]
     pub fn is_draining(&self) -> bool {
         self.0.draining.is_cancelled()

@@ -27,7 +27,7 @@ impl From<&Limits> for MatchLimits {
     }
 }
 
-/// What a recording is matched by.
+/// The camera, the recording and the options of a match.
 #[derive(Debug, Clone, Copy)]
 pub struct MatchRequest<'a> {
     /// The camera's model; `None` to find one.
@@ -51,14 +51,14 @@ pub struct MatchedRecording {
     pub receivers: Receivers,
     /// How each sure box was matched, by time and receiver.
     pub associations: Associations,
-    /// What was matched.
+    /// The report of the match.
     pub report: MatchReport,
 }
 
 /// How boxes were matched, by time and target.
 pub type Associations = BTreeMap<(Timestamp, TargetId), Association>;
 
-/// What became of tracklets and receivers.
+/// The outcome of a match for its tracklets and receivers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchReport {
     /// Tracklets: stretches of boxes of one tracker's id.
@@ -77,7 +77,7 @@ pub struct MatchReport {
     pub pairs: Vec<MatchedPair>,
     /// Clock offsets found, beside those given.
     pub clock_offsets: Vec<(ReceiverId, ClockOffset)>,
-    /// What the search of a camera without a model found.
+    /// The scores of the search of a camera without a model.
     pub world: Option<WorldScores>,
 }
 

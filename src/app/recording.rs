@@ -42,14 +42,14 @@ pub struct RejectedParts {
     pub rows: Vec<(Part, RowError)>,
 }
 
-/// What was read of two files, in memory.
+/// The rows of two files, in memory.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Recording {
     /// The boxes, in the file's order.
     pub detections: Vec<Detection>,
     /// The fixes, in the file's order.
     pub fixes: Vec<ReceivedFix>,
-    /// What could not be read.
+    /// The rows that could not be read.
     pub rejected: RejectedParts,
 }
 
@@ -215,7 +215,7 @@ pub fn of_part(part: Part, error: Error) -> Error {
     }
 }
 
-/// What became of the rows of two files; a row that was rejected counts nowhere here.
+/// Counts of the rows of two files. Rejected rows are not counted here.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PairingCounts {
     /// Boxes read.

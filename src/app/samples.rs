@@ -27,28 +27,28 @@ const BATCHES_AHEAD: usize = 8;
 pub struct ImportOptions {
     /// When they are acknowledged.
     pub durability: Durability,
-    /// What becomes of samples that are stored already.
+    /// The rule for samples that are stored already.
     pub on_conflict: OnConflict,
     /// Given if the client may send the same import again.
     pub idempotent: Option<IdempotentRequest>,
 }
 
-/// What became of an import's rows.
+/// The counts of an import's rows.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ImportReport {
     /// Stored now.
     pub accepted: u64,
-    /// Of the accepted ones, those without a fix.
+    /// Number of accepted samples without a fix.
     pub without_fix: u64,
     /// The same camera, target and time were stored before, or stand twice in the import.
     pub duplicate: u64,
-    /// Of the accepted ones, those that replaced a stored sample on request.
+    /// Number of accepted samples that replaced a stored sample on request.
     pub replaced: u64,
     /// Not stored for a fault of their own.
     pub rejected: u64,
     /// The first of them, with their reasons.
     pub rejected_rows: Vec<RejectedRow>,
-    /// What seems to be wrong with the rows as a whole, with its remedy.
+    /// Probable faults of the rows as a whole, each with its remedy.
     #[serde(default)]
     pub warnings: Vec<String>,
 }
@@ -163,7 +163,7 @@ impl App {
         import.finish(end).await
     }
 
-    /// What became of an import that was made under the same key before, if any.
+    /// The report of an import that was made under the same key before, if any.
     ///
     /// # Errors
     /// `IdempotencyKeyReused` if that was another one.
@@ -173,7 +173,7 @@ impl App {
         first.map(|report| serde_json::from_str(&report).map_err(Error::fault)).transpose()
     }
 
-    /// What the rows of a camera must keep.
+    /// The rules for rows of a camera.
     ///
     /// # Errors
     /// `CameraNotFound`.

@@ -73,7 +73,7 @@ impl PlaceCheck {
         }
     }
 
-    /// What is wrong with the import as a whole, with the remedy.
+    /// Returns the faults of the import as a whole, each with its remedy.
     pub(super) fn warnings(&self) -> Vec<String> {
         const REMEDY: &str =
             "swap the two columns and import the rows again with on_conflict=replace (--replace)";

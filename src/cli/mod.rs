@@ -191,7 +191,7 @@ impl DataFolder {
     }
 }
 
-/// What to do where there is no data folder.
+/// The rule for a missing data folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum MissingData {
     Create,

@@ -29,7 +29,7 @@ impl ByteBudget {
         self.bytes
     }
 
-    /// What is charged for so many bytes: what is larger than the whole budget waits for all of it.
+    /// The charge for a number of bytes: more than the whole budget waits for all of it.
     fn charge(&self, bytes: usize) -> u32 {
         u32::try_from(bytes.min(self.bytes)).unwrap_or(u32::MAX)
     }

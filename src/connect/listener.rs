@@ -73,7 +73,7 @@ impl Source for LineListener {
     }
 }
 
-/// What the connection's status says of its clients.
+/// The clients of a connection, for its status.
 #[derive(Clone)]
 struct ClientStatus {
     live: Arc<LiveConnection>,

@@ -123,7 +123,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .prepare()
 }
 
-/// What a request is for, by its path.
+/// The class of a request, by its path.
 #[must_use]
 pub fn class(path: &str) -> RequestClass {
     match path {

@@ -274,7 +274,7 @@ impl StreamSession {
     }
 }
 
-/// Whether a refusal is of the whole stream, not of an item.
+/// True if a refusal is of the whole stream, not of an item.
 const fn ends_stream(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::CameraNotFound | ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }

@@ -1,4 +1,4 @@
-//! What every matched route asks of a request: that its caller may use it, and that its query names parameters
+//! The checks of every matched route: its caller may use it, and its query names parameters
 //! of the operation only.
 
 use std::collections::{HashMap, HashSet};

@@ -42,9 +42,9 @@ const TURN_BYTES: u64 = 64 * 1024;
 /// Bytes that a coded byte may decode to. NDJSON of a target that stands still, with the same box and fix in every row, comes
 /// to 76 by gzip and to 217 by zstd at its best; zeros come to 1,030 and to more than 20,000.
 const MOST_RATIO: u64 = 256;
-/// What a body may decode to besides, whatever its length.
+/// Bytes that a body may decode to in addition, whatever its length.
 const FREE_BYTES: u64 = 1024 * 1024;
-/// What a member of gzip, or a frame of zstd, counts as if it had decoded to that much: it needs a decoder of its own.
+/// Decoded bytes that each member of gzip, or frame of zstd, counts as: it needs a decoder of its own.
 const MEMBER_BYTES: u64 = 64 * 1024;
 
 /// The most that so many coded bytes decode to.
@@ -52,7 +52,7 @@ const fn most_decoded_bytes(coded_bytes: u64) -> u64 {
     coded_bytes.saturating_mul(MOST_RATIO).saturating_add(FREE_BYTES)
 }
 
-/// What a client accepts of the codings of a response.
+/// The codings of a response that a client accepts.
 pub(super) struct AcceptedCoding(Vec<HeaderValue>);
 
 impl AcceptedCoding {

@@ -29,7 +29,7 @@ impl BodyError {
         Self::Broken
     }
 
-    /// What its sender is told.
+    /// The refusal that the sender receives.
     pub(super) fn refusal(self) -> Error {
         let kind = match self {
             Self::Broken => ErrorKind::Cancelled,

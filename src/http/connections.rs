@@ -50,7 +50,7 @@ struct ConnectionChange {
     /// New name; null is the id.
     #[schema(max_length = 200)]
     display_name: Option<String>,
-    /// Whether it stays at rest.
+    /// True if the connection stays paused.
     paused: Option<bool>,
     /// Changes to the source.
     source: Option<SourceSettings>,
@@ -96,7 +96,7 @@ struct LastMessage {
     subject: String,
     /// Its first 4 KiB.
     text: String,
-    /// What it says: its items, what was skipped and why, or why it cannot be read.
+    /// Its items, what was skipped and why, or why it cannot be read.
     reading: Vec<String>,
 }
 
@@ -128,13 +128,13 @@ impl From<crate::app::CountedReason> for CountedReason {
     }
 }
 
-/// What failed.
+/// The latest error of a connection.
 #[derive(Serialize, ToSchema)]
 struct LastError {
     /// When.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
-    /// What.
+    /// The error's text.
     message: String,
 }
 
@@ -148,7 +148,7 @@ struct ConnectionNode {
     url: Option<String>,
 }
 
-/// What a connection does, since the server was started; counts are those of all nodes.
+/// The status of a connection since the server was started; counts are those of all nodes.
 #[derive(Serialize, ToSchema)]
 struct ConnectionStatus {
     /// State.
@@ -160,7 +160,7 @@ struct ConnectionStatus {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     since: Option<Timestamp>,
-    /// What failed last.
+    /// The latest error.
     #[serde(skip_serializing_if = "Option::is_none")]
     last_error: Option<LastError>,
     /// The last message.
@@ -209,7 +209,7 @@ struct Connection {
     id: String,
     /// The name for people.
     display_name: String,
-    /// Whether it stays at rest.
+    /// True if the connection stays paused.
     paused: bool,
     /// Takes detections or fixes in.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -227,7 +227,7 @@ struct Connection {
     /// When it was changed last.
     #[schema(value_type = String, format = DateTime)]
     updated_at: Timestamp,
-    /// What it does; not part of the entity tag's revision.
+    /// The status of the connection; not part of the entity tag's revision.
     #[serde(skip_serializing_if = "Option::is_none")]
     status: Option<ConnectionStatus>,
 }
@@ -289,13 +289,13 @@ struct ConnectionPage {
     next_cursor: Option<String>,
 }
 
-/// What came of trying a connection.
+/// The outcome of a trial of a connection.
 #[derive(Serialize, ToSchema)]
 struct Trial {
     /// The message with its reading; missing if none came, or nothing could be sent.
     #[serde(skip_serializing_if = "Option::is_none")]
     message: Option<LastMessage>,
-    /// What failed.
+    /// The error that ended the trial.
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
 }

@@ -55,7 +55,7 @@ impl From<domain::TimeRange> for TimeRange {
     }
 }
 
-/// What to evaluate.
+/// The parameters of an evaluation.
 #[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct EvaluationDraft {
@@ -162,7 +162,7 @@ struct Evaluation {
     /// The target walked on this line.
     #[serde(skip_serializing_if = "Option::is_none")]
     truth_line: Option<Vec<[f64; 2]>>,
-    /// What is compared.
+    /// The methods that are compared.
     methods: Vec<String>,
     /// The recipe that tracks stand on.
     recipe: Recipe,
@@ -267,7 +267,7 @@ async fn start_evaluation(CallerApp(app): CallerApp, body: JsonBody) -> ApiResul
 #[utoipa::path(
     get, path = "/v1/evaluations", tag = "evaluations",
     params(
-        ("camera" = Option<String>, Query, description = "Of this camera alone"),
+        ("camera" = Option<String>, Query, description = "Only evaluations of this camera"),
         ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
     ),

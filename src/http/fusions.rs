@@ -19,7 +19,7 @@ use crate::app::App;
 use crate::domain::{Error, Observation, Receivers, Result, convert_all};
 use crate::exchange::{Format, RowRules, read_observation_features, read_observations, wire, write_fused};
 
-/// What observations are read from, and positions written in.
+/// The formats from which observations are read, and in which positions are written.
 const FORMATS: [Format; 4] = [Format::Json, Format::Csv, Format::Ndjson, Format::GeoJson];
 /// Typical size of a fused position as JSON, to reserve memory.
 const ITEM_BYTES: usize = 800;

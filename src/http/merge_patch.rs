@@ -11,7 +11,7 @@ pub(super) type JsonObject = serde_json::Map<String, Value>;
 /// Times that a patch without a version is made of what was read.
 const ATTEMPTS: u32 = 8;
 
-/// What a resource becomes by a patch, as the JSON of its draft: its id and the fields that may be patched.
+/// Returns a patched resource as the JSON of its draft: its id and the fields that may be patched.
 ///
 /// # Errors
 /// `InvalidArgument` naming a field that cannot be changed.

@@ -49,7 +49,7 @@ struct ModelVersion {
     created_at: Timestamp,
     /// Size of the weights.
     weights_bytes: u64,
-    /// What it says of itself.
+    /// The version's own description.
     metadata: ModelMetadata,
 }
 

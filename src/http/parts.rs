@@ -27,7 +27,7 @@ use crate::domain::{Error, ErrorKind, Result};
 
 /// Read at once while the body is split into its parts.
 const CHUNK_BYTES: usize = 32 * 1024;
-/// What may come between two parts: a boundary and a few headers.
+/// The largest head between two parts: a boundary and a few headers.
 const LONGEST_HEAD_BYTES: usize = 8 * CHUNK_BYTES;
 
 /// A part of a body.

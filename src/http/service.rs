@@ -1,4 +1,4 @@
-//! What watches the server: `/livez`, `/readyz`, `/metrics`.
+//! Routes for those that watch the server: `/livez`, `/readyz`, `/metrics`.
 
 use std::time::Duration;
 
@@ -22,7 +22,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz)).routes(routes!(metrics))
 }
 
-/// Whether the process is alive
+/// Check that the process is alive
 #[utoipa::path(
     get, path = "/livez", tag = "service",
     responses((status = 200, description = "It is", body = String, content_type = "text/plain"))
@@ -34,7 +34,7 @@ async fn livez() -> &'static str {
 /// Cameras that `/readyz` names one by one.
 const NAMED_CAMERAS: usize = 100;
 
-/// Whether the server can take work
+/// Check that the server is ready
 ///
 /// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
 /// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has

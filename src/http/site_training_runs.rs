@@ -24,7 +24,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(cancel_site_training_run))
 }
 
-/// What to fit; all of it may be left out.
+/// The options of a fit; all of them may be left out.
 #[derive(Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct SiteRunDraft {
@@ -72,14 +72,13 @@ struct SiteTrainingRun {
     progress: RunProgress,
     /// Times a worker has claimed it without returning it to the queue in order.
     attempt: u32,
-    /// What the run found out, once it has succeeded: the version of each camera, and what the cameras gain from each
-    /// other.
+    /// The run's findings, once it has succeeded: the version of each camera, and its gain from the other cameras.
     #[serde(skip_serializing_if = "Option::is_none")]
     report: Option<SiteTrainingReport>,
     /// The report as lines of text.
     #[serde(skip_serializing_if = "Option::is_none")]
     report_text: Option<String>,
-    /// Whether the versions became active, and why or why not, or why the run failed.
+    /// Says if the versions became active, and why or why not, or why the run failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     outcome: Option<String>,
     /// When it was asked for.

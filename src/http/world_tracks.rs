@@ -53,7 +53,7 @@ struct WorldSighting {
     last_seen_at: Timestamp,
 }
 
-/// What a world track says of its target at the latest instant measured.
+/// The state of a world track at the latest instant measured.
 #[derive(Serialize, ToSchema)]
 struct WorldTrackState {
     /// The track's id. It is never used again, also not after a start of the server.
@@ -227,7 +227,7 @@ async fn get_world_track(
     answer(&headers, &app.world_track_history(&id, track).await?, None)
 }
 
-/// What an event tells beside a position.
+/// The contents of an event besides a position.
 #[derive(Serialize, ToSchema)]
 struct TrackChange {
     /// The instant by the clock of the cameras.
@@ -273,7 +273,7 @@ struct LostSiteEventCount {
     events: Option<u64>,
 }
 
-/// What the events of a site carry, by the event's name.
+/// The bodies of a site's events, by the event's name.
 #[derive(ToSchema)]
 #[serde(untagged)]
 #[expect(dead_code, reason = "the shapes of events, for the description alone")]

@@ -30,7 +30,7 @@ const DISCOVERY_TIME: SignedDuration = SignedDuration::from_mins(10);
 /// Longest name of a person that is stored, in bytes.
 const MAX_NAME_BYTES: usize = 128;
 
-/// What binds the two halves of a sign-in to one browser.
+/// The secret that binds the two halves of a sign-in to one browser.
 pub struct SignInSecret(String);
 
 impl SignInSecret {
@@ -79,11 +79,11 @@ pub struct Identity {
     pub name: String,
     /// The provider's address and its id of the person, who keeps it when names change.
     pub subject: String,
-    /// What they may do.
+    /// The scope of the user.
     pub scope: Scope,
 }
 
-/// What the provider says of itself (OpenID Connect Discovery 1.0).
+/// The provider's own description (OpenID Connect Discovery 1.0).
 #[derive(Clone, Deserialize)]
 struct Discovery {
     issuer: String,
@@ -137,7 +137,7 @@ impl Provider {
         }))
     }
 
-    /// Whether browsers reach this server by HTTPS, so that its cookies are for HTTPS alone.
+    /// True if browsers reach this server by HTTPS, so that its cookies are for HTTPS alone.
     #[must_use]
     pub fn is_https(&self) -> bool {
         self.redirect_url.starts_with("https://")
@@ -261,7 +261,7 @@ impl Provider {
         (authorization, form.finish())
     }
 
-    /// What the provider has answered. Why it has not is for the log alone.
+    /// Returns the provider's answer. The reason of a failure is for the log alone.
     fn provided<T>(&self, answer: anyhow::Result<T>) -> Result<T> {
         answer.map_err(|error| {
             let error = format!("{error:#}");

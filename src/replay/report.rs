@@ -101,7 +101,7 @@ pub struct ReplayReport {
     pub answered: u64,
     /// Items refused, by reason.
     pub refused: BTreeMap<String, u64>,
-    /// Of these, items that are older than what their track takes, so that it did not move.
+    /// Number of these items that are older than what their track takes, so that it did not move.
     pub too_late: u64,
     /// Items whose answer the server dropped because this client read too slowly.
     pub lost_answers: u64,
@@ -211,7 +211,7 @@ impl ReplayReport {
         }
     }
 
-    /// Whether every item was answered (or its answer was dropped) and acknowledged.
+    /// True if every item was answered (or its answer was dropped) and acknowledged.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.unanswered == 0 && self.unacknowledged.unwrap_or(0) == 0 && self.given_up == 0

@@ -7,7 +7,7 @@ use tokio::time::Instant;
 
 use crate::admission::TokenBucket;
 
-/// What a client begins an HTTP/2 connection with (RFC 9113, 3.4).
+/// The first bytes of a client's HTTP/2 connection (RFC 9113, 3.4).
 pub(super) const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
 const FRAME_HEADER_BYTES: usize = 9;

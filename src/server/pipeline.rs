@@ -1,4 +1,4 @@
-//! What every request goes through, whatever its transport: id, span, host and origin, admission,
+//! The pipeline of every request, whatever its transport: id, span, host and origin, admission,
 //! deadline, then the transport.
 
 use std::convert::Infallible;
@@ -76,7 +76,7 @@ pub(super) struct RequestPipeline {
     cors: Option<CorsLayer>,
 }
 
-/// What a request was granted.
+/// The grants of a request.
 struct Granted {
     ticket: Ticket,
     caller: Caller,

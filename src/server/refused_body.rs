@@ -61,7 +61,7 @@ impl Discards {
     }
 }
 
-/// What a client is charged for a body of so many bytes, and a rest that was discarded: nothing unless it was refused.
+/// The bytes that a client is charged for a body and a rest that was discarded: nothing unless it was refused.
 pub(super) fn read_in_vain(
     response: &Response<Body>,
     received_bytes: u64,

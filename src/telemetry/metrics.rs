@@ -258,7 +258,7 @@ impl Metrics {
         self.maintenance_errors.increment(1);
     }
 
-    /// Whether samples are not deleted for their age, since the clock is not believed.
+    /// True if samples are not deleted for their age, since the clock is not believed.
     pub fn retention_refused(&self, is_refused: bool) {
         self.retention_refused.set(f64::from(u8::from(is_refused)));
     }
@@ -285,7 +285,7 @@ impl Metrics {
         self.models_unusable.set(cameras as f64);
     }
 
-    /// What connections with other systems do.
+    /// Records the figures of connections with other systems.
     pub fn outside_connections(&self, connections: &[OutsideFigures]) {
         self.outside.store(Arc::new(outside::rendered(connections)));
     }

@@ -118,7 +118,7 @@ pub(super) struct KeyTable {
 }
 
 impl KeyTable {
-    /// Whether no key was ever created; `false` before the store was read.
+    /// True if no key was ever created; `false` before the store was read.
     pub(super) fn is_empty(&self) -> bool {
         self.keys.load().version.as_ref().is_some_and(KeysVersion::is_empty)
     }
@@ -164,13 +164,13 @@ impl KeyTable {
         key.cloned().ok_or_else(does_not_work)
     }
 
-    /// Whether a key of that digest is in the table.
+    /// True if a key of that digest is in the table.
     pub(super) fn has(&self, digest: &SecretDigest) -> bool {
         let keys = self.keys.load();
         keys.by_bucket.get(&digest.bucket()).is_some_and(|keys| keys.iter().any(|key| key.digest == *digest))
     }
 
-    /// Whether so long has gone by since the latest call that it was worth a look at the store.
+    /// True if enough time has passed since the latest call to read the store again.
     pub(super) fn may_look(&self, at: Duration) -> bool {
         let (at_ns, pause_ns) = (as_ns(at), as_ns(LOOK_PAUSE));
         let looks =

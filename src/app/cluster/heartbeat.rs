@@ -1,5 +1,5 @@
-//! What a node does by itself: renew, end the registrations of silent nodes, give up what nobody uses, hand over at its
-//! end.
+//! The periodic work of a node: it renews its registration, ends the registrations of silent nodes, releases unused
+//! leases, and hands over at its end.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;

@@ -1,5 +1,5 @@
-//! What a node does where the database goes on from before what it has acknowledged, as after a fail-over to a standby
-//! that had not received everything.
+//! The actions of a node when the database continues from an earlier state than it has acknowledged, as after a
+//! fail-over to a standby that had not received everything.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,7 +10,7 @@ use crate::app::App;
 use crate::app::live::sync::lock;
 use crate::store::HistoryMark;
 
-/// Whether what this process knows is of the history that the database has.
+/// The history of what this process knows, compared with that of the database.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DatabaseHistory {
     /// It is.

@@ -44,12 +44,12 @@ enum Joined {
     Shared(Box<Membership>),
 }
 
-/// What a process tells the others of itself.
+/// The description of a process for the others.
 #[derive(Debug, Clone)]
 pub struct NodeSettings {
     /// Where clients reach it.
     pub url: Option<String>,
-    /// What it does.
+    /// The role of the process.
     pub role: NodeRole,
     /// How long it counts as alive without another renewal.
     pub lease: Duration,
@@ -75,7 +75,7 @@ pub struct NodeStatus {
     pub node: Node,
     /// Cameras that it owns.
     pub cameras: u64,
-    /// Whether it is this process.
+    /// True if it is this process.
     pub is_this: bool,
 }
 
@@ -188,7 +188,7 @@ impl App {
         membership.map_or_else(Watch::default, |it| it.watches.begin(Watched::Site(site)))
     }
 
-    /// Whether what this process knows is of the history that the database has.
+    /// Compares the history of what this process knows with that of the database.
     #[must_use]
     pub fn database_history(&self) -> DatabaseHistory {
         let membership = self.cluster.membership();

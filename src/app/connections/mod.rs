@@ -41,9 +41,9 @@ pub struct ConnectionRequest {
     pub id: ConnectionId,
     /// The name for people; the id if left out.
     pub display_name: Option<String>,
-    /// Whether it is at rest.
+    /// True if it is paused.
     pub paused: bool,
-    /// What it does.
+    /// The settings of its source or sink.
     pub settings: ConnectionSettings,
     /// Secrets to be set, or removed.
     pub secrets: BTreeMap<String, Option<String>>,
@@ -228,7 +228,7 @@ impl App {
         Ok(())
     }
 
-    /// What a connection does, the node that runs it if several share the database, and what is in its outbox.
+    /// The status of a connection, the node that runs it if several share the database, and the counts of its outbox.
     ///
     /// # Errors
     /// A fault of the store.

@@ -1,4 +1,4 @@
-//! What connections do, as every node shows it.
+//! The status of connections, as every node shows it.
 
 use std::collections::HashMap;
 
@@ -16,7 +16,7 @@ pub struct ConnectionNode {
     pub url: Option<String>,
 }
 
-/// What this node has reported to the others.
+/// The statuses that this node has reported to the others.
 #[derive(Default)]
 pub struct ReportedStatuses {
     node: Option<NodeId>,
@@ -47,7 +47,7 @@ impl App {
         Ok(())
     }
 
-    /// What a connection does, whichever node runs it, and that node. Counts are those of all nodes.
+    /// The status of a connection, whichever node runs it, and that node. Counts are those of all nodes.
     ///
     /// # Errors
     /// The database does not answer.

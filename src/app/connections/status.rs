@@ -1,4 +1,4 @@
-//! What connections do now: state, counts, the last message. In memory, since the server was started.
+//! The present status of connections: state, counts, the last message. In memory, since the server was started.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -40,12 +40,12 @@ pub struct LastMessage {
     pub subject: String,
     /// Its beginning.
     pub text: String,
-    /// What it says: its items, what was skipped, or why it cannot be read.
+    /// Its items, what was skipped, or why it cannot be read.
     pub reading: Vec<String>,
 }
 
 impl LastMessage {
-    /// Of a payload, of which the first 4 KiB are kept.
+    /// Makes the last message of a payload and keeps its first 4 KiB.
     #[must_use]
     pub fn new(time: Timestamp, subject: String, payload: &[u8], reading: Vec<String>) -> Self {
         let shown = &payload[..payload.len().min(SHOWN_BYTES)];
@@ -60,7 +60,7 @@ pub struct CountedReason {
     pub reason: String,
     /// How many there were.
     pub count: u64,
-    /// What the latest of them was: an item in words, or the beginning of a message.
+    /// The latest example: an item in words, or the beginning of a message.
     pub example: String,
     /// When that came.
     pub last_at: Timestamp,
@@ -77,7 +77,7 @@ fn without_numbers(reason: &str) -> impl Iterator<Item = char> {
     reason.chars().filter(|own| !own.is_ascii_digit())
 }
 
-/// What a connection does.
+/// The status of a connection.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ConnectionStatus {
@@ -85,7 +85,7 @@ pub struct ConnectionStatus {
     pub state: ConnectionState,
     /// Since when.
     pub since: Option<Timestamp>,
-    /// What failed last, and when.
+    /// The last error and its time.
     pub last_error: Option<(Timestamp, String)>,
     /// The last message.
     pub last_message: Option<LastMessage>,
@@ -179,7 +179,7 @@ pub struct LiveConnection {
 }
 
 impl LiveConnection {
-    /// What it does now.
+    /// Returns the present status.
     #[must_use]
     pub fn status(&self) -> ConnectionStatus {
         lock(&self.status).clone()
@@ -244,7 +244,7 @@ impl ConnectionBoard {
         live.iter().map(|(id, (key, connection))| (id.clone(), *key, connection.status())).collect()
     }
 
-    /// What is known of each.
+    /// Returns the status of each connection.
     pub(super) fn statuses(&self) -> HashMap<ConnectionKey, ConnectionStatus> {
         lock(&self.live).values().map(|(key, connection)| (*key, connection.status())).collect()
     }

@@ -39,7 +39,7 @@ impl ResidualQueue {
     }
 }
 
-/// What waits, for the task.
+/// The residuals that wait for the task.
 pub(in crate::app) struct WaitingResiduals {
     receiver: mpsc::Receiver<PairResidual>,
     closed: CancellationToken,

@@ -26,7 +26,7 @@ pub(super) struct Observed {
     pub(super) frozen_since: Option<Timestamp>,
 }
 
-/// What happens in a camera's view.
+/// An event in a camera's view.
 #[derive(Debug, Clone)]
 pub enum CameraEvent {
     /// A target was measured.
@@ -106,7 +106,7 @@ impl CameraLive {
         self.replaced.cancelled().await;
     }
 
-    /// Whether the camera is deleted.
+    /// True if the camera is deleted.
     #[cfg(test)]
     pub(in crate::app) fn is_deleted(&self) -> bool {
         self.deleted.is_cancelled()
@@ -133,7 +133,7 @@ impl CameraLive {
         }
     }
 
-    /// What was observed since the server was started.
+    /// Returns the counts of what was observed since the server was started.
     pub(super) fn latest_observed(&self) -> Observed {
         *lock(&self.observed)
     }

@@ -42,7 +42,7 @@ impl<T> EventLog<T> {
     }
 }
 
-/// What a reader reads next.
+/// The next event of a reader.
 pub(super) enum NextEvent<T> {
     /// An event with its number.
     Event(u64, Arc<T>),

@@ -57,7 +57,7 @@ impl SampleRecorder {
         (Arc::new(Self { pending: Mutex::new(pending), commits, settings }), queue)
     }
 
-    /// Whether nothing more can be recorded: a commit has failed.
+    /// True if nothing more can be recorded: a commit has failed.
     pub(super) fn has_failed(&self) -> bool {
         self.commits.is_closed()
     }

@@ -33,20 +33,20 @@ pub struct SinkPosition {
     pub number: u64,
     /// The camera that tracks the target.
     pub camera: CameraId,
-    /// What it was made of.
+    /// The observation from which the position was computed.
     pub observation: Observation,
     /// The track with it.
     pub point: Arc<TrackPoint>,
 }
 
-/// What a sink wants.
+/// The positions that a sink requests.
 #[derive(Debug, Clone)]
 pub struct WantedPositions {
     /// The sink.
     pub key: ConnectionKey,
-    /// Of these cameras.
+    /// Only positions of these cameras.
     pub cameras: Vec<CameraId>,
-    /// Of each target at most one in so many seconds.
+    /// The least time between two positions of a target, s.
     pub min_interval_s: f64,
 }
 
@@ -125,7 +125,7 @@ impl SinkFeed {
 }
 
 impl Waiting {
-    /// Whether a target's last position was taken long enough ago.
+    /// True if a target's last position was taken long enough ago.
     fn is_due(&mut self, camera: &CameraId, point: &TrackPoint) -> bool {
         let (interval_s, time_s) = (self.min_interval_s, point.state.time.as_microsecond() as f64 * 1e-6);
         if !self.last_sent_s.contains_key(camera) {

@@ -313,7 +313,7 @@ impl LiveStream {
         }
     }
 
-    /// What is settled; `None` on a stream that stores nothing.
+    /// Returns the items that are settled; `None` on a stream that stores nothing.
     ///
     /// # Errors
     /// The samples could not be stored; the stream must end, for nothing after them is acknowledged.

@@ -131,7 +131,7 @@ fn evict_longest_silent(targets: &mut Targets, now: Duration) {
 }
 
 impl TrackedTarget {
-    /// What an observation measures, seen beside the target's latest boxes.
+    /// Returns the positions that an observation measures, compared with the target's latest boxes.
     pub(super) fn observe<'a>(
         &mut self,
         observation: &Observation,

@@ -31,7 +31,7 @@ impl CollectionId {
         }
     }
 
-    /// What its features are.
+    /// Returns the description of its features.
     pub(super) const fn description(&self) -> &'static str {
         match self {
             Self::Cameras => "Cameras; the geometry is the area on the ground that the active model covers",

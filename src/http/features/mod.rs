@@ -53,7 +53,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 struct LandingPage {
     /// Its title.
     title: &'static str,
-    /// What it offers.
+    /// A description of the data.
     description: &'static str,
     /// Where its parts are.
     links: Vec<Link>,
@@ -83,7 +83,7 @@ struct Collection {
     id: String,
     /// Its title.
     title: String,
-    /// What its features are.
+    /// The description of its features.
     description: &'static str,
     /// `feature`.
     #[serde(rename = "itemType")]
@@ -143,7 +143,7 @@ struct GeoJsonFeature {
     /// Its properties.
     #[schema(value_type = Object)]
     properties: Map<String, Value>,
-    /// Of a single feature: where it and its collection are.
+    /// Links of a single feature: to itself and to its collection.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     links: Vec<Link>,
 }

@@ -51,7 +51,7 @@ impl Geometry {
         }
     }
 
-    /// Whether it shares a point with the area; where none is known, it does, as the standard has it.
+    /// True if it shares a point with the area; also true where no geometry is known, as the standard requires.
     fn intersects(&self, area: Option<&Area>) -> bool {
         let Some(area) = area else { return true };
         match self {

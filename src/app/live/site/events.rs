@@ -1,4 +1,4 @@
-//! What happens at a site.
+//! The events of a site.
 
 use std::sync::Arc;
 
@@ -12,11 +12,11 @@ use crate::domain::{CameraId, LiveId, TargetId};
 pub struct SiteEvent {
     /// Its instant by the clock of the cameras.
     pub time: Timestamp,
-    /// What happened.
+    /// The kind of event.
     pub kind: SiteEventKind,
 }
 
-/// What happened at a site.
+/// The kinds of events of a site.
 #[derive(Debug)]
 pub enum SiteEventKind {
     /// A target was measured.

@@ -62,7 +62,7 @@ pub struct WorldSighting {
 }
 
 impl WorldSighting {
-    /// Whether the camera still sees the target at an instant.
+    /// True if the camera still sees the target at an instant.
     pub(super) fn is_current(last_seen_at: Timestamp, now: Timestamp) -> bool {
         now.duration_since(last_seen_at) <= SEEN_FOR
     }

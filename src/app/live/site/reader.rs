@@ -83,7 +83,7 @@ impl SiteEvents {
         Self { reader: live.events.reader(number), live, restarted, reason, metrics, watch }
     }
 
-    /// Whether they have ended since they continue on another node: the reader should ask again.
+    /// True if they have ended since they continue on another node: the reader should ask again.
     #[must_use]
     pub fn continue_elsewhere(&self) -> bool {
         self.watch.has_ended()

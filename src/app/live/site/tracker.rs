@@ -79,7 +79,7 @@ struct Carrier {
 /// A world tracker with its plane.
 struct ActiveTracker {
     tracker: WorldTracker,
-    /// Whether the plane is that of the operator or of a model; a fix alone may be anywhere.
+    /// True if the plane is that of the operator or of a model; a fix alone may be anywhere.
     has_trusted_plane: bool,
     /// Reading of the monotonic clock when a frame was tracked last.
     tracked_at: Duration,
@@ -165,7 +165,7 @@ impl SiteTracker {
         true
     }
 
-    /// Whether time changes anything: frames wait, or tracks may end.
+    /// True if time changes anything: frames wait, or tracks may end.
     pub(super) fn is_busy(&self) -> bool {
         !self.frames.is_empty() || self.active.as_ref().is_some_and(|it| it.tracker.tracks().next().is_some())
     }

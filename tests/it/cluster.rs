@@ -32,7 +32,7 @@ fn url(server: &TestServer) -> String {
     format!("http://{}", server.address)
 }
 
-/// What a statement gives in the database of a folder.
+/// The output of a statement in the database of a folder.
 fn sql(folder: &Path, statement: &str) -> String {
     let [_, url] = store_arguments(folder);
     let output = Command::new("psql").args([&url, "-Atqc", statement]).output().expect("psql runs");

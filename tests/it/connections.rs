@@ -1,4 +1,4 @@
-//! What a client may leave half done, hold open or flood, and how the server ends all the same.
+//! Requests and connections that a client leaves half done, holds open or floods. The server ends all the same.
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;

@@ -127,7 +127,7 @@ async fn start() -> (TempDir, TestServer, Provider) {
     (folder, server, provider)
 }
 
-/// What a browser has after it was sent to the provider.
+/// The state of a browser after it was sent to the provider.
 struct Begun {
     cookie: String,
     state: String,

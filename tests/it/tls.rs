@@ -247,7 +247,7 @@ async fn holders_of_certificates_have_idempotency_keys_of_their_own() {
     }
 }
 
-/// Whether the server presents a certificate of the authority.
+/// True if the server presents a certificate of the authority.
 async fn trusts(address: SocketAddr, authority: &Authority) -> bool {
     connect(address, authority, &["h2"], None).await.is_ok()
 }

@@ -1,4 +1,4 @@
-//! What must hold of a database after its server was killed.
+//! Invariants of a database after its server was killed.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -7,7 +7,7 @@ use rusqlite::{Connection, OptionalExtension as _};
 
 use super::load::{Load, ROWS, Streamer, Trainer, Work, Writer, active_model};
 
-/// What a check found to be wrong.
+/// The violations that a check has found.
 #[derive(Debug, Default)]
 pub(super) struct Findings {
     /// Acknowledged, and not there.

@@ -1,7 +1,7 @@
 //! Admission control: how much of each bounded resource all clients together, and one client, may hold at
 //! a time, and how many requests per second one client may send.
 //!
-//! Never here: waiting. A request beyond a quota is refused at once and may be tried again.
+//! Does not wait. A request beyond a quota is refused at once and may be tried again.
 
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]

@@ -148,7 +148,7 @@ impl Server {
         self.monitoring.as_ref()?.local_addr().ok()
     }
 
-    /// The application behind both transports.
+    /// The application that both transports use.
     #[must_use]
     pub fn app(&self) -> &App {
         &self.app

@@ -61,7 +61,7 @@ pub type Associations = BTreeMap<(Timestamp, TargetId), Association>;
 /// The outcome of a match for its tracklets and receivers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchReport {
-    /// Tracklets: stretches of boxes of one tracker's id.
+    /// Tracklets: segments of boxes of one tracker's id.
     pub tracklets: usize,
     /// Receivers with fixes.
     pub receivers: usize,

@@ -1,6 +1,6 @@
 //! The use cases, without a transport: both REST and gRPC call these and nothing below them.
 //!
-//! Never here: SQL, status codes, wire formats, reading the wall clock.
+//! Does not contain SQL, status codes or wire formats, and does not read the wall clock.
 
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]

@@ -1,6 +1,6 @@
 //! Recorded detections and fixes that come apart, made into samples.
 //!
-//! Never here: files opened, pairing rules (they are [`crate::fusion::pairing`]'s).
+//! Does not open files, and does not contain pairing rules (they are [`crate::fusion::pairing`]'s).
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,7 +1,7 @@
 //! The command line: one file per subcommand. A subcommand reads its flags, calls the layers below, and
 //! prints the result.
 //!
-//! Never here: rules of the domain.
+//! Does not contain rules of the domain.
 
 mod backup;
 mod config;
@@ -95,7 +95,7 @@ enum Command {
     Keys(keys::Keys),
     /// Copy the database into one verified file, also while a server uses it
     Backup(backup::Backup),
-    /// Put a backup in place of the database
+    /// Replace the database by a backup
     Restore(restore::Restore),
     /// Copy everything from a data folder or database into another one, and compare
     Copy(copy::Copy),

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 
-/// Bytes that a message takes up besides its content.
+/// Bytes that a message occupies besides its content.
 const OVERHEAD_BYTES: usize = 128;
 
 /// Bytes that one source may hold of what it has read and nobody has taken.

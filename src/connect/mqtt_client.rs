@@ -72,7 +72,7 @@ pub(super) enum Report {
 }
 
 impl Report {
-    /// Bytes that it takes up.
+    /// Bytes that it occupies.
     pub(super) fn bytes(&self) -> usize {
         match self {
             Self::Message(message) => message.payload.len() + message.topic.len(),

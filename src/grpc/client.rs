@@ -2,7 +2,7 @@
 //!
 //! One [`Connection`] carries many streams. [`Connection::open`] gives the two halves of one: an
 //! [`ItemSender`], whose waiting is the server's backpressure, and the [`Events`] that come back.
-//! Never here: retries, buffers and clocks; the caller decides on those, see
+//! Has no retries, buffers or clocks; the caller decides on those, see
 //! [`crate::replay`].
 
 use std::fmt;

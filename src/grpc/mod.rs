@@ -1,6 +1,6 @@
 //! The gRPC transport of `sightfix.v1` over [`crate::app`]: convert, call the use case, convert.
 //!
-//! Never here: checks on numbers (the constructors of [`crate::domain`] make them), status
+//! Does not contain checks on numbers (the constructors of [`crate::domain`] make them), status
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
 // What clients send reaches this module: nothing in it may end the process.

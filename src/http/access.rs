@@ -91,7 +91,7 @@ impl<S> Layer<S> for AuthorizeLayer {
     }
 }
 
-/// A route behind an [`AuthorizeLayer`]. A service and not a function: that would cost every request two more
+/// A route with an [`AuthorizeLayer`]. A service and not a function: that would cost every request two more
 /// boxes.
 #[derive(Clone)]
 pub(super) struct Authorize<S> {

@@ -2,8 +2,8 @@
 //!
 //! A body is decoded as it is read, so its reader applies the limit: of one that decodes to more,
 //! no more than the limit is ever held. How much is decoded at most follows from how much has come, and other
-//! requests have their turn in between. Never here: a body decoded at once or before its sender may use
-//! the route, an event stream or what is compressed already compressed.
+//! requests have their turn in between. A body is not decoded at once, nor before its sender may use the route.
+//! Event streams and compressed content are not compressed.
 
 use std::convert::Infallible;
 use std::io;
@@ -174,7 +174,7 @@ impl Member {
         }
     }
 
-    /// The member behind this one; `None` at the end of the body.
+    /// The next member; `None` at the end of the body.
     async fn next(self) -> io::Result<Option<Self>> {
         let (coding, mut coded) = match self {
             Self::Gzip(decoder) => (Coding::Gzip, decoder.into_inner()),

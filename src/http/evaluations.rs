@@ -27,7 +27,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(cancel_evaluation))
 }
 
-/// A stretch of time; an end that is left out is open.
+/// An interval of time; an end that is left out is open.
 #[derive(Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct TimeRange {
@@ -194,7 +194,7 @@ struct Evaluation {
     #[schema(value_type = Option<String>, format = DateTime)]
     ended_at: Option<Timestamp>,
     /// Once it has succeeded: the figures, as in the document of `sightfix evaluate --json`, and the positions
-    /// behind them. Lists leave it out.
+    /// from which they are computed. Lists leave it out.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<ReportWithPositions>)]
     report: Option<Box<RawValue>>,

@@ -1,8 +1,8 @@
 //! The REST transport over [`crate::app`]: routes, conversion of JSON, problems, OpenAPI.
 //!
-//! Route and description are declared together, a file per resource. Never here:
-//! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
-//! done by the constructors of [`crate::domain`]), a body without a limit.
+//! Route and description are declared together, a file per resource. Does not contain gRPC, SQL, statuses chosen by
+//! hand (they come from [`crate::status`]), checks on numbers (the constructors of [`crate::domain`] make them), or
+//! a body without a limit.
 
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]

@@ -85,7 +85,7 @@ struct PairedSamples {
 /// Boxes matched with receivers. The samples of a match have the receiver's id as target id.
 #[derive(Serialize, ToSchema)]
 struct Matching {
-    /// Tracklets: stretches of boxes of one tracker's id.
+    /// Tracklets: segments of boxes of one tracker's id.
     tracklets: usize,
     /// Receivers with fixes.
     receivers: usize,

@@ -3,7 +3,7 @@
 //! The whole body is spooled first, under the same limits and timeouts as any import; then each part
 //! is spooled by itself. multer, the library beneath, has constraints on sizes of the whole body and of fields,
 //! but none on the head of a part, which it gathers in memory; so chunks are handed to it one by one, and those
-//! without a part are counted here. Never here: a part held in memory beyond the spool's limit.
+//! without a part are counted here. A part in memory never exceeds the spool's limit.
 
 use std::collections::VecDeque;
 use std::io;

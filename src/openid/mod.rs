@@ -3,7 +3,7 @@
 //!
 //! [`Provider::authorization_url`] sends the browser to the provider, [`Provider::identity`] redeems the code that it
 //! comes back with. Nothing is stored in between: state, nonce and PKCE verifier are derived from one random
-//! [`SignInSecret`], which the browser keeps in a cookie. Never here: sessions, HTTP of our own clients.
+//! [`SignInSecret`], which the browser keeps in a cookie. Does not contain sessions, nor HTTP of our own clients.
 
 mod fetch;
 mod id_token;

@@ -115,7 +115,7 @@ pub struct ReplayReport {
     pub latency_ms: LatencyMs,
     /// Time from the failure of a stream to the next answer or acknowledgement; `None` if none failed.
     pub recovery_ms: Option<LatencyMs>,
-    /// Largest lag of sending behind the pace, ms.
+    /// Largest lag of sending, compared with the pace, ms.
     pub furthest_behind_ms: f64,
     /// Streams opened.
     pub streams: u64,

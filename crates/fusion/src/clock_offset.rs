@@ -3,7 +3,7 @@
 //! For any camera geometry, motion in the image and motion of the fixes agree best at the true offset.
 //! Displacements over a few seconds are regressed linearly on differences of box features; the estimate
 //! maximises the explained share of their variance (R^2) over the offset. Displacements instead of
-//! positions cancel the receiver's slow bias. Never here: files, pairing.
+//! positions cancel the receiver's slow bias. Does not read files or pair.
 
 use jiff::{SignedDuration, Timestamp};
 use nalgebra::{SMatrix, SVector};

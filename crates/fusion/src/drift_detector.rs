@@ -7,8 +7,8 @@
 //! `T = max_k |m_post - m_pre|^2 / (v_post + v_pre)`, with variances v per axis that account for
 //! correlated errors: the receiver's bias of tens of seconds, its slower error of about an hour, the
 //! part of it common to all receivers, and the model's own error, which depends on the place.
-//! Never here: an alarm from one receiver among several, or from one stop; an alarm for
-//! a constant offset that was there from the start.
+//! Does not raise an alarm for one receiver among several, for one stop, or for a constant offset that was there from
+//! the start.
 
 mod block;
 mod pooling;

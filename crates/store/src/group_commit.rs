@@ -2,8 +2,8 @@
 //!
 //! A commit costs much more than a row, so every batch that is queued when a transaction begins joins
 //! it. Nothing is acknowledged before its commit, and a caller's batch is stored atomically.
-//! Never here: a caller waits for more callers to come, the queue grows without bound, a
-//! cancelled caller disturbs the others.
+//! A caller does not wait for more callers to come, the queue has a limit, and a cancelled caller does not disturb the
+//! others.
 
 use std::collections::HashMap;
 use std::fmt;

@@ -2,7 +2,7 @@
 //!
 //! [`Access::authenticate`] makes a [`Principal`] of a credential, [`Caller::authorize`] compares it with the
 //! [`Permission`] that an operation needs, and [`Caller::authorize_camera`] restricts devices to their
-//! cameras. All of it is answered from memory. Never here: headers, status codes, TLS.
+//! cameras. All of it is answered from memory. Does not know headers, status codes or TLS.
 
 mod caller;
 mod key_table;

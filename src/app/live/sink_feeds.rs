@@ -2,7 +2,7 @@
 //!
 //! The feed of a sink is a log of the positions of its cameras, from the moment they are made until they are in its outbox,
 //! however long the database does not answer. Cameras are known by their ids: one that is created later, or comes back from
-//! another node, misses nothing. Never here: a track waits for a sink; memory grows without a limit.
+//! another node, misses nothing. A track does not wait for a sink, and memory has a limit.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex};

@@ -20,7 +20,7 @@ pub struct SampleFilter {
 }
 
 impl SampleFilter {
-    /// All samples of a stretch of time.
+    /// All samples of an interval of time.
     #[must_use]
     pub fn within(range: TimeRange) -> Self {
         Self { from: range.from(), until: range.until(), ..Self::default() }

@@ -4,7 +4,7 @@
 //! metres, in standard deviations of the stated errors, and the share beyond the gate of a single pair. Errors that
 //! last longer than the mean do not average out, so a mean of n pairs has the variance `c + (1 - c) / n`, with c the
 //! share of such errors. Beside it each source is held against the motion of a target: it may not jump, nor stand
-//! still to the last digit. Never here: estimates, the filter's own state.
+//! still to the last digit. Does not contain estimates or the filter's own state.
 
 use jiff::Timestamp;
 

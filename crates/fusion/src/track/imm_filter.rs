@@ -2,7 +2,7 @@
 //! and Kirubarajan 2001, 11.6.6): one [`ModeFilter`] per motion mode, their mixing, and the gate.
 //!
 //! Motion modes: stationary, steady (slowly varying velocity), agile (turning or starting).
-//! Never here: history, time to live, out-of-sequence measurements ([`super::Track`]).
+//! Does not contain history, time to live, or out-of-sequence measurements ([`super::Track`]).
 
 use jiff::Timestamp;
 

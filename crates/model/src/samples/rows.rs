@@ -1,7 +1,7 @@
 //! Training samples in the form that every recipe is fitted to: in metres, sorted by target and time,
 //! divided into traverses and into blocks of time.
 //!
-//! A *traverse* is a stretch of one target's samples without a gap. The true position that a sample may
+//! A *traverse* is an interval of one target's samples without a gap. The true position that a sample may
 //! state is never read here.
 
 use std::collections::HashMap;

@@ -3,7 +3,7 @@
 //!
 //! Does not wait. A request beyond a quota is refused at once and may be tried again.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod decoded_memory;

@@ -3,7 +3,7 @@
 //! A request enters here once, whatever its transport: it gets its id, its span, its place among
 //! the requests at work and its deadline, then goes to `http` or `grpc` by its content type.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod activity;

@@ -2,7 +2,7 @@
 //!
 //! Does not contain SQL, status codes or wire formats, and does not read the wall clock.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 pub mod access;

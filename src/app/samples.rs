@@ -108,7 +108,7 @@ impl App {
         let reading =
             tokio::task::spawn_blocking(move || read_batches(file, format, &layout, &rules, &sender));
         while let Some(mut batch) = batches.recv().await {
-            // What was read while the last batch was stored goes into one transaction.
+            // Rows that were read while the last batch was stored go into one transaction.
             while let Ok(more) = batches.try_recv() {
                 batch.extend(more);
             }
@@ -134,7 +134,7 @@ impl App {
         if let Some(request) = &options.idempotent
             && self.stored_answer(request).await?.is_some()
         {
-            // What is asked for is known once all of it has come.
+            // The request is known once all of it has come.
             while let Some(chunk) = batches.next().await {
                 chunk.into_iter().try_for_each(|row| row.map(drop))?;
             }
@@ -325,7 +325,7 @@ fn read_batches(
         match row {
             Ok(row) => batch.push(row),
             Err(error) => {
-                // What came before the break is stored; the receiver is gone only with its request.
+                // Rows that came before the break are stored; the receiver is gone only with its request.
                 let _ = batches.blocking_send(batch);
                 return Err(error);
             }

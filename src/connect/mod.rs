@@ -8,7 +8,7 @@
 //! Does not contain formats of messages (they are in `exchange`), rules of tracks (they are in `app`), or a
 //! queue without a limit.
 
-// What other systems send reaches this module: nothing in it may end the process.
+// Input of other systems reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod credentials;

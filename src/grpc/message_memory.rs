@@ -63,7 +63,7 @@ struct Shapes {
 }
 
 static SHAPES: LazyLock<Shapes> = LazyLock::new(|| {
-    // What the build wrote; every start reads it for server reflection, too.
+    // The descriptors that the build wrote; every start reads them for server reflection, too.
     Shapes::of(&FileDescriptorSet::decode(proto::FILE_DESCRIPTOR_SET).unwrap_or_default())
 });
 

@@ -3,7 +3,7 @@
 //! Does not contain checks on numbers (the constructors of [`crate::domain`] make them), status
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod audit;

@@ -4,7 +4,7 @@
 //! hand (they come from [`crate::status`]), checks on numbers (the constructors of [`crate::domain`] make them), or
 //! a body without a limit.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod access;

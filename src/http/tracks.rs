@@ -509,7 +509,7 @@ async fn watch_camera(
     LastEventId(last_seen): LastEventId,
 ) -> ApiResult {
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
-    // What is no id of ours names no event that is known.
+    // A text that is no id of ours names no known event.
     let last_seen = last_seen.map(|text| text.parse().unwrap_or(EventId::UNKNOWN));
     let events = app.camera_events(&id, last_seen).await?;
     let shutdown = rest.shutdown.clone();

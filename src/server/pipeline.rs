@@ -368,7 +368,7 @@ impl RequestPipeline {
         };
         let ticket = Ticket::open(&self.app, class, client, held_bytes)?;
         if request.headers().contains_key(CONTENT_ENCODING) {
-            // What it decodes to is not known before it has been read.
+            // Its decoded size is not known before it has been read.
             ticket.charge(held_bytes as u64)?;
         }
         let has_no_body = request.body().is_end_stream()
@@ -404,7 +404,7 @@ impl RequestPipeline {
         }
         let clock = &self.app.clock;
         let principal = match self.app.access.authenticate(credential, clock.now(), clock.monotonic()) {
-            // What watches the server learns that it is alive, whatever has become of its key.
+            // A probe learns that the server is alive, whatever has become of its key.
             Err(_) if class == RequestClass::Probe => Principal::Anonymous,
             principal => principal?,
         };

@@ -221,7 +221,7 @@ fn draw_series(svg: &mut String, series: &Series, frame: &Frame) {
         is_drawing = is_drawn;
     }
     let (colour, dashes) = (series.colour(), series.dashes());
-    // What is known is thin, so that it hides nothing of what it is compared with.
+    // Known values are thin, so that they hide nothing of what they are compared with.
     let is_truth = series.number.is_none();
     let style = match series.shape {
         Shape::Dots if is_truth => "stroke-width=\"1.2\" stroke-linecap=\"round\"".to_owned(),

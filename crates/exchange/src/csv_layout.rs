@@ -126,7 +126,7 @@ impl CsvLayout {
             return ',';
         }
         let count = |separator: &char| header.matches(*separator).count();
-        // Of equals the last.
+        // Among equals the last.
         ['|', ',', '\t', ';'].into_iter().max_by_key(count).unwrap_or(',')
     }
 

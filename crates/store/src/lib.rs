@@ -14,7 +14,7 @@
 //! against a server.
 
 #![warn(missing_docs)]
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod contract;

@@ -194,7 +194,7 @@ impl KeyTable {
         let distrusted = self.distrusted.load(Ordering::Acquire);
         let known = self.keys.load_full();
         let version = store.keys_version().await?;
-        // What was open for a key that has expired has ended; if the clock was wrong, the key works again.
+        // Requests and streams of an expired key have ended; if the clock was wrong, the key works again.
         let has_returned = known.iter().any(|key| key.has_ended() && key.key.is_valid_at(now));
         if has_returned || known.version.as_ref() != Some(&version) {
             let is_first = known.version.as_ref().is_some_and(KeysVersion::is_empty) && !version.is_empty();
@@ -219,7 +219,7 @@ impl KeyTable {
         let mut kept = HashSet::new();
         for (key, digest) in stored {
             kept.insert(key.id);
-            // What is open for a key holds the same value, and ends with it.
+            // Requests and streams of a key hold the same value, and end with it.
             let known = by_id.get(&key.id).filter(|known| !known.has_ended());
             let active = known.map_or_else(|| ActiveKey::new(key, digest), |&it| it.clone());
             by_bucket.entry(digest.bucket()).or_default().push(active);

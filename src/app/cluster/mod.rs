@@ -118,7 +118,7 @@ impl App {
             Some(leases) => {
                 let sent_at = self.clock.monotonic();
                 let mark = leases.register(id, &profile, heartbeat::random(self)).await?;
-                // What is read from here on is of that history, or of a later one that a renewal notices.
+                // Everything read from here on is of that history, or of a later one that a renewal notices.
                 self.access.set_lease(lease);
                 self.access.refresh(&self.store, &self.clock).await?;
                 let registration = Registration::new(id, sent_at);

@@ -34,7 +34,7 @@ impl App {
             reported.statuses.clear();
         }
         let mut statuses = self.connection_board.statuses();
-        // What nothing is known of needs no report.
+        // A status that equals the reported one needs no report.
         statuses.retain(|key, status| *reported.statuses.entry(*key).or_default() != *status);
         if statuses.is_empty() {
             return Ok(());

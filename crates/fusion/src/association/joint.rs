@@ -193,7 +193,7 @@ impl<'a> JointSearch<'a> {
     /// The best world, if it is better than all that must be wrong and all others that may be right.
     fn accepted_world(&self) -> Result<(World, WorldScores)> {
         let worlds = self.worlds(0..self.cameras.len(), &self.fixes);
-        // What was cancelled has found nothing.
+        // A cancelled match has found nothing.
         self.scene.cancellation.check()?;
         let Some(best) = worlds.first().copied() else {
             return Err(not_identifiable(

@@ -378,7 +378,7 @@ fn a_receiver_whose_error_is_white_keeps_no_bias() {
     let (_, report) = fit(&rows, &settings).expect("rows that determine a map");
     let receiver = report.receiver;
     println!("{receiver:?}");
-    // Of 29.5 m per axis.
+    // Parts of an error of 29.5 m per axis.
     assert!(receiver.session_m2.sqrt() < 1.5, "{receiver:?}");
     assert!(receiver.white_m2.sqrt() > 25.0, "{receiver:?}");
 }

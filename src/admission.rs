@@ -143,9 +143,9 @@ impl Quota {
 /// How much of a [`Quota`] all clients hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct QuotaUsage {
-    /// Held now.
+    /// Units held now.
     pub held: u64,
-    /// At most.
+    /// The largest number of units.
     pub limit: u64,
 }
 

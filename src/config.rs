@@ -137,9 +137,9 @@ impl NodeRole {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
-    /// For people.
+    /// Lines for people.
     Text,
-    /// For machines.
+    /// JSON for machines.
     Json,
 }
 
@@ -214,7 +214,7 @@ pub struct Limits {
     pub refused_bytes_per_s: u32,
     /// Seconds that a request may take, its body included, until its answer begins.
     pub request_s: u64,
-    /// Open connections.
+    /// Number of open connections.
     pub connections: usize,
     /// Streams per HTTP/2 connection.
     pub streams_per_connection: u32,

@@ -40,7 +40,6 @@ impl CheckStatus {
     }
 }
 
-/// One check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Check {
     /// The object of the check.

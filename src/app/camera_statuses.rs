@@ -9,7 +9,6 @@ use crate::domain::{Camera, CameraId, JobState, Result, RunId};
 
 /// A camera with its latest run, its model and what happens in its view.
 pub struct CameraStatus {
-    /// Its profile.
     pub camera: Camera,
     /// Its latest training run, and that run's state.
     pub latest_run: Option<(RunId, JobState)>,

@@ -84,17 +84,15 @@ pub struct MatchReport {
 /// A tracklet, or a part of it, with its receiver.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchedPair {
-    /// The receiver.
     pub receiver_id: ReceiverId,
     /// Id that the tracker gave the boxes.
     pub tracker_id: TargetId,
     /// First and last box.
     pub from: Timestamp,
-    /// Last box.
+    /// The time of the last box.
     pub to: Timestamp,
     /// Number of boxes.
     pub detections: u64,
-    /// Posterior probability.
     pub probability: f64,
 }
 

@@ -100,7 +100,6 @@ pub struct Parts {
     pub serial_devices: OnceLock<Vec<PathBuf>>,
     /// Keys and sessions, ready to answer.
     pub access: Access,
-    /// The clock.
     pub clock: Clock,
     /// Ids and seeds.
     pub randomness: Randomness,

@@ -22,11 +22,9 @@ use crate::model::Regressor;
 pub struct PairedImport<D, F> {
     /// Rows of boxes.
     pub detections: D,
-    /// Their format.
     pub detections_format: Format,
     /// Rows of fixes.
     pub fixes: F,
-    /// Their format.
     pub fixes_format: FixFormat,
     /// How a box finds its fix.
     pub settings: PairingSettings,

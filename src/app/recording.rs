@@ -16,9 +16,7 @@ use crate::fusion::pairing::{Paired, PairingSettings, pair};
 /// Which of the two files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Part {
-    /// The boxes.
     Detections,
-    /// The fixes.
     Fixes,
 }
 
@@ -36,7 +34,6 @@ impl Part {
 /// Rows of both files that are none.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RejectedParts {
-    /// Their number.
     pub count: u64,
     /// The first of each file, with their reasons.
     pub rows: Vec<(Part, RowError)>,
@@ -218,11 +215,11 @@ pub fn of_part(part: Part, error: Error) -> Error {
 /// Counts of the rows of two files. Rejected rows are not counted here.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PairingCounts {
-    /// Boxes read.
+    /// Number of boxes read.
     pub detections: u64,
-    /// Fixes read.
+    /// Number of fixes read.
     pub fixes: u64,
-    /// Samples made.
+    /// Number of samples made.
     pub paired: u64,
     /// Boxes of targets that no fix belongs to.
     pub detections_without_fixes: u64,

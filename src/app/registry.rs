@@ -74,7 +74,6 @@ pub struct ModelSummary {
 /// An active model version that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelFault {
-    /// The version.
     pub version: u32,
     /// A sentence for the operator.
     pub reason: String,

@@ -36,7 +36,7 @@ pub struct ImportOptions {
 /// The counts of an import's rows.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ImportReport {
-    /// Stored now.
+    /// Number of samples stored now.
     pub accepted: u64,
     /// Number of accepted samples without a fix.
     pub without_fix: u64,

@@ -293,7 +293,6 @@ impl Source for MqttSource {
     }
 }
 
-/// Publishes messages.
 pub(super) struct MqttSink {
     link: Link,
     media_type: &'static str,

@@ -53,15 +53,12 @@ pub enum Event {
     /// The answer for one item.
     Answer(Box<proto::StreamAnswer>),
     /// Every item up to this seq is committed or can no longer become a sample.
-    Acknowledged {
-        /// The seq.
-        seq: u64,
-    },
+    Acknowledged { seq: u64 },
     /// The camera no longer looks where it looked when its model was trained.
     CameraMoved(proto::CameraMoved),
     /// Half-close, wait for the last acknowledgement and the end, and open another stream.
     Reconnect {
-        /// For people.
+        /// The reason, for people.
         reason: String,
     },
 }
@@ -71,7 +68,7 @@ pub enum Event {
 pub struct ClientError {
     /// The stable name of the kind of error if the server gave one; else the name of the code.
     pub reason: String,
-    /// For people.
+    /// The error, for people.
     pub message: String,
     /// True if the same may succeed later: the connection broke, or the server is overloaded.
     pub retryable: bool,

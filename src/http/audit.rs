@@ -71,7 +71,7 @@ impl From<domain::AuditEntry> for AuditEntry {
 /// A page of the audit log, newest first.
 #[derive(Serialize, ToSchema)]
 struct AuditPage {
-    /// Entries.
+    /// A page of entries.
     items: Vec<AuditEntry>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

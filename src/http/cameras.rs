@@ -34,10 +34,10 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 #[derive(Clone, Copy, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ImageSize {
-    /// Columns.
+    /// Number of columns.
     #[schema(minimum = 1, maximum = 131_072, example = 1920)]
     width_px: u32,
-    /// Rows.
+    /// Number of rows.
     #[schema(minimum = 1, maximum = 131_072, example = 1080)]
     height_px: u32,
 }
@@ -316,7 +316,7 @@ impl From<&domain::CameraMoved> for CameraMoved {
 /// A page of cameras, by id.
 #[derive(Serialize, ToSchema)]
 struct CameraPage {
-    /// Cameras.
+    /// A page of cameras.
     items: Vec<Camera>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

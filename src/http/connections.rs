@@ -131,7 +131,7 @@ impl From<crate::app::CountedReason> for CountedReason {
 /// The latest error of a connection.
 #[derive(Serialize, ToSchema)]
 struct LastError {
-    /// When.
+    /// The time of the error.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
     /// The error's text.
@@ -151,12 +151,12 @@ struct ConnectionNode {
 /// The status of a connection since the server was started; counts are those of all nodes.
 #[derive(Serialize, ToSchema)]
 struct ConnectionStatus {
-    /// State.
+    /// State of the connection.
     state: State,
     /// The node that runs it, where several share a database; missing while none does.
     #[serde(skip_serializing_if = "Option::is_none")]
     node: Option<ConnectionNode>,
-    /// Since when.
+    /// The time of the latest change of the state.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     since: Option<Timestamp>,
@@ -282,7 +282,7 @@ impl Connection {
 /// A page of connections, by id.
 #[derive(Serialize, ToSchema)]
 struct ConnectionPage {
-    /// Connections.
+    /// A page of connections.
     items: Vec<Connection>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -303,13 +303,13 @@ struct Trial {
 /// A message that is not tried any more.
 #[derive(Serialize, ToSchema)]
 struct DeadLetter {
-    /// Its number.
+    /// Number of the dead letter.
     number: i64,
     /// Its id, as the receiver saw it.
     id: String,
     /// Where it was to go at the receiver.
     subject: String,
-    /// Its content.
+    /// Content of the message.
     text: String,
     /// When it was made.
     #[schema(value_type = String, format = DateTime)]
@@ -321,7 +321,7 @@ struct DeadLetter {
 /// A page of dead letters, oldest first.
 #[derive(Serialize, ToSchema)]
 struct DeadLetterPage {
-    /// Dead letters.
+    /// A page of dead letters.
     items: Vec<DeadLetter>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -331,7 +331,7 @@ struct DeadLetterPage {
 /// How many dead letters were changed.
 #[derive(Serialize, ToSchema)]
 struct DeadLetterCount {
-    /// Their number.
+    /// Number of dead letters.
     dead_letters: u64,
 }
 

@@ -59,7 +59,7 @@ impl From<domain::TimeRange> for TimeRange {
 #[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct EvaluationDraft {
-    /// Whose samples.
+    /// The camera whose samples are used.
     camera_id: String,
     /// The samples to learn from. Given together with `test`, or not at all.
     train: Option<TimeRange>,
@@ -150,7 +150,7 @@ struct Evaluation {
     /// A UUID of version 7.
     #[schema(format = "uuid")]
     id: String,
-    /// Whose samples.
+    /// The camera whose samples are used.
     camera_id: String,
     /// The samples to learn from.
     train: TimeRange,
@@ -173,7 +173,7 @@ struct Evaluation {
     /// Standard deviation per axis of the receiver, if known.
     #[serde(skip_serializing_if = "Option::is_none")]
     gnss_sigma_m: Option<f64>,
-    /// Its state.
+    /// State of the evaluation.
     state: JobState,
     /// How far it has come.
     progress: EvaluationProgress,

@@ -68,7 +68,7 @@ pub(super) enum FusionRequest {
 /// One answer per observation, in their order.
 #[derive(Serialize, ToSchema)]
 struct Fusions<'a> {
-    /// Positions.
+    /// The fused positions.
     items: Vec<wire::FusedFix<'a>>,
 }
 

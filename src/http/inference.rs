@@ -63,9 +63,9 @@ impl<S: Send + Sync> axum::extract::FromRequestParts<S> for ModelName {
 /// Name, version and extensions of the server.
 #[derive(Serialize, ToSchema)]
 struct ServerMetadata {
-    /// Its name.
+    /// Name of the server.
     name: &'static str,
-    /// Its version.
+    /// Version of the server.
     version: &'static str,
     /// Extensions of the protocol; there are none.
     extensions: [String; 0],
@@ -112,7 +112,7 @@ struct InferenceModelMetadata {
 /// Name, type and shape of a tensor.
 #[derive(Serialize, ToSchema)]
 struct TensorMetadata {
-    /// Its name.
+    /// Name of the tensor.
     name: &'static str,
     /// Type of its elements.
     datatype: &'static str,
@@ -269,7 +269,7 @@ impl<'de> Visitor<'de> for TensorItem<'_> {
 /// An output that is asked for.
 #[derive(Deserialize, ToSchema)]
 struct RequestedOutput {
-    /// Its name.
+    /// Name of the tensor.
     #[schema(example = "position_deg")]
     name: String,
     /// Parameters; none is used.
@@ -285,7 +285,7 @@ struct InferenceResponse {
     model_name: String,
     /// Number of the model version that answered.
     model_version: String,
-    /// The request's.
+    /// The id of the request, if it had one.
     #[serde(skip_serializing_if = "Option::is_none")]
     id: Option<String>,
     /// The output tensors.
@@ -295,9 +295,9 @@ struct InferenceResponse {
 /// An output tensor.
 #[derive(Serialize, ToSchema)]
 struct OutputData {
-    /// Its name.
+    /// Name of the tensor.
     name: &'static str,
-    /// Its extents.
+    /// Extents of the tensor.
     shape: [usize; 2],
     /// Type of its elements.
     datatype: &'static str,

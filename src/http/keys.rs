@@ -151,7 +151,7 @@ impl CreatedKey {
 /// A page of keys, newest first.
 #[derive(Serialize, ToSchema)]
 struct KeyPage {
-    /// Keys.
+    /// A page of keys.
     items: Vec<Key>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

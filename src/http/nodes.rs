@@ -28,7 +28,7 @@ struct Node {
     /// `both`, `serve` or `train`.
     #[schema(example = "serve")]
     role: String,
-    /// Its version.
+    /// The node's version of the program.
     #[schema(example = "0.1.0")]
     version: String,
     /// When it was started.

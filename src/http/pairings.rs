@@ -137,11 +137,11 @@ struct RejectedPartRow {
 /// Counts of the rows that could be read.
 #[derive(Serialize, ToSchema)]
 struct Pairing {
-    /// Boxes.
+    /// Number of boxes read.
     detections: u64,
-    /// Fixes.
+    /// Number of fixes read.
     fixes: u64,
-    /// Samples made.
+    /// Number of samples made.
     paired: u64,
     /// Boxes that became no sample.
     unpaired_detections: UnpairedDetections,
@@ -178,7 +178,7 @@ struct UnusedFixes {
 /// The clock offset of one receiver, estimated from the files.
 #[derive(Serialize, ToSchema)]
 struct ClockOffsetEstimate {
-    /// The receiver.
+    /// The receiver's id.
     receiver_id: String,
     /// The target that carries it.
     target_id: String,

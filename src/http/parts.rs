@@ -32,7 +32,6 @@ const LONGEST_HEAD_BYTES: usize = 8 * CHUNK_BYTES;
 
 /// A part of a body.
 pub(super) struct BodyPart {
-    /// Its content.
     pub(super) content: Spooled,
     /// Its announced type, if any.
     pub(super) media_type: Option<String>,

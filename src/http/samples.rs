@@ -37,7 +37,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 /// The counts of an import's rows.
 #[derive(Serialize, ToSchema)]
 pub(super) struct Imported {
-    /// Stored now.
+    /// Number of samples stored now.
     accepted: u64,
     /// Number of accepted samples without a fix.
     accepted_without_fix: u64,
@@ -96,7 +96,7 @@ impl Imported {
 /// A page of samples, by time and target.
 #[derive(Serialize, ToSchema)]
 struct SamplePage<'a> {
-    /// Samples.
+    /// A page of samples.
     items: Vec<wire::Sample<'a>>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -106,7 +106,7 @@ struct SamplePage<'a> {
 /// How many samples there are.
 #[derive(Serialize, ToSchema)]
 struct SampleCount {
-    /// Their number.
+    /// Number of samples.
     count: u64,
     /// Number of these samples without a fix.
     without_fix: u64,
@@ -115,7 +115,7 @@ struct SampleCount {
 /// How many samples were deleted.
 #[derive(Serialize, ToSchema)]
 struct DeletedSamples {
-    /// Their number.
+    /// Number of samples deleted.
     deleted: u64,
 }
 

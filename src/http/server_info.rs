@@ -23,7 +23,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 /// Version and limits of the server, and the map tiles of the console.
 #[derive(Serialize, ToSchema)]
 struct Server {
-    /// Its version.
+    /// Version of the program.
     #[schema(example = "0.1.0")]
     version: &'static str,
     /// The limits in force, by the name of the setting below `limits`.

@@ -66,7 +66,7 @@ struct SiteTrainingRun {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     until: Option<Timestamp>,
-    /// Its state.
+    /// State of the run.
     state: JobState,
     /// How far it has come; its epochs count fits of all cameras and epochs of networks.
     progress: RunProgress,
@@ -118,7 +118,7 @@ impl From<domain::TrainingRun<SiteId>> for SiteTrainingRun {
 /// A page of training runs of a site, newest first.
 #[derive(Serialize, ToSchema)]
 struct SiteRunPage {
-    /// Runs.
+    /// A page of runs.
     items: Vec<SiteTrainingRun>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -117,7 +117,7 @@ impl From<&track::Rejection> for Rejection {
 /// The state of a track at one instant.
 #[derive(Serialize, ToSchema)]
 struct TrackState {
-    /// The target.
+    /// The target's id.
     target_id: String,
     /// The latest instant measured.
     #[schema(value_type = String, format = DateTime)]
@@ -380,7 +380,7 @@ impl<'a> From<&'a TargetUpdate> for TrackUpdate<'a> {
 /// One answer per observation, in their order.
 #[derive(Serialize, ToSchema)]
 struct FollowedObservations<'a> {
-    /// Answers.
+    /// The answers, in the order of the observations.
     items: Vec<FollowedObservation<'a>>,
     /// The counts of stored observations, if storage was requested.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -94,7 +94,7 @@ struct TrainingRun {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     until: Option<Timestamp>,
-    /// Its state.
+    /// State of the run.
     state: JobState,
     /// How far it has come.
     progress: RunProgress,
@@ -152,7 +152,7 @@ impl From<domain::TrainingRun<CameraId>> for TrainingRun {
 /// A page of training runs, newest first.
 #[derive(Serialize, ToSchema)]
 struct RunPage {
-    /// Runs.
+    /// A page of runs.
     items: Vec<TrainingRun>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -324,7 +324,7 @@ struct LogLine {
 /// A run's log, oldest line first.
 #[derive(Serialize, ToSchema)]
 struct TrainingLog {
-    /// Lines.
+    /// A page of lines.
     items: Vec<LogLine>,
 }
 

@@ -233,7 +233,7 @@ struct TrackChange {
     /// The instant by the clock of the cameras.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
-    /// The track.
+    /// The track's id.
     track_id: String,
     /// `handed_over`: the camera that saw the target last.
     #[serde(skip_serializing_if = "Option::is_none")]

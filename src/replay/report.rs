@@ -87,7 +87,7 @@ fn add_each(totals: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
 /// acknowledgements `items` = `acknowledged` + `unacknowledged`.
 #[derive(Debug, Clone, Serialize)]
 pub struct ReplayReport {
-    /// Simulated cameras.
+    /// Number of simulated cameras.
     pub cameras: usize,
     /// Duration of the replay, s.
     pub elapsed_s: f64,
@@ -117,7 +117,7 @@ pub struct ReplayReport {
     pub recovery_ms: Option<LatencyMs>,
     /// Largest lag of sending, compared with the pace, ms.
     pub furthest_behind_ms: f64,
-    /// Streams opened.
+    /// Number of streams opened.
     pub streams: u64,
     /// Streams opened after a camera's first.
     pub reconnects: u64,
@@ -131,7 +131,7 @@ pub struct ReplayReport {
     pub cameras_moved: u64,
     /// Model versions that answered.
     pub model_versions: BTreeSet<u32>,
-    /// Injected faults.
+    /// Numbers of injected faults.
     pub injected: Injected,
     /// Cameras that gave up before everything was sent.
     pub given_up: u64,
@@ -142,13 +142,12 @@ pub struct ReplayReport {
 /// Quantiles of the latency in ms, at most 1 % above the true ones.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct LatencyMs {
-    /// Median.
     pub p50: f64,
     /// 90 % quantile.
     pub p90: f64,
     /// 99 % quantile.
     pub p99: f64,
-    /// Maximum; exact.
+    /// The maximum; exact.
     pub max: f64,
 }
 

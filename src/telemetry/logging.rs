@@ -104,7 +104,6 @@ impl RequestId {
         &self.0
     }
 
-    /// As text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         self.0.to_str().unwrap_or_default()

@@ -40,9 +40,7 @@ pub struct Metrics {
     handle: PrometheusHandle,
     fusions: FusionMetrics,
     imports: ImportMetrics,
-    /// Training runs.
     pub training_runs: JobMetrics,
-    /// Evaluations.
     pub evaluations: JobMetrics,
     connections: ConnectionMetrics,
     /// Metrics of connections with other systems, as text.

@@ -48,7 +48,6 @@ impl ActiveKey {
         &self.key
     }
 
-    /// Its name.
     #[must_use]
     pub fn name(&self) -> Arc<str> {
         self.name.clone()

@@ -36,7 +36,7 @@ pub use signed_in_user::SignedInUser;
 /// The credential that a client presents.
 #[derive(Debug, Clone)]
 pub enum Credential<'a> {
-    /// Nothing.
+    /// No credential.
     None,
     /// A key's secret.
     Key(Cow<'a, str>),

@@ -223,7 +223,6 @@ pub const OPERATIONS: &[Operation] = &[
 /// A REST route with the permission that it needs.
 #[derive(Debug, Clone, Copy)]
 pub struct RoutePermission {
-    /// Its method.
     pub method: &'static str,
     /// The template of its path.
     pub template: &'static str,

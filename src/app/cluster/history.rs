@@ -13,9 +13,9 @@ use crate::store::HistoryMark;
 /// The history of what this process knows, compared with that of the database.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DatabaseHistory {
-    /// It is.
+    /// The known state is of the database's history.
     Unbroken,
-    /// It may not be, and is being read again.
+    /// It may not be, and is read again.
     Reading,
     /// Everything was read again after the history broke at this time.
     BrokenAt(Timestamp),

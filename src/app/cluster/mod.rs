@@ -71,7 +71,6 @@ impl NodeSettings {
 /// A node, for operators.
 #[derive(Debug, Clone)]
 pub struct NodeStatus {
-    /// The node.
     pub node: Node,
     /// Cameras that it owns.
     pub cameras: u64,

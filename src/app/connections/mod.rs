@@ -37,7 +37,6 @@ const SOURCE_START: Duration = Duration::from_secs(2);
 /// A connection as a caller describes it.
 #[derive(Debug, Clone)]
 pub struct ConnectionRequest {
-    /// Its id.
     pub id: ConnectionId,
     /// The name for people; the id if left out.
     pub display_name: Option<String>,

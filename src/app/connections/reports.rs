@@ -10,7 +10,6 @@ use crate::store::ConnectionReports;
 /// The node that runs a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConnectionNode {
-    /// Its id.
     pub id: NodeId,
     /// Where clients reach it, if that is known.
     pub url: Option<String>,

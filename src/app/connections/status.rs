@@ -34,11 +34,11 @@ pub enum ConnectionState {
 /// A message as it came or went, with what was read from it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LastMessage {
-    /// When.
+    /// The time of the message.
     pub time: Timestamp,
     /// Its topic, or the address of its sender.
     pub subject: String,
-    /// Its beginning.
+    /// The beginning of the payload, as text.
     pub text: String,
     /// Its items, what was skipped, or why it cannot be read.
     pub reading: Vec<String>,
@@ -81,9 +81,8 @@ fn without_numbers(reason: &str) -> impl Iterator<Item = char> {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ConnectionStatus {
-    /// State.
     pub state: ConnectionState,
-    /// Since when.
+    /// The time of the latest change of the state.
     pub since: Option<Timestamp>,
     /// The last error and its time.
     pub last_error: Option<(Timestamp, String)>,
@@ -160,7 +159,6 @@ impl ConnectionStatus {
 pub struct PushedMessage {
     /// Who sends it.
     pub sender: String,
-    /// Content.
     pub payload: Bytes,
     /// Answered when what was to be stored is stored: the error of a message that cannot be read.
     pub settled: oneshot::Sender<Result<(), String>>,

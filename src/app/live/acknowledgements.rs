@@ -35,7 +35,6 @@ impl NotStoredReason {
 /// Items of a stream that are not part of a sample for one reason.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NotStored {
-    /// Why.
     pub reason: NotStoredReason,
     /// How many, since the stream was opened.
     pub count: u64,

@@ -20,7 +20,7 @@ use crate::domain::{BoundingBox, CameraMoved, FusedFix};
 /// When something was observed, by the server's clock.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Observed {
-    /// Last.
+    /// The time of the last one.
     pub(super) last_at: Option<Timestamp>,
     /// Since when every box was frozen.
     pub(super) frozen_since: Option<Timestamp>,

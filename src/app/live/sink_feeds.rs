@@ -42,7 +42,6 @@ pub struct SinkPosition {
 /// The positions that a sink requests.
 #[derive(Debug, Clone)]
 pub struct WantedPositions {
-    /// The sink.
     pub key: ConnectionKey,
     /// Only positions of these cameras.
     pub cameras: Vec<CameraId>,

@@ -9,7 +9,6 @@ use crate::domain::{CameraId, Error, ErrorKind, Result};
 /// A collection of features.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum CollectionId {
-    /// Every camera.
     Cameras,
     /// The samples of a camera.
     Samples(CameraId),

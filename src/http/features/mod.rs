@@ -51,7 +51,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 /// Where the interface begins.
 #[derive(Serialize, ToSchema)]
 struct LandingPage {
-    /// Its title.
+    /// Title of the interface.
     title: &'static str,
     /// A description of the data.
     description: &'static str,
@@ -62,7 +62,7 @@ struct LandingPage {
 /// Requirements classes that are satisfied.
 #[derive(Serialize, ToSchema)]
 struct Conformance {
-    /// Their URIs.
+    /// URIs of the conformance classes.
     #[serde(rename = "conformsTo")]
     conforms_to: [&'static str; 2],
 }
@@ -81,7 +81,7 @@ struct Collections {
 struct Collection {
     /// Its id: `cameras`, `{camera}.samples` or `{camera}.tracks`.
     id: String,
-    /// Its title.
+    /// Title of the collection.
     title: String,
     /// The description of its features.
     description: &'static str,
@@ -140,7 +140,7 @@ struct GeoJsonFeature {
     /// Its geometry; null where none is known.
     #[schema(value_type = Option<Object>)]
     geometry: Value,
-    /// Its properties.
+    /// Properties of the feature.
     #[schema(value_type = Object)]
     properties: Map<String, Value>,
     /// Links of a single feature: to itself and to its collection.

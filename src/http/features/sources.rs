@@ -26,7 +26,6 @@ pub(super) struct Feature {
 pub(super) enum Geometry {
     /// None is known.
     Unknown,
-    /// A position.
     Point(Position),
     /// A convex area, by its corners counterclockwise.
     Polygon(Vec<Position>),

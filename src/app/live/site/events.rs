@@ -33,12 +33,7 @@ pub enum SiteEventKind {
         to: CameraId,
     },
     /// The target of a track is known by a receiver that it carries.
-    Identified {
-        /// The track.
-        track: LiveId,
-        /// The target.
-        target_id: TargetId,
-    },
+    Identified { track: LiveId, target_id: TargetId },
     /// Two tracks were of one target.
     Merged {
         /// The track that goes on.

@@ -33,7 +33,7 @@ pub(super) enum ItemSource {
         /// Origin of the model's plane.
         model_origin: Position,
     },
-    /// A receiver.
+    /// A fix of a receiver.
     Fix {
         /// Error variance per axis, m2.
         variance_m2: f64,

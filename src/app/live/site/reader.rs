@@ -14,7 +14,6 @@ use crate::telemetry::Metrics;
 pub struct StoredSiteEvent {
     /// A reader continues after it.
     pub id: LiveId,
-    /// The event.
     pub event: Arc<SiteEvent>,
 }
 
@@ -25,7 +24,6 @@ pub struct LostSiteEvents {
     pub id: LiveId,
     /// How many; `None` where nobody knows.
     pub events: Option<u64>,
-    /// Why.
     pub reason: LossReason,
 }
 

@@ -50,7 +50,7 @@ const MOST_BUCKETS: usize = 4_096;
 const REFILL_TIME: Duration = Duration::from_secs(1);
 
 impl RateLimit {
-    /// A limit of so many; 0 is no limit.
+    /// A limit of `per_s` units per second; 0 is no limit.
     #[must_use]
     pub fn new(what: &'static str, per_s: u32) -> Self {
         Self { what, per_s, buckets: Mutex::default() }
@@ -104,7 +104,7 @@ const FREE_S: f64 = 16.0;
 const MAX_WAIT_S: f64 = 10.0;
 
 impl RefusedBodies {
-    /// Forgives so many bytes per second; 0 charges nothing.
+    /// Forgives `bytes_per_s` bytes per second; 0 charges nothing.
     #[must_use]
     pub fn new(bytes_per_s: u32) -> Self {
         Self { bytes_per_s: f64::from(bytes_per_s), debts: Mutex::default() }

@@ -25,7 +25,7 @@ pub(super) struct PlaceCheck {
     swapped: u64,
     first_swapped: Option<Position>,
     kept: Vec<FootPosition>,
-    /// Every so many fixes one is kept.
+    /// One fix in this number of fixes is kept.
     stride: u64,
 }
 

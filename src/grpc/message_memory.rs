@@ -49,11 +49,11 @@ struct Shape {
 
 #[derive(Clone, Copy)]
 enum Field {
-    /// A text or bytes, each with so many bytes besides its content.
+    /// A text or bytes, each with this number of bytes besides its content.
     Text { header_bytes: usize },
     /// A message, by its place among the shapes, and how many of its structs each one takes besides the message around it.
     Message { shape: usize, structs: usize },
-    /// Many numbers, each of so many bytes in memory and, if that is fixed, on the wire.
+    /// Many numbers, each of this number of bytes in memory and, if that is fixed, on the wire.
     Numbers { bytes: usize, wire_bytes: Option<usize> },
 }
 

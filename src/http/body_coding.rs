@@ -47,7 +47,7 @@ const FREE_BYTES: u64 = 1024 * 1024;
 /// Decoded bytes that each member of gzip, or frame of zstd, counts as: it needs a decoder of its own.
 const MEMBER_BYTES: u64 = 64 * 1024;
 
-/// The most that so many coded bytes decode to.
+/// The largest number of bytes that `coded_bytes` bytes decode to.
 const fn most_decoded_bytes(coded_bytes: u64) -> u64 {
     coded_bytes.saturating_mul(MOST_RATIO).saturating_add(FREE_BYTES)
 }

@@ -169,7 +169,7 @@ struct TensorData {
 }
 
 impl TensorData {
-    /// The elements of a tensor, of which those of at most so many boxes are kept.
+    /// The elements of a tensor; those of at most this number of boxes are kept.
     ///
     /// # Errors
     /// `InvalidArgument` naming the tensor's data.

@@ -13,7 +13,7 @@ use serde::de::{
 /// A vector that grows has twice the place of its elements; so have maps.
 const GROWTH: usize = 2;
 
-/// Parses a value whose structs are objects, and whose elements and map entries come to at most so many bytes in memory.
+/// Parses a value whose structs are objects, with a limit on the memory of its elements and map entries, bytes.
 ///
 /// # Errors
 /// Those of the deserializer, also for an array instead of an object, and for more elements.

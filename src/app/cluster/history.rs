@@ -59,7 +59,7 @@ impl HistoryWatch {
         self.breaks.load(Ordering::Acquire)
     }
 
-    /// Notes that everything was read again after so many breaks.
+    /// Notes that everything was read again after this number of breaks.
     pub(super) fn has_read_after(&self, breaks: u64) {
         self.read_after.store(breaks, Ordering::Release);
     }

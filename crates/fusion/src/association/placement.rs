@@ -370,7 +370,7 @@ impl PlacementSearch {
     }
 }
 
-/// Those that differ from all better ones by at least a distance, m; at most so many.
+/// Those that differ from all better ones by at least a distance, m, up to a number.
 fn distinct(sorted: &[Placement], points: &[C], most: usize, apart_m: f64) -> Vec<Placement> {
     let mut kept: Vec<Placement> = Vec::new();
     for own in sorted {

@@ -36,10 +36,10 @@ const NAMED_CAMERAS: usize = 100;
 
 /// Check that the server is ready
 ///
-/// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
-/// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
-/// a line `degraded: insufficient-storage: ...`, nor damaged pages, nor a database that went on from before what it had acknowledged, of which a line
-/// `degraded: database: ...` tells. Callers that may not read get the first line only.
+/// The first line is `ready`. The server stays ready in these states, each of which has a line of its own: an active
+/// model that cannot be used (`degraded: camera ...`; the camera's fixes still pass through), a full disk
+/// (`degraded: insufficient-storage: ...`), and damaged pages, or a database that continues from an earlier state than
+/// it had acknowledged (`degraded: database: ...`). Callers that may not read get the first line only.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(

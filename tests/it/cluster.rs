@@ -106,7 +106,7 @@ async fn a_stream_that_meets_another_node_is_redirected_to_the_owner() {
     let location = followed.header("location").to_owned();
     assert_eq!(location, format!("{}/v1/cameras/yard/tracks?store_samples=false", url(&first)));
     first.post("/v1/cameras/yard/tracks?store_samples=false", &observation).await.expect(200);
-    // What changes no live state is answered anywhere.
+    // A request that changes no live state is answered by any node.
     second.post("/v1/cameras/yard/fusions", &observation).await.expect(200);
 
     feed.upto = 40;

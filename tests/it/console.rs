@@ -45,7 +45,7 @@ async fn hashed_files_are_kept_for_a_year_and_sent_compressed() {
         let whole = asset(&server, path, &[]).await.expect(200);
         assert_eq!(whole.header("cache-control"), "public, max-age=31536000, immutable");
         assert!(!whole.headers.contains_key("content-encoding"));
-        // Of a hundred bytes a compressed form is not shorter.
+        // A compressed form of a hundred bytes is not shorter.
         if whole.body.len() < 512 {
             continue;
         }

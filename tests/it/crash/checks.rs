@@ -119,7 +119,7 @@ fn check_writer(database: &Connection, writer: &mut Writer, findings: &mut Findi
         return check_importer(database, writer, findings);
     }
     let name = &writer.name;
-    // What the state would be after a step, and the state that is found.
+    // The state expected after a step, and the state that is found.
     let (state_after, found): (fn(u64) -> u64, u64) = match writer.work {
         Work::Erase => {
             let stored: i64 = samples(database, name).values().sum();

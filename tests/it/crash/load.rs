@@ -216,7 +216,7 @@ impl Streamer {
     async fn run(&mut self, client: &Client) {
         self.streams += 1;
         self.acknowledged = (format!("stream-{}", self.streams), 0);
-        // What was stored before has been looked for; it would fill the database in the end.
+        // Samples stored before have been looked for; they would fill the database in the end.
         while matches!(delete_samples(client, "streamed").await, Reply::Refused(..)) {
             tokio::time::sleep(PAUSE).await;
         }

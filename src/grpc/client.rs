@@ -1,4 +1,4 @@
-//! A client of `FusionService.Stream`, without a word of the transport in what it takes and gives.
+//! A client of `FusionService.Stream`, whose interface does not show the transport.
 //!
 //! One [`Connection`] carries many streams. [`Connection::open`] gives the two halves of one: an
 //! [`ItemSender`], whose waiting is the server's backpressure, and the [`Events`] that come back.

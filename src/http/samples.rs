@@ -130,7 +130,7 @@ struct DeletedSamples {
 /// fix. Training uses its box for the geometry of the camera. One of the two alone is rejected.
 ///
 /// One bad row never loses the others. Samples that are stored already are counted, not stored again, so an
-/// import that broke off can be sent again as it is; but a sample with a fix replaces one without.
+/// interrupted import can be sent again as it is; but a sample with a fix replaces one without.
 /// With `on_conflict=replace`, which is for operators, each sample replaces the stored one.
 ///
 /// With `columns`, `box_form` or `box_unit` a CSV file may have any separator, decimal commas, Unix times and
@@ -292,7 +292,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
         match export {
             None => Ok::<_, Error>(None),
             Some(export) => export.step().await.map(Some).inspect_err(|error| {
-                tracing::error!(%error, "an export broke off");
+                tracing::error!(%error, "an export was interrupted");
             }),
         }
     });

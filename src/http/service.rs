@@ -76,7 +76,7 @@ async fn readyz(State(rest): State<Rest>, CallerApp(app): CallerApp) -> ApiResul
     }
     if app.store.is_damaged() {
         text.push_str(
-            "degraded: database: a damaged page was met; restore a backup: sightfix restore FILE\n",
+            "degraded: database: a damaged page was read; restore a backup: sightfix restore FILE\n",
         );
     }
     for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {

@@ -167,7 +167,7 @@ impl Provider {
     /// Who has signed in, by the code that the provider gave the browser.
     ///
     /// # Errors
-    /// `Unauthenticated` for a state of another browser, or a code or token that does not hold;
+    /// `Unauthenticated` for a state of another browser, or a code or token that is not valid;
     /// `PermissionDenied` for a person without a role; `SignInUnavailable`.
     pub async fn identity(
         &self,
@@ -185,8 +185,8 @@ impl Provider {
         let nonce = secret.nonce();
         let expected = Expected { issuer: &self.issuer, client_id: &self.client_id, nonce: &nonce, now };
         let claims = id_token::verify(&token, &keys, &expected).map_err(|reason| {
-            tracing::warn!(reason, "the OpenID provider sent an ID token that does not hold");
-            not_signed_in("the provider's ID token does not hold; the log says why")
+            tracing::warn!(reason, "the OpenID provider sent an ID token that is not valid");
+            not_signed_in("the provider's ID token is not valid; the log says why")
         })?;
         let name = display_name(&claims);
         let Some(role) = self.role_of(&claims) else {

@@ -194,7 +194,7 @@ impl Body for AdmittedBody {
                 }
             },
             Poll::Ready(Some(Err(error))) => {
-                let message = format!("the body broke off: {error}");
+                let message = format!("the body is incomplete: {error}");
                 this.refuse(Error::refused(ErrorKind::Cancelled, message))
             }
             Poll::Ready(None) => match this.ticket.begin_work() {

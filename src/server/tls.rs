@@ -86,7 +86,7 @@ impl Tls {
             }
             Err(error) => tracing::error!(
                 error = format!("{error:#}"),
-                "the changed certificate cannot be used; the one before stays in use"
+                "the changed certificate cannot be used; the previous one stays in use"
             ),
         }
     }

@@ -28,7 +28,7 @@ impl LogControl {
     /// Logs what another filter selects.
     ///
     /// # Errors
-    /// A filter that cannot be read; the one before stays.
+    /// A filter that cannot be read; the previous one stays.
     pub fn set_filter(&self, filter: &str) -> anyhow::Result<()> {
         self.filter.reload(EnvFilter::try_new(filter)?).context("cannot change the log's filter")
     }

@@ -193,7 +193,7 @@ async fn run_attempt<J: Job>(
     shutdown: &Shutdown,
 ) -> Result<Option<JobState>> {
     if claim.job.identity().attempt > MAX_ATTEMPTS {
-        let outcome = format!("given up: {MAX_ATTEMPTS} workers claimed it and none came to its end");
+        let outcome = format!("given up: {MAX_ATTEMPTS} workers claimed it and none finished it");
         return J::fail(app, claim, outcome).await;
     }
     let mut thread = JobThread::spawn(J::NAME, J::prepare(app, claim).await?).map_err(Error::fault)?;

@@ -405,7 +405,7 @@ impl SourceSettings {
             }
             if self.ids_name_targets {
                 let rule =
-                    "is for detections; whose a receiver is stands in the profile of the camera (receivers)";
+                    "is for detections; the profile of the camera (receivers) says whose a receiver is";
                 return Err(Error::invalid("ids_name_targets", rule));
             }
         }

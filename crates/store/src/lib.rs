@@ -198,7 +198,7 @@ impl Store {
         }
     }
 
-    /// True if a damaged page was met since the process was started, so that a backup should be restored. For a
+    /// True if a damaged page was read since the process was started, so that a backup should be restored. For a
     /// PostgreSQL database see its own log.
     #[must_use]
     pub fn is_damaged(&self) -> bool {

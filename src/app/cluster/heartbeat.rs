@@ -89,7 +89,7 @@ async fn renew(app: &App, membership: &Membership) -> Result<()> {
     let silent = membership.observe(nodes, registration.id, app.clock.monotonic());
     for (id, renewal) in silent {
         if membership.leases.end_unrenewed(id, renewal).await? {
-            tracing::warn!(node = %id, "a node has ended without a word: its cameras are free");
+            tracing::warn!(node = %id, "a node has ended without releasing its cameras: they are free");
         }
     }
     Ok(())

@@ -184,7 +184,7 @@ async fn oldest_offset(client: &PartitionClient, missing: i64) -> Result<i64, Pe
         partition,
         missing,
         oldest,
-        "messages are gone; the oldest that is left comes next"
+        "the broker has deleted messages; reading continues with the oldest that it has"
     );
     Ok(oldest)
 }

@@ -187,8 +187,8 @@ async fn a_file_of_tiles_is_served_by_ranges_and_the_policy_stays() {
     assert_eq!((end.body.as_ref(), end.header("content-range")), (&content[2_000..], "bytes 2000-2007/2008"));
     let other = [("range", "bytes=0-9"), ("if-range", "\"other\"")];
     asset(&server, "/v1/tiles", &other).await.expect(200);
-    let behind = asset(&server, "/v1/tiles", &[("range", "bytes=2008-")]).await.expect(416).json();
-    assert_eq!(behind["violations"][0]["field"], "range", "{behind}");
+    let beyond = asset(&server, "/v1/tiles", &[("range", "bytes=2008-")]).await.expect(416).json();
+    assert_eq!(beyond["violations"][0]["field"], "range", "{beyond}");
 }
 
 #[tokio::test]

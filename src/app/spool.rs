@@ -109,7 +109,7 @@ impl Spool {
     /// An empty one.
     ///
     /// # Errors
-    /// `Overloaded` if the client has as many imports under way as it may.
+    /// `Overloaded` if the client has reached its limit of imports under way.
     pub fn new(app: &App, client: ClientId) -> Result<Self> {
         Ok(Self {
             memory_bytes: app.limits.import_memory_bytes,

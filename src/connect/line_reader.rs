@@ -15,7 +15,7 @@ const CHUNK_BYTES: usize = 4 << 10;
 pub(super) enum Line {
     /// Without its end.
     Whole(Bytes),
-    /// A line that is longer than may be; its rest is skipped.
+    /// A line that is longer than the limit; its rest is skipped.
     TooLong,
 }
 

@@ -25,7 +25,7 @@ use crate::exchange::Address;
 
 /// Time in which a client must send its first line.
 const FIRST_LINE: Duration = Duration::from_secs(30);
-/// A client that was silent for so long gives way when all places are taken.
+/// A client that was silent for this time is closed for a new one when all places are taken.
 const GIVES_WAY: Duration = Duration::from_secs(10);
 
 /// Takes lines of clients.

@@ -134,7 +134,7 @@ fn observed_rows(app: &App, content: &[u8], format: Format, rules: &RowRules) ->
     if format == Format::GeoJson {
         return read_observation_features(content, rules);
     }
-    // One more than may be, so that what is too long is not read to its end.
+    // Reads at most limit + 1 observations, to detect an oversized batch.
     let rows = read_observations(content, format, rules)?.take(app.limits.batch_observations + 1);
     let rows = rows.collect::<Result<Vec<_>>>()?;
     app.check_batch(rows.len())?;

@@ -46,7 +46,7 @@ fn merge(target: &mut JsonObject, patch: &JsonObject) {
     }
 }
 
-/// Makes a change of what was read, so another change in between would be undone: it is made again then, unless
+/// Makes a read-modify-write. If a concurrent update has changed the resource, it is made again, unless
 /// the client named a version.
 ///
 /// # Errors

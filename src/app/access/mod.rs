@@ -187,8 +187,7 @@ impl Access {
     }
 
     /// True if the keys should be read again for a credential, at a reading of the monotonic clock: it is an unknown
-    /// key, which another process may have created a moment ago. The keys are read at most ten times a second, whatever
-    /// clients present.
+    /// key, which another process may have created a moment ago. The keys are read at most ten times a second.
     pub fn is_worth_refresh(&self, credential: Credential<'_>, monotonic: Duration) -> bool {
         let Credential::Key(secret) = credential else { return false };
         let Ok(secret) = KeySecret::parse(&secret) else { return false };

@@ -31,7 +31,7 @@ pub use status::{
     PushedMessage,
 };
 
-/// A source that was created or resumed begins beside the answer; a message that comes before it waits for at most so long.
+/// A source that was created or resumed starts while the caller is answered; a message that comes before it waits at most this long.
 const SOURCE_START: Duration = Duration::from_secs(2);
 
 /// A connection as a caller describes it.

@@ -103,7 +103,7 @@ impl LiveMatching {
         Ok(())
     }
 
-    /// Ends a round that began at a reading of the monotonic clock and took so long.
+    /// Ends a round that began at `begun`, by the monotonic clock, and took `taken`.
     pub(super) fn end_round(&self, begun: Duration, taken: Duration) {
         let mut state = lock(&self.state);
         state.is_running = false;

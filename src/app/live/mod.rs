@@ -130,7 +130,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraBetweenNodes` if the lease has ended; `InvalidArgument` naming `time` for a time ahead of the
-    /// server's clock; `Overloaded` if the camera tracks as many targets as it may.
+    /// server's clock; `Overloaded` if the camera has reached its limit of targets.
     pub fn follow(
         &self,
         (camera, lease): (&Arc<ActiveCamera>, &CameraLease),

@@ -251,7 +251,7 @@ impl Quotas {
         }
     }
 
-    /// How many there are.
+    /// Number of quotas.
     pub const COUNT: usize = 8;
     /// Their names in the metrics, in the order of [`Quotas::usages`].
     pub const NAMES: [&str; Self::COUNT] = [

@@ -220,7 +220,7 @@ pub struct Limits {
     pub streams_per_connection: u32,
     /// Requests worked on at a time; one counts from the end of its body to the start of its answer.
     pub requests: usize,
-    /// How many of `requests` are reserved for fusions.
+    /// Number of `requests` that are reserved for fusions.
     pub reserved_requests: usize,
     /// Requests per second of one client, which is a key, or an address without one; 0 is no limit.
     pub requests_per_s: u32,

@@ -19,7 +19,7 @@ const BELIEVED: SignedDuration = SignedDuration::from_hours(7 * 24);
 /// The outcome of the deletion of old samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Retention {
-    /// So many samples were deleted.
+    /// Number of samples that were deleted.
     Deleted(u64),
     /// None was, for the clock is not believed.
     Refused(ClockDoubt),

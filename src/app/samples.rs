@@ -196,7 +196,7 @@ impl App {
         Ok(page_of(samples, limit, SampleKey::of))
     }
 
-    /// How many samples there are.
+    /// Number of samples.
     ///
     /// # Errors
     /// `CameraNotFound`.

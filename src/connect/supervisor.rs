@@ -159,7 +159,7 @@ impl Supervisor {
             tracing::warn!(connection = %connection.id(), message);
             let error = Some((self.app.clock.now(), message.to_owned()));
             self.app.live_connection(connection).update(|status| {
-                // How many is not known.
+                // The number of positions is not known.
                 status.dropped += 1;
                 status.last_error = error;
             });

@@ -112,7 +112,7 @@ impl From<crate::app::LastMessage> for LastMessage {
 struct CountedReason {
     /// The reason, of the latest of them.
     reason: String,
-    /// How many there were; reasons that differ in numbers alone are one.
+    /// Number of messages or parts; reasons that differ in numbers alone are one.
     count: u64,
     /// The latest of them: an item in words, or the beginning of a message.
     example: String,
@@ -328,7 +328,7 @@ struct DeadLetterPage {
     next_cursor: Option<String>,
 }
 
-/// How many dead letters were changed.
+/// Number of dead letters that were changed.
 #[derive(Serialize, ToSchema)]
 struct DeadLetterCount {
     /// Number of dead letters.

@@ -163,7 +163,7 @@ struct InputTensor<'r> {
 struct TensorData {
     numbers: Vec<f64>,
     is_of_rows: bool,
-    /// How many there are, of which at most `most` are kept.
+    /// Number of elements; at most `most` are kept.
     count: usize,
     most: usize,
 }

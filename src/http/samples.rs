@@ -103,7 +103,7 @@ struct SamplePage<'a> {
     next_cursor: Option<String>,
 }
 
-/// How many samples there are.
+/// The count of samples.
 #[derive(Serialize, ToSchema)]
 struct SampleCount {
     /// Number of samples.
@@ -112,7 +112,7 @@ struct SampleCount {
     without_fix: u64,
 }
 
-/// How many samples were deleted.
+/// The count of deleted samples.
 #[derive(Serialize, ToSchema)]
 struct DeletedSamples {
     /// Number of samples deleted.

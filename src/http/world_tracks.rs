@@ -268,7 +268,7 @@ struct LostSiteEventCount {
     /// `too_old`: the event to continue after is not kept any more; `restarted`: it is of before the start of the
     /// server; `too_slow`: the client reads too slowly.
     reason: &'static str,
-    /// How many, if it is known.
+    /// Number of lost events, if it is known.
     #[serde(skip_serializing_if = "Option::is_none")]
     events: Option<u64>,
 }

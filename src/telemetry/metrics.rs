@@ -1,4 +1,4 @@
-//! Metrics, as one typed struct: no name is spelled at a call site.
+//! Metrics, as one typed struct: no call site names a metric by a text.
 
 mod answers;
 mod cluster;
@@ -186,12 +186,12 @@ impl Metrics {
         self.live.cameras_moved.increment(1);
     }
 
-    /// How many processes share the database.
+    /// Number of processes that share the database.
     pub fn nodes(&self, nodes: usize) {
         self.cluster.nodes.set(nodes as f64);
     }
 
-    /// How many cameras this process owns.
+    /// Number of cameras that this process owns.
     pub fn owned_cameras(&self, cameras: usize) {
         self.cluster.owned_cameras.set(cameras as f64);
     }
@@ -269,7 +269,7 @@ impl Metrics {
         }
     }
 
-    /// How many jobs have not ended.
+    /// Number of jobs that have not ended.
     pub fn jobs(&self, counts: &JobCounts) {
         let QueueMetrics { training, evaluation } = &self.queues;
         for (gauges, counts) in [(training, counts.training), (evaluation, counts.evaluation)] {
@@ -278,7 +278,7 @@ impl Metrics {
         }
     }
 
-    /// How many cameras have an active model that cannot be used.
+    /// Number of cameras with an active model that cannot be used.
     pub fn models_unusable(&self, cameras: usize) {
         self.models_unusable.set(cameras as f64);
     }

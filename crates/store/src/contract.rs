@@ -168,13 +168,13 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn thinned_detections(&self, id: &CameraId, filter: &SampleFilter, most: u32) -> Result<Vec<Detection>>;
 
-    /// How many samples a filter selects.
+    /// Number of samples that a filter selects.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`].
     fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64>;
 
-    /// How many of the samples with a fix that a filter selects state the truth.
+    /// Number of samples with a fix that a filter selects and that state the truth.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`].
@@ -186,7 +186,7 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn sample_time(&self, id: &CameraId, before: u64) -> Result<Option<Timestamp>>;
 
-    /// How many samples with a fix a filter selects, and the corners of the ground they cover (south-west,
+    /// Number of samples with a fix that a filter selects, and the corners of the ground they cover (south-west,
     /// north-east in degrees; across the antimeridian, of the whole parallel).
     ///
     /// # Errors
@@ -413,7 +413,7 @@ contract! {
     /// [`ErrorKind::EvaluationNotFound`].
     fn delete_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<()>;
 
-    /// How many jobs have not ended.
+    /// Number of jobs that have not ended.
     ///
     /// # Errors
     /// Faults only.

@@ -31,7 +31,7 @@ pub use status::{
     PushedMessage,
 };
 
-/// A source that was created or resumed starts while the caller is answered; a message that comes before it waits at most this long.
+/// A pushed message waits at most this long for a source that was just created or resumed.
 const SOURCE_START: Duration = Duration::from_secs(2);
 
 /// A connection as a caller describes it.

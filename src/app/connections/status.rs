@@ -58,7 +58,7 @@ impl LastMessage {
 pub struct CountedReason {
     /// The reason, of the latest of them.
     pub reason: String,
-    /// How many there were.
+    /// Number of messages or parts.
     pub count: u64,
     /// The latest example: an item in words, or the beginning of a message.
     pub example: String,

@@ -36,7 +36,7 @@ impl NotStoredReason {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NotStored {
     pub reason: NotStoredReason,
-    /// How many, since the stream was opened.
+    /// Number of them since the stream was opened.
     pub count: u64,
     /// The latest of them.
     pub last_seq: u64,

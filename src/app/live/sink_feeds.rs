@@ -112,7 +112,7 @@ impl SinkFeed {
         positions.drain(..settled);
     }
 
-    /// How many positions were lost since the last call, for the outbox took none for too long.
+    /// Number of positions lost since the last call, for the outbox took none for too long.
     #[must_use]
     pub fn take_lost(&self) -> u64 {
         std::mem::take(&mut lock(&self.waiting).lost)

@@ -22,7 +22,7 @@ pub struct StoredSiteEvent {
 pub struct LostSiteEvents {
     /// The last of them; a reader continues after it.
     pub id: LiveId,
-    /// How many; `None` where nobody knows.
+    /// Number of lost events; `None` where nobody knows.
     pub events: Option<u64>,
     pub reason: LossReason,
 }

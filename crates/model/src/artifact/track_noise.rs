@@ -7,11 +7,11 @@ use crate::domain::{NoiseCorrelation, Result, SessionBias};
 /// Correlation of the errors of receiver and model, whose variances are stated elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackNoiseModel {
-    /// Of the receiver's error beside its bias of the session.
+    /// The noise of the receiver's error besides its bias of the session.
     pub gnss: NoiseCorrelation,
-    /// Of the receiver's error, the part that lasts for a session.
+    /// The part of the receiver's error that lasts for a session.
     pub gnss_session: SessionBias,
-    /// Of the model's error while the target is stationary.
+    /// The noise of the model's error while the target is stationary.
     pub regression: NoiseCorrelation,
     /// Distance over which the correlation of the model's error falls to 1/e, m.
     pub regression_length_m: f64,

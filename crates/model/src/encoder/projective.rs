@@ -38,9 +38,9 @@ const IGNORED_SHARE: usize = 100;
 /// The parts of the recipe that are used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Variant {
-    /// Whether the position depends on width and height besides the foot point.
+    /// True if the position depends on width and height besides the foot point.
     pub(crate) uses_size: bool,
-    /// Whether the hidden units of a network are added to the geometric map.
+    /// True if the hidden units of a network are added to the geometric map.
     pub(crate) residual: bool,
 }
 

@@ -228,17 +228,17 @@ fn fitted_candidate(
     let artifact = fit_with(samples, fit_options, overrides, &mut |event| {
         if let crate::FitEvent::HeldOut(errors) = event {
             // Spells of 20 neighbours: their errors are correlated.
-            let of_spell = |spell: &[crate::domain::HeldOutSampleError]| {
-                spell.iter().map(|error| (0.5 * error.distance_m.powi(2)).min(bound_m2)).sum()
+            let of_segment = |segment: &[crate::domain::HeldOutSampleError]| {
+                segment.iter().map(|error| (0.5 * error.distance_m.powi(2)).min(bound_m2)).sum()
             };
-            misses_m2 = errors.chunks(20).map(of_spell).collect();
+            misses_m2 = errors.chunks(20).map(of_segment).collect();
         }
         std::ops::ControlFlow::Continue(())
     });
     Fitted { regressor: artifact.expect("fits").load().expect("loads"), misses_m2 }
 }
 
-/// The comparison behind docs/explanation/method.md: choosing one candidate against averaging all by the shares of a
+/// The comparison in docs/explanation/method.md: choosing one candidate against averaging all by the shares of a
 /// Bayesian bootstrap.
 #[test]
 #[ignore = "a measurement of minutes"]

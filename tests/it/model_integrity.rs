@@ -138,7 +138,7 @@ async fn a_file_without_a_checksum_is_refused() {
     entries.remove("sightfix.sha256").expect("the checksum");
     let tensors = SafeTensors::deserialize(&file).expect("safetensors").tensors();
     let without = safetensors::serialize(tensors, Some(entries)).expect("a file");
-    let refused = upload(&server, without).await.expect(400);
+    let refused = upload(&server, without).await.expect(422);
     assert!(refused.text().contains("checksum"), "{}", refused.text());
     upload(&server, file).await.expect(201);
 }

@@ -6,17 +6,15 @@
 // What clients send reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
-mod decoded_memory;
 mod rates;
 
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::config::Limits;
-use crate::domain::{Error, ErrorKind, KeyId, Refusal, Result};
+use crate::domain::{Error, ErrorKind, KeyId, Result};
 
-pub use decoded_memory::DecodedMemory;
 pub use rates::{RateLimit, RefusedBodies, TokenBucket};
 
 /// What a request costs while it is open, besides its body: connection buffers and its task. Charged
@@ -67,23 +65,6 @@ pub enum RequestClass {
     LiveStream,
     /// Everything else.
     Other,
-}
-
-/// Why a request's body was refused while it was read, once it was. Clones share it.
-#[derive(Clone, Default)]
-pub struct BodyRefusal(Arc<OnceLock<Refusal>>);
-
-impl BodyRefusal {
-    /// Records why; the first reason stays.
-    pub fn set(&self, refusal: Refusal) {
-        let _ = self.0.set(refusal);
-    }
-
-    /// The reason, if the body was refused.
-    #[must_use]
-    pub fn get(&self) -> Option<Error> {
-        self.0.get().cloned().map(Error::Refused)
-    }
 }
 
 /// A resource of which all clients together and one client may hold so much at a time. Clones share it.
@@ -289,10 +270,12 @@ impl Quotas {
         self.request_memory.try_acquire(client, REQUEST_OVERHEAD_BYTES)
     }
 
-    /// What the messages of one request come to when they are decoded, besides the bytes of its body.
-    #[must_use]
-    pub fn decoded_memory(&self, client: ClientId, refusal: BodyRefusal) -> DecodedMemory {
-        DecodedMemory::new(self.request_memory.clone(), client, refusal)
+    /// Memory for a message of that many bytes once it is decoded, besides the bytes of the request's body.
+    ///
+    /// # Errors
+    /// `Overloaded`.
+    pub fn decoded_memory(&self, client: ClientId, bytes: u64) -> Result<Lease> {
+        self.request_memory.try_acquire(client, bytes)
     }
 
     /// The place of a request that begins to be worked on; `None` where the class needs none.

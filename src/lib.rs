@@ -19,6 +19,7 @@ pub mod grpc;
 pub mod http;
 pub mod openid;
 pub mod replay;
+pub mod request;
 pub mod server;
 pub mod shutdown;
 pub mod status;

@@ -7,6 +7,7 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod activity;
+mod async_layer;
 mod connection;
 mod connection_gate;
 mod cors;

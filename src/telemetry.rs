@@ -10,6 +10,6 @@ mod traces;
 
 pub use logging::{LogControl, REQUEST_ID, REQUESTS, RequestId, start_log};
 pub use metrics::{CloseReason, JobMetrics, Metrics, OpenConnection, OutsideFigures, SiteItemOutcome};
-pub use request_metrics::{MatchedRoute, OTHER_RPC, Route, RpcCall};
+pub use request_metrics::{OTHER_RPC, Route, RpcCall};
 #[cfg(feature = "otel")]
 pub use traces::continue_trace;

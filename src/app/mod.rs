@@ -107,7 +107,7 @@ pub struct Parts {
     /// What an outside client may make large.
     pub limits: Limits,
     /// How much of each bounded resource clients may hold at a time.
-    pub quotas: Quotas,
+    pub quotas: Arc<Quotas>,
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
@@ -155,7 +155,7 @@ impl App {
         access.refresh(&store, &clock).await?;
         let pairings = Arc::new(Semaphore::new(limits.pairings));
         let (residuals, waiting) = live::residual_queue();
-        let quotas = Quotas::new(&limits);
+        let quotas = Arc::new(Quotas::new(&limits));
         let parts = Parts {
             opened_store: store,
             registry,

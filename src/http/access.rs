@@ -19,9 +19,10 @@ use super::body_coding::decoded;
 use super::extract::Params;
 use super::problem::{ApiError, ApiResult};
 use crate::app::App;
-use crate::app::access::{Caller, Permission, RoutePermission};
-use crate::domain::{Error, Result};
-use crate::telemetry::{MatchedRoute, Route};
+use crate::app::access::{Permission, RoutePermission};
+use crate::domain::Result;
+use crate::request::RequestContext;
+use crate::telemetry::Route;
 
 /// The query parameters of the operations, as the description names them. Missing are operations that take any: those
 /// with a parameter that is exploded.
@@ -102,12 +103,12 @@ pub(super) struct Authorize<S> {
 impl<S> Authorize<S> {
     fn check(&self, request: &Request) -> Result<()> {
         let template = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
-        let caller = request.extensions().get::<Caller>().ok_or_else(no_caller)?;
+        let context = RequestContext::of(request.extensions())?;
         let route = RoutePermission::of(request.method().as_str(), template);
-        if let (Some(matched), Some(route)) = (request.extensions().get::<MatchedRoute>(), route) {
-            matched.set(Route { method: route.method, template: route.template });
+        if let Some(route) = route {
+            context.matched(Route { method: route.method, template: route.template });
         }
-        caller.authorize(route.map_or(Permission::Administer, |route| route.permission))?;
+        context.caller().authorize(route.map_or(Permission::Administer, |route| route.permission))?;
         self.parameters.check(template, request.method(), request.uri())
     }
 }
@@ -137,11 +138,7 @@ impl FromRequestParts<Rest> for CallerApp {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, rest: &Rest) -> ApiResult<Self> {
-        let caller = parts.extensions.get::<Caller>().ok_or_else(no_caller)?;
-        Ok(Self(rest.app.on_behalf_of(caller.clone())))
+        let context = RequestContext::of(&parts.extensions)?;
+        Ok(Self(rest.app.on_behalf_of(context.caller().clone())))
     }
-}
-
-fn no_caller() -> Error {
-    Error::fault("a request came without its caller")
 }

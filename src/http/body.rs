@@ -8,9 +8,9 @@ use hyper::header::CONTENT_LENGTH;
 use hyper::http::request::Parts;
 
 use super::body_error::BodyError;
-use crate::admission::ClientId;
 use crate::app::{App, Spool, Spooled};
 use crate::domain::{Error, ErrorKind, Result};
+use crate::request::RequestContext;
 
 /// The whole body. What is beyond the limit is not read, and so never decoded.
 ///
@@ -68,7 +68,7 @@ impl Gathered {
 pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<Spooled> {
     let limit = app.limits.import_bytes;
     check_announced(&head.headers, limit)?;
-    let mut spool = Spool::new(app, client_id(head))?;
+    let mut spool = Spool::new(app, RequestContext::of(&head.extensions)?.client())?;
     while let Some(part) = next(&mut body).await? {
         if spool.length() + part.len() > limit {
             return Err(too_large(limit));
@@ -76,11 +76,6 @@ pub(super) async fn spooled(app: &App, head: &Parts, mut body: Body) -> Result<S
         spool.push(part).await?;
     }
     spool.finish().await
-}
-
-/// Who sends a request.
-pub(super) fn client_id(head: &Parts) -> ClientId {
-    head.extensions.get().copied().unwrap_or(ClientId::UNKNOWN)
 }
 
 async fn next(body: &mut Body) -> Result<Option<Bytes>> {

@@ -18,6 +18,7 @@ use crate::domain::{
     SiteId, TargetId, parse_time, parse_time_zone,
 };
 use crate::exchange::{CsvLayout, Cursor, Format, read_cursor, wire};
+use crate::request::RequestContext;
 
 /// Items on a page whose length the client leaves open.
 const PAGE_ITEMS: u32 = 100;
@@ -29,7 +30,7 @@ impl<S: Send + Sync> FromRequestParts<S> for Client {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> ApiResult<Self> {
-        Ok(Self(body::client_id(parts)))
+        Ok(Self(RequestContext::of(&parts.extensions)?.client()))
     }
 }
 

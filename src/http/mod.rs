@@ -80,12 +80,28 @@ use crate::telemetry::RequestId;
 
 pub use session::session_token;
 
-/// What the handlers share.
+/// What the handlers share. One pointer: the router clones it several times for each request.
 #[derive(Clone)]
-struct Rest {
+struct Rest(Arc<RestState>);
+
+struct RestState {
     app: App,
-    console: Arc<Console>,
+    console: Console,
     shutdown: Shutdown,
+}
+
+impl Rest {
+    fn new(app: App, console: Console, shutdown: Shutdown) -> Self {
+        Self(Arc::new(RestState { app, console, shutdown }))
+    }
+}
+
+impl std::ops::Deref for Rest {
+    type Target = RestState;
+
+    fn deref(&self) -> &RestState {
+        &self.0
+    }
 }
 
 /// All REST routes, the description at `/openapi.json` and its page at `/docs`, the operator's console at `/`.
@@ -97,7 +113,7 @@ impl Transport {
     #[must_use]
     pub fn new(app: App, console: Console, shutdown: Shutdown) -> Self {
         let console_routes = console::routes(&console);
-        let rest = Rest { app, console: Arc::new(console), shutdown };
+        let rest = Rest::new(app, console, shutdown);
         let (routes, described) = described().split_for_parts();
         let authorize = access::AuthorizeLayer::of(&described);
         // The page would otherwise ask a server on the internet whether the description is well formed.
@@ -118,13 +134,12 @@ impl Transport {
     /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
     #[must_use]
     pub fn monitoring(app: App, shutdown: Shutdown) -> Self {
-        let rest = Rest { app, console: Arc::default(), shutdown };
+        let rest = Rest::new(app, Console::default(), shutdown);
         let (routes, described) = service::routes().split_for_parts();
         Self(routes.route_layer(access::AuthorizeLayer::of(&described)).with_state(rest))
     }
 
-    /// Answers a request, which carries its [`RequestId`] and its [`Caller`](crate::app::access::Caller) as
-    /// extensions. Whatever part of the router refuses it, or panics, the answer is a problem.
+    /// Answers a request, which carries its [`RequestContext`](crate::request::RequestContext) as an extension. Whatever part of the router refuses it, or panics, the answer is a problem.
     pub async fn answer(&self, request: Request<Body>) -> Response<Body> {
         // Not as layers of the router: axum would box the service and the future of every request for each.
         let coding = body_coding::AcceptedCoding::of(&request);

@@ -20,10 +20,11 @@ use hyper::header::CONTENT_TYPE;
 use hyper::http::request::Parts;
 use tokio::io::AsyncReadExt as _;
 
-use super::body::{self, client_id};
+use super::body;
 use super::extract::{media_type, not_read};
 use crate::app::{App, Content, Spool, SpoolLeases, Spooled};
 use crate::domain::{Error, ErrorKind, Result};
+use crate::request::RequestContext;
 
 /// Read at once while the body is split into its parts.
 const CHUNK_BYTES: usize = 32 * 1024;
@@ -78,6 +79,7 @@ pub(super) async fn parts<const N: usize>(
         return Err(not_read(&["multipart/form-data"]));
     }
     let whole = body::spooled(app, head, content).await?;
+    let client = RequestContext::of(&head.extensions)?.client();
     let since = Arc::new(AtomicUsize::new(0));
     let mut multipart = multipart(&head.headers, chunks(whole, since.clone())).await?;
     let mut found: [Option<BodyPart>; N] = std::array::from_fn(|_| None);
@@ -97,7 +99,7 @@ pub(super) async fn parts<const N: usize>(
         if place.is_some() {
             return Err(Error::invalid(name, "the part appears twice"));
         }
-        *place = Some(spooled(field, Spool::new(app, client_id(head))?, &since).await?);
+        *place = Some(spooled(field, Spool::new(app, client)?, &since).await?);
     }
     let mut missing = None;
     let found = found.into_iter().zip(names).map(|(part, name)| part.ok_or(name));

@@ -17,6 +17,7 @@ use utoipa::ToSchema;
 
 use super::shown_path;
 use crate::domain::{Error, ErrorKind, Refusal};
+use crate::request::RequestContext;
 use crate::status;
 use crate::telemetry::RequestId;
 
@@ -148,7 +149,7 @@ pub(super) struct Refused {
 impl Refused {
     pub(super) fn of(request: &Request) -> Self {
         Self {
-            id: request.extensions().get().cloned(),
+            id: RequestContext::of(request.extensions()).ok().map(|context| context.id().clone()),
             uri: request.uri().clone(),
             is_head: request.method() == Method::HEAD,
         }

@@ -7,18 +7,23 @@ mod fusions;
 mod samples;
 mod training;
 
+use std::sync::Arc;
+
 use axum::body::{Body, Bytes};
 use http_body_util::BodyExt as _;
 use hyper::http::HeaderValue;
+use hyper::http::uri::Scheme;
 use hyper::{HeaderMap, Request, StatusCode};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::Transport;
+use super::{Transport, class};
+use crate::admission::Quotas;
 use crate::app::App;
 use crate::app::access::{Caller, Principal};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Console, Limits};
+use crate::request::{RequestContext, RequestHead};
 use crate::shutdown::Shutdown;
 use crate::store::Store;
 use crate::telemetry::{Metrics, RequestId};
@@ -26,6 +31,7 @@ use crate::telemetry::{Metrics, RequestId};
 /// The transport over a store of its own; no worker runs.
 struct Rest {
     transport: Transport,
+    quotas: Arc<Quotas>,
     shutdown: Shutdown,
     _folder: TempDir,
 }
@@ -85,8 +91,9 @@ impl Rest {
         let app =
             App::new(store, clock, Randomness::seeded(1), limits, Metrics::new()).await.expect("an app");
         let shutdown = Shutdown::new();
+        let quotas = app.quotas.clone();
         let transport = Transport::new(app, Console::default(), shutdown.clone());
-        Self { transport, shutdown, _folder: folder }
+        Self { transport, quotas, shutdown, _folder: folder }
     }
 
     /// With a camera `c` of 640 x 480 px.
@@ -109,8 +116,16 @@ impl Rest {
             request = request.header(*name, *value);
         }
         let mut request = request.body(body).expect("a request");
-        request.extensions_mut().insert(RequestId::new(HeaderValue::from_static("the-request")));
-        request.extensions_mut().insert(Caller::new(Principal::Everyone, None, None));
+        let head = RequestHead {
+            id: RequestId::new(HeaderValue::from_static("the-request")),
+            is_grpc: false,
+            class: class(request.method(), path),
+            scheme: Scheme::HTTP,
+            address: [127, 0, 0, 1].into(),
+        };
+        let context = RequestContext::new(head, self.quotas.clone());
+        context.authenticated(Caller::new(Principal::Everyone, None, None));
+        request.extensions_mut().insert(context);
         self.transport.answer(request).await
     }
 

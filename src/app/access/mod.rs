@@ -188,9 +188,9 @@ impl Access {
 
     /// Whether the keys should be read again for a credential, at a reading of the monotonic clock: it is an unknown key, which
     /// another process may have created a moment ago. So ten times a second at most, whatever clients present.
-    pub fn is_worth_refresh(&self, credential: Credential<'_>, monotonic: Duration) -> bool {
+    pub fn is_worth_refresh(&self, credential: &Credential<'_>, monotonic: Duration) -> bool {
         let Credential::Key(secret) = credential else { return false };
-        let Ok(secret) = KeySecret::parse(&secret) else { return false };
+        let Ok(secret) = KeySecret::parse(secret) else { return false };
         !self.is_open() && !self.keys.has(&secret.digest()) && self.keys.may_look(monotonic)
     }
 

@@ -2,11 +2,11 @@
 
 use hyper::header::HOST;
 use hyper::http::request::Parts;
-use hyper::http::uri::Scheme;
 use serde::Serialize;
 use utoipa::ToSchema;
 
 use crate::http::problem::ApiError;
+use crate::request::RequestContext;
 
 pub(super) const JSON: &str = "application/json";
 pub(super) const GEOJSON: &str = "application/geo+json";
@@ -44,8 +44,8 @@ impl<S: Send + Sync> axum::extract::FromRequestParts<S> for BaseUrl {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, ApiError> {
-        let scheme = parts.extensions.get().cloned().unwrap_or(Scheme::HTTP);
-        // Checked by the pipeline: there is one, and this server answers for it.
+        let scheme = RequestContext::of(&parts.extensions)?.scheme();
+        // Checked by the server's layers: there is one, and this server answers for it.
         let header = || parts.headers.get(HOST).and_then(|host| host.to_str().ok());
         let host = parts.uri.authority().map(|authority| authority.as_str()).or_else(header);
         Ok(Self(format!("{scheme}://{}", host.unwrap_or("localhost"))))

@@ -32,6 +32,7 @@ mod simulate;
 mod simulate_site;
 mod site_recording;
 mod summary;
+mod tls;
 mod train;
 
 use std::path::{Path, PathBuf};
@@ -93,6 +94,8 @@ enum Command {
     Replay(replay::Replay),
     /// Create, list and revoke the keys that clients of a server present
     Keys(keys::Keys),
+    /// Make the certificate that browsers on phones need, without a name of one's own
+    Tls(tls::Tls),
     /// Copy the database into one verified file, also while a server uses it
     Backup(backup::Backup),
     /// Put a backup in place of the database
@@ -143,6 +146,7 @@ impl Cli {
             Command::Simulate(command) => command.run(),
             Command::Replay(command) => command.run(file),
             Command::Keys(command) => command.run(file),
+            Command::Tls(command) => command.run(),
             Command::Backup(command) => command.run(file),
             Command::Restore(command) => command.run(file),
             Command::Copy(command) => command.run(),

@@ -25,6 +25,8 @@ pub struct Console {
     pub tile_file: Option<PathBuf>,
     /// What the provider of the tiles asks to be shown on the map.
     pub tile_attribution: Option<String>,
+    /// File with the authority (PEM) of the server's own certificate. Phones fetch it from `/authority.crt` to trust it.
+    pub authority: Option<PathBuf>,
     /// Whether the page offers the map of OpenStreetMap, whose server browsers ask once their user has agreed. Only without
     /// tiles of these settings.
     pub offer_openstreetmap: bool,
@@ -32,12 +34,22 @@ pub struct Console {
 
 impl Default for Console {
     fn default() -> Self {
-        Self { tile_url: None, tile_file: None, tile_attribution: None, offer_openstreetmap: true }
+        Self {
+            tile_url: None,
+            tile_file: None,
+            tile_attribution: None,
+            authority: None,
+            offer_openstreetmap: true,
+        }
     }
 }
 
 impl Console {
     pub(super) fn check(&self) -> anyhow::Result<()> {
+        if let Some(authority) = &self.authority {
+            std::fs::File::open(authority)
+                .with_context(|| format!("console.authority: cannot read {}", authority.display()))?;
+        }
         if let Some(url) = &self.tile_url {
             anyhow::ensure!(
                 tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),

@@ -9,6 +9,7 @@
 
 mod access;
 mod audit;
+mod authority;
 mod body;
 mod body_coding;
 mod body_error;
@@ -126,6 +127,7 @@ impl Transport {
                 .route_layer(authorize)
                 .merge(page)
                 .merge(console_routes)
+                .merge(authority::routes())
                 .merge(openid::callback())
                 .with_state(rest),
         )

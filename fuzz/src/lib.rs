@@ -1,5 +1,5 @@
 //! What is fuzzed: one function per kind of input, over the public interface, with what must hold whatever
-//! the input is. The fuzz targets and the seeded test `tests/it/hostile.rs` share them.
+//! the input is. The fuzz targets and the seeded test `tests/it/hostile` share them.
 
 use std::io::Write as _;
 use std::sync::LazyLock;

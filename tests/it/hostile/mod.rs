@@ -3,7 +3,7 @@
 //! `FUZZ_ITERATIONS=100000 cargo test --test it hostile::` mutates for longer; `fuzz/` has the same targets for
 //! cargo-fuzz, which is guided by coverage.
 
-#[path = "../../fuzz/src/lib.rs"]
+#[path = "../../../fuzz/src/lib.rs"]
 #[expect(unreachable_pub, reason = "it is the library of the fuzz targets")]
 mod targets;
 

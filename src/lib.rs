@@ -18,6 +18,7 @@ pub mod doctor;
 pub mod grpc;
 pub mod http;
 pub mod openid;
+pub mod operations;
 pub mod replay;
 pub mod request;
 pub mod server;

@@ -30,13 +30,13 @@ use super::request_body::{AdmittedBody, RateGuard};
 use super::revocable_body::RevocableBody;
 use crate::admission::{ClientId, RequestClass};
 use crate::app::App;
-use crate::app::access::{Caller, Credential, Permission, Principal};
+use crate::app::access::{Caller, Credential, Principal};
 use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
 use crate::request::{RequestContext, RequestHead};
 use crate::shutdown::Shutdown;
 use crate::telemetry::{Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
-use crate::{grpc, http};
+use crate::{grpc, http, operations};
 
 /// Longest request id that is taken from a client, in bytes.
 const LONGEST_REQUEST_ID: usize = 128;
@@ -168,7 +168,7 @@ async fn observe<S: Next<Incoming, Infallible>>(
     let metrics = &on.pipeline.app.metrics;
     let context = on.context(&request);
     request.extensions_mut().insert(context.clone());
-    let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
+    let rpc = operations::rpc_name(request.uri().path()).unwrap_or(OTHER_RPC);
     let call = context.is_grpc().then(|| metrics.call(rpc));
     let closes = on.peer.refusal.is_some() && request.version() < Version::HTTP_2;
     let span = tracing::debug_span!(
@@ -325,7 +325,7 @@ impl Connection {
         }
         if context.is_grpc() {
             // `http` compares a route's permission itself: it knows the template of the path.
-            context.caller().authorize(Permission::of_rpc(request.uri().path()))?;
+            context.caller().authorize(operations::rpc_permission(request.uri().path()))?;
         }
         Ok(())
     }

@@ -29,7 +29,7 @@ use crate::store::{KeysVersion, Store};
 
 pub use caller::{Caller, CertificateHolder, Principal};
 pub use key_table::ActiveKey;
-pub use permission::{OPERATIONS, Operation, Permission, RoutePermission};
+pub use permission::Permission;
 pub use sessions::{SESSION_TIME, SessionToken};
 pub use signed_in_user::SignedInUser;
 

@@ -18,9 +18,10 @@ use super::body_coding::decoded;
 use super::extract::Params;
 use super::problem::{ApiError, ApiResult};
 use crate::app::App;
-use crate::app::access::{Permission, RoutePermission};
+use crate::app::access::Permission;
 use crate::domain::Result;
 use crate::http::plumbing::state::Rest;
+use crate::operations::RoutePermission;
 use crate::request::RequestContext;
 use crate::telemetry::Route;
 

@@ -15,6 +15,7 @@ use super::problem::PROBLEM_JSON;
 use crate::app::access::Permission;
 use crate::domain::{ErrorKind, Role};
 use crate::http::resources::session::SESSION_COOKIE;
+use crate::operations::route_permission;
 use crate::status;
 
 const TAGS: [(&str, &str); 13] = [
@@ -122,7 +123,7 @@ pub(in crate::http) fn add_security(openapi: &mut OpenApi) {
         let methods = ["GET", "POST", "PUT", "PATCH", "DELETE"];
         for (method, operation) in methods.into_iter().zip(operations(item)) {
             let Some(operation) = operation else { continue };
-            let permission = Permission::of_route(method, path);
+            let permission = route_permission(method, path);
             if permission == Permission::Public {
                 continue;
             }

@@ -20,6 +20,7 @@ const LAYERS: &[(&str, u32)] = &[
     ("app", 6),
     ("worker", 7),
     ("connect", 7),
+    ("operations", 7),
     ("request", 7),
     ("status", 7),
     ("http", 8),

@@ -5,7 +5,7 @@ mod description;
 mod evaluations;
 mod fusions;
 mod samples;
-mod training;
+mod training_runs;
 
 use std::sync::Arc;
 

@@ -45,7 +45,7 @@ impl FusionService for Fusion {
             let rules = camera.row_rules(app.clock.now());
             let convert = |message| observation(message, &rules);
             let observations = convert_all("observations", asked.observations, convert)?;
-            let fused = app.fuse(camera, &observations).await?;
+            let fused = app.fuse_batch(camera, &observations).await?;
             Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
         })
         .await

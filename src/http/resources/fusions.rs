@@ -111,7 +111,7 @@ async fn fuse(
         FormattedBody::Json(json) => observations(&app, &json.read()?, &rules, &camera.receivers)?,
         FormattedBody::Rows(rows, format) => observed_rows(&app, rows, *format, &rules)?,
     };
-    let fused = app.fuse(camera, &observations).await?;
+    let fused = app.fuse_batch(camera, &observations).await?;
     let mut response = match written {
         Format::Json => {
             let items = fused.iter().map(wire::FusedFix::from).collect();

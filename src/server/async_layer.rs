@@ -2,39 +2,33 @@
 
 use std::task::{Context, Poll};
 
-use hyper::Request;
 use tower::{Layer, Service};
 
-/// A layer by a function of some state, a request and the service below. All services of the stack are always ready.
-pub(super) const fn async_layer<T, F>(state: T, function: F) -> AsyncLayer<T, F> {
-    AsyncLayer { state, function }
+/// A layer by a function of a request and the service below. All services of the stack are always ready.
+pub(super) const fn async_layer<F>(function: F) -> AsyncLayer<F> {
+    AsyncLayer(function)
 }
 
-pub(super) struct AsyncLayer<T, F> {
-    state: T,
-    function: F,
-}
+pub(super) struct AsyncLayer<F>(F);
 
-impl<T: Clone, F: Clone, S> Layer<S> for AsyncLayer<T, F> {
-    type Service = AsyncLayered<T, F, S>;
+impl<F: Clone, S> Layer<S> for AsyncLayer<F> {
+    type Service = AsyncLayered<F, S>;
 
     fn layer(&self, next: S) -> Self::Service {
-        AsyncLayered { state: self.state.clone(), function: self.function.clone(), next }
+        AsyncLayered { function: self.0.clone(), next }
     }
 }
 
 /// A service under an [`AsyncLayer`].
 #[derive(Clone)]
-pub(super) struct AsyncLayered<T, F, S> {
-    state: T,
+pub(super) struct AsyncLayered<F, S> {
     function: F,
     next: S,
 }
 
-impl<T, F, S, B, A, R, E> Service<Request<B>> for AsyncLayered<T, F, S>
+impl<F, S, Q, A, R, E> Service<Q> for AsyncLayered<F, S>
 where
-    T: Clone,
-    F: FnMut(T, Request<B>, S) -> A,
+    F: FnMut(Q, S) -> A,
     S: Clone,
     A: Future<Output = Result<R, E>>,
 {
@@ -46,7 +40,7 @@ where
         Poll::Ready(Ok(()))
     }
 
-    fn call(&mut self, request: Request<B>) -> A {
-        (self.function)(self.state.clone(), request, self.next.clone())
+    fn call(&mut self, request: Q) -> A {
+        (self.function)(request, self.next.clone())
     }
 }

@@ -31,7 +31,6 @@ use rustls::pki_types::ServerName;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
-use tower::Service;
 
 use super::activity::GRPC_STATUS;
 use super::proxies::{X_FORWARDED_FOR, X_FORWARDED_PROTO};
@@ -67,42 +66,39 @@ impl Forwarder {
     }
 
     /// The answer of this node, or that of the node which it names.
-    pub(super) async fn answer<S>(
+    pub(super) async fn answer<F>(
         &self,
         request: Request<Body>,
         context: &RequestContext,
         memory: Result<Lease, Error>,
-        mut here: S,
-    ) -> Response<Body>
+        answer_here: impl FnOnce(Request<Body>) -> F,
+    ) -> Result<Response<Body>, Infallible>
     where
-        S: Service<Request<Body>, Response = Response<Body>, Error = Infallible>,
+        F: Future<Output = Result<Response<Body>, Infallible>>,
     {
         // Sessions of browsers are those of one node.
         let is_own = request.headers().contains_key(FORWARDED) || request.headers().contains_key(COOKIE);
         if is_own || matches!(context.class(), RequestClass::Import | RequestClass::ImportStream) {
-            return here.call(request).await.unwrap_or_else(|never| match never {});
+            return answer_here(request).await;
         }
         let (parts, body) = request.into_parts();
         let is_live = context.class() == RequestClass::LiveStream;
         let record = Record::of(body, self.record_bytes, memory.ok());
         let head = copy_of(&parts, context);
         let recorded = Request::from_parts(parts, Body::new(RecordedBody(record.clone())));
-        let here = here.call(recorded).await.unwrap_or_else(|never| match never {});
+        let here = answer_here(recorded).await?;
         let (here, owner) = owner_of(here, context.is_grpc(), is_live).await;
         let Some(owner) = owner else {
             record.stop();
-            return here;
+            return Ok(here);
         };
-        let Some(body) = record.replay() else { return here };
+        let Some(body) = record.replay() else { return Ok(here) };
         // The client of a live stream opens it again elsewhere after the last acknowledgement.
         let body = if is_live { body.ended_by(self.shutdown.clone()) } else { body };
-        match self.send(&owner, head, body).await {
-            Ok(response) => response,
-            Err(error) => {
-                tracing::warn!(%owner, error = format!("{error:#}"), "a request could not be sent on to the node that has its camera");
-                here
-            }
-        }
+        Ok(self.send(&owner, head, body).await.unwrap_or_else(|error| {
+            tracing::warn!(%owner, error = format!("{error:#}"), "a request could not be sent on to the node that has its camera");
+            here
+        }))
     }
 
     async fn send(&self, owner: &Uri, head: Parts, body: Replay) -> anyhow::Result<Response<Body>> {

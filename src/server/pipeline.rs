@@ -77,14 +77,18 @@ struct Connection {
 /// The body of every response; it holds what the request was granted until its end.
 pub(super) type ResponseBody = ObservedBody<RequestContext>;
 
-/// What is below a layer: the layers between it and the transports.
-trait Next<B, E>:
-    Service<Request<B>, Response = Response<Body>, Error = E, Future: Send> + Send + 'static
-{
+/// A request below the layer of CORS, with what the layers know of it.
+struct Exchange<B> {
+    on: Arc<Connection>,
+    context: RequestContext,
+    request: Request<B>,
 }
 
-impl<S, B, E> Next<B, E> for S where
-    S: Service<Request<B>, Response = Response<Body>, Error = E, Future: Send> + Send + 'static
+/// What is below a layer: the layers between it and the transports.
+trait Next<Q, E>: Service<Q, Response = Response<Body>, Error = E, Future: Send> + Send + 'static {}
+
+impl<S, Q, E> Next<Q, E> for S where
+    S: Service<Q, Response = Response<Body>, Error = E, Future: Send> + Send + 'static
 {
 }
 
@@ -145,21 +149,22 @@ impl RequestPipeline {
     > + Clone {
         let cors = self.cors.clone();
         let on = Arc::new(Connection { pipeline: self, peer, activity });
+        let same = on.clone();
         let layers = (
-            async_layer(on.clone(), observe),
+            async_layer(move |request, next| observe(on.clone(), request, next)),
             option_layer(cors),
-            async_layer(on.clone(), explain_refusal),
-            async_layer(on.clone(), authenticate),
-            async_layer(on.clone(), admit),
-            async_layer(on.clone(), limit_time),
-            async_layer(on.clone(), forward),
+            async_layer(move |request, next| explain_refusal(same.clone(), request, next)),
+            async_layer(authenticate),
+            async_layer(admit),
+            async_layer(limit_time),
+            async_layer(forward),
         );
-        layers.layer(service_fn(move |request| transport(on.clone(), request)))
+        layers.layer(service_fn(transport))
     }
 }
 
 /// Gives the request its context and its span, and counts and logs the answer.
-async fn observe<S: Next<Incoming, Infallible>>(
+async fn observe<S: Next<Request<Incoming>, Infallible>>(
     on: Arc<Connection>,
     mut request: Request<Incoming>,
     mut next: S,
@@ -168,8 +173,8 @@ async fn observe<S: Next<Incoming, Infallible>>(
     let metrics = &on.pipeline.app.metrics;
     let context = on.context(&request);
     request.extensions_mut().insert(context.clone());
-    let rpc = operations::rpc_name(request.uri().path()).unwrap_or(OTHER_RPC);
-    let call = context.is_grpc().then(|| metrics.call(rpc));
+    let rpc = || operations::rpc_name(request.uri().path()).unwrap_or(OTHER_RPC);
+    let call = context.is_grpc().then(|| metrics.call(rpc()));
     let closes = on.peer.refusal.is_some() && request.version() < Version::HTTP_2;
     let span = tracing::debug_span!(
         target: REQUESTS, "request", id = %context.id(), method = %request.method(), path = &*http::shown_path(request.uri().path()), key = Empty
@@ -249,20 +254,16 @@ fn count(
     Some(call)
 }
 
-/// What the first layer knows of a request.
-fn context_of<B>(request: &Request<B>) -> RequestContext {
-    #[expect(clippy::expect_used, reason = "the first layer inserts it")]
-    RequestContext::of(request.extensions()).expect("a context").clone()
-}
-
 /// Answers what the layers below refuse, in the form of the request's transport.
-async fn explain_refusal<S: Next<Incoming, Error>>(
+async fn explain_refusal<S: Next<Exchange<Incoming>, Error>>(
     on: Arc<Connection>,
     request: Request<Incoming>,
     mut next: S,
 ) -> Result<Response<Body>, Infallible> {
-    let context = context_of(&request);
-    Ok(next.call(request).await.unwrap_or_else(|error| {
+    #[expect(clippy::expect_used, reason = "the first layer inserts it")]
+    let context = RequestContext::of(request.extensions()).expect("a context").clone();
+    let exchange = Exchange { on: on.clone(), context: context.clone(), request };
+    Ok(next.call(exchange).await.unwrap_or_else(|error| {
         if error.kind() == ErrorKind::Overloaded {
             on.pipeline.app.metrics.refused();
         }
@@ -272,12 +273,11 @@ async fn explain_refusal<S: Next<Incoming, Error>>(
 }
 
 /// Finds out who makes the request, and whether they may. What is open for long ends when the caller's key does.
-async fn authenticate<S: Next<Incoming, Error>>(
-    on: Arc<Connection>,
-    request: Request<Incoming>,
+async fn authenticate<S: Next<Exchange<Incoming>, Error>>(
+    Exchange { on, context, request }: Exchange<Incoming>,
     mut next: S,
 ) -> Result<Response<Body>> {
-    let (context, app) = (context_of(&request), &on.pipeline.app);
+    let app = &on.pipeline.app;
     if app.access.is_worth_refresh(&on.credential(&context, &request), app.clock.monotonic())
         && let Err(error) = app.access.refresh(&app.store, &app.clock).await
     {
@@ -287,7 +287,7 @@ async fn authenticate<S: Next<Incoming, Error>>(
         on.pipeline.discard_refused(&context, request, &error).await;
         return Err(error);
     }
-    let response = next.call(request).await?;
+    let response = next.call(Exchange { on, context: context.clone(), request }).await?;
     if !context.caller().is_revocable() || response.body().size_hint().exact().is_some() {
         return Ok(response);
     }
@@ -372,12 +372,11 @@ impl RequestPipeline {
 }
 
 /// Grants the request memory, its body a least rate, and a place among the requests at work once the body has come.
-async fn admit<S: Next<Body, Error>>(
-    on: Arc<Connection>,
-    request: Request<Incoming>,
+async fn admit<S: Next<Exchange<Body>, Error>>(
+    Exchange { on, context, request }: Exchange<Incoming>,
     mut next: S,
 ) -> Result<Response<Body>> {
-    let (context, pipeline) = (context_of(&request), &*on.pipeline);
+    let pipeline = &*on.pipeline;
     let has_body = !request.body().is_end_stream();
     let waited = if has_body { pipeline.wait_for_refused(&context).await } else { Ok(()) };
     if let Err(error) = waited.and_then(|()| pipeline.grant(&context, &request)) {
@@ -392,7 +391,7 @@ async fn admit<S: Next<Body, Error>>(
     let pace = (context.class() != RequestClass::LiveStream)
         .then(|| RateGuard::new(limits.body_grace(), limits.body_bytes_per_s));
     let request = request.map(|body| Body::new(AdmittedBody::new(body, context.clone(), pace)));
-    let answer = next.call(request).await;
+    let answer = next.call(Exchange { on: on.clone(), context: context.clone(), request }).await;
     let rest = context.end_work().filter(|_| is_discarded);
     let response = answer?;
     // An import stream reports by itself what it has stored of a body that was refused.
@@ -452,18 +451,17 @@ impl RequestPipeline {
 }
 
 /// Ends a request that takes too long, whose caller's key was revoked, or that the shutdown does not wait for.
-async fn limit_time<S: Next<Body, Error>>(
-    on: Arc<Connection>,
-    request: Request<Body>,
+async fn limit_time<S: Next<Exchange<Body>, Error>>(
+    exchange: Exchange<Body>,
     mut next: S,
 ) -> Result<Response<Body>> {
-    let (context, pipeline) = (context_of(&request), &*on.pipeline);
-    let time = Duration::from_secs(pipeline.app.limits.request_s);
+    let (on, context) = (exchange.on.clone(), exchange.context.clone());
+    let time = Duration::from_secs(on.pipeline.app.limits.request_s);
     tokio::select! {
         biased;
-        answer = tokio::time::timeout(time, next.call(request)) => answer.unwrap_or_else(|_| Err(too_slow(time))),
+        answer = tokio::time::timeout(time, next.call(exchange)) => answer.unwrap_or_else(|_| Err(too_slow(time))),
         error = context.caller().ended() => Err(error),
-        () = pipeline.shutdown.forced() => Err(shutting_down()),
+        () = on.pipeline.shutdown.forced() => Err(shutting_down()),
     }
 }
 
@@ -476,22 +474,25 @@ fn shutting_down() -> Error {
 }
 
 /// Sends the request on to the node that has its camera, where the settings say so.
-async fn forward<S: Next<Body, Infallible>>(
-    on: Arc<Connection>,
-    request: Request<Body>,
+async fn forward<S: Next<Exchange<Body>, Infallible>>(
+    exchange: Exchange<Body>,
     mut next: S,
 ) -> Result<Response<Body>> {
-    let Some(forwarder) = &on.pipeline.forwarder else {
-        return Ok(next.call(request).await.unwrap_or_else(|never| match never {}));
+    let on = exchange.on.clone();
+    let answer = match &on.pipeline.forwarder {
+        Some(forwarder) => {
+            let Exchange { on, context, request } = exchange;
+            let (memory, asked) = (on.pipeline.app.quotas.open_request(context.client()), context.clone());
+            let answer_here = |request| next.call(Exchange { on, context, request });
+            forwarder.answer(request, &asked, memory, answer_here).await
+        }
+        None => next.call(exchange).await,
     };
-    let context = context_of(&request);
-    let memory = on.pipeline.app.quotas.open_request(context.client());
-    Ok(forwarder.answer(request, &context, memory, next).await)
+    Ok(answer.unwrap_or_else(|never| match never {}))
 }
 
 /// Answers by the transport.
-async fn transport(on: Arc<Connection>, request: Request<Body>) -> Result<Response<Body>, Infallible> {
-    let context = context_of(&request);
+async fn transport(Exchange { on, context, request }: Exchange<Body>) -> Result<Response<Body>, Infallible> {
     if !context.is_grpc() {
         return Ok(on.pipeline.http.answer(request).await);
     }

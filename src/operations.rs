@@ -6,10 +6,10 @@ use std::sync::LazyLock;
 use crate::app::access::Permission;
 use crate::app::access::Permission::{Administer, Authenticated, Ingest, Operate, Public, Read};
 
-/// What a client can ask for, on either transport.
+/// An operation that a client can ask for, on either transport.
 #[derive(Debug, Clone, Copy)]
 pub struct Operation {
-    /// What it needs.
+    /// The permission that it needs.
     pub permission: Permission,
     /// `METHOD template` of the REST route; empty without one.
     pub route: &'static str,
@@ -172,11 +172,10 @@ pub const OPERATIONS: &[Operation] = &[
 /// A REST route with the permission that it needs.
 #[derive(Debug, Clone, Copy)]
 pub struct RoutePermission {
-    /// Its method.
     pub method: &'static str,
     /// The template of its path.
     pub template: &'static str,
-    /// What it needs.
+    /// The permission that it needs.
     pub permission: Permission,
 }
 
@@ -190,7 +189,7 @@ impl RoutePermission {
     }
 }
 
-/// What a REST route needs. A route that is missing in the table is for administrators only.
+/// Returns the permission for a REST route. A route that is missing in the table is for administrators only.
 #[must_use]
 pub fn route_permission(method: &str, template: &str) -> Permission {
     RoutePermission::of(method, template).map_or(Administer, |route| route.permission)
@@ -202,7 +201,7 @@ pub fn rpc_name(path: &str) -> Option<&'static str> {
     RPCS.get_key_value(path.strip_prefix('/').unwrap_or(path)).map(|(name, _)| *name)
 }
 
-/// What an RPC needs, by its path. One that is missing in the table is for administrators only.
+/// Returns the permission for an RPC, by its path. One that is missing in the table is for administrators only.
 #[must_use]
 pub fn rpc_permission(path: &str) -> Permission {
     RPCS.get(path.strip_prefix('/').unwrap_or(path)).copied().unwrap_or(Administer)

@@ -1,9 +1,9 @@
-//! What the server knows of a request while it is answered: the layers of `server` fill it, the transports read it.
+//! The context of a request while it is answered: the layers of `server` fill it, the transports read it.
 //!
 //! It is one extension of the request. What it holds of bounded resources is given back when the last clone is dropped,
 //! at the end of the response's body.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 use std::net::IpAddr;
@@ -22,17 +22,17 @@ tokio::task_local! {
     static CURRENT: RequestContext;
 }
 
-/// What a request says of itself before it is authenticated.
+/// The facts about a request before it is authenticated.
 pub struct RequestHead {
     /// The client's own id, or a new one.
     pub id: RequestId,
-    /// Whether it is for the transport gRPC, else REST.
+    /// True for the transport gRPC, false for REST.
     pub is_grpc: bool,
-    /// What it is for.
+    /// Its class, by method and path.
     pub class: RequestClass,
     /// The scheme by which the client reached the server or a trusted proxy.
     pub scheme: Scheme,
-    /// Where it comes from.
+    /// The address of its sender.
     pub address: IpAddr,
 }
 
@@ -49,7 +49,7 @@ struct State {
     grant: Mutex<Grant>,
 }
 
-/// What a request holds and has used of what the server bounds.
+/// The bounded resources that a request holds.
 #[derive(Default)]
 struct Grant {
     /// Bytes of the body that are still to be charged for.
@@ -59,7 +59,7 @@ struct Grant {
     place: Option<Lease>,
     /// Memory of the message that was decoded last.
     decoded: Option<Lease>,
-    /// What its reader left of the body.
+    /// The rest of the body that its reader left.
     rest: Option<Incoming>,
     is_answered: bool,
 }
@@ -86,19 +86,19 @@ impl RequestContext {
         extensions.get().ok_or_else(|| Error::fault("a request came without its context"))
     }
 
-    /// Its id.
+    /// The id of the request.
     #[must_use]
     pub fn id(&self) -> &RequestId {
         &self.0.head.id
     }
 
-    /// Whether it is for the transport gRPC.
+    /// True if the request is for the transport gRPC.
     #[must_use]
     pub fn is_grpc(&self) -> bool {
         self.0.head.is_grpc
     }
 
-    /// What it is for.
+    /// The class of the request, by method and path.
     #[must_use]
     pub fn class(&self) -> RequestClass {
         self.0.head.class
@@ -110,7 +110,7 @@ impl RequestContext {
         &self.0.head.scheme
     }
 
-    /// Where it comes from.
+    /// The address of the sender.
     #[must_use]
     pub fn address(&self) -> IpAddr {
         self.0.head.address
@@ -204,7 +204,7 @@ impl RequestContext {
         self.grant().received_bytes
     }
 
-    /// Keeps what its reader leaves of a body until the answer begins.
+    /// Keeps the rest of a body until the answer begins.
     pub fn leave(&self, rest: Incoming) {
         let mut grant = self.grant();
         if !grant.is_answered {
@@ -212,7 +212,7 @@ impl RequestContext {
         }
     }
 
-    /// The work is done and the answer begins. What its reader left of the body is for the caller.
+    /// The work is done and the answer begins. Returns the rest of the body that its reader left.
     pub fn end_work(&self) -> Option<Incoming> {
         let mut grant = self.grant();
         grant.place = None;
@@ -228,7 +228,7 @@ impl RequestContext {
         }
     }
 
-    /// Why its body was refused, if it was.
+    /// The reason for which its body was refused, if it was.
     #[must_use]
     pub fn body_refusal(&self) -> Option<Error> {
         self.0.body_refusal.get().cloned().map(Error::Refused)

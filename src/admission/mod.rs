@@ -1,9 +1,9 @@
 //! Admission control: how much of each bounded resource all clients together, and one client, may hold at
 //! a time, and how many requests per second one client may send.
 //!
-//! Never here: waiting. A request beyond a quota is refused at once and may be tried again.
+//! Does not wait. A request beyond a quota is refused at once and may be tried again.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod rates;
@@ -17,7 +17,7 @@ use crate::domain::{Error, ErrorKind, KeyId, Result};
 
 pub use rates::{RateLimit, RefusedBodies, TokenBucket};
 
-/// What a request costs while it is open, besides its body: connection buffers and its task. Charged
+/// Memory of a request while it is open, besides its body: connection buffers and its task. Charged
 /// to [`Quotas::request_memory`].
 const REQUEST_OVERHEAD_BYTES: u64 = 16 << 10;
 /// Sign-ins that wait for the OpenID provider at a time.
@@ -50,7 +50,7 @@ impl From<IpAddr> for ClientId {
     }
 }
 
-/// What a request is for, which decides what it must be granted before it is worked on.
+/// The class of a request, which decides the quotas that it needs before it is handled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RequestClass {
     /// Health and metrics: always answered.
@@ -72,7 +72,7 @@ pub enum RequestClass {
 pub struct Quota(Arc<QuotaState>);
 
 struct QuotaState {
-    /// What is counted, in the plural, for the refusal.
+    /// The name of the counted unit, in the plural, for the refusal.
     what: &'static str,
     total: u64,
     per_client: u64,
@@ -124,13 +124,13 @@ impl Quota {
 /// How much of a [`Quota`] all clients hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct QuotaUsage {
-    /// Held now.
+    /// Units held now.
     pub held: u64,
-    /// At most.
+    /// The largest number of units.
     pub limit: u64,
 }
 
-/// What one holder has of a [`Quota`].
+/// The share of a [`Quota`] that one holder has.
 pub struct Lease {
     quota: Quota,
     client: ClientId,
@@ -232,7 +232,7 @@ impl Quotas {
         }
     }
 
-    /// How many there are.
+    /// Number of quotas.
     pub const COUNT: usize = 8;
     /// Their names in the metrics, in the order of [`Quotas::usages`].
     pub const NAMES: [&str; Self::COUNT] = [

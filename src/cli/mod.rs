@@ -1,7 +1,7 @@
 //! The command line: one file per subcommand. A subcommand reads its flags, calls the layers below, and
 //! prints the result.
 //!
-//! Never here: rules of the domain.
+//! Does not contain rules of the domain.
 
 mod backup;
 mod config;
@@ -98,7 +98,7 @@ enum Command {
     Tls(tls::Tls),
     /// Copy the database into one verified file, also while a server uses it
     Backup(backup::Backup),
-    /// Put a backup in place of the database
+    /// Replace the database by a backup
     Restore(restore::Restore),
     /// Copy everything from a data folder or database into another one, and compare
     Copy(copy::Copy),
@@ -195,7 +195,7 @@ impl DataFolder {
     }
 }
 
-/// What to do where there is no data folder.
+/// The rule for a missing data folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum MissingData {
     Create,

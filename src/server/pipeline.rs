@@ -52,7 +52,7 @@ enum Audience {
     Monitoring,
 }
 
-/// What the layers of all connections of a listener share.
+/// The state that the layers of all connections of a listener share.
 pub(super) struct RequestPipeline {
     app: App,
     http: http::Transport,
@@ -67,7 +67,7 @@ pub(super) struct RequestPipeline {
     cors: Option<CorsLayer>,
 }
 
-/// What the layers of one connection share.
+/// The state that the layers of one connection share.
 struct Connection {
     pipeline: Arc<RequestPipeline>,
     peer: Peer,
@@ -84,7 +84,7 @@ struct Exchange<B> {
     request: Request<B>,
 }
 
-/// What is below a layer: the layers between it and the transports.
+/// The service below a layer.
 trait Next<Q, E>: Service<Q, Response = Response<Body>, Error = E, Future: Send> + Send + 'static {}
 
 impl<S, Q, E> Next<Q, E> for S where
@@ -272,7 +272,7 @@ async fn explain_refusal<S: Next<Exchange<Incoming>, Error>>(
     }))
 }
 
-/// Finds out who makes the request, and whether they may. What is open for long ends when the caller's key does.
+/// Finds out who makes the request, and whether they may. A response that is open for long ends with the caller's key.
 async fn authenticate<S: Next<Exchange<Incoming>, Error>>(
     Exchange { on, context, request }: Exchange<Incoming>,
     mut next: S,
@@ -340,7 +340,7 @@ impl Connection {
             hosts.check_same_origin(request)?;
         }
         let principal = match app.access.authenticate(credential, app.clock.now(), app.clock.monotonic()) {
-            // What watches the server learns that it is alive, whatever has become of its key.
+            // A probe learns that the server is alive, whatever has become of its key.
             Err(_) if context.class() == RequestClass::Probe => Principal::Anonymous,
             principal => principal?,
         };
@@ -438,7 +438,7 @@ impl RequestPipeline {
         };
         context.open(held_bytes)?;
         if request.headers().contains_key(CONTENT_ENCODING) {
-            // What it decodes to is not known before it has been read.
+            // Its decoded size is not known before it has been read.
             context.charge_whole_body()?;
         }
         let has_no_body = request.body().is_end_stream()

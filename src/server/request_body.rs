@@ -72,7 +72,7 @@ impl Body for AdmittedBody {
                 }
             },
             Poll::Ready(Some(Err(error))) => {
-                let message = format!("the body broke off: {error}");
+                let message = format!("the body is incomplete: {error}");
                 this.refuse(Error::refused(ErrorKind::Cancelled, message))
             }
             Poll::Ready(None) => match this.context.begin_work() {
@@ -98,7 +98,7 @@ impl Body for AdmittedBody {
     }
 }
 
-/// What nobody reads is left to the layer that admits requests.
+/// Leaves the unread rest to the layer that admits requests.
 impl Drop for AdmittedBody {
     fn drop(&mut self) {
         if let Some(rest) = self.body.take().filter(|body| !body.is_end_stream()) {
@@ -172,7 +172,7 @@ impl LeastRate {
         Self { window, bytes_per_s, received: 0, waited: Duration::ZERO }
     }
 
-    /// Whether a window that is over brought enough; begins the next one.
+    /// True if a window that is over brought enough; begins the next one.
     fn holds(&mut self) -> bool {
         if self.waited < self.window {
             return true;
@@ -206,7 +206,7 @@ mod tests {
 
     const WINDOW: Duration = Duration::from_secs(10);
 
-    /// Whether the rate holds when so many bytes come after each of these times of waiting.
+    /// True if the rate holds when `bytes` bytes come after each of these times of waiting.
     fn holds(bytes: u64, waits_s: &[u64]) -> bool {
         let mut rate = LeastRate::new(WINDOW, 10);
         waits_s.iter().all(|&wait_s| {

@@ -305,7 +305,7 @@ async fn holders_of_certificates_have_idempotency_keys_of_their_own() {
     }
 }
 
-/// Whether the server presents a certificate of the authority.
+/// True if the server presents a certificate of the authority.
 async fn trusts(address: SocketAddr, authority: &Authority) -> bool {
     connect(address, authority, &["h2"], None).await.is_ok()
 }
@@ -326,7 +326,7 @@ async fn a_changed_certificate_is_loaded_and_a_broken_one_is_not() {
     server
         .logged(|entry| entry["message"].as_str().is_some_and(|text| text.contains("cannot be used")))
         .await;
-    assert!(trusts(&second).await, "the one before stays");
+    assert!(trusts(&second).await, "the previous one stays");
     files.replace(&first);
     while !trusts(&first).await {
         tokio::time::sleep(Duration::from_millis(100)).await;

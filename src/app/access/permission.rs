@@ -1,8 +1,8 @@
-//! What an operation may need, and the roles that have it.
+//! The permissions of operations, and the roles that have them.
 
 use crate::domain::Role;
 
-/// What an operation needs.
+/// The permission that an operation needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Permission {
     /// Nothing: health and the description of the interface.
@@ -20,7 +20,7 @@ pub enum Permission {
 }
 
 impl Permission {
-    /// Whether a role has it.
+    /// True if a role has the permission.
     #[must_use]
     pub const fn is_granted_to(self, role: Role) -> bool {
         match self {

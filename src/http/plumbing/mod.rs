@@ -1,4 +1,4 @@
-//! What resources share: how a request is read and an answer written.
+//! The parts that resources share: how a request is read and an answer written.
 
 pub(super) mod access;
 pub(super) mod body;

@@ -33,7 +33,7 @@ const FEATURES: &str = "/ogc";
 #[derive(Clone)]
 pub(in crate::http) struct ApiError(Arc<Error>);
 
-/// What a handler gives.
+/// The result of a handler.
 pub(in crate::http) type ApiResult<T = Response> = std::result::Result<T, ApiError>;
 
 impl From<Error> for ApiError {
@@ -50,7 +50,7 @@ impl IntoResponse for ApiError {
     }
 }
 
-/// What is wrong, by RFC 9457.
+/// A refusal or a fault, by RFC 9457.
 #[derive(Serialize, ToSchema)]
 pub(in crate::http) struct Problem<'a> {
     /// Stable name of the kind of problem.
@@ -90,7 +90,7 @@ struct Violation<'a> {
     /// Path of the field in the body, or name of the parameter.
     #[schema(value_type = String, example = "observations[3].bounding_box.width_px")]
     field: &'a str,
-    /// What is wrong and what would be right.
+    /// States the fault and the valid values.
     #[schema(value_type = String)]
     message: &'a str,
 }
@@ -139,7 +139,7 @@ pub(in crate::http) fn response(error: &Error, id: &RequestId, instance: Option<
     response
 }
 
-/// What the problem of a request says of it, should it be refused.
+/// The facts about a request that its problem states, should it be refused.
 pub(in crate::http) struct Refused {
     id: Option<RequestId>,
     uri: Uri,
@@ -217,7 +217,7 @@ pub(in crate::http) fn no_route() -> Error {
     Error::refused(ErrorKind::RouteNotFound, "there is no such path; /docs lists them")
 }
 
-/// What is answered when a handler panics.
+/// The response when a handler panics.
 pub(in crate::http) fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
     let message = panic.downcast_ref::<String>().cloned();
     let message = message.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()));

@@ -7,7 +7,7 @@ use crate::app::App;
 use crate::config::Console;
 use crate::shutdown::Shutdown;
 
-/// What the handlers share. One pointer: the router clones it several times for each request.
+/// The state that the handlers share. One pointer: the router clones it several times for each request.
 #[derive(Clone)]
 pub(in crate::http) struct Rest(Arc<RestState>);
 

@@ -1,5 +1,5 @@
 //! Fuzzed functions: one per kind of input, over the public interface, with the properties that hold whatever
-//! the input is. The fuzz targets and the seeded test `tests/it/hostile.rs` share them.
+//! the input is. The fuzz targets and the seeded test `tests/it/hostile` share them.
 
 use std::io::Write as _;
 use std::sync::LazyLock;

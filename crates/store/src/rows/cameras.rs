@@ -9,6 +9,7 @@ use crate::domain::{
     GnssError, ImageSize, ModelMetadata, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision,
     SampleCount, SigmaM, SiteId, TargetClass, TargetId,
 };
+use crate::geo::Position;
 use crate::refusals::unknown_site;
 use crate::row_decoder::{RowDecoder, StoredRow};
 
@@ -106,6 +107,8 @@ struct StoredProfile {
     /// Width and height.
     image_size_px: Option<(u32, u32)>,
     gnss_sigma_m: Option<f64>,
+    /// Longitude and latitude.
+    location_deg: Option<(f64, f64)>,
     gnss_bias_sigma_m: Option<f64>,
     recipe: String,
     target_classes: Vec<String>,
@@ -137,6 +140,7 @@ pub(crate) fn write_profile(profile: &NewCamera) -> Result<String> {
             GnssError::Known(sigma) => Some(sigma.metres()),
             GnssError::Unknown => None,
         },
+        location_deg: profile.location.map(|at| (at.longitude_deg(), at.latitude_deg())),
         gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
         recipe: profile.recipe.as_str().to_owned(),
         target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
@@ -150,6 +154,7 @@ pub(crate) fn write_profile(profile: &NewCamera) -> Result<String> {
 fn read_profile(json: &str, id: CameraId) -> Result<NewCamera> {
     let stored: StoredProfile = serde_json::from_str(json).map_err(Error::fault)?;
     let image_size = stored.image_size_px.map(|(width_px, height_px)| ImageSize::new(width_px, height_px));
+    let location = stored.location_deg.map(|(longitude, latitude)| Position::new(longitude, latitude));
     let target_classes = stored.target_classes.iter().map(|class| TargetClass::new(class));
     let receivers = stored.receivers.iter().map(StoredReceiver::to_domain);
     Ok(NewCamera {
@@ -159,6 +164,7 @@ fn read_profile(json: &str, id: CameraId) -> Result<NewCamera> {
             Some(sigma_m) => GnssError::Known(SigmaM::new(sigma_m)?),
             None => GnssError::Unknown,
         },
+        location: location.transpose().map_err(Error::fault)?,
         gnss_bias_sigma: stored.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
         recipe: stored.recipe.parse().map_err(Error::fault)?,
         target_classes: target_classes.collect::<Result<_>>()?,

@@ -31,7 +31,7 @@ pub(super) struct PlaceCheck {
     swapped: u64,
     first_swapped: Option<Position>,
     kept: Vec<FootPosition>,
-    /// Every so many fixes one is kept.
+    /// One fix in this number of fixes is kept.
     stride: u64,
 }
 
@@ -91,7 +91,7 @@ impl PlaceCheck {
         }
     }
 
-    /// What is wrong with the import as a whole, with the remedy.
+    /// Returns the faults of the import as a whole, each with its remedy.
     pub(super) fn warnings(&self) -> Vec<String> {
         let far = self.first_far_m.map(|distance_m| {
             format!(

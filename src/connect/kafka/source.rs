@@ -23,7 +23,7 @@ use crate::store::Store;
 
 /// Records that a broker sends at a time, bytes; a larger batch comes whole.
 const FETCH_BYTES: i32 = 1 << 20;
-/// What is kept of a message that is too large, for the status.
+/// Bytes of a message that is too large which are kept for the status.
 const KEPT_BYTES: usize = 4 << 10;
 /// How long a broker waits for records.
 const FETCH_WAIT: Duration = Duration::from_millis(500);
@@ -206,7 +206,7 @@ impl Reader {
             partition,
             missing,
             oldest,
-            "messages are gone; the oldest that is left comes next"
+            "the broker has deleted messages; reading continues with the oldest that it has"
         );
         *missing = oldest;
         Ok(())

@@ -201,7 +201,7 @@ async fn a_batch_that_becomes_too_large_is_rejected_and_what_comes_after_it_is_r
     assert_eq!((&status["items"], &status["rejected"]), (&json!(4), &json!(4)), "{status}");
     assert_eq!(status["connects"], 1, "{status}");
     let reason = &status["reasons"][0];
-    let expected = "the batch becomes more than 3000000 bytes when decompressed";
+    let expected = "rejected: the batch becomes more than 3000000 bytes when decompressed";
     assert_eq!((&reason["reason"], &reason["count"]), (&json!(expected), &json!(4)), "{status}");
     let example = reason["example"].as_str().expect("a text");
     assert!(example.contains("of partition 0 of detections"), "{example}");

@@ -115,9 +115,9 @@ impl ObservedBox {
         regressor: &Regressor,
         fix: Option<EastNorth>,
         image_size: Option<ImageSize>,
-        recent: Option<&mut RecentBoxes>,
+        mut recent: Option<&mut RecentBoxes>,
     ) -> Self {
-        let hidden = regressor.hidden_foot(bounding_box);
+        let hidden = regressor.hidden_foot(bounding_box, recent.as_deref_mut());
         let is_foot_hidden = hidden.is_some_and(|hidden| hidden.probability >= 0.5);
         let seen = match recent.filter(|_| !is_foot_hidden) {
             Some(recent) => regressor.regress_next(bounding_box, None, recent),

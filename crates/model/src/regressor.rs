@@ -303,12 +303,18 @@ impl Regressor {
     }
 
     /// Whether something hides the lower part of a box, as far as the model knows how tall its targets are: only one of
-    /// the recipe `gaussian_process` does.
+    /// the recipe `gaussian_process` does. `recent` summarises the earlier boxes of the same target and takes this one in.
     #[must_use]
     #[inline]
-    pub fn hidden_foot(&self, bounding_box: &BoundingBox) -> Option<HiddenFoot> {
+    pub fn hidden_foot(
+        &self,
+        bounding_box: &BoundingBox,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Option<HiddenFoot> {
         match &self.encoder {
-            Encoder::GaussianProcess(map) => HiddenFoot::of(bounding_box, &map.predictor.plausibility),
+            Encoder::GaussianProcess(map) => {
+                HiddenFoot::of(bounding_box, &map.predictor.plausibility, recent)
+            }
             Encoder::Paper(_) | Encoder::Hybrid(_) | Encoder::Projective(_) => None,
         }
     }

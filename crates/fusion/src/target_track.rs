@@ -138,9 +138,10 @@ impl TargetTrack {
         let plane = self.plane_for(observed, &mut rejected);
         let Some(plane) = plane else { return self.estimate_with(rejected) };
         let mut measurement = measurement_in(&plane, observed, rejected.is_empty());
-        withhold_useless(&mut measurement, observed, self.active.is_some(), &mut rejected);
+        // An active track decides about such positions itself, as it has to take back what it learnt from their source.
         if self.active.is_none() {
             withdraw_contradicting(&mut measurement, observed, &mut rejected);
+            withhold_useless(&mut measurement, observed, &mut rejected);
         }
         let mut state = match &mut self.active {
             Some(active) => active.track.update(&measurement),
@@ -266,22 +267,20 @@ fn measurement_in(plane: &LocalPlane, observed: &ObservedPositions<'_>, with_fix
             white: Some(box_noise),
             stated_scale: scale,
             repeated_s: observed.repeated_s,
-            is_doubtful: observed.is_unusual,
+            is_doubtful: observed.is_unusual || observed.is_vague,
+            is_vague: observed.is_vague,
         }
     });
     Measurement { time: observed.time, fix, regressed }
 }
 
-/// A box that says no more than that a target is in view enters no track, and a frozen one starts none.
+/// A box that says no more than that a target is in view, or that is frozen, starts no track.
 fn withhold_useless(
     measurement: &mut Measurement,
     observed: &ObservedPositions<'_>,
-    is_active: bool,
     rejected: &mut Vec<Rejection>,
 ) {
     let reason = match observed.usable_box() {
-        // An active track decides about it, as it has to take back what it learnt from such boxes.
-        Some(seen) if seen.is_frozen && is_active => return,
         Some(seen) if seen.is_frozen => RejectionReason::Frozen,
         Some(seen) if seen.is_vague => RejectionReason::UnusableVariance,
         _ => return,

@@ -307,6 +307,7 @@ fn withdraw_contradicting(
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
     use std::ops::ControlFlow;
 
     use jiff::SignedDuration;
@@ -314,7 +315,7 @@ mod tests {
     use super::*;
     use crate::domain::{Fix, GnssError, Recipe};
     use crate::model::{FitOptions, fit};
-    use crate::simulation::{Options, simulate};
+    use crate::simulation::{Options, World, simulate};
 
     fn fix_at(seconds: i64, longitude_deg: f64, latitude_deg: f64) -> Observation {
         let position = Position::new(longitude_deg, latitude_deg).expect("valid");
@@ -370,9 +371,7 @@ mod tests {
         assert_eq!(accepted, [false, false, true, true, true]);
     }
 
-    #[test]
-    fn the_error_of_the_map_s_scale_is_in_that_of_the_velocity() {
-        let world = simulate(&Options { samples: 400, ..Options::demo() });
+    fn trained(world: &World) -> Regressor {
         let options = FitOptions {
             recipe: Recipe::GaussianProcess,
             seed: 1,
@@ -382,7 +381,45 @@ mod tests {
             gnss_bias_sigma_m: None,
         };
         let fitted = fit(&world.training_samples(), &options, &mut |_| ControlFlow::Continue(()));
-        let model = fitted.expect("usable samples").load().expect("a model");
+        fitted.expect("usable samples").load().expect("a model")
+    }
+
+    #[test]
+    fn a_foot_that_stays_hidden_is_noticed_in_more_boxes_than_one_by_one() {
+        let world = simulate(&Options { samples: 800, targets: 4, ..Options::demo() });
+        let model = trained(&world);
+        let is_hidden = |observed: &ObservedPositions<'_>| {
+            usize::from(observed.regressed.is_some_and(|seen| seen.is_foot_hidden))
+        };
+        for hidden_share in [0.2, 0.0] {
+            let mut tracks: BTreeMap<usize, TargetTrack> = BTreeMap::new();
+            let (mut followed, mut alone) = (0, 0);
+            for row in &world.rows {
+                let Some(bounding_box) = row.bounding_box else { continue };
+                let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
+                let seen = BoundingBox::new(left_px, top_px, width_px, (1.0 - hidden_share) * height_px);
+                let observation = Observation::new(row.time, None, seen.ok(), row.fix).expect("a box");
+                let track = tracks.entry(row.target).or_default();
+                let model = Some(&model);
+                followed += is_hidden(&track.observe(&observation, model, Some(world.image_size), None));
+                alone += is_hidden(&ObservedPositions::of(
+                    &observation,
+                    model,
+                    Some(world.image_size),
+                    None,
+                    None,
+                ));
+            }
+            let most_whole = alone + world.rows.len() / 8;
+            let is_noticed = if hidden_share > 0.0 { followed > alone } else { followed <= most_whole };
+            assert!(is_noticed, "{hidden_share}: {followed}, one by one {alone}");
+        }
+    }
+
+    #[test]
+    fn the_error_of_the_map_s_scale_is_in_that_of_the_velocity() {
+        let world = simulate(&Options { samples: 400, ..Options::demo() });
+        let model = trained(&world);
         let mut track = TargetTrack::default();
         let mut strained = 0;
         for observation in world.rows.iter().filter(|row| row.target == 0).filter_map(|row| row.observation())

@@ -52,7 +52,7 @@ struct SourceMotion {
     implausible: f64,
     /// The same of those whose stated error rests on nothing of training.
     doubtful: f64,
-    /// The same of those that jump, or say no more than that a target is in view.
+    /// The same of those that jump away from where they are expected, or say no more than that a target is in view.
     scattered: f64,
     /// Running mean of the stated covariances and of the squared distances from the predicted positions, m2 (covariance
     /// matching; Mehra 1970).
@@ -240,7 +240,9 @@ impl SourceMotion {
         let is_implausible = jumps || measured.is_doubtful || measured.repeated_s >= REPEATED_S;
         let weight = 1.0 - (-step_s.max(0.0) / MEMORY_S).exp();
         self.implausible += weight * (as_share(is_implausible) - self.implausible);
-        self.scattered += weight * (as_share(jumps || measured.is_vague) - self.scattered);
+        // After a single false position the next one jumps back to where it is expected.
+        let is_astray = jumps && measured.position.distance_m(position) > noise_m + speed_m_s * step_s;
+        self.scattered += weight * (as_share(is_astray || measured.is_vague) - self.scattered);
         self.doubtful += weight * (doubtful - self.doubtful);
         self.missed = self.missed.scaled(1.0 - weight).plus(missed.scaled(weight));
     }

@@ -315,8 +315,10 @@ impl ImmFilter {
         let reach = self.reach(settings, decomposition);
         let history = &mut self.histories[source as usize];
         // A fix of 30 m passes the gate of a track that has lost its target, too, and would keep it for long.
-        let is_another =
-            history.agree_on(now, measured.position, reach) && (!other_is_active || is_confirmed);
+        // Positions that are the same to the last digit are one observation: those of a frozen picture agree, too.
+        let is_another = measured.repeated_s == 0.0
+            && history.agree_on(now, measured.position, reach)
+            && (!other_is_active || is_confirmed);
         let rejected_s = history.record_rejection(now, settings.reacquire_after_s);
         if is_another {
             self.restart(settings, source, measured);

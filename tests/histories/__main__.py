@@ -4,6 +4,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -100,6 +101,8 @@ def read_final_state(cluster: Cluster, folder: Path) -> None:
         rows = pages(unrecorded, f"/v1/cameras/{camera}/samples")
         recorder.note("list-samples", camera, {}, [[row["time"], row["bounding_box"]["left_px"]] for row in rows])
     recorder.note("final-runs", "runs", {}, final_runs(unrecorded, runs))
+    outcomes = [[run["id"], run["outcome"]] for run in pages(unrecorded, runs) if run["state"] == "failed"]
+    recorder.note("final-failures", "runs", {}, outcomes)
     models = pages(unrecorded, "/v1/cameras/runs/models")
     recorder.note("final-models", "runs", {}, [[model["number"], model.get("run_id")] for model in models])
     entries = pages(unrecorded, "/v1/audit")
@@ -225,6 +228,8 @@ def report(folder: Path, options: dict[str, Any], faults_of_processes: list[str]
 def main() -> int:
     """Runs the command; 1 if a check has found something, 2 if the run could not be made."""
     options = arguments()
+    # Servers and disks are removed at an end by a signal, too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(2))
     try:
         if options.check is not None:
             before = json.loads((options.check / "report.json").read_text("utf-8"))

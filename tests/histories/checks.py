@@ -1,5 +1,6 @@
 """What must be true of a history, whatever the faults were."""
 
+import bisect
 import dataclasses
 import itertools
 from collections import Counter, defaultdict
@@ -22,6 +23,8 @@ REPLICATED_LATE_S = 0.5
 #: After a fail-over two nodes may own a camera until the next renewal, s.
 RENEWED_S = 2.0
 LIVE = ("queued", "running", "cancelling")
+#: Faults that fail a run for good: no space for its version, or five attempts that ended with their workers.
+FAILURES = ("is full", "no space", "given up")
 ENDED = ("succeeded", "failed", "cancelled")
 #: Changes that have an entry in the audit log, and its action.
 AUDITED = {
@@ -144,7 +147,7 @@ def active_models_are_linearizable(history: History) -> Iterable[str]:
         register = [
             RegisterOperation("write", one.call_ns, returned(one), value=one.arguments["number"], label=one.request_id)
             for one in operations
-            if one.action == "activate" and not one.is_refused and one.arguments
+            if one.action == "activate" and not one.is_refused
         ]
         register += [
             RegisterOperation("read", one.call_ns, one.return_ns, value=one.answer, label=one.request_id)
@@ -156,26 +159,25 @@ def active_models_are_linearizable(history: History) -> Iterable[str]:
 
 def fusions_use_a_recent_model(history: History) -> Iterable[str]:
     """A fusion is answered by a version that was active at most `STALE_S` before it was asked for."""
-    changes = [one for one in history.of("activate") if not one.is_refused and one.arguments]
+    changes = [one for one in history.of("activate") if not one.is_refused]
+    by_version: dict[int, list[Operation]] = defaultdict(list)
+    for change in changes:
+        by_version[change.arguments["number"]].append(change)
+    superseding = sorted((one for one in changes if one.is_done), key=lambda one: one.return_ns)
+    # The latest call of the changes that were over by then: what had ended before it was no longer active.
+    ends, latest = (
+        [one.return_ns for one in superseding],
+        list(itertools.accumulate((one.call_ns for one in superseding), max)),
+    )
     for fusion in history.of("fuse"):
-        if fusion.is_done and not _may_answer(fusion, changes):
-            yield f"{fusion.request_id}: version {fusion.answer} answered, which was not active within {STALE_S} s"
-
-
-def _may_answer(fusion: Operation, changes: list[Operation]) -> bool:
-    """Whether an activation of its version may have been the latest one in the time before the fusion."""
-    oldest_ns = fusion.call_ns - seconds(STALE_S)
-    begins = [one for one in changes if one.arguments["number"] == fusion.answer and one.call_ns < fusion.return_ns]
-    if fusion.answer == 1:
-        begins.append(dataclasses.replace(fusion, call_ns=0, return_ns=0))
-    for begin in begins:
-        # Superseded for sure by a change that began after this one had ended and was over before the oldest time.
+        if not fusion.is_done:
+            continue
+        over = bisect.bisect_left(ends, fusion.call_ns - seconds(STALE_S))
+        since_ns = latest[over - 1] if over else 0
         if not any(
-            one.is_done and one.call_ns > returned(begin) and one.return_ns < oldest_ns and one is not begin
-            for one in changes
+            one.call_ns < fusion.return_ns and returned(one) >= since_ns for one in reversed(by_version[fusion.answer])
         ):
-            return True
-    return False
+            yield f"{fusion.request_id}: version {fusion.answer} answered, which was not active within {STALE_S} s"
 
 
 def keys_work_from_creation_to_revocation(history: History) -> Iterable[str]:
@@ -229,6 +231,10 @@ def _final_runs(history: History, final: Operation) -> Iterable[str]:
     yield from (f"one idempotency key gave the runs {ids}" for ids in seeds.values() if len(ids) > 1)
     yield from (f"run {run[0]} is {run[1]} at the end" for run in found.values() if run[1] not in ENDED)
     made = Counter(run for models in history.of("final-models") for _, run in models.answer if run is not None)
+    for failures in history.of("final-failures"):
+        for run_id, outcome in failures.answer:
+            if not any(reason in outcome for reason in FAILURES):
+                yield f"run {run_id} has failed: {outcome}"
     for run in found.values():
         if made[run[0]] != (run[1] == "succeeded"):
             yield f"run {run[0]} has {run[1]} and made {made[run[0]]} versions"
@@ -245,12 +251,15 @@ def live_runs_are_not_taken_over(history: History) -> Iterable[str]:
                 seen[run].append((listing.call_ns, attempt))
     for run, attempts in seen.items():
         first_ns = attempts[0][0] - seconds(STALE_S)
-        for number, (seen_ns, attempt) in enumerate(attempts):
-            possible = sum(
-                first_ns < fault.end_ns + seconds(2 * STALE_S) and fault.begin_ns < seen_ns for fault in faults
-            )
-            if number and attempt > attempts[number - 1][1] and attempt > 1 + possible:
-                yield f"run {run} is in attempt {attempt} after {possible} faults that may end a lease"
+        for (_, before), (seen_ns, attempt) in itertools.pairwise(attempts):
+            if attempt > before:
+                possible = sum(_may_end_a_lease(fault, first_ns, seen_ns) for fault in faults)
+                if attempt > 1 + possible:
+                    yield f"run {run} is in attempt {attempt} after {possible} faults that may end a lease"
+
+
+def _may_end_a_lease(fault: Interval, begin_ns: int, end_ns: int) -> bool:
+    return begin_ns < fault.end_ns + seconds(2 * STALE_S) and fault.begin_ns < end_ns
 
 
 def the_audit_log_has_exactly_the_changes(history: History) -> Iterable[str]:
@@ -353,25 +362,30 @@ def a_camera_has_one_owner(history: History) -> Iterable[str]:
     Node A has taken x, then B takes y, then A still follows x: A has answered as the owner before and after B.
     """
     taken = {one.arguments["target"]: one for one in history.of("probe") if one.is_done}
-    others = sorted(taken.values(), key=lambda one: one.call_ns)
+    by_node: dict[str, list[Operation]] = defaultdict(list)
+    for one in sorted(taken.values(), key=lambda one: one.call_ns):
+        by_node[one.arguments["node"]].append(one)
     for read in history.of("probe-read"):
-        if not read.is_done:
-            continue
-        node = read.arguments["node"]
-        known = [taken[target] for target in read.answer if target in taken]
-        own = [one for one in known if one.arguments["node"] == node]
-        if strangers := [one for one in known if one.arguments["node"] != node]:
-            yield f"{read.request_id}: {node} follows {strangers[0].arguments['target']}, which another node has taken"
-        if not own:
-            continue
-        since = min(own, key=lambda one: one.return_ns)
-        for other in others:
-            if other.arguments["node"] != node and other.call_ns > since.return_ns and other.return_ns < read.call_ns:
-                yield (
-                    f"{read.request_id}: {node} follows {since.arguments['target']} although {other.arguments['node']} "
-                    f"has taken {other.arguments['target']} since"
-                )
-                break
+        if read.is_done:
+            known = [taken[target] for target in read.answer if target in taken]
+            yield from _owners_beside(read, known, by_node)
+
+
+def _owners_beside(read: Operation, known: list[Operation], by_node: dict[str, list[Operation]]) -> Iterable[str]:
+    """Others that have answered as the owner while the node that was read was it."""
+    node = read.arguments["node"]
+    own = [one for one in known if one.arguments["node"] == node]
+    if strangers := [one for one in known if one.arguments["node"] != node]:
+        yield f"{read.request_id}: {node} follows {strangers[0].arguments['target']}, which another node has taken"
+    if not own:
+        return
+    since = min(own, key=lambda one: one.return_ns)
+    for other, answers in by_node.items():
+        begin = bisect.bisect_right(answers, since.return_ns, key=lambda one: one.call_ns)
+        between = next((one for one in answers[begin:] if one.return_ns < read.call_ns), None)
+        if other != node and between is not None:
+            followed, stranger = since.arguments["target"], between.arguments["target"]
+            yield f"{read.request_id}: {node} follows {followed} although {other} has taken {stranger} since"
 
 
 def all_nodes_agree_at_the_end(history: History) -> Iterable[str]:

@@ -1,5 +1,6 @@
 """The servers of a run: nodes and workers, each with own ways to the database and from clients, and a balancer."""
 
+import functools
 import http.client
 import json
 import os
@@ -158,7 +159,7 @@ class Cluster:
     def until_ready(self) -> None:
         """Waits until every serving node says that it is ready."""
         for node in self.serving:
-            until(lambda node=node: is_ready(node.url), f"{node.name} is ready")
+            until(functools.partial(is_ready, node.url), f"{node.name} is ready")
 
     def stop(self) -> list[str]:
         """Ends all servers in order; says what was wrong with their ends."""

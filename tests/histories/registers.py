@@ -8,6 +8,7 @@ G. Lowe, Testing for linearizability, Concurrency and Computation: Practice and 
 """
 
 import dataclasses
+import itertools
 from collections import defaultdict
 from collections.abc import Hashable, Iterable
 from typing import Any
@@ -102,22 +103,52 @@ def first_contradiction(initial: State, operations: list[RegisterOperation]) -> 
         [(operation.call_ns, 0, index) for index, operation in enumerate(operations)]
         + [(op.return_ns, 1, index) for index, op in enumerate(operations) if not op.is_unknown]
     )
-    under_way: set[int] = set()
+    under_way = _UnderWay(operations)
     configurations = {_Configuration(initial)}
     for _, is_return, index in events:
         if not is_return:
             under_way.add(index)
             continue
-        configurations = _returned(configurations, operations, under_way, index)
-        under_way.remove(index)
+        configurations = _returned(configurations, under_way, index)
+        under_way.known.remove(index)
         if not configurations:
             return operations[index]
     return None
 
 
-def _returned(
-    configurations: set[_Configuration], operations: list[RegisterOperation], under_way: set[int], index: int
-) -> set[_Configuration]:
+class _UnderWay:
+    """The operations that were called and have not returned.
+
+    Those of unknown outcome are many and stay: they are found by what they would do. Of equal ones one is as good as
+    another.
+    """
+
+    def __init__(self, operations: list[RegisterOperation]) -> None:
+        self.operations = operations
+        self.known: set[int] = set()
+        self._writes: dict[Any, list[int]] = defaultdict(list)
+        self._conditional: dict[Any, list[int]] = defaultdict(list)
+
+    def add(self, index: int) -> None:
+        """Notes a call."""
+        operation = self.operations[index]
+        if not operation.is_unknown:
+            self.known.add(index)
+        elif operation.kind == "write":
+            self._writes[operation.value].append(index)
+        else:
+            self._conditional[operation.expected].append(index)
+
+    def unknown(self, configuration: "_Configuration") -> Iterable[int]:
+        """Those of unknown outcome that may change the state, one of each kind."""
+        for value, indices in self._writes.items():
+            if value != configuration.state:
+                yield from itertools.islice((one for one in indices if one not in configuration.unknown), 1)
+        if isinstance(configuration.state, tuple):
+            yield from set(self._conditional.get(configuration.state[0], ())) - configuration.unknown
+
+
+def _returned(configurations: set[_Configuration], under_way: _UnderWay, index: int) -> set[_Configuration]:
     """The configurations in which an operation that returns now has taken effect."""
     done: set[_Configuration] = set()
     seen = set(configurations)
@@ -127,36 +158,27 @@ def _returned(
         if index in configuration.known:
             done.add(dataclasses.replace(configuration, known=configuration.known - {index}))
             continue
-        for following in _following(configuration, operations, under_way):
+        for following in _following(configuration, under_way):
             if following not in seen:
                 seen.add(following)
                 waiting.append(following)
         if len(seen) > MOST_CONFIGURATIONS:
-            raise SearchTooLargeError(f"more than {MOST_CONFIGURATIONS} orders at {operations[index]}")
+            raise SearchTooLargeError(f"more than {MOST_CONFIGURATIONS} orders at {under_way.operations[index]}")
     return _without_dominated(done)
 
 
-def _following(
-    configuration: _Configuration, operations: list[RegisterOperation], under_way: set[int]
-) -> Iterable[_Configuration]:
+def _following(configuration: _Configuration, under_way: _UnderWay) -> Iterable[_Configuration]:
     """The configurations in which one more operation has taken effect."""
-    tried: set[tuple[Any, ...]] = set()
-    for index in sorted(under_way - configuration.known - configuration.unknown):
-        operation = operations[index]
-        if configuration.is_unseen and (operation.is_unknown or operation.kind == "write"):
+    for index in under_way.known - configuration.known:
+        operation = under_way.operations[index]
+        if configuration.is_unseen and operation.kind == "write":
             continue
-        if operation.is_unknown:
-            # Of equal operations without an outcome one is as good as another.
-            alike = (operation.kind, operation.expected, operation.value)
-            if alike in tried:
-                continue
-            tried.add(alike)
         for state in operation.apply(configuration.state):
-            if operation.is_unknown:
-                if state != configuration.state:
-                    yield _Configuration(state, configuration.known, configuration.unknown | {index}, is_unseen=True)
-            else:
-                yield _Configuration(state, configuration.known | {index}, configuration.unknown)
+            yield _Configuration(state, configuration.known | {index}, configuration.unknown)
+    if not configuration.is_unseen:
+        for index in under_way.unknown(configuration):
+            for state in under_way.operations[index].apply(configuration.state):
+                yield _Configuration(state, configuration.known, configuration.unknown | {index}, is_unseen=True)
 
 
 def _without_dominated(configurations: set[_Configuration]) -> set[_Configuration]:

@@ -338,7 +338,10 @@ def prepare(api: Api, model: bytes, samples: bytes, hook_port: int) -> None:
     """
 
     def must(action: str, subject: str, method: str, path: str, body: Any, content_type: str = JSON) -> None:
-        done = api.send(action, subject, method, path, body, headers={"content-type": content_type})
+        arguments = body if isinstance(body, dict) else {}
+        done = api.send(
+            action, subject, method, path, body, arguments=arguments, headers={"content-type": content_type}
+        )
         if not done.is_done:
             raise RuntimeError(f"{method} {path}: {done.status} {done.answer}")
 

@@ -397,6 +397,13 @@ def all_nodes_agree_at_the_end(history: History) -> Iterable[str]:
         yield from (f"{action}: {one.arguments} answered {one.status}" for one in history.of(action) if not one.is_done)
 
 
+def every_kind_of_request_was_answered(history: History) -> Iterable[str]:
+    """Each kind of request was done at least once: a promise that nobody asked for was not tried."""
+    done = Counter(one.action for one in history.operations if one.is_done)
+    wanted = {one.action for one in history.operations} | {*AUDITED, *READS, "publish", "delivery", "list-samples"}
+    yield from (f"no {action} was done" for action in sorted(wanted) if not done[action])
+
+
 def json_key(answer: Any) -> str:
     """An answer as a text to compare."""
     return repr(answer)
@@ -406,7 +413,7 @@ CHECKS: tuple[Callable[[History], Iterable[str]], ...] = (
     samples_are_stored_exactly_once, profiles_are_linearizable, active_models_are_linearizable,
     fusions_use_a_recent_model, keys_work_from_creation_to_revocation, runs_end_once, live_runs_are_not_taken_over,
     the_audit_log_has_exactly_the_changes, events_are_complete_or_marked_lost, positions_are_delivered_under_stable_ids,
-    a_camera_has_one_owner, all_nodes_agree_at_the_end,
+    a_camera_has_one_owner, all_nodes_agree_at_the_end, every_kind_of_request_was_answered,
 )  # fmt: skip
 #: Findings of one check that are listed.
 MOST_FINDINGS = 20

@@ -27,7 +27,7 @@ ROWS_PER_BATCH = 3
 #: Model versions of the camera whose active version changes.
 VERSIONS = 6
 #: Uses of a key before and after it is revoked.
-KEY_USES = 8
+KEY_USES = 12
 #: Silence after which a reader of events opens a new stream, s.
 EVENT_SILENCE_S = 4.0
 
@@ -285,6 +285,10 @@ def receive_hooks(client: Client) -> None:
         """Answers deliveries."""
 
         protocol_version = "HTTP/1.1"
+
+        def handle(self) -> None:
+            with contextlib.suppress(ConnectionError):
+                super().handle()
 
         def do_POST(self) -> None:
             body = json.loads(self.rfile.read(int(self.headers["content-length"])))

@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from .nemesis import ENDS_LEASES, Interval
+from .nemesis import ENDS_LEASES, ON_DATABASE, ON_LINKS_TO_DATABASE, Interval
 from .record import FOREVER_NS, Operation, by_subject, of_action
 from .registers import RegisterOperation, SearchTooLargeError, first_contradiction
 from .workloads import ROWS_PER_BATCH, at
@@ -335,25 +335,28 @@ def positions_are_delivered_under_stable_ids(history: History) -> Iterable[str]:
 
 
 def lost_queues(history: History) -> Iterable[tuple[int, int]]:
-    """Times whose positions a killed server may not have queued: the last before it, and while it had no database."""
-    outages = [
-        fault
-        for fault in history.intervals
-        if fault.kind.startswith("database-") or fault.kind in ("full-disk", "fail-over")
-    ]
-    for kill in history.intervals:
-        if kill.kind not in ("node-kill", "node-restart", "rolling-restart"):
+    """Times whose positions a killed server may not have queued: its last, and those in which it could not queue."""
+    for end in history.intervals:
+        if end.kind not in ("node-kill", "node-restart", "rolling-restart"):
             continue
-        begin_ns = kill.begin_ns
-        for outage in sorted(outages, key=lambda one: one.begin_ns, reverse=True):
-            if outage.begin_ns < kill.end_ns and outage.end_ns + seconds(STALE_S) > begin_ns:
+        begin_ns = end.begin_ns
+        for outage in sorted(history.intervals, key=lambda one: one.begin_ns, reverse=True):
+            is_near = outage.begin_ns < end.end_ns and outage.end_ns + seconds(STALE_S) > begin_ns
+            if is_near and _keeps_from_queueing(outage, end):
                 begin_ns = min(begin_ns, outage.begin_ns)
-        if kill.kind == "node-kill" or begin_ns < kill.begin_ns:
-            yield begin_ns - seconds(QUEUED_LATE_S), kill.end_ns
+        if end.kind == "node-kill" or begin_ns < end.begin_ns:
+            yield begin_ns - seconds(QUEUED_LATE_S), end.end_ns
     if history.replication == "asynchronous":
         for fault in history.intervals:
             if fault.kind == "fail-over":
                 yield fault.begin_ns - seconds(QUEUED_LATE_S), fault.end_ns
+
+
+def _keeps_from_queueing(outage: Interval, end: Interval) -> bool:
+    """Whether a fault kept the node that ends from bringing positions into the outbox."""
+    if outage.kind in (*ON_LINKS_TO_DATABASE, "node-stop"):
+        return outage.node == end.node or end.kind == "rolling-restart"
+    return outage.kind in (*ON_DATABASE, "full-disk", "fail-over")
 
 
 def a_camera_has_one_owner(history: History) -> Iterable[str]:

@@ -15,6 +15,7 @@ from .planted import Plant, in_groups, plants
 from .processes import HarnessError
 from .record import read_operations
 from .running import ROOT, Options, make_history
+from .soak import soak
 
 #: Without faults at the end of a run, and for all of one with plants, s.
 SETTLE_S = 6.0
@@ -38,6 +39,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="folder of the history; must not exist")
     parser.add_argument("--check", type=Path, metavar="FOLDER", help="only check the history of a folder again")
     parser.add_argument("--planted", action="store_true", help="no faults: break promises on purpose, and find that")
+    parser.add_argument("--soak", type=float, metavar="SECONDS", help="no faults: measure what the servers hold")
     return parser.parse_args()
 
 
@@ -101,6 +103,8 @@ def main() -> int:
         )
         new = ROOT / "target" / "histories" / f"{given.backend}-{given.seed}-{int(time.time())}"
         folder = (given.out or new).resolve()
+        if given.soak is not None:
+            return 0 if soak(options, folder, given.soak) else 1
         if given.planted:
             return 0 if find_planted(dataclasses.replace(options, faults=0, settle_s=PLANTED_S), folder) else 1
         return 1 if any(checked(folder, options, make_history(options, folder, [])).values()) else 0

@@ -161,14 +161,16 @@ class Cluster:
         for node in self.serving:
             until(functools.partial(is_ready, node.url), f"{node.name} is ready")
 
-    def stop(self) -> list[str]:
-        """Ends all servers in order; says what was wrong with their ends."""
+    def stop(self) -> None:
+        """Ends all servers in order."""
         for node in self.nodes:
             node.terminate()
-        faults = [f"{node.name} ended with exit code {code}" for node in self.nodes for code in node.unexpected_exits]
-        faults += [f"{node.name}: {line}" for node in self.nodes for line in node.panics()]
         self.network.stop()
-        return faults
+
+    def faults(self) -> list[str]:
+        """What was wrong with the ends of processes."""
+        faults = [f"{node.name} ended with exit code {code}" for node in self.nodes for code in node.unexpected_exits]
+        return faults + [f"{node.name}: {line}" for node in self.nodes for line in node.panics()]
 
 
 def is_ready(url: str) -> bool:

@@ -1,11 +1,14 @@
 """One run: servers, clients and faults, and what is stored after them."""
 
+import contextlib
 import dataclasses
 import multiprocessing
+import multiprocessing.process
 import os
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -142,32 +145,47 @@ def read_nodes(ways: Ways, api: Api) -> None:
                  keep=lambda answer, _: answer["items"][0]["model_version"])  # fmt: skip
 
 
+@contextlib.contextmanager
+def servers(options: Options, folder: Path, settings: dict[str, str]) -> Iterator[Cluster]:
+    """Servers and their database for as long as it is entered; both are removed at the end.
+
+    Raises:
+        HarnessError: They do not start.
+    """
+    program = binary()
+    (folder / "history").mkdir(parents=True)
+    backend = DataFolder(folder) if options.backend == "folder" else PostgreSQL(folder, options.replication)
+    try:
+        cluster = Cluster(program, folder, backend, random_roles(options.nodes), settings)
+        try:
+            yield cluster
+        finally:
+            cluster.stop()
+    finally:
+        backend.stop()
+
+
 def make_history(options: Options, folder: Path, planted: list[Plant]) -> list[str]:
     """Runs servers, clients and faults; gives what was wrong with the processes themselves.
 
     Raises:
         HarnessError: The run could not be made, or the system did not become whole after the faults.
     """
-    program = binary()
-    operations = folder / "history"
-    operations.mkdir(parents=True)
-    backend = DataFolder(folder) if options.backend == "folder" else PostgreSQL(folder, options.replication)
-    try:
-        cluster = Cluster(program, folder, backend, random_roles(options.nodes), SETTINGS)
-        try:
-            hook_port = free_port()
-            ways = through(planted, cluster, hook_port)
-            api = Api(cluster.url, cluster.admin_key, Recorder(operations / "setup.ndjson", "setup"), timeout_s=30)
-            prepare(api, MODEL.read_bytes(), training_rows(program, folder), ways.hook_port)
-            with_clients(options, cluster, ways, folder, hook_port)
-            if any(plant.place == "process" for plant in planted):
-                os.kill(cluster.nodes[0].process_id or 0, signal.SIGKILL)
-                time.sleep(1.0)
-        finally:
-            faults = cluster.stop()
-    finally:
-        backend.stop()
-    return faults
+    with servers(options, folder, SETTINGS) as cluster:
+        hook_port = free_port()
+        ways = through(planted, cluster, hook_port)
+        with clients_at_work(options, cluster, ways, folder, hook_port) as clients:
+            kinds = options.kinds or kinds_for(cluster, FAKETIME.exists())
+            faults = draw(options.seed, options.faults, kinds, len(cluster.nodes))
+            Nemesis(cluster, folder / "faults.ndjson").run(faults)
+            cluster.until_ready()
+            time.sleep(options.settle_s)
+            clients.end()
+            read_final_state(cluster, ways, folder / "history")
+        if any(plant.place == "process" for plant in planted):
+            os.kill(cluster.nodes[0].process_id or 0, signal.SIGKILL)
+            time.sleep(1.0)
+    return cluster.faults()
 
 
 def through(planted: list[Plant], cluster: Cluster, hook_port: int) -> Ways:
@@ -181,42 +199,69 @@ def through(planted: list[Plant], cluster: Cluster, hook_port: int) -> Ways:
     )
 
 
-def with_clients(options: Options, cluster: Cluster, ways: Ways, folder: Path, hook_port: int) -> None:
-    """Runs the clients and the faults, and reads the state after them."""
-    context = multiprocessing.get_context("spawn")
-    ending, all_over = context.Event(), context.Event()
-    clients = []
-    for name in names():
-        setting = Setting(
-            name, ways.url, ways.node_urls, cluster.admin_key, options.seed, folder / "history", EPOCHS, hook_port
-        )
-        # The receiver of webhooks stays until all is delivered.
-        is_receiver = name.startswith("hooks")
-        clients.append(context.Process(target=run, args=(setting, all_over if is_receiver else ending), name=name))
-        clients[-1].start()
+class Clients:
+    """The processes of the clients."""
+
+    def __init__(self, settings: list[Setting]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._ending, self._all_over = context.Event(), context.Event()
+        self._processes = [
+            # The receiver of webhooks stays until all is delivered.
+            context.Process(target=run, args=(one, self._all_over if is_receiver(one) else self._ending))
+            for one in settings
+        ]
+        for process in self._processes:
+            process.start()
+        until(lambda: all((one.history / f"{one.client}.ndjson").exists() for one in settings), "every client works")
+
+    def end(self) -> None:
+        """Ends all but the receiver of webhooks.
+
+        Raises:
+            HarnessError: One does not end, or has failed.
+        """
+        self._ending.set()
+        for process in self._processes[:-1]:
+            join(process)
+
+    def end_receiver(self) -> None:
+        """Ends the receiver of webhooks, and all others where they have not ended."""
+        self._all_over.set()
+        self._ending.set()
+        for process in self._processes:
+            process.join(END_S)
+            process.terminate()
+
+
+def is_receiver(setting: Setting) -> bool:
+    """Whether a client receives webhooks."""
+    return setting.client.startswith("hooks")
+
+
+@contextlib.contextmanager
+def clients_at_work(options: Options, cluster: Cluster, ways: Ways, folder: Path, hook_port: int) -> Iterator[Clients]:
+    """Clients at work for as long as it is entered, on what they need."""
+    history = folder / "history"
+    api = Api(cluster.url, cluster.admin_key, Recorder(history / "setup.ndjson", "setup"), timeout_s=30)
+    prepare(api, MODEL.read_bytes(), training_rows(binary(), folder), ways.hook_port)
+    clients = Clients(
+        [
+            Setting(name, ways.url, ways.node_urls, cluster.admin_key, options.seed, history, EPOCHS, hook_port)
+            for name in names()
+        ]
+    )
     try:
-        until(lambda: all((folder / "history" / f"{name}.ndjson").exists() for name in names()), "every client works")
-        kinds = options.kinds or kinds_for(cluster, FAKETIME.exists())
-        Nemesis(cluster, folder / "faults.ndjson").run(draw(options.seed, options.faults, kinds, len(cluster.nodes)))
-        cluster.until_ready()
-        time.sleep(options.settle_s)
-        ending.set()
-        join([client for client in clients if not client.name.startswith("hooks")])
-        read_final_state(cluster, ways, folder / "history")
-        all_over.set()
-        join(clients)
+        yield clients
     finally:
-        for client in clients:
-            client.terminate()
+        clients.end_receiver()
 
 
-def join(clients: list[Any]) -> None:
-    """Waits for clients.
+def join(client: multiprocessing.process.BaseProcess) -> None:
+    """Waits for a client.
 
     Raises:
-        HarnessError: One does not end, or has failed.
+        HarnessError: It does not end, or has failed.
     """
-    for client in clients:
-        client.join(60)
-        if client.exitcode != 0:
-            raise HarnessError(f"client {client.name} ended with {client.exitcode}")
+    client.join(60)
+    if client.exitcode != 0:
+        raise HarnessError(f"client {client.name} ended with {client.exitcode}")

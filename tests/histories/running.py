@@ -32,9 +32,9 @@ SETTINGS = {
 }  # fmt: skip
 #: Rows of the camera that is trained, and passes over them: a run takes seconds.
 TRAINING_ROWS = 600
-EPOCHS = 800
+EPOCHS = 400
 #: Time for runs and deliveries that are under way at the end, s.
-END_S = 180.0
+END_S = 600.0
 
 
 @dataclasses.dataclass(frozen=True)

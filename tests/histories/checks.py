@@ -339,12 +339,12 @@ def lost_queues(history: History) -> Iterable[tuple[int, int]]:
     for end in history.intervals:
         if end.kind not in ("node-kill", "node-restart", "rolling-restart"):
             continue
-        begin_ns = end.begin_ns
+        begin_ns, is_kept = end.begin_ns, end.kind == "node-kill"
         for outage in sorted(history.intervals, key=lambda one: one.begin_ns, reverse=True):
             is_near = outage.begin_ns < end.end_ns and outage.end_ns + seconds(STALE_S) > begin_ns
             if is_near and _keeps_from_queueing(outage, end):
-                begin_ns = min(begin_ns, outage.begin_ns)
-        if end.kind == "node-kill" or begin_ns < end.begin_ns:
+                begin_ns, is_kept = min(begin_ns, outage.begin_ns), True
+        if is_kept:
             yield begin_ns - seconds(QUEUED_LATE_S), end.end_ns
     if history.replication == "asynchronous":
         for fault in history.intervals:
@@ -382,10 +382,11 @@ def _owners_beside(read: Operation, known: list[Operation], by_node: dict[str, l
         yield f"{read.request_id}: {node} follows {strangers[0].arguments['target']}, which another node has taken"
     if not own:
         return
-    since = min(own, key=lambda one: one.return_ns)
+    since, latest = min(own, key=lambda one: one.return_ns), max(own, key=lambda one: one.call_ns)
     for other, answers in by_node.items():
         begin = bisect.bisect_right(answers, since.return_ns, key=lambda one: one.call_ns)
-        between = next((one for one in answers[begin:] if one.return_ns < read.call_ns), None)
+        # A node without an owner beside it shows what it followed last: only what it takes afterwards is of an owner.
+        between = next((one for one in answers[begin:] if one.return_ns < latest.call_ns), None)
         if other != node and between is not None:
             followed, stranger = since.arguments["target"], between.arguments["target"]
             yield f"{read.request_id}: {node} follows {followed} although {other} has taken {stranger} since"

@@ -46,6 +46,7 @@ def test_a_kill_excuses_its_last_moment_and_the_outage_before_it() -> None:
 def test_an_orderly_end_excuses_nothing_but_outages() -> None:
     assert windows_s(fault("node-restart", 10, 12)) == []
     assert windows_s(fault("database-kill", 9, 11), fault("node-restart", 10, 12)) == [(8.4, 12)]
+    assert windows_s(fault("database-kill", 10.5, 11), fault("rolling-restart", 10, 12)) == [(9.4, 12)]
 
 
 def test_a_figure_that_grows_is_told_from_one_that_varies() -> None:

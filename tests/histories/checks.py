@@ -7,9 +7,11 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from .backends import PostgreSQL
+from .cluster import RUN_LEASE_S
 from .nemesis import ENDS_LEASES, ON_DATABASE, ON_LINKS_TO_DATABASE, Interval
 from .record import FOREVER_NS, Operation, by_subject, of_action
-from .registers import RegisterOperation, SearchTooLargeError, first_contradiction
+from .registers import ANYTHING, RegisterOperation, SearchTooLargeError, first_contradiction
 from .workloads import ROWS_PER_BATCH, at
 
 SECOND_NS = 1_000_000_000
@@ -54,12 +56,10 @@ class History:
 
 def without_lost_changes(history: History) -> History:
     """The history without what an asynchronous fail-over may undo: such changes have an unknown outcome."""
-    if history.replication != "asynchronous":
-        return history
     windows = [
         (fault.begin_ns - seconds(REPLICATED_LATE_S), fault.end_ns + seconds(RENEWED_S))
         for fault in history.intervals
-        if fault.kind == "fail-over"
+        if _undoes(history, fault)
     ]
 
     def is_inside(operation: Operation) -> bool:
@@ -111,6 +111,23 @@ def judged(name: str, initial: Any, operations: list[RegisterOperation]) -> Iter
         yield f"{name} is not linearizable: no order of effects explains {found}"
 
 
+def by_era(history: History, *actions: str) -> Iterable[tuple[str, list[Operation]]]:
+    """Operations by subject, and by the times between fail-overs that may have undone changes.
+
+    Those of unknown outcome may take effect in later times, too.
+    """
+    ends = [fault.end_ns + seconds(RENEWED_S) for fault in history.intervals if _undoes(history, fault)]
+    for subject, operations in by_subject(history.of(*actions)).items():
+        for begin_ns, end_ns in itertools.pairwise([0, *sorted(ends), FOREVER_NS]):
+            era = [one for one in operations if begin_ns <= one.call_ns < end_ns]
+            if era:
+                yield subject, [one for one in operations if one.call_ns < begin_ns and one.is_unknown] + era
+
+
+def _undoes(history: History, fault: Interval) -> bool:
+    return history.replication == "asynchronous" and fault.kind == "fail-over"
+
+
 def returned(operation: Operation) -> int:
     """When the effect of a change had taken place at the latest."""
     return FOREVER_NS if operation.is_unknown else operation.return_ns
@@ -118,9 +135,9 @@ def returned(operation: Operation) -> int:
 
 def profiles_are_linearizable(history: History) -> Iterable[str]:
     """A profile is a register: reads see the latest change, and of two changes of one revision one is made."""
-    for camera, operations in by_subject(history.of("read-profile", "change-profile")).items():
+    for camera, operations in by_era(history, "read-profile", "change-profile"):
         register: list[RegisterOperation] = []
-        initial: tuple[str, str] | None = None
+        initial: Any = None if operations[0].client == "setup" else ANYTHING
         for operation in operations:
             if operation.action == "read-profile":
                 if operation.is_done:
@@ -143,7 +160,7 @@ def profiles_are_linearizable(history: History) -> Iterable[str]:
 
 def active_models_are_linearizable(history: History) -> Iterable[str]:
     """The active version is a register."""
-    for camera, operations in by_subject(history.of("activate", "read-active")).items():
+    for camera, operations in by_era(history, "activate", "read-active"):
         register = [
             RegisterOperation("write", one.call_ns, returned(one), value=one.arguments["number"], label=one.request_id)
             for one in operations
@@ -154,7 +171,7 @@ def active_models_are_linearizable(history: History) -> Iterable[str]:
             for one in operations
             if one.action == "read-active" and one.is_done
         ]
-        yield from judged(f"active model of {camera}", 1, register)
+        yield from judged(f"active model of {camera}", ANYTHING, register)
 
 
 def fusions_use_a_recent_model(history: History) -> Iterable[str]:
@@ -253,9 +270,16 @@ def live_runs_are_not_taken_over(history: History) -> Iterable[str]:
         first_ns = attempts[0][0] - seconds(STALE_S)
         for (_, before), (seen_ns, attempt) in itertools.pairwise(attempts):
             if attempt > before:
-                possible = sum(_may_end_a_lease(fault, first_ns, seen_ns) for fault in faults)
+                possible = sum(_leases_ended(fault) for fault in faults if _may_end_a_lease(fault, first_ns, seen_ns))
                 if attempt > 1 + possible:
                     yield f"run {run} is in attempt {attempt} after {possible} faults that may end a lease"
+
+
+def _leases_ended(fault: Interval) -> int:
+    """How many leases a fault may end one after the other."""
+    if fault.kind == "rolling-restart":
+        return PostgreSQL.most_nodes
+    return 1 + (fault.end_ns - fault.begin_ns) // seconds(RUN_LEASE_S)
 
 
 def _may_end_a_lease(fault: Interval, begin_ns: int, end_ns: int) -> bool:
@@ -346,10 +370,9 @@ def lost_queues(history: History) -> Iterable[tuple[int, int]]:
                 begin_ns, is_kept = min(begin_ns, outage.begin_ns), True
         if is_kept:
             yield begin_ns - seconds(QUEUED_LATE_S), end.end_ns
-    if history.replication == "asynchronous":
-        for fault in history.intervals:
-            if fault.kind == "fail-over":
-                yield fault.begin_ns - seconds(QUEUED_LATE_S), fault.end_ns
+    for fault in history.intervals:
+        if _undoes(history, fault):
+            yield fault.begin_ns - seconds(QUEUED_LATE_S), fault.end_ns
 
 
 def _keeps_from_queueing(outage: Interval, end: Interval) -> bool:

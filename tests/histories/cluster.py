@@ -16,7 +16,7 @@ from .processes import Process, checked, until
 
 #: Of the registration of a node, and of a training run, s.
 NODE_LEASE_S = 2
-RUN_LEASE_S = 3
+RUN_LEASE_S = 5
 #: Longest orderly end of a node, s.
 DRAIN_S = 4
 #: The database does not answer, or its disk is full: the server asks for a start later.

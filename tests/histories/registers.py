@@ -19,6 +19,8 @@ from .record import FOREVER_NS
 MOST_CONFIGURATIONS = 200_000
 
 State = Hashable
+#: The state of a register of which nothing is known: the first effect that is seen tells it.
+ANYTHING = "anything"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +67,11 @@ def _apply(operation: RegisterOperation, state: State) -> Iterable[State]:
 
 
 def _is_open(state: State) -> bool:
-    return isinstance(state, tuple) and state[0] is None
+    return state == ANYTHING or (isinstance(state, tuple) and state[0] is None)
 
 
 def _agrees(read: Any, state: State) -> bool:
-    return bool(read == state or (_is_open(state) and isinstance(state, tuple) and read[1] == state[1]))
+    return bool(state in (read, ANYTHING) or (_is_open(state) and isinstance(state, tuple) and read[1] == state[1]))
 
 
 def _has_version(state: State, version: Any) -> bool:

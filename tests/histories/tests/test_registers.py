@@ -5,7 +5,7 @@ import random
 from collections.abc import Iterator
 
 from histories.record import FOREVER_NS
-from histories.registers import RegisterOperation, first_contradiction
+from histories.registers import ANYTHING, RegisterOperation, first_contradiction
 
 
 def write(call: int, end: int, value: object) -> RegisterOperation:
@@ -64,6 +64,13 @@ def test_a_conditional_write_of_unknown_outcome_gives_a_version_that_a_read_tell
     assert first_contradiction(("a", 0), [lost, read(1, 2, ("a", 0)), read(3, 4, ("b", 1))]) is None
     wrong = read(5, 6, ("a", 0))
     assert first_contradiction(("a", 0), [lost, read(3, 4, ("b", 1)), wrong]) is wrong
+
+
+def test_a_register_of_which_nothing_is_known_is_what_is_seen_first() -> None:
+    assert first_contradiction(ANYTHING, [read(0, 1, ("b", 1)), read(2, 3, ("b", 1))]) is None
+    other = read(2, 3, ("c", 2))
+    assert first_contradiction(ANYTHING, [read(0, 1, ("b", 1)), other]) is other
+    assert first_contradiction(ANYTHING, [conditional(0, 1, "a", ("b", 1)), read(2, 3, ("b", 1))]) is None
 
 
 def orders(history: list[RegisterOperation]) -> Iterator[tuple[RegisterOperation, ...]]:

@@ -56,7 +56,7 @@ mod write;
 
 pub use address::{Address, Scheme, SerialLine, bracketed};
 pub use connection::{
-    CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, ReceiverFrom, SaslMechanism, Secrets,
+    CameraMapping, ConnectionDraft, ConnectionSettings, ImagePoint, OutgoingFormat, ReceiverFrom, SaslMechanism, Secrets,
     SinkSettings, SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};

@@ -9,7 +9,7 @@ use tokio::sync::watch;
 
 use super::ItemResult;
 use super::acknowledgements::{AckTracker, Acknowledgement, NotStoredReason};
-use super::camera::StreamCount;
+use super::camera::{StreamCount, UnplacedBox};
 use super::sample_committer::{self, SampleSink};
 use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
@@ -275,6 +275,16 @@ impl LiveStream {
             Observation::new(time, target_id, item.bounding_box, fix)?.with_tracker_id(item.tracker_id)?;
         // A time that no track takes must not move the pairing either.
         self.app.live_time_bounds(now).check(time)?;
+        if let Some(bounding_box) = observation.bounding_box().filter(|_| camera.model().is_none()) {
+            camera.live.announce_box(self.app.clock.monotonic(), || UnplacedBox {
+                time,
+                target_id: observation.target_id().cloned(),
+                tracker_id: observation.tracker_id().cloned(),
+                bounding_box,
+                class: item.class.clone(),
+                score: item.score,
+            });
+        }
         let identified = self.app.identify(camera, observation, item.class.as_ref());
         if identified.is_sure {
             self.record(seq, &identified.observation, item.class, item.score).await?;

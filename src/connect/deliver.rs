@@ -35,7 +35,8 @@ impl Delivery<'_> {
     /// Opens the sink and delivers until it fails. `progressed` is set when something was delivered.
     pub(super) async fn run(&self, progressed: &AtomicBool) -> Result<Infallible, PeerError> {
         let clock = &self.app.clock;
-        let mut sink = open::sink(self.app, self.id, self.settings, self.secrets, self.client_id).await?;
+        let mut sink =
+            open::sink(self.app, self.id, self.settings, self.secrets, (self.client_id, true)).await?;
         // A sink that is seen running misses no position of this process's cameras.
         let _ = tokio::time::timeout(PUBLISHER_WAIT, self.live.publishing.wait()).await;
         self.live.enter(ConnectionState::Running, clock.now());

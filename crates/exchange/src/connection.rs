@@ -199,6 +199,9 @@ pub enum OutgoingFormat {
     Cot,
     /// An ONVIF metadata frame (XML, `tt:MetadataStream`) with the object's geolocation per position.
     Onvif,
+    /// Attributes of device trackers of Home Assistant, which are announced to it by MQTT discovery; of targets whose receiver is
+    /// known alone. For addresses of MQTT.
+    HomeAssistant,
     /// Tracks in files of GPX 1.1, for the address `file:`.
     Gpx,
     /// Tracks in files of KML 2.2, for the address `file:`.
@@ -210,7 +213,7 @@ impl OutgoingFormat {
     #[must_use]
     pub const fn track_file(self) -> Option<TrackFileFormat> {
         match self {
-            Self::Json | Self::Cot | Self::Onvif => None,
+            Self::Json | Self::Cot | Self::Onvif | Self::HomeAssistant => None,
             Self::Gpx => Some(TrackFileFormat::Gpx),
             Self::Kml => Some(TrackFileFormat::Kml),
         }
@@ -507,9 +510,6 @@ impl CameraMapping {
     pub fn stream_size(&self) -> Result<Option<ImageSize>> {
         self.image_size.map(|size| ImageSize::new(size.width_px, size.height_px)).transpose()
     }
-}
-
-impl SinkSettings {
 
     /// The part of the camera's image whose boxes are taken, if it is not all of it.
     ///
@@ -519,6 +519,9 @@ impl SinkSettings {
         let corners = |area: &Vec<ImagePoint>| area.iter().map(|point| [point.x_px, point.y_px]).collect();
         self.area.as_ref().map(|area| ImageArea::new(corners(area))).transpose()
     }
+}
+
+impl SinkSettings {
     /// Where it is.
     ///
     /// # Errors
@@ -535,6 +538,9 @@ impl SinkSettings {
                 "format",
                 "must be gpx or kml for the address file:, and for no other",
             ));
+        }
+        if self.format == OutgoingFormat::HomeAssistant && !scheme.is_mqtt() {
+            return Err(Error::invalid("format", "can be home_assistant for addresses of MQTT alone"));
         }
         check_username(self.username.as_deref())?;
         check_sasl(self.sasl_mechanism, scheme, self.username.as_deref())?;

@@ -27,7 +27,7 @@ const FILES: [&str; 12] = [
 const BOXED: [&str; 3] =
     ["sightfix.v1.StreamResponse.answer", "sightfix.v1.Sample.fix", "sightfix.v1.Sample.truth"];
 
-/// What `npm run build` in `console/` writes.
+/// The folder that `npm run build` in `console/` writes.
 const CONSOLE: &str = "console/dist";
 
 fn main() -> Result<(), Box<dyn Error>> {

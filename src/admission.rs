@@ -1,9 +1,9 @@
 //! Admission control: how much of each bounded resource all clients together, and one client, may hold at
 //! a time, and how many requests per second one client may send.
 //!
-//! Never here: waiting. A request beyond a quota is refused at once and may be tried again.
+//! Does not wait. A request beyond a quota is refused at once and may be tried again.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod decoded_memory;
@@ -19,7 +19,7 @@ use crate::domain::{Error, ErrorKind, KeyId, Refusal, Result};
 pub use decoded_memory::DecodedMemory;
 pub use rates::{RateLimit, RefusedBodies, TokenBucket};
 
-/// What a request costs while it is open, besides its body: connection buffers and its task. Charged
+/// Memory of a request while it is open, besides its body: connection buffers and its task. Charged
 /// to [`Quotas::request_memory`].
 const REQUEST_OVERHEAD_BYTES: u64 = 16 << 10;
 /// Sign-ins that wait for the OpenID provider at a time.
@@ -52,7 +52,7 @@ impl From<IpAddr> for ClientId {
     }
 }
 
-/// What a request is for, which decides what it must be granted before it is worked on.
+/// The class of a request, which decides the quotas that it needs before it is handled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RequestClass {
     /// Health and metrics: always answered.
@@ -91,7 +91,7 @@ impl BodyRefusal {
 pub struct Quota(Arc<QuotaState>);
 
 struct QuotaState {
-    /// What is counted, in the plural, for the refusal.
+    /// The name of the counted unit, in the plural, for the refusal.
     what: &'static str,
     total: u64,
     per_client: u64,
@@ -143,13 +143,13 @@ impl Quota {
 /// How much of a [`Quota`] all clients hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct QuotaUsage {
-    /// Held now.
+    /// Units held now.
     pub held: u64,
-    /// At most.
+    /// The largest number of units.
     pub limit: u64,
 }
 
-/// What one holder has of a [`Quota`].
+/// The share of a [`Quota`] that one holder has.
 pub struct Lease {
     quota: Quota,
     client: ClientId,
@@ -251,7 +251,7 @@ impl Quotas {
         }
     }
 
-    /// How many there are.
+    /// Number of quotas.
     pub const COUNT: usize = 8;
     /// Their names in the metrics, in the order of [`Quotas::usages`].
     pub const NAMES: [&str; Self::COUNT] = [
@@ -289,7 +289,7 @@ impl Quotas {
         self.request_memory.try_acquire(client, REQUEST_OVERHEAD_BYTES)
     }
 
-    /// What the messages of one request come to when they are decoded, besides the bytes of its body.
+    /// Returns the memory account of the messages of one request when they are decoded, besides the bytes of its body.
     #[must_use]
     pub fn decoded_memory(&self, client: ClientId, refusal: BodyRefusal) -> DecodedMemory {
         DecodedMemory::new(self.request_memory.clone(), client, refusal)

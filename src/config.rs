@@ -30,12 +30,12 @@ pub struct Config {
     /// URL of a PostgreSQL database that replaces the folder, such as
     /// `postgres://user:password@host/sightfix?sslmode=verify-full`; none by default.
     pub database: Option<Secret>,
-    /// What this process does of the work that all processes with one database share.
+    /// The role of this process among those that share one database.
     pub role: NodeRole,
     /// Address of this process for clients that others with the same database redirect here, such as
     /// `https://node-1.example.org:8443`; by default that of `listen`, if it names one machine.
     pub advertised_url: Option<String>,
-    /// What happens to a request for the live state of a camera that another process has: `redirect`, or `proxy`.
+    /// The response to a request for the live state of a camera that another process has: `redirect`, or `proxy`.
     pub camera_on_other_node: OtherNode,
     /// Seconds after which the live streams of a silent process go to another one with the same database.
     pub node_lease_s: u32,
@@ -65,7 +65,7 @@ pub struct Config {
     pub api_key: Option<Secret>,
     /// `text` or `json` lines in the log.
     pub log_format: LogFormat,
-    /// What is logged, as `tracing`'s env filter reads it.
+    /// The filter of log lines, in the syntax of `tracing`'s env filter.
     pub log_filter: String,
     /// Collector of OpenTelemetry traces (OTLP over gRPC), such as `http://localhost:4317`; needs the cargo feature
     /// `otel`.
@@ -83,11 +83,11 @@ pub struct Config {
     pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
     pub console: Console,
-    /// What an outside client may make large.
+    /// The limits of everything that an outside client can make large.
     pub limits: Limits,
 }
 
-/// What happens to a request for the live state of a camera that another process has.
+/// The response to a request for the live state of a camera that another process has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum OtherNode {
@@ -97,7 +97,7 @@ pub enum OtherNode {
     Proxy,
 }
 
-/// What a process does of the work that all processes with one database share.
+/// The role of a process among those that share one database.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NodeRole {
@@ -110,7 +110,7 @@ pub enum NodeRole {
 }
 
 impl NodeRole {
-    /// Whether it works on training runs and evaluations.
+    /// True if it works on training runs and evaluations.
     #[must_use]
     pub const fn works_on_jobs(self) -> bool {
         matches!(self, Self::Both | Self::Train)
@@ -126,7 +126,7 @@ impl NodeRole {
         }
     }
 
-    /// Whether it answers clients.
+    /// True if it answers clients.
     #[must_use]
     pub const fn answers_clients(self) -> bool {
         matches!(self, Self::Both | Self::Serve)
@@ -137,9 +137,9 @@ impl NodeRole {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
-    /// For people.
+    /// Lines for people.
     Text,
-    /// For machines.
+    /// JSON for machines.
     Json,
 }
 
@@ -214,13 +214,13 @@ pub struct Limits {
     pub refused_bytes_per_s: u32,
     /// Seconds that a request may take, its body included, until its answer begins.
     pub request_s: u64,
-    /// Open connections.
+    /// Number of open connections.
     pub connections: usize,
     /// Streams per HTTP/2 connection.
     pub streams_per_connection: u32,
     /// Requests worked on at a time; one counts from the end of its body to the start of its answer.
     pub requests: usize,
-    /// How many of `requests` are reserved for fusions.
+    /// Number of `requests` that are reserved for fusions.
     pub reserved_requests: usize,
     /// Requests per second of one client, which is a key, or an address without one; 0 is no limit.
     pub requests_per_s: u32,
@@ -320,7 +320,7 @@ pub struct Limits {
     pub samples_per_camera: u64,
     /// Days that samples are kept, by their times; 0 is without end.
     pub sample_days: u32,
-    /// What happens beyond `samples_per_camera`: `refuse`, or `delete_oldest`.
+    /// The rule beyond `samples_per_camera`: `refuse`, or `delete_oldest`.
     pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
     pub samples: u64,

@@ -1,6 +1,6 @@
-//! What may keep a server from working on this machine: a list of checks, each with its remedy.
+//! Checks of everything that may keep a server from working on this machine, each with its remedy.
 //!
-//! Never here: a repair, a change of settings, an older schema brought up to date.
+//! Does not repair, change settings, or migrate an older schema.
 
 mod database;
 mod folder;
@@ -40,16 +40,15 @@ impl CheckStatus {
     }
 }
 
-/// One check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Check {
-    /// What was looked at.
+    /// The object of the check.
     pub name: &'static str,
     /// How serious it is.
     pub status: CheckStatus,
-    /// What was found.
+    /// The finding, in words.
     pub finding: String,
-    /// What to do, unless nothing.
+    /// The remedy, unless none is needed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub remedy: Option<String>,
 }

@@ -3,7 +3,7 @@
 //! A request enters here once, whatever its transport: it gets its id, its span, its place among
 //! the requests at work and its deadline, then goes to `http` or `grpc` by its content type.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod activity;
@@ -148,7 +148,7 @@ impl Server {
         self.monitoring.as_ref()?.local_addr().ok()
     }
 
-    /// The application behind both transports.
+    /// The application that both transports use.
     #[must_use]
     pub fn app(&self) -> &App {
         &self.app
@@ -160,7 +160,7 @@ impl Server {
         Reloader { app: self.app.clone(), tls: self.tls.clone() }
     }
 
-    /// Whether it speaks TLS.
+    /// True if it speaks TLS.
     #[must_use]
     pub const fn has_tls(&self) -> bool {
         self.tls.is_some()

@@ -3,7 +3,7 @@
 /// Rounds of each side; the median of their ratios counts.
 const ROUNDS: usize = 7;
 
-/// What came of a comparison.
+/// The outcome of a comparison.
 pub(crate) struct Ratio {
     /// Median measure of ours and of the peer.
     pub(crate) ours: f64,

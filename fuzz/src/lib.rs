@@ -1,4 +1,4 @@
-//! What is fuzzed: one function per kind of input, over the public interface, with what must hold whatever
+//! Fuzzed functions: one per kind of input, over the public interface, with the properties that hold whatever
 //! the input is. The fuzz targets and the seeded test `tests/it/hostile.rs` share them.
 
 use std::io::Write as _;

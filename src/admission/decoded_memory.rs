@@ -1,4 +1,4 @@
-//! What messages come to in memory when they are decoded: charged where they are decoded, which knows nothing of the
+//! Memory of decoded messages: charged where they are decoded, by code that knows nothing of the
 //! request but that it is one.
 
 use std::cell::RefCell;

@@ -67,7 +67,7 @@ impl App {
         Ok(())
     }
 
-    /// What answers for a camera; looks into the store for one that another process has made.
+    /// The active camera of an id; looks into the store for one that another process has made.
     ///
     /// # Errors
     /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.

@@ -25,7 +25,7 @@ pub(super) struct PlaceCheck {
     swapped: u64,
     first_swapped: Option<Position>,
     kept: Vec<FootPosition>,
-    /// Every so many fixes one is kept.
+    /// One fix in this number of fixes is kept.
     stride: u64,
 }
 
@@ -73,7 +73,7 @@ impl PlaceCheck {
         }
     }
 
-    /// What is wrong with the import as a whole, with the remedy.
+    /// Returns the faults of the import as a whole, each with its remedy.
     pub(super) fn warnings(&self) -> Vec<String> {
         const REMEDY: &str =
             "swap the two columns and import the rows again with on_conflict=replace (--replace)";

@@ -105,7 +105,7 @@ pub(super) struct Pair {
 /// Matching of boxes that have only a tracker's ids with fixes that have only receivers'
 #[derive(Args)]
 struct MatchFlags {
-    /// Find out whose boxes show whose receivers: boxes need only a tracker's ids. Sure samples get the
+    /// Match boxes with receivers: boxes need only a tracker's ids. Sure samples get the
     /// receiver's id as target_id, and the columns tracker_id and match_probability
     #[arg(long = "match", conflicts_with_all = ["receivers", "estimate_offset"])]
     matches: bool,

@@ -84,7 +84,7 @@ impl Serve {
             } else if self.demo && !has_tls && app.access.is_open() {
                 tokio::spawn(async move {
                     if let Err(error) = demo::walk(address, Clock::system().now()).await {
-                        tracing::error!(%error, "the demonstration does not move");
+                        tracing::error!(%error, "the targets of the demonstration do not move");
                     }
                 });
             }
@@ -158,7 +158,7 @@ impl SettingsSource {
         let settings = Config::load(self.file.as_deref(), self.overrides.clone());
         match settings.and_then(|settings| log.set_filter(&settings.log_filter)) {
             Ok(()) => {}
-            Err(error) => tracing::error!(error = format!("{error:#}"), "the log's filter stays"),
+            Err(error) => tracing::error!(error = format!("{error:#}"), "the log filter is unchanged"),
         }
     }
 }

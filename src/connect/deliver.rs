@@ -19,12 +19,12 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// The publisher of the same process begins beside the delivery.
 const PUBLISHER_WAIT: Duration = Duration::from_secs(1);
 
-/// What an attempt leaves for the next one.
+/// The results of an attempt that the next one needs.
 #[derive(Default)]
 pub(super) struct Attempt {
-    /// Whether a message was taken or delivered.
+    /// True once a message was taken or delivered.
     pub(super) progressed: AtomicBool,
-    /// How long the peer asks to be left alone.
+    /// The pause that the peer asks for.
     pub(super) retry_after: OnceLock<Duration>,
 }
 

@@ -1,4 +1,4 @@
-//! What a sink is.
+//! The interface of a sink.
 
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ pub(super) trait Sink: Send {
         outcomes: &'a mut Outcomes,
     ) -> BoxFuture<'a, Result<(), PeerError>>;
 
-    /// How long the receiver asks to be left alone, after a delivery has failed.
+    /// The pause that the receiver asks for after a delivery has failed.
     fn retry_after(&self) -> Option<Duration> {
         None
     }

@@ -1,4 +1,4 @@
-//! What a source is.
+//! The interface of a source.
 
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
@@ -37,7 +37,7 @@ pub(super) trait Source: Send {
     }
 }
 
-/// What became of a message.
+/// The outcome of a message.
 pub(super) struct Settled {
     pub(super) receipt: u64,
     /// `Ok` when all is stored that was to be stored of it, else why it cannot be read.
@@ -48,6 +48,6 @@ pub(super) struct Settled {
 pub(super) struct SourceIdentity {
     /// Name of the client, the same at every attempt.
     pub(super) client_id: String,
-    /// Whether the peer keeps what is not acknowledged while the source is away.
+    /// True if the peer keeps what is not acknowledged while the source is away.
     pub(super) is_lasting: bool,
 }

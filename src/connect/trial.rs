@@ -20,12 +20,12 @@ const WATCH_EVERY: Duration = Duration::from_millis(100);
 /// The target of test messages.
 const TEST_TARGET: &str = "sightfix-test";
 
-/// What came of trying a connection.
+/// The outcome of a trial of a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Trial {
     /// The message, with what was read from it; `None` if none came in time.
     pub message: Option<LastMessage>,
-    /// What failed.
+    /// The error that ended the trial.
     pub error: Option<String>,
 }
 

@@ -42,7 +42,7 @@ pub(super) struct Webhook {
     signing_key: Option<Vec<u8>>,
     media_type: &'static str,
     clock: Clock,
-    /// What the receiver asked for when it took no message.
+    /// The pause that the latest answer asks for.
     retry_after: Option<Duration>,
     _connection: AbortOnDropHandle<()>,
 }

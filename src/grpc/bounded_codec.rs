@@ -12,7 +12,7 @@ use crate::admission::DecodedMemory;
 
 /// Shorter messages are decoded at once: what they come to is within what a request counts as (16 KiB), or not much more.
 const SHORT_BYTES: usize = 512;
-/// What the elements of a message may come to in memory, for each of its bytes, bytes.
+/// The largest memory of the elements of a message, for each of its bytes, bytes.
 const MEMORY_PER_BYTE: usize = 8;
 /// The same whatever its length: a batch of a thousand short observations.
 const FREE_MEMORY_BYTES: usize = 512 * 1024;

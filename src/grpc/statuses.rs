@@ -25,7 +25,7 @@ const LONGEST_TEXT: usize = 400;
 /// The same for each text about a field at fault.
 const LONGEST_VIOLATION_TEXT: usize = 160;
 
-/// What a unary method gives.
+/// The result of a unary method.
 pub(super) type Reply<T> = std::result::Result<tonic::Response<T>, Status>;
 
 /// Answers a unary request by a use case, which gets the application on behalf of the caller.

@@ -99,7 +99,7 @@ impl StreamSession {
             error = stream.ended() => Err(error),
             () = self.shutdown.forced() => Err(ending()),
         };
-        // What is settled is acknowledged even where the rest could not be.
+        // Settled items are acknowledged even where the rest could not be.
         if let Ok(Some(acknowledgement)) = stream.acknowledgement() {
             self.outbox.acknowledge(acknowledgement.into());
         }
@@ -264,7 +264,7 @@ impl StreamSession {
         match answered {
             Ok(item) => Ok(answer_of(seq, item)),
             Err(Error::Refused(refusal)) if !ends_stream(refusal.kind) => {
-                // What was recorded before the refusal is acknowledged with its commit.
+                // Items recorded before the refusal are acknowledged with their commit.
                 stream.acknowledgement()?;
                 stream.ack_refused(seq);
                 Ok(refused(seq, &Error::Refused(refusal)))
@@ -274,7 +274,7 @@ impl StreamSession {
     }
 }
 
-/// Whether a refusal is of the whole stream, not of an item.
+/// True if a refusal is of the whole stream, not of an item.
 const fn ends_stream(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::CameraNotFound | ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }

@@ -64,7 +64,7 @@ impl TrackService for Tracks {
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let camera = camera_id(&asked.camera_id)?;
-            // What is no id of ours names no event that is known.
+            // A text that is no id of ours names no known event.
             let after = Some(asked.resume_after.as_str())
                 .filter(|text| !text.is_empty())
                 .map(|text| text.parse().unwrap_or(EventId::UNKNOWN));

@@ -1,4 +1,4 @@
-//! What every matched route asks of a request: that its caller may use it, and that its query names parameters
+//! The checks of every matched route: its caller may use it, and its query names parameters
 //! of the operation only.
 
 use std::collections::{HashMap, HashSet};
@@ -91,7 +91,7 @@ impl<S> Layer<S> for AuthorizeLayer {
     }
 }
 
-/// A route behind an [`AuthorizeLayer`]. A service and not a function: that would cost every request two more
+/// A route with an [`AuthorizeLayer`]. A service and not a function: that would cost every request two more
 /// boxes.
 #[derive(Clone)]
 pub(super) struct Authorize<S> {

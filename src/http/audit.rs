@@ -40,14 +40,14 @@ struct AuditEntry {
     /// Id of the request, as in the server's log.
     #[serde(skip_serializing_if = "Option::is_none")]
     request_id: Option<String>,
-    /// What was done.
+    /// The kind of change.
     #[schema(example = "camera-deleted")]
     action: &'static str,
     /// The camera that it was done to or for. It may have been deleted since.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(example = "north-gate")]
     camera_id: Option<String>,
-    /// What exactly: id of a run, version of a model, name of a key.
+    /// The object of the change: id of a run, version of a model, name of a key.
     #[serde(skip_serializing_if = "Option::is_none")]
     subject: Option<String>,
 }
@@ -71,7 +71,7 @@ impl From<domain::AuditEntry> for AuditEntry {
 /// A page of the audit log, newest first.
 #[derive(Serialize, ToSchema)]
 struct AuditPage {
-    /// Entries.
+    /// A page of entries.
     items: Vec<AuditEntry>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -2,8 +2,8 @@
 //!
 //! A body is decoded as it is read, so its reader applies the limit: of one that decodes to more,
 //! no more than the limit is ever held. How much is decoded at most follows from how much has come, and other
-//! requests have their turn in between. Never here: a body decoded at once or before its sender may use
-//! the route, an event stream or what is compressed already compressed.
+//! requests have their turn in between. A body is not decoded at once, nor before its sender may use the route.
+//! Event streams and compressed content are not compressed.
 
 use std::convert::Infallible;
 use std::io;
@@ -42,17 +42,17 @@ const TURN_BYTES: u64 = 64 * 1024;
 /// Bytes that a coded byte may decode to. NDJSON of a target that stands still, with the same box and fix in every row, comes
 /// to 76 by gzip and to 217 by zstd at its best; zeros come to 1,030 and to more than 20,000.
 const MOST_RATIO: u64 = 256;
-/// What a body may decode to besides, whatever its length.
+/// Bytes that a body may decode to in addition, whatever its length.
 const FREE_BYTES: u64 = 1024 * 1024;
-/// What a member of gzip, or a frame of zstd, counts as if it had decoded to that much: it needs a decoder of its own.
+/// Decoded bytes that each member of gzip, or frame of zstd, counts as: it needs a decoder of its own.
 const MEMBER_BYTES: u64 = 64 * 1024;
 
-/// The most that so many coded bytes decode to.
+/// The largest number of bytes that `coded_bytes` bytes decode to.
 const fn most_decoded_bytes(coded_bytes: u64) -> u64 {
     coded_bytes.saturating_mul(MOST_RATIO).saturating_add(FREE_BYTES)
 }
 
-/// What a client accepts of the codings of a response.
+/// The codings of a response that a client accepts.
 pub(super) struct AcceptedCoding(Vec<HeaderValue>);
 
 impl AcceptedCoding {
@@ -174,7 +174,7 @@ impl Member {
         }
     }
 
-    /// The member behind this one; `None` at the end of the body.
+    /// The next member; `None` at the end of the body.
     async fn next(self) -> io::Result<Option<Self>> {
         let (coding, mut coded) = match self {
             Self::Gzip(decoder) => (Coding::Gzip, decoder.into_inner()),

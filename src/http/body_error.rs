@@ -8,7 +8,7 @@ use crate::domain::{Error, ErrorKind};
 /// Why a body ends early.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum BodyError {
-    /// It broke off, or was refused where requests are admitted, which is known and reported there.
+    /// It is incomplete, or was refused where requests are admitted, which is known and reported there.
     Broken,
     /// It is not of its coding.
     Undecodable,
@@ -29,7 +29,7 @@ impl BodyError {
         Self::Broken
     }
 
-    /// What its sender is told.
+    /// The refusal that the sender receives.
     pub(super) fn refusal(self) -> Error {
         let kind = match self {
             Self::Broken => ErrorKind::Cancelled,
@@ -43,7 +43,7 @@ impl BodyError {
 impl fmt::Display for BodyError {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
-            Self::Broken => "the body broke off",
+            Self::Broken => "the body is incomplete",
             Self::Undecodable => "the body is not of its content-encoding, or is cut off",
             Self::TooDense => {
                 "the body decodes to more than its length allows (docs/reference/limits.md); send it without \

@@ -50,10 +50,10 @@ struct CameraStatus {
 /// The latest training run of a camera.
 #[derive(Serialize, ToSchema)]
 struct LatestRun {
-    /// Its id.
+    /// The run's id.
     #[schema(format = "uuid")]
     id: String,
-    /// Its state.
+    /// State of the run.
     state: JobState,
 }
 
@@ -98,7 +98,7 @@ impl CameraStatus {
 /// A page of statuses, by camera id.
 #[derive(Serialize, ToSchema)]
 struct CameraStatusPage {
-    /// Statuses.
+    /// A page of statuses.
     items: Vec<CameraStatus>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

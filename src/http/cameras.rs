@@ -34,10 +34,10 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 #[derive(Clone, Copy, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ImageSize {
-    /// Columns.
+    /// Number of columns.
     #[schema(minimum = 1, maximum = 131_072, example = 1920)]
     width_px: u32,
-    /// Rows.
+    /// Number of rows.
     #[schema(minimum = 1, maximum = 131_072, example = 1080)]
     height_px: u32,
 }
@@ -110,11 +110,11 @@ struct CameraDraft {
     #[serde(default)]
     #[schema(max_items = 1_024)]
     receivers: Vec<Receiver>,
-    /// Whether a training run is started by itself once the camera is found to have moved.
+    /// True if a training run starts automatically once the camera is found to have moved.
     #[serde(default)]
     retrain_when_moved: bool,
-    /// Whether the camera, while it has no model, records boxes of trackers and fixes of receivers, and is trained on those
-    /// that belong together beyond doubt (`GET .../learning`); true if left out.
+    /// True if the camera, while it has no model, records boxes of trackers and fixes of receivers, and is trained on
+    /// those that certainly belong together (`GET .../learning`); true if left out.
     learn_automatically: Option<bool>,
     /// The site whose world tracks the camera contributes to; it must exist.
     #[schema(example = "harbour")]
@@ -176,9 +176,9 @@ struct CameraChange {
     /// New receivers, all of them; null is none.
     #[schema(max_items = 1_024)]
     receivers: Option<Vec<Receiver>>,
-    /// Whether to start a training run once the camera is found to have moved; null is not to.
+    /// True to start a training run once the camera is found to have moved; null for false.
     retrain_when_moved: Option<bool>,
-    /// Whether to record and learn while there is no model; null is to.
+    /// True to record and learn while there is no model; null for true.
     learn_automatically: Option<bool>,
     /// New site; null removes the camera from its site.
     site: Option<String>,
@@ -215,9 +215,10 @@ pub(super) struct Camera {
     labels: BTreeMap<String, String>,
     /// Whose the GNSS receivers are, and how far their clocks are off, by receiver id.
     receivers: Vec<Receiver>,
-    /// Whether a training run is started by itself once the camera is found to have moved.
+    /// True if a training run starts automatically once the camera is found to have moved.
     retrain_when_moved: bool,
-    /// Whether the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on them.
+    /// True if the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on
+    /// them.
     learn_automatically: bool,
     /// The site whose world tracks the camera contributes to, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -241,9 +242,9 @@ pub(super) struct Camera {
     moved: Option<CameraMoved>,
     /// Number of stored samples.
     samples: u64,
-    /// Of these, those without a fix.
+    /// Number of these samples without a fix.
     samples_without_fix: u64,
-    /// What is lost by what was left out.
+    /// Consequences of fields that were left out.
     warnings: Vec<String>,
 }
 
@@ -315,7 +316,7 @@ impl From<&domain::CameraMoved> for CameraMoved {
 /// A page of cameras, by id.
 #[derive(Serialize, ToSchema)]
 struct CameraPage {
-    /// Cameras.
+    /// A page of cameras.
     items: Vec<Camera>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

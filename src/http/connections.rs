@@ -50,7 +50,7 @@ struct ConnectionChange {
     /// New name; null is the id.
     #[schema(max_length = 200)]
     display_name: Option<String>,
-    /// Whether it stays at rest.
+    /// True if the connection stays paused.
     paused: Option<bool>,
     /// Changes to the source.
     source: Option<SourceSettings>,
@@ -96,7 +96,7 @@ struct LastMessage {
     subject: String,
     /// Its first 4 KiB.
     text: String,
-    /// What it says: its items, what was skipped and why, or why it cannot be read.
+    /// Its items, what was skipped and why, or why it cannot be read.
     reading: Vec<String>,
 }
 
@@ -112,7 +112,7 @@ impl From<crate::app::LastMessage> for LastMessage {
 struct CountedReason {
     /// The reason, of the latest of them.
     reason: String,
-    /// How many there were; reasons that differ in numbers alone are one.
+    /// Number of messages or parts; reasons that differ in numbers alone are one.
     count: u64,
     /// The latest of them: an item in words, or the beginning of a message.
     example: String,
@@ -128,13 +128,13 @@ impl From<crate::app::CountedReason> for CountedReason {
     }
 }
 
-/// What failed.
+/// The latest error of a connection.
 #[derive(Serialize, ToSchema)]
 struct LastError {
-    /// When.
+    /// The time of the error.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
-    /// What.
+    /// The error's text.
     message: String,
 }
 
@@ -148,19 +148,19 @@ struct ConnectionNode {
     url: Option<String>,
 }
 
-/// What a connection does, since the server was started; counts are those of all nodes.
+/// The status of a connection since the server was started; counts are those of all nodes.
 #[derive(Serialize, ToSchema)]
 struct ConnectionStatus {
-    /// State.
+    /// State of the connection.
     state: State,
     /// The node that runs it, where several share a database; missing while none does.
     #[serde(skip_serializing_if = "Option::is_none")]
     node: Option<ConnectionNode>,
-    /// Since when.
+    /// The time of the latest change of the state.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     since: Option<Timestamp>,
-    /// What failed last.
+    /// The latest error.
     #[serde(skip_serializing_if = "Option::is_none")]
     last_error: Option<LastError>,
     /// The last message.
@@ -209,7 +209,7 @@ struct Connection {
     id: String,
     /// The name for people.
     display_name: String,
-    /// Whether it stays at rest.
+    /// True if the connection stays paused.
     paused: bool,
     /// Takes detections or fixes in.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -227,7 +227,7 @@ struct Connection {
     /// When it was changed last.
     #[schema(value_type = String, format = DateTime)]
     updated_at: Timestamp,
-    /// What it does; not part of the entity tag's revision.
+    /// The status of the connection; not part of the entity tag's revision.
     #[serde(skip_serializing_if = "Option::is_none")]
     status: Option<ConnectionStatus>,
 }
@@ -282,20 +282,20 @@ impl Connection {
 /// A page of connections, by id.
 #[derive(Serialize, ToSchema)]
 struct ConnectionPage {
-    /// Connections.
+    /// A page of connections.
     items: Vec<Connection>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
     next_cursor: Option<String>,
 }
 
-/// What came of trying a connection.
+/// The outcome of a trial of a connection.
 #[derive(Serialize, ToSchema)]
 struct Trial {
     /// The message with its reading; missing if none came, or nothing could be sent.
     #[serde(skip_serializing_if = "Option::is_none")]
     message: Option<LastMessage>,
-    /// What failed.
+    /// The error that ended the trial.
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
 }
@@ -303,13 +303,13 @@ struct Trial {
 /// A message that is not tried any more.
 #[derive(Serialize, ToSchema)]
 struct DeadLetter {
-    /// Its number.
+    /// Number of the dead letter.
     number: i64,
     /// Its id, as the receiver saw it.
     id: String,
     /// Where it was to go at the receiver.
     subject: String,
-    /// Its content.
+    /// Content of the message.
     text: String,
     /// When it was made.
     #[schema(value_type = String, format = DateTime)]
@@ -321,17 +321,17 @@ struct DeadLetter {
 /// A page of dead letters, oldest first.
 #[derive(Serialize, ToSchema)]
 struct DeadLetterPage {
-    /// Dead letters.
+    /// A page of dead letters.
     items: Vec<DeadLetter>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
     next_cursor: Option<String>,
 }
 
-/// How many dead letters were changed.
+/// Number of dead letters that were changed.
 #[derive(Serialize, ToSchema)]
 struct DeadLetterCount {
-    /// Their number.
+    /// Number of dead letters.
     dead_letters: u64,
 }
 

@@ -1,4 +1,4 @@
-//! What the OpenAPI description says of the interface as a whole, and of every operation alike.
+//! The parts of the OpenAPI description that concern the interface as a whole, and every operation alike.
 
 use std::collections::BTreeMap;
 
@@ -30,7 +30,7 @@ const TAGS: [(&str, &str); 13] = [
     ("connections", "Other systems that give detections and fixes, or take positions"),
     ("evaluations", "Methods side by side on stored samples, against the truth"),
     ("access", "Keys that clients present, and sessions of browsers"),
-    ("service", "What watches the server"),
+    ("service", "Health and metrics of the server"),
 ];
 
 /// Refusals that any operation may meet.

@@ -9,7 +9,7 @@ use hyper::{HeaderMap, StatusCode};
 
 use crate::domain::{Error, ErrorKind, ExpectedVersion, Result, Revision};
 
-/// What a change that needs `If-Match` is based on; `None` for `*`, whatever is there.
+/// Reads the version that a change is based on from the required `If-Match`; `None` for `*`, any version.
 ///
 /// # Errors
 /// `RevisionRequired` without the header; `RevisionMismatch` for what this server never gave.

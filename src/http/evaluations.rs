@@ -27,7 +27,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(cancel_evaluation))
 }
 
-/// A stretch of time; an end that is left out is open.
+/// An interval of time; an end that is left out is open.
 #[derive(Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct TimeRange {
@@ -55,11 +55,11 @@ impl From<domain::TimeRange> for TimeRange {
     }
 }
 
-/// What to evaluate.
+/// The parameters of an evaluation.
 #[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct EvaluationDraft {
-    /// Whose samples.
+    /// The camera whose samples are used.
     camera_id: String,
     /// The samples to learn from. Given together with `test`, or not at all.
     train: Option<TimeRange>,
@@ -150,7 +150,7 @@ struct Evaluation {
     /// A UUID of version 7.
     #[schema(format = "uuid")]
     id: String,
-    /// Whose samples.
+    /// The camera whose samples are used.
     camera_id: String,
     /// The samples to learn from.
     train: TimeRange,
@@ -162,7 +162,7 @@ struct Evaluation {
     /// The target walked on this line.
     #[serde(skip_serializing_if = "Option::is_none")]
     truth_line: Option<Vec<[f64; 2]>>,
-    /// What is compared.
+    /// The methods that are compared.
     methods: Vec<String>,
     /// The recipe that tracks stand on.
     recipe: Recipe,
@@ -173,7 +173,7 @@ struct Evaluation {
     /// Standard deviation per axis of the receiver, if known.
     #[serde(skip_serializing_if = "Option::is_none")]
     gnss_sigma_m: Option<f64>,
-    /// Its state.
+    /// State of the evaluation.
     state: JobState,
     /// How far it has come.
     progress: EvaluationProgress,
@@ -194,7 +194,7 @@ struct Evaluation {
     #[schema(value_type = Option<String>, format = DateTime)]
     ended_at: Option<Timestamp>,
     /// Once it has succeeded: the figures, as in the document of `sightfix evaluate --json`, and the positions
-    /// behind them. Lists leave it out.
+    /// from which they are computed. Lists leave it out.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<ReportWithPositions>)]
     report: Option<Box<RawValue>>,
@@ -267,7 +267,7 @@ async fn start_evaluation(CallerApp(app): CallerApp, body: JsonBody) -> ApiResul
 #[utoipa::path(
     get, path = "/v1/evaluations", tag = "evaluations",
     params(
-        ("camera" = Option<String>, Query, description = "Of this camera alone"),
+        ("camera" = Option<String>, Query, description = "Only evaluations of this camera"),
         ("limit" = Option<u32>, Query, description = "Items on a page, 100 if left out"),
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page before"),
     ),

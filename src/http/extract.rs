@@ -1,4 +1,4 @@
-//! What handlers take from a request: path, parameters, JSON body, media types.
+//! Extractors of the handlers: path, parameters, JSON body, media types.
 
 use axum::extract::{FromRequest, FromRequestParts, Path, Query, Request};
 use bytes::Bytes;
@@ -367,7 +367,7 @@ impl JsonBody {
         wire::parse_document(&self.0)
     }
 
-    /// What was sent.
+    /// Returns the bytes that were sent.
     pub(super) fn bytes(&self) -> &[u8] {
         &self.0
     }

@@ -19,7 +19,7 @@ use crate::app::App;
 use crate::domain::{Error, Observation, Receivers, Result, convert_all};
 use crate::exchange::{Format, RowRules, read_observation_features, read_observations, wire, write_fused};
 
-/// What observations are read from, and positions written in.
+/// The formats from which observations are read, and in which positions are written.
 const FORMATS: [Format; 4] = [Format::Json, Format::Csv, Format::Ndjson, Format::GeoJson];
 /// Typical size of a fused position as JSON, to reserve memory.
 const ITEM_BYTES: usize = 800;
@@ -68,7 +68,7 @@ pub(super) enum FusionRequest {
 /// One answer per observation, in their order.
 #[derive(Serialize, ToSchema)]
 struct Fusions<'a> {
-    /// Positions.
+    /// The fused positions.
     items: Vec<wire::FusedFix<'a>>,
 }
 
@@ -134,7 +134,7 @@ fn observed_rows(app: &App, content: &[u8], format: Format, rules: &RowRules) ->
     if format == Format::GeoJson {
         return read_observation_features(content, rules);
     }
-    // One more than may be, so that what is too long is not read to its end.
+    // Reads at most limit + 1 observations, to detect an oversized batch.
     let rows = read_observations(content, format, rules)?.take(app.limits.batch_observations + 1);
     let rows = rows.collect::<Result<Vec<_>>>()?;
     app.check_batch(rows.len())?;

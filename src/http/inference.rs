@@ -60,41 +60,41 @@ impl<S: Send + Sync> axum::extract::FromRequestParts<S> for ModelName {
     }
 }
 
-/// What the server is.
+/// Name, version and extensions of the server.
 #[derive(Serialize, ToSchema)]
 struct ServerMetadata {
-    /// Its name.
+    /// Name of the server.
     name: &'static str,
-    /// Its version.
+    /// Version of the server.
     version: &'static str,
     /// Extensions of the protocol; there are none.
     extensions: [String; 0],
 }
 
-/// Whether the server is alive.
+/// States that the server is alive.
 #[derive(Serialize, ToSchema)]
 struct Live {
-    /// Whether it is.
+    /// True if the server is alive.
     live: bool,
 }
 
-/// Whether the server can take work.
+/// The readiness of the server.
 #[derive(Serialize, ToSchema)]
 struct Ready {
-    /// Whether it can.
+    /// True if the server is ready for requests.
     ready: bool,
 }
 
-/// Whether a model can take work.
+/// The readiness of a model.
 #[derive(Serialize, ToSchema)]
 struct ModelReady {
     /// The camera's id.
     name: String,
-    /// Whether it can.
+    /// True if the model is ready for requests.
     ready: bool,
 }
 
-/// What a model takes and gives.
+/// Inputs and outputs of a model.
 #[derive(Serialize, ToSchema)]
 struct InferenceModelMetadata {
     /// The camera's id.
@@ -103,16 +103,16 @@ struct InferenceModelMetadata {
     versions: Vec<String>,
     /// Framework of the model.
     platform: &'static str,
-    /// What it takes.
+    /// The input tensors.
     inputs: Vec<TensorMetadata>,
-    /// What it gives.
+    /// The output tensors.
     outputs: Vec<TensorMetadata>,
 }
 
-/// What is known of a tensor.
+/// Name, type and shape of a tensor.
 #[derive(Serialize, ToSchema)]
 struct TensorMetadata {
-    /// Its name.
+    /// Name of the tensor.
     name: &'static str,
     /// Type of its elements.
     datatype: &'static str,
@@ -163,13 +163,13 @@ struct InputTensor<'r> {
 struct TensorData {
     numbers: Vec<f64>,
     is_of_rows: bool,
-    /// How many there are, of which at most `most` are kept.
+    /// Number of elements; at most `most` are kept.
     count: usize,
     most: usize,
 }
 
 impl TensorData {
-    /// The elements of a tensor, of which those of at most so many boxes are kept.
+    /// The elements of a tensor; those of at most this number of boxes are kept.
     ///
     /// # Errors
     /// `InvalidArgument` naming the tensor's data.
@@ -269,7 +269,7 @@ impl<'de> Visitor<'de> for TensorItem<'_> {
 /// An output that is asked for.
 #[derive(Deserialize, ToSchema)]
 struct RequestedOutput {
-    /// Its name.
+    /// Name of the tensor.
     #[schema(example = "position_deg")]
     name: String,
     /// Parameters; none is used.
@@ -285,7 +285,7 @@ struct InferenceResponse {
     model_name: String,
     /// Number of the model version that answered.
     model_version: String,
-    /// The request's.
+    /// The id of the request, if it had one.
     #[serde(skip_serializing_if = "Option::is_none")]
     id: Option<String>,
     /// The output tensors.
@@ -295,9 +295,9 @@ struct InferenceResponse {
 /// An output tensor.
 #[derive(Serialize, ToSchema)]
 struct OutputData {
-    /// Its name.
+    /// Name of the tensor.
     name: &'static str,
-    /// Its extents.
+    /// Extents of the tensor.
     shape: [usize; 2],
     /// Type of its elements.
     datatype: &'static str,
@@ -316,7 +316,7 @@ async fn server_metadata() -> ApiResult {
     Ok(json(&metadata)?)
 }
 
-/// Whether the inference server is alive
+/// Check that the inference server is alive
 #[utoipa::path(
     get, path = "/v2/health/live", tag = "inference",
     responses((status = 200, description = "It is", body = Live))
@@ -325,7 +325,7 @@ async fn server_live() -> ApiResult {
     Ok(json(&Live { live: true })?)
 }
 
-/// Whether the inference server can take work
+/// Check that the inference server is ready
 #[utoipa::path(
     get, path = "/v2/health/ready", tag = "inference",
     responses(
@@ -379,7 +379,7 @@ async fn metadata(app: &App, model: ModelName) -> ApiResult {
     })?)
 }
 
-/// Whether a camera's active model can take work
+/// Check that a camera's active model is ready
 #[utoipa::path(
     get, path = "/v2/models/{camera}/ready", tag = "inference",
     params(("camera" = String, Path, description = "The camera's id")),
@@ -392,7 +392,7 @@ async fn model_ready(CallerApp(app): CallerApp, model: ModelName) -> ApiResult {
     ready(&app, model).await
 }
 
-/// Whether a model version can take work
+/// Check that a model version is ready
 #[utoipa::path(
     get, path = "/v2/models/{camera}/versions/{version}/ready", tag = "inference",
     params(("camera" = String, Path, description = "The camera's id"), ("version" = String, Path, description = "The version's number")),

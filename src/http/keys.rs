@@ -21,7 +21,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(create_key, list_keys)).routes(routes!(get_key, revoke_key))
 }
 
-/// What a key may do.
+/// The operations that a key allows.
 #[derive(Clone, Copy, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Role {
@@ -61,10 +61,10 @@ impl From<domain::Role> for Role {
 #[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct KeyDraft {
-    /// What it is for, for people.
+    /// The key's purpose, for people.
     #[schema(min_length = 1, max_length = 128, example = "camera box at the north gate")]
     name: String,
-    /// What it may do.
+    /// The role of the key.
     role: Role,
     /// The cameras that the role `edge` is restricted to; none for the other roles.
     #[serde(default)]
@@ -88,9 +88,9 @@ impl KeyDraft {
 pub(super) struct Key {
     /// Its id, which is no secret.
     id: String,
-    /// What it is for, for people.
+    /// The key's purpose, for people.
     name: String,
-    /// What it may do.
+    /// The role of the key.
     role: Role,
     /// The cameras that it is restricted to; empty for all.
     camera_ids: Vec<String>,
@@ -151,7 +151,7 @@ impl CreatedKey {
 /// A page of keys, newest first.
 #[derive(Serialize, ToSchema)]
 struct KeyPage {
-    /// Keys.
+    /// A page of keys.
     items: Vec<Key>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

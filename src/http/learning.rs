@@ -45,7 +45,7 @@ impl From<app::LearningState> for LearningState {
     }
 }
 
-/// What a camera has recorded to learn from, and what is missing.
+/// The recording that a camera learns from, and what is missing in it.
 #[derive(Serialize, ToSchema)]
 struct Learning {
     /// How far it has come.
@@ -78,7 +78,7 @@ struct LearningAttempt {
     /// When it ended.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
-    /// What came of it.
+    /// The outcome of the attempt.
     outcome: String,
 }
 
@@ -108,7 +108,7 @@ impl From<app::Learning> for Learning {
     get, path = "/v1/cameras/{camera}/learning", tag = "cameras",
     params(("camera" = String, Path, description = "The camera's id")),
     responses(
-        (status = 200, description = "What is recorded, and what is missing", body = Learning),
+        (status = 200, description = "The recording, and what is missing in it", body = Learning),
         (status = 404, description = "There is no such camera", body = Problem, content_type = "application/problem+json"),
     )
 )]

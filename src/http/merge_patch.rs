@@ -11,7 +11,7 @@ pub(super) type JsonObject = serde_json::Map<String, Value>;
 /// Times that a patch without a version is made of what was read.
 const ATTEMPTS: u32 = 8;
 
-/// What a resource becomes by a patch, as the JSON of its draft: its id and the fields that may be patched.
+/// Returns a patched resource as the JSON of its draft: its id and the fields that may be patched.
 ///
 /// # Errors
 /// `InvalidArgument` naming a field that cannot be changed.
@@ -46,7 +46,7 @@ fn merge(target: &mut JsonObject, patch: &JsonObject) {
     }
 }
 
-/// Makes a change of what was read, so another change in between would be undone: it is made again then, unless
+/// Makes a read-modify-write. If a concurrent update has changed the resource, it is made again, unless
 /// the client named a version.
 ///
 /// # Errors

@@ -1,14 +1,15 @@
 //! The REST transport over [`crate::app`]: routes, conversion of JSON, problems, OpenAPI.
 //!
-//! Route and description are declared together, a file per resource. Never here:
-//! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
-//! done by the constructors of [`crate::domain`]), a body without a limit.
+//! Route and description are declared together, a file per resource. Does not contain gRPC, SQL, statuses chosen by
+//! hand (they come from [`crate::status`]), checks on numbers (the constructors of [`crate::domain`] make them), or
+//! a body without a limit.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod access;
 mod audit;
+mod authority;
 mod body;
 mod body_coding;
 mod body_error;
@@ -80,7 +81,7 @@ use crate::telemetry::RequestId;
 
 pub use session::session_token;
 
-/// What the handlers share.
+/// The state that the handlers share.
 #[derive(Clone)]
 struct Rest {
     app: App,
@@ -110,6 +111,7 @@ impl Transport {
                 .route_layer(authorize)
                 .merge(page)
                 .merge(console_routes)
+                .merge(authority::routes())
                 .merge(openid::callback())
                 .with_state(rest),
         )
@@ -136,7 +138,7 @@ impl Transport {
     }
 }
 
-/// What the page of the description may do: run its own scripts and ask its own server, nothing else.
+/// The content security policy of the description's page: it runs its own scripts and asks its own server only.
 /// Swagger UI sets styles by attribute and shows images that it holds itself.
 const DESCRIPTION_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
      img-src 'self' data:; font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
@@ -174,7 +176,7 @@ async fn named(response: Response) -> Response {
 const LIBRARY_TITLE: &str = "<title>Swagger UI</title>";
 const TITLE: &str = "<title>sightfix: REST interface</title>";
 
-/// What a request is for, by its method and path.
+/// The class of a request, by its method and path.
 #[must_use]
 pub fn class(method: &Method, path: &str) -> RequestClass {
     let last = path.rsplit('/').next().unwrap_or_default();

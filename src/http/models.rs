@@ -36,7 +36,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 /// An immutable model of one camera.
 #[derive(Serialize, ToSchema)]
 struct ModelVersion {
-    /// Whose.
+    /// The camera of the model.
     camera_id: String,
     /// Counts from 1 per camera.
     number: u32,
@@ -49,7 +49,7 @@ struct ModelVersion {
     created_at: Timestamp,
     /// Size of the weights.
     weights_bytes: u64,
-    /// What it says of itself.
+    /// The version's own description.
     metadata: ModelMetadata,
 }
 
@@ -69,7 +69,7 @@ impl From<domain::ModelVersion> for ModelVersion {
 /// A page of model versions, newest first.
 #[derive(Serialize, ToSchema)]
 struct ModelPage {
-    /// Versions.
+    /// A page of versions.
     items: Vec<ModelVersion>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

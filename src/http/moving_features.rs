@@ -24,7 +24,7 @@ struct MovingFeature {
     /// `Feature`.
     #[schema(example = "Feature")]
     r#type: &'static str,
-    /// The target.
+    /// The target's id.
     id: String,
     /// The path, for readers that know GeoJSON alone.
     geometry: Path,
@@ -63,7 +63,7 @@ struct TemporalGeometry {
     /// `MovingPoint`.
     #[schema(example = "MovingPoint")]
     r#type: &'static str,
-    /// Instants.
+    /// The instants of the positions.
     #[schema(value_type = Vec<String>)]
     datetimes: Vec<Timestamp>,
     /// Longitudes and latitudes in degrees, WGS 84.
@@ -76,7 +76,7 @@ struct TemporalGeometry {
 /// Properties that change with time.
 #[derive(Serialize, ToSchema)]
 struct TemporalProperties {
-    /// Instants.
+    /// The instants of the values.
     #[schema(value_type = Vec<String>)]
     datetimes: Vec<Timestamp>,
     /// Radius about the position that holds the true one with 95 % probability.
@@ -102,7 +102,7 @@ struct Measure {
 /// Properties that do not change.
 #[derive(Serialize, ToSchema)]
 struct TargetProperties {
-    /// The target.
+    /// The target's id.
     target_id: String,
 }
 

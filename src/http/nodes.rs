@@ -28,7 +28,7 @@ struct Node {
     /// `both`, `serve` or `train`.
     #[schema(example = "serve")]
     role: String,
-    /// Its version.
+    /// The node's version of the program.
     #[schema(example = "0.1.0")]
     version: String,
     /// When it was started.
@@ -39,11 +39,11 @@ struct Node {
     seen_at: Timestamp,
     /// Seconds of silence after which another node takes its cameras over.
     lease_s: f64,
-    /// Whether it is shutting down.
+    /// True if the node is shutting down.
     is_draining: bool,
     /// Cameras whose live state it has.
     cameras: u64,
-    /// Whether it is the node that answers.
+    /// True if it is the node that answers.
     is_this: bool,
 }
 

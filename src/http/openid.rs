@@ -39,7 +39,7 @@ pub(super) fn callback() -> Router<Rest> {
 /// How browsers sign in here.
 #[derive(Serialize, ToSchema)]
 struct SignInMethods {
-    /// Whether `/v1/session/openid` leads to a provider where people sign in.
+    /// True if `/v1/session/openid` leads to a provider where people sign in.
     openid: bool,
 }
 

@@ -50,31 +50,31 @@ struct PairingParts {
     fixes: Vec<u8>,
 }
 
-/// What became of an import in two parts.
+/// The result of an import in two parts.
 #[derive(Serialize, ToSchema)]
 struct PairedSamples {
     /// Samples stored now.
     accepted: u64,
-    /// Of the accepted ones, those without a fix.
+    /// Number of accepted samples without a fix.
     accepted_without_fix: u64,
     /// Samples of which the same camera, target and time were stored before.
     duplicate: u64,
-    /// Of the accepted ones, those that replaced a stored sample (`on_conflict=replace`).
+    /// Number of accepted samples that replaced a stored sample (`on_conflict=replace`).
     replaced: u64,
     /// Rows of both parts that are none.
     rejected: u64,
     /// The first 100 of these in each part.
     rejected_rows: Vec<RejectedPartRow>,
-    /// What the accepted samples are safe from.
+    /// The guarantee for the accepted samples.
     durability: Durability,
-    /// What seems to be wrong with the samples as a whole, with its remedy; they are stored all the same.
+    /// Probable faults of the samples as a whole, each with its remedy; they are stored all the same.
     warnings: Vec<String>,
-    /// What became of the other rows.
+    /// The counts of the other rows.
     pairing: Pairing,
     /// Whose the fixes are that name no receiver, if there are any and somebody claims them.
     #[serde(skip_serializing_if = "Option::is_none")]
     unnamed_fixes_of: Option<Receiver>,
-    /// What was matched, if that was asked for.
+    /// The report of the match, if one was requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     matching: Option<Matching>,
     /// Clock offsets of the receivers as the files show them, if that was asked for.
@@ -85,7 +85,7 @@ struct PairedSamples {
 /// Boxes matched with receivers. The samples of a match have the receiver's id as target id.
 #[derive(Serialize, ToSchema)]
 struct Matching {
-    /// Tracklets: stretches of boxes of one tracker's id.
+    /// Tracklets: segments of boxes of one tracker's id.
     tracklets: usize,
     /// Receivers with fixes.
     receivers: usize,
@@ -130,18 +130,18 @@ struct RejectedPartRow {
     line: u64,
     /// Column, or path of the field; empty if the row as a whole is at fault.
     field: String,
-    /// What is wrong and what would be right.
+    /// States the fault and the valid values.
     reason: String,
 }
 
-/// What became of the rows that could be read.
+/// Counts of the rows that could be read.
 #[derive(Serialize, ToSchema)]
 struct Pairing {
-    /// Boxes.
+    /// Number of boxes read.
     detections: u64,
-    /// Fixes.
+    /// Number of fixes read.
     fixes: u64,
-    /// Samples made.
+    /// Number of samples made.
     paired: u64,
     /// Boxes that became no sample.
     unpaired_detections: UnpairedDetections,
@@ -178,7 +178,7 @@ struct UnusedFixes {
 /// The clock offset of one receiver, estimated from the files.
 #[derive(Serialize, ToSchema)]
 struct ClockOffsetEstimate {
-    /// The receiver.
+    /// The receiver's id.
     receiver_id: String,
     /// The target that carries it.
     target_id: String,
@@ -229,9 +229,9 @@ struct ClockOffsetEstimate {
         ("min_probability" = Option<f64>, Query, description = "With `match`, leave out samples whose match is less probable, 0.9 if left out; 0.5 to 1"),
         ("clock_window_s" = Option<f64>, Query, description = "With `match`, the receivers' clocks are off by at most this, 0 if left out; 0 to 30"),
         ("durability" = inline(Option<Durability>), Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
-        ("on_conflict" = inline(Option<OnConflict>), Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
+        ("on_conflict" = inline(Option<OnConflict>), Query, description = "The rule for a sample that is stored already: `keep` (if left out) counts the new one as a duplicate, `replace` stores the new one instead"),
         ("columns" = Option<String>, Query, description = "The columns of CSV parts: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` (such as `time:Timestamp,left:x1`) names them; other columns are ignored"),
-        ("box_form" = inline(Option<BoxForm>), Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV part hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
+        ("box_form" = inline(Option<BoxForm>), Query, description = "The meaning of the columns `left`, `top`, `width`, `height` of a CSV part: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
         ("box_unit" = inline(Option<BoxUnit>), Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
         ("timezone" = Option<String>, Query, description = "The IANA time zone (such as `Europe/Berlin`) whose local times are the times of a CSV file without an offset; such times are refused if left out"),
         ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters: an import that is sent again under the same key gets the answer of the first; for a day"),
@@ -239,7 +239,7 @@ struct ClockOffsetEstimate {
     ),
     request_body(content = PairingParts, content_type = "multipart/form-data"),
     responses(
-        (status = 200, description = "What became of the rows", body = PairedSamples),
+        (status = 200, description = "The counts of the rows", body = PairedSamples),
         (status = 422, description = "A parameter cannot be used, or, with `match`, nobody can tell whose fixes belong to whose boxes", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
     )

@@ -3,7 +3,7 @@
 //! The whole body is spooled first, under the same limits and timeouts as any import; then each part
 //! is spooled by itself. multer, the library beneath, has constraints on sizes of the whole body and of fields,
 //! but none on the head of a part, which it gathers in memory; so chunks are handed to it one by one, and those
-//! without a part are counted here. Never here: a part held in memory beyond the spool's limit.
+//! without a part are counted here. A part in memory never exceeds the spool's limit.
 
 use std::collections::VecDeque;
 use std::io;
@@ -27,12 +27,11 @@ use crate::domain::{Error, ErrorKind, Result};
 
 /// Read at once while the body is split into its parts.
 const CHUNK_BYTES: usize = 32 * 1024;
-/// What may come between two parts: a boundary and a few headers.
+/// The largest head between two parts: a boundary and a few headers.
 const LONGEST_HEAD_BYTES: usize = 8 * CHUNK_BYTES;
 
 /// A part of a body.
 pub(super) struct BodyPart {
-    /// Its content.
     pub(super) content: Spooled,
     /// Its announced type, if any.
     pub(super) media_type: Option<String>,

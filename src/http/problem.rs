@@ -32,7 +32,7 @@ const FEATURES: &str = "/ogc";
 #[derive(Clone)]
 pub(super) struct ApiError(Arc<Error>);
 
-/// What a handler gives.
+/// The result of a handler.
 pub(super) type ApiResult<T = Response> = std::result::Result<T, ApiError>;
 
 impl From<Error> for ApiError {
@@ -49,7 +49,7 @@ impl IntoResponse for ApiError {
     }
 }
 
-/// What is wrong, by RFC 9457.
+/// A refusal or a fault, by RFC 9457.
 #[derive(Serialize, ToSchema)]
 pub(super) struct Problem<'a> {
     /// Stable name of the kind of problem.
@@ -89,7 +89,7 @@ struct Violation<'a> {
     /// Path of the field in the body, or name of the parameter.
     #[schema(value_type = String, example = "observations[3].bounding_box.width_px")]
     field: &'a str,
-    /// What is wrong and what would be right.
+    /// States the fault and the valid values.
     #[schema(value_type = String)]
     message: &'a str,
 }
@@ -138,7 +138,7 @@ pub(super) fn response(error: &Error, id: &RequestId, instance: Option<&str>) ->
     response
 }
 
-/// What the problem of a request says of it, should it be refused.
+/// The facts about a request that its problem states, should it be refused.
 pub(super) struct Refused {
     id: Option<RequestId>,
     uri: Uri,
@@ -216,7 +216,7 @@ pub(super) fn no_route() -> Error {
     Error::refused(ErrorKind::RouteNotFound, "there is no such path; /docs lists them")
 }
 
-/// What is answered when a handler panics.
+/// The response when a handler panics.
 pub(super) fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
     let message = panic.downcast_ref::<String>().cloned();
     let message = message.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()));

@@ -34,24 +34,24 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(count_samples))
 }
 
-/// What became of an import's rows.
+/// The counts of an import's rows.
 #[derive(Serialize, ToSchema)]
 pub(super) struct Imported {
-    /// Stored now.
+    /// Number of samples stored now.
     accepted: u64,
-    /// Of the accepted ones, those without a fix.
+    /// Number of accepted samples without a fix.
     accepted_without_fix: u64,
     /// The same camera, target and time were stored before, or appear twice in the import.
     duplicate: u64,
-    /// Of the accepted ones, those that replaced a stored sample (`on_conflict=replace`).
+    /// Number of accepted samples that replaced a stored sample (`on_conflict=replace`).
     replaced: u64,
     /// Not stored for a fault of their own.
     rejected: u64,
     /// The first 100 of these.
     rejected_rows: Vec<RejectedRow>,
-    /// What the accepted rows are safe from.
+    /// The guarantee for the accepted rows.
     durability: Durability,
-    /// What seems to be wrong with the rows as a whole, with its remedy, such as latitude and longitude swapped. The rows
+    /// Probable faults of the rows as a whole, each with its remedy, such as latitude and longitude swapped. The rows
     /// are stored all the same.
     warnings: Vec<String>,
 }
@@ -64,7 +64,7 @@ pub(super) struct RejectedRow {
     /// Column, or path of the field; empty if the row as a whole is at fault.
     #[schema(example = "latitude")]
     field: String,
-    /// What is wrong and what would be right.
+    /// States the fault and the valid values.
     reason: String,
 }
 
@@ -96,26 +96,26 @@ impl Imported {
 /// A page of samples, by time and target.
 #[derive(Serialize, ToSchema)]
 struct SamplePage<'a> {
-    /// Samples.
+    /// A page of samples.
     items: Vec<wire::Sample<'a>>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
     next_cursor: Option<String>,
 }
 
-/// How many samples there are.
+/// The count of samples.
 #[derive(Serialize, ToSchema)]
 struct SampleCount {
-    /// Their number.
+    /// Number of samples.
     count: u64,
-    /// Of these, those without a fix.
+    /// Number of these samples without a fix.
     without_fix: u64,
 }
 
-/// How many samples were deleted.
+/// The count of deleted samples.
 #[derive(Serialize, ToSchema)]
 struct DeletedSamples {
-    /// Their number.
+    /// Number of samples deleted.
     deleted: u64,
 }
 
@@ -130,7 +130,7 @@ struct DeletedSamples {
 /// fix. Training uses its box for the geometry of the camera. One of the two alone is rejected.
 ///
 /// One bad row never loses the others. Samples that are stored already are counted, not stored again, so an
-/// import that broke off can be sent again as it is; but a sample with a fix replaces one without.
+/// interrupted import can be sent again as it is; but a sample with a fix replaces one without.
 /// With `on_conflict=replace`, which is for operators, each sample replaces the stored one.
 ///
 /// With `columns`, `box_form` or `box_unit` a CSV file may have any separator, decimal commas, Unix times and
@@ -140,9 +140,9 @@ struct DeletedSamples {
     params(
         ("camera" = String, Path, description = "The camera's id"),
         ("durability" = inline(Option<Durability>), Query, description = "When the rows are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
-        ("on_conflict" = inline(Option<OnConflict>), Query, description = "What becomes of a sample that is stored already: `keep` (if left out) counts it as a duplicate, `replace` stores the new one in its place"),
+        ("on_conflict" = inline(Option<OnConflict>), Query, description = "The rule for a sample that is stored already: `keep` (if left out) counts the new one as a duplicate, `replace` stores the new one instead"),
         ("columns" = Option<String>, Query, description = "The columns of a CSV file: `auto` finds them by usual names in either case, `FIELD:COLUMN,...` (such as `time:Timestamp,left:x1`) names them; other columns are ignored"),
-        ("box_form" = inline(Option<BoxForm>), Query, description = "What the columns `left`, `top`, `width`, `height` of a CSV file hold: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
+        ("box_form" = inline(Option<BoxForm>), Query, description = "The meaning of the columns `left`, `top`, `width`, `height` of a CSV file: `left_top`, `centre` (of the box, and its size) or `corners` (the last two are right and bottom); by the columns' names if left out"),
         ("box_unit" = inline(Option<BoxUnit>), Query, description = "`px` (if left out), or `share` for sides that are shares of the image's width and height"),
         ("timezone" = Option<String>, Query, description = "The IANA time zone (such as `Europe/Berlin`) whose local times are the times of a CSV file without an offset; such times are refused if left out"),
         ("target_id" = Option<String>, Query, description = "The target of rows of a CSV file that name none"),
@@ -154,7 +154,7 @@ struct DeletedSamples {
         (Vec<wire::Sample<'static>> = "application/json"),
     )),
     responses(
-        (status = 200, description = "What became of the rows", body = Imported),
+        (status = 200, description = "The counts of the rows", body = Imported),
         (status = 507, description = "There is no space for them", body = Problem, content_type = "application/problem+json"),
     )
 )]
@@ -198,7 +198,7 @@ fn import_format(headers: &HeaderMap) -> Result<Format> {
         ("camera" = String, Path, description = "The camera's id"),
         ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
         ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
-        ("target_id" = Option<String>, Query, description = "Of this target alone"),
+        ("target_id" = Option<String>, Query, description = "Only samples of this target"),
         ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
         ("limit" = Option<u32>, Query, description = "Items on a page of JSON, 100 if left out"),
         ("cursor" = Option<String>, Query, description = "`next_cursor` of the page of JSON before"),
@@ -292,7 +292,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
         match export {
             None => Ok::<_, Error>(None),
             Some(export) => export.step().await.map(Some).inspect_err(|error| {
-                tracing::error!(%error, "an export broke off");
+                tracing::error!(%error, "an export was interrupted");
             }),
         }
     });
@@ -310,7 +310,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
         ("camera" = String, Path, description = "The camera's id"),
         ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
         ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
-        ("target_id" = Option<String>, Query, description = "Of this target alone"),
+        ("target_id" = Option<String>, Query, description = "Only samples of this target"),
         ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
     ),
     responses((status = 200, description = "Their number", body = SampleCount))
@@ -332,7 +332,7 @@ async fn count_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, ur
         ("camera" = String, Path, description = "The camera's id"),
         ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
         ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
-        ("target_id" = Option<String>, Query, description = "Of this target alone"),
+        ("target_id" = Option<String>, Query, description = "Only samples of this target"),
         ("has_fix" = Option<bool>, Query, description = "`true`: only samples with a fix; `false`: only those without"),
     ),
     responses((status = 200, description = "How many were deleted", body = DeletedSamples))

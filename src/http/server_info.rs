@@ -20,10 +20,10 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(get_server))
 }
 
-/// What the server is, and what it allows.
+/// Version and limits of the server, and the map tiles of the console.
 #[derive(Serialize, ToSchema)]
 struct Server {
-    /// Its version.
+    /// Version of the program.
     #[schema(example = "0.1.0")]
     version: &'static str,
     /// The limits in force, by the name of the setting below `limits`.
@@ -54,7 +54,7 @@ struct Tiles {
     url: String,
     /// How they are stored there.
     format: TileFormat,
-    /// What their provider asks to be shown.
+    /// The attribution that their provider asks for.
     attribution: String,
 }
 

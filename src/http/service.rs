@@ -1,4 +1,4 @@
-//! What watches the server: `/livez`, `/readyz`, `/metrics`.
+//! Routes for those that watch the server: `/livez`, `/readyz`, `/metrics`.
 
 use std::time::Duration;
 
@@ -22,7 +22,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz)).routes(routes!(metrics))
 }
 
-/// Whether the process is alive
+/// Check that the process is alive
 #[utoipa::path(
     get, path = "/livez", tag = "service",
     responses((status = 200, description = "It is", body = String, content_type = "text/plain"))
@@ -34,12 +34,12 @@ async fn livez() -> &'static str {
 /// Cameras that `/readyz` names one by one.
 const NAMED_CAMERAS: usize = 100;
 
-/// Whether the server can take work
+/// Check that the server is ready
 ///
-/// The first line is `ready`. A camera whose active model cannot be used does not make the server unready,
-/// since its fixes still pass through; each has a line `degraded: camera ...`. A full disk does not either: it has
-/// a line `degraded: insufficient-storage: ...`, nor damaged pages, nor a database that went on from before what it had acknowledged, of which a line
-/// `degraded: database: ...` tells. Callers that may not read get the first line only.
+/// The first line is `ready`. The server stays ready in these states, each of which has a line of its own: an active
+/// model that cannot be used (`degraded: camera ...`; the camera's fixes still pass through), a full disk
+/// (`degraded: insufficient-storage: ...`), and damaged pages, or a database that continues from an earlier state than
+/// it had acknowledged (`degraded: database: ...`). Callers that may not read get the first line only.
 #[utoipa::path(
     get, path = "/readyz", tag = "service",
     responses(
@@ -76,7 +76,7 @@ async fn readyz(State(rest): State<Rest>, CallerApp(app): CallerApp) -> ApiResul
     }
     if app.store.is_damaged() {
         text.push_str(
-            "degraded: database: a damaged page was met; restore a backup: sightfix restore FILE\n",
+            "degraded: database: a damaged page was read; restore a backup: sightfix restore FILE\n",
         );
     }
     for (camera, fault) in faults.iter().take(NAMED_CAMERAS) {

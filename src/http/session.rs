@@ -40,7 +40,7 @@ struct SessionDraft {
 /// Who asks, and what they may do.
 #[derive(Serialize, ToSchema)]
 struct Session {
-    /// What the caller may do.
+    /// The role of the caller.
     role: Role,
     /// Name of the caller's key, or of the person who has signed in.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -50,7 +50,7 @@ struct Session {
     key_id: Option<String>,
     /// The cameras that the caller is restricted to; empty for all.
     camera_ids: Vec<String>,
-    /// Whether everybody may do everything, because no key was created yet.
+    /// True if everybody may do everything, because no key was created yet.
     open_access: bool,
 }
 

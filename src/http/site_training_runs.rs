@@ -24,7 +24,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(cancel_site_training_run))
 }
 
-/// What to fit; all of it may be left out.
+/// The options of a fit; all of them may be left out.
 #[derive(Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct SiteRunDraft {
@@ -66,20 +66,19 @@ struct SiteTrainingRun {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     until: Option<Timestamp>,
-    /// Its state.
+    /// State of the run.
     state: JobState,
     /// How far it has come; its epochs count fits of all cameras and epochs of networks.
     progress: RunProgress,
     /// Times a worker has claimed it without returning it to the queue in order.
     attempt: u32,
-    /// What the run found out, once it has succeeded: the version of each camera, and what the cameras gain from each
-    /// other.
+    /// The run's findings, once it has succeeded: the version of each camera, and its gain from the other cameras.
     #[serde(skip_serializing_if = "Option::is_none")]
     report: Option<SiteTrainingReport>,
     /// The report as lines of text.
     #[serde(skip_serializing_if = "Option::is_none")]
     report_text: Option<String>,
-    /// Whether the versions became active, and why or why not, or why the run failed.
+    /// Says if the versions became active, and why or why not, or why the run failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     outcome: Option<String>,
     /// When it was asked for.
@@ -119,7 +118,7 @@ impl From<domain::TrainingRun<SiteId>> for SiteTrainingRun {
 /// A page of training runs of a site, newest first.
 #[derive(Serialize, ToSchema)]
 struct SiteRunPage {
-    /// Runs.
+    /// A page of runs.
     items: Vec<SiteTrainingRun>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -124,7 +124,7 @@ impl From<domain::Site> for Site {
 /// A page of sites, by id.
 #[derive(Serialize, ToSchema)]
 struct SitePage {
-    /// Sites.
+    /// A page of sites.
     items: Vec<Site>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -130,14 +130,14 @@ mod tests {
     }
 
     #[test]
-    fn a_range_is_cut_at_the_end_and_refused_behind_it() {
+    fn a_range_is_cut_at_the_end_and_refused_after_it() {
         assert_eq!(parsed("bytes=0-9"), Some(Ok((0, 9))));
         assert_eq!(parsed("bytes=90-16383"), Some(Ok((90, 99))));
         assert_eq!(parsed("bytes=99-"), Some(Ok((99, 99))));
         assert_eq!(parsed("bytes=-10"), Some(Ok((90, 99))));
         assert_eq!(parsed("bytes=-1000"), Some(Ok((0, 99))));
-        for behind in ["bytes=100-", "bytes=100-200", "bytes=-0", "bytes=99999999999999999999-"] {
-            assert_eq!(parsed(behind), Some(Err(ErrorKind::RangeNotSatisfiable)), "{behind}");
+        for later in ["bytes=100-", "bytes=100-200", "bytes=-0", "bytes=99999999999999999999-"] {
+            assert_eq!(parsed(later), Some(Err(ErrorKind::RangeNotSatisfiable)), "{later}");
         }
         for ignored in ["bytes=5-1", "bytes=0-1,3-4", "rows=0-1", "bytes=-", "bytes=a-b", ""] {
             assert_eq!(parsed(ignored), None, "{ignored}");

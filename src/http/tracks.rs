@@ -115,10 +115,10 @@ impl From<&track::Rejection> for Rejection {
     }
 }
 
-/// What a track says of its target at one instant.
+/// The state of a track at one instant.
 #[derive(Serialize, ToSchema)]
 struct TrackState {
-    /// The target.
+    /// The target's id.
     target_id: String,
     /// The latest instant measured.
     #[schema(value_type = String, format = DateTime)]
@@ -136,11 +136,11 @@ struct TrackState {
     /// Normalised innovation squared of what was used; 2 on average for each of box and fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     nis: Option<f64>,
-    /// What was not used.
+    /// The positions that were not used.
     rejections: Vec<Rejection>,
-    /// Whether the track was restarted at this measurement.
+    /// True if the track was restarted at this measurement.
     restarted: bool,
-    /// Whether boxes and fixes have lately differed by more than chance explains; `r95_m` then holds the true
+    /// True if boxes and fixes have lately differed by more than chance explains; `r95_m` then holds the true
     /// position whichever of them is right, or one of them is not used.
     sources_disagree: bool,
 }
@@ -240,7 +240,7 @@ fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     Ok(response)
 }
 
-/// What histories are written as.
+/// The format of a history.
 #[derive(Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 enum HistoryForm {
@@ -416,14 +416,14 @@ impl<'a> From<&'a UnplacedBox> for SeenBox<'a> {
 /// One answer per observation, in their order.
 #[derive(Serialize, ToSchema)]
 struct FollowedObservations<'a> {
-    /// Answers.
+    /// The answers, in the order of the observations.
     items: Vec<FollowedObservation<'a>>,
-    /// What was stored, if that was asked for.
+    /// The counts of stored observations, if storage was requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     stored: Option<StoredObservations>,
 }
 
-/// What became of observations that were to be stored.
+/// Counts of observations that were to be stored.
 #[derive(Default, Serialize, ToSchema)]
 struct StoredObservations {
     /// Boxes and fixes that are part of a stored sample.
@@ -506,7 +506,7 @@ async fn follow(
     Ok(json_of_about(&FollowedObservations { items, stored }, 64 + ITEM_BYTES * followed.len())?)
 }
 
-/// What the events of a camera carry, by the event's name.
+/// The bodies of a camera's events, by the event's name.
 #[derive(ToSchema)]
 #[serde(untagged)]
 #[expect(dead_code, clippy::large_enum_variant, reason = "the shapes of events, for the description alone")]
@@ -548,7 +548,7 @@ async fn watch_camera(
     LastEventId(last_seen): LastEventId,
 ) -> ApiResult {
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
-    // What is no id of ours names no event that is known.
+    // A text that is no id of ours names no known event.
     let last_seen = last_seen.map(|text| text.parse().unwrap_or(EventId::UNKNOWN));
     let events = app.camera_events(&id, last_seen).await?;
     let shutdown = rest.shutdown.clone();

@@ -40,7 +40,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .routes(routes!(get_training_curve))
 }
 
-/// What to fit; all of it may be left out.
+/// The options of a fit; all of them may be left out.
 #[derive(Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct RunDraft {
@@ -94,7 +94,7 @@ struct TrainingRun {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>, format = DateTime)]
     until: Option<Timestamp>,
-    /// Its state.
+    /// State of the run.
     state: JobState,
     /// How far it has come.
     progress: RunProgress,
@@ -103,13 +103,13 @@ struct TrainingRun {
     /// The version it yielded.
     #[serde(skip_serializing_if = "Option::is_none")]
     model_version: Option<u32>,
-    /// What the run found out: its candidates, and what would help.
+    /// The run's findings: its candidates, and advice.
     #[serde(skip_serializing_if = "Option::is_none")]
     report: Option<TrainingReport>,
     /// The report as lines of text.
     #[serde(skip_serializing_if = "Option::is_none")]
     report_text: Option<String>,
-    /// Whether that version became active, and why or why not, or why the run failed.
+    /// Says if that version became active, and why or why not, or why the run failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     outcome: Option<String>,
     /// When it was asked for.
@@ -152,7 +152,7 @@ impl From<domain::TrainingRun<CameraId>> for TrainingRun {
 /// A page of training runs, newest first.
 #[derive(Serialize, ToSchema)]
 struct RunPage {
-    /// Runs.
+    /// A page of runs.
     items: Vec<TrainingRun>,
     /// Asks for the next page; missing on the last.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -317,14 +317,14 @@ struct LogLine {
     /// When it was written.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
-    /// What happened.
+    /// The event, in words.
     text: String,
 }
 
 /// A run's log, oldest line first.
 #[derive(Serialize, ToSchema)]
 struct TrainingLog {
-    /// Lines.
+    /// A page of lines.
     items: Vec<LogLine>,
 }
 

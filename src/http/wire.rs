@@ -83,7 +83,7 @@ impl<'de> Visitor<'de> for LabelsVisitor {
     }
 }
 
-/// What becomes of a sample that is stored already.
+/// The rule for a sample that is stored already.
 #[derive(ToSchema)]
 #[schema(rename_all = "snake_case")]
 #[expect(dead_code, reason = "the values of a parameter, for the description alone")]

@@ -53,7 +53,7 @@ struct WorldSighting {
     last_seen_at: Timestamp,
 }
 
-/// What a world track says of its target at the latest instant measured.
+/// The state of a world track at the latest instant measured.
 #[derive(Serialize, ToSchema)]
 struct WorldTrackState {
     /// The track's id. It is never used again, also not after a start of the server.
@@ -227,13 +227,13 @@ async fn get_world_track(
     answer(&headers, &app.world_track_history(&id, track).await?, None)
 }
 
-/// What an event tells beside a position.
+/// The contents of an event besides a position.
 #[derive(Serialize, ToSchema)]
 struct TrackChange {
     /// The instant by the clock of the cameras.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
-    /// The track.
+    /// The track's id.
     track_id: String,
     /// `handed_over`: the camera that saw the target last.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -268,12 +268,12 @@ struct LostSiteEventCount {
     /// `too_old`: the event to continue after is not kept any more; `restarted`: it is of before the start of the
     /// server; `too_slow`: the client reads too slowly.
     reason: &'static str,
-    /// How many, if it is known.
+    /// Number of lost events, if it is known.
     #[serde(skip_serializing_if = "Option::is_none")]
     events: Option<u64>,
 }
 
-/// What the events of a site carry, by the event's name.
+/// The bodies of a site's events, by the event's name.
 #[derive(ToSchema)]
 #[serde(untagged)]
 #[expect(dead_code, reason = "the shapes of events, for the description alone")]

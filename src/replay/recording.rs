@@ -8,7 +8,6 @@ use crate::exchange::ObservedRow;
 /// The owner of fixes that name no target.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FixOwner {
-    /// A target.
     Target(TargetId),
     /// A receiver; the server knows its target.
     Receiver(ReceiverId),

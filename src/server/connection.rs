@@ -54,7 +54,7 @@ pub(super) fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
     socket.listen(BACKLOG)
 }
 
-/// What becomes of the connections of one listener.
+/// Accepts the connections of one listener.
 pub(super) struct Acceptor {
     pub(super) pipeline: Arc<RequestPipeline>,
     pub(super) tls: Option<Arc<Tls>>,
@@ -143,7 +143,7 @@ fn builder(limits: &Limits) -> Builder<TokioExecutor> {
     builder
 }
 
-/// What all connections share.
+/// The state that all connections share.
 struct ConnectionServer {
     builder: Builder<TokioExecutor>,
     acceptor: Acceptor,
@@ -245,7 +245,7 @@ impl ConnectionServer {
     }
 }
 
-/// Whether the library ended a connection for a flood, such as of streams that are reset at once.
+/// True if the library ended a connection for a flood, such as of streams that are reset at once.
 fn is_flood(error: &(dyn std::error::Error + 'static)) -> bool {
     let causes = std::iter::successors(Some(error), |error| error.source());
     causes
@@ -253,7 +253,7 @@ fn is_flood(error: &(dyn std::error::Error + 'static)) -> bool {
         .any(|error| error.is_library() && error.reason() == Some(h2::Reason::ENHANCE_YOUR_CALM))
 }
 
-/// Whether the client is on this machine, by either of its addresses.
+/// True if the client is on this machine, by either of its addresses.
 fn is_of_this_machine(stream: &TcpStream, peer: &Peer) -> bool {
     let is_own = |own: SocketAddr| own.ip().to_canonical() == peer.address;
     peer.address.is_loopback() || stream.local_addr().is_ok_and(is_own)
@@ -269,7 +269,7 @@ struct Closing {
     reason: Option<CloseReason>,
 }
 
-/// What to do with a connection.
+/// The next action for a connection.
 enum ConnectionAction {
     Keep,
     /// Let open requests end and take no new ones.

@@ -42,7 +42,7 @@ use crate::tls_client::{authorities, client_config};
 
 /// Marks a request that was sent on, which no node sends on again.
 const FORWARDED: HeaderName = HeaderName::from_static("x-sightfix-forwarded");
-/// Of one connection (RFC 9110, 7.6.1), or replaced by what the request to the other node says itself.
+/// Headers of one connection (RFC 9110, 7.6.1), or replaced by those of the request to the other node.
 const OF_ONE_CONNECTION: [HeaderName; 5] = [CONNECTION, HOST, TE, TRANSFER_ENCODING, UPGRADE];
 /// Time to open a connection to another node, its handshakes included.
 const OPEN_TIME: Duration = Duration::from_secs(3);
@@ -211,7 +211,7 @@ struct Recorded {
     read: Option<VecDeque<Result<Frame<Bytes>, axum::Error>>>,
     /// How much more may be recorded, bytes.
     room_bytes: usize,
-    /// What is recorded, as limits count it.
+    /// The memory of the recorded bytes, as limits count it.
     memory: Option<Lease>,
 }
 
@@ -297,7 +297,7 @@ struct Replay {
     rest: Body,
     /// When it ends, whatever the client still sends.
     end: Option<BoxFuture<'static, ()>>,
-    /// What was read, as limits count it.
+    /// The memory of the bytes read, as limits count it.
     memory: Option<Lease>,
 }
 

@@ -16,7 +16,7 @@ pub(super) struct Peer {
     pub(super) address: IpAddr,
     /// Whose certificate was verified, if one was presented.
     pub(super) certificate: Option<CertificateHolder>,
-    /// Whether the connection is TLS.
+    /// True if the connection is TLS.
     pub(super) is_tls: bool,
     /// Why only probes are answered on it, if so.
     pub(super) refusal: Option<Arc<Error>>,

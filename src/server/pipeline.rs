@@ -1,4 +1,4 @@
-//! What every request goes through, whatever its transport: id, span, host and origin, admission,
+//! The pipeline of every request, whatever its transport: id, span, host and origin, admission,
 //! deadline, then the transport.
 
 use std::convert::Infallible;
@@ -76,7 +76,7 @@ pub(super) struct RequestPipeline {
     cors: Option<CorsLayer>,
 }
 
-/// What a request was granted.
+/// The grants of a request.
 struct Granted {
     ticket: Ticket,
     caller: Caller,
@@ -368,7 +368,7 @@ impl RequestPipeline {
         };
         let ticket = Ticket::open(&self.app, class, client, held_bytes)?;
         if request.headers().contains_key(CONTENT_ENCODING) {
-            // What it decodes to is not known before it has been read.
+            // Its decoded size is not known before it has been read.
             ticket.charge(held_bytes as u64)?;
         }
         let has_no_body = request.body().is_end_stream()
@@ -404,7 +404,7 @@ impl RequestPipeline {
         }
         let clock = &self.app.clock;
         let principal = match self.app.access.authenticate(credential, clock.now(), clock.monotonic()) {
-            // What watches the server learns that it is alive, whatever has become of its key.
+            // A probe learns that the server is alive, whatever has become of its key.
             Err(_) if class == RequestClass::Probe => Principal::Anonymous,
             principal => principal?,
         };

@@ -54,7 +54,7 @@ impl TrustedProxies {
         Cow::Owned(Peer { client: ClientId::from(address), address, is_tls, ..peer.clone() })
     }
 
-    /// Whether an address, in its canonical form, is a trusted proxy's.
+    /// True if an address, in its canonical form, is a trusted proxy's.
     pub(super) fn trusts(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(address))
     }
@@ -71,7 +71,7 @@ fn address_of(entry: &str) -> Option<IpAddr> {
 #[derive(Clone)]
 struct Network {
     first: Ipv6Addr,
-    /// Of the 128 bits of an IPv6 address, to which IPv4 addresses are mapped.
+    /// Length of the prefix in the 128 bits of an IPv6 address, to which IPv4 addresses are mapped.
     prefix_bits: u32,
 }
 

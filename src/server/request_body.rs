@@ -19,7 +19,7 @@ use crate::app::App;
 use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Result};
 
-/// What one request was granted, shared between its body and the pipeline.
+/// The grants of one request, shared between its body and the pipeline.
 #[derive(Clone)]
 pub(super) struct Ticket(Arc<Mutex<Grant>>);
 
@@ -33,7 +33,7 @@ struct Grant {
     memory: Option<Lease>,
     place: Option<Lease>,
     refusal: BodyRefusal,
-    /// What its reader left of the body.
+    /// The rest of the body that its reader left.
     rest: Option<Incoming>,
     is_answered: bool,
 }
@@ -194,7 +194,7 @@ impl Body for AdmittedBody {
                 }
             },
             Poll::Ready(Some(Err(error))) => {
-                let message = format!("the body broke off: {error}");
+                let message = format!("the body is incomplete: {error}");
                 this.refuse(Error::refused(ErrorKind::Cancelled, message))
             }
             Poll::Ready(None) => match this.ticket.begin_work() {
@@ -220,7 +220,7 @@ impl Body for AdmittedBody {
     }
 }
 
-/// What nobody reads is left to the pipeline.
+/// Leaves the unread rest to the pipeline.
 impl Drop for AdmittedBody {
     fn drop(&mut self) {
         if let Some(rest) = self.body.take().filter(|body| !body.is_end_stream()) {
@@ -294,7 +294,7 @@ impl LeastRate {
         Self { window, bytes_per_s, received: 0, waited: Duration::ZERO }
     }
 
-    /// Whether a window that is over brought enough; begins the next one.
+    /// True if a window that is over brought enough; begins the next one.
     fn holds(&mut self) -> bool {
         if self.waited < self.window {
             return true;
@@ -328,7 +328,7 @@ mod tests {
 
     const WINDOW: Duration = Duration::from_secs(10);
 
-    /// Whether the rate holds when so many bytes come after each of these times of waiting.
+    /// True if the rate holds when `bytes` bytes come after each of these times of waiting.
     fn holds(bytes: u64, waits_s: &[u64]) -> bool {
         let mut rate = LeastRate::new(WINDOW, 10);
         waits_s.iter().all(|&wait_s| {

@@ -1,4 +1,4 @@
-//! Metrics, as one typed struct: no name is spelled at a call site.
+//! Metrics, as one typed struct: no call site names a metric by a text.
 
 mod answers;
 mod cluster;
@@ -40,9 +40,7 @@ pub struct Metrics {
     handle: PrometheusHandle,
     fusions: FusionMetrics,
     imports: ImportMetrics,
-    /// Training runs.
     pub training_runs: JobMetrics,
-    /// Evaluations.
     pub evaluations: JobMetrics,
     connections: ConnectionMetrics,
     /// Metrics of connections with other systems, as text.
@@ -188,12 +186,12 @@ impl Metrics {
         self.live.cameras_moved.increment(1);
     }
 
-    /// How many processes share the database.
+    /// Number of processes that share the database.
     pub fn nodes(&self, nodes: usize) {
         self.cluster.nodes.set(nodes as f64);
     }
 
-    /// How many cameras this process owns.
+    /// Number of cameras that this process owns.
     pub fn owned_cameras(&self, cameras: usize) {
         self.cluster.owned_cameras.set(cameras as f64);
     }
@@ -258,7 +256,7 @@ impl Metrics {
         self.maintenance_errors.increment(1);
     }
 
-    /// Whether samples are not deleted for their age, since the clock is not believed.
+    /// True if samples are not deleted for their age, since the clock is not believed.
     pub fn retention_refused(&self, is_refused: bool) {
         self.retention_refused.set(f64::from(u8::from(is_refused)));
     }
@@ -271,7 +269,7 @@ impl Metrics {
         }
     }
 
-    /// How many jobs have not ended.
+    /// Number of jobs that have not ended.
     pub fn jobs(&self, counts: &JobCounts) {
         let QueueMetrics { training, evaluation } = &self.queues;
         for (gauges, counts) in [(training, counts.training), (evaluation, counts.evaluation)] {
@@ -280,12 +278,12 @@ impl Metrics {
         }
     }
 
-    /// How many cameras have an active model that cannot be used.
+    /// Number of cameras with an active model that cannot be used.
     pub fn models_unusable(&self, cameras: usize) {
         self.models_unusable.set(cameras as f64);
     }
 
-    /// What connections with other systems do.
+    /// Records the figures of connections with other systems.
     pub fn outside_connections(&self, connections: &[OutsideFigures]) {
         self.outside.store(Arc::new(outside::rendered(connections)));
     }

@@ -66,7 +66,7 @@ const RPC_CODES: [&str; 17] = [
 const CANCELLED: usize = 1;
 const UNKNOWN: usize = 2;
 
-/// What is counted and timed of requests. Clones share it.
+/// Counts and durations of requests. Clones share it.
 #[derive(Clone)]
 pub(super) struct RequestMetrics(Arc<State>);
 

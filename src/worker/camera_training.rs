@@ -1,4 +1,4 @@
-//! What is particular to training runs of a camera: its samples, the fit, and the model version that it gives.
+//! Training runs of a camera: its samples, the fit, and the model version that it gives.
 
 use super::promotion::{self, PromotionCandidate};
 use super::training::{Trained, Update, finish, report};

@@ -10,7 +10,7 @@ use crate::model::{FitError, FitEvent};
 use crate::store::{Claim, Heartbeat, JobEnd};
 use crate::telemetry::{JobMetrics, Metrics};
 
-/// What a fit has reported since the last look.
+/// The reports of a fit since the last call.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Update {
     pub(super) progress: RunProgress,
@@ -33,7 +33,7 @@ impl Update {
     }
 }
 
-/// What is particular to training a camera or a site.
+/// The parts that differ between the training of a camera and of a site.
 pub(super) trait Trained: Trainable {
     /// Name of its runs in the log.
     const NAME: &'static str;

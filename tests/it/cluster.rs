@@ -32,7 +32,7 @@ fn url(server: &TestServer) -> String {
     format!("http://{}", server.address)
 }
 
-/// What a statement gives in the database of a folder.
+/// The output of a statement in the database of a folder.
 fn sql(folder: &Path, statement: &str) -> String {
     let [_, url] = store_arguments(folder);
     let output = Command::new("psql").args([&url, "-Atqc", statement]).output().expect("psql runs");
@@ -106,7 +106,7 @@ async fn a_stream_that_meets_another_node_is_redirected_to_the_owner() {
     let location = followed.header("location").to_owned();
     assert_eq!(location, format!("{}/v1/cameras/yard/tracks?store_samples=false", url(&first)));
     first.post("/v1/cameras/yard/tracks?store_samples=false", &observation).await.expect(200);
-    // What changes no live state is answered anywhere.
+    // A request that changes no live state is answered by any node.
     second.post("/v1/cameras/yard/fusions", &observation).await.expect(200);
 
     feed.upto = 40;

@@ -55,7 +55,7 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("metrics_exporter_prometheus", &["telemetry"]),
 ];
 
-/// Whether a text uses a library by the path `library::`.
+/// True if a text uses a library by the path `library::`.
 fn uses(text: &str, library: &str) -> bool {
     text.match_indices(&format!("{library}::"))
         .any(|(at, _)| !text[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == ':'))

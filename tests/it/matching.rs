@@ -15,7 +15,7 @@ use tempfile::TempDir;
 use self::crowd::{Crowd, IMAGE, Recorded};
 use crate::harness::{data_folder, sightfix};
 
-/// What `sightfix pair --match` printed and wrote.
+/// The output and the files of `sightfix pair --match`.
 struct Matched {
     succeeded: bool,
     printed: String,

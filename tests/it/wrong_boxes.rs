@@ -27,8 +27,8 @@ async fn trained(folder: &std::path::Path, recipe: &str) -> TestServer {
 fn walk(seed: u64, seconds: usize) -> Vec<SimulatedRow> {
     let options = Options { seed, samples: 8 * seconds, targets: 1, ..Options::demo() };
     let rows = simulate(&options).rows;
-    let spells = rows.chunk_by(|one, next| next.time.duration_since(one.time).as_secs() == 1);
-    spells.max_by_key(|spell| spell.len()).expect("rows").iter().take(seconds).cloned().collect()
+    let walks = rows.chunk_by(|one, next| next.time.duration_since(one.time).as_secs() == 1);
+    walks.max_by_key(|walk| walk.len()).expect("rows").iter().take(seconds).cloned().collect()
 }
 
 fn box_json(row: &SimulatedRow) -> Value {

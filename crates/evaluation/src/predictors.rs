@@ -35,7 +35,7 @@ pub(super) type TargetRows = Vec<usize>;
 /// Predicts a position for each of one target's rows, in their order; `None` where the method cannot.
 pub(super) type Predictor<'a> = Box<dyn FnMut(&TargetRows) -> Vec<Option<Prediction>> + 'a>;
 
-/// What the predictors of one evaluation have in common.
+/// The state that the predictors of one evaluation share.
 #[derive(Clone, Copy)]
 pub(super) struct Predictors<'a> {
     pub(super) train: FitInput<'a>,

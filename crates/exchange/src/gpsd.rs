@@ -139,7 +139,7 @@ impl Reports {
         self.of_device(report).state(second_of_day(time), sigma);
     }
 
-    /// What is known of the report's device. Of several devices, only that of the latest report is remembered.
+    /// The stated deviations of the report's device. Of several devices, only that of the latest report is remembered.
     fn of_device(&mut self, report: &GpsdReport<'_>) -> &mut StatedDeviations<Option<u8>> {
         let device = report.device.as_ref().map(Text::as_str);
         if self.device.as_deref() != device {

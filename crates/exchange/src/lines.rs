@@ -6,7 +6,7 @@ use super::MAX_ROW_BYTES;
 
 /// One line without its line ending.
 pub(super) enum Line<'a> {
-    /// Valid text.
+    /// The line is valid text.
     Text(&'a str),
     /// It is not UTF-8.
     NotUtf8,

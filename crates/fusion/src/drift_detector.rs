@@ -7,8 +7,8 @@
 //! `T = max_k |m_post - m_pre|^2 / (v_post + v_pre)`, with variances v per axis that account for
 //! correlated errors: the receiver's bias of tens of seconds, its slower error of about an hour, the
 //! part of it common to all receivers, and the model's own error, which depends on the place.
-//! Never here: an alarm from one receiver among several, or from one stop; an alarm for
-//! a constant offset that was there from the start.
+//! Does not raise an alarm for one receiver among several, for one stop, or for a constant offset that was there from
+//! the start.
 
 mod block;
 mod pooling;
@@ -34,7 +34,7 @@ use crate::geo::EastNorth;
 const MAX_ARCHIVED_CELLS: usize = 1_024;
 /// Independent epochs, and cells of ground, that the only target of a camera must cover.
 const MIN_SINGLE_TARGET_EPOCHS: u32 = 3;
-/// The variance of the archived offset is at least that of the slow errors of so many epochs: a day.
+/// The variance of the archived offset is at least that of the slow errors of this number of epochs: a day.
 const MAX_ARCHIVED_EPOCHS: f64 = 24.0;
 
 /// The camera's pose has changed.

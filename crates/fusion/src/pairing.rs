@@ -64,7 +64,7 @@ pub struct PairingSettings {
     pub window: SignedDuration,
     /// Fixes are joined by a line over at most this long a gap (interpolated).
     pub longest_gap: SignedDuration,
-    /// On a stream, items that come this much behind the watermark still find their partner.
+    /// On a stream, items this much earlier than the watermark still find their partner.
     pub allowed_lateness: SignedDuration,
     /// On a stream, items buffered per target and source; beyond, the target is decided early.
     pub items_per_target: usize,
@@ -110,18 +110,18 @@ impl PairingSettings {
     }
 }
 
-/// What did not become part of a sample.
+/// Numbers of boxes and fixes that did not become part of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Unpaired {
     /// Boxes without a partner.
     pub detections: u64,
-    /// Of these, boxes whose nearest fix is nearer to another box (nearest).
+    /// Number of these boxes whose nearest fix is nearer to another box (nearest).
     pub fix_claimed_by_nearer_box: u64,
     /// Fixes without a partner.
     pub fixes: u64,
     /// Boxes or fixes of a target and instant that was there already.
     pub duplicates: u64,
-    /// Of these, fixes.
+    /// Number of these that are fixes.
     pub duplicate_fixes: u64,
     /// Fixes that name no receiver.
     pub receiver_missing: u64,
@@ -136,9 +136,9 @@ pub struct Paired {
     pub unpaired_detections: Vec<Detection>,
     /// All that is part of no sample, counted.
     pub unpaired: Unpaired,
-    /// Of the boxes without a partner, those of targets that no fix belongs to.
+    /// Number of the boxes without a partner whose targets have no fix.
     pub detections_without_fixes: u64,
-    /// Of the fixes without a partner, those of targets that no box shows.
+    /// Number of the fixes without a partner whose targets no box shows.
     pub fixes_without_detections: u64,
 }
 

@@ -103,8 +103,8 @@ pub struct TrackEstimate {
 }
 
 impl TargetTrack {
-    /// What the next observation of the target measures, its box seen beside the target's latest ones: a
-    /// deviation too small to be noticed in one box is noticed when it lasts.
+    /// Returns the positions that the next observation of the target measures. Its box is compared with the target's
+    /// latest ones: a deviation too small to be noticed in one box is noticed when it lasts.
     pub fn observe<'a>(
         &mut self,
         observation: &Observation,

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use crate::domain::Role;
 
-/// What an operation needs.
+/// The permission that an operation needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Permission {
     /// Nothing: health and the description of the interface.
@@ -23,7 +23,7 @@ pub enum Permission {
 }
 
 impl Permission {
-    /// Whether a role has it.
+    /// True if a role has the permission.
     #[must_use]
     pub const fn is_granted_to(self, role: Role) -> bool {
         match self {
@@ -35,7 +35,7 @@ impl Permission {
         }
     }
 
-    /// What a REST route needs, by its method and the template of its path. A route that is missing in
+    /// Returns the permission for a REST route, by its method and the template of its path. A route that is missing in
     /// the table is for administrators only.
     #[must_use]
     pub fn of_route(method: &str, template: &str) -> Self {
@@ -48,17 +48,17 @@ impl Permission {
         RPCS.get_key_value(path.strip_prefix('/').unwrap_or(path)).map(|(name, _)| *name)
     }
 
-    /// What an RPC needs, by its path. One that is missing in the table is for administrators only.
+    /// Returns the permission for an RPC, by its path. One that is missing in the table is for administrators only.
     #[must_use]
     pub fn of_rpc(path: &str) -> Self {
         RPCS.get(path.strip_prefix('/').unwrap_or(path)).copied().unwrap_or(Self::Administer)
     }
 }
 
-/// What a client can ask for, on either transport.
+/// An operation that a client can ask for, on either transport.
 #[derive(Debug, Clone, Copy)]
 pub struct Operation {
-    /// What it needs.
+    /// The permission that it needs.
     pub permission: Permission,
     /// `METHOD template` of the REST route; empty without one.
     pub route: &'static str,
@@ -223,11 +223,10 @@ pub const OPERATIONS: &[Operation] = &[
 /// A REST route with the permission that it needs.
 #[derive(Debug, Clone, Copy)]
 pub struct RoutePermission {
-    /// Its method.
     pub method: &'static str,
     /// The template of its path.
     pub template: &'static str,
-    /// What it needs.
+    /// The permission that it needs.
     pub permission: Permission,
 }
 

@@ -323,7 +323,7 @@ impl LiveStream {
         }
     }
 
-    /// What is settled; `None` on a stream that stores nothing.
+    /// Returns the items that are settled; `None` on a stream that stores nothing.
     ///
     /// # Errors
     /// The samples could not be stored; the stream must end, for nothing after them is acknowledged.
@@ -358,7 +358,7 @@ impl LiveStream {
         self.settle_within(if is_alone { Duration::ZERO } else { recorder.allowed_lateness() }).await
     }
 
-    /// Waits for so long until everything is settled, then decides the rest.
+    /// Waits until everything is settled, for at most `patience`, then decides the rest.
     async fn settle_within(&self, patience: Duration) -> Result<()> {
         let Some(StreamRecording { recorder, tracker }) = &self.recording else { return Ok(()) };
         // Elapsed is no failure: the rest is decided below.

@@ -120,7 +120,7 @@ impl Brokers {
     }
 }
 
-/// What a broker says of an error, if it was a broker's answer.
+/// The broker's error code, if a broker answered.
 const fn answer_of(error: &Error) -> Option<ProtocolError> {
     match error {
         Error::ServerError { protocol_error, .. } => Some(*protocol_error),

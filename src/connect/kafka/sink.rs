@@ -39,7 +39,7 @@ fn partition_of(key: &str, partitions: &[i32]) -> Option<i32> {
     partitions.get((crc32fast::hash(key.as_bytes()) % count) as usize).copied()
 }
 
-/// Whether a broker will never take what it has refused.
+/// True if a broker will never take what it has refused.
 const fn is_refusal(answer: ProtocolError) -> bool {
     matches!(
         answer,

@@ -21,7 +21,7 @@ use crate::store::Store;
 /// Records that a broker sends at a time, bytes, over all partitions at most what a source may hold; a larger batch comes
 /// whole.
 const FETCH_BYTES: std::ops::RangeInclusive<usize> = 16 << 10..=256 << 10;
-/// What is kept of a message that is too large, for the status.
+/// Bytes of a message that is too large which are kept for the status.
 const KEPT_BYTES: usize = 4 << 10;
 /// How long a broker waits for records.
 const FETCH_WAIT: Duration = Duration::from_millis(500);
@@ -184,7 +184,7 @@ async fn oldest_offset(client: &PartitionClient, missing: i64) -> Result<i64, Pe
         partition,
         missing,
         oldest,
-        "messages are gone; the oldest that is left comes next"
+        "the broker has deleted messages; reading continues with the oldest that it has"
     );
     Ok(oldest)
 }

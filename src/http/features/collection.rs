@@ -9,7 +9,6 @@ use crate::domain::{CameraId, Error, ErrorKind, Result};
 /// A collection of features.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum CollectionId {
-    /// Every camera.
     Cameras,
     /// The samples of a camera.
     Samples(CameraId),
@@ -31,7 +30,7 @@ impl CollectionId {
         }
     }
 
-    /// What its features are.
+    /// Returns the description of its features.
     pub(super) const fn description(&self) -> &'static str {
         match self {
             Self::Cameras => "Cameras; the geometry is the area on the ground that the active model covers",

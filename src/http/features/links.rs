@@ -16,7 +16,7 @@ pub(super) const GEOJSON: &str = "application/geo+json";
 pub(super) struct Link {
     /// Where it leads.
     href: String,
-    /// What that is to this.
+    /// The relation of that resource to this one.
     #[schema(value_type = String, example = "self")]
     rel: &'static str,
     /// Its media type.

@@ -51,9 +51,9 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 /// Where the interface begins.
 #[derive(Serialize, ToSchema)]
 struct LandingPage {
-    /// Its title.
+    /// Title of the interface.
     title: &'static str,
-    /// What it offers.
+    /// A description of the data.
     description: &'static str,
     /// Where its parts are.
     links: Vec<Link>,
@@ -62,7 +62,7 @@ struct LandingPage {
 /// Requirements classes that are satisfied.
 #[derive(Serialize, ToSchema)]
 struct Conformance {
-    /// Their URIs.
+    /// URIs of the conformance classes.
     #[serde(rename = "conformsTo")]
     conforms_to: [&'static str; 2],
 }
@@ -81,9 +81,9 @@ struct Collections {
 struct Collection {
     /// Its id: `cameras`, `{camera}.samples` or `{camera}.tracks`.
     id: String,
-    /// Its title.
+    /// Title of the collection.
     title: String,
-    /// What its features are.
+    /// The description of its features.
     description: &'static str,
     /// `feature`.
     #[serde(rename = "itemType")]
@@ -140,10 +140,10 @@ struct GeoJsonFeature {
     /// Its geometry; null where none is known.
     #[schema(value_type = Option<Object>)]
     geometry: Value,
-    /// Its properties.
+    /// Properties of the feature.
     #[schema(value_type = Object)]
     properties: Map<String, Value>,
-    /// Of a single feature: where it and its collection are.
+    /// Links of a single feature: to itself and to its collection.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     links: Vec<Link>,
 }

@@ -1,4 +1,4 @@
-//! What of a collection is asked for: a box, a time, a number.
+//! The query of a collection: a box, a time, a number.
 
 use std::fmt::Write as _;
 
@@ -87,7 +87,7 @@ impl Area {
         if is_valid { Ok(Self { west_deg, south_deg, east_deg, north_deg }) } else { Err(invalid()) }
     }
 
-    /// Whether a point is within, borders included.
+    /// True if a point is in the area, borders included.
     pub(super) fn contains(&self, point: Position) -> bool {
         let longitude_deg = point.longitude_deg();
         let is_between = if self.west_deg <= self.east_deg {
@@ -98,7 +98,7 @@ impl Area {
         is_between && (self.south_deg..=self.north_deg).contains(&point.latitude_deg())
     }
 
-    /// Whether a convex polygon shares a point with the area (separating axes: the sides of both).
+    /// True if a convex polygon shares a point with the area (separating axes: the sides of both).
     pub(super) fn intersects(&self, corners: &[Position]) -> bool {
         self.rectangles().iter().any(|rectangle| {
             let polygon: Vec<[f64; 2]> =
@@ -120,7 +120,7 @@ impl Area {
     }
 }
 
-/// Whether a side of `one`, counterclockwise, has all of `other` beyond it.
+/// True if a side of `one`, counterclockwise, has all of `other` beyond it.
 fn is_separated(one: &[[f64; 2]], other: &[[f64; 2]]) -> bool {
     let next = one.iter().cycle().skip(1);
     one.iter().zip(next).any(|(from, to)| {
@@ -161,7 +161,7 @@ impl Interval {
         Ok(interval)
     }
 
-    /// Whether an instant is within, ends included.
+    /// True if an instant is in the interval, ends included.
     pub(super) fn contains(self, time: Timestamp) -> bool {
         self.from.is_none_or(|from| from <= time) && self.to.is_none_or(|to| time <= to)
     }

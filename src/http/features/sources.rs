@@ -26,7 +26,6 @@ pub(super) struct Feature {
 pub(super) enum Geometry {
     /// None is known.
     Unknown,
-    /// A position.
     Point(Position),
     /// A convex area, by its corners counterclockwise.
     Polygon(Vec<Position>),
@@ -51,7 +50,7 @@ impl Geometry {
         }
     }
 
-    /// Whether it shares a point with the area; where none is known, it does, as the standard has it.
+    /// True if it shares a point with the area; also true where no geometry is known, as the standard requires.
     fn intersects(&self, area: Option<&Area>) -> bool {
         let Some(area) = area else { return true };
         match self {

@@ -1,4 +1,4 @@
-//! What a client of any gRPC server meets, and a server to meet it at.
+//! The behaviour of any gRPC server to its clients, and a server for these tests.
 
 use std::net::SocketAddr;
 use std::time::Duration;

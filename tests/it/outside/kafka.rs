@@ -131,7 +131,7 @@ async fn a_broker_of_kafka_is_read_on_behind_what_is_stored_also_after_a_kill() 
     assert_eq!((&sample["target_id"], &sample["class"]), (&json!("345"), &json!("Bicycle")));
     server.kill();
 
-    // What was acknowledged does not come again, and what came meanwhile does.
+    // Acknowledged messages do not come again, and those that came meanwhile do.
     let time = now();
     cluster.publish(0, &detection(time, "7"));
     cluster.publish(2, &detection(time, "8"));

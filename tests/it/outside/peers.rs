@@ -89,7 +89,7 @@ impl Broker {
         assert!(process.wait().expect("it ends").success());
     }
 
-    /// What the broker keeps for those who subscribe later; empty if nothing.
+    /// The retained message of a topic; empty if there is none.
     pub(crate) fn retained(&self, topic: &str) -> String {
         let mut command = Command::new("mosquitto_sub");
         command.args(&self.client_arguments);

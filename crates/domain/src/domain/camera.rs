@@ -37,10 +37,10 @@ pub struct NewCamera {
     pub labels: BTreeMap<String, String>,
     /// The targets that carry the GNSS receivers, and the receivers' clock offsets.
     pub receivers: Receivers,
-    /// Whether a training run starts automatically after the camera has moved.
+    /// True if a training run starts automatically after the camera has moved.
     pub retrain_when_moved: bool,
-    /// Whether the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on those
-    /// that belong together beyond doubt.
+    /// True if the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on
+    /// those that certainly belong together.
     pub learn_automatically: bool,
     /// The site whose tracks the camera contributes to.
     pub site: Option<SiteId>,
@@ -127,9 +127,9 @@ pub struct CameraChange {
     pub labels: Option<BTreeMap<String, String>>,
     /// New receivers; they replace all.
     pub receivers: Option<Receivers>,
-    /// Whether to retrain automatically.
+    /// The new value of [`NewCamera::retrain_when_moved`].
     pub retrain_when_moved: Option<bool>,
-    /// Whether to learn automatically while there is no model.
+    /// The new value of [`NewCamera::learn_automatically`].
     pub learn_automatically: Option<bool>,
     /// New site; `Some(None)` removes the camera from its site.
     pub site: Option<Option<SiteId>>,
@@ -209,7 +209,7 @@ impl From<CameraKey> for i64 {
     }
 }
 
-/// What a change of a camera or a site is based on: refused if it is another one by now, or has been changed.
+/// The version that a change of a camera or a site is based on. The change is refused if another version is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ExpectedVersion<K = CameraKey> {
     /// The key, if the caller knows which of those that had the id it means.
@@ -262,7 +262,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// What a change of it is based on.
+    /// Returns the version that a change of this camera is based on.
     #[must_use]
     pub const fn version(&self) -> ExpectedVersion {
         ExpectedVersion { key: Some(self.key), revision: self.revision }

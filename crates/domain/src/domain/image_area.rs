@@ -31,7 +31,7 @@ impl ImageArea {
         Ok(Self { corners_px })
     }
 
-    /// Whether the foot of a box, the middle of its lower edge, is inside.
+    /// True if the foot of a box, the middle of its lower edge, is inside.
     #[must_use]
     pub fn contains_foot_of(&self, bounding_box: &BoundingBox) -> bool {
         let x_px = bounding_box.left_px() + 0.5 * bounding_box.width_px();

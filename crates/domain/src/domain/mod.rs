@@ -3,7 +3,7 @@
 //! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
 //! it and do not check again.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod access;

@@ -48,7 +48,7 @@ pub struct RunProgress {
 /// One point of a run's learning curve: one epoch of the final fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct EpochReport {
-    /// From 1.
+    /// Number of the epoch, from 1.
     pub epoch: u32,
     /// L of (1).
     pub loss: f64,
@@ -60,11 +60,11 @@ pub struct EpochReport {
     pub error_scale: f64,
 }
 
-/// What a training run trains: a camera, or all cameras of a site together.
+/// The subject of a training run: a camera, or all cameras of a site together.
 pub trait TrainingSubject {
     /// The parameters of its runs.
     type Options: fmt::Debug + Clone + PartialEq + Send + Sync + 'static;
-    /// What its runs find out.
+    /// The findings of its runs.
     type Report: fmt::Debug + Clone + PartialEq + Send + Sync + 'static;
 }
 
@@ -95,10 +95,10 @@ pub struct TrainingRun<S: TrainingSubject> {
     pub attempt: u32,
     /// The model version it produced; `None` for a site, whose report has those of its cameras.
     pub model_version: Option<u32>,
-    /// What the run found out: for a camera while the version that it produced is stored, for a site once it has
+    /// The run's findings: for a camera while the version that it produced is stored, for a site once it has
     /// succeeded.
     pub report: Option<S::Report>,
-    /// Whether its versions were activated and why, or why the run failed.
+    /// Says if the run's versions were activated and why, or why the run failed.
     pub outcome: Option<String>,
     /// Time of creation.
     pub created_at: Timestamp,
@@ -175,7 +175,7 @@ pub struct CandidateReport {
     pub held_out: HeldOutError,
 }
 
-/// What a run found out about one candidate.
+/// The findings of a run about one candidate.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CandidateFinding {
@@ -191,13 +191,13 @@ pub struct CandidateFinding {
     pub summary: String,
 }
 
-/// What a training run kept, how sure it is, and what would make it surer.
+/// The candidate that a training run kept, its errors, and advice to reduce them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingReport {
     /// One per candidate, in the order in which they were tried.
     pub candidates: Vec<CandidateFinding>,
-    /// What would help, one sentence each.
+    /// Measures that would reduce the error, one sentence each.
     pub advice: Vec<String>,
 }
 
@@ -219,7 +219,7 @@ impl fmt::Display for TrainingReport {
     }
 }
 
-/// Of which joint training a model version is part: its map's error is correlated with those of the other cameras'
+/// The site training run that made a model version: its map's error is correlated with those of the other cameras'
 /// versions of the same run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -269,7 +269,7 @@ pub struct ModelMetadata {
     pub held_out: Option<HeldOutError>,
     /// The candidates of the model selection.
     pub candidates: Vec<CandidateReport>,
-    /// What the run found out; `None` for models of earlier releases.
+    /// The run's findings; `None` for models of earlier releases.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub report: Option<TrainingReport>,
     /// The run that trained it together with the other cameras of its site, if one did.

@@ -1,10 +1,10 @@
-//! Whether the boxes and the fixes of a target agree, over longer than one instant.
+//! The agreement of the boxes and the fixes of a target, over longer than one instant.
 //!
 //! Each fix is paired with the box of its instant. Of the pairs' differences (fix less box) running means are kept: in
 //! metres, in standard deviations of the stated errors, and the share beyond the gate of a single pair. Errors that
 //! last longer than the mean do not average out, so a mean of n pairs has the variance `c + (1 - c) / n`, with c the
 //! share of such errors. Beside it each source is held against the motion of a target: it may not jump, nor stand
-//! still to the last digit. Never here: estimates, the filter's own state.
+//! still to the last digit. Does not contain estimates or the filter's own state.
 
 use jiff::Timestamp;
 
@@ -67,10 +67,10 @@ struct Pairs {
     contradicting: f64,
 }
 
-/// What boxes and fixes together say.
+/// The verdict on boxes and fixes together.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Verdict {
-    /// Whether they differ by more than chance explains.
+    /// True if they differ by more than chance explains.
     pub(super) disagrees: bool,
     /// The source that is not to be used, and why: its positions are not those of a moving target where they differ from
     /// the other's, or its boxes are frozen.
@@ -113,7 +113,7 @@ impl Agreement {
         }
     }
 
-    /// What is known so far.
+    /// Returns the verdict so far.
     #[inline]
     pub(super) fn verdict(&self) -> Verdict {
         let [by_box, by_fix] = self.motions.map(|motion| motion.implausible > 0.5);

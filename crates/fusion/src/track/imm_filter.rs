@@ -2,7 +2,7 @@
 //! and Kirubarajan 2001, 11.6.6): one [`ModeFilter`] per motion mode, their mixing, and the gate.
 //!
 //! Motion modes: stationary, steady (slowly varying velocity), agile (turning or starting).
-//! Never here: history, time to live, out-of-sequence measurements ([`super::Track`]).
+//! Does not contain history, time to live, or out-of-sequence measurements ([`super::Track`]).
 
 use jiff::Timestamp;
 
@@ -44,7 +44,7 @@ pub(super) struct ImmFilter {
     last_regressed_at: Option<Timestamp>,
     camera: CameraError,
     agreement: Agreement,
-    /// Whether the filter is to restart from the next fix, as what the boxes have told it is void.
+    /// True if the filter is to restart from the next fix, as what the boxes have told it is void.
     awaits_fix: bool,
     /// Square of the highest speed observed with confidence, decaying, m2/s2.
     speed_envelope_m2_s2: f64,
@@ -453,7 +453,7 @@ impl ImmFilter {
     }
 }
 
-/// Whether a regressed position and a fix of one instant pass each other's gate.
+/// True if a regressed position and a fix of one instant pass each other's gate.
 fn agree(settings: &TrackSettings, regressed: MeasuredPosition, fix: MeasuredPosition) -> bool {
     let covariance = fix.covariance.plus(regressed.covariance.scaled(regressed.stated_scale));
     fix.covariance.is_positive()

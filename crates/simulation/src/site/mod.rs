@@ -46,7 +46,7 @@ pub struct LabelledDetection {
 pub struct SimulatedCamera {
     /// Its id.
     pub id: CameraId,
-    /// What it detected.
+    /// The camera's detections.
     pub detections: Vec<LabelledDetection>,
 }
 
@@ -126,7 +126,7 @@ struct CarriedReceiver {
     id: ReceiverId,
     target: usize,
     receiver: SimulatedReceiver,
-    /// Of its latest fix, s since the start.
+    /// Time of its latest fix, s since the start.
     latest_s: Option<f64>,
 }
 

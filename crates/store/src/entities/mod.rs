@@ -1,4 +1,4 @@
-//! What is stored, an entity per file, with statements that both backends execute.
+//! The stored entities, a file each, with statements that both backends execute.
 
 mod audit;
 mod camera_contents;

@@ -36,7 +36,7 @@ pub struct CameraVersions {
     pub versions: Vec<CameraVersion>,
     /// Those that were deleted; `None` where `versions` has all that there are.
     pub deleted: Option<Vec<(CameraId, CameraKey)>>,
-    /// What to ask with next; `None` on a store that reads all in any case.
+    /// The mark to ask with next; `None` on a store that reads all in any case.
     pub upto: Option<ChangeMark>,
 }
 

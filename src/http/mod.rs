@@ -26,6 +26,7 @@ mod fusions;
 mod gnss_error;
 mod idempotency;
 mod inference;
+mod inference_body;
 mod keys;
 mod learning;
 mod merge_patch;

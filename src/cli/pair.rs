@@ -50,11 +50,12 @@ pub(super) struct Pair {
     /// Time of the first frame of such a file, such as 2026-06-01T12:00:00Z
     #[arg(long, value_name = "TIME", value_parser = parse_time, requires = "detections_format")]
     start_time: Option<Timestamp>,
-    /// Fixes as CSV, NMEA, GPX or gpsd reports (.json), by file extension, which may be followed by .gz or .zst; - is standard
+    /// Fixes as CSV, NMEA, GPX, gpsd reports (.json) or solutions of RTKLIB (.pos), by file extension, which may be
+    /// followed by .gz or .zst; - is standard
     /// input
     #[arg(long, value_name = "FILE")]
     fixes: PathBuf,
-    /// Format of the fixes if the extension does not determine it: csv, nmea, gpx or gpsd
+    /// Format of the fixes if the extension does not determine it: csv, nmea, gpx, gpsd or rtklib
     #[arg(long, value_name = "FORMAT")]
     fixes_format: Option<FixFormat>,
     /// Output file for `sightfix import`: CSV, NDJSON or JSON, by file extension, which may be followed by .gz or
@@ -106,7 +107,7 @@ pub(super) struct Pair {
 /// Matching of boxes that have only a tracker's ids with fixes that have only receivers'
 #[derive(Args)]
 struct MatchFlags {
-    /// Find out whose boxes show whose receivers: boxes need only a tracker's ids. Sure samples get the
+    /// Match boxes with receivers: boxes need only a tracker's ids. Sure samples get the
     /// receiver's id as target_id, and the columns tracker_id and match_probability
     #[arg(long = "match", conflicts_with_all = ["receivers", "estimate_offset"])]
     matches: bool,
@@ -231,7 +232,7 @@ impl Pair {
         anyhow::ensure!(!both, "only one of --detections and --fixes can be standard input");
         let format = files::fix_format_of(&self.fixes, self.fixes_format).with_context(|| {
             let name = self.fixes.display();
-            format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx or gpsd")
+            format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx, gpsd or rtklib")
         })?;
         if let Some(out) = &self.out {
             files::format_of(out, None)?; // fail early

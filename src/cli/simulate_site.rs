@@ -174,7 +174,7 @@ fn write_identities(out: &mut dyn Write, site: &SimulatedSite) -> std::io::Resul
     writeln!(out, "camera,target_id,person,from,until")?;
     for camera in &site.cameras {
         let mut latest: BTreeMap<&TargetId, (&TargetId, Timestamp, Timestamp)> = BTreeMap::new();
-        let mut spells = Vec::new();
+        let mut segments = Vec::new();
         for LabelledDetection { detection, target } in &camera.detections {
             let Some(target) = target else { continue };
             let time = detection.time;
@@ -182,13 +182,13 @@ fn write_identities(out: &mut dyn Write, site: &SimulatedSite) -> std::io::Resul
                 Some((person, _, until)) if *person == target => *until = time,
                 _ => {
                     let ended = latest.insert(&detection.target_id, (target, time, time));
-                    spells.extend(ended.map(|spell| (&detection.target_id, spell)));
+                    segments.extend(ended.map(|segment| (&detection.target_id, segment)));
                 }
             }
         }
-        spells.extend(latest);
-        spells.sort();
-        for (id, (person, from, until)) in spells {
+        segments.extend(latest);
+        segments.sort();
+        for (id, (person, from, until)) in segments {
             writeln!(out, "{},{id},{person},{from},{until}", camera.id)?;
         }
     }

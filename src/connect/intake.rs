@@ -134,19 +134,16 @@ impl Intake {
         self.pending_items
     }
 
-    /// Takes a message. What is wrong with it, or with one of its items, is counted and shown in the status.
+    /// Takes a message. Faults of the message, or of one of its items, are counted and shown in the status.
     ///
     /// # Errors
-    /// What failed is not the message's fault, so it must come again.
+    /// A failure that is not the message's fault, so the message must come again.
     pub(super) async fn take(&mut self, message: Message) -> Result<(), PeerError> {
         let now = self.app.clock.now();
         let time_bounds = self.app.live_time_bounds(now);
         let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
-        let read = if message.size_bytes > self.app.limits.connection_message_bytes {
-            Err(format!("is larger than {} bytes", self.app.limits.connection_message_bytes))
-        } else {
-            self.decoder.decode(&message.payload, &context)
-        };
+        let content = message.content(self.app.limits.connection_message_bytes);
+        let read = content.and_then(|content| self.decoder.decode(content, &context));
         let mut account = Account { now, ..Account::default() };
         let mut items = Vec::new();
         let outcome = match read {
@@ -289,12 +286,12 @@ async fn open_stream(
     }
 }
 
-/// Whether another node has a camera, or may have it.
+/// True if another node has a camera, or may have it.
 const fn is_elsewhere(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }
 
-/// Whether an error concerns one item, so that the rest goes on.
+/// True if an error concerns one item, so that the rest goes on.
 const fn is_of_item(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::InvalidArgument | ErrorKind::CameraNotFound | ErrorKind::Overloaded)
 }
@@ -372,12 +369,12 @@ fn box_in(
     BoundingBox::new(left * across, top * down, (right - left) * across, (bottom - top) * down)
 }
 
-/// What is said of a message that could be read and says nothing.
+/// The reading of a message that was decoded and is empty.
 const EMPTY_READING: &str = "the message contains no detection and no fix";
 /// Bytes of a message that was not taken which are kept as an example.
 const EXAMPLE_BYTES: usize = 200;
 
-/// What became of the items of one message.
+/// The counts of the items of one message.
 #[derive(Default)]
 struct Account {
     now: Timestamp,

@@ -29,16 +29,16 @@ use crate::config::Limits;
 use crate::domain::OutboxMessage;
 use crate::exchange::{Address, Scheme, bracketed};
 
-/// What a PUBLISH packet has besides its payload, at most: topic and properties.
+/// The largest size of a PUBLISH packet besides its payload: topic and properties.
 const PACKET_OVERHEAD_BYTES: usize = 66_000;
 /// Messages that a sink may have under way; fewer where the broker states so.
 const PUBLISH_QUEUE: usize = 128;
-/// What a broker may send to a sink, which subscribes to nothing, bytes.
+/// The largest size of a broker's messages to a sink, which subscribes to nothing, bytes.
 const SINK_BYTES: usize = 64 << 10;
 /// Largest packet of a sink, bytes.
 const SINK_PACKET_BYTES: usize = 1 << 20;
 
-/// Of a broker that never answers a subscription.
+/// The error of a broker that never answers a subscription.
 const UNCONFIRMED: &str = "the broker has not confirmed the subscription within 10 s";
 
 const NEEDS_MQTT: &str = "connections need MQTT 5 or 3.1.1";
@@ -233,7 +233,7 @@ impl MqttSource {
         Ok(())
     }
 
-    /// What the broker sends next, if it is a message.
+    /// Returns the broker's next packet, if it is a message.
     async fn message(&mut self) -> Result<Option<(Incoming, HeldBytes)>, PeerError> {
         match self.link.report().await? {
             (Report::Message(message), held) => return Ok(Some((message, held))),
@@ -293,7 +293,6 @@ impl Source for MqttSource {
     }
 }
 
-/// Publishes messages.
 pub(super) struct MqttSink {
     link: Link,
     media_type: &'static str,

@@ -21,10 +21,10 @@ pub(super) enum Version {
     ThreeOneOne,
 }
 
-/// What a client asks of its broker.
+/// The options that a client asks of its broker.
 pub(super) struct Wishes {
     pub(super) client_id: String,
-    /// Whether the broker keeps the session while the client is away.
+    /// True if the broker keeps the session while the client is away.
     pub(super) is_kept: bool,
     /// Messages that the broker may send before they are acknowledged; as many as it likes if `None`.
     pub(super) receive_maximum: Option<u16>,
@@ -47,7 +47,7 @@ pub(super) struct Place {
 pub(super) struct Incoming {
     pub(super) topic: String,
     pub(super) payload: Bytes,
-    /// What is acknowledged; `None` for QoS 0.
+    /// The promise to acknowledge the message; `None` for QoS 0.
     pub(super) promise: Option<Promise>,
 }
 
@@ -57,7 +57,7 @@ pub(super) enum Promise {
     ThreeOneOne(Box<rumqttc::Publish>),
 }
 
-/// What the task of a connection reports.
+/// A report of the task of a connection.
 pub(super) enum Report {
     Subscribed(Result<(), String>),
     Connected,
@@ -72,7 +72,7 @@ pub(super) enum Report {
 }
 
 impl Report {
-    /// Bytes that it takes up.
+    /// Bytes that it occupies.
     pub(super) fn bytes(&self) -> usize {
         match self {
             Self::Message(message) => message.payload.len() + message.topic.len(),
@@ -80,7 +80,7 @@ impl Report {
         }
     }
 
-    /// Whether the connection has ended.
+    /// True if the connection has ended.
     pub(super) const fn is_end(&self) -> bool {
         matches!(self, Self::Failed(_) | Self::UnknownVersion(_))
     }
@@ -204,7 +204,7 @@ impl Client {
 }
 
 impl Connection {
-    /// What happens next; `None` for what nobody asks for.
+    /// Returns the next report; `None` for an event that nobody needs.
     pub(super) async fn next(&mut self, is_connected: bool) -> Option<Report> {
         match self {
             Self::Five(connection) => match connection.poll().await {
@@ -222,7 +222,7 @@ impl Connection {
     }
 }
 
-/// Whether a broker may have failed to answer because it does not know MQTT 5: it says so, ends the connection, or
+/// True if a broker may have failed to answer because it does not know MQTT 5: it says so, ends the connection, or
 /// sends the answer of MQTT 3.1.1, which is two bytes shorter than a packet of MQTT 5 can be.
 const fn may_lack_mqtt_5(error: &v5::ConnectionError) -> bool {
     use ConnectReturnCode::{RefusedProtocolVersion, UnsupportedProtocolVersion};

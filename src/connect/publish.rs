@@ -32,7 +32,7 @@ pub(super) struct Publisher<'a> {
 impl Publisher<'_> {
     pub(super) async fn run(self) {
         let Some(feed) = self.app.sink_feeds.of(self.key) else { return };
-        // Before anything else the database is told of the log, so that it will be known if this process ends too soon.
+        // The database first learns of the log, so that it is known if this process ends too soon.
         self.store(&[]).await;
         // Set before, where the settings have changed since.
         let _ = self.live.publishing.set(());

@@ -1,4 +1,4 @@
-//! What a sink is.
+//! The interface of a sink.
 
 use futures_util::future::BoxFuture;
 

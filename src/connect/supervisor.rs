@@ -40,7 +40,7 @@ const DEFAULT_INTERVAL_S: f64 = 1.0;
 /// Connections read at a time.
 const PAGE: u32 = 256;
 
-/// What a task does for a connection.
+/// The part of a connection that a task runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Part {
     /// Reads the source.
@@ -51,7 +51,7 @@ enum Part {
     Delivery,
 }
 
-/// What a task was started for.
+/// The version of the settings with which a task was started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct TaskVersion {
     key: ConnectionKey,
@@ -132,15 +132,16 @@ impl Supervisor {
     /// Starts and ends tasks, so that they are those of the stored connections, and tells other nodes what they do.
     async fn look(&mut self) -> Result<()> {
         let connections = all_connections(&self.app).await?;
-        self.count_lost(&connections).await?;
         let all: Vec<_> =
             connections.iter().map(|connection| (connection.key, connection.revision)).collect();
         let active: Vec<_> = connections
-            .into_iter()
+            .iter()
             .filter(|connection| !connection.profile.paused)
-            .filter_map(|connection| self.read(connection).map(Arc::new))
+            .filter_map(|connection| self.read(connection.clone()).map(Arc::new))
             .collect();
+        // Before anything is written, which a full disk refuses: from here on no position is missed.
         self.feed(all, &active);
+        self.count_lost(&connections).await?;
         let site_of = |camera: &CameraId| self.app.registry.get(camera).and_then(|known| known.site.clone());
         let keyed = active.iter().map(|active| (active.connection.key, &active.settings));
         let groups = connection_groups(keyed, site_of);
@@ -159,7 +160,7 @@ impl Supervisor {
             tracing::warn!(connection = %connection.id(), message);
             let error = Some((self.app.clock.now(), message.to_owned()));
             self.app.live_connection(connection).update(|status| {
-                // How many is not known.
+                // The number of positions is not known.
                 status.dropped += 1;
                 status.last_error = error;
             });
@@ -296,7 +297,7 @@ async fn run_part(app: &App, task: &WantedTask, live: &Arc<LiveConnection>) {
     }
 }
 
-/// What a connection does again after each failure.
+/// The work that a connection repeats after each failure.
 enum Work<'a> {
     Source { settings: &'a SourceSettings, secrets: &'a Secrets },
     Delivery(Delivery<'a>),

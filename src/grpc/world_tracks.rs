@@ -19,7 +19,7 @@ use crate::telemetry::RequestId;
 pub(super) mod live_id {
     use crate::domain::{Error, ErrorKind, LiveId, Result};
 
-    /// What is no id of a track names none that there is.
+    /// A text that is no id of a track names a track that does not exist.
     pub(in crate::grpc) fn of_track(text: &str) -> Result<LiveId> {
         text.parse().map_err(|_: Error| {
             Error::refused(ErrorKind::TrackNotFound, "that is not the id of a world track")

@@ -7,7 +7,6 @@ use crate::domain::{Error, LiveItem, ReceiverId, Result, TargetId};
 /// The owner of fixes that name no target.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FixOwner {
-    /// A target.
     Target(TargetId),
     /// A receiver; the server knows its target.
     Receiver(ReceiverId),

@@ -20,7 +20,7 @@ use crate::grpc::proto::stream_answer::Outcome;
 use crate::grpc::proto::track_rejection::Reason;
 use crate::grpc::proto::{StreamAnswer, TrackRejection};
 
-/// What several cameras share.
+/// The state that several cameras share.
 pub(super) struct Link {
     /// Connection to the server, or to what stands before its nodes.
     pub(super) server: Connection,
@@ -41,7 +41,7 @@ pub(super) struct SimulatedCamera {
     link: Link,
     /// Where the next stream is opened.
     connection: Connection,
-    /// Whether nothing was answered since another node was named.
+    /// True if nothing was answered since another node was named.
     is_redirected: bool,
     /// Since when nothing has been answered after a failure.
     broken_at: Option<Instant>,

@@ -130,11 +130,11 @@ async fn what_is_kept_no_more_is_said_to_be_lost() {
     }
     assert_eq!(times(&kept).last(), Some(&"2020-12-14T08:16:39Z"));
     // The next event goes on after the loss.
-    let mut behind = Events::open(&server, EVENTS, Some(&lost.id)).await;
-    assert_eq!(behind.next().await.as_ref(), kept.first());
+    let mut later = Events::open(&server, EVENTS, Some(&lost.id)).await;
+    assert_eq!(later.next().await.as_ref(), kept.first());
 
     // Another run of the server knows nothing of these events.
-    drop((events, again, behind));
+    drop((events, again, later));
     server.kill();
     let server = TestServer::start(folder.path());
     for id in [first.id.as_str(), "nonsense", "0000000000000000-5"] {

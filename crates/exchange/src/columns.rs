@@ -33,7 +33,7 @@ pub(super) const RECEIVER_ID: usize = 15;
 pub(super) const COUNT: usize = 16;
 /// Number of columns of a file of samples, observations or detections: the first of all.
 pub(super) const OF_SAMPLES: usize = 15;
-/// Of these, the columns of samples that were not matched: the last two say how a sample was.
+/// Number of columns of samples that were not matched: the last two say how a sample was.
 pub(super) const OF_UNMATCHED: usize = 13;
 
 /// All columns, in the order of writing.

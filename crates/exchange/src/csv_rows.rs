@@ -33,7 +33,7 @@ struct ValueRules {
     is_documented: bool,
     has_decimal_comma: bool,
     box_form: BoxForm,
-    /// What the sides of boxes are multiplied by, in x and y.
+    /// The factors of the sides of boxes, in x and y.
     scale_px: [f64; 2],
     timezone: Option<TimeZone>,
 }

@@ -12,7 +12,7 @@ pub struct RowError {
     pub line: u64,
     /// Column, or path of the field in the row's JSON; empty if the row as a whole is invalid.
     pub field: String,
-    /// What is wrong and what is valid.
+    /// States the fault and the valid values.
     pub reason: String,
 }
 

@@ -16,7 +16,7 @@
 //! | [`Cursor`] | the key after which the next page of a list begins, as text |
 
 #![warn(missing_docs)]
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod address;
@@ -46,6 +46,7 @@ mod objects_only;
 mod outgoing;
 mod recording;
 mod rows;
+mod rtklib;
 mod source_decoder;
 #[cfg(test)]
 mod tests;

@@ -17,7 +17,7 @@ use crate::domain::{
 };
 use crate::geo::Position;
 
-/// What rows are checked against.
+/// The rules that rows are checked against.
 #[derive(Debug, Clone, Copy)]
 pub struct RowRules {
     /// Valid times.

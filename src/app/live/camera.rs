@@ -20,13 +20,13 @@ use crate::domain::{BoundingBox, CameraMoved, FusedFix};
 /// When something was observed, by the server's clock.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Observed {
-    /// Last.
+    /// The time of the last one.
     pub(super) last_at: Option<Timestamp>,
     /// Since when every box was frozen.
     pub(super) frozen_since: Option<Timestamp>,
 }
 
-/// What happens in a camera's view.
+/// An event in a camera's view.
 #[derive(Debug, Clone)]
 pub enum CameraEvent {
     /// A target was measured.
@@ -106,7 +106,7 @@ impl CameraLive {
         self.replaced.cancelled().await;
     }
 
-    /// Whether the camera is deleted.
+    /// True if the camera is deleted.
     #[cfg(test)]
     pub(in crate::app) fn is_deleted(&self) -> bool {
         self.deleted.is_cancelled()
@@ -133,7 +133,7 @@ impl CameraLive {
         }
     }
 
-    /// What was observed since the server was started.
+    /// Returns the counts of what was observed since the server was started.
     pub(super) fn latest_observed(&self) -> Observed {
         *lock(&self.observed)
     }

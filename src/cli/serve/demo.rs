@@ -25,7 +25,7 @@ const CAMERA: &str = "demo";
 const TARGETS: usize = 8;
 /// Rows of the walk, which then begins again.
 const ROWS: usize = 20_000;
-/// Of the targets, those that carry a phone.
+/// Number of targets that carry a phone.
 const PHONES: usize = 2;
 /// Every so often one phone loses GNSS, and its track goes on by the boxes alone.
 const GNSS_LOSS_EVERY_S: i64 = 60;
@@ -108,7 +108,7 @@ pub(super) async fn walk(address: SocketAddr, now: Timestamp) -> anyhow::Result<
     Ok(())
 }
 
-/// What camera and phones give of a row; `None` if nothing.
+/// The item of a row by camera and phones; `None` if nothing.
 fn observed(row: &SimulatedRow, first: Timestamp) -> Option<LiveItem> {
     let elapsed_s = row.time.duration_since(first).as_secs();
     let is_denied = row.target == 0 && elapsed_s % GNSS_LOSS_EVERY_S >= GNSS_LOSS_EVERY_S - GNSS_LOSS_S;

@@ -60,7 +60,7 @@ async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
     assert_eq!((&sample["class"], &sample["score"]), (&json!("person"), &json!(0.87890625)));
     server.kill();
 
-    // What was acknowledged does not come again.
+    // Acknowledged messages do not come again.
     let server = TestServer::start(folder.path());
     connection_when(&server, "frigate", |status| status["state"] == "running").await;
     broker.publish("frigate/events", "not JSON");

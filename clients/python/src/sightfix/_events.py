@@ -17,7 +17,7 @@ class LostEvents:
 
 @dataclass(frozen=True)
 class SiteEvent:
-    """What happened at a site."""
+    """An event of a site."""
 
     id: str
     """Its id; a watch can resume after it."""

@@ -144,7 +144,7 @@ impl BoundingBox {
         [self.left_px + 0.5 * self.width_px, self.top_px + self.height_px]
     }
 
-    /// Whether the image border truncates the box, to within one pixel. Without an image size only the
+    /// True if the image border truncates the box, to within one pixel. Without an image size only the
     /// upper and left borders are checked.
     #[must_use]
     pub fn touches_border(self, image_size: Option<ImageSize>) -> bool {

@@ -3,7 +3,7 @@
 //! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
 //! it and do not check again.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod access;
@@ -38,7 +38,7 @@ mod score;
 mod site;
 mod site_training;
 mod time;
-mod training;
+mod training_run;
 
 pub use access::{ApiKey, KeyId, KeySecret, NewKey, Role, Scope, SecretDigest};
 pub use audit::{Actor, AuditAction, AuditEntry, AuditNumber};
@@ -78,7 +78,7 @@ pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport};
 pub use time::{TimeBounds, parse_time, parse_time_in, parse_time_zone};
-pub use training::{
+pub use training_run::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
     HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,
     TrainingReport, TrainingRun, TrainingSubject,

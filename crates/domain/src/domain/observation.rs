@@ -90,7 +90,7 @@ impl Observation {
         Ok(Self { time, target_id, tracker_id: None, bounding_box, fix })
     }
 
-    /// Of a box that has only the number of its camera's tracker.
+    /// Returns the observation of a box that has only the number of its camera's tracker.
     ///
     /// # Errors
     /// Names `tracker_id` beside a target or a fix, whose target would be known.
@@ -117,7 +117,7 @@ impl Observation {
         Self { target_id: Some(target_id), ..self }
     }
 
-    /// Of a fix, with or without a box.
+    /// Returns the observation of a fix, with or without a box.
     #[must_use]
     pub const fn with_fix(
         time: Timestamp,

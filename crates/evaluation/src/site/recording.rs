@@ -14,7 +14,7 @@ const VISIT_GAP_S: f64 = 5.0;
 /// A detection with the target that it is of.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledBox {
-    /// When.
+    /// The instant of the detection.
     pub time: Timestamp,
     /// The id by the camera's tracker.
     pub tracker_id: TargetId,
@@ -27,7 +27,7 @@ pub struct LabelledBox {
 /// The detections of one camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedCamera {
-    /// Its id.
+    /// The id of the camera.
     pub id: CameraId,
     /// In the order of time.
     pub boxes: Vec<LabelledBox>,

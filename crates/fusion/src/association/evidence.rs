@@ -30,7 +30,7 @@ const FREEDOM: f64 = 4.0;
 /// After so long a gap between fixes the motion of somebody else starts again, s.
 const MAX_GAP_S: f64 = 60.0;
 
-/// What the likelihoods assume.
+/// The assumptions of the likelihoods.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct EvidenceModel {
     /// Error of a receiver.
@@ -50,9 +50,9 @@ impl EvidenceModel {
 #[derive(Debug, Clone, Copy, Default)]
 struct Innovations {
     fixes: f64,
-    /// Of the logarithms of the variances of both axes.
+    /// Sum of the logarithms of the variances of both axes.
     log_determinant: f64,
-    /// Of the normalised squares, those of outliers bounded.
+    /// Sum of the normalised squares, those of outliers bounded.
     squares: f64,
 }
 

@@ -293,7 +293,7 @@ fn clock_offsets_s(
         for offset_s in (-steps..=steps).map(|step| f64::from(step) * OFFSET_STEP_S) {
             cancellation.check()?;
             let evidence = evidence(fixes, offset_s);
-            // Of equals the last.
+            // Among equals the last.
             if evidence.total_cmp(&best.1).is_ge() {
                 best = (offset_s, evidence);
             }

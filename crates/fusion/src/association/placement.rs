@@ -42,7 +42,7 @@ const ROUNDS: usize = 25;
 /// Log-likelihood ratios are multiplied by it: what the noise model leaves out makes them overstated.
 const TEMPERING: f64 = 0.6;
 
-/// What a likelihood ratio is the ratio of.
+/// The variable of the densities whose ratio is a likelihood ratio.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Density {
     /// Densities of the fixes, given the boxes.
@@ -59,7 +59,7 @@ pub(super) struct GroundPrior {
     pub(super) map_sigma_m: f64,
     /// Standard deviation of the logarithm of the scale.
     pub(super) scale_sigma: f64,
-    /// What the evidence is a density of.
+    /// The variable of the evidence's density.
     pub(super) density: Density,
 }
 
@@ -370,7 +370,7 @@ impl PlacementSearch {
     }
 }
 
-/// Those that differ from all better ones by at least a distance, m; at most so many.
+/// Those that differ from all better ones by at least a distance, m, up to a number.
 fn distinct(sorted: &[Placement], points: &[C], most: usize, apart_m: f64) -> Vec<Placement> {
     let mut kept: Vec<Placement> = Vec::new();
     for own in sorted {

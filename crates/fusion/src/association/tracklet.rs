@@ -121,7 +121,7 @@ impl SceneMotion {
     /// Time over which a speed is measured, s: longer than the noise of boxes matters.
     const BASELINE_S: f64 = 2.0;
 
-    /// Of the targets that the tracklets show.
+    /// Returns the motion of the targets that the tracklets show.
     #[must_use]
     pub(super) fn of(tracklets: &[Tracklet]) -> Self {
         let points = || tracklets.iter().flat_map(|tracklet| &tracklet.points);

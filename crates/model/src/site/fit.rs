@@ -162,7 +162,7 @@ fn receiver_rows(input: &SiteFitInput<'_>) -> Vec<Vec<FixRow>> {
     all.filter(|rows| !rows.is_empty()).collect()
 }
 
-/// Whether the border of an image hides the foot of either box.
+/// True if the border of an image hides the foot of either box.
 fn is_cut(pair: &SitePair, input: &SiteFitInput<'_>) -> bool {
     [0, 1].into_iter().any(|at| is_foot_cut(&pair.boxes[at], input.image_sizes[pair.cameras[at]]))
 }
@@ -209,7 +209,7 @@ fn upright_geometries(
     maps.iter_mut().enumerate().map(of_camera).collect()
 }
 
-/// What the boxes' heights say, linearised at the maps. A camera that is none there goes on without.
+/// Priors from the boxes' heights, linearised at the maps. A camera without such a prior is fitted without it.
 fn foot_priors(geometries: &mut [Option<UprightGeometry>], maps: &[GroundMap]) -> Vec<Option<FootPrior>> {
     let of_camera = |(geometry, map): (&mut Option<UprightGeometry>, &GroundMap)| {
         let prior = geometry.as_mut()?.prior_at(&map.0);

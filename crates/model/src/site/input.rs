@@ -1,4 +1,4 @@
-//! What a site is trained on.
+//! The training input of a site.
 
 use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation};
 use crate::geo::EastNorth;
@@ -86,7 +86,7 @@ pub(super) fn foot_and_size(bounding_box: &BoundingBox) -> [f64; 4] {
     ]
 }
 
-/// Whether the border of the image hides the foot of a box or a side of it. The upper border hides the head
+/// True if the border of the image hides the foot of a box or a side of it. The upper border hides the head
 /// only.
 pub(super) fn is_foot_cut(bounding_box: &BoundingBox, image_size: Option<ImageSize>) -> bool {
     const NEAR_PX: f64 = 1.0;

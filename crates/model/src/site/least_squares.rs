@@ -59,7 +59,7 @@ pub(super) struct LeastSquaresProblem {
     pub(super) transfers: Vec<Transfer>,
     /// Standard deviation of a foot per axis, px.
     pub(super) foot_sigma_px: f64,
-    /// What the heights of boxes say of each camera's parameters, if anything.
+    /// Priors of each camera's parameters from the heights of boxes, if any.
     pub(super) foot_priors: Vec<Option<FootPrior>>,
     /// Noise of the fixes per axis, and the filters that whiten each receiver's.
     noise: GaussMarkovNoise,

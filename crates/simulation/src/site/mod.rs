@@ -48,7 +48,7 @@ pub struct LabelledDetection {
 pub struct SimulatedCamera {
     /// Its id.
     pub id: CameraId,
-    /// What it detected.
+    /// The camera's detections.
     pub detections: Vec<LabelledDetection>,
 }
 
@@ -135,7 +135,7 @@ struct CarriedReceiver {
     id: ReceiverId,
     target: usize,
     receiver: SimulatedReceiver,
-    /// Of its latest fix, s since the start.
+    /// Time of its latest fix, s since the start.
     latest_s: Option<f64>,
 }
 

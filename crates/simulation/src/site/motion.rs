@@ -31,7 +31,7 @@ pub(super) struct Mover {
     speed_deviation: f64,
     halt_s: f64,
     random: ChaCha8Rng,
-    /// Of the outline, drawn per camera: it must not change the motion.
+    /// Random numbers of the outline, drawn per camera: it must not change the motion.
     gait: ChaCha8Rng,
 }
 

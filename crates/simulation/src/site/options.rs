@@ -5,7 +5,7 @@ use jiff::Timestamp;
 /// Default time of the first frame: 2026-01-05T08:00:00Z, in seconds since 1970.
 const START_S: i64 = 1_767_600_000;
 
-/// What is at the site, and how well it is seen.
+/// The targets and cameras of the site, and how well they see.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SiteOptions {
     /// Seed of everything but the cameras and the receivers' errors.
@@ -24,7 +24,7 @@ pub struct SiteOptions {
     pub vehicles: usize,
     /// Share of the targets that carry a receiver.
     pub receiver_share: f64,
-    /// Length, s.
+    /// Length of the simulation, s.
     pub duration_s: f64,
     /// Time between two frames of a camera, s. All cameras take theirs at the same instants.
     pub frame_interval_s: f64,

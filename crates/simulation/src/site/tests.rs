@@ -1,4 +1,4 @@
-//! What a simulated site contains.
+//! Tests of the contents of a simulated site.
 
 use std::collections::{BTreeMap, BTreeSet};
 

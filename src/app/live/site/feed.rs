@@ -1,4 +1,4 @@
-//! What live observations hand to the tracker of their camera's site.
+//! The items that live observations hand to the tracker of their camera's site.
 
 use tokio::sync::mpsc;
 

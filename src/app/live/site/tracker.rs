@@ -79,7 +79,7 @@ struct Carrier {
 /// A world tracker with its plane.
 struct ActiveTracker {
     tracker: WorldTracker,
-    /// Whether the plane is that of the operator or of a model; a fix alone may be anywhere.
+    /// True if the plane is that of the operator or of a model; a fix alone may be anywhere.
     has_trusted_plane: bool,
     /// Reading of the monotonic clock when a frame was tracked last.
     tracked_at: Duration,
@@ -147,9 +147,9 @@ impl SiteTracker {
         if let Some(carrier) = self.carriers.get_mut(target_id) {
             carrier.cameras.insert(camera.clone());
             carrier.noted_at = now;
-            // Of a recording that is played again the times are far behind.
-            let behind = carrier.fixed_at.duration_since(time);
-            let is_new = behind.is_negative() || behind > self.fix_lateness;
+            // The times of a recording that is played again are much earlier.
+            let lag = carrier.fixed_at.duration_since(time);
+            let is_new = lag.is_negative() || lag > self.fix_lateness;
             if is_new {
                 carrier.fixed_at = time;
             }
@@ -165,7 +165,7 @@ impl SiteTracker {
         true
     }
 
-    /// Whether time changes anything: frames wait, or tracks may end.
+    /// True if time changes anything: frames wait, or tracks may end.
     pub(super) fn is_busy(&self) -> bool {
         !self.frames.is_empty() || self.active.as_ref().is_some_and(|it| it.tracker.tracks().next().is_some())
     }
@@ -382,7 +382,7 @@ impl SiteTracker {
                 WorldEvent::Merged { track, ended } => {
                     let (track, ended) = (self.id_of(track), self.id_of(ended));
                     if self.announced.contains_key(&ended) {
-                        // A track that was not confirmed is, once it has taken up one that was.
+                        // A tentative track that merges a confirmed one becomes confirmed.
                         self.announce_start(track, time);
                     }
                     self.announce_end(ended, time, SiteEventKind::Merged { track, ended });

@@ -432,7 +432,9 @@ fn common_motion(scene: &Scene<'_>, cameras: &[GroundCamera], ground: &GroundPri
     let mean = |of: fn(&SceneMotion) -> f64| {
         (motions.iter().map(|motion| of(motion).ln()).sum::<f64>() / motions.len().max(1) as f64).exp()
     };
-    SceneMotion { spread_m: mean(|own| own.spread_m), speed_m_s: mean(|own| own.speed_m_s) }
+    let speed_m_s = mean(|own| own.speed_m_s);
+    // The search takes one speed for all.
+    SceneMotion { spread_m: mean(|own| own.spread_m), speed_m_s, speeds_m_s: [speed_m_s; 3] }
 }
 
 fn motion_of_receivers(fixes: &[Vec<TimedFix>]) -> SceneMotion {

@@ -17,7 +17,7 @@ const MODEL: EvidenceModel = EvidenceModel {
         variance_m2: 6.8,
         correlation: NoiseCorrelation { white_share: 0.083, time_constant_s: 30.0 },
     },
-    motion: SceneMotion { spread_m: 6.0, speed_m_s: 0.8 },
+    motion: SceneMotion { spread_m: 6.0, speed_m_s: 0.8, speeds_m_s: [0.8; 3] },
 };
 
 const GROUND: GroundPrior = GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06, density: Density::Fixes };

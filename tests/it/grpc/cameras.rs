@@ -18,6 +18,7 @@ fn yard() -> proto::CameraProfile {
         learn_automatically: Some(false),
         site: None,
         gnss_bias_sigma_m: Some(1.5),
+        location: None,
     }
 }
 

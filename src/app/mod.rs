@@ -106,7 +106,7 @@ pub struct Parts {
     /// The limits of everything that an outside client can make large.
     pub limits: Limits,
     /// How much of each bounded resource clients may hold at a time.
-    pub quotas: Quotas,
+    pub quotas: Arc<Quotas>,
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
@@ -154,7 +154,7 @@ impl App {
         access.refresh(&store, &clock).await?;
         let pairings = Arc::new(Semaphore::new(limits.pairings));
         let (residuals, waiting) = live::residual_queue();
-        let quotas = Quotas::new(&limits);
+        let quotas = Arc::new(Quotas::new(&limits));
         let parts = Parts {
             opened_store: store,
             registry,

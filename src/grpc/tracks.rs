@@ -9,7 +9,7 @@ use super::convert::{camera_id, timestamp};
 use super::proto;
 use super::proto::track_service_server::TrackService;
 use super::proto::watch_camera_response::Event;
-use super::statuses::{Reply, answer, client_id, request_id, to_status};
+use super::statuses::{Reply, answer, context, to_status};
 use crate::admission::Lease;
 use crate::app::{App, CameraEvent, CameraEvents, EventId, LostEvents, TargetUpdate, UnplacedBox};
 use crate::domain::{CameraId, Error, ErrorKind, Score, TargetId};
@@ -59,8 +59,8 @@ impl TrackService for Tracks {
     type WatchCameraStream = Events;
 
     async fn watch_camera(&self, request: tonic::Request<proto::WatchCameraRequest>) -> Reply<Events> {
-        let id = request_id(request.extensions());
-        let client = client_id(request.extensions());
+        let context = context(request.extensions())?;
+        let (id, client) = (context.id().clone(), context.client());
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let camera = camera_id(&asked.camera_id)?;

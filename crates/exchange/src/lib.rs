@@ -47,6 +47,7 @@ mod objects_only;
 mod outgoing;
 mod recording;
 mod rows;
+mod rtklib;
 mod source_decoder;
 #[cfg(test)]
 mod tests;
@@ -57,8 +58,8 @@ mod write;
 
 pub use address::{Address, Scheme, SerialLine, bracketed};
 pub use connection::{
-    CameraMapping, ConnectionDraft, ConnectionSettings, ImagePoint, OutgoingFormat, ReceiverFrom, SaslMechanism, Secrets,
-    SinkSettings, SourceSettings,
+    CameraMapping, ConnectionDraft, ConnectionSettings, ImagePoint, OutgoingFormat, ReceiverFrom,
+    SaslMechanism, Secrets, SinkSettings, SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};

@@ -39,7 +39,7 @@ mod score;
 mod site;
 mod site_training;
 mod time;
-mod training;
+mod training_run;
 
 pub use access::{ApiKey, KeyId, KeySecret, NewKey, Role, Scope, SecretDigest};
 pub use audit::{Actor, AuditAction, AuditEntry, AuditNumber};
@@ -80,7 +80,7 @@ pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport};
 pub use time::{TimeBounds, parse_time, parse_time_in, parse_time_zone};
-pub use training::{
+pub use training_run::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
     HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,
     TrainingReport, TrainingRun, TrainingSubject,

@@ -290,6 +290,8 @@ pub struct Limits {
     pub connection_unsettled: usize,
     /// Bytes that one source holds of messages that were read and not taken yet; beyond, no more are read.
     pub connection_queue_bytes: usize,
+    /// Bytes of a compressed batch of messages of a source once it is decompressed; a larger one is rejected.
+    pub connection_batch_bytes: usize,
     /// Clients that may be connected to one listening source.
     pub connection_clients: usize,
     /// Messages of one sink that wait for their receiver; beyond, the oldest is dropped.
@@ -452,6 +454,7 @@ impl Default for Limits {
             connection_queue: 1_024,
             connection_unsettled: 32_768,
             connection_queue_bytes: 8 << 20,
+            connection_batch_bytes: 16 << 20,
             connection_clients: 64,
             outbox_messages: 100_000,
             export_files: 256,

@@ -142,11 +142,8 @@ impl Intake {
         let now = self.app.clock.now();
         let time_bounds = self.app.live_time_bounds(now);
         let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
-        let read = if message.size_bytes > self.app.limits.connection_message_bytes {
-            Err(format!("is larger than {} bytes", self.app.limits.connection_message_bytes))
-        } else {
-            self.decoder.decode(&message.payload, &context)
-        };
+        let content = message.content(self.app.limits.connection_message_bytes);
+        let read = content.and_then(|content| self.decoder.decode(content, &context));
         let mut account = Account { now, ..Account::default() };
         let mut items = Vec::new();
         let outcome = match read {

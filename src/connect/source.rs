@@ -15,13 +15,27 @@ pub(super) struct Message {
     pub(super) payload: Bytes,
     /// Bytes of the whole content.
     pub(super) size_bytes: usize,
+    /// Why the source could not read it; its content then says where it is.
+    pub(super) unread: Option<String>,
 }
 
 impl Message {
     /// A message with its whole content.
     pub(super) const fn new(receipt: u64, subject: String, payload: Bytes) -> Self {
         let size_bytes = payload.len();
-        Self { receipt, subject, payload, size_bytes }
+        Self { receipt, subject, payload, size_bytes, unread: None }
+    }
+
+    /// The whole content, of at most so many bytes.
+    ///
+    /// # Errors
+    /// Why there is none.
+    pub(super) fn content(&self, most_bytes: usize) -> Result<&Bytes, String> {
+        match &self.unread {
+            Some(reason) => Err(reason.clone()),
+            None if self.size_bytes > most_bytes => Err(format!("is larger than {most_bytes} bytes")),
+            None => Ok(&self.payload),
+        }
     }
 }
 

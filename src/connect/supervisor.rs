@@ -132,15 +132,16 @@ impl Supervisor {
     /// Starts and ends tasks, so that they are those of the stored connections, and tells other nodes what they do.
     async fn look(&mut self) -> Result<()> {
         let connections = all_connections(&self.app).await?;
-        self.count_lost(&connections).await?;
         let all: Vec<_> =
             connections.iter().map(|connection| (connection.key, connection.revision)).collect();
         let active: Vec<_> = connections
-            .into_iter()
+            .iter()
             .filter(|connection| !connection.profile.paused)
-            .filter_map(|connection| self.read(connection).map(Arc::new))
+            .filter_map(|connection| self.read(connection.clone()).map(Arc::new))
             .collect();
+        // Before anything is written, which a full disk refuses: from here on no position is missed.
         self.feed(all, &active);
+        self.count_lost(&connections).await?;
         let site_of = |camera: &CameraId| self.app.registry.get(camera).and_then(|known| known.site.clone());
         let keyed = active.iter().map(|active| (active.connection.key, &active.settings));
         let groups = connection_groups(keyed, site_of);

@@ -90,7 +90,8 @@ async fn try_source(
     let now = app.clock.now();
     let time_bounds = app.live_time_bounds(now);
     let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
-    let reading = match source_decoder(settings).decode(&message.payload, &context) {
+    let content = message.content(app.limits.connection_message_bytes);
+    let reading = match content.and_then(|content| source_decoder(settings).decode(content, &context)) {
         Ok(read) => {
             let skipped = read.skipped.iter().map(|reason| format!("skipped: {reason}"));
             read.items.iter().map(describe).chain(skipped).take(32).collect()

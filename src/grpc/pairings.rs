@@ -125,6 +125,7 @@ fn fix_format(format: i32) -> Result<FixFormat> {
         Ok(proto::FixFormat::Nmea) => Ok(FixFormat::Nmea),
         Ok(proto::FixFormat::Gpx) => Ok(FixFormat::Gpx),
         Ok(proto::FixFormat::Gpsd) => Ok(FixFormat::Gpsd),
+        Ok(proto::FixFormat::Rtklib) => Ok(FixFormat::Rtklib),
         Err(_) => Err(unknown("fixes_format", format)),
     }
 }

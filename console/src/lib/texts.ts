@@ -438,6 +438,8 @@ const table = {
   'profile.deleted': ['{id} was deleted', '{id} wurde gelöscht'],
   'profile.label.key': ['Key of the label', 'Schlüssel des Labels'],
   'profile.label.value': ['Value of the label', 'Wert des Labels'],
+  'profile.longitude': ['Longitude of the camera, degrees', 'Länge der Kamera, Grad'],
+  'profile.latitude': ['Latitude of the camera, degrees', 'Breite der Kamera, Grad'],
   'profile.bias': ['Common bias of all fixes, sigma in m', 'Gemeinsamer Versatz aller Fixe, Sigma in m'],
   'profile.bias.prior': ['model’s own prior', 'Annahme des Modells'],
   'profile.labels': ['Labels', 'Labels'],

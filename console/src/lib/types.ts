@@ -59,6 +59,7 @@ export interface Camera {
   updated_at: string;
   samples: number;
   samples_without_fix: number;
+  location?: Position;
   gnss_bias_sigma_m?: number;
   active_model?: number;
   model_fault?: string;

@@ -46,6 +46,7 @@ mod objects_only;
 mod outgoing;
 mod recording;
 mod rows;
+mod rtklib;
 mod source_decoder;
 #[cfg(test)]
 mod tests;

@@ -12,7 +12,7 @@ use utoipa_axum::routes;
 use super::receivers::{Receiver, receivers, shown};
 use crate::app::App;
 use crate::domain::{self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass};
-use crate::exchange::wire::parse_document;
+use crate::exchange::wire::{Position, parse_document};
 use crate::exchange::write_cursor;
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::etag::{self, unless_known, with_etag};
@@ -93,6 +93,8 @@ struct CameraDraft {
     image_size: Option<ImageSize>,
     /// `"unknown"` if left out.
     gnss_error: Option<GnssError>,
+    /// Rough position of the camera itself. An import tells of fixes that are far from it, and of swapped coordinates.
+    location: Option<Position>,
     /// Standard deviation per axis, m, of the bias that all fixes have in common, which no sample can show;
     /// without it, the model has a prior of its own.
     #[schema(exclusive_minimum = 0.0, maximum = 100.0, example = 1.5)]
@@ -124,10 +126,12 @@ struct CameraDraft {
 impl CameraDraft {
     fn into_domain(self) -> Result<NewCamera> {
         let blank = NewCamera::named(CameraId::new(&self.id)?);
+        let location = self.location.map(Position::to_domain).transpose();
         Ok(NewCamera {
             display_name: self.display_name.unwrap_or(blank.display_name),
             image_size: self.image_size.map(ImageSize::to_domain).transpose()?,
             gnss_error: self.gnss_error.map_or(Ok(blank.gnss_error), GnssError::to_domain)?,
+            location: location.map_err(|error| error.under("location"))?,
             gnss_bias_sigma: self.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
             recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
             target_classes: classes(&self.target_classes)?,
@@ -163,6 +167,8 @@ struct CameraChange {
     image_size: Option<ImageSize>,
     /// New error of the receiver; null is `"unknown"`.
     gnss_error: Option<GnssError>,
+    /// New position of the camera itself; null forgets it.
+    location: Option<Position>,
     /// New standard deviation per axis, m, of the bias that all fixes have in common; null is the model's own
     /// prior.
     #[schema(exclusive_minimum = 0.0, maximum = 100.0)]
@@ -204,6 +210,9 @@ pub(super) struct Camera {
     image_size: Option<ImageSize>,
     /// The receiver's error.
     gnss_error: GnssError,
+    /// Rough position of the camera itself, if stated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    location: Option<Position>,
     /// Standard deviation per axis, m, of the bias that all fixes have in common, if stated.
     #[serde(skip_serializing_if = "Option::is_none")]
     gnss_bias_sigma_m: Option<f64>,
@@ -262,6 +271,7 @@ impl Camera {
                 .image_size
                 .map(|size| ImageSize { width_px: size.width_px(), height_px: size.height_px() }),
             gnss_error: profile.gnss_error.into(),
+            location: profile.location.map(Into::into),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             recipe: profile.recipe.into(),
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),

@@ -276,7 +276,7 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
         names[1],
         FixFormat::from_media_type,
         FixFormat::from_path,
-        "CSV, NMEA, GPX or gpsd's reports",
+        "CSV, NMEA, GPX, gpsd's reports or solutions of RTKLIB",
     )?;
     let import = PairedImport {
         detections: detections.content,

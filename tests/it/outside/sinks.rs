@@ -478,6 +478,23 @@ async fn outages_of_the_outbox_lose_no_position() {
     connection_when(&server, "hook", |status| status["queued"] == 0 && status["dropped"] == 0).await;
 }
 
+/// A server that starts while the database takes no changes keeps what it measures meanwhile.
+#[tokio::test]
+async fn a_start_while_nothing_can_be_written_loses_no_position() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    idle_sink(&server, own_address()).await;
+    server.kill();
+    let database = rusqlite::Connection::open(folder.path().join("sightfix.db")).expect("the database");
+    let refuse = "CREATE TRIGGER full BEFORE DELETE ON outbox_logs BEGIN SELECT RAISE(ABORT, 'full'); END";
+    database.execute_batch(refuse).expect("a trigger");
+    let server = TestServer::start(folder.path());
+    send_fixes(&server, "van", 20).await;
+    server.logged(|line| line.to_string().contains("cannot look for changed connections")).await;
+    database.execute_batch("DROP TRIGGER full").expect("dropped");
+    connection_when(&server, "hook", |status| status["items"] == 20).await;
+}
+
 /// A server that ends in order leaves every position in the outbox. One that is killed may lose the latest, which the next
 /// one counts.
 #[tokio::test]

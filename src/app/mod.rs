@@ -60,7 +60,7 @@ pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SinkFeed, SinkFeeds,
     SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
-    TrackPoint, WantedPositions, WorldSighting, WorldTrackPoint,
+    TrackPoint, UnplacedBox, WantedPositions, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;

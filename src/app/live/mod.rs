@@ -46,7 +46,7 @@ use crate::fusion::observed::ObservedPositions;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
-pub use camera::{CameraEvent, TargetUpdate};
+pub use camera::{CameraEvent, TargetUpdate, UnplacedBox};
 pub use camera_events::{EventId, LostEvents};
 pub(super) use identification::MatchingSlot;
 pub(super) use learning::LearningProgress;

@@ -9,7 +9,7 @@ use tokio::sync::watch;
 
 use super::ItemResult;
 use super::acknowledgements::{AckTracker, Acknowledgement, NotStoredReason};
-use super::camera::StreamCount;
+use super::camera::{StreamCount, UnplacedBox};
 use super::sample_committer::{self, SampleSink};
 use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
@@ -281,7 +281,18 @@ impl LiveStream {
         (class, score): (Option<TargetClass>, Option<Score>),
     ) -> Result<ItemResult> {
         // A time that no track takes must not move the pairing either.
-        self.app.live_time_bounds(now).check(observation.time())?;
+        let time = observation.time();
+        self.app.live_time_bounds(now).check(time)?;
+        if let Some(bounding_box) = observation.bounding_box().filter(|_| camera.model().is_none()) {
+            camera.live.announce_box(self.app.clock.monotonic(), || UnplacedBox {
+                time,
+                target_id: observation.target_id().cloned(),
+                tracker_id: observation.tracker_id().cloned(),
+                bounding_box,
+                class: class.clone(),
+                score,
+            });
+        }
         let identified = self.app.identify(camera, observation, class.as_ref());
         if identified.is_sure {
             self.record(seq, &identified.observation, class, score).await?;

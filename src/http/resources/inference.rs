@@ -11,11 +11,12 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::inference_body::InferenceBody;
 use crate::app::{App, BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 use crate::domain::{CameraId, Error, ErrorKind, Result};
 use crate::exchange::wire::parse_field;
 use crate::http::plumbing::access::CallerApp;
-use crate::http::plumbing::extract::{JsonBody, camera_of, path};
+use crate::http::plumbing::extract::{camera_of, path};
 use crate::http::plumbing::problem::{ApiError, ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
 use crate::http::plumbing::wire::{json, json_of_about};
@@ -67,8 +68,8 @@ struct ServerMetadata {
     name: &'static str,
     /// Version of the server.
     version: &'static str,
-    /// Extensions of the protocol; there are none.
-    extensions: [String; 0],
+    /// Extensions of the protocol.
+    extensions: [&'static str; 1],
 }
 
 /// States that the server is alive.
@@ -149,14 +150,41 @@ struct InputTensor<'r> {
     /// `FP64` or `FP32`.
     #[schema(example = "FP64")]
     datatype: String,
-    /// Parameters; none is used.
-    #[schema(value_type = Option<Object>)]
-    #[serde(rename = "parameters")]
-    _parameters: Option<IgnoredAny>,
-    /// Its elements row by row, as one array or as an array per row.
-    #[schema(value_type = Vec<f64>, example = json!([[475.0, 11.0, 28.0, 77.0]]))]
+    /// Parameters.
+    parameters: Option<TensorParameters>,
+    /// Its elements row by row, as one array or as an array per row; left out where they come in binary.
+    #[schema(value_type = Option<Vec<f64>>, example = json!([[475.0, 11.0, 28.0, 77.0]]))]
     #[serde(borrow)]
-    data: &'r RawValue,
+    data: Option<&'r RawValue>,
+}
+
+/// Parameters of an input tensor; others are not used.
+#[derive(Deserialize, ToSchema)]
+struct TensorParameters {
+    /// Bytes of its elements, which come after the JSON, little-endian and row by row; the header
+    /// `inference-header-content-length` has the bytes of the JSON.
+    binary_data_size: Option<usize>,
+}
+
+impl InputTensor<'_> {
+    /// Its elements; those of at most this number of boxes are kept.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the tensor's data.
+    fn elements(&self, binary: &[u8], most_boxes: usize) -> Result<TensorData> {
+        let size = self.parameters.as_ref().and_then(|parameters| parameters.binary_data_size);
+        match (self.data, size) {
+            (Some(json), None) => TensorData::read(json, most_boxes),
+            (None, Some(size)) if size == binary.len() => {
+                TensorData::read_binary(binary, &self.datatype, most_boxes)
+            }
+            (None, Some(size)) => Err(Error::invalid(
+                "inputs[0].parameters.binary_data_size",
+                format!("is {size}, but {} bytes come after the JSON", binary.len()),
+            )),
+            _ => Err(Error::invalid("inputs[0].data", "give either data or parameters.binary_data_size")),
+        }
+    }
 }
 
 /// Elements of a tensor, row by row.
@@ -177,6 +205,26 @@ impl TensorData {
         let most = most_boxes.saturating_mul(BOX_COLUMNS);
         let data = Self { numbers: Vec::new(), is_of_rows: false, count: 0, most };
         parse_field("inputs[0].data", json, TensorVisitor(data))
+    }
+
+    /// The same of little-endian numbers of a type.
+    fn read_binary(bytes: &[u8], datatype: &str, most_boxes: usize) -> Result<Self> {
+        let most = most_boxes.saturating_mul(BOX_COLUMNS);
+        let mut data = Self { numbers: Vec::new(), is_of_rows: false, count: 0, most };
+        let rest = if datatype == FP64 {
+            let (numbers, rest) = bytes.as_chunks();
+            numbers.iter().for_each(|number| data.add(f64::from_le_bytes(*number)));
+            rest
+        } else {
+            let (numbers, rest) = bytes.as_chunks();
+            numbers.iter().for_each(|number| data.add(f32::from_le_bytes(*number).into()));
+            rest
+        };
+        if rest.is_empty() {
+            return Ok(data);
+        }
+        let message = format!("has {} bytes, which are no whole numbers", bytes.len());
+        Err(Error::invalid("inputs[0].parameters.binary_data_size", message))
     }
 
     fn add(&mut self, number: f64) {
@@ -311,8 +359,11 @@ struct OutputData {
     responses((status = 200, description = "Name and version", body = ServerMetadata))
 )]
 async fn server_metadata() -> ApiResult {
-    let metadata =
-        ServerMetadata { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION"), extensions: [] };
+    let metadata = ServerMetadata {
+        name: env!("CARGO_PKG_NAME"),
+        version: env!("CARGO_PKG_VERSION"),
+        extensions: ["binary_tensor_data"],
+    };
     Ok(json(&metadata)?)
 }
 
@@ -425,7 +476,7 @@ async fn ready(app: &App, model: ModelName) -> ApiResult {
         (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn infer(CallerApp(app): CallerApp, model: ModelName, body: JsonBody) -> ApiResult {
+async fn infer(CallerApp(app): CallerApp, model: ModelName, body: InferenceBody) -> ApiResult {
     inferred(&app, model, &body).await
 }
 
@@ -440,17 +491,17 @@ async fn infer(CallerApp(app): CallerApp, model: ModelName, body: JsonBody) -> A
         (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),
     )
 )]
-async fn infer_version(CallerApp(app): CallerApp, model: ModelName, body: JsonBody) -> ApiResult {
+async fn infer_version(CallerApp(app): CallerApp, model: ModelName, body: InferenceBody) -> ApiResult {
     inferred(&app, model, &body).await
 }
 
-async fn inferred(app: &App, model: ModelName, body: &JsonBody) -> ApiResult {
+async fn inferred(app: &App, model: ModelName, body: &InferenceBody) -> ApiResult {
     let request: InferenceRequest<'_> = body.read()?;
     let outputs = OutputTensor::named(request.outputs.iter().map(|output| output.name.as_str()))?;
     let [input] = &request.inputs[..] else {
         return Err(Error::invalid("inputs", format!("must be one tensor, `{BOXES}`")).into());
     };
-    let data = TensorData::read(input.data, app.limits.batch_observations)?;
+    let data = input.elements(&body.elements, app.limits.batch_observations)?;
     app.check_batch(data.count.div_ceil(BOX_COLUMNS)).map_err(|error| error.at(BOXES))?;
     let boxes = boxes(input, &data.numbers)?;
     let answer = app.infer(&model.camera, model.version.as_deref(), boxes, &outputs).await?;

@@ -11,6 +11,7 @@ mod features;
 mod fusions;
 mod gnss_error;
 mod inference;
+mod inference_body;
 mod keys;
 mod learning;
 mod models;

@@ -24,8 +24,9 @@ use super::fusions::{FusionRequest, observations};
 use super::moving_features::MovingFeatures;
 use crate::app::{
     Acknowledgement, CameraEvent, EventId, ItemResult, LostEvents, NotStoredReason, TargetUpdate, TrackPoint,
+    UnplacedBox,
 };
-use crate::domain::{Error, Result};
+use crate::domain::{Error, Result, Score, TargetClass, TargetId, TrackerId};
 use crate::exchange::wire;
 use crate::fusion::track;
 use crate::geo::Position;
@@ -377,6 +378,41 @@ impl<'a> From<&'a TargetUpdate> for TrackUpdate<'a> {
     }
 }
 
+/// A box of a live stream or a source that has no position, since the camera has no model.
+#[derive(Serialize, ToSchema)]
+struct SeenBox<'a> {
+    /// Time of the frame.
+    #[schema(value_type = String, format = DateTime)]
+    time: Timestamp,
+    /// The target, where the detector knows it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    target_id: Option<&'a str>,
+    /// The id that the camera's tracker gave it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tracker_id: Option<&'a str>,
+    /// The box.
+    bounding_box: wire::BoundingBox,
+    /// Class reported by the detector.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    class: Option<&'a str>,
+    /// Confidence score of the detector.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    score: Option<f64>,
+}
+
+impl<'a> From<&'a UnplacedBox> for SeenBox<'a> {
+    fn from(seen: &'a UnplacedBox) -> Self {
+        Self {
+            time: seen.time,
+            target_id: seen.target_id.as_ref().map(TargetId::as_str),
+            tracker_id: seen.tracker_id.as_ref().map(TrackerId::as_str),
+            bounding_box: seen.bounding_box.into(),
+            class: seen.class.as_ref().map(TargetClass::as_str),
+            score: seen.score.map(Score::value),
+        }
+    }
+}
+
 /// One answer per observation, in their order.
 #[derive(Serialize, ToSchema)]
 struct FollowedObservations<'a> {
@@ -477,6 +513,8 @@ async fn follow(
 enum CameraEventBody<'a> {
     /// `track`.
     Track(TrackUpdate<'a>),
+    /// `box`.
+    Box(SeenBox<'a>),
     /// `camera_moved`.
     Moved(CameraMoved),
     /// `lost`: the number of lost events, null where it is not known.
@@ -486,8 +524,9 @@ enum CameraEventBody<'a> {
 /// Watch a camera
 ///
 /// Server-sent events from now on: `track` with a position as GeoJSON whenever a target was
-/// measured, `camera_moved` when the camera's pose is found to have changed, and `lost` with the number
-/// of events that were lost because the client read too slowly. They end when the camera is deleted.
+/// measured, `box` with a box of a stream or a source while the camera has no model, `camera_moved` when the
+/// camera's pose is found to have changed, and `lost` with the number of events that were lost because
+/// the client read too slowly. They end when the camera is deleted.
 ///
 /// A client that comes back with the `last-event-id` of an event goes on after it. The latest 1,024 events are
 /// kept, up to a minute without a client; of those that are not kept any more, `lost` tells the number, or
@@ -530,6 +569,7 @@ async fn watch_camera(
 fn camera_event(event: &CameraEvent) -> Event {
     match event {
         CameraEvent::Track(update) => event_of("track", &TrackUpdate::from(&**update)),
+        CameraEvent::Box(seen) => event_of("box", &SeenBox::from(&**seen)),
         CameraEvent::Moved(moved) => event_of("camera_moved", &CameraMoved::from(&**moved)),
     }
 }

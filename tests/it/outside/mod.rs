@@ -4,6 +4,7 @@
 
 mod broker;
 mod files;
+mod filters;
 mod kafka;
 mod messages;
 pub(crate) mod peers;

@@ -17,6 +17,7 @@ mod error;
 mod evaluation;
 mod gnss_error;
 mod idempotency;
+mod image_area;
 mod job;
 mod live_id;
 mod method;
@@ -54,6 +55,7 @@ pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Viola
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssBiasSigma, GnssError, SigmaM};
 pub use idempotency::{IdempotencyKey, IdempotentRequest, RequestDigest, RequestHasher};
+pub use image_area::ImageArea;
 pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};

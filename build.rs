@@ -1,5 +1,5 @@
 //! Compiles `proto/` in pure Rust (protox), so that no `protoc` is needed, and lists the built files of the
-//! operator's console for `src/http/console.rs`.
+//! operator's console for `src/http/resources/console.rs`.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};

@@ -15,6 +15,7 @@ use tokio::task::JoinSet;
 use crate::load;
 use crate::ratio::{self, in_turn};
 use crate::served::{Served, runtime};
+use crate::tables;
 use crate::transports::request_body;
 
 /// Requests of each connection of the measured client in a round.
@@ -34,9 +35,15 @@ pub(crate) fn run() {
     // First: what others leave to the allocator would not count.
     idle_connections();
     beside_attacks();
-    println!("\n## Three times the capacity, {ITEMS} observations per request\n");
-    println!("| places | capacity | goodput / capacity | refusals | their median | their 99 % |");
-    println!("|---:|---:|---:|---:|---:|---:|");
+    let columns = [
+        "places",
+        "capacity (requests/s)",
+        "goodput / capacity",
+        "refusals",
+        "their median (ms)",
+        "their 99 % (ms)",
+    ];
+    tables::head(&format!("Three times the capacity, {ITEMS} observations per request"), &columns);
     for (places, connections) in PLACES {
         at_three_times_the_capacity(places, connections);
     }
@@ -200,13 +207,14 @@ fn at_three_times_the_capacity(places: usize, connections: usize) {
     let pause = Duration::from_secs_f64(OFFERING_CONNECTIONS as f64 / (3.0 * capacity));
     let (goodput, refusals_ms) = rate(OFFERING_CONNECTIONS, pause);
     let quantile = |share: f64| refusals_ms.get((refusals_ms.len() as f64 * share) as usize);
-    println!(
-        "| {places} | {capacity:.0} requests/s | {:.2} | {} | {:.2} ms | {:.2} ms |",
-        goodput / capacity,
-        refusals_ms.len(),
-        quantile(0.5).copied().unwrap_or_default(),
-        quantile(0.99).copied().unwrap_or_default(),
-    );
+    let numbers = [
+        (capacity, 0),
+        (goodput / capacity, 2),
+        (refusals_ms.len() as f64, 0),
+        (quantile(0.5).copied().unwrap_or_default(), 2),
+        (quantile(0.99).copied().unwrap_or_default(), 2),
+    ];
+    tables::row(places, &numbers);
     served.end();
 }
 
@@ -228,9 +236,10 @@ fn idle_connections() {
         ..Limits::default()
     };
     let served = runtime.block_on(Served::start_limited(1, limits));
-    println!("\n## Idle connections, each after one request\n");
-    println!("| connections | bytes of resident memory each |");
-    println!("|---:|---:|");
+    tables::head(
+        "Idle connections, each after one request",
+        &["connections", "bytes of resident memory each"],
+    );
     let mut held = Vec::new();
     let mut before = resident_bytes();
     for begin in [b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n".to_vec(), PREFACE.to_vec()] {
@@ -242,11 +251,8 @@ fn idle_connections() {
         }
         let after = resident_bytes();
         let protocol = if begin == PREFACE { "HTTP/2" } else { "HTTP/1.1" };
-        println!(
-            "| {} of {protocol} | {:.0} |",
-            IDLE_CONNECTIONS / 2,
-            (after - before) / (IDLE_CONNECTIONS / 2) as f64
-        );
+        let each = (after - before) / (IDLE_CONNECTIONS / 2) as f64;
+        tables::row(format!("{} of {protocol}", IDLE_CONNECTIONS / 2), &[(each, 0)]);
         before = after;
     }
     drop(held);

@@ -7,6 +7,7 @@ use sightfix::simulation::{Options, Scene, simulate};
 use crate::load;
 use crate::ratio::median;
 use crate::served::{Served, runtime};
+use crate::tables;
 use crate::transports::request_body;
 
 const EACH: usize = 1_500;
@@ -55,10 +56,10 @@ pub(crate) fn run() {
             rates.push(busy / quiet);
             late.push(percentile(&mut busy_times, 0.99) / percentile(&mut quiet_times, 0.99));
         }
-        println!("\n### Fusion while a training run uses each of {cores} cores\n");
-        println!("| measure | busy / quiet |\n|---|---:|");
-        println!("| requests per second | {:.2} |", median(&mut rates));
-        println!("| 99th percentile of the latency | {:.2} |", median(&mut late));
+        let title = format!("Fusion while a training run uses each of {cores} cores");
+        tables::head(&title, &["measure", "busy / quiet"]);
+        tables::row("requests per second", &[(median(&mut rates), 2)]);
+        tables::row("99th percentile of the latency", &[(median(&mut late), 2)]);
         served.end();
     });
 }

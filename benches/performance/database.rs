@@ -15,6 +15,7 @@ use sightfix::store::{DatabaseUrl, Location, RunEnd, Store, StoreOptions};
 
 use crate::ratio::{self, in_turn, median};
 use crate::served::runtime;
+use crate::tables;
 
 const SERVER: &str = "SIGHTFIX_TEST_POSTGRES";
 const ROWS: usize = 50_000;
@@ -145,12 +146,12 @@ fn claims(url: &str) {
     });
     let p50 = median(&mut times);
     let p99 = times[times.len() * 99 / 100];
-    println!(
-        "\n### PostgreSQL: claims by {WORKERS} workers of {PROCESSES} processes, {QUEUED_RUNS} runs queued\n"
+    let title = format!(
+        "PostgreSQL: claims by {WORKERS} workers of {PROCESSES} processes, {QUEUED_RUNS} runs queued"
     );
-    println!("| claimed and ended | runs/s | claim p50 (ms) | claim p99 (ms) |\n|---:|---:|---:|---:|");
+    tables::head(&title, &["claimed and ended", "runs/s", "claim p50 (ms)", "claim p99 (ms)"]);
     let rate = times.len() as f64 / took.as_secs_f64();
-    println!("| {} | {rate:.0} | {p50:.1} | {p99:.1} |", times.len());
+    tables::row(times.len(), &[(rate, 0), (p50, 1), (p99, 1)]);
 }
 
 async fn open(url: &str) -> Store {

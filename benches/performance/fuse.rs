@@ -9,13 +9,15 @@ use sightfix::model::{self, FitOptions};
 use sightfix::simulation::{Options, simulate};
 
 use crate::ratio::median;
+use crate::tables;
 
 const CALLS: usize = 200_000;
 
 pub(crate) fn run() {
-    println!("\n### One observation in memory: forward pass, decoder, weights, positions\n");
-    println!("| recipe | with a fix (ns) | without a fix (ns) |");
-    println!("|---|---:|---:|");
+    tables::head(
+        "One observation in memory: forward pass, decoder, weights, positions",
+        &["recipe", "with a fix (ns)", "without a fix (ns)"],
+    );
     let world = simulate(&Options::demo());
     let samples = world.training_samples();
     for recipe in [Recipe::Paper, Recipe::Hybrid, Recipe::Projective, Recipe::GaussianProcess] {
@@ -55,6 +57,6 @@ pub(crate) fn run() {
             median(&mut rounds)
         });
         let [with_fix, denied] = &mut times;
-        println!("| {recipe} | {with_fix:.0} | {denied:.0} |");
+        tables::row(recipe, &[(*with_fix, 0), (*denied, 0)]);
     }
 }

@@ -1,7 +1,8 @@
 //! The tables of docs/explanation/performance.md. Every row is a ratio of two things measured in turn in this
 //! one run, since machines differ and are shared.
 //!
-//! `cargo bench` runs all parts; `cargo bench -- fuse http` some of them.
+//! `cargo bench` runs all parts; `cargo bench -- fuse http` some of them. The tables are also written to
+//! `target/bench.json`; `benches/compare.py` compares two such files.
 
 mod attacks;
 mod beside;
@@ -14,6 +15,7 @@ mod load;
 mod ratio;
 mod served;
 mod streams;
+mod tables;
 mod train;
 mod transports;
 mod world;
@@ -44,4 +46,5 @@ fn main() {
             part();
         }
     }
+    tables::write();
 }

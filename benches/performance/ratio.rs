@@ -1,5 +1,7 @@
 //! Two things measured in turn, round by round.
 
+use crate::tables;
+
 /// Rounds of each side; the median of their ratios counts.
 const ROUNDS: usize = 7;
 
@@ -43,12 +45,12 @@ pub(crate) fn median(values: &mut [f64]) -> f64 {
 
 /// Head of a table of ratios.
 pub(crate) fn head(title: &str, unit: &str) {
-    println!("\n### {title}\n\n| case | ours ({unit}) | peer ({unit}) | ratio | min | max |");
-    println!("|---|---:|---:|---:|---:|---:|");
+    let (ours, peer) = (format!("ours ({unit})"), format!("peer ({unit})"));
+    tables::head(title, &["case", &ours, &peer, "ratio", "min", "max"]);
 }
 
 /// A row of it.
 pub(crate) fn row(case: &str, ratio: &Ratio) {
     let Ratio { ours, peer, median, min_ratio, max_ratio } = ratio;
-    println!("| {case} | {ours:.4} | {peer:.4} | {median:.2} | {min_ratio:.2} | {max_ratio:.2} |");
+    tables::row(case, &[(*ours, 4), (*peer, 4), (*median, 2), (*min_ratio, 2), (*max_ratio, 2)]);
 }

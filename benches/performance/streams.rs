@@ -20,6 +20,7 @@ use tonic::transport::{Channel, Endpoint};
 
 use crate::ratio::{self, in_turn};
 use crate::served::{Served, runtime};
+use crate::tables;
 
 /// Items on their way of one stream.
 const IN_FLIGHT: usize = 64;
@@ -235,16 +236,13 @@ pub(crate) fn run() {
     let mut times_s = runtime.block_on(many(&served, &observations));
     times_s.sort_by(f64::total_cmp);
     let quantile = |share: f64| 1e3 * times_s[((times_s.len() - 1) as f64 * share) as usize];
-    println!(
-        "\n### {CAMERAS} live streams of {RATE_HZ} items per second for {SECONDS} s, client and server in one process\n\n\
-         | answers | p50 (ms) | p90 (ms) | p99 (ms) | max (ms) |\n|---:|---:|---:|---:|---:|\n\
-         | {} | {:.2} | {:.2} | {:.2} | {:.2} |",
-        times_s.len(),
-        quantile(0.5),
-        quantile(0.9),
-        quantile(0.99),
-        quantile(1.0)
+    tables::head(
+        &format!(
+            "{CAMERAS} live streams of {RATE_HZ} items per second for {SECONDS} s, client and server in one process"
+        ),
+        &["answers", "p50 (ms)", "p90 (ms)", "p99 (ms)", "max (ms)"],
     );
+    tables::row(times_s.len(), &[0.5, 0.9, 0.99, 1.0].map(|share| (quantile(share), 2)));
     served.end();
 }
 

@@ -14,7 +14,9 @@ use sightfix::model::network::{Activation, LossWeights, NetShape, Schedule, Trai
 use sightfix::simulation::{Options, Scene, simulate};
 
 use crate::ratio::{self, in_turn, median};
+use crate::tables;
 
+const TITLE: &str = "Training 10,000 samples, 100 epochs, batch 512, net 4-32-2-32-4, one thread";
 const SAMPLES: usize = 10_000;
 const INPUTS: usize = 4;
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/peers/train_torch.py");
@@ -26,21 +28,23 @@ pub(crate) fn run() {
     let ours = || fit(&set);
     match std::env::var("PEERS_PYTHON") {
         Ok(python) => {
-            ratio::head("Training 10,000 samples, 100 epochs, batch 512, net 4-32-2-32-4, one thread", "s");
+            ratio::head(TITLE, "s");
             ratio::row("compared with PyTorch", &in_turn(ours, || by_torch(&python)));
         }
         Err(_) => {
-            println!("\n### Training 10,000 samples, 100 epochs, batch 512, net 4-32-2-32-4, one thread\n");
+            tables::head(TITLE, &["case", "ours (s)"]);
             let mut rounds: Vec<f64> = (0..7).map(|_| ours()).collect();
-            println!("ours: {:.3} s; set PEERS_PYTHON for the peer (benches/peers)", median(&mut rounds));
+            tables::row("set PEERS_PYTHON for the peer (benches/peers)", &[(median(&mut rounds), 3)]);
         }
     }
 }
 
 /// A whole default run: every candidate, held-out blocks, the final fit.
 fn whole() {
-    println!("\n### The default recipe on 10,000 simulated rows, one thread\n");
-    println!("| scene | s (target 20) | model bytes (target 65536) |\n|---|---|---|");
+    tables::head(
+        "The default recipe on 10,000 simulated rows, one thread",
+        &["scene", "s (target 20)", "model bytes (target 65536)"],
+    );
     for &scene in Scene::ALL {
         let options = Options { seed: 1001, camera_seed: 1001, ..Options::new(scene) };
         let world = simulate(&options);
@@ -56,7 +60,7 @@ fn whole() {
         let began = Instant::now();
         let artifact = sightfix::model::fit(&samples, &fit_options, &mut |_| ControlFlow::Continue(()))
             .expect("a simulated world can be learnt");
-        println!("| {scene} | {:.2} | {} |", began.elapsed().as_secs_f64(), artifact.weights.len());
+        tables::row(scene, &[(began.elapsed().as_secs_f64(), 2), (artifact.weights.len() as f64, 0)]);
     }
 }
 

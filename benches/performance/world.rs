@@ -11,6 +11,7 @@ use sightfix::fusion::world::{CameraFrame, WorldDetection, WorldTrackSettings, W
 use sightfix::geo::{EastNorth, LocalPlane, PlaneCovariance, Position};
 
 use crate::ratio::median;
+use crate::tables;
 
 const CAMERAS: usize = 20;
 const TARGETS_PER_CAMERA: usize = 20;
@@ -18,15 +19,17 @@ const FRAMES_PER_S: usize = 10;
 const DURATION_S: usize = 20;
 
 pub(crate) fn run() {
-    println!("\n### World tracks, 20 cameras x 20 targets x 10 frames a second, one thread\n");
-    println!("| targets | us per detection | share of one core (target 1) |\n|---|---:|---:|");
+    tables::head(
+        "World tracks, 20 cameras x 20 targets x 10 frames a second, one thread",
+        &["targets", "us per detection", "share of one core (target 1)"],
+    );
     for (name, spacing_m) in [("of each camera its own", 60.0), ("each seen by two cameras", 30.0)] {
         let frames = frames(spacing_m);
         let mut rounds: Vec<f64> = (0..5).map(|_| track(&frames)).collect();
         let seconds = median(&mut rounds);
         let detections: usize = frames.iter().map(|frame| frame.detections.len()).sum();
         let per_detection_us = 1e6 * seconds / detections as f64;
-        println!("| {name} | {per_detection_us:.2} | {:.4} |", seconds / DURATION_S as f64);
+        tables::row(name, &[(per_detection_us, 2), (seconds / DURATION_S as f64, 4)]);
     }
 }
 

@@ -60,7 +60,7 @@ pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SinkFeed, SinkFeeds,
     SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
-    TrackPoint, WantedPositions, WorldSighting, WorldTrackPoint,
+    TrackPoint, UnplacedBox, WantedPositions, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;
@@ -106,7 +106,7 @@ pub struct Parts {
     /// The limits of everything that an outside client can make large.
     pub limits: Limits,
     /// How much of each bounded resource clients may hold at a time.
-    pub quotas: Quotas,
+    pub quotas: Arc<Quotas>,
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
@@ -154,7 +154,7 @@ impl App {
         access.refresh(&store, &clock).await?;
         let pairings = Arc::new(Semaphore::new(limits.pairings));
         let (residuals, waiting) = live::residual_queue();
-        let quotas = Quotas::new(&limits);
+        let quotas = Arc::new(Quotas::new(&limits));
         let parts = Parts {
             opened_store: store,
             registry,

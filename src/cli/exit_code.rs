@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use crate::domain::Error;
+use crate::domain::{Error, ErrorKind};
 use crate::store::{FolderFault, FolderFaultKind};
 
 /// The data folder is in use, or the server of the database does not answer; trying again later may help. Invalid flags are 2.
@@ -18,16 +18,18 @@ const REJECTED: u8 = 5;
 #[error("{0}")]
 pub(super) struct TooManyRejected(pub(super) String);
 
-/// The exit code for an error: 3 and 4 for a data folder, 5 for too many rejected rows, else 1.
+/// The exit code for an error: 3 and 4 for a data folder or database, 5 for too many rejected rows, else 1.
 #[must_use]
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     if error.is::<TooManyRejected>() {
         return ExitCode::from(REJECTED);
     }
-    let fault = error.downcast_ref::<Error>().and_then(|error| match error {
-        Error::Fault(fault) => fault.cause::<FolderFault>(),
-        Error::Refused(_) => None,
-    });
+    let fault = match error.downcast_ref::<Error>() {
+        // The database has ended a connection, or has too much to do.
+        Some(error) if error.kind() == ErrorKind::Overloaded => return ExitCode::from(IN_USE),
+        Some(Error::Fault(fault)) => fault.cause::<FolderFault>(),
+        _ => None,
+    };
     match fault.map(|fault| fault.kind) {
         None => ExitCode::FAILURE,
         Some(FolderFaultKind::InUse | FolderFaultKind::Unreachable) => ExitCode::from(IN_USE),

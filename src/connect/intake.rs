@@ -11,8 +11,8 @@ use super::source::{Message, Settled};
 use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
 use crate::domain::{
-    BoundingBox, CameraId, ConnectionId, Durability, Error, ErrorKind, ImageSize, LiveItem, ReceivedFix,
-    ReceiverId, Result, TargetId, TrackerId,
+    BoundingBox, CameraId, ConnectionId, Durability, Error, ErrorKind, ImageArea, ImageSize, LiveItem,
+    ReceivedFix, ReceiverId, Result, TargetId, TrackerId,
 };
 use crate::exchange::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, SourceSettings,
@@ -26,9 +26,20 @@ const OWNING_PAUSE: Duration = Duration::from_millis(200);
 /// The name that stands for any camera of a sender.
 const ANY_CAMERA: &str = "*";
 
+/// A camera of the sender.
+#[derive(Clone)]
+struct SenderCamera {
+    /// The camera here.
+    id: CameraId,
+    /// Size of the sender's stream, if it is not that of the camera's images.
+    stream_size: Option<ImageSize>,
+    /// The part of the camera's image whose boxes are taken.
+    area: Option<Arc<ImageArea>>,
+}
+
 /// Which camera an item is for.
 pub(super) struct Routing {
-    cameras: HashMap<String, (CameraId, Option<ImageSize>)>,
+    cameras: HashMap<String, SenderCamera>,
     fix_cameras: Vec<CameraId>,
     receiver: Option<ReceiverId>,
     ids_name_targets: bool,
@@ -36,10 +47,10 @@ pub(super) struct Routing {
 
 impl Routing {
     pub(super) fn of(settings: &SourceSettings) -> Result<Self> {
-        let cameras = settings
-            .cameras
-            .iter()
-            .map(|(name, mapping)| Ok((name.clone(), (mapping.camera()?, mapping.stream_size()?))));
+        let cameras = settings.cameras.iter().map(|(name, mapping)| {
+            let (id, stream_size) = (mapping.camera()?, mapping.stream_size()?);
+            Ok((name.clone(), SenderCamera { id, stream_size, area: mapping.area()?.map(Arc::new) }))
+        });
         Ok(Self {
             cameras: cameras.collect::<Result<_>>()?,
             fix_cameras: settings.fix_cameras()?,
@@ -48,13 +59,16 @@ impl Routing {
         })
     }
 
-    /// The camera of a sender's name, and the size of the sender's stream if it is another.
-    fn camera(&self, name: &str) -> Result<(CameraId, Option<ImageSize>)> {
+    /// The camera of a sender's name.
+    fn camera(&self, name: &str) -> Result<SenderCamera> {
         match self.cameras.get(name).or_else(|| self.cameras.get(ANY_CAMERA)) {
             Some(known) => Ok(known.clone()),
-            None => CameraId::new(name).map(|id| (id, None)).map_err(|_| {
-                Error::invalid("cameras", format!("names no camera for the sender's camera `{name}`"))
-            }),
+            None => {
+                let id = CameraId::new(name).map_err(|_| {
+                    Error::invalid("cameras", format!("names no camera for the sender's camera `{name}`"))
+                })?;
+                Ok(SenderCamera { id, stream_size: None, area: None })
+            }
         }
     }
 
@@ -172,7 +186,7 @@ impl Intake {
         let description = describe(&item);
         let targets = match item {
             MessageItem::Detection(detection) => match self.routing.camera(&detection.camera) {
-                Ok((camera, size)) => vec![(camera, LiveSource::Detection(detection, size))],
+                Ok(camera) => vec![(camera.id.clone(), LiveSource::Detection(detection, camera))],
                 Err(error) => return account.skip(&description, &error),
             },
             MessageItem::Fix(fix) => {
@@ -298,7 +312,7 @@ const fn is_of_item(kind: ErrorKind) -> bool {
 
 /// An item with what turns it into that of a camera.
 enum LiveSource {
-    Detection(NamedDetection, Option<ImageSize>),
+    Detection(NamedDetection, SenderCamera),
     Fix(ReceivedFix, ReceiverId),
 }
 
@@ -312,12 +326,18 @@ impl LiveSource {
 
     fn item(self, camera: &ActiveCamera, routing: &Routing) -> Result<LiveItem> {
         Ok(match self {
-            Self::Detection(detection, stream_size) => {
+            Self::Detection(detection, sender) => {
                 let (target_id, tracker_id) = routing.identity(&detection)?;
                 let image_size = camera.image_size;
-                let bounding_box = box_in(image_size, detection.detected_box, stream_size)?;
+                let bounding_box = box_in(image_size, detection.detected_box, sender.stream_size)?;
                 let bounding_box =
                     image_size.map_or(Ok(bounding_box), |image_size| bounding_box.within(image_size))?;
+                if sender.area.is_some_and(|area| !area.contains_foot_of(&bounding_box)) {
+                    return Err(Error::invalid(
+                        "area",
+                        "the foot of the box is outside of the source's area",
+                    ));
+                }
                 LiveItem {
                     time: detection.time,
                     target_id,

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rumqttc::v5::mqttbytes as five;
-use rumqttc::v5::mqttbytes::v5::{ConnectReturnCode, PubAckReason, PublishProperties};
+use rumqttc::v5::mqttbytes::v5::{ConnectReturnCode, LastWill, PubAckReason, PublishProperties};
 use rumqttc::{Outgoing, Transport, v5};
 
 use super::credentials::{Credentials, PeerError};
@@ -34,6 +34,8 @@ pub(super) struct Wishes {
     /// Requests to the broker that are not sent: one for each message that may be acknowledged at once, or both sides
     /// would wait for each other.
     pub(super) requests: usize,
+    /// A topic, and what the broker publishes and retains there when the connection is lost.
+    pub(super) last_will: Option<(String, &'static str)>,
 }
 
 /// Where a broker is reached: a host, or the path of a Unix socket.
@@ -124,6 +126,9 @@ pub(super) fn client(
             if let Some((name, password)) = login {
                 options.set_credentials(name, password);
             }
+            if let Some((topic, text)) = &wishes.last_will {
+                options.set_last_will(LastWill::new(topic, *text, five::QoS::AtLeastOnce, true, None));
+            }
             let (client, connection) = v5::AsyncClient::new(options, wishes.requests);
             (Client::Five(client), Connection::Five(Box::new(connection)))
         }
@@ -139,6 +144,10 @@ pub(super) fn client(
             }
             if let Some((name, password)) = login {
                 options.set_credentials(name, password);
+            }
+            if let Some((topic, text)) = &wishes.last_will {
+                let qos = rumqttc::QoS::AtLeastOnce;
+                options.set_last_will(rumqttc::LastWill::new(topic, *text, qos, true));
             }
             let (client, mut connection) = rumqttc::AsyncClient::new(options, wishes.requests);
             connection.network_options.set_connection_timeout(OPEN_TIME.as_secs());
@@ -198,6 +207,20 @@ impl Client {
             Self::ThreeOneOne(client) => {
                 let qos = rumqttc::QoS::AtLeastOnce;
                 client.publish_bytes(topic, qos, false, payload).await.map_err(ended)
+            }
+        }
+    }
+}
+
+impl Client {
+    /// Publishes with QoS 1 what the broker keeps for those who subscribe later.
+    pub(super) async fn retain(&self, topic: &str, payload: Bytes) -> Result<(), PeerError> {
+        match self {
+            Self::Five(client) => {
+                client.publish_bytes(topic, five::QoS::AtLeastOnce, true, payload).await.map_err(ended)
+            }
+            Self::ThreeOneOne(client) => {
+                client.publish_bytes(topic, rumqttc::QoS::AtLeastOnce, true, payload).await.map_err(ended)
             }
         }
     }

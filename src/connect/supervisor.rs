@@ -7,7 +7,7 @@
 use std::collections::{HashMap, HashSet};
 use std::convert::Infallible;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use rand::SeedableRng as _;
@@ -17,7 +17,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::credentials::PeerError;
-use super::deliver::Delivery;
+use super::deliver::{Attempt, Delivery};
 use super::intake::Intake;
 use super::open;
 use super::publish::Publisher;
@@ -132,15 +132,16 @@ impl Supervisor {
     /// Starts and ends tasks, so that they are those of the stored connections, and tells other nodes what they do.
     async fn look(&mut self) -> Result<()> {
         let connections = all_connections(&self.app).await?;
-        self.count_lost(&connections).await?;
         let all: Vec<_> =
             connections.iter().map(|connection| (connection.key, connection.revision)).collect();
         let active: Vec<_> = connections
-            .into_iter()
+            .iter()
             .filter(|connection| !connection.profile.paused)
-            .filter_map(|connection| self.read(connection).map(Arc::new))
+            .filter_map(|connection| self.read(connection.clone()).map(Arc::new))
             .collect();
+        // Before anything is written, which a full disk refuses: from here on no position is missed.
         self.feed(all, &active);
+        self.count_lost(&connections).await?;
         let site_of = |camera: &CameraId| self.app.registry.get(camera).and_then(|known| known.site.clone());
         let keyed = active.iter().map(|active| (active.connection.key, &active.settings));
         let groups = connection_groups(keyed, site_of);
@@ -310,15 +311,15 @@ async fn retried(app: &App, connection: &Connection, live: &Arc<LiveConnection>,
     let mut was_failing = false;
     loop {
         live.enter(ConnectionState::Connecting, app.clock.now());
-        let progressed = AtomicBool::new(false);
-        let attempt = match &work {
+        let attempt = Attempt::default();
+        let ended = match &work {
             Work::Source { settings, secrets } => {
-                run_source(app, connection, settings, secrets, live, &progressed).await
+                run_source(app, connection, settings, secrets, live, &attempt).await
             }
-            Work::Delivery(delivery) => delivery.run(&progressed).await,
+            Work::Delivery(delivery) => delivery.run(&attempt).await,
         };
-        let Err(error) = attempt;
-        let has_progressed = progressed.into_inner();
+        let Err(error) = ended;
+        let has_progressed = attempt.progressed.into_inner();
         if has_progressed {
             backoff.reset();
         }
@@ -330,7 +331,8 @@ async fn retried(app: &App, connection: &Connection, live: &Arc<LiveConnection>,
         let now = app.clock.now();
         live.update(|status| status.last_error = Some((now, error.to_string())));
         live.enter(ConnectionState::Waiting, now);
-        tokio::time::sleep(backoff.next_delay().unwrap_or(LOOK_EVERY)).await;
+        let asked = attempt.retry_after.into_inner().unwrap_or_default();
+        tokio::time::sleep(backoff.next_delay().unwrap_or(LOOK_EVERY).max(asked)).await;
     }
 }
 
@@ -345,7 +347,7 @@ async fn run_source(
     settings: &SourceSettings,
     secrets: &Secrets,
     live: &Arc<LiveConnection>,
-    progressed: &AtomicBool,
+    attempt: &Attempt,
 ) -> Result<Infallible, PeerError> {
     let identity = SourceIdentity { client_id: client_id(connection), is_lasting: true };
     let mut source = open::source(app, connection, settings, secrets, &identity, live).await?;
@@ -356,7 +358,7 @@ async fn run_source(
         tokio::select! {
             message = source.next(), if intake.pending() < app.limits.connection_unsettled => {
                 intake.take(message?).await?;
-                progressed.store(true, Ordering::Relaxed);
+                attempt.progressed.store(true, Ordering::Relaxed);
             }
             () = tokio::time::sleep(SETTLE_EVERY), if intake.pending() > 0 => {}
         }

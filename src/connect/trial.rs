@@ -112,7 +112,7 @@ async fn try_sink(
     let now = app.clock.now();
     let random = app.randomness.uuid_v7(now);
     let client_id = format!("sightfix-{}-test-{}", connection.id(), random.simple());
-    let mut sink = open::sink(app, connection.id(), settings, secrets, &client_id).await?;
+    let mut sink = open::sink(app, connection.id(), settings, secrets, (&client_id, false)).await?;
     let cameras = settings.cameras()?;
     let camera: &CameraId = cameras.first().ok_or_else(|| PeerError::from("the sink names no camera"))?;
     let target = TargetId::new(TEST_TARGET)?;

@@ -10,8 +10,8 @@ mod evaluation;
 mod job_thread;
 mod learning;
 mod promotion;
+mod run_jobs;
 mod site_training;
-mod training;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

@@ -2,7 +2,7 @@
 //! activated together or not at all.
 
 use super::promotion::{self, CameraPromotion, PromotionCandidate, SitePromotion};
-use super::training::{Trained, Update, finish, report};
+use super::run_jobs::{Trained, Update, finish, report};
 use super::{JobIdentity, Work, load_samples};
 use crate::app::App;
 use crate::domain::{

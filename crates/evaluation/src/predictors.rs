@@ -1,8 +1,8 @@
 //! The predictor of every method: from the rows of one target to positions.
 
 use super::baselines::{dnn, homography, imm_ukf};
+use super::model_fits::RecipeModel;
 use super::options::{EvaluateOptions, TestRow};
-use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, SigmaM};
 use crate::filters::ImmUkf;
 use crate::fusion::observed::UNKNOWN_RECEIVER_M2;

@@ -101,6 +101,11 @@ impl Scheme {
         Self::SUBSCRIBED.contains(&self)
     }
 
+    /// True if it is MQTT, plain or encrypted.
+    pub(super) const fn is_mqtt(self) -> bool {
+        matches!(self, Self::Mqtt | Self::Mqtts)
+    }
+
     /// True if it is Kafka, plain or encrypted.
     pub(super) const fn is_kafka(self) -> bool {
         matches!(self, Self::Kafka | Self::Kafkas)

@@ -12,7 +12,7 @@ use super::address::{Address, Scheme};
 use super::messages::{JsonMapping, MessageFormat};
 use super::track_files::TrackFileFormat;
 use crate::domain::{
-    CameraId, Error, ImageSize, ReceiverId, Result, Score, TargetClass, TargetId, check_text,
+    CameraId, Error, ImageArea, ImageSize, ReceiverId, Result, Score, TargetClass, TargetId, check_text,
 };
 
 /// Cameras that a connection may name.
@@ -58,7 +58,7 @@ pub struct ConnectionSettings {
 }
 
 /// A camera of this server, by the sender's name of it.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CameraMapping {
     /// The camera here.
@@ -67,6 +67,21 @@ pub struct CameraMapping {
     /// Size of the stream that the sender's boxes are in, if it is not the camera's `image_size`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image_size: Option<StreamSize>,
+    /// Corners of the part of the camera's image whose boxes are taken: those whose foot, the middle of the lower edge, is
+    /// inside. All boxes are taken if it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(min_items = 3, max_items = 64)]
+    pub area: Option<Vec<ImagePoint>>,
+}
+
+/// A point of an image.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ImagePoint {
+    /// Px from the left border.
+    pub x_px: f64,
+    /// Px from the upper border.
+    pub y_px: f64,
 }
 
 /// Size of a stream, px.
@@ -184,6 +199,9 @@ pub enum OutgoingFormat {
     Cot,
     /// An ONVIF metadata frame (XML, `tt:MetadataStream`) with the object's geolocation per position.
     Onvif,
+    /// Attributes of device trackers of Home Assistant, which are announced to it by MQTT discovery; of targets whose receiver is
+    /// known alone. For addresses of MQTT.
+    HomeAssistant,
     /// Tracks in files of GPX 1.1, for the address `file:`.
     Gpx,
     /// Tracks in files of KML 2.2, for the address `file:`.
@@ -195,7 +213,7 @@ impl OutgoingFormat {
     #[must_use]
     pub const fn track_file(self) -> Option<TrackFileFormat> {
         match self {
-            Self::Json | Self::Cot | Self::Onvif => None,
+            Self::Json | Self::Cot | Self::Onvif | Self::HomeAssistant => None,
             Self::Gpx => Some(TrackFileFormat::Gpx),
             Self::Kml => Some(TrackFileFormat::Kml),
         }
@@ -420,7 +438,8 @@ impl SourceSettings {
         for (name, mapping) in &self.cameras {
             let checked = || {
                 mapping.camera()?;
-                mapping.stream_size().map(drop)
+                mapping.stream_size()?;
+                mapping.area().map(drop)
             };
             checked().map_err(|error: Error| error.under(&format!("cameras.{name}")))?;
         }
@@ -491,6 +510,15 @@ impl CameraMapping {
     pub fn stream_size(&self) -> Result<Option<ImageSize>> {
         self.image_size.map(|size| ImageSize::new(size.width_px, size.height_px)).transpose()
     }
+
+    /// The part of the camera's image whose boxes are taken, if it is not all of it.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `area`.
+    pub fn area(&self) -> Result<Option<ImageArea>> {
+        let corners = |area: &Vec<ImagePoint>| area.iter().map(|point| [point.x_px, point.y_px]).collect();
+        self.area.as_ref().map(|area| ImageArea::new(corners(area))).transpose()
+    }
 }
 
 impl SinkSettings {
@@ -510,6 +538,9 @@ impl SinkSettings {
                 "format",
                 "must be gpx or kml for the address file:, and for no other",
             ));
+        }
+        if self.format == OutgoingFormat::HomeAssistant && !scheme.is_mqtt() {
+            return Err(Error::invalid("format", "can be home_assistant for addresses of MQTT alone"));
         }
         check_username(self.username.as_deref())?;
         check_sasl(self.sasl_mechanism, scheme, self.username.as_deref())?;

@@ -72,6 +72,11 @@ pub(super) fn sigma_of_radius_68(radius_m: f64) -> Option<SigmaM> {
     stated(radius_m / RADIUS_68)
 }
 
+/// Radius that contains a circular normal error of this variance per axis, m2, in 68 of 100 cases, m.
+pub(super) fn radius_68_m(variance_m2: f64) -> f64 {
+    RADIUS_68 * variance_m2.sqrt()
+}
+
 /// 0 and what is not a number mean that nothing is known. What no receiver can know is the nearest that is possible.
 fn stated(sigma_m: f64) -> Option<SigmaM> {
     let is_known = sigma_m.is_finite() && sigma_m > 0.0;

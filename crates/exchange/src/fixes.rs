@@ -13,6 +13,7 @@ use super::format::FixFormat;
 use super::gpsd::GpsdFixes;
 use super::gpx::GpxFixes;
 use super::nmea_fixes::NmeaFixes;
+use super::rtklib::RtklibFixes;
 use crate::domain::{Error, Fix, ReceivedFix, ReceiverId, Result, TimeBounds, parse_time};
 
 /// A fix, and its time if the file has it.
@@ -64,6 +65,7 @@ enum FixRows<R> {
     Nmea(NmeaFixes<R>),
     Gpx(Box<GpxFixes<R>>),
     Gpsd(GpsdFixes<R>),
+    Rtklib(RtklibFixes<R>),
 }
 
 impl<R: Read> FixRows<R> {
@@ -76,6 +78,7 @@ impl<R: Read> FixRows<R> {
             FixFormat::Nmea => Self::Nmea(NmeaFixes::new(reader, time_bounds)),
             FixFormat::Gpx => Self::Gpx(Box::new(GpxFixes::new(reader, time_bounds))),
             FixFormat::Gpsd => Self::Gpsd(GpsdFixes::new(reader, time_bounds)),
+            FixFormat::Rtklib => Self::Rtklib(RtklibFixes::new(reader, time_bounds)),
         })
     }
 
@@ -89,6 +92,7 @@ impl<R: Read> FixRows<R> {
             Self::Nmea(rows) => rows.next_row(),
             Self::Gpx(rows) => rows.next_row(),
             Self::Gpsd(rows) => rows.next_row(),
+            Self::Rtklib(rows) => rows.next_row(),
         }
     }
 }

@@ -110,6 +110,16 @@ impl Regression {
         }
     }
 
+    /// The same position with a larger error variance, m2 per axis.
+    #[must_use]
+    pub fn with_added_variance(self, added_m2: f64) -> Self {
+        Self {
+            e_regression_m2: self.e_regression_m2 + added_m2,
+            covariance: self.covariance.plus(PlaneCovariance::isotropic(added_m2)),
+            ..self
+        }
+    }
+
     /// Covariance, m2, of the normal distribution that has the stated 95 % radius.
     #[must_use]
     pub fn normal_covariance(&self) -> PlaneCovariance {
@@ -304,11 +314,18 @@ impl Regressor {
 
     /// Returns the completed boxes if something hides the lower part of a box. Only a model of the recipe
     /// `gaussian_process` knows how tall its targets are; others return `None`.
+    /// `recent` summarises the earlier boxes of the same target and takes this one in.
     #[must_use]
     #[inline]
-    pub fn hidden_foot(&self, bounding_box: &BoundingBox) -> Option<HiddenFoot> {
+    pub fn hidden_foot(
+        &self,
+        bounding_box: &BoundingBox,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Option<HiddenFoot> {
         match &self.encoder {
-            Encoder::GaussianProcess(map) => HiddenFoot::of(bounding_box, &map.predictor.plausibility),
+            Encoder::GaussianProcess(map) => {
+                HiddenFoot::of(bounding_box, &map.predictor.plausibility, recent)
+            }
             Encoder::Paper(_) | Encoder::Hybrid(_) | Encoder::Projective(_) => None,
         }
     }

@@ -29,7 +29,7 @@ use crate::store::{KeysVersion, Store};
 
 pub use caller::{Caller, CertificateHolder, Principal};
 pub use key_table::ActiveKey;
-pub use permission::{OPERATIONS, Operation, Permission, RoutePermission};
+pub use permission::Permission;
 pub use sessions::{SESSION_TIME, SessionToken};
 pub use signed_in_user::SignedInUser;
 
@@ -188,9 +188,9 @@ impl Access {
 
     /// True if the keys should be read again for a credential, at a reading of the monotonic clock: it is an unknown
     /// key, which another process may have created a moment ago. The keys are read at most ten times a second.
-    pub fn is_worth_refresh(&self, credential: Credential<'_>, monotonic: Duration) -> bool {
+    pub fn is_worth_refresh(&self, credential: &Credential<'_>, monotonic: Duration) -> bool {
         let Credential::Key(secret) = credential else { return false };
-        let Ok(secret) = KeySecret::parse(&secret) else { return false };
+        let Ok(secret) = KeySecret::parse(secret) else { return false };
         !self.is_open() && !self.keys.has(&secret.digest()) && self.keys.may_look(monotonic)
     }
 

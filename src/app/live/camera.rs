@@ -15,7 +15,7 @@ use super::matching::LiveMatching;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
-use crate::domain::{BoundingBox, CameraMoved, FusedFix};
+use crate::domain::{BoundingBox, CameraMoved, FusedFix, Score, TargetClass, TargetId, TrackerId};
 
 /// When something was observed, by the server's clock.
 #[derive(Debug, Clone, Copy, Default)]
@@ -31,6 +31,8 @@ pub(super) struct Observed {
 pub enum CameraEvent {
     /// A target was measured.
     Track(Arc<TargetUpdate>),
+    /// A box was seen that has no position: the camera has no model.
+    Box(Arc<UnplacedBox>),
     /// The camera's pose has changed.
     Moved(Arc<CameraMoved>),
 }
@@ -44,6 +46,23 @@ pub struct TargetUpdate {
     pub bounding_box: Option<BoundingBox>,
     /// The observation's own position; `None` for a box while the camera has no model.
     pub fused: Option<FusedFix>,
+}
+
+/// A box of a camera that has no model.
+#[derive(Debug)]
+pub struct UnplacedBox {
+    /// Time of the frame.
+    pub time: Timestamp,
+    /// The target, where the detector knows it.
+    pub target_id: Option<TargetId>,
+    /// The id that the camera's tracker gave it.
+    pub tracker_id: Option<TrackerId>,
+    /// The box.
+    pub bounding_box: BoundingBox,
+    /// Class reported by the detector.
+    pub class: Option<TargetClass>,
+    /// Confidence score of the detector.
+    pub score: Option<Score>,
 }
 
 /// Tracks, drift detection, listeners and the recording of samples of one camera.
@@ -120,6 +139,11 @@ impl CameraLive {
     /// Makes the update only if somebody listens, or may come back. `now` is a reading of the monotonic clock.
     pub(super) fn announce_track(&self, now: Duration, update: impl FnOnce() -> TargetUpdate) {
         self.events.push(now, || CameraEvent::Track(Arc::new(update())));
+    }
+
+    /// The same for a box without a position.
+    pub(super) fn announce_box(&self, now: Duration, unplaced: impl FnOnce() -> UnplacedBox) {
+        self.events.push(now, || CameraEvent::Box(Arc::new(unplaced())));
     }
 
     /// Remembers that something was observed at that time of the server, and whether its box, if it has one, is frozen.

@@ -35,7 +35,7 @@ use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
 use super::cluster::{CameraLease, Watch};
-use super::fusion::fuse_observed;
+use super::fusion::fuse_for_camera;
 use super::registry::ActiveCamera;
 use crate::domain::{
     CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, ReceiverMatch, Result, TargetId,
@@ -46,7 +46,7 @@ use crate::fusion::observed::ObservedPositions;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
-pub use camera::{CameraEvent, TargetUpdate};
+pub use camera::{CameraEvent, TargetUpdate, UnplacedBox};
 pub use camera_events::{EventId, LostEvents};
 pub(super) use identification::MatchingSlot;
 pub(super) use learning::LearningProgress;
@@ -169,7 +169,7 @@ impl App {
             Some(target) => target.observe(observation, regressor, image_size, e_gnss_m2),
             None => ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None),
         };
-        let fused = fuse_observed(camera, observation, &observed);
+        let fused = fuse_for_camera(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(observed_at, observed.regressed.map(|seen| seen.is_frozen));
         let world_track = self.feed_site(camera, observation, &observed);

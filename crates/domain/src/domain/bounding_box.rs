@@ -3,7 +3,7 @@
 use super::error::{Error, Result};
 
 /// Larger images are refused; within this f32 resolves pixels to 1/64.
-const MAX_IMAGE_PX: u32 = 131_072;
+pub(super) const MAX_IMAGE_PX: u32 = 131_072;
 
 /// Size of a camera's image in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -23,6 +23,9 @@ pub struct MeasuredPosition {
     pub repeated_s: f64,
     /// True if its stated error rests on nothing of training: a box unlike those, a fix far from the scene.
     pub is_doubtful: bool,
+    /// True if its error is as large as the scene, so that it says no more than that a target is in view: it updates no
+    /// estimate.
+    pub is_vague: bool,
 }
 
 impl MeasuredPosition {
@@ -36,6 +39,7 @@ impl MeasuredPosition {
             stated_scale: 1.0,
             repeated_s: 0.0,
             is_doubtful: false,
+            is_vague: false,
         }
     }
 }

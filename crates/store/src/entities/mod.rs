@@ -17,12 +17,12 @@ mod outbox;
 mod pictures;
 mod recordings;
 mod retention;
+mod run_progress;
 mod runs;
 mod sample_retention;
 mod samples;
 mod site_runs;
 mod sites;
 mod source_offsets;
-mod training;
 
 pub use runs::RunSubject;

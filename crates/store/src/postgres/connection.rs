@@ -84,7 +84,7 @@ fn options(url: &DatabaseUrl) -> Result<PgConnectOptions> {
 }
 
 pub(super) async fn begin_read(pool: &PgPool) -> Result<Transaction<'static, Postgres>> {
-    pool.begin_with(BEGIN_READ).await.map_err(failed)
+    begin(pool, BEGIN_READ).await.map_err(failed)
 }
 
 /// A transaction that is flushed to the disk when it is committed, or may be undone by a power cut.
@@ -92,7 +92,15 @@ pub(crate) async fn begin_write(
     pool: &PgPool,
     durability: Durability,
 ) -> Result<Transaction<'static, Postgres>> {
-    pool.begin_with(begin_write_statement(durability)).await.map_err(failed)
+    begin(pool, begin_write_statement(durability)).await.map_err(failed)
+}
+
+/// Begins a transaction on a task of its own, which goes on when its caller is gone: the library would give the connection
+/// back to the pool in the middle of the statement, and the next caller would go on in that transaction, with its snapshot.
+async fn begin(pool: &PgPool, statement: &'static str) -> sqlx::Result<Transaction<'static, Postgres>> {
+    let pool = pool.clone();
+    let beginning = tokio::spawn(async move { pool.begin_with(statement).await });
+    beginning.await.unwrap_or_else(|ended| Err(sqlx::Error::Io(ended.into())))
 }
 
 /// As [`begin_write`], for a connection that is at hand.
@@ -108,7 +116,7 @@ pub(super) const fn begin_write_statement(durability: Durability) -> &'static st
 async fn migrate(pool: &PgPool) -> Result<(), MigrateError> {
     let began = Instant::now();
     loop {
-        let mut transaction = pool.begin_with(BEGIN_SCHEMA).await?;
+        let mut transaction = begin(pool, BEGIN_SCHEMA).await?;
         if try_lock_limit(&mut transaction, Limit::Schema).await? {
             MIGRATIONS.run_direct(None, &mut *transaction, false).await?;
             return Ok(transaction.commit().await?);

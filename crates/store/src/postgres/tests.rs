@@ -360,6 +360,29 @@ async fn a_waiting_start_does_not_block_an_index_that_is_built_concurrently() {
     waiting.await.expect("no panic");
 }
 
+/// Calls that are given up at any point leave no transaction open on a connection of the pool, whose next caller would
+/// read the state of then.
+#[tokio::test]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn calls_that_are_given_up_leave_no_transaction_open() {
+    let home = database().await;
+    let store = home.open().await;
+    let camera = id("gate");
+    store.insert_camera(&NewCamera::named(camera.clone()), at(0)).await.expect("stored");
+    for after_ms in 1..=20 {
+        // More calls than connections, so that some are given up while they begin.
+        let calls =
+            (0..30).map(|_| tokio::time::timeout(Duration::from_millis(after_ms), store.camera(&camera)));
+        futures_util::future::join_all(calls).await;
+    }
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let open = "SELECT count(*) FROM pg_stat_activity \
+                WHERE datname = current_database() AND state LIKE 'idle in transaction%'";
+    let open: i64 =
+        sqlx::query_scalar(open).fetch_one(&mut connect(&url(&home)).await).await.expect("a count");
+    assert_eq!(open, 0);
+}
+
 #[tokio::test]
 #[ignore = "needs PostgreSQL: .ci/postgres"]
 async fn a_folder_is_copied_into_a_database_and_back() {

@@ -68,12 +68,14 @@ pub(crate) struct Deviation {
     widen: f64,
 }
 
-/// The running mean of how a target's boxes deviate from those of training: one per target, kept by the
-/// caller between its boxes.
+/// The running mean of how a target's boxes deviate from those of training, and whether its foot is hidden: one per
+/// target, kept by the caller between its boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RecentBoxes {
     mean: [f64; 2],
     count: u32,
+    /// Probability that the foot of the latest box is hidden.
+    pub(super) hidden: f64,
 }
 
 impl RecentBoxes {

@@ -3,9 +3,12 @@
 //! Hypotheses about a box (left, top, width, height): it is whole; a share x of the target's height is hidden below it,
 //! so the target's box has the height h / (1 - x) and its foot is lower; or it is of anything. The densities of log width
 //! and log height at the hypothetical foot are those of the training boxes (`box_plausibility`), which have the heights
-//! of different targets in them, with x uniform. Bayes' rule gives the probability that the foot is hidden.
+//! of different targets in them, with x uniform. Bayes' rule gives the probability that the foot is hidden. What hides a
+//! foot mostly hides it in the next box, too: the prior probability of a target's next box follows from that of its latest
+//! one (a hidden Markov model of two states). Otherwise the boxes of a hidden foot that look whole by chance would tell
+//! its position alone, as they state the smallest errors.
 
-use super::box_plausibility::BoxPlausibility;
+use super::box_plausibility::{BoxPlausibility, RecentBoxes};
 use super::projective_mean::Box4;
 use crate::domain::BoundingBox;
 use crate::encoder::features::features_of;
@@ -13,6 +16,8 @@ use crate::encoder::features::features_of;
 /// Prior probability that a foot is hidden, and that a box is of anything.
 const HIDDEN: f64 = 0.05;
 const ANYTHING: f64 = 0.01;
+/// What is left, after one box, of how far the probability of a target's latest box exceeds the prior one.
+const PERSISTENCE: f64 = 0.9;
 /// Density of a box of anything: uniform over a factor of 20 in width and in height.
 const ANYTHING_DENSITY: f64 = 0.11;
 /// Largest hidden share of a height.
@@ -34,16 +39,31 @@ pub struct HiddenFoot {
 }
 
 impl HiddenFoot {
-    /// `None` for a box that is most probably whole.
+    /// `None` for a box that is most probably whole. `recent` is that of its target and takes the box in.
     #[inline]
-    pub(crate) fn of(bounding_box: &BoundingBox, plausibility: &BoxPlausibility) -> Option<Self> {
+    pub(crate) fn of(
+        bounding_box: &BoundingBox,
+        plausibility: &BoxPlausibility,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Option<Self> {
+        // A whole box says nothing about the next: something may come between at any time.
+        let latest = recent.as_ref().map_or(HIDDEN, |recent| recent.hidden.max(HIDDEN));
+        let hidden = Self::with_prior(bounding_box, plausibility, HIDDEN + PERSISTENCE * (latest - HIDDEN));
+        if let Some(recent) = recent {
+            recent.hidden = hidden.map_or(0.0, |hidden| hidden.probability);
+        }
+        hidden
+    }
+
+    #[inline]
+    fn with_prior(bounding_box: &BoundingBox, plausibility: &BoxPlausibility, prior: f64) -> Option<Self> {
         let sides = features_of(bounding_box);
         let seen = plausibility.deviation(&sides);
-        if seen.normalized[1] > -WHOLE_SIGMAS {
+        if prior <= HIDDEN && seen.normalized[1] > -WHOLE_SIGMAS {
             return None;
         }
         let (density, mean, variance) = hidden_density(plausibility, &sides);
-        let (hidden, whole) = (HIDDEN * density, (1.0 - HIDDEN - ANYTHING) * plausibility.density(&seen));
+        let (hidden, whole) = (prior * density, (1.0 - prior - ANYTHING) * plausibility.density(&seen));
         let probability = hidden / (hidden + whole + ANYTHING * ANYTHING_DENSITY);
         if probability < LEAST_PROBABILITY {
             return None;

@@ -1,0 +1,1 @@
+"""Checked histories: clients and faults against real servers, and what the answers must have been."""

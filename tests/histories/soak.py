@@ -1,0 +1,102 @@
+"""A soak: the clients of a history without faults, and what the servers hold while they work."""
+
+import dataclasses
+import os
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+from .api import Api
+from .cluster import Cluster
+from .links import free_port
+from .record import Recorder
+from .running import Options, clients_at_work, servers, through
+from .workloads import names
+
+#: So small that all are reached in the first third of a soak of a minute, and rows come and go from then on.
+SETTINGS = {
+    "SIGHTFIX_LIMITS__SAMPLES_PER_CAMERA": "300", "SIGHTFIX_LIMITS__SAMPLE_OVERFLOW": "delete_oldest",
+    "SIGHTFIX_LIMITS__AUDIT_ENTRIES": "100", "SIGHTFIX_LIMITS__KEYS": "10",
+    "SIGHTFIX_LIMITS__ENDED_RUNS_PER_CAMERA": "3", "SIGHTFIX_LIMITS__MODELS_PER_CAMERA": "8",
+    "SIGHTFIX_LIMITS__IDEMPOTENCY_KEYS": "50",
+}  # fmt: skip
+#: Lines of the table.
+LINES = 12
+#: What a figure of the last third may be above that of the second one, as a share and in its unit.
+GROWTH = {"memory (MB)": (0.10, 8.0), "descriptors": (0.10, 16.0), "rows": (0.02, 20.0), "disk (MB)": (0.10, 8.0)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Figures:
+    """What all servers hold together at a time."""
+
+    time_s: float
+    values: dict[str, float]
+
+
+def memory_mb(process: int) -> float:
+    """Resident memory of a process."""
+    status = Path(f"/proc/{process}/status").read_text("ascii")
+    return int(status.partition("VmRSS:")[2].split()[0]) / 1024
+
+
+def stored_rows(api: Api) -> int:
+    """Rows of all that the clients change: samples, keys, runs, model versions and entries of the audit log."""
+    cameras = [name for name in names() if name.startswith("samples-")]
+    counts = [_answer(api, f"/v1/cameras/{camera}/samples/count")["count"] for camera in cameras]
+    lists = ["/v1/keys", "/v1/audit", "/v1/cameras/runs/training-runs", "/v1/cameras/runs/models"]
+    return int(sum(counts)) + sum(len(_answer(api, f"{path}?limit=1000")["items"]) for path in lists)
+
+
+def _answer(api: Api, path: str) -> Any:
+    read = api.send("soak", path, "GET", path, keep=lambda answer, _: answer)
+    if not read.is_done:
+        raise RuntimeError(f"{path}: {read.status} {read.answer}")
+    return read.answer
+
+
+def measure(cluster: Cluster, api: Api, began_s: float) -> Figures:
+    """The figures of now."""
+    processes = [node.process_id for node in cluster.nodes if node.process_id is not None]
+    values = {
+        "memory (MB)": sum(memory_mb(process) for process in processes),
+        "descriptors": float(sum(len(os.listdir(f"/proc/{process}/fd")) for process in processes)),
+        "rows": float(stored_rows(api)),
+        "disk (MB)": cluster.backend.stored_bytes() / 1e6,
+    }
+    return Figures(time.monotonic() - began_s, values)
+
+
+def soak(options: Options, folder: Path, duration_s: float) -> bool:
+    """Measures while the clients work, and prints the table; whether all figures stay flat."""
+    lines: list[Figures] = []
+    with servers(options, folder, SETTINGS) as cluster:
+        hook_port = free_port()
+        api = Api(cluster.url, cluster.admin_key, Recorder(Path(os.devnull), "soak"), timeout_s=30)
+        with clients_at_work(options, cluster, through([], cluster, hook_port), folder, hook_port) as clients:
+            began_s = time.monotonic()
+            for line in range(1, LINES + 1):
+                time.sleep(max(0.0, began_s + line * duration_s / LINES - time.monotonic()))
+                lines.append(measure(cluster, api, began_s))
+            clients.end()
+    return report(lines)
+
+
+def report(lines: list[Figures]) -> bool:
+    """Prints the table, and which figures have grown; whether none has."""
+    names_of = list(GROWTH)
+    print(f"| time (s) | {' | '.join(names_of)} |\n|---:|{'---:|' * len(names_of)}")
+    for line in lines:
+        print(f"| {line.time_s:.0f} | {' | '.join(f'{line.values[name]:.0f}' for name in names_of)} |")
+    grown = [name for name in names_of if has_grown(name, [line.values[name] for line in lines])]
+    print(f"grown: {', '.join(grown)}" if grown else "flat: no figure of the last third is above that of the second")
+    return not grown
+
+
+def has_grown(name: str, values: list[float]) -> bool:
+    """Whether the median of the last third is above that of the second by more than is allowed."""
+    third = len(values) // 3
+    before, after = statistics.median(values[third : 2 * third]), statistics.median(values[2 * third :])
+    share, amount = GROWTH[name]
+    return after > before * (1 + share) + amount

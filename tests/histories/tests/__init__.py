@@ -1,0 +1,1 @@
+"""Tests of the checkers: each finds what it is for."""

@@ -369,7 +369,7 @@ impl Default for Config {
             openid: OpenIdSettings::default(),
             api_key: None,
             log_format: LogFormat::Text,
-            log_filter: "info,rskafka=off".to_owned(),
+            log_filter: "info".to_owned(),
             trace_endpoint: None,
             training: Workers::default(),
             evaluation: Workers::default(),

@@ -14,7 +14,8 @@ use super::output::print_note;
 use super::summary::{Summary, SummaryFlags};
 use super::{DataFolder, MissingData, camera_id, open_app, receiver_id, runtime, target_id};
 use crate::app::{
-    MatchReport, MatchRequest, PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part,
+    MatchReport, MatchRequest, MatchedPair, PairingCounts, Part, Recording, RecordingLimits, RejectedParts,
+    of_part,
 };
 use crate::clock::Clock;
 use crate::config::Limits;
@@ -182,7 +183,7 @@ impl Pair {
             return self.write_matched(recording, &receivers, &settings, out, config, &summary);
         }
         let (paired, counts, rejected) = recording.paired(&receivers, &settings);
-        print_counts(&summary, &counts, &rejected)?;
+        print_counts(&summary, &counts, &rejected, None)?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
         let mut file = Output::create(out)?;
         if self.keep_unpaired {
@@ -214,7 +215,7 @@ impl Pair {
         let matched = recording.matched(receivers, &request)?;
         print_match(summary, &matched.report)?;
         let (paired, counts, rejected) = matched.recording.paired(&matched.receivers, settings);
-        print_counts(summary, &counts, &rejected)?;
+        print_counts(summary, &counts, &rejected, Some(&matched.report))?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
         let mut file = Output::create(out)?;
         let mut writer = MatchedSampleWriter::new(&mut file, files::format_of(out, None)?);
@@ -369,9 +370,46 @@ fn print_match(summary: &Summary, report: &MatchReport) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn print_counts(summary: &Summary, counts: &PairingCounts, rejected: &RejectedParts) -> anyhow::Result<()> {
+/// What was matched, in the names of the answer over REST, and the scores of the search without a model.
+fn match_document(report: &MatchReport) -> serde_json::Value {
+    let pair = |pair: &MatchedPair| {
+        serde_json::json!({
+            "receiver_id": pair.receiver_id.as_str(),
+            "tracker_id": pair.tracker_id.as_str(),
+            "from": pair.from,
+            "to": pair.to,
+            "detections": pair.detections,
+            "probability": pair.probability,
+        })
+    };
+    let offset = |(id, offset): &(ReceiverId, ClockOffset)| serde_json::json!({ "receiver_id": id.as_str(), "offset_s": offset.seconds() });
+    let score = |score: f64| score.is_finite().then_some(score);
+    serde_json::json!({
+        "tracklets": report.tracklets,
+        "receivers": report.receivers,
+        "cuts": report.cuts,
+        "min_probability": report.min_probability,
+        "matched_detections": report.matched_detections,
+        "unsure_detections": report.unsure_detections,
+        "pairs": report.pairs.iter().map(pair).collect::<Vec<_>>(),
+        "clock_offsets": report.clock_offsets.iter().map(offset).collect::<Vec<_>>(),
+        "scores": report.world.map(|world| serde_json::json!({
+            "best": world.best,
+            "shifted_clocks": score(world.best_shifted),
+            "another_place": score(world.second),
+        })),
+    })
+}
+
+fn print_counts(
+    summary: &Summary,
+    counts: &PairingCounts,
+    rejected: &RejectedParts,
+    matched: Option<&MatchReport>,
+) -> anyhow::Result<()> {
     let PairingCounts { detections, fixes, paired, .. } = counts;
     summary.document(&serde_json::json!({
+        "matching": matched.map(match_document),
         "detections": detections,
         "fixes": fixes,
         "paired": paired,

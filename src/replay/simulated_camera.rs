@@ -14,7 +14,7 @@ use super::progress::Counters;
 use super::report::Counts;
 use super::resend_buffer::{Answered, ResendBuffer};
 use crate::backoff::Backoff;
-use crate::domain::{LiveItem, ReceiverId, TargetId};
+use crate::domain::{LiveItem, ReceiverId, TargetId, TrackerId};
 use crate::grpc::client::{ClientError, Connection, Event, Events, ItemSender, Opening, SendPermit};
 use crate::grpc::proto::stream_answer::Outcome;
 use crate::grpc::proto::track_rejection::Reason;
@@ -33,7 +33,7 @@ pub(super) struct Link {
 pub(super) struct SimulatedCamera {
     options: Arc<ReplayOptions>,
     opening: Opening,
-    /// Appended to target ids where several simulated cameras share one camera of the server.
+    /// Appended to ids where several simulated cameras share one camera of the server.
     id_suffix: Option<String>,
     feed: PacedFeed,
     buffer: ResendBuffer,
@@ -335,9 +335,11 @@ impl SimulatedCamera {
     fn with_suffixed_ids(&self, mut item: LiveItem) -> LiveItem {
         if let Some(suffix) = &self.id_suffix {
             let target = |id: TargetId| TargetId::new(&format!("{id}{suffix}")).unwrap_or(id);
+            let tracker = |id: TrackerId| TrackerId::new(&format!("{id}{suffix}")).unwrap_or(id);
             let receiver = |id: ReceiverId| ReceiverId::new(&format!("{id}{suffix}")).unwrap_or(id);
             item.target_id = item.target_id.map(target);
             item.receiver_id = item.receiver_id.map(receiver);
+            item.tracker_id = item.tracker_id.map(tracker);
         }
         item
     }

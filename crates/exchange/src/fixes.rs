@@ -72,7 +72,7 @@ impl<R: Read> FixRows<R> {
     fn new(reader: R, laid_out: &LaidOut<FixFormat>, time_bounds: TimeBounds) -> Result<Self> {
         Ok(match laid_out.format {
             FixFormat::Csv => {
-                let rows = CsvRows::of_fixes(reader, &[LONGITUDE, LATITUDE], &laid_out.layout)?;
+                let rows = CsvRows::with_receivers(reader, &[LONGITUDE, LATITUDE], &laid_out.layout)?;
                 Self::Csv { rows, time_bounds, receiver_id: None }
             }
             FixFormat::Nmea => Self::Nmea(NmeaFixes::new(reader, time_bounds)),

@@ -75,7 +75,8 @@ pub use messages::{
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use recording::{read_recording, write_recording};
 pub use rows::{
-    ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
+    ObservedRow, RowRules, read_detections, read_live_items, read_observation_features, read_observations,
+    read_samples,
 };
 pub use source_decoder::source_decoder;
 pub use track_files::{TrackFile, TrackFileFormat};

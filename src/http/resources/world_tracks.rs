@@ -99,7 +99,7 @@ impl From<&WorldTrackPoint> for WorldTrackState {
                 .iter()
                 .map(|sighting| WorldSighting {
                     camera_id: sighting.camera_id.to_string(),
-                    tracker_id: sighting.tracker_id.as_ref().map(TargetId::to_string),
+                    tracker_id: sighting.tracker_id.as_ref().map(|id| id.as_sent().to_owned()),
                     last_seen_at: sighting.last_seen_at,
                 })
                 .collect(),

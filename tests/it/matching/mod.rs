@@ -87,13 +87,19 @@ const ONE_AMONG_TEN: Crowd =
 fn one_phone_among_ten_walkers_is_matched_without_a_model() {
     let folder = data_folder();
     let recorded = ONE_AMONG_TEN.recorded();
-    let matched = run_match(&folder, &recorded, &["--image-size", IMAGE]);
+    let matched = run_match(&folder, &recorded, &["--image-size", IMAGE, "--json"]);
     let (right, all) = matched.right();
     assert!(
         matched.succeeded && all > 200 && right * 100 >= all * 95,
         "{right} of {all}: {}",
         matched.printed
     );
+    let document: serde_json::Value =
+        serde_json::from_str(matched.printed.lines().next().unwrap_or("")).expect("a document");
+    let (pairs, scores) = (&document["matching"]["pairs"], &document["matching"]["scores"]);
+    let sure = |pair: &serde_json::Value| pair["probability"].as_f64().is_some_and(|own| own >= 0.9);
+    assert!(pairs.as_array().is_some_and(|pairs| pairs.len() >= 3 && pairs.iter().all(sure)), "{document}");
+    assert!(scores["best"].as_f64() > scores["shifted_clocks"].as_f64(), "{document}");
     // The samples are as the importer reads them.
     let data = folder.path().join("data");
     let output = sightfix()

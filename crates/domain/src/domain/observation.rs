@@ -104,6 +104,13 @@ impl Observation {
         Ok(Self { tracker_id, ..self })
     }
 
+    /// The name under which the camera's tracker follows the target: its number, else the target. It stays when the
+    /// target of the number becomes known.
+    #[must_use]
+    pub fn tracked_as(&self) -> Option<TargetId> {
+        self.tracker_id.as_ref().map(TargetId::from).or_else(|| self.target_id.clone())
+    }
+
     /// The same of a known target.
     #[must_use]
     pub fn with_target(self, target_id: TargetId) -> Self {

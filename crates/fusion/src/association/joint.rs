@@ -14,7 +14,7 @@ use rand::Rng;
 use super::cancellation::Cancellation;
 use super::evidence::EvidenceModel;
 use super::matching::{
-    Located, MatchSettings, Matching, check_size, match_located, match_scene, receiver_noise,
+    Located, MatchSettings, Matching, check_size, clock_grid, match_located, match_scene, receiver_noise,
 };
 use super::placement::{Density, GroundPrior, Placement, PlacementSearch};
 use super::recording::Scene;
@@ -187,7 +187,14 @@ impl<'a> JointSearch<'a> {
     fn search(&self, camera: usize, fixes: &[Vec<TimedFix>]) -> PlacementSearch {
         let tracklets = self.on_ground(camera);
         let log_prior = self.cameras[camera].log_prior();
-        PlacementSearch::new(&tracklets, fixes, &self.model, &self.ground, log_prior)
+        PlacementSearch::new(
+            &tracklets,
+            fixes,
+            &clock_grid(self.settings),
+            &self.model,
+            &self.ground,
+            log_prior,
+        )
     }
 
     /// The best world, if it is better than all that must be wrong and all others that may be right.
@@ -432,7 +439,9 @@ fn common_motion(scene: &Scene<'_>, cameras: &[GroundCamera], ground: &GroundPri
     let mean = |of: fn(&SceneMotion) -> f64| {
         (motions.iter().map(|motion| of(motion).ln()).sum::<f64>() / motions.len().max(1) as f64).exp()
     };
-    SceneMotion { spread_m: mean(|own| own.spread_m), speed_m_s: mean(|own| own.speed_m_s) }
+    let speed_m_s = mean(|own| own.speed_m_s);
+    // The search takes one speed for all.
+    SceneMotion { spread_m: mean(|own| own.spread_m), speed_m_s, speeds_m_s: [speed_m_s; 3] }
 }
 
 fn motion_of_receivers(fixes: &[Vec<TimedFix>]) -> SceneMotion {

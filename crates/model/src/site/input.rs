@@ -3,8 +3,8 @@
 use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation};
 use crate::geo::EastNorth;
 
-/// Correlation over time of the receivers' errors that a fit assumes: that of phones, in the open and near walls. A
-/// receiver with whiter errors only gets too wide a covariance by it.
+/// Correlation over time of the receivers' errors that a fit begins with: that of phones, in the open and near walls. The
+/// time constant stays; the white share is estimated.
 pub const RECEIVER_CORRELATION: NoiseCorrelation =
     NoiseCorrelation { white_share: 0.08, time_constant_s: 30.0 };
 
@@ -52,7 +52,7 @@ pub struct SiteFitInput<'a> {
     pub fixes: &'a [SiteFix],
     /// Targets in two cameras at once.
     pub pairs: &'a [SitePair],
-    /// Correlation over time of the receivers' errors; their variance is estimated.
+    /// Correlation over time of the receivers' errors to begin with; their variance and white share are estimated.
     pub correlation: NoiseCorrelation,
 }
 

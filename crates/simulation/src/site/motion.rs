@@ -101,6 +101,13 @@ impl Mover {
         }
     }
 
+    /// Goes where another one goes, at a distance (m) from it.
+    pub(super) const fn accompany(&mut self, leader: Pose, offset_m: EastNorth) {
+        let EastNorth { east_m, north_m } = leader.position;
+        let position = EastNorth { east_m: east_m + offset_m.east_m, north_m: north_m + offset_m.north_m };
+        self.pose = Pose { position, ..leader };
+    }
+
     /// Points of the outline.
     pub(super) fn body(&mut self) -> Vec<Point> {
         if !self.is_vehicle {

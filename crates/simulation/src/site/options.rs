@@ -18,6 +18,8 @@ pub struct SiteOptions {
     pub cameras: usize,
     /// Number of walkers.
     pub walkers: usize,
+    /// Share of the walkers who walk in groups of two to four.
+    pub group_share: f64,
     /// Number of vehicles.
     pub vehicles: usize,
     /// Share of the targets that carry a receiver.
@@ -54,6 +56,7 @@ impl Default for SiteOptions {
             receiver_seed: 1,
             cameras: 3,
             walkers: 16,
+            group_share: 0.0,
             vehicles: 4,
             receiver_share: 0.5,
             duration_s: 300.0,

@@ -13,6 +13,8 @@ pub(super) struct SiteItem {
     pub(super) camera: CameraId,
     pub(super) time: Timestamp,
     pub(super) target_id: Option<TargetId>,
+    /// The name under which the camera's tracker follows the target.
+    pub(super) tracked_as: Option<TargetId>,
     pub(super) position: Position,
     pub(super) source: ItemSource,
 }

@@ -450,7 +450,7 @@ fn detection_of(
     };
     let noise_m2 = covariance_m2.minus(*map_covariance_m2).minus(lasting_noise_m2);
     Ok(WorldDetection {
-        tracker_id: item.target_id.clone(),
+        tracker_id: item.tracked_as.clone(),
         receiver: carrier.map(ReceiverId::from),
         position,
         covariance_m2: noise_m2,
@@ -488,6 +488,7 @@ mod tests {
                 camera: CameraId::new("a").expect("a slug"),
                 time: Timestamp::from_millisecond(1_000 * START_S + ms).expect("in range"),
                 target_id: Some(TargetId::new(tracker_id).expect("a name")),
+                tracked_as: Some(TargetId::new(tracker_id).expect("a name")),
                 position: origin,
                 source: ItemSource::Box {
                     covariance_m2: PlaneCovariance::isotropic(self.box_variance_m2),
@@ -551,6 +552,7 @@ mod tests {
             camera: CameraId::new("a").expect("a slug"),
             time: Timestamp::from_second(START_S).expect("in range"),
             target_id: Some(TargetId::new("walker").expect("a name")),
+            tracked_as: None,
             position: Position::new(8.0, 47.0).expect("valid"),
             source: ItemSource::Fix { variance_m2: 4.0 },
         };

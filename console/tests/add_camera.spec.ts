@@ -57,7 +57,7 @@ test('boxes of any JSON are found in a message, drawn as they come, and filtered
   expect([after.status.items - before.status.items, after.status.skipped - before.status.skipped]).toEqual([1, 3]);
 
   await page.getByText(/^Why 3 messages or parts/).click();
-  await expect(page.getByText("the class car is not among the source's classes")).toBeVisible();
+  await expect(page.getByText("1 the class car is not among the source's classes")).toBeVisible();
 
   // Nothing was kept until now.
   const learning = (): Promise<{ boxes: number; state: string }> => server.request('GET', '/v1/cameras/gate/learning');

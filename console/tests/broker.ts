@@ -6,6 +6,9 @@ import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 import { createInterface } from 'node:readline';
 
+/** A topic of the test's own. */
+const READY = 'test/ready';
+
 async function freePort(): Promise<number> {
   const server = createServer();
   await new Promise<void>((done) => server.listen(0, '127.0.0.1', done));
@@ -52,17 +55,21 @@ export class Broker {
 
   /** The messages of some topics from now on, by their topics. */
   async subscribe(topics: string[]): Promise<[topic: string, payload: string][]> {
-    const flags = topics.flatMap((topic) => ['-t', topic]);
-    const process = spawn('mosquitto_sub', ['-h', '127.0.0.1', '-p', String(this.port), '-q', '1', '-v', '-d', ...flags], { stdio: ['ignore', 'pipe', 'ignore'] });
+    const flags = [...topics, READY].flatMap((topic) => ['-t', topic]);
+    const process = spawn('mosquitto_sub', ['-h', '127.0.0.1', '-p', String(this.port), '-q', '1', '-v', ...flags], { stdio: ['ignore', 'pipe', 'ignore'] });
     this.#processes.push(process);
     const messages: [string, string][] = [];
-    await new Promise<void>((done) => {
-      createInterface({ input: process.stdout }).on('line', (line) => {
-        if (line.includes('SUBACK')) done();
-        const message = /^(\S+) (.*)$/.exec(line);
-        if (message && !line.startsWith('Client ')) messages.push([message[1]!, message[2]!]);
-      });
+    let isReady = false;
+    createInterface({ input: process.stdout }).on('line', (line) => {
+      const [topic] = line.split(' ', 1);
+      if (topic === READY) isReady = true;
+      else messages.push([topic!, line.slice(topic!.length + 1)]);
     });
+    // The client does not say when it has subscribed.
+    while (!isReady) {
+      this.publish(READY, ['']);
+      await new Promise((done) => setTimeout(done, 100));
+    }
     return messages;
   }
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 #: A process that has not come up by then is at fault, s.
-START_S = 60.0
+START_S = 180.0
 PAUSE_S = 0.05
 
 

@@ -16,8 +16,8 @@ from .workloads import names
 
 #: So small that all are reached in the first third of a soak of a minute, and rows come and go from then on.
 SETTINGS = {
-    "SIGHTFIX_LIMITS__SAMPLES_PER_CAMERA": "300", "SIGHTFIX_LIMITS__SAMPLE_OVERFLOW": "delete_oldest",
-    "SIGHTFIX_LIMITS__AUDIT_ENTRIES": "100", "SIGHTFIX_LIMITS__KEYS": "10",
+    "SIGHTFIX_LIMITS__SAMPLES_PER_CAMERA": "60", "SIGHTFIX_LIMITS__SAMPLE_OVERFLOW": "delete_oldest",
+    "SIGHTFIX_LIMITS__AUDIT_ENTRIES": "50", "SIGHTFIX_LIMITS__KEYS": "10",
     "SIGHTFIX_LIMITS__ENDED_RUNS_PER_CAMERA": "3", "SIGHTFIX_LIMITS__MODELS_PER_CAMERA": "8",
     "SIGHTFIX_LIMITS__IDEMPOTENCY_KEYS": "50",
 }  # fmt: skip

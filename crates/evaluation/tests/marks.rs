@@ -180,9 +180,11 @@ fn people_whose_feet_are_hidden() {
     let (whole, some) = (&shares["none hidden"], &shares["in a tenth of the rows 20 to 60 % hidden"]);
     assert!(some.0.mean_m() <= 1.3 * whole.0.mean_m() && some.0.inside() >= 0.88);
     assert!(some.1.mean_m() <= 1.3 * whole.1.mean_m() && some.1.inside() >= 0.88);
+    let fifth = &shares["20 % hidden"];
+    assert!(fifth.0.inside() >= 0.85 && fifth.1.inside() >= 0.75);
 }
 
-/// A large aircraft on a line that no training has shown, beside an IMM-UKF of its fixes.
+/// A large aircraft 12 m beside the lines of training.
 #[test]
 #[ignore = "takes minutes"]
 fn a_line_that_was_never_walked() {
@@ -215,6 +217,8 @@ fn a_line_that_was_never_walked() {
         tracked.0.append(&mut camera.tracked.0);
     }
     println!("GNSS {}; two-step {}; track {}", gnss.text(), fused.text(), tracked.text());
+    assert!(fused.mean_m() <= 0.5 * gnss.mean_m() && tracked.mean_m() <= fused.mean_m());
+    assert!(fused.inside() >= 0.8 && tracked.inside() >= 0.75);
 }
 
 /// A box of any size anywhere in the image.
@@ -283,9 +287,10 @@ fn boxes_that_are_wrong() {
         for (case, (fused, tracked)) in &cases {
             println!("{scene:?}, {case}: two-step {}; track {}", fused.text(), tracked.text());
         }
-        for case in ["none", "frozen", "25 % false", "all false"] {
-            let (fused, tracked) = &cases[case];
-            assert!(fused.inside() >= 0.85 && tracked.inside() >= 0.85, "{scene:?}, {case}");
+        for (case, (fused, tracked)) in &cases {
+            // The boxes of a vehicle count until the picture is known to be frozen.
+            let mark = if *case == "frozen" { 0.85 } else { 0.88 };
+            assert!(fused.inside() >= mark && tracked.inside() >= mark, "{scene:?}, {case}");
         }
     }
 }

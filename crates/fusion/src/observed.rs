@@ -57,8 +57,6 @@ pub struct ObservedBox {
     pub one_step: Regression,
     /// From the box alone, so independent of the fix.
     pub independent: Regression,
-    /// Error variance beside that of `independent`, m2 per axis, by the fixes of a target that is followed.
-    pub offset_m2: f64,
     /// True if `independent` and its covariance are finite and within the plane's range. If not, both regressions are
     /// replaced by the plane's origin with [`PLANE_RANGE_M`] as their 95 % radius.
     pub is_usable: bool,
@@ -133,7 +131,6 @@ impl ObservedBox {
         Self {
             one_step: if is_usable { one_step } else { anywhere_in_range(&one_step) },
             independent: if is_usable { independent } else { anywhere_in_range(&independent) },
-            offset_m2: 0.0,
             is_usable,
             is_unusual: independent.outside_training || bounding_box.touches_border(image_size),
             is_vague: regressor.is_vague(&independent),
@@ -141,12 +138,6 @@ impl ObservedBox {
             repeated_s: 0.0,
             is_frozen: false,
         }
-    }
-
-    /// With `offset_m2` in the errors of both regressions.
-    pub(super) fn with_offset(&self) -> Self {
-        let widened = |regression: Regression| regression.with_added_variance(self.offset_m2);
-        Self { one_step: widened(self.one_step), independent: widened(self.independent), ..*self }
     }
 
     /// The box after its target's boxes have been the same to the pixel for some time.

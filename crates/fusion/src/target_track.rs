@@ -119,7 +119,6 @@ impl TargetTrack {
         {
             seen.repeated_for(self.same_box.lasting_s(bounding_box, observed.time), regressor);
             self.map_strain.observe(bounding_box, seen, regressor);
-            seen.offset_m2 = self.active.as_ref().map_or(0.0, |active| active.track.box_offset_m2());
         }
         if let Some(fix) = &mut observed.fix {
             fix.repeated_s = self.same_fix.lasting_s(fix.position, observed.time);
@@ -141,8 +140,8 @@ impl TargetTrack {
         let mut measurement = measurement_in(&plane, observed, rejected.is_empty());
         // An active track decides about such positions itself, as it has to take back what it learnt from their source.
         if self.active.is_none() {
-            withhold_useless(&mut measurement, observed, &mut rejected);
             withdraw_contradicting(&mut measurement, observed, &mut rejected);
+            withhold_useless(&mut measurement, observed, &mut rejected);
         }
         let mut state = match &mut self.active {
             Some(active) => active.track.update(&measurement),

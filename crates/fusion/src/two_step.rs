@@ -70,7 +70,7 @@ pub fn fuse_observed(
         return pass_through(observation, observed);
     };
     let ((_, version), plane) = (model?, observed.plane?);
-    let regressed = &observed.regressed.as_ref()?.with_offset();
+    let regressed = observed.regressed.as_ref()?;
     let mut flags = Vec::new();
     if observation.fix().is_none() {
         flags.push(Flag::GnssDenied);

@@ -110,16 +110,6 @@ impl Regression {
         }
     }
 
-    /// The same position with a larger error variance, m2 per axis.
-    #[must_use]
-    pub fn with_added_variance(self, added_m2: f64) -> Self {
-        Self {
-            e_regression_m2: self.e_regression_m2 + added_m2,
-            covariance: self.covariance.plus(PlaneCovariance::isotropic(added_m2)),
-            ..self
-        }
-    }
-
     /// Covariance, m2, of the normal distribution that has the stated 95 % radius.
     #[must_use]
     pub fn normal_covariance(&self) -> PlaneCovariance {

@@ -134,7 +134,8 @@ impl Broker {
 
     /// Waits until an answer begins; how long it is, bytes.
     pub(super) async fn answer_size(&mut self) -> Result<u64, PeerError> {
-        let size = u64::from(self.stream.read_u32().await?);
+        let size = self.stream.read_u32().await.map(u64::from);
+        let size = size.map_err(|error| PeerError(format!("the broker sent no answer: {error}")))?;
         match size {
             ..=MAX_ANSWER_BYTES => Ok(size),
             _ => Err(PeerError(format!("the broker's answer is larger than {MAX_ANSWER_BYTES} bytes"))),

@@ -136,17 +136,14 @@ pub(super) struct TopicEntry {
 
 impl Request for Metadata<'_> {
     const KEY: i16 = 3;
-    const VERSION: i16 = 4;
+    const VERSION: i16 = 2;
     type Answer = (Vec<BrokerEntry>, Vec<TopicEntry>);
 
     fn write(&self, out: &mut BytesMut) {
         out.put_array(self.topics.iter(), |out, topic| out.put_text(topic));
-        let allow_auto_topic_creation = 1;
-        out.put_i8(allow_auto_topic_creation);
     }
 
     fn read(answer: &mut Fields) -> Result<Self::Answer, FieldError> {
-        let _throttle_time_ms = answer.i32()?;
         let brokers = answer.array(|it| {
             let broker = BrokerEntry { id: it.i32()?, host: it.text()?, port: it.i32()? };
             let _rack = it.text()?;

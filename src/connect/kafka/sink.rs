@@ -105,7 +105,7 @@ impl KafkaSink {
             time_ms: message.created_at.as_millisecond(),
             key: destination(message).1,
             value: &message.payload,
-            headers: [("message-id", &message.message_id), ("content-type", self.media_type)],
+            headers: [("content-type", self.media_type), ("message-id", &message.message_id)],
         }
     }
 

@@ -18,7 +18,7 @@ fn yard() -> proto::CameraProfile {
         learn_automatically: Some(false),
         site: None,
         gnss_bias_sigma_m: Some(1.5),
-        location: None,
+        location: Some(proto::Position { longitude_deg: Some(103.98678), latitude_deg: Some(30.6280135) }),
     }
 }
 

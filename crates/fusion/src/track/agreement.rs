@@ -184,14 +184,9 @@ impl Agreement {
         let apart_m =
             if self.disagrees { pairs.latest_m.max(east_m.hypot(north_m)) } else { east_m.hypot(north_m) };
         let either_m = apart_m + ONE_SIDED_95 * (pairs.variance_m2 * pairs.share_of_variance()).sqrt();
-        let share = if self.disagrees { 1.0 } else { pairs.share_beyond_chance() };
+        let share = ((pairs.statistic() - CHI_SQUARE_95) / (CHI_SQUARE_99_9 - CHI_SQUARE_95)).clamp(0.0, 1.0);
+        let share = if self.disagrees { 1.0 } else { share };
         r95_m + share * (either_m - r95_m).max(0.0)
-    }
-
-    /// Error variance per axis, m2, that a box has beside the stated one where the mean difference to the fixes is larger
-    /// than chance explains: the map is wrong where the target is, for no training was there.
-    pub(super) fn box_offset_m2(&self) -> f64 {
-        self.pairs.map_or(0.0, |pairs| pairs.share_beyond_chance() * pairs.offset_m2())
     }
 
     fn forget(&mut self, now: Timestamp) {
@@ -334,18 +329,6 @@ impl Pairs {
     /// Variance of the mean per unit variance of a difference.
     fn share_of_variance(&self) -> f64 {
         self.lasting_share + (1.0 - self.lasting_share) * self.white_factor
-    }
-
-    /// Share, 0 to 1, in which the mean difference counts as one that chance does not explain.
-    fn share_beyond_chance(&self) -> f64 {
-        ((self.statistic() - CHI_SQUARE_95) / (CHI_SQUARE_99_9 - CHI_SQUARE_95)).clamp(0.0, 1.0)
-    }
-
-    /// Square of the mean difference per axis less what the stated errors make of it, m2.
-    fn offset_m2(&self) -> f64 {
-        let [east_m, north_m] = self.mean_m;
-        let square_m2 = 0.5 * (east_m * east_m + north_m * north_m);
-        (square_m2 - self.variance_m2 * self.share_of_variance()).max(0.0)
     }
 
     /// Chi-square with 2 degrees of freedom for sources that agree.

@@ -94,11 +94,6 @@ impl ImmFilter {
         self.awaits_fix = !uses_boxes && (self.awaits_fix || used_boxes);
     }
 
-    /// Error variance of a box beyond the stated one, m2 per axis, by the fixes so far.
-    pub(super) fn box_offset_m2(&self) -> f64 {
-        self.agreement.box_offset_m2()
-    }
-
     /// Propagates to a later instant; an earlier one changes nothing.
     pub(super) fn predict(&mut self, settings: &TrackSettings, time: Timestamp) {
         let step_s = time.duration_since(self.time).as_secs_f64();
@@ -201,8 +196,6 @@ impl ImmFilter {
             if measured.is_vague {
                 return GateOutcome::unused(MeasurementSource::Regressed, RejectionReason::UnusableVariance);
             }
-            let offset = PlaneCovariance::isotropic(self.box_offset_m2());
-            let measured = MeasuredPosition { covariance: measured.covariance.plus(offset), ..measured };
             let measured = self.camera.at_place(settings, measured);
             let correlation = self.camera.correlation(settings, &measured);
             for mode in &mut self.modes {

@@ -88,13 +88,6 @@ impl Track {
         self.current.time
     }
 
-    /// Error variance that the next box has beside the stated one, m2 per axis: positive where the fixes of the last seconds
-    /// differ from the boxes by more than both state.
-    #[must_use]
-    pub fn box_offset_m2(&self) -> f64 {
-        self.current.box_offset_m2()
-    }
-
     /// True if the target has not been measured for longer than `time_to_live_s`.
     #[must_use]
     pub fn is_expired(&self, at: Timestamp) -> bool {

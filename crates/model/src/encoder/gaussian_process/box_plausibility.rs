@@ -68,13 +68,13 @@ pub(crate) struct Deviation {
     widen: f64,
 }
 
-/// The running mean of how a target's boxes deviate from those of training, and whether its foot is hidden: one per
-/// target, kept by the caller between its boxes.
+/// Running means of how a target's boxes deviate from those of training, and of the probability that its foot is hidden:
+/// one per target, kept by the caller between its boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RecentBoxes {
     mean: [f64; 2],
     count: u32,
-    /// Probability that the foot of the latest box is hidden.
+    /// Exponential mean, over as many boxes, of the probability that the foot is hidden.
     pub(super) hidden: f64,
 }
 

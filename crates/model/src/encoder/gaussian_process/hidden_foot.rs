@@ -4,11 +4,11 @@
 //! so the target's box has the height h / (1 - x) and its foot is lower; or it is of anything. The densities of log width
 //! and log height at the hypothetical foot are those of the training boxes (`box_plausibility`), which have the heights
 //! of different targets in them, with x uniform. Bayes' rule gives the probability that the foot is hidden. What hides a
-//! foot mostly hides it in the next box, too: the prior probability of a target's next box follows from that of its latest
-//! one (a hidden Markov model of two states). Otherwise the boxes of a hidden foot that look whole by chance would tell
-//! its position alone, as they state the smallest errors.
+//! foot mostly hides it in the next box, too, so the prior probability of a target's next box is the mean of what its latest
+//! boxes tell one by one. Otherwise the boxes of a hidden foot that look whole by chance would tell its position alone, as
+//! they state the smallest errors. What they tell is not multiplied, for a short target is short in every box.
 
-use super::box_plausibility::{BoxPlausibility, RecentBoxes};
+use super::box_plausibility::{BoxPlausibility, RECENT_BOXES, RecentBoxes};
 use super::projective_mean::Box4;
 use crate::domain::BoundingBox;
 use crate::encoder::features::features_of;
@@ -16,8 +16,6 @@ use crate::encoder::features::features_of;
 /// Prior probability that a foot is hidden, and that a box is of anything.
 const HIDDEN: f64 = 0.05;
 const ANYTHING: f64 = 0.01;
-/// What is left, after one box, of how far the probability of a target's latest box exceeds the prior one.
-const PERSISTENCE: f64 = 0.9;
 /// Density of a box of anything: uniform over a factor of 20 in width and in height.
 const ANYTHING_DENSITY: f64 = 0.11;
 /// Largest hidden share of a height.
@@ -46,25 +44,21 @@ impl HiddenFoot {
         plausibility: &BoxPlausibility,
         recent: Option<&mut RecentBoxes>,
     ) -> Option<Self> {
-        // A whole box says nothing about the next: something may come between at any time.
-        let latest = recent.as_ref().map_or(HIDDEN, |recent| recent.hidden.max(HIDDEN));
-        let hidden = Self::with_prior(bounding_box, plausibility, HIDDEN + PERSISTENCE * (latest - HIDDEN));
-        if let Some(recent) = recent {
-            recent.hidden = hidden.map_or(0.0, |hidden| hidden.probability);
-        }
-        hidden
-    }
-
-    #[inline]
-    fn with_prior(bounding_box: &BoundingBox, plausibility: &BoxPlausibility, prior: f64) -> Option<Self> {
+        let prior = recent.as_ref().map_or(HIDDEN, |recent| recent.hidden.max(HIDDEN));
         let sides = features_of(bounding_box);
         let seen = plausibility.deviation(&sides);
-        if prior <= HIDDEN && seen.normalized[1] > -WHOLE_SIGMAS {
-            return None;
+        let is_whole = prior <= HIDDEN && seen.normalized[1] > -WHOLE_SIGMAS;
+        let density = (!is_whole).then(|| hidden_density(plausibility, &sides));
+        let posterior = |prior: f64| {
+            let hidden = prior * density.map_or(0.0, |(density, ..)| density);
+            let whole = (1.0 - prior - ANYTHING) * plausibility.density(&seen);
+            hidden / (hidden + whole + ANYTHING * ANYTHING_DENSITY)
+        };
+        if let Some(recent) = recent {
+            recent.hidden += (posterior(HIDDEN) - recent.hidden) / RECENT_BOXES as f64;
         }
-        let (density, mean, variance) = hidden_density(plausibility, &sides);
-        let (hidden, whole) = (prior * density, (1.0 - prior - ANYTHING) * plausibility.density(&seen));
-        let probability = hidden / (hidden + whole + ANYTHING * ANYTHING_DENSITY);
+        let (_, mean, variance) = density?;
+        let probability = posterior(prior);
         if probability < LEAST_PROBABILITY {
             return None;
         }

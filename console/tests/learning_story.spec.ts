@@ -6,8 +6,16 @@ import { join } from 'node:path';
 import type { Locator, Page } from '@playwright/test';
 import { distance_m } from '../src/lib/geo';
 import { Broker } from './broker';
-import { accessibilityFindings, expect, test } from './fixtures';
+import { accessibilityFindings, expect, test as base } from './fixtures';
 import { BINARY } from './server';
+
+const test = base.extend<{ broker: Broker }>({
+  broker: async ({}, use) => {
+    const broker = await Broker.start();
+    await use(broker);
+    broker.stop();
+  },
+});
 
 /** Recorded time after which the camera must have its model, s. */
 const LEARNT_FROM_S = 600;
@@ -66,11 +74,10 @@ async function settingsOf(dialog: Locator): Promise<Record<string, string>> {
 
 const step = (page: Page, name: RegExp): Locator => page.getByRole('listitem').filter({ has: page.getByRole('heading', { name }) });
 
-test('one phone among eleven people trains a camera of Frigate, and Home Assistant follows it', async ({ console: page, server }) => {
+test('one phone among eleven people trains a camera of Frigate, and Home Assistant follows it', async ({ console: page, server, broker }) => {
   // Training runs at the lowest priority: on a busy machine it takes as long as it takes.
   test.setTimeout(1_800_000);
   const square = simulateSquare();
-  const broker = await Broker.start();
   const begin_ms = square.boxes[0]!.time_ms;
   const within = (from_s: number, until_s: number) => ({ time_ms }: Row): boolean => time_ms >= begin_ms + from_s * 1000 && time_ms < begin_ms + until_s * 1000;
   const { secret } = await server.request<{ secret: string }>('POST', '/v1/keys', { name: 'first', role: 'admin', camera_ids: [] });
@@ -96,8 +103,11 @@ test('one phone among eleven people trains a camera of Frigate, and Home Assista
   // Its boxes as they come, of people alone.
   const some = square.boxes.filter(within(0, 5));
   const parked = some.map((row) => frigateEvent({ ...row, cells: ['parked', '900', '500', '200', '120'] }, 'car'));
-  broker.publish('frigate/events', [...some.map((row) => frigateEvent(row)), ...parked]);
-  await expect(boxes.getByRole('img', { name: /Picture with [1-9]\d* boxes/ })).toBeVisible();
+  await expect(async () => {
+    // The page may only just begin to listen.
+    broker.publish('frigate/events', [...some.map((row) => frigateEvent(row)), ...parked]);
+    await expect(boxes.getByRole('img', { name: /Picture with [1-9]\d* boxes/ })).toBeVisible({ timeout: 2000 });
+  }).toPass();
   await boxes.getByRole('button', { name: 'person', exact: true }).click();
   await boxes.getByRole('button', { name: 'Save the filter' }).click();
   await expect(page.getByText('The filter is saved')).toBeVisible();
@@ -174,5 +184,4 @@ test('one phone among eleven people trains a camera of Frigate, and Home Assista
   expect(errors_m.length).toBeGreaterThan(50);
   // The phone alone is off by 2.6 m per axis, which is 3.3 m on average.
   expect(mean_m).toBeLessThan(2.5);
-  broker.stop();
 });

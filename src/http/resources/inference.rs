@@ -212,11 +212,11 @@ impl TensorData {
         let most = most_boxes.saturating_mul(BOX_COLUMNS);
         let mut data = Self { numbers: Vec::new(), is_of_rows: false, count: 0, most };
         let rest = if datatype == FP64 {
-            let (numbers, rest) = bytes.as_chunks();
+            let (numbers, rest) = bytes.as_chunks::<8>();
             numbers.iter().for_each(|number| data.add(f64::from_le_bytes(*number)));
             rest
         } else {
-            let (numbers, rest) = bytes.as_chunks();
+            let (numbers, rest) = bytes.as_chunks::<4>();
             numbers.iter().for_each(|number| data.add(f32::from_le_bytes(*number).into()));
             rest
         };
